@@ -49,7 +49,9 @@ def main() -> None:
             one = milliseconds(lambda w=world, v=view: w.render(v, supersample=1), options.repeats)
             rows.setdefault("480x320, 1 ray per pixel", []).append(one)
         rows.setdefault("sweep 64 x 1800", []).append(milliseconds(lambda w=world: w.lidar_sweep(8), options.repeats))
-    sys.stdout.write(f"{'':28s} {'median ms':>10s} {'max ms':>10s}   ({options.threads} threads, {options.seeds} seeds)\n")
+    sys.stdout.write(
+        f"{'':28s} {'median ms':>10s} {'max ms':>10s}   ({options.threads} threads, {options.seeds} seeds)\n"
+    )
     for name, values in rows.items():
         sys.stdout.write(f"{name:28s} {statistics.median(values):10.1f} {max(values):10.1f}\n")
 

@@ -1,4 +1,5 @@
-"""Dense depth from six sweeps on generated cities, against the nearest measurement and linear interpolation; sky is given.
+"""Dense depth from six sweeps on generated cities, against the nearest measurement and linear interpolation; sky is
+given.
 
 python bench/complete.py --seeds 2200100 2200101 --size 640x400
 """
@@ -33,7 +34,8 @@ def say(line: str) -> None:
 
 
 def points_at(world: CityWorld, view: View, middle: int, sweeps: int) -> NDArray[np.float32]:
-    """Points of ``sweeps`` sweeps around frame ``middle``, movers as they stand at the view's time, f32[N, 3] metres."""
+    """Points of ``sweeps`` sweeps around frame ``middle``, movers as they stand at the view's time, f32[N, 3]
+    metres."""
     rules = FusionRules()
     movers = [track for track in world.tracks() if judge_track(track, rules).moving]
     parts = []
@@ -91,8 +93,10 @@ def main() -> None:
             rows.setdefault(name, []).append(
                 np.r_[scores(depth, recorded.depth, near), scores(depth, recorded.depth, above)]
             )
-        say(f"seed {seed}: {100 * known.mean():.0f} % measured, {worked:.2f} s of processor time, AbsRel "
-            + ", ".join(f"{name} {row[-1][0]:.4f}" for name, row in rows.items()))  # fmt: skip
+        say(
+            f"seed {seed}: {100 * known.mean():.0f} % measured, {worked:.2f} s of processor time, AbsRel "
+            + ", ".join(f"{name} {row[-1][0]:.4f}" for name, row in rows.items())
+        )
     say("mean             AbsRel  RMSE m  delta1 | above the beams: AbsRel  RMSE m  delta1")
     for name, row in rows.items():
         mean = np.nanmean(np.stack(row), 0)

@@ -1,7 +1,9 @@
-"""DepthLab at its published sizes: tensors and parameters of every part, counted on the meta device; or a stand-in of the files.
+"""DepthLab at its published sizes: tensors and parameters of every part, counted on the meta device; or a stand-in of
+the files.
 
     python bench/depthlab_size.py                    # prints the table
-    python bench/depthlab_size.py --write FOLDER     # made-up values in half precision, 4.6 GB: something to rehearse `mudg convert` with
+    python bench/depthlab_size.py --write FOLDER     # made-up values in half precision, 4.6 GB: something to rehearse
+                                                     `mudg convert` with
 
 Needs the extra ``models``. The sizes are those of Stable Diffusion 2 (Marigold v1-0) and CLIP ViT-H/14.
 """
@@ -19,21 +21,44 @@ from safetensors.torch import save_file
 from mudg.labels.depth import depthlab
 
 UNET = {
-    "_class_name": "UNet2DConditionModel", "in_channels": 8, "out_channels": 4, "block_out_channels": [320, 640, 1280, 1280],
-    "attention_head_dim": [5, 10, 20, 20], "cross_attention_dim": 1024, "use_linear_projection": True, "layers_per_block": 2,
-}  # fmt: skip
+    "_class_name": "UNet2DConditionModel",
+    "in_channels": 8,
+    "out_channels": 4,
+    "block_out_channels": [320, 640, 1280, 1280],
+    "attention_head_dim": [5, 10, 20, 20],
+    "cross_attention_dim": 1024,
+    "use_linear_projection": True,
+    "layers_per_block": 2,
+}
 VAE = {
-    "_class_name": "AutoencoderKL", "block_out_channels": [128, 256, 512, 512], "layers_per_block": 2, "latent_channels": 4,
-    "down_block_types": ["DownEncoderBlock2D"] * 4, "up_block_types": ["UpDecoderBlock2D"] * 4, "scaling_factor": 0.18215,
-}  # fmt: skip
+    "_class_name": "AutoencoderKL",
+    "block_out_channels": [128, 256, 512, 512],
+    "layers_per_block": 2,
+    "latent_channels": 4,
+    "down_block_types": ["DownEncoderBlock2D"] * 4,
+    "up_block_types": ["UpDecoderBlock2D"] * 4,
+    "scaling_factor": 0.18215,
+}
 VISION = {
-    "hidden_size": 1280, "intermediate_size": 5120, "num_hidden_layers": 32, "num_attention_heads": 16, "image_size": 224,
-    "patch_size": 14, "hidden_act": "gelu", "projection_dim": 512,
-}  # fmt: skip
+    "hidden_size": 1280,
+    "intermediate_size": 5120,
+    "num_hidden_layers": 32,
+    "num_attention_heads": 16,
+    "image_size": 224,
+    "patch_size": 14,
+    "hidden_act": "gelu",
+    "projection_dim": 512,
+}
 SCHEDULE = {
-    "_class_name": "DDIMScheduler", "beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear",
-    "clip_sample": False, "set_alpha_to_one": False, "steps_offset": 1, "prediction_type": "v_prediction",
-}  # fmt: skip
+    "_class_name": "DDIMScheduler",
+    "beta_start": 0.00085,
+    "beta_end": 0.012,
+    "beta_schedule": "scaled_linear",
+    "clip_sample": False,
+    "set_alpha_to_one": False,
+    "steps_offset": 1,
+    "prediction_type": "v_prediction",
+}
 
 
 def main() -> None:
@@ -53,12 +78,15 @@ def main() -> None:
         return
     texts = {
         "marigold-depth-v1-0/model_index.json": {"_class_name": "MarigoldPipeline"},
-        "marigold-depth-v1-0/unet/config.json": UNET, "marigold-depth-v1-0/vae/config.json": VAE,
+        "marigold-depth-v1-0/unet/config.json": UNET,
+        "marigold-depth-v1-0/vae/config.json": VAE,
         "marigold-depth-v1-0/scheduler/scheduler_config.json": SCHEDULE,
         "CLIP-ViT-H-14-laion2B-s32B-b79K/config.json": {
-            "model_type": "clip", "projection_dim": 1024, "vision_config": {**VISION, "model_type": "clip_vision_model"}
+            "model_type": "clip",
+            "projection_dim": 1024,
+            "vision_config": {**VISION, "model_type": "clip_vision_model"},
         },
-    }  # fmt: skip
+    }
     for name, content in texts.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(json.dumps(content))

@@ -1,4 +1,5 @@
-"""How often the comparison of LiDAR and image edges is right: generated cities as they are, and with cameras turned by a degree.
+"""How often the comparison of LiDAR and image edges is right: generated cities as they are, and with cameras turned by
+a degree.
 
 python bench/edge_alignment.py [--seeds 8]
 """

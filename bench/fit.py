@@ -4,9 +4,10 @@
     python bench/fit.py --steps 60 --threads 1        # a quick look: the first 60 of them
     python bench/fit.py --densify mcmc --json fit.json
 
-The scene is a generated city, made once and kept in --work. The loop is `gaussians/fit.py` as it is: its functions are wrapped with
-a clock, nothing is left out. With one thread processor time is measured, else wall time. "rasteriser" is what the library's own
-clock counts in its phases; "losses" contains torch's backward pass outside the rasteriser, "Adam" the check of gradients before it.
+The scene is a generated city, made once and kept in --work. The loop is `gaussians/fit.py` as it is: its functions are
+wrapped with a clock, nothing is left out. With one thread processor time is measured, else wall time. "rasteriser" is
+what the library's own clock counts in its phases; "losses" contains torch's backward pass outside the rasteriser,
+"Adam" the check of gradients before it.
 """
 
 from __future__ import annotations
@@ -74,7 +75,8 @@ class Clock:
         return timed
 
     def move_phases(self, source: str, target: str, names: tuple[str, ...]) -> None:
-        """Book what the library counted in these phases of its last call under its own part; asking takes time itself."""
+        """Book what the library counted in these phases of its last call under its own part; asking takes time
+        itself."""
         began = self.now()
         found = raster_cpu.last_statistics()
         self.asking += self.now() - began
@@ -86,13 +88,15 @@ class Clock:
 def instrument(clock: Clock) -> None:
     """Put the clock into the loop of `gaussians/fit.py`."""
     for part, names in {
-        "compose": ("compose",), "Adam": ("adam_step",), "densify": ("_densify_if_due", "shorten_needles"),
+        "compose": ("compose",),
+        "Adam": ("adam_step",),
+        "densify": ("_densify_if_due", "shorten_needles"),
         "losses": ("recorded_terms", "virtual_terms", "regularisers"),
-    }.items():  # fmt: skip
+    }.items():
         for name in names:
             setattr(fit, name, clock.wrapped(part, getattr(fit, name)))
-    FiniteCheck.terms = clock.wrapped("losses", FiniteCheck.terms)  # type: ignore[method-assign]
-    FiniteCheck.gradients = clock.wrapped("Adam", FiniteCheck.gradients)  # type: ignore[method-assign]
+    FiniteCheck.terms = clock.wrapped("losses", FiniteCheck.terms)
+    FiniteCheck.gradients = clock.wrapped("Adam", FiniteCheck.gradients)
     rasterize, backward = clock.wrapped("rest", fit.rasterize), clock.wrapped("losses", torch.Tensor.backward)
 
     def timed_rasterize(*arguments: Any, **named: Any) -> Any:
@@ -105,10 +109,10 @@ def instrument(clock: Clock) -> None:
         clock.move_phases("losses", "rasteriser backward", BACKWARD)
 
     fit.rasterize = timed_rasterize
-    torch.Tensor.backward = timed_backward  # type: ignore[method-assign]
-    ViewSet.choose = clock.wrapped("view loading", ViewSet.choose)  # type: ignore[method-assign]
-    StoredView.as_tensors = clock.wrapped("view loading", StoredView.as_tensors)  # type: ignore[method-assign]
-    DensifyStats.observe = clock.wrapped("densify", DensifyStats.observe)  # type: ignore[method-assign]
+    torch.Tensor.backward = timed_backward
+    ViewSet.choose = clock.wrapped("view loading", ViewSet.choose)
+    StoredView.as_tensors = clock.wrapped("view loading", StoredView.as_tensors)
+    DensifyStats.observe = clock.wrapped("densify", DensifyStats.observe)
 
 
 def street(folder: Path, frames: int, size: str, cameras: int) -> tuple[Path, Path]:
@@ -155,11 +159,18 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         Fit(scene=scene, fused=fused, out=Path(folder) / "fit", settings=config).run()
     clock.seconds["rest"] += taken["seconds"] - sum(clock.seconds.values())
     return {
-        **taken, "iterations": config.iterations, "densify": config.densify.kind, "frames": options.frames, "cameras": options.cameras,
-        "size": options.size, "threads": options.threads, "clock": "processor" if options.threads == 1 else "wall",
-        "isa": native.isa(), "it_per_s": taken["steps"] / taken["seconds"],
+        **taken,
+        "iterations": config.iterations,
+        "densify": config.densify.kind,
+        "frames": options.frames,
+        "cameras": options.cameras,
+        "size": options.size,
+        "threads": options.threads,
+        "clock": "processor" if options.threads == 1 else "wall",
+        "isa": native.isa(),
+        "it_per_s": taken["steps"] / taken["seconds"],
         "ms": {part: 1e3 * value / taken["steps"] for part, value in clock.seconds.items()},
-    }  # fmt: skip
+    }
 
 
 def table(found: dict[str, Any]) -> str:
@@ -167,8 +178,10 @@ def table(found: dict[str, Any]) -> str:
     step_ms = sum(found["ms"].values())
     lines = [
         native.status(),
-        f"{found['frames']} frames x {found['cameras']} cameras, {found['size']}, densify {found['densify']}, "
-        f"{found['gaussians']} Gaussians at the end; {found['steps']} steps, {found['clock']} time",
+        (
+            f"{found['frames']} frames x {found['cameras']} cameras, {found['size']}, densify {found['densify']}, "
+            f"{found['gaussians']} Gaussians at the end; {found['steps']} steps, {found['clock']} time"
+        ),
         f"{found['it_per_s']:.1f} it/s, {step_ms:.1f} ms per step",
         *(f"  {part:<21}{value:7.2f} ms {value / step_ms:5.0%}" for part, value in found["ms"].items()),
     ]

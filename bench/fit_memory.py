@@ -4,10 +4,10 @@
     python bench/fit_memory.py --views 1000 --virtual 200    # the size of a log of five cameras
     python bench/fit_memory.py --views 100 --in-memory       # the same with all views decoded in memory
 
-The scene is a generated city of 8 frames at the wanted size, made once and kept in --work; its frames (and exact virtual views of
-them) are named as often as views are wanted, so that all are read and decoded but the disk holds few. The fit is the product's own:
-`load_recorded`, `load_virtual`, the starting model and the loop. The peak is that of anonymous memory: pages of the scratch
-file that the system keeps are its own to drop.
+The scene is a generated city of 8 frames at the wanted size, made once and kept in --work; its frames (and exact
+virtual views of them) are named as often as views are wanted, so that all are read and decoded but the disk holds few.
+The fit is the product's own: `load_recorded`, `load_virtual`, the starting model and the loop. The peak is that of
+anonymous memory: pages of the scratch file that the system keeps are its own to drop.
 """
 
 from __future__ import annotations
@@ -73,11 +73,14 @@ class PeakMemory:
     def _watch(self) -> None:
         while not self._over.wait(0.05):
             lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
-            self.peak = max(self.peak, 1024 * next(int(line.split()[1]) for line in lines if line.startswith("RssAnon")))
+            self.peak = max(
+                self.peak, 1024 * next(int(line.split()[1]) for line in lines if line.startswith("RssAnon"))
+            )
 
 
 def city_of(folder: Path, size: str) -> tuple[Scene, Path, ObservationSet]:
-    """A scene of 8 frames, its fused cloud, and exact virtual views 2 m to the left of the front camera; made when missing."""
+    """A scene of 8 frames, its fused cloud, and exact virtual views 2 m to the left of the front camera; made when
+    missing."""
     width, height = (int(side) for side in size.split("x"))
     config = CityConfig(seed=3, n_frames=FRAMES, width=width, height=height, cameras=CAMERAS)
     root = folder / f"memory_{size}"
@@ -97,7 +100,9 @@ def repeated(scene: Scene, count: int) -> Scene:
     return replace(scene, frames=tuple(sorted(frames, key=lambda frame: (frame.view.time_s, frame.id))))
 
 
-def timed(function: Callable[..., Any], seconds: list[float], now: Callable[[], float] = time.perf_counter) -> Callable[..., Any]:
+def timed(
+    function: Callable[..., Any], seconds: list[float], now: Callable[[], float] = time.perf_counter
+) -> Callable[..., Any]:
     """The function, the time of every call noted."""
 
     def call(*arguments: Any, **named: Any) -> Any:
@@ -117,9 +122,12 @@ def loaded(
     scene, fused, observations = repeated(city[0], options.views), *city[1:]
     sets = {f"set{n:04d}": observations for n in range(-(-options.virtual // len(observations)))}
     config = FitConfig(
-        method="mudg_s" if sets else "street_gaussians", iterations=30_000, checkpoint_every=10**6, preview_every=10**6,
+        method="mudg_s" if sets else "street_gaussians",
+        iterations=30_000,
+        checkpoint_every=10**6,
+        preview_every=10**6,
         virtual=VirtualConfig(start=0.0, gaussians=options.unseen),
-    )  # fmt: skip
+    )
     virtual = sum(map(len, sets.values()))
     needed = kept.recorded_bytes(scene.frames, 0) + kept.virtual_bytes(sets)
     kept.IN_MEMORY_BYTES = 1 << 62 if options.in_memory else 0
@@ -130,13 +138,20 @@ def loaded(
     measured = views.fused_lidar(cloud, scene.tracks)
     found = replace(found, virtual=kept.keep(views.load_virtual(sets, classes, measured), virtual, scratch))
     numbers = {
-        "views": options.views, "virtual": virtual, "size": options.size, "in_memory": options.in_memory,
-        "loading_s": time.perf_counter() - began[0], "loading_cpu_s": time.process_time() - began[1], "expected_gib": needed / GIB,
-    }  # fmt: skip
+        "views": options.views,
+        "virtual": virtual,
+        "size": options.size,
+        "in_memory": options.in_memory,
+        "loading_s": time.perf_counter() - began[0],
+        "loading_cpu_s": time.process_time() - began[1],
+        "expected_gib": needed / GIB,
+    }
     for name in ("recorded", "virtual"):
         every = getattr(found, name)
         if isinstance(every, kept.ViewFile):
-            numbers[f"bytes_per_{name}_view"] = statistics.fmean(slot.size for slot in every._slots) if len(every) else 0
+            numbers[f"bytes_per_{name}_view"] = (
+                statistics.fmean(slot.size for slot in every._slots) if len(every) else 0
+            )
     began = time.perf_counter(), time.process_time()
     state = fit.start_state(config, scene, cloud, found, classes)
     return state, config, {**numbers, "start_s": time.perf_counter() - began[0], "gaussians": len(state.model.table)}
@@ -144,7 +159,8 @@ def loaded(
 
 @contextlib.contextmanager
 def step_times(first: int, last: int) -> Iterator[dict[str, list[float]]]:
-    """Clocks in the loop: waiting for views, reading them and making tensors (processor time of the thread), whole steps."""
+    """Clocks in the loop: waiting for views, reading them and making tensors (processor time of the thread), whole
+    steps."""
     found: dict[str, list[float]] = {"waiting": [], "tensors": [], "reading": [], "step": []}
     chosen_ahead, due, choose, tensors = fit.chosen_ahead, fit._densify_if_due, ViewSet.choose, StoredView.as_tensors
     began = [time.perf_counter()]
@@ -162,14 +178,14 @@ def step_times(first: int, last: int) -> Iterator[dict[str, list[float]]]:
             raise EnoughSteps
         return due(state, config, step)
 
-    fit.chosen_ahead, fit._densify_if_due = with_clock, count  # type: ignore[assignment]
-    ViewSet.choose = timed(choose, found["reading"], time.thread_time)  # type: ignore[method-assign]
-    StoredView.as_tensors = timed(tensors, found["tensors"], time.thread_time)  # type: ignore[method-assign]
+    fit.chosen_ahead, fit._densify_if_due = with_clock, count
+    ViewSet.choose = timed(choose, found["reading"], time.thread_time)
+    StoredView.as_tensors = timed(tensors, found["tensors"], time.thread_time)
     try:
         yield found
     finally:
         fit.chosen_ahead, fit._densify_if_due = chosen_ahead, due
-        ViewSet.choose, StoredView.as_tensors = choose, tensors  # type: ignore[method-assign]
+        ViewSet.choose, StoredView.as_tensors = choose, tensors
     for name in found:
         found[name] = found[name][first:]
 
@@ -185,24 +201,51 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
         with contextlib.closing(state.views), step_times(3, options.steps) as found, contextlib.suppress(EnoughSteps):
             fit.optimise(state, config, folder)
     medians = {f"{name}_ms": 1e3 * statistics.median(values) for name, values in found.items()}
-    return {**numbers, **medians, "peak_gib": memory.peak / GIB, "steps": len(found["step"]), "threads": options.threads}
+    return {
+        **numbers,
+        **medians,
+        "peak_gib": memory.peak / GIB,
+        "steps": len(found["step"]),
+        "threads": options.threads,
+    }
 
 
 def table(found: dict[str, Any]) -> str:
     """The numbers for people."""
     count = found["views"] + found["virtual"]
     step, waiting = found["step_ms"], found["waiting_ms"]
-    held = [f"{found[f'bytes_per_{n}_view'] / 1e6:.1f} MB per {n} view" for n in ("recorded", "virtual") if f"bytes_per_{n}_view" in found]
-    return "\n".join([
-        f"{found['views']} recorded and {found['virtual']} virtual views of {found['size']}, {found['expected_gib']:.1f} GiB expected, "
-        f"{'in memory' if found['in_memory'] else 'in a scratch file: ' + ', '.join(held)}",
-        f"loading {found['loading_s']:.0f} s, {1e3 * found['loading_cpu_s'] / count:.0f} ms of processor time per view",
-        f"starting model {found['start_s']:.1f} s, {found['gaussians']} Gaussians",
-        f"peak of anonymous memory: {found['peak_loading_gib']:.2f} GiB while loading, {found['peak_gib']:.2f} GiB in all",
-        f"{found['steps']} steps, {found['threads']} threads, medians: step {step:.0f} ms, of which waiting for views {waiting:.1f} ms "
-        f"({waiting / step:.1%}), the making of tensors included; processor time: tensors of a view {found['tensors_ms']:.1f} ms, "
-        f"reading the views of a step, in other threads if in a file, {found['reading_ms']:.1f} ms",
-    ]) + "\n"  # fmt: skip
+    held = [
+        f"{found[f'bytes_per_{n}_view'] / 1e6:.1f} MB per {n} view"
+        for n in ("recorded", "virtual")
+        if f"bytes_per_{n}_view" in found
+    ]
+    return (
+        "\n".join(
+            [
+                (
+                    f"{found['views']} recorded and {found['virtual']} virtual views of {found['size']},"
+                    f" {found['expected_gib']:.1f} GiB expected,"
+                    f" {'in memory' if found['in_memory'] else 'in a scratch file: ' + ', '.join(held)}"
+                ),
+                (
+                    f"loading {found['loading_s']:.0f} s, {1e3 * found['loading_cpu_s'] / count:.0f} ms of processor"
+                    " time per view"
+                ),
+                f"starting model {found['start_s']:.1f} s, {found['gaussians']} Gaussians",
+                (
+                    f"peak of anonymous memory: {found['peak_loading_gib']:.2f} GiB while loading,"
+                    f" {found['peak_gib']:.2f} GiB in all"
+                ),
+                (
+                    f"{found['steps']} steps, {found['threads']} threads, medians: step {step:.0f} ms, of which waiting"
+                    f" for views {waiting:.1f} ms ({waiting / step:.1%}), the making of tensors included; processor"
+                    f" time: tensors of a view {found['tensors_ms']:.1f} ms, reading the views of a step, in other"
+                    f" threads if in a file, {found['reading_ms']:.1f} ms"
+                ),
+            ]
+        )
+        + "\n"
+    )
 
 
 def main() -> None:
@@ -212,10 +255,14 @@ def main() -> None:
     parser.add_argument("--virtual", type=int, default=0, help="virtual views with dense depth")
     parser.add_argument("--size", default="1600x1066")
     parser.add_argument("--steps", type=int, default=15)
-    parser.add_argument("--unseen", type=int, default=0, help="Gaussians at surfaces that only virtual views show (0 = not looked for)")
+    parser.add_argument(
+        "--unseen", type=int, default=0, help="Gaussians at surfaces that only virtual views show (0 = not looked for)"
+    )
     parser.add_argument("--threads", type=int, default=1)
     parser.add_argument("--in-memory", action="store_true", help="keep all views in memory, whatever they take")
-    parser.add_argument("--work", default=str(Path(tempfile.gettempdir()) / "mudg_bench_fit"), help="where scene and scratch file lie")
+    parser.add_argument(
+        "--work", default=str(Path(tempfile.gettempdir()) / "mudg_bench_fit"), help="where scene and scratch file lie"
+    )
     parser.add_argument("--json", default="", help="also write the numbers here")
     options = parser.parse_args()
     native.require("this benchmark")

@@ -2,8 +2,8 @@
 
     python bench/ingest_cost.py FORMAT SOURCE [--workers N] [--resolution R] [--frames a:b]
 
-A frame is one image with its share of the sweeps. Processor seconds do not depend on what else the machine does; peak memory is
-the largest resident size less that of the program with the importer loaded.
+A frame is one image with its share of the sweeps. Processor seconds do not depend on what else the machine does; peak
+memory is the largest resident size less that of the program with the importer loaded.
 """
 
 from __future__ import annotations
@@ -32,9 +32,11 @@ def main() -> None:
     asked = parser.parse_args()
     log.set_quiet(True)
     options = ImportOptions(
-        frames=parse_frame_range(asked.frames), sequence=asked.sequence, workers=asked.workers,
+        frames=parse_frame_range(asked.frames),
+        sequence=asked.sequence,
+        workers=asked.workers,
         resolution=parse_resolution(asked.resolution),
-    )  # fmt: skip
+    )
     for module in ("PIL.PngImagePlugin", "PIL.JpegImagePlugin", "safetensors.numpy", "scipy.sparse"):
         importlib.import_module(module)
     before_kib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
@@ -45,8 +47,8 @@ def main() -> None:
     peak = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before_kib) / 1024
     frames = len(scene.frames)
     sys.stdout.write(
-        f"{asked.format}: {frames} images, {len(scene.sweeps)} sweeps, {asked.workers} workers: {wall / frames:.3f} s a frame "
-        f"({cpu / frames:.3f} of the processor), peak memory {peak:.0f} MiB above {before_kib / 1024:.0f} MiB\n"
+        f"{asked.format}: {frames} images, {len(scene.sweeps)} sweeps, {asked.workers} workers: {wall / frames:.3f} s a"
+        f" frame ({cpu / frames:.3f} of the processor), peak memory {peak:.0f} MiB above {before_kib / 1024:.0f} MiB\n"
     )
 
 

@@ -1,6 +1,6 @@
 """Seconds of the small diffusion model: one network pass, one decoding, one whole clip of eight frames, on one thread.
 
-    OMP_NUM_THREADS=1 python bench/mdm.py [--model embedded] [--steps 2] [--profile]
+OMP_NUM_THREADS=1 python bench/mdm.py [--model embedded] [--steps 2] [--profile]
 """
 
 from __future__ import annotations
@@ -49,13 +49,16 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     model = mdm_files.load(options.model)
-    height = max(1, round((model.config.area_px / 1.5) ** 0.5 / model.config.pixel_multiple)) * model.config.pixel_multiple
+    height = (
+        max(1, round((model.config.area_px / 1.5) ** 0.5 / model.config.pixel_multiple)) * model.config.pixel_multiple
+    )
     width = model.config.area_px // height
     condition = made_up_condition(model.config.window, height, width)
     latents = model.sample(condition, SampleRequest(1)).latents
     encoded = model.encode_condition(condition)
     print(  # noqa: T201
-        f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f} M parameters, {model.config.window} frames of {width}x{height}"
+        f"{sum(p.numel() for p in model.parameters()) / 1e6:.1f} M parameters, {model.config.window} frames of"
+        f" {width}x{height}"
     )
     for bf16 in (False, True):
         with torch.no_grad(), torch.autocast("cpu", torch.bfloat16, enabled=bf16):
@@ -73,7 +76,8 @@ def main() -> None:
     if options.profile:
         with torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU]) as profile:
             model.sample(condition, SampleRequest(options.steps, bf16=True))
-        print(profile.key_averages().table(sort_by="self_cpu_time_total", row_limit=12, max_name_column_width=40))  # noqa: T201
+        rows = profile.key_averages().table(sort_by="self_cpu_time_total", row_limit=12, max_name_column_width=40)
+        print(rows)  # noqa: T201
     peak_gb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     print(f"largest memory of this process {peak_gb:.2f} GB")  # noqa: T201
 

@@ -1,9 +1,10 @@
 """How well the light of a street is known for a vehicle from another one (``editing/light.py``), on generated cities.
 
-Every city is fitted as by `mudg bench edit`. Of its vehicle that shows most pixels the true mean light is known in its own city, and, drawn
-in place of theirs (``CityWorld.recast``), in all others: their ratio per channel is the factor that an inserted object needs. Printed is
-the root mean square of the logarithm of what is left of it after a guess: none; the ratio of the roads' median light in the true images;
-the ratio of the surfaces' mean light in the fits; that to the power that is used.
+Every city is fitted as by `mudg bench edit`. Of its vehicle that shows most pixels the true mean light is known in its
+own city, and, drawn in place of theirs (``CityWorld.recast``), in all others: their ratio per channel is the factor
+that an inserted object needs. Printed is the root mean square of the logarithm of what is left of it after a guess:
+none; the ratio of the roads' median light in the true images; the ratio of the surfaces' mean light in the fits; that
+to the power that is used.
 
     python bench/object_light.py --cities 2000100 2000101 2000102 2000103 2000104 2000105 --work runs/light
 """
@@ -40,7 +41,9 @@ def vehicle_light(case: EditCase, world: CityWorld) -> np.ndarray | None:
 def road_light(case: EditCase) -> np.ndarray:
     """Median light f64[3] of the road in true images."""
     truths = [case.world.render(frame.view) for frame in case.scene.frames[::EVERY_FRAMES]]
-    return linear_of(np.median(np.concatenate([t.rgb[t.semantics == ID["road"]] for t in truths]).astype(np.float64), 0))
+    return linear_of(
+        np.median(np.concatenate([t.rgb[t.semantics == ID["road"]] for t in truths]).astype(np.float64), 0)
+    )
 
 
 def main() -> None:
@@ -50,8 +53,10 @@ def main() -> None:
     asked = parser.parse_args()
     cases = [case_of(BenchConfig(), seed, asked.work) for seed in asked.cities]
     own = [vehicle_light(case, case.world) for case in cases]
-    lights = {"roads": [road_light(case) for case in cases],
-              "surfaces": [surface_light(case.model, [frame.view for frame in case.scene.frames]) for case in cases]}  # fmt: skip
+    lights = {
+        "roads": [road_light(case) for case in cases],
+        "surfaces": [surface_light(case.model, [frame.view for frame in case.scene.frames]) for case in cases],
+    }
     true: list[np.ndarray] = []
     guessed: dict[str, list[np.ndarray]] = {name: [] for name in lights}
     for i, here in enumerate(cases):

@@ -3,9 +3,9 @@
     python bench/page_size.py --run runs/demo                     # 3,000,000 Gaussians, made and opened
     python bench/page_size.py --run runs/demo --gaussians 500000 --no-browser
 
-The scene is the fit of a finished run (``mudg demo``), its street laid out again and again along the drive, every copy perturbed, and
-driven along in one go. Chromium draws without a graphics card, where it is installed: pictures take seconds then, and the sorting, the
-memory and the order of arrival are what is measured.
+The scene is the fit of a finished run (``mudg demo``), its street laid out again and again along the drive, every copy
+perturbed, and driven along in one go. Chromium draws without a graphics card, where it is installed: pictures take
+seconds then, and the sorting, the memory and the order of arrival are what is measured.
 """
 
 from __future__ import annotations
@@ -50,16 +50,21 @@ def memory_mb(name: str, process: int | str = "self") -> float:
 
 
 def long_street(model: SceneModel, scene: Scene, count: int) -> tuple[SceneModel, Scene]:
-    """The fit with its static Gaussians repeated along the drive until there are `count`, and the drive through all of it."""
+    """The fit with its static Gaussians repeated along the drive until there are `count`, and the drive through all of
+    it."""
     ego = scene.ego.world_from_ego[:, :3, 3]
     step = ego[-1] - ego[0]
     node = model.table.labels["node"]
     still = torch.nonzero(node == 0)[:, 0]
     copies = -(-(count - len(node)) // len(still))
     rng = torch.Generator().manual_seed(0)
-    chosen = [still] * (copies - 1) + [still[torch.randperm(len(still), generator=rng)[: count - len(node) - (copies - 1) * len(still)]]]
+    chosen = [still] * (copies - 1) + [
+        still[torch.randperm(len(still), generator=rng)[: count - len(node) - (copies - 1) * len(still)]]
+    ]
     rows = torch.cat([*chosen, torch.arange(len(node))])
-    shift = torch.repeat_interleave(torch.arange(1, copies + 2) % (copies + 1), torch.tensor([*map(len, chosen), len(node)]))
+    shift = torch.repeat_interleave(
+        torch.arange(1, copies + 2) % (copies + 1), torch.tensor([*map(len, chosen), len(node)])
+    )
     order = torch.argsort(node[rows], stable=True)
     rows, shift = rows[order], shift[order]
     columns = {name: value.detach()[rows] for name, value in model.table.columns.items()}
@@ -97,14 +102,17 @@ def served(folder: Path) -> Iterator[str]:
 SORT = """(async () => {
   const app = window.mudg, loaded = app.loaded[0], view = app.last.view, times = [];
   let before = performance.now(), gap = 0;
-  const ticking = setInterval(() => { const now = performance.now(); gap = Math.max(gap, now - before); before = now; }, 4);
+  const ticking = setInterval(() => {
+    const now = performance.now(); gap = Math.max(gap, now - before); before = now;
+  }, 4);
   for (let k = 0; k < SORTS; k++) {
     const poses = loaded.scene.placed(app.state.t, new Set()).rows;
     await loaded.sorter.order({ poses, eye: view.eye, ahead: view.axes[2], near: 0.2 });
     times.push(loaded.sorter.ms);
   }
   clearInterval(ticking);
-  return JSON.stringify({ sort_ms: times.map(Math.round), blocked_ms: Math.round(gap), unpack_ms: Math.round(loaded.sorter.unpackMs) });
+  const unpack_ms = Math.round(loaded.sorter.unpackMs);
+  return JSON.stringify({ sort_ms: times.map(Math.round), blocked_ms: Math.round(gap), unpack_ms });
 })()""".replace("SORTS", str(SORTS))
 
 
@@ -140,22 +148,31 @@ def browse(address: str, size: tuple[int, int], picture: Path | None) -> None:
         try:
             began = time.monotonic()
             browser.open(address, "document.documentElement?.dataset.firstPictureMs !== undefined", 300)
-            first = browser.run("JSON.stringify({ms: Number(document.documentElement.dataset.firstPictureMs), have: mudg.arrival.have})")
+            first = browser.run(
+                "JSON.stringify({ms: Number(document.documentElement.dataset.firstPictureMs), have: mudg.arrival.have})"
+            )
             say(f"first picture       {json.loads(first)['ms'] / 1000:.1f} s")
             if picture:
                 browser.picture(picture.with_name(picture.stem + "_first.png"))
             browser.wait("document.documentElement.dataset.arrival === 'whole'", 600)
             say(f"all chunks          {time.monotonic() - began:.1f} s")
             browser.wait("mudg.sharp && !mudg.fresh && !mudg.loaded[0].sorter.busy", 300)
-            say(f"drawn at rest       {browser.run('document.documentElement.dataset.frameMs')} ms per picture, "
-                f"{browser.run('mudg.used().left.drawn'):,} Gaussians before the camera")  # fmt: skip
+            say(
+                f"drawn at rest       {browser.run('document.documentElement.dataset.frameMs')} ms per picture, "
+                f"{browser.run('mudg.used().left.drawn'):,} Gaussians before the camera"
+            )
             told = json.loads(browser.run(SORT))
-            say(f"sorting             {told['sort_ms']} ms in the worker, a chunk is unpacked in {told['unpack_ms']} ms; "
-                f"meanwhile the page was never blocked for more than {told['blocked_ms']} ms")  # fmt: skip
+            say(
+                f"sorting             {told['sort_ms']} ms in the worker, a chunk is unpacked in {told['unpack_ms']}"
+                f" ms; meanwhile the page was never blocked for more than {told['blocked_ms']} ms"
+            )
             heap = browser.call("Runtime.getHeapUsage")
             arrays, most = heap.get("backingStorageSize", 0) / 1e6, processes(browser.process.pid)
-            say(f"memory of scripts   {heap['usedSize'] / 1e6:.0f} MB and {arrays:.0f} MB of arrays in the page, without the worker; "
-                f"processes at most: {', '.join(f'{kind} {mb:.0f} MB' for kind, mb in most.items())}")  # fmt: skip
+            say(
+                f"memory of scripts   {heap['usedSize'] / 1e6:.0f} MB and {arrays:.0f} MB of arrays in the page,"
+                " without the worker; processes at most:"
+                f" {', '.join(f'{kind} {mb:.0f} MB' for kind, mb in most.items())}"
+            )
             if picture:
                 browser.picture(picture)
             say(f"problems            {browser.errors or 'none'}")
@@ -177,7 +194,10 @@ def main() -> None:
     shown = view.find_shown(config, given.run, None, None)
     name, model = shown.fits[0]
     model, scene = long_street(model, shown.scene, given.gaussians)
-    say(f"scene               {len(model.table):,} Gaussians, degree {model.sh_degree}, {len(scene.frames)} recorded frames")
+    say(
+        f"scene               {len(model.table):,} Gaussians, degree {model.sh_degree}, {len(scene.frames)} recorded"
+        " frames"
+    )
     Path("/proc/self/clear_refs").write_text("5")
     before, began = memory_mb("VmRSS"), time.monotonic()
     with tempfile.TemporaryDirectory() as folder:
@@ -188,8 +208,13 @@ def main() -> None:
         say(f"made                in {time.monotonic() - began:.1f} s ({laid_out:.1f} s of it choosing and ordering)")
         say(f"memory              {memory_mb('VmHWM') - before:.0f} MB at most beside the scene's {before:.0f} MB")
         each = made["bytes"] / page.scenes[0][1].kept
-        say(f"size                {made['bytes'] / 1e6:.1f} MB in {page.chunks()} chunks, {each:.1f} bytes per Gaussian")
-        say(f"needs               {page.graphics_bytes() / 1e6:.0f} MB of graphics memory, {page.heap_bytes() / 1e6:.0f} MB for sorting")
+        say(
+            f"size                {made['bytes'] / 1e6:.1f} MB in {page.chunks()} chunks, {each:.1f} bytes per Gaussian"
+        )
+        say(
+            f"needs               {page.graphics_bytes() / 1e6:.0f} MB of graphics memory,"
+            f" {page.heap_bytes() / 1e6:.0f} MB for sorting"
+        )
         if given.browser:
             with served(work) as address:
                 browse(f"{address}/{Path(made['page']).relative_to(work)}", tuple(given.size), given.picture)

@@ -1,6 +1,6 @@
 """Times the point z-buffer: points into one view. Wall time and processor time, medians, milliseconds.
 
-    python bench/project.py --points 2000000 --size 960x640 --threads 2
+python bench/project.py --points 2000000 --size 960x640 --threads 2
 """
 
 from __future__ import annotations
@@ -62,8 +62,10 @@ def main() -> None:
             wall.append(1e3 * (time.perf_counter() - started))
             busy.append(1e3 * (time.process_time() - worked))
         share = float(seen.valid.float().mean())
-        say(f"{options.points} points, {options.size}, {options.threads} threads, {name}: "
-              f"wall {statistics.median(wall[1:]):.1f}, processor {statistics.median(busy[1:]):.1f}, covered {share:.2f}")  # fmt: skip
+        say(
+            f"{options.points} points, {options.size}, {options.threads} threads, {name}: "
+            f"wall {statistics.median(wall[1:]):.1f}, processor {statistics.median(busy[1:]):.1f}, covered {share:.2f}"
+        )
 
 
 if __name__ == "__main__":

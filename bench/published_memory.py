@@ -2,7 +2,8 @@
 
     python bench/published_memory.py
 
-Prints the table of docs/published.md. Gigabytes are 10^9 bytes; see `mudg/diffusion/training/memory_plan.py` for what is counted.
+Prints the table of docs/published.md. Gigabytes are 10^9 bytes; see `mudg/diffusion/training/memory_plan.py` for what
+is counted.
 """
 
 import sys
@@ -10,7 +11,12 @@ import sys
 from mudg.diffusion.published.model import PublishedConfig
 from mudg.diffusion.training import memory_plan
 
-CUTS = (("all at once", 6), ("modalities together, guidance apart", 3), ("guidance together, modalities apart", 2), ("one by one", 1))
+CUTS = (
+    ("all at once", 6),
+    ("modalities together, guidance apart", 3),
+    ("guidance together, modalities apart", 2),
+    ("one by one", 1),
+)
 BUDGETS_GB = (8, 10, 16, 24, 40, 80)
 
 
@@ -25,7 +31,10 @@ def report(needs: memory_plan.Needs) -> list[str]:
     for budget in BUDGETS_GB:
         plan, peak_bytes = memory_plan.choose(needs, budget * 10**9)
         way = [f"modalities {'together' if plan.modalities_together else 'apart'}"]
-        way += [f"guidance {'together' if plan.guidance_together else 'apart'}", f"{plan.frames_at_once} frames per decoding"]
+        way += [
+            f"guidance {'together' if plan.guidance_together else 'apart'}",
+            f"{plan.frames_at_once} frames per decoding",
+        ]
         way += ["tower offloaded"] if plan.offload else []
         fits = "" if peak_bytes <= budget * 1e9 else "  (does not fit)"
         lines.append(f"  budget {budget:2d} GB: {', '.join(way):<80}{peak_bytes / 1e9:5.1f} GB{fits}")

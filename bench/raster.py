@@ -7,8 +7,8 @@
     python bench/raster.py --first-call                 # import and first picture, in a fresh process
 
 Variants are interleaved within one run, so that a busy machine hits all of them alike. With one thread the processor
-time of this process is measured (it does not count what others take), else wall time; the library's own clock, which times
-the phases, does the same. Medians; milliseconds.
+time of this process is measured (it does not count what others take), else wall time; the library's own clock, which
+times the phases, does the same. Medians; milliseconds.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ DEFAULT_SIZES = ("10000:480x320", "50000:480x320", "200000:480x320", "50000:960x
 
 
 def street(count: int, width: int, height: int, channels: int, seed: int = 0) -> tuple[Gaussians, View]:
-    """Ground, house fronts, cars, trees and a far backdrop; sizes follow the spacing, opacities look trained. SH degree 3."""
+    """Ground, house fronts, cars, trees and a far backdrop; sizes follow the spacing, opacities look trained. SH degree
+    3."""
     rng = np.random.default_rng(seed)
 
     def spread(low: float, high: float, n: int) -> np.ndarray:
@@ -50,7 +51,11 @@ def street(count: int, width: int, height: int, channels: int, seed: int = 0) ->
     ground, front, car, tree = (int(share * count) for share in (0.35, 0.33, 0.15, 0.12))
     sky = count - ground - front - car - tree
     z = spread(2.5, 90, ground)
-    parts = [np.stack([rng.uniform(-1, 1, ground) * np.minimum(14, 4 + 0.9 * z), 1.6 + 0.03 * rng.standard_normal(ground), z], 1)]
+    parts = [
+        np.stack(
+            [rng.uniform(-1, 1, ground) * np.minimum(14, 4 + 0.9 * z), 1.6 + 0.03 * rng.standard_normal(ground), z], 1
+        )
+    ]
     z = spread(5, 90, front)
     side = rng.choice([-1, 1], front) * (11 + 0.45 * np.floor(3 * np.sin(0.15 * z)) + 0.05 * rng.standard_normal(front))
     parts.append(np.stack([side, rng.uniform(-9, 1.6, front), z], 1))
@@ -101,13 +106,17 @@ def instruction_sets() -> list[str]:
     return found
 
 
-def measure(size: str, channels: int, repeats: int, with_torch: bool, clock: Callable[[], float]) -> list[dict[str, Any]]:
+def measure(
+    size: str, channels: int, repeats: int, with_torch: bool, clock: Callable[[], float]
+) -> list[dict[str, Any]]:
     """Rows of the table for one scene."""
     count, shape = size.split(":")
     width, height = (int(side) for side in shape.split("x"))
     gaussians, view = street(int(count), width, height, channels)
     generator = torch.Generator().manual_seed(1)
-    upstream = [torch.randn(c, height, width, generator=generator) for c in (3, 1, 1, *([channels] if channels else []))]
+    upstream = [
+        torch.randn(c, height, width, generator=generator) for c in (3, 1, 1, *([channels] if channels else []))
+    ]
     variants = instruction_sets()
     times: dict[str, list[float]] = {name: [] for name in variants}
     phases: dict[str, list[dict[str, float]]] = {name: [] for name in variants}
@@ -126,14 +135,30 @@ def measure(size: str, channels: int, repeats: int, with_torch: bool, clock: Cal
         middle = statistics.median(times[name])
         shares = {p: round(1e3 * statistics.median(run[p] for run in phases[name]), 2) for p in raster_cpu.PHASES}
         counts = {k: int(phases[name][-1][k]) for k in ("visible", "entries", "pairs", "context_bytes")}
-        rows.append({"scene": size, "variant": name, "ms": round(middle, 1), "ratio": round(middle / best, 2),
-                     "phases_ms": shares, "counts": counts})  # fmt: skip
+        rows.append(
+            {
+                "scene": size,
+                "variant": name,
+                "ms": round(middle, 1),
+                "ratio": round(middle / best, 2),
+                "phases_ms": shares,
+                "counts": counts,
+            }
+        )
     if with_torch:
         started = clock()
         once(gaussians, view, RasterConfig(backend="torch"), upstream)
         taken = 1e3 * (clock() - started)
-        rows.append({"scene": size, "variant": "torch", "ms": round(taken, 1), "ratio": round(taken / best, 2),
-                     "phases_ms": {}, "counts": {}})  # fmt: skip
+        rows.append(
+            {
+                "scene": size,
+                "variant": "torch",
+                "ms": round(taken, 1),
+                "ratio": round(taken / best, 2),
+                "phases_ms": {},
+                "counts": {},
+            }
+        )
     return rows
 
 
@@ -160,7 +185,7 @@ def say(line: str) -> None:
     sys.stdout.flush()
 
 
-# ---- roofline ------------------------------------------------------------------------------------------------------
+# ---- roofline ------------------------------------------------------------------------------------
 
 
 def peak_flops(rounds: int = 20_000_000) -> float:
@@ -189,7 +214,8 @@ def bandwidth(megabytes: int = 256) -> float:
 
 
 def roofline(row: dict[str, Any], size: str, channels: int, flops: float, bytes_per_s: float) -> list[str]:
-    """What each phase does, counted by hand per blended (Gaussian, 4x4 block) pair or per Gaussian, beside what it took."""
+    """What each phase does, counted by hand per blended (Gaussian, 4x4 block) pair or per Gaussian, beside what it
+    took."""
     count, width, height = int(size.split(":")[0]), *(int(side) for side in size.split(":")[1].split("x"))
     pairs, entries, visible = (row["counts"][name] for name in ("pairs", "entries", "visible"))
     planes, pixel_bytes = 4 + channels, 4 * width * height
@@ -199,23 +225,28 @@ def roofline(row: dict[str, Any], size: str, channels: int, flops: float, bytes_
     work = {
         "project": (count * 330 + visible * 96, count * gaussian_bytes + visible * (192 + row_bytes) + 8 * entries),
         "blend": (16 * pairs * (24 + 5 + 2 * planes), entries * (12 + row_bytes) + (planes + 1) * pixel_bytes),
-        "blend_backward": (16 * pairs * (24 + 18 + 4 * planes + 8), entries * (12 + row_bytes + record_bytes) + (planes + 1) * pixel_bytes),
+        "blend_backward": (
+            16 * pairs * (24 + 18 + 4 * planes + 8),
+            entries * (12 + row_bytes + record_bytes) + (planes + 1) * pixel_bytes,
+        ),
         "project_backward": (
             visible * 900 + entries * 40,
             entries * record_bytes + visible * (2 * 192 + row_bytes) + 2 * count * gaussian_bytes + 192 * count,
         ),
-    }  # fmt: skip
+    }
     lines = []
     for name, (operations, moved) in work.items():
         bound = 1e3 * max(operations / flops, moved / bytes_per_s)
         which = "arithmetic" if operations / flops > moved / bytes_per_s else "memory"
         taken = row["phases_ms"][name]
-        lines.append(f"  {name:<17}{1e-9 * operations:7.2f} Gflop {1e-6 * moved:7.1f} MB  bound {bound:6.2f} ms ({which}), "
-                     f"took {taken:6.2f} ms = {bound / taken:4.0%} of the roofline")  # fmt: skip
+        lines.append(
+            f"  {name:<17}{1e-9 * operations:7.2f} Gflop {1e-6 * moved:7.1f} MB  bound {bound:6.2f} ms ({which}), "
+            f"took {taken:6.2f} ms = {bound / taken:4.0%} of the roofline"
+        )
     return lines
 
 
-# ---- regression check ----------------------------------------------------------------------------------------------
+# ---- regression check ----------------------------------------------------------------------------
 
 
 def check(rows: list[dict[str, Any]]) -> list[str]:
@@ -243,7 +274,10 @@ def store_ratios(rows: list[dict[str, Any]]) -> None:
         total = sum(row["phases_ms"].values())
         shares = {name: round(value / total, 3) for name, value in row["phases_ms"].items()}
         scenes.setdefault(row["scene"], {})[row["variant"]] = {"ratio": row["ratio"], "shares": shares}
-    RATIOS.write_text(json.dumps({"ratio_tolerance": 0.25, "share_tolerance": 0.1, "scenes": scenes}, indent=1) + "\n", encoding="utf-8")
+    RATIOS.write_text(
+        json.dumps({"ratio_tolerance": 0.25, "share_tolerance": 0.1, "scenes": scenes}, indent=1) + "\n",
+        encoding="utf-8",
+    )
 
 
 FIRST_CALL = """
@@ -256,10 +290,12 @@ import numpy as np
 from mudg.base.types import Camera, Gaussians, View
 from mudg.core.raster import RasterConfig, rasterize
 n = 50000
-g = Gaussians(torch.rand(n, 3) + torch.tensor([-0.5, -0.5, 3.0]), torch.rand(n, 4), torch.full((n, 3), 0.01), torch.full((n,), 0.5),
-              torch.zeros(n, 16, 3), None, torch.zeros(n, dtype=torch.int32))
+g = Gaussians(torch.rand(n, 3) + torch.tensor([-0.5, -0.5, 3.0]), torch.rand(n, 4),
+              torch.full((n, 3), 0.01), torch.full((n,), 0.5), torch.zeros(n, 16, 3), None,
+              torch.zeros(n, dtype=torch.int32))
 rasterize(g, View(Camera("front", 480, 320, 400.0, 400.0, 240.0, 160.0), np.eye(4), 0.0))
-print(f"import torch {torch_s:.2f} s; import of the rasteriser and the first picture {time.perf_counter() - began:.2f} s")
+first_s = time.perf_counter() - began
+print(f"import torch {torch_s:.2f} s; import of the rasteriser and the first picture {first_s:.2f} s")
 """
 
 
@@ -280,7 +316,11 @@ def main() -> None:
     options = parser.parse_args()
     native.require("this benchmark")
     if options.first_call:
-        say(subprocess.run([sys.executable, "-c", FIRST_CALL], capture_output=True, text=True, check=True).stdout.strip())
+        say(
+            subprocess.run(
+                [sys.executable, "-c", FIRST_CALL], capture_output=True, text=True, check=True
+            ).stdout.strip()
+        )
         return
     if options.scaling:
         torch.set_num_threads(1)
@@ -294,7 +334,10 @@ def main() -> None:
     torch.set_num_threads(options.threads)
     clock = time.process_time if options.threads == 1 else time.perf_counter
     say(native.status())
-    say(f"forward + backward, {4 + options.channels} channels, {options.threads} thread(s), median of {options.repeats}, ms")
+    say(
+        f"forward + backward, {4 + options.channels} channels, {options.threads} thread(s), median of"
+        f" {options.repeats}, ms"
+    )
     table = []
     flops, bytes_per_s = (peak_flops(), bandwidth()) if options.roofline else (0.0, 0.0)
     if options.roofline:

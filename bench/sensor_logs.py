@@ -4,8 +4,8 @@
     python bench/sensor_logs.py argoverse2 --seconds 4
     python bench/sensor_logs.py dgp --seconds 4
 
-Cameras, rates, image sizes and points per sweep are those of the data sets; all images are copies of one textured JPEG. ``--rows`` pads the
-large nuScenes tables with records of other scenes (the full release has 2,600,000).
+Cameras, rates, image sizes and points per sweep are those of the data sets; all images are copies of one textured JPEG.
+``--rows`` pads the large nuScenes tables with records of other scenes (the full release has 2,600,000).
 """
 
 from __future__ import annotations
@@ -261,9 +261,10 @@ def main() -> None:
         text = subprocess.run(command, check=True, capture_output=True, text=True).stdout
         result = json.loads(text.splitlines()[-1])
         say(
-            f"{options.format}: {moments} frames, {result['images']} images, {result['sweeps']} sweeps, {result['tracks']} tracks; "
-            f"{result['cpu_s'] / moments:.3f} s of processor a frame ({result['cpu_s']:.2f} s), {result['wall_s']:.2f} s; "
-            f"peak {result['peak_mb']:.0f} MB, of which {result['before_mb']:.0f} MB before"
+            f"{options.format}: {moments} frames, {result['images']} images, {result['sweeps']} sweeps,"
+            f" {result['tracks']} tracks; {result['cpu_s'] / moments:.3f} s of processor a frame ({result['cpu_s']:.2f}"
+            f" s), {result['wall_s']:.2f} s; peak {result['peak_mb']:.0f} MB, of which {result['before_mb']:.0f} MB"
+            " before"
         )
 
 

@@ -4,10 +4,10 @@
     python bench/streaming.py --address s3://bucket/clips --cities 24 --steps 20 --rounds 4 -- \\
         --data.no-renders --network.no-renders --network.widths 32 48 64 --network.finish-widths
 
-Clips are generated (a minute per city, seconds without renders), uploaded, and trained on: from the folder, from the address with an
-empty cache, and from the address without reading ahead. The order changes every round. The losses of all are compared: they must be
-the same numbers. What follows ``--`` are further settings of ``mudg learn``. ``tools/storage_tests.sh`` shows how to start an S3
-server on this machine.
+Clips are generated (a minute per city, seconds without renders), uploaded, and trained on: from the folder, from the
+address with an empty cache, and from the address without reading ahead. The order changes every round. The losses of
+all are compared: they must be the same numbers. What follows ``--`` are further settings of ``mudg learn``.
+``tools/storage_tests.sh`` shows how to start an S3 server on this machine.
 """
 
 from __future__ import annotations
@@ -24,9 +24,15 @@ from mudg.base.location import Location
 
 WAYS = ("local", "streamed", "no reading ahead")
 FLAGS = {
-    "codec.steps": 2, "codec.fit-batches": 1, "data.first-cities": 2, "data.held-out": 1, "score.steps": 1, "score.every": 10**6,
-    "compute.log-every": 1, "compute.checkpoint-every": 10**6,
-}  # fmt: skip
+    "codec.steps": 2,
+    "codec.fit-batches": 1,
+    "data.first-cities": 2,
+    "data.held-out": 1,
+    "score.steps": 1,
+    "score.every": 10**6,
+    "compute.log-every": 1,
+    "compute.checkpoint-every": 10**6,
+}
 
 
 def say(line: str) -> None:
@@ -38,7 +44,9 @@ def say(line: str) -> None:
 def train(flags: dict[str, object], more: list[str]) -> None:
     """One training; the program's own words on failure."""
     words = [word for name, value in flags.items() for word in (f"--{name}", str(value))]
-    done = subprocess.run([sys.executable, "-m", "mudg", "learn", "--quiet", *words, *more], capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-m", "mudg", "learn", "--quiet", *words, *more], capture_output=True, text=True
+    )
     if done.returncode:
         raise SystemExit(done.stderr)
 
@@ -83,7 +91,9 @@ def main() -> None:
         raise SystemExit("the losses differ")
     for way in WAYS[1:]:
         ratios = [a / b for a, b in zip(rates[way], rates["local"], strict=True)]
-        say(f"{way}: {statistics.median(ratios):.3f} of local ({min(ratios):.3f} to {max(ratios):.3f}); the same losses")
+        say(
+            f"{way}: {statistics.median(ratios):.3f} of local ({min(ratios):.3f} to {max(ratios):.3f}); the same losses"
+        )
 
 
 if __name__ == "__main__":

@@ -2,9 +2,9 @@
 
     python bench/waymo.py [--frames 10] [--workers 1]
 
-A made-up log is written to a temporary folder in both formats: five JPEG images (3 of 1920x1280, 2 of 1920x886) with lenses, 64x2650
-range images with two returns and pixel poses, four smaller LiDARs. Each import is a process of its own; seconds per frame
-are the difference between a long and a short import, so that what happens once does not count.
+A made-up log is written to a temporary folder in both formats: five JPEG images (3 of 1920x1280, 2 of 1920x886) with
+lenses, 64x2650 range images with two returns and pixel poses, four smaller LiDARs. Each import is a process of its own;
+seconds per frame are the difference between a long and a short import, so that what happens once does not count.
 """
 
 from __future__ import annotations
@@ -84,10 +84,19 @@ def full_size_log(frames: int) -> write_waymo.Log:
         frame = {"timestamp_us": write_waymo.EPOCH_US + index * 100_000, "pose": pose, "lasers": [], "boxes": []}
         time_s = frame["timestamp_us"] / 1e6 + 0.05
         frame["images"] = [
-            {"number": number, "image": image, "pose": pose, "velocity": np.zeros(6), "pose_time": time_s + 0.0125 * number,
-             "shutter": 0.002, "trigger": time_s - 0.02, "done": time_s + 0.02, "panoptic": None}
+            {
+                "number": number,
+                "image": image,
+                "pose": pose,
+                "velocity": np.zeros(6),
+                "pose_time": time_s + 0.0125 * number,
+                "shutter": 0.002,
+                "trigger": time_s - 0.02,
+                "done": time_s + 0.02,
+                "panoptic": None,
+            }
             for number, image in images.items()
-        ]  # fmt: skip
+        ]
         for number in range(1, 6):
             rows, columns = (64, 2650) if number == 1 else (200, 600)
             returns = []

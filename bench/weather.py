@@ -1,7 +1,8 @@
 """Weather and light on images of generated cities, against the same cities generated with that weather.
 
 python bench/weather.py                                   all edits, seeds 41 and 42
-python bench/weather.py --only fog --fit RUN              with the depth of a fitted scene (folder of mudg demo or mudg run)
+python bench/weather.py --only fog --fit RUN              with the depth of a fitted scene (folder of mudg demo or mudg
+                                                          run)
 python bench/weather.py --only none --sheet weather.png   a picture of all effects
 python bench/weather.py --seeds 41 --pairs pairs.png      a picture of all edits (above) and the truth (below)
 """
@@ -73,8 +74,8 @@ def matched(image: NDArray[np.floating], target: NDArray[np.floating], where: Ma
 
 
 def best_transfer(image: Picture, target: Picture, where: Mask) -> float:
-    """PSNR of the better of two global colour transfers that know the true target: means and deviations of display values, and of
-    l-alpha-beta (Reinhard et al. 2001)."""
+    """PSNR of the better of two global colour transfers that know the true target: means and deviations of display
+    values, and of l-alpha-beta (Reinhard et al. 2001)."""
     lms = np.array([[0.3811, 0.5783, 0.0402], [0.1967, 0.7244, 0.0782], [0.0241, 0.1288, 0.8444]])
     axes = np.diag([3**-0.5, 6**-0.5, 2**-0.5]) @ np.array([[1, 1, 1], [1, 1, -2], [1, -1, 0]])
 
@@ -128,7 +129,7 @@ class Case:
 def config_of(seed: int, size: tuple[int, int], **changes: object) -> CityConfig:
     """Seven frames in a second, with the middle one looked at."""
     plain = CityConfig(seed=seed, n_frames=7, rate_hz=2.0, width=size[0], height=size[1], light="day")
-    return replace(plain, **changes)  # type: ignore[arg-type]
+    return replace(plain, **changes)
 
 
 def case_of(config: CityConfig) -> Case:
@@ -172,25 +173,31 @@ def score_fog(
             a = psnr(own.encode(foggy(case, with_own, visibility_m, around, case.light.visibility_m)), truth.rgb, solid)
             b = psnr(SRGB.encode(foggy(case, with_srgb, visibility_m, guess, 0.0)), truth.rgb, solid)
             lines.append(
-                f"fitted depth, {name}: city's curve {a:.1f}, sRGB {b:.1f} (unedited {psnr(colors, case.truth.rgb, solid):.1f})"
+                f"fitted depth, {name}: city's curve {a:.1f}, sRGB {b:.1f} (unedited"
+                f" {psnr(colors, case.truth.rgb, solid):.1f})"
             )
     return Result(lines, np.where(solid[..., None], best, case.truth.rgb), truth.rgb)
 
 
 def score_light(case: Case, name: str) -> Result:
     """Another light against a global colour transfer that knows the target's statistics."""
-    config = replace(case.world.config, light=name)  # type: ignore[arg-type]
+    config = replace(case.world.config, light=name)
     world = CityWorld(config)
     truth, target = world.render(case.view), city_light(config, world.lamps)
     solid = ~truth.sky
     own, there = case.light.response.curve(), target.response.curve()
-    lines = [f"unedited {psnr(case.truth.rgb, truth.rgb, solid):.1f}",
-             f"global transfer {best_transfer(case.truth.rgb, truth.rgb, solid):.1f}"]  # fmt: skip
+    lines = [
+        f"unedited {psnr(case.truth.rgb, truth.rgb, solid):.1f}",
+        f"global transfer {best_transfer(case.truth.rgb, truth.rgb, solid):.1f}",
+    ]
     heights = case.heights()
     around, goal = case.light.surroundings, target.surroundings
     estimated = case.gbuffer(own, heights)
-    estimated = replace(estimated, sunlit=sun_visibility(estimated, case.view, heights, around.sun_direction),
-                        new_sunlit=sun_visibility(estimated, case.view, heights, goal.sun_direction))  # fmt: skip
+    estimated = replace(
+        estimated,
+        sunlit=sun_visibility(estimated, case.view, heights, around.sun_direction),
+        new_sunlit=sun_visibility(estimated, case.view, heights, goal.sun_direction),
+    )
     exact = replace(case.exact(own), new_sunlit=world.surfaces(case.view).sunlit)
     for label, gbuffer in (("exact surfaces", exact), ("height map", estimated)):
         clear = np.exp(
@@ -220,10 +227,7 @@ def score_wet(case: Case) -> Result:
     planes = [own.decode(case.world.render(mirror_view(case.view, z)).rgb)[::-1] for z in (0.0, KERB_M)]
     mirrored = np.where(dry.classes[..., None] == ID["road"], *planes)
     lines = [f"unedited {psnr(case.truth.rgb, truth.rgb, where):.1f}"]
-    for label, gbuffer in (
-        ("mirror in the image", dry),
-        ("mirror pass", replace(dry, mirror=mirrored)),
-    ):
+    for label, gbuffer in (("mirror in the image", dry), ("mirror pass", replace(dry, mirror=mirrored))):
         light, _ = ground.wet_ground(gbuffer, case.view, around, 1.0, 0.35, config.seed)
         shown = own.encode(light)
         lines.append(f"{label} {psnr(shown, truth.rgb, where):.1f}")
@@ -318,7 +322,7 @@ def main() -> None:
     options = parser.parse_args()
     width, height = (int(n) for n in options.size.split("x"))
     scores: dict[str, Callable[[Case], Result]] = {"fog": score_fog, "wet": score_wet, "snow": score_snow}
-    scores |= {name: (lambda case, name=name: score_light(case, name)) for name in ("dusk", "overcast", "night")}
+    scores |= {name: lambda case, name=name: score_light(case, name) for name in ("dusk", "overcast", "night")}
     if options.fit is not None:
         case, fitted = fitted_view(options.fit, (width, height))
         say(f"fog, {options.fit}: " + "; ".join(score_fog(case, fitted=fitted).lines))

@@ -4,8 +4,9 @@
     python bench/write_log.py FORMAT FOLDER [--frames 6]         the sensors and image sizes of the data set
     python bench/ingest_cost.py FORMAT FOLDER
 
-FORMAT is one of kitti360, pandaset, nuplan, custom and, with ``--small`` only, waymo, nuscenes, argoverse2, dgp (argoverse2 needs pyarrow).
-The logs are written by the writers of ``tests/``; cameras that the city's car lacks show another camera's images.
+FORMAT is one of kitti360, pandaset, nuplan, custom and, with ``--small`` only, waymo, nuscenes, argoverse2, dgp
+(argoverse2 needs pyarrow). The logs are written by the writers of ``tests/``; cameras that the city's car lacks show
+another camera's images.
 """
 
 from __future__ import annotations
@@ -35,8 +36,14 @@ from mudg.city import sensors
 from mudg.city.logs import write_city
 
 DISTORTION = (-0.356, 0.171, -0.0003, -0.0002, -0.05)
-PANDASET = {"front_camera": "front", "front_left_camera": "front_left", "front_right_camera": "front",
-            "left_camera": "front_left", "right_camera": "front", "back_camera": "front_left"}  # fmt: skip
+PANDASET = {
+    "front_camera": "front",
+    "front_left_camera": "front_left",
+    "front_right_camera": "front",
+    "left_camera": "front_left",
+    "right_camera": "front",
+    "back_camera": "front_left",
+}
 NUPLAN = {f"CAM_{name}": ("front", "front_left")[k % 2] for k, name in enumerate("F0 L0 L1 L2 R0 R1 R2 B0".split())}
 
 
@@ -56,9 +63,15 @@ def write_waymo(truth: Scene, folder: Path) -> None:
 
 
 SMALL_WRITERS: dict[str, Callable[[Scene, Path], object]] = {
-    "kitti360": write_kitti360, "pandaset": write_pandaset, "nuplan": write_nuplan, "custom": write_log,
-    "waymo": write_waymo, "nuscenes": write_nuscenes, "argoverse2": write_av2, "dgp": write_dgp,
-}  # fmt: skip
+    "kitti360": write_kitti360,
+    "pandaset": write_pandaset,
+    "nuplan": write_nuplan,
+    "custom": write_log,
+    "waymo": write_waymo,
+    "nuscenes": write_nuscenes,
+    "argoverse2": write_av2,
+    "dgp": write_dgp,
+}
 
 
 def write_small(name: str, folder: Path, frames: int) -> int:
@@ -71,8 +84,9 @@ def write_small(name: str, folder: Path, frames: int) -> int:
 
 def write_full(name: str, folder: Path, frames: int) -> int:
     """The log with the sensors and image sizes of the data set. Returns its number of boxes per frame."""
-    config = replace(roundtrip.SMALL, n_frames=frames, width=1920, height=1080, lidar_beams=64,
-                     lidar_azimuth_step_deg=0.13)  # fmt: skip
+    config = replace(
+        roundtrip.SMALL, n_frames=frames, width=1920, height=1080, lidar_beams=64, lidar_azimuth_step_deg=0.13
+    )
     if name == "kitti360":
         config = replace(config, width=1408, height=376, lidar_azimuth_step_deg=0.18)
     if name == "custom":

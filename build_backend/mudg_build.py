@@ -1,8 +1,9 @@
 """PEP 517 build back-end: setuptools, plus the native library when a compiler can be found.
 
-`pip install .` and `pip wheel .` compile into a temporary folder and put the library into the wheel, which is then tagged
-`py3-none-<platform>`; without a library the wheel is `py3-none-any`. `pip install -e .` compiles next to the sources.
-For development: ``python build_backend/mudg_build.py --inplace`` (see `mudg_compile` for the choice of a compiler).
+`pip install .` and `pip wheel .` compile into a temporary folder and put the library into the wheel, which is then
+tagged `py3-none-<platform>`; without a library the wheel is `py3-none-any`. `pip install -e .` compiles next to the
+sources. For development: ``python build_backend/mudg_build.py --inplace`` (see `mudg_compile` for the choice of a
+compiler).
 """
 
 from __future__ import annotations

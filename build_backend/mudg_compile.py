@@ -6,8 +6,8 @@ The choice, in this order:
 2. the compiler inside the ``ziglang`` wheel (a tool chain that pip alone can install);
 3. none: the package is then installed as pure Python and works through slow fall-backs.
 
-The environment variable ``MUDG_NATIVE`` steers it: ``auto`` (default) does the above, ``require`` turns "no library" into
-an error, ``off`` skips compilation. A compiler counts as working only when a probe library that it made can be
+The environment variable ``MUDG_NATIVE`` steers it: ``auto`` (default) does the above, ``require`` turns "no library"
+into an error, ``off`` skips compilation. A compiler counts as working only when a probe library that it made can be
 loaded and answers; `--version` proves little. Standard library only.
 """
 
@@ -39,21 +39,40 @@ MODES = ("auto", "require", "off")
 # bit for bit on which pixels a Gaussian touches, so a multiply and an add may only fuse where the source says fma().
 # No -ffast-math: NaN and infinity must stay visible. math-errno and trapping-math change no value.
 COMMON_FLAGS = (
-    "-O3", "-std=c++17", "-fPIC", "-pthread", "-fvisibility=hidden", "-fvisibility-inlines-hidden",
-    "-fno-math-errno", "-fno-trapping-math", "-ffp-contract=off",
-    "-Wall", "-Wextra", "-Wno-unused-function", "-Wno-uninitialized", "-Wno-maybe-uninitialized",
-)  # fmt: skip
+    "-O3",
+    "-std=c++17",
+    "-fPIC",
+    "-pthread",
+    "-fvisibility=hidden",
+    "-fvisibility-inlines-hidden",
+    "-fno-math-errno",
+    "-fno-trapping-math",
+    "-ffp-contract=off",
+    "-Wall",
+    "-Wextra",
+    "-Wno-unused-function",
+    "-Wno-uninitialized",
+    "-Wno-maybe-uninitialized",
+)
 LINK_FLAGS = ("-shared", "-pthread", "-Wl,-s") if sys.platform == "linux" else ("-shared", "-pthread")
 
-# Files called *_avx2.cpp and *_avx512.cpp are compiled only for x86-64, each for its own instruction set; which one runs is
-# decided when the library is loaded (cpu.cpp). All other files are compiled for the baseline of the architecture.
+# Files called *_avx2.cpp and *_avx512.cpp are compiled only for x86-64, each for its own instruction set; which one
+# runs is decided when the library is loaded (cpu.cpp). All other files are compiled for the baseline of the
+# architecture.
 VARIANT_FLAGS: dict[str, tuple[str, ...]] = {
     "_avx2": ("-mavx2", "-mfma", "-mbmi", "-mbmi2"),
     "_avx512": (
-        "-mavx512f", "-mavx512dq", "-mavx512vl", "-mavx512bw", "-mavx2", "-mfma", "-mbmi", "-mbmi2",
+        "-mavx512f",
+        "-mavx512dq",
+        "-mavx512vl",
+        "-mavx512bw",
+        "-mavx2",
+        "-mfma",
+        "-mbmi",
+        "-mbmi2",
         "-mprefer-vector-width=512",
     ),
-}  # fmt: skip
+}
 # zig spells processors its own way and, left alone, would target the processor of the build machine.
 ZIG_VARIANT_FLAGS: dict[str, tuple[str, ...]] = {
     "": ("-mcpu=baseline",),
@@ -160,7 +179,8 @@ def system_candidates(environ: Mapping[str, str], which: Callable[[str], str | N
 
 
 def zig_is_offered(system: str = sys.platform, machine: str = platform.machine()) -> bool:
-    """Whether the package index has a ziglang wheel for this platform; asking for one that is not there would end the build."""
+    """Whether the package index has a ziglang wheel for this platform; asking for one that is not there would end the
+    build."""
     return system in ("linux", "darwin", "win32") and machine.lower() in ("x86_64", "amd64", "aarch64", "arm64")
 
 
@@ -172,7 +192,8 @@ def zig_candidate() -> Compiler | None:
 
 
 def probe(compiler: Compiler, run: Run = run_command) -> ProbeResult:
-    """Builds a small threaded C++17 library with the compiler, loads it in a fresh Python and asks it for its architecture."""
+    """Builds a small threaded C++17 library with the compiler, loads it in a fresh Python and asks it for its
+    architecture."""
     with tempfile.TemporaryDirectory(prefix="mudg-probe-") as folder:
         source, library = Path(folder, "probe.cpp"), Path(folder, LIBRARY_NAME)
         source.write_text(PROBE_SOURCE, encoding="utf-8")
@@ -216,7 +237,7 @@ def flags_for(compiler: Compiler, source: Path) -> tuple[str, ...]:
 
 
 def variant_of(source: Path) -> str:
-    """"_avx2", "_avx512" or "" (baseline)."""
+    """ "_avx2", "_avx512" or "" (baseline)."""
     return next((suffix for suffix in VARIANT_FLAGS if source.stem.endswith(suffix)), "")
 
 
@@ -227,7 +248,8 @@ def sources_for(compiler: Compiler, folder: Path = NATIVE_SOURCES) -> list[Path]
 
 
 def digest_of(compiler: Compiler, flags: Sequence[str], source: Path) -> str:
-    """A hash over everything that an object file depends on: compiler, flags, the source and the headers it includes."""
+    """A hash over everything that an object file depends on: compiler, flags, the source and the headers it
+    includes."""
     hasher = hashlib.sha256(repr((compiler.command, compiler.version, tuple(flags))).encode())
     pending, seen = [source], set()
     while pending:
@@ -242,7 +264,9 @@ def digest_of(compiler: Compiler, flags: Sequence[str], source: Path) -> str:
     return hasher.hexdigest()[:24]
 
 
-def compile_library(compiler: Compiler, library: Path, objects: Path, run: Run = run_command, jobs: int = 0) -> list[str]:
+def compile_library(
+    compiler: Compiler, library: Path, objects: Path, run: Run = run_command, jobs: int = 0
+) -> list[str]:
     """Compiles all sources in parallel into `objects` (reused by content hash) and links them into `library`.
 
     Returns warnings that the compiler printed. Raises CompileError; an existing library is then left as it was.
@@ -310,7 +334,11 @@ def build(
     if candidates is None:
         zig = zig_candidate()
         candidates = [*system_candidates(environ), *([zig] if zig else [])]
-    remaining, notes, reason = list(candidates), [], "no C++ compiler was found (tried $CXX, c++, g++, clang++ and the ziglang wheel)"
+    remaining, notes, reason = (
+        list(candidates),
+        [],
+        "no C++ compiler was found (tried $CXX, c++, g++, clang++ and the ziglang wheel)",
+    )
     while remaining:
         compiler, tried = find_compiler(remaining, check)
         notes += tried
@@ -351,4 +379,3 @@ def report(outcome: Outcome) -> str:
 def last_lines(text: str, count: int = 6) -> str:
     """The end of a compiler's output."""
     return "\n".join(text.strip().splitlines()[-count:])
-

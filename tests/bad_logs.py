@@ -1,7 +1,8 @@
-"""A tiny log in every format, written once for all tests of bad input, and ways to damage one record of it for a moment.
+"""A tiny log in every format, written once for all tests of bad input, and ways to damage one record of it for a
+moment.
 
-Every format is given the same three moments of the small city (KITTI: its own made-up drive). ``damaged`` hands out a source with
-one image or cloud changed and the words by which an error must name it; afterwards the log is whole again.
+Every format is given the same three moments of the small city (KITTI: its own made-up drive). ``damaged`` hands out a
+source with one image or cloud changed and the words by which an error must name it; afterwards the log is whole again.
 """
 
 from __future__ import annotations
@@ -167,13 +168,14 @@ def ingest(kind: str, source: Path, out: Path, options: ImportOptions) -> Scene:
 def assert_refused(
     kind: str, source: Path, tmp_path: Path, options: ImportOptions, words: str, where: str = ""
 ) -> InputError:
-    """The import fails with an ``InputError`` that has these words and names this place (patterns), and leaves nothing."""
+    """The import fails with an ``InputError`` that has these words and names this place (patterns), and leaves
+    nothing."""
     error = roundtrip.assert_refused(lambda log, out: ingest(kind, log, out, options), source, tmp_path / "out", words)
     assert re.search(where, error.where, re.DOTALL), error.where
     return error
 
 
-# --- images ---------------------------------------------------------------------------------------------------------------
+# --- images ---------------------------------------------------------------------------------------
 
 
 def png(image: Image.Image, **save: Any) -> bytes:

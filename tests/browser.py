@@ -20,10 +20,19 @@ CHROMIUM = next(
 )
 NO_BROWSER = "no Chromium is installed"
 FLAGS = (
-    "--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist",
-    "--remote-debugging-pipe", "--disable-dev-shm-usage", "--no-first-run", "--disable-extensions", "--disable-background-networking",
-    "--hide-scrollbars", "--mute-audio",
-)  # fmt: skip
+    "--headless=new",
+    "--no-sandbox",
+    "--use-angle=swiftshader",
+    "--enable-unsafe-swiftshader",
+    "--ignore-gpu-blocklist",
+    "--remote-debugging-pipe",
+    "--disable-dev-shm-usage",
+    "--no-first-run",
+    "--disable-extensions",
+    "--disable-background-networking",
+    "--hide-scrollbars",
+    "--mute-audio",
+)
 
 
 class BrowserError(Exception):
@@ -41,8 +50,10 @@ class Browser:
         plumbing = f'exec "$@" 3<&{ours[0]} 4>&{theirs[1]}'  # the protocol's pipes have fixed numbers
         self.process = subprocess.Popen(
             ["bash", "-c", plumbing, "bash", str(CHROMIUM), *FLAGS, *address],
-            pass_fds=(ours[0], theirs[1]), stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
-        )  # fmt: skip
+            pass_fds=(ours[0], theirs[1]),
+            stderr=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+        )
         os.close(ours[0])
         os.close(theirs[1])
         self._out, self._in, self._buffer, self._id = ours[1], theirs[0], b"", 0

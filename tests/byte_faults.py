@@ -1,4 +1,5 @@
-"""Damage to bytes, by seeded chance: cut, flipped, overwritten, taken out, put in; also within what has a checksum of its own."""
+"""Damage to bytes, by seeded chance: cut, flipped, overwritten, taken out, put in; also within what has a checksum of
+its own."""
 
 from __future__ import annotations
 
@@ -65,16 +66,22 @@ def damaged(content: bytes, rng: np.random.Generator) -> bytes:
 
 
 def damaged_within(name: str, content: bytes, rng: np.random.Generator) -> bytes:
-    """The bytes of a file damaged below its own compression or checksums, which then fit again; as ``damaged`` where it has none."""
+    """The bytes of a file damaged below its own compression or checksums, which then fit again; as ``damaged`` where it
+    has none."""
     found = _within(PurePath(name).suffix.lower())
     return damaged(content, rng) if found is None else found(content, rng)
 
 
 def _within(suffix: str) -> Damage | None:
     return {
-        ".gz": _in_gzip, ".spz": _in_gzip, ".npz": _in_zip, ".sog": _in_zip, ".glb": _in_json_of_glb, ".tfrecord": _in_record,
+        ".gz": _in_gzip,
+        ".spz": _in_gzip,
+        ".npz": _in_zip,
+        ".sog": _in_zip,
+        ".glb": _in_json_of_glb,
+        ".tfrecord": _in_record,
         ".png": _in_png,
-    }.get(suffix)  # fmt: skip
+    }.get(suffix)
 
 
 def _in_gzip(content: bytes, rng: np.random.Generator) -> bytes:

@@ -12,16 +12,21 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, settings
 
-# Set before any test imports torch: tests are many and small, workers share the cores, and results must not depend on their number.
+# Set before any test imports torch: tests are many and small, workers share the cores, and results must not depend on
+# their number.
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MUDG_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault("NO_COLOR", "1")
 os.environ.setdefault("COLUMNS", "120")
 
 settings.register_profile(
-    "mudg", deadline=None, derandomize=True, max_examples=25, database=None,
+    "mudg",
+    deadline=None,
+    derandomize=True,
+    max_examples=25,
+    database=None,
     suppress_health_check=[HealthCheck.too_slow],
-)  # fmt: skip
+)
 settings.load_profile("mudg")
 
 REPOSITORY = Path(__file__).resolve().parents[1]
@@ -80,9 +85,9 @@ def _no_network() -> Iterator[None]:
             raise RuntimeError(f"a test tried to reach the network: {address}")
         return connect(self, address)
 
-    socket.socket.connect = guarded  # type: ignore[method-assign, assignment]
+    socket.socket.connect = guarded
     yield
-    socket.socket.connect = connect  # type: ignore[method-assign]
+    socket.socket.connect = connect
 
 
 @pytest.fixture(autouse=True, scope="session")

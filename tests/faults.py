@@ -1,4 +1,5 @@
-"""Fault injection: every point at which something is put on the disk can fail, or be the last thing that a process does."""
+"""Fault injection: every point at which something is put on the disk can fail, or be the last thing that a process
+does."""
 
 from __future__ import annotations
 
@@ -23,10 +24,11 @@ Act = Callable[[int, str], None]
 
 @contextmanager
 def points(act: Act, root: Path) -> Iterator[list[str]]:
-    """Call ``act`` before every operation below ``root`` that changes the disk: names such as ``replace out.txt``, in order.
+    """Call ``act`` before every operation below ``root`` that changes the disk: names such as ``replace out.txt``, in
+    order.
 
-    Operations are those of the system (a folder or temporary file made, bytes written or flushed, a file renamed or removed), so
-    that a point lies before and after each single step of what the store promises to be one.
+    Operations are those of the system (a folder or temporary file made, bytes written or flushed, a file renamed or
+    removed), so that a point lies before and after each single step of what the store promises to be one.
     """
     done: list[str] = []
 
@@ -58,7 +60,8 @@ def points(act: Act, root: Path) -> Iterator[list[str]]:
 
 
 def failing(number: int, code: int = errno.ENOSPC) -> Act:
-    """The operation of this number, and every later one that needs space, fails as a full disk does (or a broken one)."""
+    """The operation of this number, and every later one that needs space, fails as a full disk does (or a broken
+    one)."""
     space = {"mkstemp", "mkdir", "write_bytes", "append", "replace", "rename"}
 
     def act(count: int, name: str) -> None:
@@ -113,8 +116,10 @@ def in_child(work: Callable[[], Any], act: Act, root: Path) -> int:
 
 
 def contents(folder: Path) -> dict[str, bytes]:
-    """Every file below a folder, without the record and the log of the run, which tell how long it took and how it went."""
+    """Every file below a folder, without the record and the log of the run, which tell how long it took and how it
+    went."""
     return {
-        path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*"))
+        path.relative_to(folder).as_posix(): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
         if path.is_file() and path.name not in ("run.json", "log.jsonl")
-    }  # fmt: skip
+    }

@@ -1,6 +1,7 @@
 """Files of Gaussians as other programs write them, put together byte by byte from the formats' descriptions.
 
-They share no code with ``mudg.formats.splats``. `ROWS` are the Gaussians that all of them hold, before a format rounds them.
+They share no code with ``mudg.formats.splats``. `ROWS` are the Gaussians that all of them hold, before a format rounds
+them.
 """
 
 from __future__ import annotations
@@ -20,13 +21,55 @@ C1 = 0.4886025119029199
 """Factor of the harmonics of degree 1: of -y, z and -x of the direction."""
 HALF = math.sqrt(0.5)
 ROWS: list[dict[str, float]] = [
-    {"x": 1.0, "y": 2.0, "z": 3.0, "f_dc_0": 0.5, "f_dc_1": -0.25, "f_dc_2": 0.0, "opacity": 2.0,
-     "scale_0": -1.0, "scale_1": -2.0, "scale_2": -3.0, "rot_0": HALF, "rot_1": HALF, "rot_2": 0.0, "rot_3": 0.0},
-    {"x": -4.0, "y": 0.5, "z": 0.25, "f_dc_0": -0.5, "f_dc_1": 0.75, "f_dc_2": 1.0, "opacity": -1.0,
-     "scale_0": -2.5, "scale_1": -0.5, "scale_2": -4.0, "rot_0": 0.5, "rot_1": 0.5, "rot_2": 0.5, "rot_3": 0.5},
-    {"x": 2.0, "y": -3.0, "z": -1.0, "f_dc_0": 0.25, "f_dc_1": 0.25, "f_dc_2": -1.0, "opacity": 0.5,
-     "scale_0": -1.5, "scale_1": -3.5, "scale_2": 0.25, "rot_0": HALF, "rot_1": 0.0, "rot_2": 0.0, "rot_3": HALF},
-]  # fmt: skip
+    {
+        "x": 1.0,
+        "y": 2.0,
+        "z": 3.0,
+        "f_dc_0": 0.5,
+        "f_dc_1": -0.25,
+        "f_dc_2": 0.0,
+        "opacity": 2.0,
+        "scale_0": -1.0,
+        "scale_1": -2.0,
+        "scale_2": -3.0,
+        "rot_0": HALF,
+        "rot_1": HALF,
+        "rot_2": 0.0,
+        "rot_3": 0.0,
+    },
+    {
+        "x": -4.0,
+        "y": 0.5,
+        "z": 0.25,
+        "f_dc_0": -0.5,
+        "f_dc_1": 0.75,
+        "f_dc_2": 1.0,
+        "opacity": -1.0,
+        "scale_0": -2.5,
+        "scale_1": -0.5,
+        "scale_2": -4.0,
+        "rot_0": 0.5,
+        "rot_1": 0.5,
+        "rot_2": 0.5,
+        "rot_3": 0.5,
+    },
+    {
+        "x": 2.0,
+        "y": -3.0,
+        "z": -1.0,
+        "f_dc_0": 0.25,
+        "f_dc_1": 0.25,
+        "f_dc_2": -1.0,
+        "opacity": 0.5,
+        "scale_0": -1.5,
+        "scale_1": -3.5,
+        "scale_2": 0.25,
+        "rot_0": HALF,
+        "rot_1": 0.0,
+        "rot_2": 0.0,
+        "rot_3": HALF,
+    },
+]
 """Values as the PLY stores them: opacities as logits, sizes as natural logarithms, rotations w, x, y, z."""
 F_REST = [0.25, 0.0, -0.25, 0.5, 0.0, 0.0, 0.0, 0.125, 0.375]
 """Harmonics of degree 1 of each of them: red, green, blue, three values each."""
@@ -44,13 +87,23 @@ def rows(**changes: Any) -> list[dict[str, float]]:
 
 
 def ply(
-    table: Sequence[Mapping[str, float]] = ROWS, head: Iterable[str] = (), kinds: Mapping[str, str] | None = None,
-    before: tuple[str, bytes] = ("", b""), after: tuple[str, bytes] = ("", b""), order: str = "<",
-) -> bytes:  # fmt: skip
-    """A binary PLY. head: comments. kinds: types of columns other than float. before, after: lines and bytes of other elements."""
+    table: Sequence[Mapping[str, float]] = ROWS,
+    head: Iterable[str] = (),
+    kinds: Mapping[str, str] | None = None,
+    before: tuple[str, bytes] = ("", b""),
+    after: tuple[str, bytes] = ("", b""),
+    order: str = "<",
+) -> bytes:
+    """A binary PLY. head: comments. kinds: types of columns other than float. before, after: lines and bytes of other
+    elements."""
     kinds = kinds or {}
     names = list(table[0])
-    lines = ["ply", f"format binary_{'little' if order == '<' else 'big'}_endian 1.0", *head, *filter(None, before[0].split("\n"))]
+    lines = [
+        "ply",
+        f"format binary_{'little' if order == '<' else 'big'}_endian 1.0",
+        *head,
+        *filter(None, before[0].split("\n")),
+    ]
     lines += [f"element vertex {len(table)}", *(f"property {kinds.get(name, 'float')} {name}" for name in names)]
     lines += [*filter(None, after[0].split("\n")), "end_header\n"]
     packed = struct.Struct(order + "".join(KINDS[kinds.get(name, "float")] for name in names))
@@ -62,8 +115,17 @@ def compressed_ply(low: float, high: float, kind: str = "float", head: Iterable[
     """Two Gaussians at both ends of a chunk that reaches from ``low`` to ``high`` metres on every axis."""
     groups = (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
     bounds = [f"{side}_{name}" for names in groups for side in ("min", "max") for name in names]
-    lines = ["ply", "format binary_little_endian 1.0", *head, "element chunk 1", *(f"property {kind} {name}" for name in bounds)]
-    lines += ["element vertex 2", *(f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color"))]
+    lines = [
+        "ply",
+        "format binary_little_endian 1.0",
+        *head,
+        "element chunk 1",
+        *(f"property {kind} {name}" for name in bounds),
+    ]
+    lines += [
+        "element vertex 2",
+        *(f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")),
+    ]
     lines += [*([f"property uchar {more}"] if more else []), "end_header\n"]
     chunk = struct.pack(f"<18{KINDS[kind]}", *[low] * 3, *[high] * 3, *[-4] * 3, *[-1] * 3, *[0] * 3, *[1] * 3)
     half = (1 << 9) | (1 << 19) | (1 << 29)  # three components near 0, the largest is w
@@ -72,7 +134,12 @@ def compressed_ply(low: float, high: float, kind: str = "float", head: Iterable[
 
 
 def spz(
-    version: int = 3, flags: int = 0, extensions: Iterable[tuple[int, bytes]] = (), degree: int = 1, bits: int = 12, more: bytes = b""
+    version: int = 3,
+    flags: int = 0,
+    extensions: Iterable[tuple[int, bytes]] = (),
+    degree: int = 1,
+    bits: int = 12,
+    more: bytes = b"",
 ) -> bytes:
     """`ROWS` with `F_REST` as an SPZ file of version 1 to 4; those of version 4 have stored frames."""
     count, rest = len(ROWS), (degree + 1) ** 2 - 1
@@ -99,25 +166,38 @@ def spz(
     if version < 4:
         return gzip.compress(head + b"".join(planes) + zone + more, mtime=0)
     planes = [plane for plane in planes if plane]
-    frames = [b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", len(p)) + (len(p) << 3 | 1).to_bytes(3, "little") + p for p in planes]
+    frames = [
+        b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", len(p)) + (len(p) << 3 | 1).to_bytes(3, "little") + p
+        for p in planes
+    ]
     head = head[:15] + bytes([len(frames)]) + struct.pack("<I12x", 32 + len(zone))
     toc = b"".join(struct.pack("<QQ", len(frame), len(plane)) for frame, plane in zip(frames, planes))
     return head + zone + toc + b"".join(frames)
 
 
 def sog(lossy: str = "", **fields: Any) -> bytes:
-    """Two solid Gaussians at (0, 0, 0) and (e - 1, ...) as a SOG file; ``fields`` are added to meta.json, ``a.b`` within ``a``;
-    ``lossy``: the picture that is written with loss."""
+    """Two solid Gaussians at (0, 0, 0) and (e - 1, ...) as a SOG file; ``fields`` are added to meta.json, ``a.b``
+    within ``a``; ``lossy``: the picture that is written with loss."""
     table = [-5.0 + 0.01 * n for n in range(256)]
     meta: dict[str, Any] = {
-        "version": 2, "count": 2, "means": {"mins": [0.0] * 3, "maxs": [1.0] * 3, "files": ["l.png", "u.png"]},
-        "scales": {"codebook": table, "files": ["s.png"]}, "quats": {"files": ["q.png"]}, "sh0": {"codebook": table, "files": ["c.png"]},
-    }  # fmt: skip
+        "version": 2,
+        "count": 2,
+        "means": {"mins": [0.0] * 3, "maxs": [1.0] * 3, "files": ["l.png", "u.png"]},
+        "scales": {"codebook": table, "files": ["s.png"]},
+        "quats": {"files": ["q.png"]},
+        "sh0": {"codebook": table, "files": ["c.png"]},
+    }
     for name, value in fields.items():
         owner, _, inner = name.rpartition(".")
         (meta[owner] if owner else meta)[inner] = value
     black, white = (0, 0, 0, 255), (255, 255, 255, 255)
-    pixels = {"l": (black, white), "u": (black, white), "s": (black, white), "q": ((128, 128, 128, 252),) * 2, "c": ((9, 9, 9, 230),) * 2}
+    pixels = {
+        "l": (black, white),
+        "u": (black, white),
+        "s": (black, white),
+        "q": ((128, 128, 128, 252),) * 2,
+        "c": ((9, 9, 9, 230),) * 2,
+    }
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w") as archive:
         archive.writestr("meta.json", json.dumps(meta))
@@ -131,14 +211,28 @@ def sog(lossy: str = "", **fields: Any) -> bytes:
 
 
 def glb(
-    table: Sequence[Mapping[str, float]] = ROWS, *, plain: bool = True, kind: Mapping[str, Any] | None = None,
-    node: Mapping[str, Any] | None = None, document: Mapping[str, Any] | None = None, view: Mapping[str, Any] | None = None,
-    turn_length: float = 1.0, more: str = "",
-) -> bytes:  # fmt: skip
-    """Gaussians as a GLB file. plain: opacities and sizes as the standard says, else logits and logarithms. kind: fields of the extension.
-    node, document, view: further fields of the node, the document, the first buffer view. more: name of a further attribute."""
+    table: Sequence[Mapping[str, float]] = ROWS,
+    *,
+    plain: bool = True,
+    kind: Mapping[str, Any] | None = None,
+    node: Mapping[str, Any] | None = None,
+    document: Mapping[str, Any] | None = None,
+    view: Mapping[str, Any] | None = None,
+    turn_length: float = 1.0,
+    more: str = "",
+) -> bytes:
+    """Gaussians as a GLB file. plain: opacities and sizes as the standard says, else logits and logarithms. kind:
+    fields of the extension. node, document, view: further fields of the node, the document, the first buffer view.
+    more: name of a further attribute."""
     prefix = "KHR_gaussian_splatting:"
-    width = {"POSITION": 3, "ROTATION": 4, "SCALE": 3, "OPACITY": 1, "SH_DEGREE_0_COEF_0": 3, **({more: 3} if more else {})}
+    width = {
+        "POSITION": 3,
+        "ROTATION": 4,
+        "SCALE": 3,
+        "OPACITY": 1,
+        "SH_DEGREE_0_COEF_0": 3,
+        **({more: 3} if more else {}),
+    }
     parts = dict.fromkeys(width, b"")
     for row in table:
         size = [row[f"scale_{c}"] for c in range(3)]
@@ -153,17 +247,45 @@ def glb(
             parts[more] += bytes(12)
     offsets = [sum(len(p) for p in list(parts.values())[:n]) for n in range(len(parts))]
     made: dict[str, Any] = {
-        "asset": {"version": "2.0"}, "extensionsUsed": ["KHR_gaussian_splatting"], "scene": 0, "scenes": [{"nodes": [0]}],
+        "asset": {"version": "2.0"},
+        "extensionsUsed": ["KHR_gaussian_splatting"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, **(node or {})}],
-        "meshes": [{"primitives": [{
-            "mode": 0, "attributes": {name if name == "POSITION" else prefix + name: n for n, name in enumerate(width)},
-            "extensions": {"KHR_gaussian_splatting": {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", **(kind or {})}},
-        }]}],
+        "meshes": [
+            {
+                "primitives": [
+                    {
+                        "mode": 0,
+                        "attributes": {
+                            name if name == "POSITION" else prefix + name: n for n, name in enumerate(width)
+                        },
+                        "extensions": {
+                            "KHR_gaussian_splatting": {
+                                "kernel": "ellipse",
+                                "colorSpace": "srgb_rec709_display",
+                                **(kind or {}),
+                            }
+                        },
+                    }
+                ]
+            }
+        ],
         "buffers": [{"byteLength": sum(map(len, parts.values()))}],
-        "bufferViews": [{"buffer": 0, "byteOffset": at, "byteLength": len(p)} for at, p in zip(offsets, parts.values())],
-        "accessors": [{"bufferView": n, "componentType": 5126, "count": len(table), "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[w]}
-                      for n, w in enumerate(width.values())], **(document or {}),
-    }  # fmt: skip
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": at, "byteLength": len(p)} for at, p in zip(offsets, parts.values())
+        ],
+        "accessors": [
+            {
+                "bufferView": n,
+                "componentType": 5126,
+                "count": len(table),
+                "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[w],
+            }
+            for n, w in enumerate(width.values())
+        ],
+        **(document or {}),
+    }
     made["bufferViews"][0] |= view or {}
     extension = made["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
     for name in [name for name, value in extension.items() if value is None]:
@@ -181,5 +303,7 @@ def splat(table: Sequence[Mapping[str, float]] = ROWS, logs: bool = False) -> by
     for row in table:
         size = [row[f"scale_{c}"] for c in range(3)]
         turn = [round((row[f"rot_{c}"] + 1) / 2 * 255) for c in range(4)]
-        made += struct.pack("<6f8B", row["x"], row["y"], row["z"], *(size if logs else map(math.exp, size)), 99, 99, 99, 200, *turn)
+        made += struct.pack(
+            "<6f8B", row["x"], row["y"], row["z"], *(size if logs else map(math.exp, size)), 99, 99, 99, 200, *turn
+        )
     return made

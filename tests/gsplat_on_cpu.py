@@ -1,10 +1,10 @@
 """gsplat without CUDA: the real package with stand-ins for its compiled kernels.
 
-Everything that gsplat does in Python runs as it is: argument checks, autograd functions, packing, tiles, what it returns. Only
-the compiled functions are replaced, by gsplat's own references in torch (`gsplat.cuda._torch_impl`) and, where those need further
-packages, by the formulas of the kernels' source (alpha cut 1/255, cap 0.999, stop at a transmittance of 1e-4, radii that know the
-opacity). Backward kernels are autograd of the forward ones. As on a GPU, what a kernel does not write is whatever was in memory:
-here NaN.
+Everything that gsplat does in Python runs as it is: argument checks, autograd functions, packing, tiles, what it
+returns. Only the compiled functions are replaced, by gsplat's own references in torch (`gsplat.cuda._torch_impl`) and,
+where those need further packages, by the formulas of the kernels' source (alpha cut 1/255, cap 0.999, stop at a
+transmittance of 1e-4, radii that know the opacity). Backward kernels are autograd of the forward ones. As on a GPU,
+what a kernel does not write is whatever was in memory: here NaN.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def install(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
         "gsplat", reason="gsplat is not installed (pip install gsplat; it needs no CUDA for this test)"
     )
     backend = ModuleType("gsplat.cuda._backend")
-    backend._C = Kernels()  # type: ignore[attr-defined]
+    backend._C = Kernels()
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
     monkeypatch.setattr("gsplat.rendering.torch", _TorchOnCpu())
     monkeypatch.setattr("torch.cuda.synchronize", lambda *_: None)
@@ -102,8 +102,16 @@ class Kernels:
 
         return _spherical_harmonics(degree, dirs, coeffs)
 
-    def spherical_harmonics_bwd(self, bases: int, degree: int, dirs: Tensor, coeffs: Tensor, masks: Tensor | None,
-                                v_colors: Tensor, wants_dirs: bool) -> tuple[Tensor, Tensor]:  # fmt: skip
+    def spherical_harmonics_bwd(
+        self,
+        bases: int,
+        degree: int,
+        dirs: Tensor,
+        coeffs: Tensor,
+        masks: Tensor | None,
+        v_colors: Tensor,
+        wants_dirs: bool,
+    ) -> tuple[Tensor, Tensor]:
         assert dirs.norm(dim=-1).min() > 0  # the kernel divides by it
         with torch.enable_grad():
             dirs, coeffs = _leaves(dirs, coeffs)
@@ -120,10 +128,19 @@ class Kernels:
         from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 
         covars, _ = _quat_scale_to_covar_preci(quats, scales, True, False)
-        return _fully_fused_projection(means, covars, viewmats, Ks, *rest)  # type: ignore[arg-type]
+        return _fully_fused_projection(means, covars, viewmats, Ks, *rest)
 
-    def projection_ewa_3dgs_fused_fwd(self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, opacities: Tensor,
-                                      viewmats: Tensor, Ks: Tensor, *rest: Any) -> Any:  # fmt: skip
+    def projection_ewa_3dgs_fused_fwd(
+        self,
+        means: Tensor,
+        covars: None,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        viewmats: Tensor,
+        Ks: Tensor,
+        *rest: Any,
+    ) -> Any:
         width, height, eps2d, near, far, clip, compensate, model = rest
         for tensor in (means, quats, scales, opacities, viewmats, Ks):
             assert tensor.dtype == torch.float32
@@ -158,8 +175,9 @@ class Kernels:
             pairs = [(out[where[0], row], v) for out, v in zip(outputs, cotangents, strict=True) if v is not None]
             return _gradients([out for out, _ in pairs], [v for _, v in pairs], leaves)
 
-    def projection_ewa_3dgs_fused_bwd(self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor,
-                                      Ks: Tensor, *rest: Any) -> Any:  # fmt: skip
+    def projection_ewa_3dgs_fused_bwd(
+        self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any
+    ) -> Any:
         width, height, eps2d, model, radii, _, _, v_means2d, v_depths, v_conics, v_factor, _ = rest
         drawn = torch.nonzero((radii > 0).all(-1), as_tuple=True)
         cotangents = [None if v is None else v[drawn] for v in (v_means2d, v_depths, v_conics, v_factor)]
@@ -176,8 +194,9 @@ class Kernels:
         rows = [None if value is None else value[camera, gaussian] for value in (radii, *values)]
         return torch.zeros(0), torch.zeros_like(camera), camera, gaussian, *rows
 
-    def projection_ewa_3dgs_packed_bwd(self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor,
-                                       Ks: Tensor, *rest: Any) -> Any:  # fmt: skip
+    def projection_ewa_3dgs_packed_bwd(
+        self, means: Tensor, covars: None, quats: Tensor, scales: Tensor, viewmats: Tensor, Ks: Tensor, *rest: Any
+    ) -> Any:
         width, height, eps2d, model, _, camera, gaussian, _, _, *cotangents, _, sparse = rest
         assert not sparse
         inputs = (means, quats, scales, viewmats, Ks, width, height, eps2d, model)
@@ -186,8 +205,16 @@ class Kernels:
 
     # ---- tiles ----
 
-    def intersect_tile(self, means2d: Tensor, radii: Tensor, depths: Tensor, images: Tensor | None, gaussians: Tensor | None,
-                       count: int, *rest: Any) -> Any:  # fmt: skip
+    def intersect_tile(
+        self,
+        means2d: Tensor,
+        radii: Tensor,
+        depths: Tensor,
+        images: Tensor | None,
+        gaussians: Tensor | None,
+        count: int,
+        *rest: Any,
+    ) -> Any:
         from gsplat.cuda._torch_impl import _isect_tiles
 
         tile, across, down, sort, _ = rest
@@ -206,8 +233,15 @@ class Kernels:
 
     # ---- pixels: linear projection ----
 
-    def _pixels(self, colors: Tensor, size: tuple[int, int, int], offsets: Tensor, ids: Tensor, response: Any,
-                masked: tuple[Any, Any]) -> tuple[Tensor, Tensor]:  # fmt: skip
+    def _pixels(
+        self,
+        colors: Tensor,
+        size: tuple[int, int, int],
+        offsets: Tensor,
+        ids: Tensor,
+        response: Any,
+        masked: tuple[Any, Any],
+    ) -> tuple[Tensor, Tensor]:
         assert masked == (None, None)  # backgrounds and masks
         width, height, tile = size
         images = offsets.numel() // offsets.shape[-1] // offsets.shape[-2]
@@ -247,8 +281,10 @@ class Kernels:
         self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
     ) -> Any:
         background, mask, width, height, tile, offsets, ids = rest
-        means, conics, colors, opacity = (t.reshape(-1, *shape) for t, shape in
-                                          ((means2d, (2,)), (conics, (3,)), (colors, colors.shape[-1:]), (opacities, ())))  # fmt: skip
+        means, conics, colors, opacity = (
+            t.reshape(-1, *shape)
+            for t, shape in ((means2d, (2,)), (conics, (3,)), (colors, colors.shape[-1:]), (opacities, ()))
+        )
         response = self._flat_response(means, conics, opacity, width, [])
         image, alpha = self._pixels(colors, (width, height, tile), offsets, ids, response, (background, mask))
         return image, alpha, torch.zeros(0)
@@ -272,14 +308,29 @@ class Kernels:
         for gradient, (_, entries) in zip(v[3:], copies, strict=True):
             v_means.index_add_(0, entries, gradient.sum(0))
             v_abs.index_add_(0, entries, gradient.abs().sum(0))
-        return (v_abs.view_as(means2d) if absolute else None, v_means.view_as(means2d), v[0].view_as(conics),
-                v[1].view_as(colors), v[2].view_as(opacities))  # fmt: skip
+        return (
+            v_abs.view_as(means2d) if absolute else None,
+            v_means.view_as(means2d),
+            v[0].view_as(conics),
+            v[1].view_as(colors),
+            v[2].view_as(opacities),
+        )
 
     # ---- responses in space ----
 
-    def projection_ut_3dgs_fused(self, means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmats: Tensor,
-                                 viewmats_rs: Tensor | None, Ks: Tensor, *rest: Any) -> Any:  # fmt: skip
-        """Only what the pixels need of it: the order, and rectangles that certainly hold every response (the whole image)."""
+    def projection_ut_3dgs_fused(
+        self,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        viewmats: Tensor,
+        viewmats_rs: Tensor | None,
+        Ks: Tensor,
+        *rest: Any,
+    ) -> Any:
+        """Only what the pixels need of it: the order, and rectangles that certainly hold every response (the whole
+        image)."""
         width, height, _, near, far, *_ = rest
         middle = viewmats if viewmats_rs is None else (viewmats + viewmats_rs) / 2
         here = means @ middle[:, :3, :3].transpose(1, 2) + middle[:, None, :3, 3]
@@ -295,8 +346,9 @@ class Kernels:
             None,
         )
 
-    def rasterize_to_pixels_from_world_3dgs_fwd(self, means: Tensor, quats: Tensor, scales: Tensor, colors: Tensor,
-                                                opacities: Tensor, *rest: Any) -> Any:  # fmt: skip
+    def rasterize_to_pixels_from_world_3dgs_fwd(
+        self, means: Tensor, quats: Tensor, scales: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
+    ) -> Any:
         from gsplat.cuda._torch_impl import _quat_to_rotmat
 
         background, mask, width, height, tile, first, last, Ks, _, _, shutter, *lens, offsets, ids = rest
@@ -306,8 +358,12 @@ class Kernels:
 
         def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
             x, y = _centers(pixels, width)
-            rows = {"TOP_TO_BOTTOM": y.floor() / (height - 1), "LEFT_TO_RIGHT": x.floor() / (width - 1),
-                    "BOTTOM_TO_TOP": (height - y.ceil()) / (height - 1), "RIGHT_TO_LEFT": (width - x.ceil()) / (width - 1)}  # fmt: skip
+            rows = {
+                "TOP_TO_BOTTOM": y.floor() / (height - 1),
+                "LEFT_TO_RIGHT": x.floor() / (width - 1),
+                "BOTTOM_TO_TOP": (height - y.ceil()) / (height - 1),
+                "RIGHT_TO_LEFT": (width - x.ceil()) / (width - 1),
+            }
             time = rows.get(shutter.removeprefix("ROLLING_"), torch.zeros_like(x))[:, None]
             end = first if last is None else last
             assert torch.equal(end[0, :3, :3], first[0, :3, :3])  # a turning camera would need spherical interpolation
@@ -371,8 +427,9 @@ class Kernels:
 
         return response
 
-    def rasterize_to_pixels_2dgs_fwd(self, means2d: Tensor, rays: Tensor, colors: Tensor, opacities: Tensor, normals: Tensor,
-                                     *rest: Any) -> Any:  # fmt: skip
+    def rasterize_to_pixels_2dgs_fwd(
+        self, means2d: Tensor, rays: Tensor, colors: Tensor, opacities: Tensor, normals: Tensor, *rest: Any
+    ) -> Any:
         background, mask, width, height, tile, offsets, ids = rest
         assert torch.isfinite(colors).all()  # gsplat pads with uninitialised memory
         response = self._disc_response(means2d.reshape(-1, 2), rays.reshape(-1, 3, 3), opacities.reshape(-1), width)
@@ -381,8 +438,16 @@ class Kernels:
         nothing = torch.zeros_like(alpha)
         return image[..., :-3], alpha, image[..., -3:], nothing, nothing.clone(), torch.zeros(0), torch.zeros(0)
 
-    def rasterize_to_pixels_2dgs_bwd(self, means2d: Tensor, rays: Tensor, colors: Tensor, opacities: Tensor, normals: Tensor,
-                                     densify: Tensor, *rest: Any) -> Any:  # fmt: skip
+    def rasterize_to_pixels_2dgs_bwd(
+        self,
+        means2d: Tensor,
+        rays: Tensor,
+        colors: Tensor,
+        opacities: Tensor,
+        normals: Tensor,
+        densify: Tensor,
+        *rest: Any,
+    ) -> Any:
         *settings, _, _, _, _, v_image, v_alpha, v_normals, _, _, _ = rest
         with torch.enable_grad():
             leaves = _leaves(means2d, rays, colors, opacities, normals)

@@ -110,8 +110,11 @@ def write_calibration_text(path: Path, odometry: bool = False) -> None:
     if odometry:
         lines.append(f"Tr: {numbers(RECT0_FROM_VELO[:3])}")
     else:
-        lines += [f"R0_rect: {numbers(np.eye(3))}", f"Tr_velo_to_cam: {numbers(RECT0_FROM_VELO[:3])}",
-                  f"Tr_imu_to_velo: {numbers(VELO_FROM_IMU[:3])}"]  # fmt: skip
+        lines += [
+            f"R0_rect: {numbers(np.eye(3))}",
+            f"Tr_velo_to_cam: {numbers(RECT0_FROM_VELO[:3])}",
+            f"Tr_imu_to_velo: {numbers(VELO_FROM_IMU[:3])}",
+        ]
     path.write_text("\n".join(lines) + "\n")
 
 
@@ -154,11 +157,15 @@ def tracklet_xml(drive: Drive, twisted: bool) -> str:
             box = invert(world_from_velo(time_s + late)) @ world_from_car(time_s + late)
             late = np.arctan2(box[1, 3], box[0, 3]) / (2 * np.pi) * 0.1 if twisted else 0.0
         yaw = np.arctan2(box[1, 0], box[0, 0])
-        poses.append(f"<item><tx>{box[0, 3]:.9f}</tx><ty>{box[1, 3]:.9f}</ty><tz>{box[2, 3] - CAR_SIZE_M[2] / 2:.9f}</tz>"
-                     f"<rx>0</rx><ry>0</ry><rz>{yaw:.9f}</rz></item>")  # fmt: skip
+        poses.append(
+            f"<item><tx>{box[0, 3]:.9f}</tx><ty>{box[1, 3]:.9f}</ty><tz>{box[2, 3] - CAR_SIZE_M[2] / 2:.9f}</tz>"
+            f"<rx>0</rx><ry>0</ry><rz>{yaw:.9f}</rz></item>"
+        )
     return (
-        '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n<!DOCTYPE boost_serialization>\n<boost_serialization><tracklets>'
-        f"<count>1</count><item><objectType>Car</objectType><h>{CAR_SIZE_M[2]}</h><w>{CAR_SIZE_M[1]}</w><l>{CAR_SIZE_M[0]}</l>"
+        '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n<!DOCTYPE'
+        " boost_serialization>\n<boost_serialization><tracklets>"
+        f"<count>1</count><item><objectType>Car</objectType>"
+        f"<h>{CAR_SIZE_M[2]}</h><w>{CAR_SIZE_M[1]}</w><l>{CAR_SIZE_M[0]}</l>"
         f"<first_frame>{drive.frames[0]}</first_frame><poses><count>{len(poses)}</count>{''.join(poses)}</poses></item>"
         "</tracklets></boost_serialization>\n"
     )
@@ -240,8 +247,10 @@ def write_tracking(root: Path, sequence: str = "0003", drive: Drive | None = Non
     write_images(root / "image_02" / sequence, drive.frames, 6)
     write_scans(root / "velodyne" / sequence, {n: still_scan(drive, 0.1 * n) for n in drive.frames}, 6)
     write_calibration_text(root / "calib" / f"{sequence}.txt")
-    for name, rows in (("label_02", [label_line(0.1 * n, f"{n} 7 ") for n in drive.frames]),
-                       ("oxts", [oxts_line(t) for t in drive.times()])):  # fmt: skip
+    for name, rows in (
+        ("label_02", [label_line(0.1 * n, f"{n} 7 ") for n in drive.frames]),
+        ("oxts", [oxts_line(t) for t in drive.times()]),
+    ):
         (root / name).mkdir(parents=True)
         (root / name / f"{sequence}.txt").write_text("\n".join(rows) + "\n")
     return root

@@ -1,5 +1,5 @@
-"""One of two processes that train a published-type model together: started by test_learn_published with (rank, store file,
-folder of the model, folder of clips, out)."""
+"""One of two processes that train a published-type model together: started by test_learn_published with (rank, store
+file, folder of the model, folder of clips, out)."""
 
 import os
 import sys

@@ -1,4 +1,5 @@
-"""One of two processes that train together: started by test_learn_parallel with (rank, store file, folder of clips, out)."""
+"""One of two processes that train together: started by test_learn_parallel with (rank, store file, folder of clips,
+out)."""
 
 import json
 import os

@@ -24,7 +24,7 @@ class DataFrame:
     state: dict[str, Any]
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return copyreg.__newobj__, (DataFrame,), self.state  # type: ignore[attr-defined]
+        return copyreg.__newobj__, (DataFrame,), self.state
 
 
 class BlockManager:
@@ -35,7 +35,7 @@ class BlockManager:
 
     def __reduce__(self) -> tuple[Any, ...]:
         if self.state is not None:
-            return copyreg.__newobj__, (BlockManager,), self.state  # type: ignore[attr-defined]
+            return copyreg.__newobj__, (BlockManager,), self.state
         return BlockManager, self.blocks
 
 

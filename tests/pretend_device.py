@@ -1,8 +1,8 @@
 """A pretend accelerator: tensors that say they live on another device, hold their values in memory, and refuse to mix.
 
-With it, code that is meant for a GPU runs on a machine without one, with real numbers, and every slip that a GPU would punish is
-an error here too: operands on two devices, `.numpy()` without `.cpu()`, a pointer handed to native code, a generator of the wrong
-device. What it cannot tell: kernels that exist only there, speed, memory, race conditions.
+With it, code that is meant for a GPU runs on a machine without one, with real numbers, and every slip that a GPU would
+punish is an error here too: operands on two devices, `.numpy()` without `.cpu()`, a pointer handed to native code, a
+generator of the wrong device. What it cannot tell: kernels that exist only there, speed, memory, race conditions.
 """
 
 from __future__ import annotations
@@ -126,8 +126,9 @@ class Pretend(torch.Tensor):
 
 @dataclass(frozen=True)
 class Transfer:
-    """One copy between the devices: "there" or "back", number of values, and the function of the package that asked for it. Or a
-    "wait": a result whose size the CPU must know before it can go on, as that of ``nonzero`` and of a choice by a mask."""
+    """One copy between the devices: "there" or "back", number of values, and the function of the package that asked for
+    it. Or a "wait": a result whose size the CPU must know before it can go on, as that of ``nonzero`` and of a choice
+    by a mask."""
 
     way: str
     values: int
@@ -242,7 +243,8 @@ def pretend_device():
 
 @dataclass
 class Copies:
-    """Sizes, in elements, of the tensors that went from one device to the other, in order; single numbers are left out."""
+    """Sizes, in elements, of the tensors that went from one device to the other, in order; single numbers are left
+    out."""
 
     to_device: list[int]
     to_host: list[int]

@@ -1,4 +1,5 @@
-"""Takes up a training state, or trains one for three steps, saves it anew and prints the hash of all of it: LAYOUT FROM INTO."""
+"""Takes up a training state, or trains one for three steps, saves it anew and prints the hash of all of it: LAYOUT FROM
+INTO."""
 
 import hashlib
 import os

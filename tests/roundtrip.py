@@ -1,14 +1,15 @@
 """Round trips for importers: a small known log, and a comparison of what was read back with it.
 
-A test of a format writes ``small_log`` in that format with a writer of its own, imports it and calls ``assert_same_log``:
+A test of a format writes ``small_log`` in that format with a writer of its own, imports it and calls
+``assert_same_log``:
 
     truth = roundtrip.small_log(tmp_path / "truth")
     write_waymo(truth, tmp_path / "log")
     scene = IMPORTERS["waymo"](tmp_path / "log", tmp_path / "scene", ImportOptions())
     roundtrip.assert_same_log(scene, truth, cloud_m=2e-3, color_levels=3)
 
-Importers may put the world's origin and the clock's zero where they like; both are taken from the first image of the first
-camera. Everything else must agree within the tolerances.
+Importers may put the world's origin and the clock's zero where they like; both are taken from the first image of the
+first camera. Everything else must agree within the tolerances.
 """
 
 from __future__ import annotations
@@ -32,9 +33,15 @@ from mudg.city.logs import write_city
 from mudg.scene.read import read_image, read_points
 
 SMALL = CityConfig(
-    seed=3, n_frames=5, width=96, height=64, cameras=("front", "front_left"), lidar_beams=16,
-    lidar_azimuth_step_deg=1.5, supersample=1,
-)  # fmt: skip
+    seed=3,
+    n_frames=5,
+    width=96,
+    height=64,
+    cameras=("front", "front_left"),
+    lidar_beams=16,
+    lidar_azimuth_step_deg=1.5,
+    supersample=1,
+)
 
 BOX_REACH_M = 30.0
 
@@ -45,10 +52,10 @@ needs_native = pytest.mark.skipif(native.library() is None, reason="the city nee
 def small_log(folder: Path, **changes: object) -> Scene:
     """A tiny city: 2 cameras, 5 moments, one LiDAR, the boxes within 30 m, moving and parked ones.
 
-    As logs have them, boxes have keys at the times of the sweeps only and stand upright. Use the returned scene, not one read
-    from ``folder``, which holds the city's own tracks. ``changes``: other values of ``CityConfig``.
+    As logs have them, boxes have keys at the times of the sweeps only and stand upright. Use the returned scene, not
+    one read from ``folder``, which holds the city's own tracks. ``changes``: other values of ``CityConfig``.
     """
-    scene = write_city(replace(SMALL, **changes), folder)  # type: ignore[arg-type]
+    scene = write_city(replace(SMALL, **changes), folder)
     times = np.array([sweep.time_s for sweep in scene.sweeps])
     start = scene.ego.world_from_ego[0, :3, 3]
     tracks = []
@@ -103,9 +110,11 @@ def assert_same_log(
     first = truth.frames_of(next(iter(names)))[0]
     first_here = scene.frames_of(next(iter(names.values())))[0]
     compared = _Comparison(
-        truth, scene, first_here.view.world_from_cam @ invert(first.view.world_from_cam),
+        truth,
+        scene,
+        first_here.view.world_from_cam @ invert(first.view.world_from_cam),
         first_here.view.time_s - first.view.time_s,
-    )  # fmt: skip
+    )
     problems = compared.problems
     for theirs, ours in names.items():
         a, b = truth.frames_of(theirs), scene.frames_of(ours)
@@ -124,7 +133,8 @@ def assert_same_log(
 
 
 def assert_refused(ingest: Callable[[Path, Path], Scene], source: Path, out: Path, words: str) -> InputError:
-    """The import of ``source`` fails with an ``InputError`` that says ``words`` (a pattern) and a place, and leaves nothing at ``out``."""
+    """The import of ``source`` fails with an ``InputError`` that says ``words`` (a pattern) and a place, and leaves
+    nothing at ``out``."""
     with pytest.raises(InputError) as caught:
         ingest(source, out)
     error = caught.value

@@ -1,7 +1,7 @@
 """Features of the networks of the scores on made-up weights and three made-up images, as the recorded file holds them.
 
-``PYTHONPATH=src:tests python tests/score_goldens.py`` writes ``tests/golden/score_networks.safetensors`` anew. tools/oracle_parity.py
-holds the same networks against the packages of published numbers.
+``PYTHONPATH=src:tests python tests/score_goldens.py`` writes ``tests/golden/score_networks.safetensors`` anew.
+tools/oracle_parity.py holds the same networks against the packages of published numbers.
 """
 
 from __future__ import annotations
@@ -53,7 +53,9 @@ def vit_values() -> dict[str, np.ndarray]:
     """Features of a small DINOv2 with resized positions, and of a small CLIP tower."""
     tower = clip_image.ClipImageFeatures(toy_vit.clip_state())
     return {
-        "dinov2": dinov2.DinoFeatures(toy_vit.dino_state())(torch.stack([dinov2.prepared(p) for p in pictures()])).numpy(),
+        "dinov2": (
+            dinov2.DinoFeatures(toy_vit.dino_state())(torch.stack([dinov2.prepared(p) for p in pictures()])).numpy()
+        ),
         "clip": tower(torch.stack([clip_image.prepared(p, tower.side) for p in pictures()])).numpy(),
     }
 

@@ -1,4 +1,5 @@
-"""A Slurm of one node in a scratch folder: munge, controller and node daemon as processes of this test, on ports of their own.
+"""A Slurm of one node in a scratch folder: munge, controller and node daemon as processes of this test, on ports of
+their own.
 
     with slurm_here(folder) as environment: ...          None with a reason where it cannot be started
 """
@@ -74,23 +75,40 @@ def slurm_here(folder: Path) -> Iterator[dict[str, str]]:
     (folder / "munge.key").write_bytes(os.urandom(128))
     (folder / "munge.key").chmod(0o600)
     host = socket.gethostname().split(".")[0]
-    text = CONF.format(host=host, folder=folder, user="root", port=_free_port(), node_port=_free_port(), cores=os.cpu_count())
+    text = CONF.format(
+        host=host, folder=folder, user="root", port=_free_port(), node_port=_free_port(), cores=os.cpu_count()
+    )
     (folder / "slurm.conf").write_text(text)
     environment = {**os.environ, "SLURM_CONF": str(folder / "slurm.conf")}
     commands = (
-        ["munged", "--foreground", "--force", f"--key-file={folder}/munge.key", f"--socket={folder}/munge.socket",
-         f"--pid-file={folder}/munge.pid", f"--seed-file={folder}/munge.seed", f"--log-file={folder}/munge.log"],
+        [
+            "munged",
+            "--foreground",
+            "--force",
+            f"--key-file={folder}/munge.key",
+            f"--socket={folder}/munge.socket",
+            f"--pid-file={folder}/munge.pid",
+            f"--seed-file={folder}/munge.seed",
+            f"--log-file={folder}/munge.log",
+        ],
         ["slurmctld", "-D", "-f", str(folder / "slurm.conf")],
         ["slurmd", "-D", "-f", str(folder / "slurm.conf"), "-N", host],
-    )  # fmt: skip
+    )
     running: list[subprocess.Popen[bytes]] = []
     try:
         for words in commands:
             with (folder / f"{words[0]}.out").open("wb") as log:
-                running.append(subprocess.Popen([_program(words[0]) or words[0], *words[1:]], env=environment, stdout=log, stderr=log))
+                running.append(
+                    subprocess.Popen(
+                        [_program(words[0]) or words[0], *words[1:]], env=environment, stdout=log, stderr=log
+                    )
+                )
             time.sleep(1.0)
         end = time.monotonic() + 60
-        while "idle" not in subprocess.run(["sinfo", "-h", "-o", "%t"], env=environment, capture_output=True, text=True).stdout:
+        while (
+            "idle"
+            not in subprocess.run(["sinfo", "-h", "-o", "%t"], env=environment, capture_output=True, text=True).stdout
+        ):
             if time.monotonic() > end or any(one.poll() is not None for one in running):
                 logs = " ".join(path.read_text(errors="replace")[-300:] for path in sorted(folder.glob("*.out")))
                 raise RuntimeError(f"Slurm did not come up: {logs}")
@@ -98,7 +116,12 @@ def slurm_here(folder: Path) -> Iterator[dict[str, str]]:
         yield environment
     finally:
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):  # no job may outlive its daemons
-            subprocess.run(["scancel", "--full", "--signal=KILL", "--user", "root"], env=environment, capture_output=True, timeout=10)
+            subprocess.run(
+                ["scancel", "--full", "--signal=KILL", "--user", "root"],
+                env=environment,
+                capture_output=True,
+                timeout=10,
+            )
             time.sleep(2.0)
         for one in reversed(running):
             one.terminate()

@@ -1,4 +1,5 @@
-"""Readers of Gaussian files, written for tests from the formats' descriptions: one Gaussian at a time, with struct and plain numbers.
+"""Readers of Gaussian files, written for tests from the formats' descriptions: one Gaussian at a time, with struct and
+plain numbers.
 
 They share no code with ``mudg.formats.splats``. Each returns a list of ``Splat`` in the axes of the file.
 """
@@ -51,8 +52,15 @@ def read_ply(content: bytes) -> list[Splat]:
             [at[f"f_rest_{c * rest + k}"] for c in range(3)] for k in range(rest)
         ]
         assert at["nx"] == at["ny"] == at["nz"] == 0
-        found.append(Splat([at["x"], at["y"], at["z"]], [at[f"rot_{i}"] for i in range(4)], [math.exp(at[f"scale_{i}"]) for i in range(3)],
-                           sigmoid(at["opacity"]), sh))  # fmt: skip
+        found.append(
+            Splat(
+                [at["x"], at["y"], at["z"]],
+                [at[f"rot_{i}"] for i in range(4)],
+                [math.exp(at[f"scale_{i}"]) for i in range(3)],
+                sigmoid(at["opacity"]),
+                sh,
+            )
+        )
     return found
 
 
@@ -86,16 +94,30 @@ def read_compressed(content: bytes) -> list[Splat]:
             raw = body[start + 16 * counts["vertex"] + rest * row :][:rest]
             values = [-4.0 if u == 0 else 4.0 if u == 255 else ((u + 0.5) / 256 - 0.5) * 8 for u in raw]
             sh += [[values[channel * (rest // 3) + k] for channel in range(3)] for k in range(rest // 3)]
-        found.append(Splat(between(position, c[:3], c[3:6]), three_and_largest(rotation >> 30, three),
-                           [math.exp(v) for v in between(scale, c[6:9], c[9:12])], (color & 255) / 255, sh))  # fmt: skip
+        found.append(
+            Splat(
+                between(position, c[:3], c[3:6]),
+                three_and_largest(rotation >> 30, three),
+                [math.exp(v) for v in between(scale, c[6:9], c[9:12])],
+                (color & 255) / 255,
+                sh,
+            )
+        )
     return found
 
 
 def read_splat(content: bytes) -> list[Splat]:
     found = []
     for row in struct.iter_unpack("<6f8B", content):
-        found.append(Splat(list(row[:3]), [u / 255 * 2 - 1 for u in row[10:14]], list(row[3:6]), row[9] / 255,
-                           [[(u / 255 - 0.5) / C0 for u in row[6:9]]]))  # fmt: skip
+        found.append(
+            Splat(
+                list(row[:3]),
+                [u / 255 * 2 - 1 for u in row[10:14]],
+                list(row[3:6]),
+                row[9] / 255,
+                [[(u / 255 - 0.5) / C0 for u in row[6:9]]],
+            )
+        )
     return found
 
 
@@ -119,8 +141,15 @@ def read_spz(content: bytes) -> list[Splat]:
         sh = [[(raw[colors + 3 * n + i] / 255 - 0.5) / 0.15 for i in range(3)]]
         at = rest + 3 * coefficients * n
         sh += [[(raw[at + 3 * k + i] - 128) / 128 for i in range(3)] for k in range(coefficients)]
-        found.append(Splat(place, [w, x, y, z], [math.exp(raw[scales + 3 * n + i] / 16 - 10) for i in range(3)],
-                           raw[opacities + n] / 255, sh))  # fmt: skip
+        found.append(
+            Splat(
+                place,
+                [w, x, y, z],
+                [math.exp(raw[scales + 3 * n + i] / 16 - 10) for i in range(3)],
+                raw[opacities + n] / 255,
+                sh,
+            )
+        )
     return found
 
 
@@ -158,12 +187,19 @@ def read_sog(content: bytes) -> list[Splat]:
             for k in range(coefficients):
                 rgb = loaded[index % 64 * coefficients + k, index // 64]
                 sh.append([meta["shN"]["codebook"][v] for v in rgb[:3]])
-        found.append(Splat(place, three_and_largest(turn[3] - 252, three),
-                           [math.exp(meta["scales"]["codebook"][v]) for v in size[:3]], color[3] / 255, sh))  # fmt: skip
+        found.append(
+            Splat(
+                place,
+                three_and_largest(turn[3] - 252, three),
+                [math.exp(meta["scales"]["codebook"][v]) for v in size[:3]],
+                color[3] / 255,
+                sh,
+            )
+        )
     return found
 
 
-# -- glTF ----------------------------------------------------------------------------------------------------------------
+# -- glTF ------------------------------------------------------------------------------------------
 
 
 def open_glb(content: bytes) -> tuple[dict[str, Any], bytes]:
@@ -199,7 +235,7 @@ def read_glb_mesh(document: dict[str, Any], content: bytes, mesh: int) -> list[S
     ]
 
 
-# -- USD -----------------------------------------------------------------------------------------------------------------
+# -- USD -------------------------------------------------------------------------------------------
 
 
 def parse_usda(text: str) -> dict[str, Any]:

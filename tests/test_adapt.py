@@ -49,13 +49,17 @@ SIZE = (96, 64)
 def log(tmp_path_factory):
     """A small drive, its cloud, a fit to it, and a tiny model that uses renders."""
     root = tmp_path_factory.mktemp("adapt")
-    city = CityConfig(seed=5, n_frames=13, width=SIZE[0], height=SIZE[1], cameras=("front",), lidar_azimuth_step_deg=0.6)
+    city = CityConfig(
+        seed=5, n_frames=13, width=SIZE[0], height=SIZE[1], cameras=("front",), lidar_azimuth_step_deg=0.6
+    )
     Ingest(log=ingest.CITY, out=root / "scene", settings=IngestConfig(city=city, test_every=6)).run()
     Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     Fit(
-        scene=root / "scene", fused=root / "fuse", out=root / "fit",
+        scene=root / "scene",
+        fused=root / "fuse",
+        out=root / "fit",
         settings=fit_config(method="street_gaussians", iterations=30, start__gaussians=8000),
-    ).run()  # fmt: skip
+    ).run()
     before = files.load("embedded-tiny")
     grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1), area_px=SIZE[0] * SIZE[1])
     files.save(extended(before, grown), root / "tiny", "", {})
@@ -64,14 +68,24 @@ def log(tmp_path_factory):
 
 def settings(log, **changes):
     plain = AdaptConfig(
-        model=str(log / "tiny"), shifts_m=(1.0,), block=2, held_out_every=3, fit_iterations=8, steps=3, batch_frames=4, lr=1e-3,
-        precision="float32", processes=1,
-    )  # fmt: skip
+        model=str(log / "tiny"),
+        shifts_m=(1.0,),
+        block=2,
+        held_out_every=3,
+        fit_iterations=8,
+        steps=3,
+        batch_frames=4,
+        lr=1e-3,
+        precision="float32",
+        processes=1,
+    )
     return replace(plain, **changes)
 
 
 def adapted(log, out, **changes):
-    return Adapt(scene=log / "scene", fused=log / "fuse", fitted=log / "fit", out=out, settings=settings(log, **changes)).run()
+    return Adapt(
+        scene=log / "scene", fused=log / "fuse", fitted=log / "fit", out=out, settings=settings(log, **changes)
+    ).run()
 
 
 def weights_of(model):
@@ -86,7 +100,7 @@ def result(log, tmp_path_factory):
     return out
 
 
-# lessons --------------------------------------------------------------------------------------------------------------
+# lessons ------------------------------------------------------------------------------------------
 
 
 def test_lessons_show_some_frames_and_ask_for_others(log):
@@ -132,7 +146,7 @@ def test_a_photograph_carried_aside_is_nearer_to_the_truth_there(log):
     assert np.abs(carried.rgb - truth).mean() < 0.8 * np.abs(photo.rgb - truth).mean()
 
 
-# clips ----------------------------------------------------------------------------------------------------------------
+# clips --------------------------------------------------------------------------------------------
 
 
 def test_truth_is_photographs_measured_depth_and_the_models_own_guesses(log, tmp_path):
@@ -152,7 +166,7 @@ def test_truth_is_photographs_measured_depth_and_the_models_own_guesses(log, tmp
     assert int(clip.semantics.max()) < palette.UNLABELLED  # classes are the model's own everywhere
 
 
-# the verb -------------------------------------------------------------------------------------------------------------
+# the verb -----------------------------------------------------------------------------------------
 
 
 def test_the_model_is_ready_and_the_record_says_what_was_gained(log, result):
@@ -162,7 +176,9 @@ def test_the_model_is_ready_and_the_record_says_what_was_gained(log, result):
     assert model.config == before.config
     gain = record["after"]["psnr"] - record["before"]["psnr"]
     assert record["adapted"] == (gain >= adapt.LEAST_GAIN_DB)
-    same = all(torch.equal(a, b) for a, b in zip(model.state_dict().values(), before.state_dict().values(), strict=True))
+    same = all(
+        torch.equal(a, b) for a, b in zip(model.state_dict().values(), before.state_dict().values(), strict=True)
+    )
     assert same != record["adapted"]
     assert not (result / "work").exists() and (result / "before.png").is_file() and (result / "after.png").is_file()
 
@@ -194,7 +210,9 @@ def test_held_out_frames_are_never_read(log, result, tmp_path):
     scene = read_scene(damaged)
     for frame in scene.frames_in("test"):
         (damaged / frame.image.path).write_bytes(b"not a picture")
-    again = Adapt(scene=damaged, fused=log / "fuse", fitted=log / "fit", out=tmp_path / "out", settings=settings(log)).run()
+    again = Adapt(
+        scene=damaged, fused=log / "fuse", fitted=log / "fit", out=tmp_path / "out", settings=settings(log)
+    ).run()
     assert weights_of(again) == weights_of(result / "model")
 
 
@@ -246,13 +264,43 @@ for line in sys.stdin:
 
 @contextlib.contextmanager
 def commands(log):
-    """Runs ``mudg adapt`` with one thread into a folder, and sends it a signal after some seconds of work; gives the exit status."""
+    """Runs ``mudg adapt`` with one thread into a folder, and sends it a signal after some seconds of work; gives the
+    exit status."""
     environment = {**os.environ, "MUDG_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
-    words = ["adapt", log / "scene", "--fused", log / "fuse", "--fitted", log / "fit", "--model", log / "tiny", "--shifts-m", "1", "-1",
-             "--no-gaps", "--block", "1", "--held-out-every", "3", "--fit-iterations", "4", "--steps", "4", "--batch-frames", "2",
-             "--precision", "float32", "--out"]  # fmt: skip
+    words = [
+        "adapt",
+        log / "scene",
+        "--fused",
+        log / "fuse",
+        "--fitted",
+        log / "fit",
+        "--model",
+        log / "tiny",
+        "--shifts-m",
+        "1",
+        "-1",
+        "--no-gaps",
+        "--block",
+        "1",
+        "--held-out-every",
+        "3",
+        "--fit-iterations",
+        "4",
+        "--steps",
+        "4",
+        "--batch-frames",
+        "2",
+        "--precision",
+        "float32",
+        "--out",
+    ]
     with subprocess.Popen(
-        [sys.executable, "-c", COMMANDS], env=environment, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1
+        [sys.executable, "-c", COMMANDS],
+        env=environment,
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+        bufsize=1,
     ) as server:
         orders, answers = server.stdin, server.stdout
         assert orders is not None and answers is not None
@@ -266,7 +314,8 @@ def commands(log):
                 time.sleep(after_s)
                 with contextlib.suppress(ProcessLookupError):
                     os.kill(child, sent)
-            return int(next(line for line in answers if line.strip().lstrip("-").isdigit()))  # behind what the command prints
+            # behind what the command prints
+            return int(next(line for line in answers if line.strip().lstrip("-").isdigit()))
 
         yield command
         orders.close()
@@ -298,7 +347,11 @@ def test_an_adaptation_stopped_at_random_moments_is_repeated_to_the_same_files(s
 def test_what_cannot_be_adapted_is_refused(log, tmp_path):
     with pytest.raises(UsageError, match="renders"):
         Adapt(
-            scene=log / "scene", fused=log / "fuse", fitted=log / "fit", out=tmp_path / "a", settings=settings(log, model="embedded-tiny")
+            scene=log / "scene",
+            fused=log / "fuse",
+            fitted=log / "fit",
+            out=tmp_path / "a",
+            settings=settings(log, model="embedded-tiny"),
         ).run()
     with pytest.raises(InputError, match="too short|cannot be adapted"):
         adapted(log, tmp_path / "b", block=20)

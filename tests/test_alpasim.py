@@ -1,4 +1,5 @@
-"""Packages for AlpaSim, read as its reader does: by names in a zip, matrices from rig to world, microseconds, a mesh of triangles."""
+"""Packages for AlpaSim, read as its reader does: by names in a zip, matrices from rig to world, microseconds, a mesh of
+triangles."""
 
 from __future__ import annotations
 
@@ -95,9 +96,17 @@ def test_the_package_is_a_usd_package_with_files_by_name(package: Package) -> No
         assert (info.header_offset + 30 + name + extra) % 64 == 0
     facts = package.metadata
     assert set(facts) == {
-        "scene_id", "version_string", "training_date", "dataset_hash", "uuid", "is_resumable", "sensors", "logger", "time_range",
+        "scene_id",
+        "version_string",
+        "training_date",
+        "dataset_hash",
+        "uuid",
+        "is_resumable",
+        "sensors",
+        "logger",
+        "time_range",
         "training_step_outputs",
-    }  # fmt: skip
+    }
     assert facts["sensors"] == {"camera_ids": ["front", "left"], "lidar_ids": []} and set(facts["logger"]) == {
         "name",
         "run_id",
@@ -173,7 +182,7 @@ def test_unknown_ground_is_a_hole_and_the_mesh_turns_with_the_file() -> None:
 
 def test_shutters_and_the_same_bytes(package: Package) -> None:
     rolling = Package(alpasim.to_package(toy_splats.scene(1), drive(0.02), ground()))
-    (front, _) = rolling.trajectory["cameras_frame_timestamps_us"].values()
+    front, _ = rolling.trajectory["cameras_frame_timestamps_us"].values()
     assert [end - begin for begin, end in front] == [20_000, 20_000]
     told = next(iter(rolling.rig["camera_calibrations"].values()))["camera_model"]["parameters"]
     assert told["shutter_type"] == "ROLLING_TOP_TO_BOTTOM"
@@ -203,5 +212,7 @@ def test_the_command_needs_a_drive(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--scene"):
         Export(format="alpasim", source=tmp_path / "fit", out=tmp_path / "a.usdz", settings=ExportConfig()).run()
     with pytest.raises(UsageError, match="holds all moments"):
-        Export(format="alpasim", source=tmp_path / "fit", out=tmp_path / "a.usdz", settings=ExportConfig(time_s=0.2)).run()
+        Export(
+            format="alpasim", source=tmp_path / "fit", out=tmp_path / "a.usdz", settings=ExportConfig(time_s=0.2)
+        ).run()
     assert not (tmp_path / "a.usdz").exists()

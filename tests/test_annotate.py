@@ -129,7 +129,7 @@ def test_labels_of_boxes_are_train_ids() -> None:
     assert not (label_by_geometry(replace(given, tracks=[unknown])).semantics == ID["car"]).any()
 
 
-# --- parts ----------------------------------------------------------------------------------------------------------
+# --- parts ----------------------------------------------------------------------------------------
 
 
 def test_box_outline_covers_the_projected_box_exactly() -> None:
@@ -155,8 +155,14 @@ def test_elevation_of_rays() -> None:
     elevation = ray_elevation(view)
     middle = view.camera.height // 2
     assert elevation[middle - 1].min() > 0 > elevation[middle].max()
-    pitched = View(view.camera, view.world_from_cam @ geometry.from_rotation_translation(
-        [[1, 0, 0], [0, np.cos(0.1), -np.sin(0.1)], [0, np.sin(0.1), np.cos(0.1)]], [0, 0, 0]), 0.0)  # fmt: skip
+    pitched = View(
+        view.camera,
+        view.world_from_cam
+        @ geometry.from_rotation_translation(
+            [[1, 0, 0], [0, np.cos(0.1), -np.sin(0.1)], [0, np.sin(0.1), np.cos(0.1)]], [0, 0, 0]
+        ),
+        0.0,
+    )
     column = view.camera.width // 2
     assert ray_elevation(pitched)[middle, column] == pytest.approx(elevation[middle, column] + 0.1, abs=1e-3)
 
@@ -173,7 +179,7 @@ def test_sky_is_not_found_where_returns_are_or_below_the_horizon() -> None:
     assert not sky[31:].any()
 
 
-# --- the stage ------------------------------------------------------------------------------------------------------
+# --- the stage ------------------------------------------------------------------------------------
 
 
 def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: Path) -> None:
@@ -202,7 +208,9 @@ def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: P
 
 def test_a_scene_with_labels_passes_through_unchanged(tmp_path: Path) -> None:
     given = STREET.write(tmp_path / "given")
-    scene = read_scene(Annotate(scene=tmp_path / "given", out=tmp_path / "out", settings=AnnotateConfig(dynamic=False)).run())
+    scene = read_scene(
+        Annotate(scene=tmp_path / "given", out=tmp_path / "out", settings=AnnotateConfig(dynamic=False)).run()
+    )
     for frame, before in zip(scene.frames, given.frames, strict=True):
         assert set(frame.labels) == set(before.labels)
         assert (read_label(scene, frame, "semantics") == read_label(given, before, "semantics")).all()
@@ -251,7 +259,7 @@ def test_an_interrupted_run_goes_on_and_ends_the_same(tmp_path: Path) -> None:
 
     def watched(*args: object) -> Iterator[str]:
         assert stamps == {name: annotate.staged_labels(aside, name).stat().st_mtime_ns for name in first}
-        for name in real(*args):  # type: ignore[arg-type]
+        for name in real(*args):
             made.append(name)
             yield name
 
@@ -278,7 +286,8 @@ def test_sweeps_nearest_in_time_are_chosen() -> None:
 
 
 def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One frame's network answers an affine map of the true depth, the other's nonsense: the one is used, the other counted."""
+    """One frame's network answers an affine map of the true depth, the other's nonsense: the one is used, the other
+    counted."""
     street = replace(STREET, times=(0.0, 0.1))
     street.write(tmp_path / "plain", labels=False, width=96, height=48)
     plain = read_scene(tmp_path / "plain")
@@ -290,7 +299,9 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
     monkeypatch.setattr(annotate_depth, "load", lambda config: network if config.depth_network else None)
     config = AnnotateConfig(depth_network=str(tmp_path / "weights"), processes=1)
     scene = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run())
-    by_points = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "filled", settings=AnnotateConfig(processes=1)).run())
+    by_points = read_scene(
+        Annotate(scene=tmp_path / "plain", out=tmp_path / "filled", settings=AnnotateConfig(processes=1)).run()
+    )
     first, second = (read_label(scene, frame, "depth") for frame in scene.frames)
     seen = ~read_label(scene, scene.frames[0], "sky").astype(bool) & np.isfinite(street.image(plain.frames[0].view)[2])
     assert np.median(np.abs(first / truth[plain.frames[0].id] - 1)[seen]) < 1e-2

@@ -1,4 +1,5 @@
-"""Corrections of exposure and camera poses: identity at the start, gradients, what is held fixed, recovery in a small fit."""
+"""Corrections of exposure and camera poses: identity at the start, gradients, what is held fixed, recovery in a small
+fit."""
 
 from __future__ import annotations
 
@@ -53,8 +54,10 @@ def test_what_is_off_is_absent():
     assert made.penalty(VIRTUAL[0], "virtual") is None
     assert made.world_from_cam(view_at(0.0, camera()), RECORDED[0]) is None
     assert everything("camera").names == {
-        "exposure": ("front", "left"), "cameras": RECORDED, "virtual": ("front_shift+2.0", "front_shift-2.0"),
-    }  # fmt: skip
+        "exposure": ("front", "left"),
+        "cameras": RECORDED,
+        "virtual": ("front_shift+2.0", "front_shift-2.0"),
+    }
 
 
 def test_a_view_without_a_map_is_refused():
@@ -142,7 +145,7 @@ def test_state_round_trip():
     assert owner("front/000001") == "front"
 
 
-# ---- fits ------------------------------------------------------------------------------------------------------------
+# ---- fits ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -30,7 +30,7 @@ Columns = dict[str, Any]
 
 def ingest(source: Path, out: Path, **options: object) -> Scene:
     given = {"cameras": ("front", "front_left"), **options}
-    return IMPORTERS["argoverse2"](source, out, ImportOptions(**given))  # type: ignore[arg-type]
+    return IMPORTERS["argoverse2"](source, out, ImportOptions(**given))
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +43,7 @@ def drive(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.write_av2(truth, tmp_path_factory.mktemp("logs") / "7fab2350")
 
 
-# --- round trips ----------------------------------------------------------------------------------------------------
+# --- round trips ----------------------------------------------------------------------------------
 
 
 @needs_native
@@ -81,7 +81,7 @@ def test_frames_and_logs_are_chosen(drive: Path, tmp_path: Path) -> None:
     assert ingest(logs, tmp_path / "other", sequence="aaa-2").id == "aaa-2"
 
 
-# --- what is wrong is said ------------------------------------------------------------------------------------------
+# --- what is wrong is said ------------------------------------------------------------------------
 
 
 def scaled(names: tuple[str, ...], factor: float) -> Callable[[Columns], object]:
@@ -127,7 +127,7 @@ BROKEN: dict[str, tuple[str, Callable[[Columns], object], str]] = {
 def test_broken_tables_are_refused_in_words(name: str, drive: Path, tmp_path: Path) -> None:
     table, change, words = BROKEN[name]
     copy = shutil.copytree(drive, tmp_path / "log")
-    made.edit(copy / table, change)  # type: ignore[arg-type]
+    made.edit(copy / table, change)
     roundtrip.assert_refused(ingest, copy, tmp_path / "out", words)
 
 
@@ -148,7 +148,7 @@ def test_broken_files_are_refused_in_words(drive: Path, tmp_path: Path, capsys: 
     }
     for words, change in changes.items():
         scan.write_bytes(content)
-        made.edit(scan, change)  # type: ignore[arg-type]
+        made.edit(scan, change)
         with pytest.raises(InputError, match=words):
             ingest(copy, tmp_path / "out")
     scan.write_bytes(content)
@@ -197,7 +197,7 @@ def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
     assert "mudg[data]" in caught.value.remedy
 
 
-# --- real data --------------------------------------------------------------------------------------------------------
+# --- real data ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,8 @@
-"""Damage by chance to files of every format that is read: an error in words or a sound result, in bounded memory and time, nothing left.
+"""Damage by chance to files of every format that is read: an error in words or a sound result, in bounded memory and
+time, nothing left.
 
-Cases that were thought of are in ``test_splats_bad.py``, ``test_bad_*.py`` and the tests of the formats; this is for those that were not.
+Cases that were thought of are in ``test_splats_bad.py``, ``test_bad_*.py`` and the tests of the formats; this is for
+those that were not.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ def spoilt(name: str, content: bytes, seed: int, count: int) -> Iterator[bytes]:
         yield damaged_within(name, content, rng) if number % 3 else damaged(content, rng)
 
 
-# --- Gaussians ------------------------------------------------------------------------------------------------------------
+# --- Gaussians ------------------------------------------------------------------------------------
 
 
 def assert_sound(cloud: SplatCloud) -> None:
@@ -80,7 +82,7 @@ def test_damaged_gaussians_are_refused_in_words_or_read(name: str, degree: int, 
     assert refused > 2 * damages if name != "splat" else refused > damages
 
 
-# --- clouds ---------------------------------------------------------------------------------------------------------------
+# --- clouds ---------------------------------------------------------------------------------------
 
 CLOUDS = {**test_clouds.GOOD, "a.bin": np.column_stack([test_clouds.XYZ, [0.1, 0.5, 1.0]]).astype("<f4").tobytes()}
 
@@ -102,7 +104,7 @@ def test_damaged_clouds_are_refused_in_words_or_read(name: str, damages: int, tm
         assert name in told
 
 
-# --- logs -----------------------------------------------------------------------------------------------------------------
+# --- logs -----------------------------------------------------------------------------------------
 
 
 @functools.cache

@@ -1,4 +1,5 @@
-"""Images that no camera of a data set writes, in every format: refused by name, or taken and noted; nothing half-written."""
+"""Images that no camera of a data set writes, in every format: refused by name, or taken and noted; nothing
+half-written."""
 
 from __future__ import annotations
 
@@ -67,7 +68,8 @@ def test_a_grey_image_is_taken_and_noted_but_not_from_a_log_of_ones_own(
 
 @pytest.mark.parametrize("kind", ["PNG", "JPEG"])
 def test_what_is_checked_is_what_can_be_decoded(kind: str) -> None:
-    """Every cut, and many flipped bits: an image that passes the check is decoded, one that is refused here is refused there.
+    """Every cut, and many flipped bits: an image that passes the check is decoded, one that is refused here is refused
+    there.
 
     Only a PNG's checksums are known to the check alone.
     """
@@ -91,7 +93,7 @@ def test_what_is_checked_is_what_can_be_decoded(kind: str) -> None:
 
 def passes(content: bytes, function: object) -> bool:
     try:
-        function(content, "image")  # type: ignore[operator]
+        function(content, "image")
     except InputError:
         return False
     return True

@@ -241,13 +241,15 @@ def test_unknown_camera_and_missing_files_named_by_flags(drive: Path, tmp_path: 
             IMPORTERS["kitti"](drive, tmp_path / "out", ImportOptions(**{option: tmp_path / "none.txt"}))
 
 
-# --- odd but usable: the whole way to fused clouds --------------------------------------------------------------------
+# --- odd but usable: the whole way to fused clouds ------------------------------------------------
 
 
 def through(source: Path, tmp_path: Path) -> tuple[Any, Any]:
     scene_path = Ingest(log=source, out=tmp_path / "scene", settings=IngestConfig()).run()
     labelled = Annotate(scene=scene_path, out=tmp_path / "labelled", settings=AnnotateConfig()).run()
-    return read_scene(labelled), read_fused(Fuse(scene=labelled, out=tmp_path / "fuse", settings=FuseConfig(min_object_points=1)).run())
+    return read_scene(labelled), read_fused(
+        Fuse(scene=labelled, out=tmp_path / "fuse", settings=FuseConfig(min_object_points=1)).run()
+    )
 
 
 def test_no_tracks(drive: Path, tmp_path: Path) -> None:
@@ -295,7 +297,7 @@ def test_one_camera_of_several_is_enough(tmp_path: Path) -> None:
     assert len(Annotate(scene=tmp_path / "scene", out=tmp_path / "out", settings=AnnotateConfig()).run().name) > 0
 
 
-# --- broken scenes reach every stage the same way -----------------------------------------------------------------------
+# --- broken scenes reach every stage the same way -------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -403,7 +405,7 @@ def test_images_with_colour_maps_and_grey_are_read_as_rgb(tmp_path: Path) -> Non
     assert read_image(scene, scene.frames[1]).shape == (made.HEIGHT, made.WIDTH, 3)
 
 
-# --- damage at random: only our own errors, never a crash and never a picture of another size -------------------------
+# --- damage at random: only our own errors, never a crash and never a picture of another size -----
 
 
 def damaged(content: bytes, rng: np.random.Generator) -> bytes:

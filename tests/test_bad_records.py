@@ -1,6 +1,7 @@
 """Clouds, boxes, poses, times, classes and file names that contradict a data set's rules, format by format.
 
-Cases that a format's own test has are not repeated; docs/ingest.md lists them all. What is refused leaves nothing behind.
+Cases that a format's own test has are not repeated; docs/ingest.md lists them all. What is refused leaves nothing
+behind.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ def written(kind: str, folder: Path) -> bad_logs.Files | write_waymo.Log:
     return bad_logs.written(kind, folder)
 
 
-# --- clouds ---------------------------------------------------------------------------------------------------------------
+# --- clouds ---------------------------------------------------------------------------------------
 
 
 def npz(change: Callable[[bytes], bytes], member: str) -> Change:
@@ -126,14 +127,18 @@ def brighter_frame(content: bytes) -> bytes:
     ("kind", "change"),
     [("kitti", brighter(4)), ("kitti360", brighter(4)), ("nuscenes", brighter(5)), ("pandaset", brighter_frame)],
 )
-def test_intensities_of_another_scale_are_refused_not_clipped(kind: str, change: Change, folder: Path, tmp_path: Path) -> None:
+def test_intensities_of_another_scale_are_refused_not_clipped(
+    kind: str, change: Change, folder: Path, tmp_path: Path
+) -> None:
     log = written(kind, folder)
     with bad_logs.damaged(log, kind, "cloud", change, tmp_path) as (source, where):
-        error = bad_logs.assert_refused(kind, source, tmp_path, bad_logs.options_of(log), "intensity is out of range", where)
+        error = bad_logs.assert_refused(
+            kind, source, tmp_path, bad_logs.options_of(log), "intensity is out of range", where
+        )
     assert error.remedy
 
 
-# --- Waymo, both forms -------------------------------------------------------------------------------------------------------
+# --- Waymo, both forms ----------------------------------------------------------------------------
 
 
 def swap_sides(log: write_waymo.Log) -> None:
@@ -155,7 +160,7 @@ class Lying(np.ndarray):
         return np.asarray(image).view(cls)
 
     @property
-    def shape(self) -> tuple[int, ...]:  # type: ignore[override]
+    def shape(self) -> tuple[int, ...]:
         return (1 << 20, *super().shape[1:])
 
 
@@ -198,7 +203,7 @@ def test_a_page_of_a_waymo_table_that_does_not_fit_its_checksum_is_refused(folde
     bad_logs.assert_refused("waymo v2", source, tmp_path, ImportOptions(), "cannot be read", table.name)
 
 
-# --- records of the others ------------------------------------------------------------------------------------------------
+# --- records of the others ------------------------------------------------------------------------
 
 
 def label(change: Callable[[list[str]], None]) -> Callable[[Path], None]:
@@ -275,33 +280,75 @@ RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
     ("kitti", "width and length swapped"): (label(swap_label), "swapped", "label_02.txt"),
     ("nuscenes", "Windows path"): (nuscenes("sample_data", backslashes), "backslash", "sample_data.json: record"),
     ("nuplan", "Windows path"): (
-        nuplan("UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"), "backslash", "image at"),
-    ("nuplan", "width and length swapped"): (nuplan("UPDATE lidar_box SET width = length, length = width"), "swapped", "lidar_box"),
+        nuplan("UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"),
+        "backslash",
+        "image at",
+    ),
+    ("nuplan", "width and length swapped"): (
+        nuplan("UPDATE lidar_box SET width = length, length = width"),
+        "swapped",
+        "lidar_box",
+    ),
     ("dgp", "Windows path"): (
-        dgp("scene_abc.json", lambda r: [
-            d["datum"]["point_cloud"].update(filename=d["datum"]["point_cloud"]["filename"].replace("/", "\\"))
-            for d in r["data"] if "point_cloud" in d["datum"]
-        ]), "backslash", "datum LIDAR"),
+        dgp(
+            "scene_abc.json",
+            lambda r: [
+                d["datum"]["point_cloud"].update(filename=d["datum"]["point_cloud"]["filename"].replace("/", "\\"))
+                for d in r["data"]
+                if "point_cloud" in d["datum"]
+            ],
+        ),
+        "backslash",
+        "datum LIDAR",
+    ),
     ("dgp", "times of another century"): (
         dgp("scene_abc.json", lambda r: [d["id"].update(timestamp="1970-01-18T20:00:00.123456Z") for d in r["data"]]),
-        "another unit", "scene_abc.json"),
+        "another unit",
+        "scene_abc.json",
+    ),
     ("dgp", "missing image"): (lambda r: (r / "rgb/FRONT/1.png").unlink(), "missing", "1.png"),
     ("kitti", "class of 201 letters"): (text("derived/label_02.txt", "Car", LONG), "name is too long", "label_02.txt"),
     ("kitti360", "number of an object of 300 digits"): (
-        text("data_3d_bboxes/train/*.xml", "<instanceId>1<", f"<instanceId>{'1' * 300}<"), "name is too long", "id of an object"),
+        text("data_3d_bboxes/train/*.xml", "<instanceId>1<", f"<instanceId>{'1' * 300}<"),
+        "name is too long",
+        "id of an object",
+    ),
     ("nuscenes", "class of 201 letters"): (
-        nuscenes("category", lambda rows: rows[0].update(name=LONG)), "name is too long", "sample_annotation.json"),
+        nuscenes("category", lambda rows: rows[0].update(name=LONG)),
+        "name is too long",
+        "sample_annotation.json",
+    ),
     ("argoverse2", "class of 201 letters"): (
-        lambda r: write_av2.edit(r / "annotations.feather", lambda c: c.update(category=np.full(len(c["category"]), LONG, object))),
-        "name is too long", "annotations.feather"),
+        lambda r: write_av2.edit(
+            r / "annotations.feather", lambda c: c.update(category=np.full(len(c["category"]), LONG, object))
+        ),
+        "name is too long",
+        "annotations.feather",
+    ),
     ("argoverse2", "id of 201 letters"): (
-        lambda r: write_av2.edit(r / "annotations.feather", lambda c: c.update(track_uuid=np.full(len(c["category"]), LONG, object))),
-        "name is too long", "annotations.feather"),
+        lambda r: write_av2.edit(
+            r / "annotations.feather", lambda c: c.update(track_uuid=np.full(len(c["category"]), LONG, object))
+        ),
+        "name is too long",
+        "annotations.feather",
+    ),
     ("pandaset", "class of 201 letters"): (long_labels, "name is too long", "cuboids"),
-    ("dgp", "class of 201 letters"): (text("ontology/*.json", '"Car"', f'"{LONG}"'), "name is too long", "bounding_box_3d"),
-    ("custom", "class of 201 letters"): (text("log.json", '"class": "car"', f'"class": "{LONG}"'), "name is too long", "tracks"),
-    ("nuscenes", "missing image"): (lambda r: bad_logs.second(r / "samples/CAM_FRONT").unlink(), "missing", "CAM_FRONT"),
-}  # fmt: skip
+    ("dgp", "class of 201 letters"): (
+        text("ontology/*.json", '"Car"', f'"{LONG}"'),
+        "name is too long",
+        "bounding_box_3d",
+    ),
+    ("custom", "class of 201 letters"): (
+        text("log.json", '"class": "car"', f'"class": "{LONG}"'),
+        "name is too long",
+        "tracks",
+    ),
+    ("nuscenes", "missing image"): (
+        lambda r: bad_logs.second(r / "samples/CAM_FRONT").unlink(),
+        "missing",
+        "CAM_FRONT",
+    ),
+}
 
 
 @pytest.mark.parametrize(("kind", "case"), RECORDS)
@@ -317,7 +364,7 @@ def test_a_bad_record_is_refused_by_name(kind: str, case: str, folder: Path, tmp
     )
 
 
-# --- taken, and said ----------------------------------------------------------------------------------------------------------
+# --- taken, and said ------------------------------------------------------------------------------
 
 
 def test_an_unknown_class_of_kitti_keeps_its_name_and_is_noted(folder: Path, tmp_path: Path) -> None:

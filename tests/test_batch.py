@@ -53,10 +53,15 @@ def test_a_list_names_sources_folders_and_settings(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", "list is empty"), ("# nothing\n", "list is empty"), ("a/x\nb/x\n", "the same folder"), ("a b\n", "unknown setting"),
-        ("a speed=3\n", "unknown setting"), ("'a\n", "cannot parse the line"), ("a name=../up\n", "folder name"),
+        ("", "list is empty"),
+        ("# nothing\n", "list is empty"),
+        ("a/x\nb/x\n", "the same folder"),
+        ("a b\n", "unknown setting"),
+        ("a speed=3\n", "unknown setting"),
+        ("'a\n", "cannot parse the line"),
+        ("a name=../up\n", "folder name"),
     ],
-)  # fmt: skip
+)
 def test_bad_lists_are_refused_with_their_line(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "list.txt").write_text(text)
     with pytest.raises(InputError, match=words):
@@ -104,8 +109,18 @@ def test_many_logs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
     content = broken.read_bytes()
     broken.write_bytes(content[:-5])
     (tmp_path / "list.txt").write_text(f"{drives[0]} name=first frames=0:3\n{drives[1]} name=second\n")
-    words = ["ingest", "kitti", "--list", str(tmp_path / "list.txt"), "--out", str(tmp_path / "scenes"), "--jobs", "2",
-             "--no-contact-sheet", "--quiet"]  # fmt: skip
+    words = [
+        "ingest",
+        "kitti",
+        "--list",
+        str(tmp_path / "list.txt"),
+        "--out",
+        str(tmp_path / "scenes"),
+        "--jobs",
+        "2",
+        "--no-contact-sheet",
+        "--quiet",
+    ]
     assert app.main(words) == 11
     said = capsys.readouterr().out
     assert "1 of 2 scenes are there, 1 failed" in said and "cut off" in said

@@ -43,8 +43,14 @@ def damaged(content: bytes) -> Iterator[bytes]:
     for number, record in enumerate(records):
         for name in record if isinstance(record, dict) and number in (0, len(records) - 1) else ():
             for value in [..., *VALUES]:
-                changed = {key: value if key == name else kept for key, kept in record.items() if key != name or value is not ...}
-                yield "".join(f"{json.dumps(one)}\n" for one in [*records[:number], changed, *records[number + 1 :]]).encode()
+                changed = {
+                    key: value if key == name else kept
+                    for key, kept in record.items()
+                    if key != name or value is not ...
+                }
+                yield "".join(
+                    f"{json.dumps(one)}\n" for one in [*records[:number], changed, *records[number + 1 :]]
+                ).encode()
 
 
 def ends_in_words(call: Callable[[], object]) -> None:
@@ -61,7 +67,7 @@ def test_damaged_records_of_a_batch_end_in_words(kind: str, made: Path, tmp_path
     out = tmp_path / "out"
     shutil.copytree(made, out)
     scenes = Scenes(tmp_path)
-    (file, *_) = sorted((out / "_batch").glob(kind))
+    file, *_ = sorted((out / "_batch").glob(kind))
 
     def all_of_it() -> None:
         state = status.read_status(scenes.batch)
@@ -90,7 +96,7 @@ def test_damaged_records_of_a_batch_end_in_words(kind: str, made: Path, tmp_path
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_damaged_record_is_named(kind: str, made: Path, tmp_path: Path) -> None:
     shutil.copytree(made, tmp_path / "out")
-    (file, *_) = sorted((tmp_path / "out/_batch").glob(kind))
+    file, *_ = sorted((tmp_path / "out/_batch").glob(kind))
     file.write_text('{"cut')
     with pytest.raises(MudgError) as caught:
         status.read_status(Scenes(tmp_path).batch)

@@ -54,7 +54,9 @@ def on_disk(root: Path) -> set[str]:
     return {path.name for path in (root / FOLDER).glob("*/content/*")}
 
 
-def test_an_input_is_fetched_once_per_driver_and_again_when_it_is_doubted(bucket: Location, tmp_path: Path, fetched: list[str]) -> None:
+def test_an_input_is_fetched_once_per_driver_and_again_when_it_is_doubted(
+    bucket: Location, tmp_path: Path, fetched: list[str]
+) -> None:
     source, inputs, stop = put(bucket, "a", "one"), InputStore(tmp_path, "driver one"), Stop()
     for _ in range(2):
         with inputs.held(source, "", stop, keep=True) as path:
@@ -85,7 +87,9 @@ def test_nothing_in_use_is_removed(bucket: Location, tmp_path: Path) -> None:
     assert on_disk(tmp_path) == set()
 
 
-def test_workers_that_want_the_same_fetch_it_once(bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_that_want_the_same_fetch_it_once(
+    bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     source, count, fetch = put(bucket, "weights"), [], Location.fetch
 
     def slow(source: Location, to: Path, *, mirror: bool = False) -> None:
@@ -123,7 +127,7 @@ class TwoSteps(Scenes):
         self.plan = BatchPlan((first, second))
 
     def run(self, **more: object) -> dict[str, int]:
-        return super().run(scratch=self.folder / "scratch", **more)  # type: ignore[arg-type]
+        return super().run(scratch=self.folder / "scratch", **more)
 
 
 @pytest.fixture(autouse=True)
@@ -136,7 +140,7 @@ def test_results_lie_in_the_store_and_nothing_here(bucket: Location, tmp_path: P
     assert made.run() == {"done": 6} and made.run() == {}
     for record in made.batch.records("done"):
         place = made.batch.out / record.place
-        assert (place / "text").load() == f"log {record.scene[1:]}\n".strip().encode() and place.uploaded().complete  # type: ignore[union-attr]
+        assert (place / "text").load() == f"log {record.scene[1:]}\n".strip().encode() and place.uploaded().complete
     assert status.read_status(made.batch).finished == 3
     assert sorted(fetched) == ["s0", "s1", "s2"], "each log once, and no result of a step that was made here"
     assert not [path for path in (tmp_path / "scratch").rglob("*") if path.is_file() and path.suffix != ".lock"]
@@ -170,13 +174,15 @@ def test_a_driver_that_died_between_the_steps_costs_no_step(bucket: Location, tm
     assert made.runs() == {"s0.first": 1, "s0.second": 1, "s1.first": 1, "s1.second": 2, "s2.first": 1, "s2.second": 1}
 
 
-def test_a_bad_log_is_fetched_again_after_it_was_repaired(bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bad_log_is_fetched_again_after_it_was_repaired(
+    bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     made = TwoSteps(tmp_path, bucket)
     made.does("s1", 'grep -q repaired "$4" || [ "$2" = second ] || exit 4')
     run_step, codes = work.run_step, []
 
     def repaired(*args: object, **options: object) -> Ending:
-        ending = run_step(*args, **options)  # type: ignore[arg-type]
+        ending = run_step(*args, **options)
         codes.append(ending.code)
         if ending.code == 4:
             put(bucket, "logs/s1", "log 1 repaired")
@@ -186,7 +192,9 @@ def test_a_bad_log_is_fetched_again_after_it_was_repaired(bucket: Location, tmp_
     assert made.run() == {"done": 6} and codes.count(4) == 1
 
 
-def test_weights_at_an_address_are_fetched_once_for_all_scenes(bucket: Location, tmp_path: Path, fetched: list[str]) -> None:
+def test_weights_at_an_address_are_fetched_once_for_all_scenes(
+    bucket: Location, tmp_path: Path, fetched: list[str]
+) -> None:
     put(bucket, "nets/small", "weights")
     settings = {"weights": "memory://bucket/nets/small", "nested": {"model": "memory:/bucket/nets/small"}, "n": 3}
     made = TwoSteps(tmp_path, bucket, settings)
@@ -196,10 +204,16 @@ def test_weights_at_an_address_are_fetched_once_for_all_scenes(bucket: Location,
     assert made.run() == {"done": 6} and fetched.count("small") == 1
     given = [yaml.safe_load((tmp_path / f"s{n}.yaml").read_text()) for n in range(3)]
     assert given[0] == given[1] == given[2] and (tmp_path / "s2.bin").read_text() == "weights"
-    assert given[0]["nested"]["model"] == given[0]["weights"] and given[0]["weights"].startswith("weights/") and given[0]["n"] == 3
+    assert (
+        given[0]["nested"]["model"] == given[0]["weights"]
+        and given[0]["weights"].startswith("weights/")
+        and given[0]["n"] == 3
+    )
 
 
-def test_an_upload_that_fails_for_a_while_costs_no_second_run(bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_upload_that_fails_for_a_while_costs_no_second_run(
+    bucket: Location, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Stop, "sleep", lambda *_: None)
     made, push, tries = TwoSteps(tmp_path, bucket), Location.push, []
 

@@ -56,7 +56,9 @@ class Scenes:
     def does(self, name: str, script: str) -> None:
         (self.tally / f"{name}.do").write_text(script)
 
-    def run(self, jobs: int = 1, scratch: Path | None = None, threads: int = 1, stop: Stop | None = None) -> dict[str, int]:
+    def run(
+        self, jobs: int = 1, scratch: Path | None = None, threads: int = 1, stop: Stop | None = None
+    ) -> dict[str, int]:
         """Run what is missing; how many steps ended how."""
         self.batch.begin(self.plan, self.entries)
         reports: list[Ended] = []
@@ -73,8 +75,18 @@ class Scenes:
         return {one.scene: one.digest for one in self.batch.records("done")}
 
     def words(self, *more: str) -> list[str]:
-        return ["batch", "run", "--list", str(self.folder / "list.txt"), "--out", str(self.batch.out), "--quiet", *more,
-                "--command", *self.command]  # fmt: skip
+        return [
+            "batch",
+            "run",
+            "--list",
+            str(self.folder / "list.txt"),
+            "--out",
+            str(self.batch.out),
+            "--quiet",
+            *more,
+            "--command",
+            *self.command,
+        ]
 
 
 @pytest.fixture(autouse=True)
@@ -90,7 +102,7 @@ def wait_for(condition: Callable[[], object], seconds: float = 60.0) -> None:
         time.sleep(0.02)
 
 
-# ---- keys and lists -----------------------------------------------------------------------------------------------------
+# ---- keys and lists ------------------------------------------------------------------------------
 
 
 def test_a_key_depends_on_log_settings_and_what_is_read() -> None:
@@ -103,7 +115,11 @@ def test_a_key_depends_on_log_settings_and_what_is_read() -> None:
     assert {unit.key for unit in other.units(Entry("a", "/logs/a"))}.isdisjoint({first.key, second.key})
     device = plan_of(("ingest", "fuse"), LINES, {**settings, "ingest": {"frames": "", "device": "cuda"}})
     assert next(iter(device.units(Entry("a", "/logs/a")))).key == first.key
-    for changed in (Entry("a", "/logs/b"), Entry("a", "/logs/a", {"revision": "2"}), Entry("a", "/logs/a", {"frames": "0:3"})):
+    for changed in (
+        Entry("a", "/logs/b"),
+        Entry("a", "/logs/a", {"revision": "2"}),
+        Entry("a", "/logs/a", {"frames": "0:3"}),
+    ):
         assert next(iter(plan.units(changed))).key != first.key
 
 
@@ -111,9 +127,13 @@ def test_steps_need_what_they_read() -> None:
     values = {name: {} for name in ("ingest", "annotate", "fuse", "fit", "render", "synthesize", "score")}
     plan = plan_of(("ingest", "annotate", "fuse", "fit", "render", "score"), LINES, values)
     assert {stage.name: stage.needs for stage in plan.stages} == {
-        "ingest": (), "annotate": ("ingest",), "fuse": ("annotate",), "fit": ("annotate", "fuse"), "render": ("annotate", "fit"),
+        "ingest": (),
+        "annotate": ("ingest",),
+        "fuse": ("annotate",),
+        "fit": ("annotate", "fuse"),
+        "render": ("annotate", "fit"),
         "score": ("annotate", "fuse", "render"),
-    }  # fmt: skip
+    }
     assert plan_of(("fuse",), LINES, values).stages[0].words == ("fuse", "{source}")
     for names in (("fit",), ("ingest", "ingest"), ("nothing",), ()):
         with pytest.raises(UsageError):
@@ -127,7 +147,9 @@ def test_settings_of_a_line_are_those_of_ingest_also_in_the_chain() -> None:
     entry = Entry("a", "city", {"frames": "0:5", "cameras": "front,left", "seed": "7", "revision": "2"})
     ingest, fuse = plan_of(("ingest", "fuse"), LINES, values).units(entry)
     (chain,) = plan_of(("run",), LINES, values).units(entry)
-    flags = {unit.stage.name: command_of(unit, {"source": "city", "ingest": "i"}, "o", "") for unit in (ingest, fuse, chain)}
+    flags = {
+        unit.stage.name: command_of(unit, {"source": "city", "ingest": "i"}, "o", "") for unit in (ingest, fuse, chain)
+    }
     assert flags["ingest"][-5:] == ["--frames=0:5", "--cameras", "front", "left", "--city.seed=7"]
     assert flags["run"][-5:] == ["--ingest.frames=0:5", "--ingest.cameras", "front", "left", "--ingest.city.seed=7"]
     assert flags["fuse"][-1] == "--quiet"
@@ -158,22 +180,28 @@ def test_sources_may_be_addresses(tmp_path: Path) -> None:
         ("env", {"SKYPILOT_NODE_RANK": "1", "SKYPILOT_NUM_NODES": "4"}, (1, 4)),
         ("env", {"AWS_BATCH_JOB_ARRAY_INDEX": "7", "AWS_BATCH_JOB_ARRAY_SIZE": "9"}, (7, 9)),
     ],
-)  # fmt: skip
+)
 def test_schedulers_number_the_shards(text: str, environment: Mapping[str, str], wanted: tuple[int, int]) -> None:
     assert parse_shard(text, environment) == wanted
 
 
 @pytest.mark.parametrize(
     ("text", "environment"),
-    [("5/5", {}), ("a/b", {}), ("env", {}), ("env", {"JOB_COMPLETION_INDEX": "1"}), ("env/5", {"JOB_COMPLETION_INDEX": "5"}),
-     ("env/5", {"JOB_COMPLETION_INDEX": "x"})],
-)  # fmt: skip
+    [
+        ("5/5", {}),
+        ("a/b", {}),
+        ("env", {}),
+        ("env", {"JOB_COMPLETION_INDEX": "1"}),
+        ("env/5", {"JOB_COMPLETION_INDEX": "5"}),
+        ("env/5", {"JOB_COMPLETION_INDEX": "x"}),
+    ],
+)
 def test_what_is_no_shard_is_refused(text: str, environment: Mapping[str, str]) -> None:
     with pytest.raises(UsageError, match="shard|numbered"):
         parse_shard(text, environment)
 
 
-# ---- scenes -------------------------------------------------------------------------------------------------------------
+# ---- scenes --------------------------------------------------------------------------------------
 
 
 def test_a_second_run_does_nothing_and_any_order_gives_the_same(tmp_path: Path) -> None:
@@ -201,7 +229,9 @@ def test_an_output_of_another_batch_or_of_something_else_is_refused(tmp_path: Pa
 
 
 @pytest.mark.parametrize(("code", "tries"), [(1, 1), (2, 1), (3, 1), (4, 2), (5, 3), (6, 1), (134, 2), (143, 3)])
-def test_exit_codes_decide_how_often_a_step_is_tried(tmp_path: Path, code: int, tries: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exit_codes_decide_how_often_a_step_is_tried(
+    tmp_path: Path, code: int, tries: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(Stop, "sleep", lambda *_: None)
     made = Scenes(tmp_path, 2)
     made.does("s0", f"echo 'error: it broke' >&2; mkdir -p $2; echo x >> $2/left; exit {code}")
@@ -257,8 +287,10 @@ def test_a_slow_attempt_that_another_took_over_publishes_nothing(tmp_path: Path)
 def test_a_killed_step_is_tried_again_alone_and_with_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Stop, "sleep", lambda *_: None)
     made, order = Scenes(tmp_path, 2), tmp_path / "order"
-    made.does("s0", f'[ $MUDG_THREADS -gt 1 ] && kill -9 $$; echo a >> {order}; sleep 0.3; echo a >> {order}')
-    made.does("s1", f"while [ $(wc -l < {tmp_path}/tally/s0.runs) -lt 1 ]; do sleep 0.02; done; sleep 0.5; echo b >> {order}")
+    made.does("s0", f"[ $MUDG_THREADS -gt 1 ] && kill -9 $$; echo a >> {order}; sleep 0.3; echo a >> {order}")
+    made.does(
+        "s1", f"while [ $(wc -l < {tmp_path}/tally/s0.runs) -lt 1 ]; do sleep 0.02; done; sleep 0.5; echo b >> {order}"
+    )
     assert made.run(jobs=2, threads=4) == {"done": 2} and made.runs() == {"s0": 2, "s1": 1}
     assert "".join(order.read_text().split()) == "baa", "the second try waited for the other step"
     made.entries.append(Entry("s2", "/logs/2"))
@@ -276,7 +308,7 @@ def test_too_few_programs_and_processes(tmp_path: Path) -> None:
     assert next(made.batch.records("failed")).words == "it ended well but wrote nothing"
 
 
-# ---- drivers ------------------------------------------------------------------------------------------------------------
+# ---- drivers -------------------------------------------------------------------------------------
 
 
 def test_two_drivers_on_one_output_are_refused(tmp_path: Path) -> None:
@@ -341,7 +373,7 @@ except UsageError as error:
     assert answers.count("mine") <= 1 and set(answers) <= {"mine", "refused"}
 
 
-# ---- status -------------------------------------------------------------------------------------------------------------
+# ---- status --------------------------------------------------------------------------------------
 
 
 def test_status_counts_groups_and_forecasts(tmp_path: Path) -> None:
@@ -350,17 +382,30 @@ def test_status_counts_groups_and_forecasts(tmp_path: Path) -> None:
         made.does(name, f"echo 'error: it is cut off' >&2; echo '  where: {name}' >&2; exit 3")
     made.run()
     state = status.read_status(made.batch, price=2.0)
-    assert (state.stages["command"].done, state.stages["command"].failed, state.finished, state.steps_left()) == (4, 2, 4, 0)
+    assert (state.stages["command"].done, state.stages["command"].failed, state.finished, state.steps_left()) == (
+        4,
+        2,
+        4,
+        0,
+    )
     assert [(words, count) for words, count, _ in state.reasons()] == [("3 bad input: it is cut off", 2)]
     for record in (tmp_path / "out/_batch/done").iterdir():
-        record.write_text(json.dumps(json.loads(record.read_text()) | {"processor_s": 900.0, "lost_s": 900.0, "ended": 1000.0}))
+        record.write_text(
+            json.dumps(json.loads(record.read_text()) | {"processor_s": 900.0, "lost_s": 900.0, "ended": 1000.0})
+        )
     record.write_text(json.dumps(json.loads(record.read_text()) | {"ended": 1030.0}))
     for failed in made.batch.keys("failed"):
         made.batch.record("failed", failed).remove()
     made.batch.begin(made.plan, [*made.entries, Entry("more", "/logs/more")])
     state = status.read_status(made.batch, price=2.0)
     assert state.steps_left() == 3 and state.forecast_s() == pytest.approx(30.0)  # 3 further ends in 30 s
-    assert state.costs()["total"] == {"core_hours": 2.0, "lost_hours": 1.0, "core_hours_left": 1.5, "money": 4.0, "money_left": 3.0}
+    assert state.costs()["total"] == {
+        "core_hours": 2.0,
+        "lost_hours": 1.0,
+        "core_hours_left": 1.5,
+        "money": 4.0,
+        "money_left": 3.0,
+    }
     assert "cost at 2" in status.text_of(state) and json.dumps(state.record())
 
 
@@ -393,7 +438,7 @@ def test_facts_are_summed_over_the_logs(tmp_path: Path) -> None:
     assert (corpus["scenes"], corpus["images"], corpus["kilometres"], corpus["objects"]) == (3, 6, 0.033, {"car": 6})
 
 
-# ---- processes ----------------------------------------------------------------------------------------------------------
+# ---- processes -----------------------------------------------------------------------------------
 
 CHECKPOINTS = """
 import os, signal, sys, time
@@ -410,7 +455,6 @@ if not os.path.exists(half):
 os.remove(half)
 open(os.path.join(out, "whole"), "w").write("whole")
 """
-
 
 
 def start(made: Scenes, *more: str) -> subprocess.Popen[bytes]:
@@ -430,11 +474,14 @@ def test_sigterm_leads_to_a_checkpoint_and_the_same_command_goes_on(scratch: boo
     assert process.wait(30) == 143
     assert not list((tmp_path / "out/_batch").glob("owner*")) and not (tmp_path / "out/_batch/failed").exists()
     (tmp_path / "up").unlink()
-    shutil.rmtree(tmp_path / "one", ignore_errors=True)  # on another machine, a stopped worker's checkpoint is there, too
+    # on another machine, a stopped worker's checkpoint is there, too
+    shutil.rmtree(tmp_path / "one", ignore_errors=True)
     assert app.main(made.words("--jobs", "1", *more)) == 0
     assert not (tmp_path / "up").exists(), "it began from nothing"
     (record,) = made.batch.records("done")
-    assert (tmp_path / "out" / record.place / "whole").is_file() and not list((tmp_path / "out/_batch").glob("partial/*"))
+    assert (tmp_path / "out" / record.place / "whole").is_file() and not list(
+        (tmp_path / "out/_batch").glob("partial/*")
+    )
 
 
 @pytest.mark.skipif(shutil.which("setpriv") is None, reason="no setpriv")
@@ -445,8 +492,8 @@ def test_a_killed_driver_leaves_no_orphan_and_is_taken_over(tmp_path: Path) -> N
     child = int((tmp_path / "up").read_text())
     process.kill()
     process.wait()
-    gone = lambda: not Path(f"/proc/{child}").exists() or "State:\tZ" in Path(f"/proc/{child}/status").read_text()  # noqa: E731
-    wait_for(gone, 10)
+    state = Path(f"/proc/{child}/status")
+    wait_for(lambda: not state.exists() or "State:\tZ" in state.read_text(), 10)
     (work_dir,) = (tmp_path / "out/_batch/work").iterdir()
     (work_dir / "result/half").write_text("half")
     assert app.main(made.words("--jobs", "1")) == 0
@@ -456,7 +503,9 @@ def test_a_slurm_task_stops_for_its_checkpoint(tmp_path: Path) -> None:
     """What submitit calls when the job is about to end."""
     pytest.importorskip("submitit")
     made = Scenes(tmp_path, 2)
-    made.does("s0", f"trap 'touch {tmp_path}/stopped; exit 143' TERM; touch {tmp_path}/up; while :; do sleep 0.05; done")
+    made.does(
+        "s0", f"trap 'touch {tmp_path}/stopped; exit 143' TERM; touch {tmp_path}/up; while :; do sleep 0.05; done"
+    )
     made.batch.begin(made.plan, made.entries)
     task = engines.SlurmTask(Job(made.batch, made.plan, grace_s=20.0), made.entries)
     answers = []
@@ -491,7 +540,9 @@ def test_submitit_runs_the_tasks(tmp_path: Path) -> None:
     task = executor.submit(engines.SlurmTask(Job(made.batch, made.plan), made.entries))
     assert task.result() == {"done": 3}
     Scenes(tmp_path / "b").run()
-    assert made.digests() == {one.scene: one.digest for one in BatchFolder(Location.of(tmp_path / "b/out")).records("done")}
+    assert made.digests() == {
+        one.scene: one.digest for one in BatchFolder(Location.of(tmp_path / "b/out")).records("done")
+    }
 
 
 @pytest.mark.parametrize("option", ["array=0-3", "time=1\n#SBATCH --wrap=x", "--partition=gpu", ""])
@@ -561,7 +612,7 @@ def test_paths_in_settings_are_made_absolute(tmp_path: Path, monkeypatch: pytest
     assert batching.plan_for(BatchConfig(), RunConfig(), LINES).stages[0].name == "run"
 
 
-# ---- templates for schedulers -------------------------------------------------------------------------------------------
+# ---- templates for schedulers --------------------------------------------------------------------
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "docs/examples"
 

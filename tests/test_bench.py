@@ -18,14 +18,24 @@ from mudg.diffusion.model import MDM, MDMConfig
 from mudg.networks.codec import CodecConfig
 
 SMALL = MDMConfig(
-    widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,
-    embed_width=16, patch=2, codec=CodecConfig(decoder_width=8, decoder_blocks=1), refine_widths=(8, 16), refine_blocks=(1, 1),
-    window=8, area_px=24576,
-)  # fmt: skip
+    widths=(16, 24),
+    blocks=(1, 1),
+    spatial_attention=(False, True),
+    temporal_attention=(False, True),
+    head_width=8,
+    embed_width=16,
+    patch=2,
+    codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+    refine_widths=(8, 16),
+    refine_blocks=(1, 1),
+    window=8,
+    area_px=24576,
+)
 
 
 def still_wall(frames=3, height=12, width=16):
-    """A wall 10 m ahead, camera moving 0.5 m sideways (so 1 pixel) per frame: its picture moves, its surface does not change."""
+    """A wall 10 m ahead, camera moving 0.5 m sideways (so 1 pixel) per frame: its picture moves, its surface does not
+    change."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 0, 3] = 0.5 * np.arange(frames)
     lens = torch.tensor([[20.0, 20.0, width / 2, height / 2]] * frames, dtype=torch.float64)

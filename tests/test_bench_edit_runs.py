@@ -1,4 +1,5 @@
-"""``mudg bench edit RUN ...``: edits of recorded drives by measures that need no truth. A small street stands for a log."""
+"""``mudg bench edit RUN ...``: edits of recorded drives by measures that need no truth. A small street stands for a
+log."""
 
 from __future__ import annotations
 
@@ -53,8 +54,11 @@ def case(run: Path) -> RunCase:
 
 def test_an_edit_that_does_nothing_changes_nothing(case: RunCase) -> None:
     seen: list[bool] = []
-    row = measured(case, parse_edits("- move: {id: car, along_m: 0, ground: false}", "nothing"),
-                   lambda _, old, new: seen.append(torch.equal(old.rgb, new.rgb)))  # fmt: skip
+    row = measured(
+        case,
+        parse_edits("- move: {id: car, along_m: 0, ground: false}", "nothing"),
+        lambda _, old, new: seen.append(torch.equal(old.rgb, new.rgb)),
+    )
     assert seen == [True] * FRAMES and row["outside"] == 0.0
     assert row["warp"] == row["warp_before"] > 0 and row["lidar"] == row["lidar_before"] > 0
     assert row["overlap"] == row["overlap_before"] > 0.3
@@ -126,9 +130,7 @@ def test_masks_are_counted_in_both_and_in_either() -> None:
     assert view_metrics.mask_counts(a, b) == (1, 5)
 
 
-def test_two_drives_give_a_table_a_page_and_resume(
-    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_drives_give_a_table_a_page_and_resume(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     other = tmp_path / "other"
     other.symlink_to(run)
     monkeypatch.setattr(edit_runs, "EDITS", {name: edit_runs.EDITS[name] for name in ("move 1 m left", "insert")})
@@ -139,7 +141,7 @@ def test_two_drives_give_a_table_a_page_and_resume(
         rounds.append(given)
         if len(rounds) == 2:
             raise KeyboardInterrupt
-        return inner(*given)  # type: ignore[arg-type]
+        return inner(*given)
 
     monkeypatch.setattr(edit_runs, "measured", stopped)
     with pytest.raises(KeyboardInterrupt):
@@ -148,8 +150,11 @@ def test_two_drives_give_a_table_a_page_and_resume(
     assert len(rounds) == 5  # the row that was finished was not measured again
     doc = store.read_json(out / "bench.json")
     assert [(row["run"], row["edit"], row["given_by"]) for row in doc["rows"]] == [
-        ("street", "move 1 m left", None), ("street", "insert", "other"), ("other", "move 1 m left", None), ("other", "insert", "street"),
-    ]  # fmt: skip
+        ("street", "move 1 m left", None),
+        ("street", "insert", "other"),
+        ("other", "move 1 m left", None),
+        ("other", "insert", "street"),
+    ]
     assert doc["rows"][1]["overlap"] > 0.3 and doc["rows"][1]["overlap_before"] == doc["rows"][0]["overlap_before"]
     page, text = (out / "page.html").read_text(), (out / "bench.md").read_text()
     assert page.count("<img ") == 4 * 2 * 3 and "http" not in page.split("<main")[1] and text.count("\n| street |") == 2
@@ -157,7 +162,9 @@ def test_two_drives_give_a_table_a_page_and_resume(
     assert len(rounds) == 5
 
 
-def test_what_cannot_be_measured_is_refused_in_words(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_cannot_be_measured_is_refused_in_words(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with pytest.raises(InputError, match="no fitted scene"):
         bench.run("edit", BenchConfig(), tmp_path / "a", sources=[tmp_path / "nothing"])
     with pytest.raises(InputError, match="of a fit alone"):
@@ -179,7 +186,11 @@ def test_what_cannot_be_measured_is_refused_in_words(run: Path, tmp_path: Path, 
 @pytest.mark.slow
 def test_a_recorded_drive(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
     root = tmp_path / "kitti"
-    Ingest(log=shared_data("kitti_2011_09_26"), out=tmp_path / "raw", settings=IngestConfig(resolution="320", contact_sheet=False)).run()
+    Ingest(
+        log=shared_data("kitti_2011_09_26"),
+        out=tmp_path / "raw",
+        settings=IngestConfig(resolution="320", contact_sheet=False),
+    ).run()
     Annotate(scene=tmp_path / "raw", out=root / "scene", settings=AnnotateConfig()).run()
     Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     config = fit_config(method="street_gaussians", iterations=100, start__gaussians=6000, densify__max_gaussians=8000)

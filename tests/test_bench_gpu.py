@@ -95,7 +95,9 @@ def test_training_of_the_small_model(script: Callable[..., dict[str, Any]], tmp_
     result = script("train_mdm")
     shipped = FOLDER.parents[1] / "src" / "mudg" / "assets" / "mdm_small" / "model.json"
     (trained,) = (tmp_path / "work" / "learned").rglob("model.json")
-    assert result["digests"] == {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in (("shipped", shipped), ("trained", trained))}
+    assert result["digests"] == {
+        n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in (("shipped", shipped), ("trained", trained))
+    }
     training, *scores = result["rows"]
     assert training["steps"] == json.loads(trained.read_text())["facts"]["recipe"]["steps"] == 2
     for row, path in zip(scores, (shipped, trained), strict=True):
@@ -107,5 +109,7 @@ def test_the_whole_chain(script: Callable[..., dict[str, Any]], tmp_path: Path) 
     result, run = script("city_run"), tmp_path / "work" / "run"
     assert result["digests"]["metrics"] == hashlib.sha256((run / "score" / "metrics.json").read_bytes()).hexdigest()
     steps = json.loads((run / "run.json").read_text())["steps"]
-    assert {row["what"]: row["seconds"] for row in result["rows"]} == pytest.approx({n: of["seconds"] for n, of in steps.items()})
+    assert {row["what"]: row["seconds"] for row in result["rows"]} == pytest.approx(
+        {n: of["seconds"] for n, of in steps.items()}
+    )
     assert {"ingest", "fit with diffusion", "score"} <= set(steps)

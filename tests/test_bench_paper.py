@@ -1,4 +1,5 @@
-"""``mudg bench paper``: tables as data, equal numbers of views, sets of all logs, logs cut to a table, and the command."""
+"""``mudg bench paper``: tables as data, equal numbers of views, sets of all logs, logs cut to a table, and the
+command."""
 
 import csv
 import dataclasses
@@ -65,7 +66,7 @@ tables:
 TOY = papers.read_papers(TOY_YAML, "toy.yaml").tables["toy"]
 
 
-# ---- tables as data ----------------------------------------------------------------------------------------------------
+# ---- tables as data ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("table", TABLES.values(), ids=lambda table: table.name)
@@ -82,15 +83,24 @@ def test_a_table_is_complete_and_its_rows_change_something(table):
 @pytest.mark.parametrize(
     ("old", "new", "what"),
     [
-        ("better: lower, digits: 2, needs: fid_weights", "better: least, digits: 2, needs: fid_weights", "columns.fid.better"),
-        ("digits: 2", "digits: '2'", "digits"), ("columns: [fid, fvd]", "columns: [fid, fdv]", "no tables of papers"),
-        ("columns: [fid, fvd]", "columns: [fid, fid]", "twice"), ("places: [both-2, both-3]", "places: [both-2]", "not in the table"),
-        ("Other | - 70.0", "Other | 70.0", "no tables of papers"), ("data: twelve_scenes", "dada: twelve_scenes", "did you mean 'data'"),
-        ("title: Toy & table", "virtual_shifts_m: [2.0]", "virtual_shifts_m"), ("title: Toy & table", "scenes: C", "no such list"),
-        ("title: Toy & table", "only: {'9': [fid]}", "no such place"), ("exact: []", "exact: [psnr]", "no such column"),
+        (
+            "better: lower, digits: 2, needs: fid_weights",
+            "better: least, digits: 2, needs: fid_weights",
+            "columns.fid.better",
+        ),
+        ("digits: 2", "digits: '2'", "digits"),
+        ("columns: [fid, fvd]", "columns: [fid, fdv]", "no tables of papers"),
+        ("columns: [fid, fvd]", "columns: [fid, fid]", "twice"),
+        ("places: [both-2, both-3]", "places: [both-2]", "not in the table"),
+        ("Other | - 70.0", "Other | 70.0", "no tables of papers"),
+        ("data: twelve_scenes", "dada: twelve_scenes", "did you mean 'data'"),
+        ("title: Toy & table", "virtual_shifts_m: [2.0]", "virtual_shifts_m"),
+        ("title: Toy & table", "scenes: C", "no such list"),
+        ("title: Toy & table", "only: {'9': [fid]}", "no such place"),
+        ("exact: []", "exact: [psnr]", "no such column"),
         ("notes: [Nothing is stated.]", "rows: [{name: a, title: a, method: nerf}]", "no such method"),
     ],
-)  # fmt: skip
+)
 def test_what_is_wrong_with_a_file_of_tables_is_said(old, new, what):
     assert old in TOY_YAML
     with pytest.raises(InputError) as caught:
@@ -118,7 +128,11 @@ def test_one_sided_places_follow_the_side_of_their_scene():
 
 def test_published_rows_are_read_in_order():
     first, other = TOY.published
-    assert (first.title, first.source, first.values) == ("Paper's method", "a paper", [("2", "fid", 50.0), ("3", "fid", 60.5)])
+    assert (first.title, first.source, first.values) == (
+        "Paper's method",
+        "a paper",
+        [("2", "fid", 50.0), ("3", "fid", 60.5)],
+    )
     assert other.values == [("3", "fid", 70.0)]
     mudg = {row.title: row.values for row in TABLES["mudg1"].published}
     assert ("3", "fid", 49.42) in mudg["MuDG, diffusion output"] and ("4", "fvd", 1269.99) in mudg["Street Gaussians"]
@@ -151,7 +165,7 @@ def test_how_rows_are_scored(tmp_path):
     assert views.of_log(ScoreConfig(), "7") == ScoreConfig()
 
 
-# ---- numbers -----------------------------------------------------------------------------------------------------------
+# ---- numbers -------------------------------------------------------------------------------------
 
 
 def metrics(values, *, views=8, n=None):
@@ -159,8 +173,10 @@ def metrics(values, *, views=8, n=None):
     extra = {} if n is None else {"distribution": {"n": n, "n_reference": 24}, "video": {"n": 2, "n_reference": 3}}
     return {
         "metrics": [{"name": name} for name in ("psnr", "fid", "fvd", "kid")],
-        "results": [{"trajectory": name, "method": "m", "views": views, "values": of, **extra} for name, of in values.items()],
-    }  # fmt: skip
+        "results": [
+            {"trajectory": name, "method": "m", "views": views, "values": of, **extra} for name, of in values.items()
+        ],
+    }
 
 
 NAMES = ("front_shift+2.0", "front_shift-2.0")
@@ -173,13 +189,17 @@ def test_a_place_is_the_mean_over_its_trajectories_and_the_sum_of_their_views():
 
 
 def test_every_cell_without_a_number_has_its_reason():
-    document = metrics({NAMES[0]: {"psnr": "no truth", "fid": "not computed"}, NAMES[1]: {"psnr": "no truth", "fid": 3.0}})
+    document = metrics(
+        {NAMES[0]: {"psnr": "no truth", "fid": "not computed"}, NAMES[1]: {"psnr": "no truth", "fid": 3.0}}
+    )
     columns = (PSNR, FID, PAPERS.columns["nta_iou"], PAPERS.columns["imaging_quality"])
     found = paper.at_place([document], NAMES, columns)
     assert {key: of["value"] for key, of in found.items()} == {
-        "psnr": "no truth off the path on a recorded log", "fid": "no weights: --score.fid-weights",
-        "nta_iou": "no score of this version", "imaging_quality": "no score of this version",
-    }  # fmt: skip
+        "psnr": "no truth off the path on a recorded log",
+        "fid": "no weights: --score.fid-weights",
+        "nta_iou": "no score of this version",
+        "imaging_quality": "no score of this version",
+    }
     assert paper.at_place([metrics({})], NAMES, (PSNR,))["psnr"]["value"] == "not produced"
 
 
@@ -189,9 +209,18 @@ def test_floors_of_a_recorded_log():
     assert found == {"fid": {"value": 5.0, "n": 4, "n_reference": 4}, "psnr": {"value": "perfect by definition"}}
 
 
-ROWS = [{"name": "gs3d", "title": "3D Gaussians (gs3d)", "method": "gs3d", "changes": {}},
-        {"name": "mudg_s", "title": "With diffusion (mudg_s)", "method": "mudg_s", "changes": {}}]  # fmt: skip
-SETTINGS = {"list": "city:reported", "missing_scenes": [], "iterations": 10, "seed": 0, "continued_share": 0.5, "videos": False}
+ROWS = [
+    {"name": "gs3d", "title": "3D Gaussians (gs3d)", "method": "gs3d", "changes": {}},
+    {"name": "mudg_s", "title": "With diffusion (mudg_s)", "method": "mudg_s", "changes": {}},
+]
+SETTINGS = {
+    "list": "city:reported",
+    "missing_scenes": [],
+    "iterations": 10,
+    "seed": 0,
+    "continued_share": 0.5,
+    "videos": False,
+}
 FIDS = {"truth": [5.0, 7.0], "nearest_fill": [90.0, 110.0], "gs3d": [40.0, 60.0], "mudg_s": [40.0, 50.0]}
 
 
@@ -200,15 +229,31 @@ def toy_logs(fids, exact=False):
     logs, without = [], {"value": "no weights: --score.fvd-weights"}
     for number in range(len(fids["gs3d"])):
         values = {
-            row: {place: {"fid": {"value": fids[row][number] + more, "n": 12, "n_reference": 48}, "fvd": without}
-                  for place, more in (("2", 0), ("3", 1))}
+            row: {
+                place: {"fid": {"value": fids[row][number] + more, "n": 12, "n_reference": 48}, "fvd": without}
+                for place, more in (("2", 0), ("3", 1))
+            }
             for row in fids
-        }  # fmt: skip
+        }
         logs.append(
-            {"log": str(number), "dataset": "city", "cameras": ["front"], "frames": 24, "size": "384x256", "held_out": 6, "tracks": 2,
-             "note": "", "exact": exact, "values": values, "made": {}, "films": ["front_shift+2.0"], "columns": ["truth", "gs3d"],
-             "features": {}, "seconds": {"fuse": 1.0, "fit/gs3d": 2.0}}
-        )  # fmt: skip
+            {
+                "log": str(number),
+                "dataset": "city",
+                "cameras": ["front"],
+                "frames": 24,
+                "size": "384x256",
+                "held_out": 6,
+                "tracks": 2,
+                "note": "",
+                "exact": exact,
+                "values": values,
+                "made": {},
+                "films": ["front_shift+2.0"],
+                "columns": ["truth", "gs3d"],
+                "features": {},
+                "seconds": {"fuse": 1.0, "fit/gs3d": 2.0},
+            }
+        )
     return logs
 
 
@@ -229,7 +274,11 @@ def test_different_numbers_of_views_are_refused_and_such_a_floor_is_not_in_the_t
     logs[0]["values"]["truth"]["2"]["fid"]["n"] = 6
     document = paper.document(TOY, logs, ROWS, SETTINGS)
     cell = document["cells"]["truth"]["2"]["fid"]
-    assert cell["reason"] == "other n" and cell["floor"]["mean"] == 6.0 and "mean" in document["cells"]["truth"]["3"]["fid"]
+    assert (
+        cell["reason"] == "other n"
+        and cell["floor"]["mean"] == 6.0
+        and "mean" in document["cells"]["truth"]["3"]["fid"]
+    )
     logs[1]["values"]["mudg_s"]["3"]["fid"]["n"] = 11
     with pytest.raises(InputError, match=r"different numbers of views.*"):
         paper.document(TOY, logs, ROWS, SETTINGS)
@@ -238,10 +287,12 @@ def test_different_numbers_of_views_are_refused_and_such_a_floor_is_not_in_the_t
 def test_a_mean_is_over_all_logs_or_there_is_none():
     logs = toy_logs(FIDS)
     logs[1]["values"]["gs3d"]["2"]["fid"] = {"value": "too few views"}
-    assert paper.document(TOY, logs, ROWS, SETTINGS)["cells"]["gs3d"]["2"]["fid"] == {"reason": "too few views (1 of 2 logs)"}
+    assert paper.document(TOY, logs, ROWS, SETTINGS)["cells"]["gs3d"]["2"]["fid"] == {
+        "reason": "too few views (1 of 2 logs)"
+    }
 
 
-# ---- sets of all logs --------------------------------------------------------------------------------------------------
+# ---- sets of all logs ----------------------------------------------------------------------------
 
 
 def log_of(out, number, entries=paper.POOLED):
@@ -252,8 +303,9 @@ def log_of(out, number, entries=paper.POOLED):
     for name, rows in kept.items():
         store.write_safetensors(folder / "features" / f"{name}.safetensors", {"features": rows})
     sets = [
-        {"trajectory": name, "method": "a", "made": f"{name}.safetensors", "reference": "reference.safetensors"} for name in NAMES
-    ]  # fmt: skip
+        {"trajectory": name, "method": "a", "made": f"{name}.safetensors", "reference": "reference.safetensors"}
+        for name in NAMES
+    ]
     return {folder: {entry: {"sets": sets} for entry in entries}}, kept
 
 
@@ -274,7 +326,9 @@ def test_views_of_all_logs_are_one_set(tmp_path):
     assert cells["kid"]["mean"] == pytest.approx(kernel_distance(made, reference), abs=1e-5)
     assert cells["kid"]["standard_error"] is None or cells["kid"]["standard_error"] > 0
     assert cells["fvd"]["mean"] == pytest.approx(frechet_distance(made, reference), abs=1e-5)
-    single = np.mean([frechet_distance(np.concatenate([kept[name] for name in NAMES]), kept["reference"]) for kept in parts])
+    single = np.mean(
+        [frechet_distance(np.concatenate([kept[name] for name in NAMES]), kept["reference"]) for kept in parts]
+    )
     assert abs(cells["fid"]["mean"] - single) > 0.01  # not the mean over logs
     one, other = (np.concatenate([kept["reference"][start::2] for kept in parts]) for start in (0, 1))
     assert found["truth"]["2"]["fid"]["mean"] == pytest.approx(frechet_distance(one, other), abs=1e-5)
@@ -297,7 +351,7 @@ def test_the_table_prints_the_pooled_number_and_ranks_by_it():
     assert document["best"]["2"]["fid"] == ["gs3d"] and "mean_over_logs" not in document["cells"]["mudg_s"]["2"]["fid"]
 
 
-# ---- texts -------------------------------------------------------------------------------------------------------------
+# ---- texts ---------------------------------------------------------------------------------------
 
 GOLDEN = """\
 |  | FID ↓, 2 m | FVD ↓, 2 m | FID ↓, 3 m | FVD ↓, 3 m |
@@ -321,18 +375,37 @@ def test_the_forms_of_a_table():
     assert toy["cells"]["gs3d"]["3"]["psnr"] == {"reason": "no score of this version"}
     text = paper.markdown(toy)
     assert GOLDEN in text and text.startswith("# Toy & table, on 2 logs of generated cities (city:reported)\n")
-    for part in ("generated cities, not the paper's data (384x256, 24 frames, 6 images held out)", "* Nothing is stated.",
-                 "no weights: --score.fvd-weights.", "## Exact truth: 2 m", "**20.00 (0.00)**", "perfect by definition"):  # fmt: skip
+    for part in (
+        "generated cities, not the paper's data (384x256, 24 frames, 6 images held out)",
+        "* Nothing is stated.",
+        "no weights: --score.fvd-weights.",
+        "## Exact truth: 2 m",
+        "**20.00 (0.00)**",
+        "perfect by definition",
+    ):
         assert part in text
     assert "on 2 logs recorded" in paper.markdown({**toy, "settings": {**SETTINGS, "list": ""}})
     assert "Measured at LiDAR points" in paper.markdown(paper.document(TOY, toy_logs(FIDS), ROWS, SETTINGS))
     rows = list(csv.DictReader(io.StringIO(paper.as_csv(toy))))
-    assert rows[0] | {"kind": "published", "row": "Paper's method", "place": "2", "metric": "fid", "value": "50.0"} == rows[0]
+    assert (
+        rows[0] | {"kind": "published", "row": "Paper's method", "place": "2", "metric": "fid", "value": "50.0"}
+        == rows[0]
+    )
     best = next(row for row in rows if (row["row"], row["place"], row["metric"]) == ("mudg_s", "2", "fid"))
     assert best == {
-        "kind": "ours", "row": "mudg_s", "source": "", "place": "2", "metric": "fid", "value": "45", "standard_error": "5", "logs": "2",
-        "n": "24", "n_reference": "96", "reason": "", "best": "1",
-    }  # fmt: skip
+        "kind": "ours",
+        "row": "mudg_s",
+        "source": "",
+        "place": "2",
+        "metric": "fid",
+        "value": "45",
+        "standard_error": "5",
+        "logs": "2",
+        "n": "24",
+        "n_reference": "96",
+        "reason": "",
+        "best": "1",
+    }
     lines = paper.as_latex(toy).splitlines()
     assert lines[0].startswith("% Toy & table") and "% Exact truth: 3 m" in lines and lines[-1] == r"\end{tabular}"
     assert "% -- FVD ↓, 2 m: no weights: --score.fvd-weights" in lines
@@ -342,13 +415,15 @@ def test_the_forms_of_a_table():
     assert 'class="published"' in html and "<strong>45.00 (5.00)</strong>" in html
 
 
-# ---- logs --------------------------------------------------------------------------------------------------------------
+# ---- logs ----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
     """A scene of 8 frames and two cameras, whose folder bears the name of a segment."""
-    city = CityConfig(n_frames=8, width=64, height=48, cameras=("front", "front_left"), seed=2100000, lidar_azimuth_step_deg=1.0)
+    city = CityConfig(
+        n_frames=8, width=64, height=48, cameras=("front", "front_left"), seed=2100000, lidar_azimuth_step_deg=1.0
+    )
     out = tmp_path_factory.mktemp("logs") / "segment-12820461091157089924_with_camera_labels"
     return Ingest(log=ingest.CITY, out=out, settings=IngestConfig(test_every=0, contact_sheet=False, city=city)).run()
 
@@ -387,21 +462,27 @@ def test_pictures_without_truth(recorded, tmp_path):
     scene = read_scene(recorded)
     paths = [trajectory.shifted(scene, "front", 2.0), trajectory.named(scene, "front", "lane+0.1")]
     fused = Fuse(scene=recorded, out=tmp_path / "fused", settings=FuseConfig()).run()
-    one, both = (FillViews(scene=recorded, fused=fused, paths=tuple(paths[:n]), out=tmp_path / f"fill{n}").run() for n in (1, 2))
-    out = page.Film(views={"one": (one,), "both": (both,)}, paths=tuple(paths), videos=False, out=tmp_path / "film").run()
+    one, both = (
+        FillViews(scene=recorded, fused=fused, paths=tuple(paths[:n]), out=tmp_path / f"fill{n}").run() for n in (1, 2)
+    )
+    out = page.Film(
+        views={"one": (one,), "both": (both,)}, paths=tuple(paths), videos=False, out=tmp_path / "film"
+    ).run()
     assert sorted(path.name for path in out.glob("*.jpg")) == ["front_lane+0.1.jpg", "front_shift+2.0.jpg"]
     with Image.open(out / "front_lane+0.1.jpg") as picture:
         seen = np.asarray(picture.convert("L"))
     assert seen.shape == (2 * 48, 2 * 64) and seen[:, :60].max() < 40 < seen[:, 70:].max()
 
 
-# ---- the command -------------------------------------------------------------------------------------------------------
+# ---- the command ---------------------------------------------------------------------------------
 
 
 def test_the_command_writes_every_form_of_the_table(tmp_path, monkeypatch):
     def stand_in(job):
-        values = {row: {place: {"fid": {"value": 3.0, "n": 4, "n_reference": 4}, "fvd": {"value": "x"}} for place in "234"}
-                  for row in ("truth", *(row.name for row in job.rows))}  # fmt: skip
+        values = {
+            row: {place: {"fid": {"value": 3.0, "n": 4, "n_reference": 4}, "fvd": {"value": "x"}} for place in "234"}
+            for row in ("truth", *(row.name for row in job.rows))
+        }
         return {**toy_logs(FIDS)[0], "log": job.log.name, "values": values}
 
     monkeypatch.setattr(paper.PaperLog, "measure", stand_in)
@@ -422,7 +503,13 @@ def test_the_command_writes_every_form_of_the_table(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_an_interrupted_table_goes_on(tmp_path, monkeypatch):
     config = BenchConfig(
-        logs=2, processes=1, videos=False, resolution="64x48", frames="0:4", methods=("nearest_fill",), table="drivedreamer4d"
+        logs=2,
+        processes=1,
+        videos=False,
+        resolution="64x48",
+        frames="0:4",
+        methods=("nearest_fill",),
+        table="drivedreamer4d",
     )
     make_scene, seen = views.make_scene, []
 
@@ -452,9 +539,15 @@ def filled(tmp_path_factory):
     model = tmp_path_factory.mktemp("model") / "model"
     mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), model, "a model of tests", {})
     config = BenchConfig(
-        logs=2, iterations=20, processes=1, videos=False, resolution="96x64", frames="0:5", model=str(model),
+        logs=2,
+        iterations=20,
+        processes=1,
+        videos=False,
+        resolution="96x64",
+        frames="0:5",
+        model=str(model),
         methods=("street_gaussians", "mudg_r", "freevs", "mudg_s"),
-    )  # fmt: skip
+    )
     return bench.run("paper", config, tmp_path_factory.mktemp("paper") / "out", sources=("city:development",)), config
 
 
@@ -471,14 +564,19 @@ def test_a_table_on_cities_end_to_end(filled):
     assert document["cells"]["freevs"]["3"]["psnr"] == {"reason": "no model: --freevs-model"}
     seed = document["logs"][0]["log"]
     assert (out / seed / "film" / "front_shift+3.0.jpg").is_file()
-    before = {name: (out / seed / name / "run.json").stat().st_mtime_ns for name in ("fit/mudg_s", "virtual", "score/mudg_s")}
+    before = {
+        name: (out / seed / name / "run.json").stat().st_mtime_ns for name in ("fit/mudg_s", "virtual", "score/mudg_s")
+    }
     more = dataclasses.replace(config, methods=("gs3d", LONGER, "mudg_s"))
     bench.run("paper", more, out, sources=("city:development",))
     assert {name: (out / seed / name / "run.json").stat().st_mtime_ns for name in before} == before
     rows = [row["name"] for row in store.read_json(out / "bench.json")["rows"]]
     assert rows == ["truth", "nearest_fill", "gs3d", LONGER, "mudg_s"]
     control = store.read_json(out / seed / "fit" / LONGER / "run.json")
-    assert control["inputs"]["start"] == store.digest(out / seed / "fit" / "street_gaussians") and control["summary"]["steps"] == 10
+    assert (
+        control["inputs"]["start"] == store.digest(out / seed / "fit" / "street_gaussians")
+        and control["summary"]["steps"] == 10
+    )
 
 
 @pytest.mark.slow
@@ -488,7 +586,9 @@ def test_settings_and_further_paths_end_to_end(filled, table, tmp_path):
     own = [row.name for row in TABLES[table].rows]
     methods = BenchConfig().methods if own else ("mudg_r", "freevs")
     config = dataclasses.replace(config, table=table, logs=1, methods=methods, freevs_model="" if own else config.model)
-    document = store.read_json(bench.run("paper", config, tmp_path / "out", sources=("city:development",)) / "bench.json")
+    document = store.read_json(
+        bench.run("paper", config, tmp_path / "out", sources=("city:development",)) / "bench.json"
+    )
     for name in own or ["mudg_r", "freevs"]:
         for place in TABLES[table].places:
             assert "mean" in document["cells"][name][place.name]["psnr"], (name, place.name)

@@ -51,8 +51,15 @@ def test_a_constant_motion_in_the_box_frame_is_no_error_and_the_rest_is():
 
 
 def test_the_summary_pools_keys_and_says_what_was_recovered():
-    one = {"keys": 10, **{f"{when}{how}_{unit}": 0.2 if when == "before" else 0.1 for when in ("before", "after")
-                          for how in ("", "_absolute") for unit in ("m", "rad")}}  # fmt: skip
+    one = {
+        "keys": 10,
+        **{
+            f"{when}{how}_{unit}": 0.2 if when == "before" else 0.1
+            for when in ("before", "after")
+            for how in ("", "_absolute")
+            for unit in ("m", "rad")
+        },
+    }
     rows = [{"boxes": "noise", "poses": "learnt", "objects": [one, {**one, "keys": 30}], "psnr_moving": 20.0}]
     (found,) = bench_poses.summary(rows)
     assert found["recovered_m"] == pytest.approx(0.5)

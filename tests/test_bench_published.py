@@ -1,5 +1,5 @@
-"""``mudg bench shift``, ``real`` and ``paper`` under presets and with a published-type model: what runs is what was asked for, and what is
-on record; settings that change nothing are refused."""
+"""``mudg bench shift``, ``real`` and ``paper`` under presets and with a published-type model: what runs is what was
+asked for, and what is on record; settings that change nothing are refused."""
 
 import dataclasses
 import math
@@ -44,7 +44,9 @@ MODALITIES = 3
 def weights(tmp_path_factory):
     """Folder of a published-type toy model (windows of 4 frames), and a file of LPIPS weights."""
     folder = tmp_path_factory.mktemp("published")
-    store.write_safetensors(folder / "lpips.safetensors", {name: value.numpy() for name, value in lpips_state().items()})
+    store.write_safetensors(
+        folder / "lpips.safetensors", {name: value.numpy() for name, value in lpips_state().items()}
+    )
     return write_tiny(folder), folder / "lpips.safetensors"
 
 
@@ -67,17 +69,36 @@ def passes(monkeypatch):
 
 def published_set_up(weights, *flags):
     """What ``mudg bench`` makes of ``--preset paper`` with few steps, and windows that share two frames."""
-    words = ["bench", "paper", "--out", "unused", "--preset", "paper", "--model", str(weights[0]), "--synthesize.steps", "3",
-             "--synthesize.overlap", "2", "--iterations", "6", "--processes", "1", "--no-videos", *flags]  # fmt: skip
+    words = [
+        "bench",
+        "paper",
+        "--out",
+        "unused",
+        "--preset",
+        "paper",
+        "--model",
+        str(weights[0]),
+        "--synthesize.steps",
+        "3",
+        "--synthesize.overlap",
+        "2",
+        "--iterations",
+        "6",
+        "--processes",
+        "1",
+        "--no-videos",
+        *flags,
+    ]
     return parse(words)[0].settings
 
 
 def videos(trajectories, guided=True):
-    """Videos through the network: windows of 4 that share 2 of 6 frames are two; with guidance each goes through twice."""
+    """Videos through the network: windows of 4 that share 2 of 6 frames are two; with guidance each goes through
+    twice."""
     return 3 * MODALITIES * (2 if guided else 1) * 2 * trajectories
 
 
-# ---- settings ----------------------------------------------------------------------------------------------------------
+# ---- settings ------------------------------------------------------------------------------------
 
 
 def test_the_default_preset_changes_nothing():
@@ -89,7 +110,10 @@ def test_a_preset_of_a_benchmark_is_that_of_a_run(preset):
     benchmark, run = bench_preset(preset), run_preset(preset)
     assert (benchmark.model, benchmark.iterations) == (run.synthesize.model, run.fit.iterations)
     assert (benchmark.fuse, benchmark.continue_fit) == (run.fuse, run.continue_fit)
-    for mine, theirs, own in ((benchmark.synthesize, run.synthesize, {"model", "cameras"}), (benchmark.fit, run.fit, {"iterations"})):
+    for mine, theirs, own in (
+        (benchmark.synthesize, run.synthesize, {"model", "cameras"}),
+        (benchmark.fit, run.fit, {"iterations"}),
+    ):
         assert {n: v for n, v in configuration.to_dict(mine).items() if n not in own} == {
             n: v for n, v in configuration.to_dict(theirs).items() if n not in own
         }
@@ -136,11 +160,15 @@ REFUSED = [
     ("shift", ["--methods", "pvg", "--fit.poses.learn"], "poses.learn", "leave the setting out"),
     ("paper", ["--table", "mudg3", "--freevs-model", "x"], "--freevs-model", "leave it out"),
     ("paper", ["--methods", "mudg_r", "--freevs-model", "x"], "--freevs-model", "leave it out"),
-]  # fmt: skip
+]
 
 
-@pytest.mark.parametrize(("name", "words", "where", "remedy"), REFUSED, ids=[f"{name} {' '.join(words)}" for name, words, *_ in REFUSED])
-def test_a_setting_that_would_change_nothing_is_refused_before_anything_is_written(tmp_path, name, words, where, remedy):
+@pytest.mark.parametrize(
+    ("name", "words", "where", "remedy"), REFUSED, ids=[f"{name} {' '.join(words)}" for name, words, *_ in REFUSED]
+)
+def test_a_setting_that_would_change_nothing_is_refused_before_anything_is_written(
+    tmp_path, name, words, where, remedy
+):
     sources = ("city:development",) if name == "paper" else ()
     args, _ = parse(["bench", name, *sources, "--out", str(tmp_path / "out"), *words])
     with pytest.raises(UsageError) as caught:
@@ -162,44 +190,74 @@ def test_a_table_whose_rows_fit_nothing_takes_no_settings_of_fits(weights, tmp_p
 
 
 def test_a_method_for_comparison_keeps_what_the_preset_sets_and_it_does_not_know():
-    fits = {row.name: row.fit for row in shift_rows(dataclasses.replace(bench_preset("paper"), methods=("pvg", "mudg_s")), "paper")}
+    fits = {
+        row.name: row.fit
+        for row in shift_rows(dataclasses.replace(bench_preset("paper"), methods=("pvg", "mudg_s")), "paper")
+    }
     assert (fits["mudg_s"].poses.learn, fits["pvg"].poses.learn) == (True, False)
     assert fits["pvg"].start == fits["mudg_s"].start and fits["pvg"].iterations == fits["mudg_s"].iterations == 30_000
     with pytest.raises(UsageError, match="knows nothing of it"):
         method_fit(FitConfig(poses={"learn": True}), "pvg", "default")
 
 
-# ---- the published model through all three -----------------------------------------------------------------------------
+# ---- the published model through all three -------------------------------------------------------
 
 
 @pytest.mark.slow
 def test_table_2_runs_with_a_published_type_model_as_recorded(weights, tmp_path, passes):
     model, _ = weights
-    words = ("bench paper city:development --preset paper --table mudg2 --logs 1 --frames 0:6 --resolution 64x48 --processes 1 --no-videos "
-             f"--synthesize.steps 3 --synthesize.overlap 2 --model {model} --out {tmp_path / 'out'}").split()  # fmt: skip
+    words = (
+        "bench paper city:development --preset paper --table mudg2 --logs 1 --frames 0:6 --resolution 64x48"
+        f" --processes 1 --no-videos --synthesize.steps 3 --synthesize.overlap 2 --model {model} --out"
+        f" {tmp_path / 'out'}"
+    ).split()
     args, _ = parse(words)
     out = bench.run("paper", args.settings, args.out, sources=args.sources, preset=args.preset)
     assert sum(passes) == videos(len(TABLES["mudg2"].rows))
     document = store.read_json(out / "bench.json")
     asked = document["settings"]["synthesize"]
     assert document["settings"]["preset"] == "paper" and document["settings"]["renders"] is False
-    assert {name: asked[name] for name in ("steps", "overlap", "eta", "guidance", "guidance_rescale", "align_depth", "full_size")} == {
-        "steps": 3, "overlap": 2, "eta": 1.0, "guidance": 7.5, "guidance_rescale": 0.7, "align_depth": False, "full_size": False,
-    }  # fmt: skip
+    assert {
+        name: asked[name]
+        for name in ("steps", "overlap", "eta", "guidance", "guidance_rescale", "align_depth", "full_size")
+    } == {
+        "steps": 3,
+        "overlap": 2,
+        "eta": 1.0,
+        "guidance": 7.5,
+        "guidance_rescale": 0.7,
+        "align_depth": False,
+        "full_size": False,
+    }
     log = out / document["logs"][0]["log"]
     assert not (log / "fit").exists()
     for row in TABLES["mudg2"].rows:
         ran = configuration.load(SynthesizeConfig, yaml_path=log / "generated" / f"{row.name}-{RECORDED}" / "run.yaml")
         assert ran.condition == row.changes.get("condition", "full")
-        assert {name: getattr(ran, name) for name in asked if name != "device"} == {n: v for n, v in asked.items() if n != "device"}
+        assert {name: getattr(ran, name) for name in asked if name != "device"} == {
+            n: v for n, v in asked.items() if n != "device"
+        }
     psnr = [document["cells"][row.name][RECORDED]["psnr"]["mean"] for row in TABLES["mudg2"].rows]
     assert len({round(value, 6) for value in psnr}) == len(psnr)  # every condition gives other views
 
 
 @pytest.mark.slow
 def test_table_3_runs_with_a_published_type_model_as_recorded(weights, tmp_path, passes):
-    config = published_set_up(weights, "--table", "mudg3", "--logs", "1", "--frames", "0:6", "--resolution", "64x48",
-                              "--synthesize.width-px", "48", "--fit.virtual.lpips-weights", str(weights[1]))  # fmt: skip
+    config = published_set_up(
+        weights,
+        "--table",
+        "mudg3",
+        "--logs",
+        "1",
+        "--frames",
+        "0:6",
+        "--resolution",
+        "64x48",
+        "--synthesize.width-px",
+        "48",
+        "--fit.virtual.lpips-weights",
+        str(weights[1]),
+    )
     out = bench.run("paper", config, tmp_path / "out", sources=("city:development",), preset="paper")
     assert sum(passes) == videos(2)  # 2 m to both sides, once for all rows
     document = store.read_json(out / "bench.json")
@@ -208,10 +266,19 @@ def test_table_3_runs_with_a_published_type_model_as_recorded(weights, tmp_path,
         state = store.read_json(log / "fit" / row.name / "run.json")
         assert state["summary"]["steps"] == 6 and "start" not in state["inputs"]  # from nothing, with all steps
         ran = configuration.load(FitConfig, yaml_path=log / "fit" / row.name / "run.yaml")
-        assert (ran.loss.semantic_weight, ran.virtual.beside, ran.virtual.perception, ran.sh_degree) == (0.0, False, "lpips", 3)
+        assert (ran.loss.semantic_weight, ran.virtual.beside, ran.virtual.perception, ran.sh_degree) == (
+            0.0,
+            False,
+            "lpips",
+            3,
+        )
         assert math.isfinite(document["cells"][row.name][RECORDED]["psnr"]["mean"])
     recorded = document["settings"]["fit"]
-    assert (recorded["iterations"], recorded["loss"]["object_weight"], recorded["virtual"]["probability"]) == (6, 0.1, 0.2)
+    assert (recorded["iterations"], recorded["loss"]["object_weight"], recorded["virtual"]["probability"]) == (
+        6,
+        0.1,
+        0.2,
+    )
     assert document["settings"]["fuse"]["box_growth_m"] == 0.0 and document["settings"]["continued_share"] is None
     fused = configuration.load(FuseConfig, yaml_path=log / "fuse" / "run.yaml")
     assert (fused.box_growth_m, fused.occlusion_test) == (0.0, False)
@@ -219,7 +286,9 @@ def test_table_3_runs_with_a_published_type_model_as_recorded(weights, tmp_path,
 
 @pytest.mark.slow
 def test_shift_runs_with_a_published_type_model_as_recorded(weights, tmp_path, passes):
-    config = published_set_up(weights, "--logs", "1", "--methods", "mudg_r", "mudg_s", "--fit.virtual.perception", "filters")
+    config = published_set_up(
+        weights, "--logs", "1", "--methods", "mudg_r", "mudg_s", "--fit.virtual.perception", "filters"
+    )
     rules = LogRules(frames=6, width=64, height=48, cameras=("front",))
     out = shift.run(config, tmp_path / "out", preset="paper", rules=rules, distances_m=(3.0,))
     assert sum(passes) == videos(2)
@@ -238,7 +307,8 @@ def test_real_runs_with_a_published_type_model_as_recorded(weights, scene, tmp_p
     )
     config = dataclasses.replace(config, videos=True, methods=("mudg_r", "mudg_s"), protocols=("lidar",))
     out = bench.run("real", config, tmp_path / "out", sources=(scene,), preset="paper")
-    generated = 5 + 1  # the scored places (recorded path, 2 and 3 m to both sides), and the views that the fit learns from
+    # the scored places (recorded path, 2 and 3 m to both sides), and the views that the fit learns from
+    generated = 5 + 1
     assert sum(passes) == videos(generated, guided=False)
     document = store.read_json(out / "bench.json")
     assert document["settings"]["virtual_shifts_m"] == [2.0] and document["settings"]["synthesize"]["guidance"] == 1.0
@@ -249,7 +319,7 @@ def test_real_runs_with_a_published_type_model_as_recorded(weights, scene, tmp_p
     assert state["summary"]["steps"] == 6 and "start" not in state["inputs"]
 
 
-# ---- parts of a published-type model's condition ------------------------------------------------------------------------
+# ---- parts of a published-type model's condition -------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -261,16 +331,25 @@ def sources(scene, tmp_path_factory):
     given = ConditionSources(cloud, loaded.tracks, photos, ConditionRules(32, 32, 64, 48, published=True))
     dark = dataclasses.replace(cloud.static, rgb=255 - np.asarray(cloud.static.rgb), xyz=cloud.static.xyz * 1.1)
     other_points = dataclasses.replace(given, cloud=dataclasses.replace(cloud, static=dark))
-    other_images = dataclasses.replace(given, recorded=[dataclasses.replace(photo, rgb=255 - photo.rgb) for photo in photos])
+    other_images = dataclasses.replace(
+        given, recorded=[dataclasses.replace(photo, rgb=255 - photo.rgb) for photo in photos]
+    )
     assert read_image(loaded, loaded.frames[0]).shape == (48, 64, 3)
     return [frame.view for frame in loaded.frames[:4]], given, other_points, other_images
 
 
 @pytest.mark.parametrize(
     ("parts", "points", "tokens", "frame"),
-    [("full", True, True, True), ("reference", False, True, True), ("points", True, False, False), ("concat", True, False, True)],
+    [
+        ("full", True, True, True),
+        ("reference", False, True, True),
+        ("points", True, False, False),
+        ("concat", True, False, True),
+    ],
 )
-def test_a_part_that_is_switched_off_does_not_reach_a_published_type_network(weights, sources, parts, points, tokens, frame):
+def test_a_part_that_is_switched_off_does_not_reach_a_published_type_network(
+    weights, sources, parts, points, tokens, frame
+):
     model = published_files.load(weights[0])
     views, *all_sources = sources
 

@@ -1,4 +1,5 @@
-"""``mudg bench real``: what is hidden stays unused, measures with known answers, and the command end to end on a tiny log."""
+"""``mudg bench real``: what is hidden stays unused, measures with known answers, and the command end to end on a tiny
+log."""
 
 import dataclasses
 
@@ -19,30 +20,37 @@ from mudg.benchmarks import columns, places, real, truth
 from mudg.benchmarks.chain import Chain, FillViews
 from mudg.benchmarks.places import PROTOCOLS, SPLITS
 from mudg.benchmarks.rows import real_rows
-from mudg.benchmarks.settings import BenchConfig  # fmt: skip
+from mudg.benchmarks.settings import BenchConfig
 from mudg.city.world import CityWorld
 from mudg.core import calibration, lidar
 from mudg.core.fusion import STATIC
 from mudg.diffusion import files as mdm_files
 from mudg.diffusion.model import MDM
-from mudg.diffusion.settings.adapt import AdaptConfig  # fmt: skip
-from mudg.diffusion.settings.synthesize import SynthesizeConfig  # fmt: skip
+from mudg.diffusion.settings.adapt import AdaptConfig
+from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.editing import render
-from mudg.editing.view_settings import RenderConfig  # fmt: skip
+from mudg.editing.view_settings import RenderConfig
 from mudg.formats import ingest
 from mudg.formats.importers.pandaset import read_frame
-from mudg.formats.settings import IngestConfig  # fmt: skip
-from mudg.gaussians.settings import FitConfig  # fmt: skip
+from mudg.formats.settings import IngestConfig
+from mudg.gaussians.settings import FitConfig
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationWriter
 from mudg.scene.part import write_part
 from mudg.scene.read import read_image, read_points, read_scene
-from mudg.scene.settings import FuseConfig  # fmt: skip
+from mudg.scene.settings import FuseConfig
 from mudg.scene.write import SceneWriter
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
 
-CITY = {"n_frames": 6, "width": 96, "height": 64, "cameras": ("front", "front_left"), "seed": 2100000, "lidar_azimuth_step_deg": 0.6}
+CITY = {
+    "n_frames": 6,
+    "width": 96,
+    "height": 64,
+    "cameras": ("front", "front_left"),
+    "seed": 2100000,
+    "lidar_azimuth_step_deg": 0.6,
+}
 BY_NAME = {protocol.name: protocol for protocol in PROTOCOLS}
 
 
@@ -51,16 +59,22 @@ def city(tmp_path_factory):
     from mudg.city.config import CityConfig
 
     out = tmp_path_factory.mktemp("log") / "city"
-    return Ingest(log=ingest.CITY, out=out, settings=IngestConfig(test_every=0, contact_sheet=False, city=CityConfig(**CITY))).run()
+    return Ingest(
+        log=ingest.CITY, out=out, settings=IngestConfig(test_every=0, contact_sheet=False, city=CityConfig(**CITY))
+    ).run()
 
 
-# ---- what is hidden ----------------------------------------------------------------------------------------------------
+# ---- what is hidden ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("moments", "length", "blocks"),
     [
-        (24, 1, [4, 8, 12, 16, 20]), (24, 3, [(4, 6), (10, 12), (17, 19)]), (24, 5, [(5, 9), (14, 18)]), (16, 5, [(6, 10)]), (3, 1, [1]),
+        (24, 1, [4, 8, 12, 16, 20]),
+        (24, 3, [(4, 6), (10, 12), (17, 19)]),
+        (24, 5, [(5, 9), (14, 18)]),
+        (16, 5, [(6, 10)]),
+        (3, 1, [1]),
         (4, 3, []),
     ],
 )
@@ -107,7 +121,9 @@ def test_a_part_holds_nothing_of_what_is_hidden(city, tmp_path):
         assert not read_image(part, frame).any() and not frame.labels
     frame = part.frames_in("train")[0]
     original = next(f for f in scene.frames if f.id == frame.id)
-    assert np.array_equal(read_image(part, frame), read_image(scene, original)) and set(frame.labels) == set(original.labels)
+    assert np.array_equal(read_image(part, frame), read_image(scene, original)) and set(frame.labels) == set(
+        original.labels
+    )
 
 
 def corrupted(scene, out, frames, sweeps):
@@ -152,10 +168,15 @@ ADAPT = AdaptConfig(block=1, held_out_every=2, fit_iterations=2, steps=1, shifts
 def made_from(source, out, split, model):
     """Everything that methods make of a log under a split, by name, as bytes."""
     config = BenchConfig(
-        model=model, iterations=6, fit=FitConfig(densify={"kind": "none"}), synthesize=SynthesizeConfig(steps=1, shifts_m=(2.0,)),
+        model=model,
+        iterations=6,
+        fit=FitConfig(densify={"kind": "none"}),
+        synthesize=SynthesizeConfig(steps=1, shifts_m=(2.0,)),
         methods=("nearest_fill", "mudg_s"),
-    )  # fmt: skip
-    job = real.SplitJob(out, source, split, (), real_rows(config), config, dataclasses.replace(ADAPT, model=model), False)
+    )
+    job = real.SplitJob(
+        out, source, split, (), real_rows(config), config, dataclasses.replace(ADAPT, model=model), False
+    )
     whole = read_scene(source)
     held = places.held_out(whole, split, ())
     job.write_seen(whole, held)
@@ -222,10 +243,12 @@ def test_a_part_has_no_classes_of_points_and_else_the_same_points(city, tmp_path
     assert [s.id for s in part.sweeps] == [s.id for s in plain.sweeps] and len(part.sweeps) == len(scene.sweeps) - 1
     for one, other in zip(part.sweeps, plain.sweeps, strict=True):
         assert read_points(part, one).classes is None
-        assert (tmp_path / "part" / one.points.path).read_bytes() == (tmp_path / "plain" / other.points.path).read_bytes()
+        assert (tmp_path / "part" / one.points.path).read_bytes() == (
+            tmp_path / "plain" / other.points.path
+        ).read_bytes()
 
 
-# ---- measures with known answers ---------------------------------------------------------------------------------------
+# ---- measures with known answers -----------------------------------------------------------------
 
 CAMERA = Camera("front", 40, 30, 30.0, 30.0, 20.0, 15.0)
 VIEW = View(CAMERA, np.eye(4), 0.0)
@@ -274,7 +297,9 @@ def test_columns_by_hand():
     depth[3, 4], depth[6, 7], dynamic[6, 7] = 10.0, 20.0, 1
     color = np.full((30, 40, 3), 102, np.uint8)  # 0.4
     colored = (depth > 0).astype(np.uint8)
-    seen = sight({"depth": depth, "dynamic": dynamic, "color": color, "colored": colored}, depth=torch.full((1, 30, 40), 12.0))
+    seen = sight(
+        {"depth": depth, "dynamic": dynamic, "color": color, "colored": colored}, depth=torch.full((1, 30, 40), 12.0)
+    )
     value = lambda name: columns.COLUMNS[name].close(columns.COLUMNS[name].of(seen))  # noqa: E731
     assert value("abs_rel") == pytest.approx((0.2 + 0.4) / 2)
     assert (value("abs_rel_static"), value("abs_rel_dynamic")) == (pytest.approx(0.2), pytest.approx(0.4))
@@ -295,7 +320,8 @@ def test_columns_by_hand():
 
 
 def test_a_protocol_that_pools_weighs_cameras_by_what_was_seen_of_them():
-    """Of one camera 30 pixels were seen, 0.1 off, of the other 10 pixels, 0.2 off; what was not seen is far off and does not count."""
+    """Of one camera 30 pixels were seen, 0.1 off, of the other 10 pixels, 0.2 off; what was not seen is far off and
+    does not count."""
     sums = {}
     for place, seen_px, off in (("left", 30, 0.1), ("back", 10, 0.2)):
         seen, depth = np.zeros((30, 40), np.uint8), np.full((30, 40), 10.0, np.float32)
@@ -304,10 +330,14 @@ def test_a_protocol_that_pools_weighs_cameras_by_what_was_seen_of_them():
         photo[:, 0, :seen_px] = 0.5 + off
         made = torch.full((1, 30, 40), 80.0)
         made[:, 0, :seen_px] = 10 * (1 + off)
-        view = dataclasses.replace(sight({"seen": seen, "depth": depth}, depth=made, photo=photo), distance=lambda pair, d=off: d)
+        view = dataclasses.replace(
+            sight({"seen": seen, "depth": depth}, depth=made, photo=photo), distance=lambda pair, d=off: d
+        )
         sums[place] = {name: columns.COLUMNS[name].of(view) for name in BY_NAME["camera"].columns}
     found = columns.values_of(BY_NAME["camera"], sums)
-    assert [found["places"][place]["psnr_seen"] for place in sums] == pytest.approx([20.0, -20 * np.log10(0.2)], abs=1e-4)
+    assert [found["places"][place]["psnr_seen"] for place in sums] == pytest.approx(
+        [20.0, -20 * np.log10(0.2)], abs=1e-4
+    )
     mean = found["mean"]
     assert mean["psnr_seen"] == pytest.approx(-10 * np.log10((30 * 0.01 + 10 * 0.04) / 40), abs=1e-4)
     assert mean["abs_rel_seen"] == pytest.approx((30 * 0.1 + 10 * 0.2) / 40, abs=1e-5)
@@ -324,7 +354,7 @@ def test_comparisons_are_differences_or_ratios():
     assert columns.COLUMNS["psnr"].compared("none", 20.0) is None
 
 
-# ---- the truth, scored as if it were a method --------------------------------------------------------------------------
+# ---- the truth, scored as if it were a method ----------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -347,7 +377,9 @@ def exact(city, tmp_path_factory):
         targets = truth.MakeTargets(
             log=city, shown=seen, protocol=protocol, held=tuple(held.frames), cameras=cameras, out=out / "truth"
         ).run()
-        scored = columns.ScoreTargets(log=city, truth=targets, views=out / "views", protocol=protocol, out=out / "score").run()
+        scored = columns.ScoreTargets(
+            log=city, truth=targets, views=out / "views", protocol=protocol, out=out / "score"
+        ).run()
         return store.read_json(scored / "metrics.json")["mean"], truth.read_targets(targets)
 
     return of
@@ -356,7 +388,8 @@ def exact(city, tmp_path_factory):
 def test_exact_views_are_right_on_held_out_frames(exact):
     found, targets = exact("gap-3")
     assert found["psnr"] > 45 and found["ssim"] > 0.99 and found["perceptual"] < 0.01
-    assert found["psnr_dynamic"] > 45 and found["psnr_upper"] > 45 and found["abs_rel"] < 0.06  # points lie beside pixel centres
+    # points lie beside pixel centres
+    assert found["psnr_dynamic"] > 45 and found["psnr_upper"] > 45 and found["abs_rel"] < 0.06
     assert targets.facts["views"] == {"front": 3, "front_left": 3}
 
 
@@ -366,7 +399,8 @@ def test_exact_views_are_right_for_a_camera_that_was_never_shown(exact):
     assert list(targets.facts["views"]) == ["front_left"] and targets.facts["views"]["front_left"] == 3
     assert 0.05 < targets.facts["seen_share"]["front_left"] < 0.9
     assert targets.facts["weight"] == {"front_left": 1.0}
-    assert found["psnr_seen"] > 25 and found["abs_rel_seen"] < 0.03  # a colour map near the identity, fitted to noisy pairs
+    # a colour map near the identity, fitted to noisy pairs
+    assert found["psnr_seen"] > 25 and found["abs_rel_seen"] < 0.03
     assert targets.color_maps["front_left"].gain == pytest.approx((1, 1, 1), abs=0.12)
 
 
@@ -378,7 +412,7 @@ def test_exact_views_are_right_beside_the_recorded_path(exact):
     assert found["point_psnr_static"] > 20 and found["point_abs_static"] < 0.06
 
 
-# ---- the command -------------------------------------------------------------------------------------------------------
+# ---- the command ---------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -400,7 +434,9 @@ def test_the_command_compares_methods_under_every_protocol(made, city):
         assert against and "street_gaussians" not in document["protocols"][name]["against"]
     gap = document["protocols"]["gap-1"]
     mean = gap["logs"]["city"]["values"]["nearest_fill"]["mean"]["psnr"]
-    assert gap["against"]["nearest_fill"]["psnr"] == pytest.approx(mean - gap["pooled"]["street_gaussians"]["psnr"], abs=1e-5)
+    assert gap["against"]["nearest_fill"]["psnr"] == pytest.approx(
+        mean - gap["pooled"]["street_gaussians"]["psnr"], abs=1e-5
+    )
     assert "too few" in document["protocols"]["gap-5"]["left_out"]["city"]
     assert "no classes of LiDAR points" in document["protocols"]["classes"]["left_out"]["city"]
     assert document["logs"][0]["digest"] == store.digest(city)
@@ -418,9 +454,13 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     before = [path.stat().st_mtime_ns for path in watched]
     added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_s-no-renders", "mudg_r-no-adapt")
     more = dataclasses.replace(
-        config, methods=added, protocols=("gap-1",), model=model, variant=("rough=densify.kind:none,method:gs3d",),
+        config,
+        methods=added,
+        protocols=("gap-1",),
+        model=model,
+        variant=("rough=densify.kind:none,method:gs3d",),
         synthesize=SynthesizeConfig(shifts_m=(2.0,)),
-    )  # fmt: skip
+    )
     real.run(more, [city], out)
     assert [path.stat().st_mtime_ns for path in watched] == before
     document = store.read_json(out / "bench.json")
@@ -428,12 +468,16 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     assert [row["name"] for row in document["methods"]] == names
     assert isinstance(document["protocols"]["gap-1"]["against"]["mudg_s"]["psnr"], float)
     start = store.digest(split / "fit" / "street_gaussians")
-    for name in ("mudg_s", "mudg_s-no-renders", "street_gaussians-longer"):  # all go on with the same fit, for half as many steps
+    # all go on with the same fit, for half as many steps
+    for name in ("mudg_s", "mudg_s-no-renders", "street_gaussians-longer"):
         state = store.read_json(split / "fit" / name / "run.json")
         assert state["inputs"]["start"] == start and state["summary"]["steps"] == config.iterations // 2
     inputs = store.read_json(split / "fit" / "street_gaussians-longer" / "run.json")["inputs"]
     assert not [name for name in inputs if "virtual" in name or "observations" in name]
-    shown = {name: store.read_json(split / "virtual" / name / "run.json")["inputs"].get("fitted") for name in ("points", "renders")}
+    shown = {
+        name: store.read_json(split / "virtual" / name / "run.json")["inputs"].get("fitted")
+        for name in ("points", "renders")
+    }
     assert shown == {"points": None, "renders": start}
 
 
@@ -451,9 +495,15 @@ def test_a_log_too_short_to_adapt_to_is_compared_without_and_says_so(made, city)
 
 def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_said(city, model, tmp_path, monkeypatch):
     job = real.SplitJob(
-        tmp_path / "out", city, SPLITS["all"], (), (), BenchConfig(model=model, iterations=4), dataclasses.replace(ADAPT, model=model),
+        tmp_path / "out",
+        city,
+        SPLITS["all"],
+        (),
+        (),
+        BenchConfig(model=model, iterations=4),
+        dataclasses.replace(ADAPT, model=model),
         False,
-    )  # fmt: skip
+    )
     scene = read_scene(city)
     job.write_seen(scene, places.held_out(scene, SPLITS["all"], ()))
     chain = job.chain()
@@ -480,14 +530,26 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
 
 
 def test_rows_say_what_they_leave_out():
-    rows = {row.name: row for row in real_rows(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))}
+    rows = {
+        row.name: row for row in real_rows(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))
+    }
     assert list(rows) == [
-        "street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_r-no-adapt", "mudg_r-no-renders", "mudg_s", "mudg_s-no-adapt",
-        "mudg_s-no-renders", "a",
-    ]  # fmt: skip
+        "street_gaussians",
+        "street_gaussians-longer",
+        "mudg_r",
+        "mudg_r-no-adapt",
+        "mudg_r-no-renders",
+        "mudg_s",
+        "mudg_s-no-adapt",
+        "mudg_s-no-renders",
+        "a",
+    ]
     assert [rows[name].sees for name in ("mudg_s", "mudg_s-no-adapt", "mudg_s-no-renders", "a")] == [
-        "adapted", "renders", "points", "adapted",
-    ]  # fmt: skip
+        "adapted",
+        "renders",
+        "points",
+        "adapted",
+    ]
     assert rows["mudg_s"].title != rows["mudg_s-no-adapt"].title
 
 
@@ -531,12 +593,13 @@ def test_classes_of_points_change_nothing_that_methods_make(city, tmp_path):
     for name, train_id in (("a", "road"), ("b", "sky")):
         with_classes(scene, tmp_path / name, lambda count, i=ID[train_id]: np.full(count, i, np.uint8))
         job = real.SplitJob(
-            tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], (), (), BenchConfig(), ADAPT, False,
-        )  # fmt: skip
+            tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], (), (), BenchConfig(), ADAPT, False
+        )
         job.write_seen(read_scene(tmp_path / name), places.HeldOut())
         found.append((job.chain().fuse() / "static.safetensors").read_bytes())
     assert found[0] == found[1]
-    given = Fuse(scene=tmp_path / "a", out=tmp_path / "told", settings=FuseConfig()).run()  # from the whole log the cloud takes them over
+    # from the whole log the cloud takes them over
+    given = Fuse(scene=tmp_path / "a", out=tmp_path / "told", settings=FuseConfig()).run()
     assert (given / "static.safetensors").read_bytes() != found[0]
 
 
@@ -571,9 +634,14 @@ def test_other_folders_methods_and_names_are_refused(city, tmp_path):
 def test_pooled_values_leave_out_logs_without_a_number():
     protocol, logs = BY_NAME["gap-1"], []
     for name, a, b in (("one", 20.0, 21.0), ("two", 22.0, "none")):
-        values = {m: {"mean": dict.fromkeys(protocol.columns, "none") | {"psnr": v}} for m, v in (("street_gaussians", a), ("mudg_s", b))}
+        values = {
+            m: {"mean": dict.fromkeys(protocol.columns, "none") | {"psnr": v}}
+            for m, v in (("street_gaussians", a), ("mudg_s", b))
+        }
         logs.append({"log": name, "protocols": {"gap-1": {"values": values, "facts": {}}}})
-    found = real.document(logs, [{"name": "street_gaussians"}, {"name": "mudg_s"}], [protocol], {})["protocols"]["gap-1"]
+    found = real.document(logs, [{"name": "street_gaussians"}, {"name": "mudg_s"}], [protocol], {})["protocols"][
+        "gap-1"
+    ]
     assert found["pooled"]["street_gaussians"]["psnr"] == 21.0 and found["pooled"]["mudg_s"]["psnr"] == 21.0
     assert found["pooled"]["mudg_s"]["ssim"] == "none" and found["against"]["mudg_s"]["ssim"] is None
 

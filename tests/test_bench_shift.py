@@ -29,7 +29,7 @@ from mudg.scoring import truth as score_truth
 TINY = LogRules(frames=4, width=96, height=64, cameras=("front",))
 
 
-# ---- lists -------------------------------------------------------------------------------------------------------------
+# ---- lists ---------------------------------------------------------------------------------------
 
 
 def test_lists_are_apart_from_each_other_and_from_all_training_cities():
@@ -61,12 +61,14 @@ def test_the_reported_list_is_what_the_rule_gives():
 def test_moving_instances_are_those_of_the_generator():
     world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
     judged = set(city_logs.moving_instances(world))
-    still = {number for number, posed in enumerate(world.objects, start=1) if np.ptp(posed.keys[:, :2], axis=0).max() == 0}
+    still = {
+        number for number, posed in enumerate(world.objects, start=1) if np.ptp(posed.keys[:, :2], axis=0).max() == 0
+    }
     assert judged
     assert not judged & still
 
 
-# ---- rows --------------------------------------------------------------------------------------------------------------
+# ---- rows ----------------------------------------------------------------------------------------
 
 
 def test_variants_change_fields_of_the_fit():
@@ -80,7 +82,16 @@ def test_variants_change_fields_of_the_fit():
 
 @pytest.mark.parametrize(
     "text",
-    ["a", "a=", "a=densify", "=densify.kind:none", "a/b=densify.kind:none", "a=densify:[", "a=no_such:1", "a=sh_degree:9"],
+    [
+        "a",
+        "a=",
+        "a=densify",
+        "=densify.kind:none",
+        "a/b=densify.kind:none",
+        "a=densify:[",
+        "a=no_such:1",
+        "a=sh_degree:9",
+    ],
 )
 def test_a_malformed_variant_is_refused(text):
     with pytest.raises(UsageError):
@@ -102,7 +113,9 @@ def test_ablation_brings_the_rows_it_is_compared_with():
 
 
 def test_published_methods_are_rows_where_they_are_asked_for():
-    rows = {r.name: r.fit for r in shift_rows(BenchConfig(methods=("pvg", "street_gaussians", "emernerf"), iterations=30))}
+    rows = {
+        r.name: r.fit for r in shift_rows(BenchConfig(methods=("pvg", "street_gaussians", "emernerf"), iterations=30))
+    }
     assert list(rows) == ["street_gaussians", "pvg", "emernerf"]
     assert {name: (fit.method, fit.iterations) for name, fit in rows.items()} == {name: (name, 30) for name in rows}
     assert not set(PUBLISHED) & set(BenchConfig().methods)
@@ -122,17 +135,25 @@ def test_unknown_methods_and_repeated_names_are_refused():
         shift_rows(BenchConfig(variant=("mudg_s=densify.kind:none",)))
 
 
-# ---- tables ------------------------------------------------------------------------------------------------------------
+# ---- tables --------------------------------------------------------------------------------------
 
 
 def made_up(psnr, abs_rel):
     """Logs whose methods have the given numbers at 2 m and these plus 1 at 4 m; nothing else."""
-    facts = {"turn_deg": 1.0, "length_m": 2.0, "movers": 3, "mover_share": 0.1, "words": "x", "films": [], "seconds": {}}
+    facts = {
+        "turn_deg": 1.0,
+        "length_m": 2.0,
+        "movers": 3,
+        "mover_share": 0.1,
+        "words": "x",
+        "films": [],
+        "seconds": {},
+    }
     places = (("0", 5), ("2", 0), ("4", 1))
     values = [
         {m: {p: {"psnr": psnr[m][log] + more, "abs_rel": abs_rel[m][log]} for p, more in places} for m in psnr}
         for log in range(len(psnr["a"]))
-    ]  # fmt: skip
+    ]
     return [{"log": log, **facts, "values": of} for log, of in enumerate(values)]
 
 
@@ -155,8 +176,17 @@ def test_what_a_log_lacks_is_left_out_and_named():
     logs = made_up({"a": [20.0, 22.0], "b": [19.0, 20.0]}, {"a": [0.1, 0.2], "b": [0.2, 0.2]})
     logs[1]["values"]["a"]["2"]["psnr"] = "no truth"
     rows = [{"name": "a", "title": "a", "fit": None}, {"name": "b", "title": "b", "fit": None}]
-    settings = {"list": "x", "iterations": 1, "seed": 0, "frames": 4, "size_px": [8, 8], "cameras": ["front"], "held_out_every": 4,
-                "renders": True, "continued_share": 0.5}  # fmt: skip
+    settings = {
+        "list": "x",
+        "iterations": 1,
+        "seed": 0,
+        "frames": 4,
+        "size_px": [8, 8],
+        "cameras": ["front"],
+        "held_out_every": 4,
+        "renders": True,
+        "continued_share": 0.5,
+    }
     document = shift.document(logs, rows, [2.0, 4.0], settings)
     assert document["pooled"]["a"]["2"]["psnr"] == {"mean": 20.0, "standard_error": None, "logs": 1}
     assert document["logs"][1]["values"]["a"]["shifted"]["psnr"] == "no truth"
@@ -171,7 +201,7 @@ def test_what_a_log_lacks_is_left_out_and_named():
     assert evil not in page and page.count("&lt;script&gt;alert(1)") >= 5
 
 
-# ---- end to end --------------------------------------------------------------------------------------------------------
+# ---- end to end ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -210,9 +240,11 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     assert f'src="{log}/film/front_shift%2B3.0.mp4"' in (out / "page.html").read_text()
     before = (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns
     again = shift.run(
-        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify.kind:none",)), out,
-        rules=TINY, distances_m=(3.0,),
-    )  # fmt: skip
+        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify.kind:none",)),
+        out,
+        rules=TINY,
+        distances_m=(3.0,),
+    )
     assert (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns == before
     assert [m["name"] for m in store.read_json(again / "bench.json")["methods"]] == ["street_gaussians", "still"]
 
@@ -225,17 +257,29 @@ def test_fits_under_virtual_views_go_on_with_the_one_on_recorded_views(made, tmp
     log = out / str(city_logs.DEVELOPMENT[0])
     variants = ("louder=virtual.color_weight:2", "flat=sh_degree:1")
     shift.run(
-        dataclasses.replace(config, methods=("mudg_s", LONGER), videos=False, model=str(tmp_path / "model"), variant=variants), out,
-        rules=TINY, distances_m=(3.0,), overwrite=True,
-    )  # fmt: skip
+        dataclasses.replace(
+            config, methods=("mudg_s", LONGER), videos=False, model=str(tmp_path / "model"), variant=variants
+        ),
+        out,
+        rules=TINY,
+        distances_m=(3.0,),
+        overwrite=True,
+    )
     states = {name: store.read_json(log / "fit" / name / "run.json") for name in ("mudg_s", LONGER, "louder", "flat")}
     first = store.digest(log / "fit" / "street_gaussians")
-    assert states["mudg_s"]["inputs"]["start"] == states["louder"]["inputs"]["start"] == states[LONGER]["inputs"]["start"] == first
+    assert (
+        states["mudg_s"]["inputs"]["start"]
+        == states["louder"]["inputs"]["start"]
+        == states[LONGER]["inputs"]["start"]
+        == first
+    )
     assert states["flat"]["inputs"]["start"] == store.digest(log / "start" / "flat") != first
     assert not (log / "start" / "louder").exists()
     for state in states.values():
         assert state["summary"]["steps"] == 15
-    assert store.digest(log / "fit" / "louder" / "gaussians.safetensors") != store.digest(log / "fit" / "mudg_s" / "gaussians.safetensors")
+    assert store.digest(log / "fit" / "louder" / "gaussians.safetensors") != store.digest(
+        log / "fit" / "mudg_s" / "gaussians.safetensors"
+    )
     assert store.read_json(log / "synthesize" / "run.json")["inputs"]["fitted"] == first
     assert "generated with renders of the fit on recorded views" in (out / "bench.md").read_text()
 

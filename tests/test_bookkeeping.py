@@ -63,16 +63,28 @@ class _either:
         return kind is not None and issubclass(kind, MudgError)
 
 
-@pytest.mark.parametrize(("change", "error", "words"), [
-    (lambda folder: (folder / "manifest.json").unlink(), IntegrityError, "missing"),
-    (lambda folder: (folder / "log.jsonl").unlink(), IntegrityError, "missing"),
-    (lambda folder: (folder / "out.txt").write_text("other"), IntegrityError, "altered"),
-    (lambda folder: store.write_manifest(folder, ["out.txt"]), IntegrityError, "altered"),
-    (lambda folder: store.write_json(folder / "run.json", {**store.read_json(folder / "run.json"), "key": "x"}), IntegrityError, "altered"),
-    (lambda folder: store.write_json(folder / "run.json", []), IntegrityError, "damaged"),
-    (lambda folder: store.write_json(folder / "run.json", {**store.read_json(folder / "run.json"), "state": "running"}), InputError,
-     "unfinished"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("change", "error", "words"),
+    [
+        (lambda folder: (folder / "manifest.json").unlink(), IntegrityError, "missing"),
+        (lambda folder: (folder / "log.jsonl").unlink(), IntegrityError, "missing"),
+        (lambda folder: (folder / "out.txt").write_text("other"), IntegrityError, "altered"),
+        (lambda folder: store.write_manifest(folder, ["out.txt"]), IntegrityError, "altered"),
+        (
+            lambda folder: store.write_json(folder / "run.json", {**store.read_json(folder / "run.json"), "key": "x"}),
+            IntegrityError,
+            "altered",
+        ),
+        (lambda folder: store.write_json(folder / "run.json", []), IntegrityError, "damaged"),
+        (
+            lambda folder: store.write_json(
+                folder / "run.json", {**store.read_json(folder / "run.json"), "state": "running"}
+            ),
+            InputError,
+            "unfinished",
+        ),
+    ],
+)
 def test_a_folder_whose_bookkeeping_does_not_fit_is_no_input(
     finished: Path, change: Callable[[Path], object], error: type[MudgError], words: str
 ) -> None:
@@ -103,12 +115,14 @@ def test_a_copied_folder_is_an_input_with_and_without_its_record(finished: Path,
 @pytest.mark.parametrize("lost", [("check",), ("check", "sealed")])
 def test_a_record_without_its_seal_is_damaged_whatever_schema_it_names(finished: Path, lost: tuple[str, ...]) -> None:
     state = store.read_json(finished / "run.json")
-    store.write_json(finished / "run.json", {name: value for name, value in state.items() if name not in lost} | {"schema": 1})
+    store.write_json(
+        finished / "run.json", {name: value for name, value in state.items() if name not in lost} | {"schema": 1}
+    )
     with pytest.raises(IntegrityError, match="record of a run is damaged"):
         store.digest(finished)
 
 
-# ---- outputs that cannot be --------------------------------------------------------------------------------------------
+# ---- outputs that cannot be ----------------------------------------------------------------------
 
 
 def refuse_and_open(out: Path, overwrite: bool) -> None:
@@ -124,11 +138,15 @@ def test_an_output_that_cannot_be_is_refused_in_words(tmp_path: Path, overwrite:
     (tmp_path / "to_file").symlink_to("file")
     before = sorted(os.listdir(tmp_path))
     cases = {
-        **{tmp_path / name: "no folder" for name in ("file", "to_file", "nowhere", "loop")}, Path("/dev/null"): "no folder",
-        tmp_path / "file" / "below": "below something", tmp_path / "file" / "deep" / "er": "below something",
-        tmp_path / ("a" * 300): "too long", tmp_path / ("ä" * 120): "too long", tmp_path / "/".join(["abcdefgh"] * 500): "too long",
+        **{tmp_path / name: "no folder" for name in ("file", "to_file", "nowhere", "loop")},
+        Path("/dev/null"): "no folder",
+        tmp_path / "file" / "below": "below something",
+        tmp_path / "file" / "deep" / "er": "below something",
+        tmp_path / ("a" * 300): "too long",
+        tmp_path / ("ä" * 120): "too long",
+        tmp_path / "/".join(["abcdefgh"] * 500): "too long",
         tmp_path / "zero\0byte": "zero byte",
-    }  # fmt: skip
+    }
     for out, words in cases.items():
         with pytest.raises(UsageError, match=words):
             refuse_and_open(out, overwrite)

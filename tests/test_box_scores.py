@@ -47,7 +47,8 @@ def test_other_sizes_are_scaled_to_480_x_320_and_truncated() -> None:
 
 
 @pytest.mark.parametrize(
-    "other", [track("pedestrian", 0, 0, 11), track("car", 0, 0, -11), track("car", 10.0, 0, 11), track("car", 0, 0, 0.5)]
+    "other",
+    [track("pedestrian", 0, 0, 11), track("car", 0, 0, -11), track("car", 10.0, 0, 11), track("car", 0, 0, 0.5)],
 )
 def test_people_and_what_is_behind_or_not_whole_in_the_image_do_not_count(other: Track) -> None:
     assert street_scores.nta_truths(VIEW, [other]) == []
@@ -74,12 +75,13 @@ def test_the_nearest_centre_decides_not_the_best_overlap() -> None:
     assert street_scores.nta_iou([true], [off, shrunk]) == [pytest.approx(0.01)]
     assert street_scores.nta_iou([true], [off]) == [pytest.approx(36 / 44)]
     assert street_scores.nta_iou([true], [true + 8.0]) == [0.0]  # centre 11.3 px away: overlap does not help
-    assert street_scores.nta_iou([true], [true + np.array([10.0, 0, 10, 0])]) == [pytest.approx(30 / 50)]  # 10 px still count
+    # 10 px still count
+    assert street_scores.nta_iou([true], [true + np.array([10.0, 0, 10, 0])]) == [pytest.approx(30 / 50)]
     assert street_scores.nta_iou([true, true], [off]) == [pytest.approx(36 / 44)] * 2  # one detection serves two truths
     assert street_scores.nta_iou([true], []) == [0.0]
 
 
-# ---- what is really visible ------------------------------------------------------------------------------------------------
+# ---- what is really visible ----------------------------------------------------------------------
 
 
 def instances(left: int, right: int) -> np.ndarray:

@@ -42,7 +42,10 @@ def test_system_compilers_are_tried_in_order(mc: ModuleType) -> None:
     found = {"c++": "/bin/c++", "clang++": "/bin/clang++"}
     commands = [c.command for c in mc.system_candidates({"CXX": "ccache my-c++ -m64"}, which=found.get)]
     assert commands == [("ccache", "my-c++", "-m64"), ("/bin/c++",), ("/bin/clang++",)]
-    assert [c.command for c in mc.system_candidates({"CXX": "/bin/c++"}, which=found.get)] == [("/bin/c++",), ("/bin/clang++",)]
+    assert [c.command for c in mc.system_candidates({"CXX": "/bin/c++"}, which=found.get)] == [
+        ("/bin/c++",),
+        ("/bin/clang++",),
+    ]
     assert mc.system_candidates({}, which=lambda name: None) == []
 
 
@@ -51,7 +54,9 @@ def test_the_first_compiler_that_works_is_taken_and_the_log_says_why(mc: ModuleT
 
     def check(compiler: object) -> object:
         works = compiler is not broken
-        return mc.ProbeResult(works, "" if works else "cannot build a small C++17 library: no headers", "good 1.0", True)
+        return mc.ProbeResult(
+            works, "" if works else "cannot build a small C++17 library: no headers", "good 1.0", True
+        )
 
     chosen, notes = mc.find_compiler([broken, good, spare], check)
     assert chosen.command == ("good",)
@@ -85,14 +90,20 @@ def _build(mc: ModuleType, tmp_path: Path, mode: str, failing: set[str], working
     candidates = [mc.Compiler((name,), "ziglang" if name == "zig" else "system") for name in working]
 
     def compile_with(compiler: object, library: Path, objects: Path) -> list[str]:
-        name = compiler.command[0]  # type: ignore[attr-defined]
+        name = compiler.command[0]
         if name in failing:
             raise mc.CompileError(f"raster.cpp does not compile with {name}")
         library.write_bytes(b"library")
         return []
 
-    return mc.build(tmp_path, tmp_path / "objects", {"MUDG_NATIVE": mode}, candidates=candidates,
-                    check=lambda c: mc.ProbeResult(True, version="1"), compile_with=compile_with)  # fmt: skip
+    return mc.build(
+        tmp_path,
+        tmp_path / "objects",
+        {"MUDG_NATIVE": mode},
+        candidates=candidates,
+        check=lambda c: mc.ProbeResult(True, version="1"),
+        compile_with=compile_with,
+    )
 
 
 def test_a_failing_compile_hands_over_to_the_next_compiler(mc: ModuleType, tmp_path: Path) -> None:
@@ -155,7 +166,9 @@ def test_other_processors_compile_no_x86_variants(mc: ModuleType) -> None:
     names = {p.name for p in mc.sources_for(mc.Compiler(("c++",), "system", x86_64=False))}
     assert "kernels_portable.cpp" in names
     assert not [n for n in names if "avx" in n]
-    assert {"kernels_avx2.cpp", "kernels_avx512.cpp"} <= {p.name for p in mc.sources_for(mc.Compiler(("c++",), "system", x86_64=True))}
+    assert {"kernels_avx2.cpp", "kernels_avx512.cpp"} <= {
+        p.name for p in mc.sources_for(mc.Compiler(("c++",), "system", x86_64=True))
+    }
 
 
 def test_object_files_are_named_after_all_they_depend_on(mc: ModuleType, tmp_path: Path) -> None:
@@ -179,7 +192,9 @@ def test_zig_is_asked_for_only_where_it_exists(mc: ModuleType) -> None:
 
 
 @pytest.mark.skipif(importlib.util.find_spec("setuptools") is None, reason="setuptools is not installed")
-def test_the_backend_asks_for_ziglang_only_without_a_system_compiler(mc: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_backend_asks_for_ziglang_only_without_a_system_compiler(
+    mc: ModuleType, monkeypatch: pytest.MonkeyPatch
+) -> None:
     pytest.importorskip("setuptools.command.bdist_wheel")
     backend = _load("mudg_build")
     monkeypatch.delenv("MUDG_NATIVE", raising=False)
@@ -203,11 +218,16 @@ def test_variants_share_no_function_with_the_rest(mc: ModuleType, tmp_path: Path
         pytest.skip("needs a system compiler for x86-64 and nm")
     for name in ("kernels_avx2", "kernels_avx512"):
         source, target = mc.NATIVE_SOURCES / f"{name}.cpp", tmp_path / f"{name}.o"
-        subprocess.run([*compiler.command, *mc.flags_for(compiler, source), "-c", str(source), "-o", str(target)], check=True)
-        symbols = subprocess.run(["nm", "--defined-only", str(target)], capture_output=True, text=True, check=True).stdout
+        subprocess.run(
+            [*compiler.command, *mc.flags_for(compiler, source), "-c", str(source), "-o", str(target)], check=True
+        )
+        symbols = subprocess.run(
+            ["nm", "--defined-only", str(target)], capture_output=True, text=True, check=True
+        ).stdout
         kinds = {line.split()[-1]: line.split()[-2] for line in symbols.splitlines()}
         assert any(name in symbol for symbol in kinds)
-        weak = [s for s, kind in kinds.items() if kind in "WVu" and not s.startswith("DW.ref.")]  # those are addresses, alike in all
+        # those are addresses, alike in all
+        weak = [s for s, kind in kinds.items() if kind in "WVu" and not s.startswith("DW.ref.")]
         assert weak == []
         assert [s for s in kinds if "GLOBAL__sub_I" in s] == []  # nothing runs when the library is loaded
 

@@ -45,12 +45,14 @@ def test_maps_are_found_along_a_chain_of_cameras():
     rng = np.random.default_rng(0)
     colors = rng.uniform(0.1, 0.6, (6000, 3))
     darker = ColorMap((1.7, 1.7, 1.7), (0.0, 0.0, 0.0))
-    seen = [{
-        "front": _seen_of(colors, np.arange(0, 3000), ColorMap(), rng),
-        "left": _seen_of(colors, np.arange(2000, 5000), DARK, rng),
-        "back": _seen_of(colors, np.arange(4000, 6000), darker, rng),
-        "far": _seen_of(colors, np.arange(5990, 6000), darker, rng),
-    }]  # fmt: skip
+    seen = [
+        {
+            "front": _seen_of(colors, np.arange(0, 3000), ColorMap(), rng),
+            "left": _seen_of(colors, np.arange(2000, 5000), DARK, rng),
+            "back": _seen_of(colors, np.arange(4000, 6000), darker, rng),
+            "far": _seen_of(colors, np.arange(5990, 6000), darker, rng),
+        }
+    ]
     found = match_cameras(("front", "left", "back", "far"), seen)
     assert found.reference == "front" and set(found.to_common) == {"left", "back"}
     for name, wanted in (("left", DARK), ("back", darker)):
@@ -79,13 +81,16 @@ def test_maps_there_and_back_are_the_identity():
     assert np.abs(colors.bytes_of("left", colors.bytes_to_common("left", values)).astype(int) - values).max() <= 1
     assert CameraColors.of_record(colors.record()) == colors
     assert DARK.then(DARK.inverse()).gain == pytest.approx((1, 1, 1))
-    for bad in ({}, {"reference": "a", "to_common": {"b": {"gain": [1, 2], "offset": [0, 0, 0], "pairs": 1}}},
-                {"reference": "a", "to_common": {"b": {"gain": [1, 0, 1], "offset": [0, 0, 0], "pairs": 1}}}):  # fmt: skip
+    for bad in (
+        {},
+        {"reference": "a", "to_common": {"b": {"gain": [1, 2], "offset": [0, 0, 0], "pairs": 1}}},
+        {"reference": "a", "to_common": {"b": {"gain": [1, 0, 1], "offset": [0, 0, 0], "pairs": 1}}},
+    ):
         with pytest.raises((KeyError, ValueError)):
             CameraColors.of_record(bad)
 
 
-# ---- through the verbs, on a generated city of which one camera takes darker images ---------------------------------
+# ---- through the verbs, on a generated city of which one camera takes darker images --------------
 
 
 SIZE = {"n_frames": 8, "width": 160, "height": 104, "cameras": ("front", "front_left")}
@@ -93,7 +98,8 @@ SIZE = {"n_frames": 8, "width": 160, "height": 104, "cameras": ("front", "front_
 
 @pytest.fixture(scope="module")
 def city(tmp_path_factory) -> tuple[Path, Path]:
-    """A scene whose cameras are equal, and the same with a darker second camera; the first frame of each is held out."""
+    """A scene whose cameras are equal, and the same with a darker second camera; the first frame of each is held
+    out."""
     root = tmp_path_factory.mktemp("city")
     config = configuration.load(IngestConfig, overrides={"city": SIZE, "test_every": 4})
     Ingest(log="city", out=root / "equal", settings=config).run()
@@ -151,7 +157,9 @@ def test_a_scene_has_common_colors_and_every_camera_shows_its_own(city, tmp_path
     """Renders of the darker camera are as dark as its images, before any training step has brought them there."""
     scene = read_scene(city[1])
     config = fit_config(method="street_gaussians", iterations=1, densify__kind="none")
-    model = fit.load_model(Fit(scene=city[1], fused=city[1].parent / "dark_fuse", out=tmp_path / "fit", settings=config).run())
+    model = fit.load_model(
+        Fit(scene=city[1], fused=city[1].parent / "dark_fuse", out=tmp_path / "fit", settings=config).run()
+    )
     assert model.colors == fused_of(city[1]).colors
     frame = scene.frames_of("front_left")[3]
     own = render_view(model, frame.view, RasterConfig(near_m=0.2)).rgb
@@ -159,8 +167,10 @@ def test_a_scene_has_common_colors_and_every_camera_shows_its_own(city, tmp_path
     photo = torch.from_numpy(read_image(scene, frame).copy()).permute(2, 0, 1) / 255
     assert (own - photo).abs().mean() < 0.7 * (plain - photo).abs().mean()
     front = scene.frames_of("front")[3].view
-    assert torch.equal(render_view(model, front, RasterConfig(near_m=0.2)).rgb,
-                       render_view(replace(model, colors=SAME_COLORS), front, RasterConfig(near_m=0.2)).rgb)  # fmt: skip
+    assert torch.equal(
+        render_view(model, front, RasterConfig(near_m=0.2)).rgb,
+        render_view(replace(model, colors=SAME_COLORS), front, RasterConfig(near_m=0.2)).rgb,
+    )
 
 
 def test_damaged_maps_are_refused(city, tmp_path):

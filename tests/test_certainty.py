@@ -44,9 +44,13 @@ def tiny_model(order: torch.Tensor | None = None, moved: bool = True) -> SceneMo
         owner[-4:] = 1
         means[-4:] = (draw(4, 3) - 0.5) * 2
     columns = {
-        "means": means, "quats": draw(ROWS, 4) - 0.5, "log_scales": torch.log(0.1 + 0.5 * draw(ROWS, 3)),
-        "logits": 2 * draw(ROWS), "sh_dc": draw(ROWS, 1, 3) - 0.5, "semantics": draw(ROWS, 2),
-    }  # fmt: skip
+        "means": means,
+        "quats": draw(ROWS, 4) - 0.5,
+        "log_scales": torch.log(0.1 + 0.5 * draw(ROWS, 3)),
+        "logits": 2 * draw(ROWS),
+        "sh_dc": draw(ROWS, 1, 3) - 0.5,
+        "semantics": draw(ROWS, 2),
+    }
     if order is not None:
         columns, owner = {name: value[order] for name, value in columns.items()}, owner[order]
     pose = np.eye(4)
@@ -79,7 +83,8 @@ def in_double(gaussians: Gaussians) -> Gaussians:
 
 
 def test_sums_are_those_of_every_gaussians_weight_in_double_precision():
-    """With one feature per Gaussian that is 1 for itself and 0 else, a rendered feature is a Gaussian's weight at every pixel."""
+    """With one feature per Gaussian that is 1 for itself and 0 else, a rendered feature is a Gaussian's weight at every
+    pixel."""
     model, view = tiny_model(), photograph().as_tensors()
     gaussians = compose(model, view.view.time_s, semantics=False)
     alone = replace(in_double(gaussians), extra=torch.eye(ROWS, dtype=torch.float64))
@@ -140,7 +145,7 @@ def test_what_no_view_shows_has_none_and_few_views_stand_for_many():
     torch.testing.assert_close(some, every)
 
 
-# ---- renders and files -----------------------------------------------------------------------------------------------
+# ---- renders and files ---------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -67,7 +67,7 @@ def left_of_ego(world: CityWorld, time_s: float) -> np.ndarray:
     return left / np.linalg.norm(left)
 
 
-# --- exact geometry -------------------------------------------------------------------------------------------------
+# --- exact geometry -------------------------------------------------------------------------------
 
 
 def test_depth_of_the_road_is_the_plane_z_0(world: CityWorld) -> None:
@@ -179,7 +179,7 @@ def test_instances_lie_in_their_boxes(world: CityWorld) -> None:
         assert (np.abs(local) < track.size_m / 2 + [0.15, 0.3, 0.3]).all(), track.id
 
 
-# --- LiDAR ----------------------------------------------------------------------------------------------------------
+# --- LiDAR ----------------------------------------------------------------------------------------
 
 
 def test_every_return_is_where_a_camera_ray_ends(clean_world: CityWorld) -> None:
@@ -198,7 +198,8 @@ def test_every_return_is_where_a_camera_ray_ends(clean_world: CityWorld) -> None
         origin = (ego @ mount)[:3, 3]
         probe = clean_world.render(looking_at(origin, points[i], time_s), supersample=1)
         distance = float(np.linalg.norm(points[i] - origin))
-        # people's limbs keep the pose of the middle of the turn; thin things can be missed by a rounding of the direction
+        # people's limbs keep the pose of the middle of the turn; thin things can be missed by a rounding of the
+        # direction
         if abs(float(probe.depth[0, 0]) - distance) > 1e-3 * distance + 2e-3:
             wrong += 1
         else:
@@ -279,7 +280,7 @@ def test_boxes_contain_the_returns_of_their_objects(world: CityWorld) -> None:
     assert outside <= 0.02 * total  # door mirrors
 
 
-# --- the log --------------------------------------------------------------------------------------------------------
+# --- the log --------------------------------------------------------------------------------------
 
 
 def test_the_drive_starts_at_the_origin_and_curves_and_changes_speed() -> None:
@@ -388,7 +389,7 @@ def test_light_and_weather() -> None:
     assert all(0.1 < mean.mean() < 0.9 for mean in means.values())
 
 
-# --- same in, same out ----------------------------------------------------------------------------------------------
+# --- same in, same out ----------------------------------------------------------------------------
 
 
 def same(a: CityWorld, b: CityWorld) -> None:
@@ -461,7 +462,7 @@ def test_seeds_differ() -> None:
     assert np.abs(a.render(view).rgb - b.render(view).rgb).mean() > 0.02
 
 
-# --- interface and errors -------------------------------------------------------------------------------------------
+# --- interface and errors -------------------------------------------------------------------------
 
 
 def test_observation_matches_the_render(world: CityWorld) -> None:

@@ -1,4 +1,5 @@
-"""Short fits of training cities: the scene that is fitted, and the whole way from a city to a model that takes renders."""
+"""Short fits of training cities: the scene that is fitted, and the whole way from a city to a model that takes
+renders."""
 
 import json
 from dataclasses import replace
@@ -103,7 +104,9 @@ def test_a_city_is_fitted_and_learnt_from(tmp_path):
     """From the generator over a short fit to a trained model with finisher; the renders resemble what they show."""
     rules = replace(RULES, fit_steps=(60, 100))
     for city in (0, from_city.HELD_OUT):
-        assert city_fits.write_fitted_city(rules, city, tmp_path / "clips") == (2 if city == 0 else len(from_city.shifts_of(RULES, city)))
+        assert city_fits.write_fitted_city(rules, city, tmp_path / "clips") == (
+            2 if city == 0 else len(from_city.shifts_of(RULES, city))
+        )
     shifted = clip_shards.read_clip(tmp_path / "clips", 0, 0, [0, 1])
     shown = shifted.condition.renders
     assert shifted.fine is not None and shifted.fine.clip.condition.renders is not None

@@ -17,7 +17,8 @@ from mudg.city.world import CityWorld
 
 
 def hdr_bytes(rgbe: np.ndarray) -> bytes:
-    """A run-length coded Radiance file of u8[H, W, 4]; the first half of every row as runs of literals, the second as runs."""
+    """A run-length coded Radiance file of u8[H, W, 4]; the first half of every row as runs of literals, the second as
+    runs."""
     height, width = rgbe.shape[:2]
     out = bytearray(f"#?RADIANCE\nFORMAT=32-bit_rle_rgbe\n\n-Y {height} +X {width}\n".encode())
     for row in rgbe:

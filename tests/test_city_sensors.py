@@ -173,13 +173,21 @@ def test_boxes_err_as_stated_each_by_itself() -> None:
     assert np.array_equal(exact[0].world_from_object, poses)
 
 
-# --- in a city --------------------------------------------------------------------------------------------------------
+# --- in a city ------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def small() -> CityConfig:
-    return CityConfig(seed=11, n_frames=4, width=64, height=48, cameras=("front",), lidar_beams=16, lidar_azimuth_step_deg=1.0,
-                      supersample=1)  # fmt: skip
+    return CityConfig(
+        seed=11,
+        n_frames=4,
+        width=64,
+        height=48,
+        cameras=("front",),
+        lidar_beams=16,
+        lidar_azimuth_step_deg=1.0,
+        supersample=1,
+    )
 
 
 @needs_native
@@ -204,7 +212,7 @@ def test_a_wrong_clock_moves_the_points_by_the_way_driven(small: CityConfig) -> 
     driven = np.linalg.norm(world.frame_pose(0.12)[:3, 3] - world.frame_pose(0.1)[:3, 3])
 
     def wall(sweep: object) -> float:  # distance of the nearest return ahead at the height of the sensor
-        xyz, ids = sweep.points.xyz, sweep.semantics  # type: ignore[attr-defined]
+        xyz, ids = sweep.points.xyz, sweep.semantics
         return float(np.median(np.linalg.norm(xyz[(ids == 2) & (xyz[:, 0] > 5) & (np.abs(xyz[:, 1]) < 25)], axis=1)))
 
     assert 0.05 < driven < 0.4
@@ -213,7 +221,8 @@ def test_a_wrong_clock_moves_the_points_by_the_way_driven(small: CityConfig) -> 
 
 @needs_native
 def test_the_image_of_a_view_fits_it_and_the_truth_is_exact(small: CityConfig) -> None:
-    """With faulty poses the image of a moment keeps its place relative to the views of that moment; the truth has its look only."""
+    """With faulty poses the image of a moment keeps its place relative to the views of that moment; the truth has its
+    look only."""
     looks = {"front": CameraLook(gain=1.4)}
     sensors = SensorFaults(
         looks, {}, LidarFaults((0.3, 0, 0)), PoseFaults(0.05, 0.2, 0.05, 0.2), BoxFaults(0.1, 2, 0.1)
@@ -242,7 +251,7 @@ def test_without_faults_the_log_is_the_exact_one(small: CityConfig) -> None:
     assert np.array_equal(log.recorded[1].rgb, log.world.render(view).rgb_u8)
 
 
-# --- the distribution -------------------------------------------------------------------------------------------------
+# --- the distribution -----------------------------------------------------------------------------
 
 
 def test_varied_cities_follow_from_seed_and_number_alone() -> None:
@@ -326,7 +335,9 @@ def test_the_share_of_cities_with_three_cameras_changes_nothing_else() -> None:
         for share, cameras in ((0.0, 1), (1.0, 3)):
             others = [from_city.city_config(replace(rules, side_cameras=share), city) for city in range(40)]
             assert {len(config.cameras) for config in others} == {cameras}
-            assert [replace(config, cameras=("front",)) for config in others] == [replace(config, cameras=("front",)) for config in drawn]
+            assert [replace(config, cameras=("front",)) for config in others] == [
+                replace(config, cameras=("front",)) for config in drawn
+            ]
         assert 5 < sum(len(config.cameras) == 3 for config in drawn) < 25
 
 
@@ -349,7 +360,7 @@ def test_varied_clips_are_reproducible() -> None:
         assert np.array_equal(a.condition.color.numpy(), b.condition.color.numpy())
 
 
-# --- above the LiDAR --------------------------------------------------------------------------------------------------
+# --- above the LiDAR ------------------------------------------------------------------------------
 
 
 def _golden(config: CityConfig) -> str:

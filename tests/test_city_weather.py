@@ -54,7 +54,8 @@ def test_surfaces_are_unit_normals_and_albedos(clear: CityWorld, view: View) -> 
 
 
 def test_fog_follows_koschmieder(clear: CityWorld, view: View) -> None:
-    """From the clear image by the law alone: the haze of the day is taken away, the fog added, all with the city's camera."""
+    """From the clear image by the law alone: the haze of the day is taken away, the fog added, all with the city's
+    camera."""
     truth, light = clear.render(view), city_light(CLEAR)
     hazy = CityWorld(replace(CLEAR, fog_visibility_m=120.0)).render(view)
     curve, solid = light.response.curve(), ~truth.sky

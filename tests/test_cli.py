@@ -26,7 +26,7 @@ def call(monkeypatch: pytest.MonkeyPatch, outcome: object, *words: str) -> int:
     def act(_args: object) -> dict[str, Any]:
         if isinstance(outcome, BaseException):
             raise outcome
-        return outcome  # type: ignore[return-value]
+        return outcome
 
     monkeypatch.setattr(Doctor, "run", act)
     return app.main(["doctor", *words])
@@ -49,7 +49,11 @@ def test_flags_beat_the_file_and_the_file_beats_the_preset(tmp_path: Path) -> No
 
 def test_the_seed_goes_to_every_verb_that_draws() -> None:
     args = parse("demo", "--seed", "7")
-    seeds = [part["seed"] for part in configuration.to_dict(args.settings).values() if isinstance(part, dict) and "seed" in part]
+    seeds = [
+        part["seed"]
+        for part in configuration.to_dict(args.settings).values()
+        if isinstance(part, dict) and "seed" in part
+    ]
     assert len(seeds) >= 2
     assert set(seeds) == {7}
     assert args.settings.ingest.city.seed == 7
@@ -221,9 +225,15 @@ def test_sigterm_stops_like_ctrl_c_with_its_own_code(monkeypatch: pytest.MonkeyP
     assert signal.getsignal(signal.SIGTERM) is before
 
 
-@pytest.mark.parametrize(("verb", "flag", "field"), [
-    ("render", "--model", "model"), ("fit", "--fused", "fused"), ("synthesize", "--fused", "fused"), ("score", "--views", "views"),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("verb", "flag", "field"),
+    [
+        ("render", "--model", "model"),
+        ("fit", "--fused", "fused"),
+        ("synthesize", "--fused", "fused"),
+        ("score", "--views", "views"),
+    ],
+)
 def test_the_second_input_may_stand_after_the_scene(verb: str, flag: str, field: str) -> None:
     by_place = parse(verb, "scene", "a=b", "--out", "o")
     by_flag = parse(verb, "scene", flag, "a=b", "--out", "o")
@@ -245,7 +255,9 @@ def test_the_second_input_may_stand_after_the_scene(verb: str, flag: str, field:
         ("fit scene --out x --iterations=-1", "--iterations", "-1"),
     ],
 )
-def test_a_value_of_a_nested_setting_is_refused_in_our_words(line: str, flag: str, got: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_value_of_a_nested_setting_is_refused_in_our_words(
+    line: str, flag: str, got: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     assert app.main(line.split()) == 2
     said = capsys.readouterr().err
     assert said.startswith("error: ") and f"where: {flag}\n" in said and "expected: " in said

@@ -52,8 +52,13 @@ def image_of_wall(view, x_m):
 def test_warp_of_a_plane_is_exact():
     """A striped wall 10 m ahead, seen from 1.5 m beside: the warped recorded image equals the true one."""
     recorded, target = view_at(), view_at(y=1.5)
-    source = WarpSource(recorded, clips.image_tensor(image_of_wall(recorded, 10.0)), torch.full((32, 48), 10.0), torch.zeros(32, 48) > 0,
-                    torch.zeros(32, 48, dtype=torch.uint8))  # fmt: skip
+    source = WarpSource(
+        recorded,
+        clips.image_tensor(image_of_wall(recorded, 10.0)),
+        torch.full((32, 48), 10.0),
+        torch.zeros(32, 48) > 0,
+        torch.zeros(32, 48, dtype=torch.uint8),
+    )
     rgb, _, found = clips.warp(target, torch.full((32, 48), 10.0), source, source.depth, 0.08)
     truth = clips.image_tensor(image_of_wall(target, 10.0))
     assert float(found.float().mean()) > 0.85
@@ -123,7 +128,9 @@ def test_parts_of_a_condition_are_switched_off(fine):
     rules = replace(RULES, fine_width=48 * fine, fine_height=32 * fine)
     views = [view_at(y=2.0, time_s=0.1)]
     given = ConditionSources(cloud, (), recorded, rules)
-    full, points, reference, concat = (conditions_of(given, parts, views, {}) for parts in ("full", "points", "reference", "concat"))
+    full, points, reference, concat = (
+        conditions_of(given, parts, views, {}) for parts in ("full", "points", "reference", "concat")
+    )
     for grid in (0, 1):
         whole, bare, image, both = full[grid], points[grid], reference[grid], concat[grid]
         assert bool(whole.warped.any()) and not any(bool(c.warped.any()) for c in (bare, image, both))
@@ -205,7 +212,7 @@ def test_fine_grid_gives_the_same_geometry_and_cleaner_colour():
     assert error[0] <= error[1] + 1e-4
 
 
-# training clips -------------------------------------------------------------------------------------------------------
+# training clips -----------------------------------------------------------------------------------
 
 
 def some_clip(frames=3, height=16, width=24):
@@ -213,10 +220,14 @@ def some_clip(frames=3, height=16, width=24):
     draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
     camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
     condition = Condition(
-        tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames)), draw(frames, 3, height, width),
-        50 * draw(frames, 1, height, width), draw(frames, 1, height, width) > 0.5, draw(3, height, width),
-        draw(frames, 1, height, width) > 0.5, draw(frames, 3, height, width),
-    )  # fmt: skip
+        tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames)),
+        draw(frames, 3, height, width),
+        50 * draw(frames, 1, height, width),
+        draw(frames, 1, height, width) > 0.5,
+        draw(3, height, width),
+        draw(frames, 1, height, width) > 0.5,
+        draw(frames, 3, height, width),
+    )
     depth = 80 * draw(frames, 1, height, width)
     return Clip(
         condition, draw(frames, 3, height, width), depth, depth > 5, torch.randint(0, 19, (frames, height, width))
@@ -297,11 +308,12 @@ def test_held_out_cities_have_the_stated_shifts():
         assert all(0.5 <= abs(s) <= 4.2 for s in shifts[:-1])
 
 
-# ---- the condition of FreeVS -------------------------------------------------------------------------------------------
+# ---- the condition of FreeVS ---------------------------------------------------------------------
 
 
 def one_wall_per_sweep(times, track=None):
-    """Sweeps of a 5 m wide piece of a wall at x = 12, each further to the left by 1 m, coloured by an image of one colour."""
+    """Sweeps of a 5 m wide piece of a wall at x = 12, each further to the left by 1 m, coloured by an image of one
+    colour."""
     sweeps = []
     for number, time_s in enumerate(times):
         y, z = (grid.ravel() for grid in np.meshgrid(np.arange(-2.5, 2.5, 0.05) + number, np.arange(-2, 2, 0.05)))
@@ -317,7 +329,9 @@ def test_points_of_two_frames_before_and_after_are_shown():
     assert near.numbers_at(0.3) == (1, 2, 3, 4, 5)
     assert near.numbers_at(0.0) == (0, 1, 2) and near.numbers_at(9.0) == (3, 4, 5)
     condition = near_points.near_condition(near, [view_at(time_s=0.0), view_at(time_s=0.5)], RULES)
-    shades = [set((condition.color[t][:, condition.valid[t, 0]] * 255).round().int().flatten().tolist()) for t in (0, 1)]
+    shades = [
+        set((condition.color[t][:, condition.valid[t, 0]] * 255).round().int().flatten().tolist()) for t in (0, 1)
+    ]
     assert shades[0] <= {20, 60, 100} and shades[1] <= {140, 180, 220} and all(shades)
     assert not bool(condition.color[:, :, ~condition.valid[0, 0] & ~condition.valid[1, 0]].any())
     assert bool((condition.depth == RULES.far_m).all()) and not bool(condition.warped.any())

@@ -69,10 +69,14 @@ def npz(**arrays: np.ndarray) -> bytes:
 
 
 GOOD = {
-    "a.pcd": pcd("ascii"), "b.pcd": pcd("binary"), "c.pcd": pcd("binary_compressed"),
-    "a.ply": ply("ascii"), "b.ply": ply("binary_little_endian"), "c.ply": ply("binary_big_endian"),
+    "a.pcd": pcd("ascii"),
+    "b.pcd": pcd("binary"),
+    "c.pcd": pcd("binary_compressed"),
+    "a.ply": ply("ascii"),
+    "b.ply": ply("binary_little_endian"),
+    "c.ply": ply("binary_big_endian"),
     "a.npz": npz(xyz=XYZ, level=LEVEL),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", GOOD)

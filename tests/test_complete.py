@@ -16,7 +16,8 @@ LEVEL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])
 
 
 def street() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Colours, depth and sky: a road, a wall that recedes on the left, a car across, sky above the horizon elsewhere."""
+    """Colours, depth and sky: a road, a wall that recedes on the left, a car across, sky above the horizon
+    elsewhere."""
     row, column = np.indices((HEIGHT, WIDTH)) + 0.5
     x, y = (column - WIDTH / 2) / FOCAL, (row - HEIGHT / 2) / FOCAL
     road = np.where(y > 0.01, 1.5 / np.maximum(y, 0.01), np.inf)

@@ -71,7 +71,7 @@ def test_malformed_or_hostile_yaml_is_refused(tmp_path: Path, text: str) -> None
 
 def test_configurations_are_frozen() -> None:
     with pytest.raises((AttributeError, TypeError)):
-        Outer().seed = 3  # type: ignore[misc]
+        Outer().seed = 3
 
 
 @config.settings

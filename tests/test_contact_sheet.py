@@ -88,11 +88,7 @@ def test_single_images_of_several_cameras_share_rows(tmp_path: Path) -> None:
 
 def test_boxes_have_the_colour_of_their_class_also_where_there_are_no_points(tmp_path: Path) -> None:
     scene = ToyStreet(car_start=(40, 0)).write(tmp_path / "scene", labels=False, width=60, height=30)
-    for label, color in (
-        ("bus", above.VEHICLE_COLOR),
-        ("cyclist", above.PEOPLE_COLOR),
-        ("barrier", above.OTHER_COLOR),
-    ):
+    for label, color in (("bus", above.VEHICLE_COLOR), ("cyclist", above.PEOPLE_COLOR), ("barrier", above.OTHER_COLOR)):
         tracks = tuple(replace(track, label=label) for track in scene.tracks)
         top = np.array(sheets.top_view(replace(scene, tracks=tracks, sweeps=()), 400, 300))[20:250]
         assert (top == color).all(2).sum() > 20, label

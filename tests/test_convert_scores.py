@@ -40,7 +40,9 @@ def saved(tmp_path: Path, network: str) -> Path:
 LARGE = {"inception", "i3d"}
 
 
-@pytest.mark.parametrize("network", [pytest.param(one, marks=pytest.mark.slow) if one in LARGE else one for one in STATES])
+@pytest.mark.parametrize(
+    "network", [pytest.param(one, marks=pytest.mark.slow) if one in LARGE else one for one in STATES]
+)
 def test_converted_weights_are_the_published_ones_under_known_names(tmp_path: Path, network: str) -> None:
     checkpoint = saved(tmp_path, network)
     converted.convert_weights(network, checkpoint, tmp_path / "out")
@@ -64,7 +66,8 @@ def test_unknown_names_of_i3d_are_matched_by_order_and_shape() -> None:
     strange = {f"layer{number}": value for number, value in enumerate(state.values())}
     found = i3d.with_known_names(strange)
     assert all(torch.equal(found[name], value) for name, value in state.items())
-    assert set(i3d.with_known_names(dict(list(strange.items())[1:]))) == set(strange) - {"layer0"}  # one is missing: no guess
+    # one is missing: no guess
+    assert set(i3d.with_known_names(dict(list(strange.items())[1:]))) == set(strange) - {"layer0"}
 
 
 @pytest.mark.slow
@@ -78,7 +81,10 @@ def test_a_converted_file_keeps_its_origin(tmp_path: Path, monkeypatch: pytest.M
     scene = toy_views.write_scene(tmp_path / "scene")
     views = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
     out = Score(
-        scene=scene, views={"a": views}, out=tmp_path / "score", settings=ScoreConfig(fid_weights=str(weights), perceptual_views=0)
+        scene=scene,
+        views={"a": views},
+        out=tmp_path / "score",
+        settings=ScoreConfig(fid_weights=str(weights), perceptual_views=0),
     ).run()
     assert store.read_json(out / "metrics.json")["distributions"]["published_weights"] is True
     store.write_safetensors(weights, {name: value + 1 for name, value in store.read_tensors(weights).items()})
@@ -101,6 +107,10 @@ def test_the_verb_converts_replaces_and_refuses_foreign_settings(tmp_path: Path)
     assert app.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]) != 0
     assert app.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2", "--overwrite"]) == 0
     with pytest.raises(UsageError, match="diffusion models only"):
-        Convert(checkpoint=checkpoint, to=tmp_path / "other", settings=ConvertConfig(network="dinov2", dtype="float16")).run()
+        Convert(
+            checkpoint=checkpoint, to=tmp_path / "other", settings=ConvertConfig(network="dinov2", dtype="float16")
+        ).run()
     with pytest.raises(InputError, match="no such checkpoint"):
-        Convert(checkpoint=tmp_path / "missing.pth", to=tmp_path / "other", settings=ConvertConfig(network="dinov2")).run()
+        Convert(
+            checkpoint=tmp_path / "missing.pth", to=tmp_path / "other", settings=ConvertConfig(network="dinov2")
+        ).run()

@@ -168,25 +168,35 @@ TRAPS: dict[str, tuple[Any, tuple[str, ...]]] = {
     "milliseconds called ns": (lambda l: divide_times(l, 10**6), ("another unit", "ms")),
     "scaled pose": (lambda l: scale(l["ego"][2]["world_from_ego"], 1000), ("pose is scaled", "ego[2]")),
     "left-handed camera": (
-        lambda l: mirror(l["cameras"]["front"]["ego_from_camera"]), ("left-handed", "cameras.front.ego_from_camera")
+        lambda l: mirror(l["cameras"]["front"]["ego_from_camera"]),
+        ("left-handed", "cameras.front.ego_from_camera"),
     ),
     "Windows path": (
-        lambda l: l["images"][3].update(file="images\\front\\000001.png"), ("backslash", "images[3].file")
+        lambda l: l["images"][3].update(file="images\\front\\000001.png"),
+        ("backslash", "images[3].file"),
     ),
-    "path that leads out": (lambda l: l["sweeps"][0].update(file="../../etc/passwd"), ("component '..'", "sweeps[0].file")),
+    "path that leads out": (
+        lambda l: l["sweeps"][0].update(file="../../etc/passwd"),
+        ("component '..'", "sweeps[0].file"),
+    ),
     "unknown camera": (lambda l: l["images"][0].update(camera="frnt"), ("does not have", "frnt", "images[0].camera")),
     "camera without images": (
-        lambda l: l.update(images=[i for i in l["images"] if i["camera"] == "front"]), ("front_left has no images",)
+        lambda l: l.update(images=[i for i in l["images"] if i["camera"] == "front"]),
+        ("front_left has no images",),
     ),
     "LiDAR without sweeps": (lambda l: l.update(sweeps=[]), ("lidar has no sweeps",)),
     "box without width": (lambda l: l["tracks"][0].update(size_m=[4.0, 0.0, 1.5]), ("box size makes no sense",)),
     "two tracks of one id": (lambda l: l["tracks"][1].update(id=l["tracks"][0]["id"]), ("two tracks have one id",)),
     "millimetre lens": (lambda l: l["cameras"]["front"].update(fx=0.0042), ("focal length makes no sense",)),
-    "misspelt field": (lambda l: l["cameras"]["front"].update(distortions=[1]), ("unknown field", "did you mean 'distortion'")),
-    "other clock": (
-        lambda l: [i.update(time=i["time"] + 9 * 10**9) for i in l["images"]], ("do not cover", "are the clocks the same")
+    "misspelt field": (
+        lambda l: l["cameras"]["front"].update(distortions=[1]),
+        ("unknown field", "did you mean 'distortion'"),
     ),
-}  # fmt: skip
+    "other clock": (
+        lambda l: [i.update(time=i["time"] + 9 * 10**9) for i in l["images"]],
+        ("do not cover", "are the clocks the same"),
+    ),
+}
 
 
 @pytest.mark.parametrize("trap", TRAPS)
@@ -231,10 +241,14 @@ def damage_image(log: Path, kind: str) -> None:
 @pytest.mark.parametrize(
     ("kind", "words"),
     [
-        ("grey", "image is grey"), ("16 bits", "8-bit RGB"), ("EXIF", "stored rotated"), ("another size", "camera's size"),
-        ("cut off", "cannot be decoded"), ("missing", "file not found"),
+        ("grey", "image is grey"),
+        ("16 bits", "8-bit RGB"),
+        ("EXIF", "stored rotated"),
+        ("another size", "camera's size"),
+        ("cut off", "cannot be decoded"),
+        ("missing", "file not found"),
     ],
-)  # fmt: skip
+)
 def test_bad_images_are_named(log: Path, tmp_path: Path, kind: str, words: str) -> None:
     damage_image(log, kind)
     found = words_of(log)

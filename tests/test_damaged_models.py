@@ -1,4 +1,5 @@
-"""Folders of models whose files are damaged and that no manifest vouches for: an error in words, or a scene that can be drawn."""
+"""Folders of models whose files are damaged and that no manifest vouches for: an error in words, or a scene that can be
+drawn."""
 
 from __future__ import annotations
 
@@ -37,9 +38,15 @@ VALUES: list[Any] = [None, "x", -1, 10**30, 1e300, True, [], [1], [[1, "x"]], {}
 def altered(value: Any) -> Iterator[Any]:
     """A JSON value with each part of it, at every depth, missing or something else."""
     yield from VALUES
-    parts: Any = value.items() if isinstance(value, dict) else list(enumerate(value))[:2] if isinstance(value, list) else ()
+    parts: Any = (
+        value.items() if isinstance(value, dict) else list(enumerate(value))[:2] if isinstance(value, list) else ()
+    )
     for name, part in parts:
-        yield {key: kept for key, kept in value.items() if key != name} if isinstance(value, dict) else value[:name] + value[name + 1 :]
+        yield (
+            {key: kept for key, kept in value.items() if key != name}
+            if isinstance(value, dict)
+            else value[:name] + value[name + 1 :]
+        )
         for other in altered(part):
             yield {**value, name: other} if isinstance(value, dict) else [*value[:name], other, *value[name + 1 :]]
 
@@ -48,8 +55,18 @@ def altered_tensors(tensors: dict[str, np.ndarray]) -> Iterator[dict[str, np.nda
     """Tensors with each of them missing, of another shape, type or content."""
     for name, value in tensors.items():
         yield {key: kept for key, kept in tensors.items() if key != name}
-        others = [value[:0], value[:-1], np.concatenate([value, value]), value[..., None], value.reshape(-1), np.zeros((), value.dtype)]
-        others += [value.astype(np.int64), np.full_like(value, np.nan) if value.dtype.kind == "f" else np.full_like(value, 100)]
+        others = [
+            value[:0],
+            value[:-1],
+            np.concatenate([value, value]),
+            value[..., None],
+            value.reshape(-1),
+            np.zeros((), value.dtype),
+        ]
+        others += [
+            value.astype(np.int64),
+            np.full_like(value, np.nan) if value.dtype.kind == "f" else np.full_like(value, 100),
+        ]
         for other in others:
             yield {**tensors, name: np.ascontiguousarray(other)}
     yield {"x": np.zeros(1)}

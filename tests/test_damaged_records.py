@@ -1,4 +1,5 @@
-"""Records that the program wrote itself, damaged where no manifest vouches for them: whoever reads them ends in words, or does not mind."""
+"""Records that the program wrote itself, damaged where no manifest vouches for them: whoever reads them ends in words,
+or does not mind."""
 
 from __future__ import annotations
 
@@ -41,7 +42,9 @@ CASES = 24
 def begun(folder: Path) -> Path:
     """A run that was interrupted."""
     small_run(folder)
-    state = {name: value for name, value in store.read_json(folder / "run.json").items() if name not in ("check", "sealed")}
+    state = {
+        name: value for name, value in store.read_json(folder / "run.json").items() if name not in ("check", "sealed")
+    }
     store.write_json(folder / "run.json", {**state, "state": "interrupted"})
     (folder / "manifest.json").unlink()
     return folder / "run.json"
@@ -69,11 +72,17 @@ def observed(folder: Path) -> Path:
 
 def chain(folder: Path) -> Path:
     ledger = pipeline._Ledger(folder, {"verb": "run", "source": "city", **result_settings(RunConfig())}, {})
-    ledger._steps = {"fit": {"state": "complete", "seconds": 1.5, "processor_s": 2.5, "peak_bytes": 3, "written_bytes": 4}}
+    ledger._steps = {
+        "fit": {"state": "complete", "seconds": 1.5, "processor_s": 2.5, "peak_bytes": 3, "written_bytes": 4}
+    }
     ledger._report = {"key": "k", "sha256": "s"}
     folder.mkdir()
     ledger.save("complete")
-    record = {name: value for name, value in store.read_json(folder / "run.json").items() if name not in ("check", "environment")}
+    record = {
+        name: value
+        for name, value in store.read_json(folder / "run.json").items()
+        if name not in ("check", "environment")
+    }
     store.write_json(folder / "run.json", record)
     return folder / "run.json"
 
@@ -119,7 +128,10 @@ READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "interrupted run, replaced": (begun, lambda folder: small_run(folder, 2, overwrite=True)),
     "fit to go on with": (fitted, lambda folder: StartFit.of_folder(folder, {"scene": "1", "fused": "2"})),
     "fused clouds": (fused, read_fused),
-    "fused clouds of an edit": (fused, lambda folder: edit._report_of(RunParts({}, None, folder, True), read_fused(folder))),
+    "fused clouds of an edit": (
+        fused,
+        lambda folder: edit._report_of(RunParts({}, None, folder, True), read_fused(folder)),
+    ),
     "observations": (observed, lambda folder: read_observations(folder / "views" / "front_recorded")[0]),
     "whole run": (chain, read_chain),
     "whole run on a page": (lambda folder: run_of(folder) / "run.json", gallery.read_shown),
@@ -128,7 +140,10 @@ READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "scores in a report": (scored, lambda folder: report.write_page(folder, [])),
     "times in a report": (functools.partial(scored, name="run.json"), lambda folder: report.write_page(folder, [])),
     "checkpoint": (saved_checkpoint, checkpoint.latest),
-    "log of a training": (written("log.jsonl", LOSSES), lambda folder: plot_losses(folder / "log.jsonl", folder / "loss.png")),
+    "log of a training": (
+        written("log.jsonl", LOSSES),
+        lambda folder: plot_losses(folder / "log.jsonl", folder / "loss.png"),
+    ),
     "model folder": (written("model.json", MODEL), convert.own_names),
     "boxes": (written("boxes.json", BOXES), lambda folder: read_detections(folder / "boxes.json")),
 }

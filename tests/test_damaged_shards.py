@@ -16,7 +16,16 @@ from mudg.diffusion.clips import shards as clip_shards
 from mudg.steps.learn import Learn
 
 Arrays = dict[str, np.ndarray]
-NOT_FINITE = ("depth", "sparse_depth", "render_depth", "world_from_cam", "intrinsics", "shift_m", "fine_depth", "fine_world_from_cam")
+NOT_FINITE = (
+    "depth",
+    "sparse_depth",
+    "render_depth",
+    "world_from_cam",
+    "intrinsics",
+    "shift_m",
+    "fine_depth",
+    "fine_world_from_cam",
+)
 NO_CLASS = ("semantics", "ids", "backdrop_ids", "render_ids", "fine_semantics", "fine_ids")
 
 
@@ -34,7 +43,9 @@ DAMAGE: dict[str, Callable[[bytes, Arrays], bytes]] = {
     "header of another size": lambda content, _: content.replace(b"[2,4,3,32,48]", b"[2,4,3,48,32]", 1),
     "header longer than the file": lambda content, _: b"\xff" * 7 + content[7:],
     "no array": lambda _, __: save({}),
-    "fewer frames": lambda _, a: save({n: v[:, :2].copy() if v.ndim > 2 and v.shape[1] == 4 else v for n, v in a.items()}),
+    "fewer frames": lambda _, a: save(
+        {n: v[:, :2].copy() if v.ndim > 2 and v.shape[1] == 4 else v for n, v in a.items()}
+    ),
     "no clip": lambda _, a: save({n: v[:0].copy() for n, v in a.items()}),
     "without its patches' place in two numbers": lambda _, a: save({**a, "fine_place": a["fine_place"][:, :2].copy()}),
 }

@@ -26,8 +26,15 @@ from mudg.gaussians.nodes import RigidNode, StaticNode
 from mudg.gaussians.settings import FitConfig
 
 SETTINGS = DensifySettings(
-    start=10, stop=100, every=10, static_gradient=1.0, object_gradient=1.0, split_above_m=0.5, max_rows=1000, growth=10.0
-)  # fmt: skip
+    start=10,
+    stop=100,
+    every=10,
+    static_gradient=1.0,
+    object_gradient=1.0,
+    split_above_m=0.5,
+    max_rows=1000,
+    growth=10.0,
+)
 
 
 def scene(static: int = 6, moving: int = 4, scale_m: float = 0.1, opacity: float = 0.5) -> SceneModel:
@@ -36,10 +43,13 @@ def scene(static: int = 6, moving: int = 4, scale_m: float = 0.1, opacity: float
     quats = torch.zeros(count, 4)
     quats[:, 0] = 1
     columns = {
-        "means": torch.stack([number * 0.01, torch.zeros(count), torch.zeros(count)], 1), "quats": quats,
-        "log_scales": torch.full((count, 3), math.log(scale_m)), "logits": torch.full((count,), math.log(opacity / (1 - opacity))),
-        "sh_dc": number[:, None, None].repeat(1, 1, 3), "semantics": number[:, None].repeat(1, 2),
-    }  # fmt: skip
+        "means": torch.stack([number * 0.01, torch.zeros(count), torch.zeros(count)], 1),
+        "quats": quats,
+        "log_scales": torch.full((count, 3), math.log(scale_m)),
+        "logits": torch.full((count,), math.log(opacity / (1 - opacity))),
+        "sh_dc": number[:, None, None].repeat(1, 1, 3),
+        "semantics": number[:, None].repeat(1, 2),
+    }
     owner = torch.tensor([0] * static + [1] * moving, dtype=torch.int32)
     times, poses = [0.0, 1.0], [geometry.yaw_matrix(0.0), geometry.yaw_matrix(0.0, (1, 0, 0))]
     node = RigidNode("car", "car", (4.0, 2.0, 1.5), times, poses)
@@ -122,7 +132,9 @@ def test_the_budget_takes_the_loudest_first():
     model = scene(static=10, moving=0)
     stats = stats_for(model, [])
     stats.gradient += torch.arange(10.0) + 3
-    settings = DensifySettings(start=1, stop=9, every=1, static_gradient=1.0, max_rows=12, growth=10.0, split_above_m=0.5)
+    settings = DensifySettings(
+        start=1, stop=9, every=1, static_gradient=1.0, max_rows=12, growth=10.0, split_above_m=0.5
+    )
     densify(model, stats, 1, settings, 0)
     assert sorted(model.table["sh_dc"][:, 0, 0].tolist())[-4:] == [8, 8, 9, 9]
     assert len(model.table) == 12
@@ -131,7 +143,9 @@ def test_the_budget_takes_the_loudest_first():
 
 def test_thresholds_differ_by_kind_of_node():
     model = scene()
-    settings = DensifySettings(start=1, stop=9, every=1, static_gradient=5.0, object_gradient=1.0, max_rows=99, growth=10.0)
+    settings = DensifySettings(
+        start=1, stop=9, every=1, static_gradient=5.0, object_gradient=1.0, max_rows=99, growth=10.0
+    )
     densify(model, stats_for(model, [2, 7]), 1, settings, 0)
     assert model.counts() == [6, 5]
 

@@ -1,4 +1,5 @@
-"""Depth by networks from folders: the alignment to LiDAR with known answers, and each kind against the package that it comes from."""
+"""Depth by networks from folders: the alignment to LiDAR with known answers, and each kind against the package that it
+comes from."""
 
 from __future__ import annotations
 
@@ -44,7 +45,7 @@ def street(height: int = 48, width: int = 72, measured: float = 0.2, seed: int =
     return DepthInput(rgb, np.where(seen, depth, np.float32(np.nan)), depth.copy(), sky), depth
 
 
-# --- alignment --------------------------------------------------------------------------------------------------------
+# --- alignment ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -61,7 +62,7 @@ def test_an_affine_map_of_the_truth_comes_back_as_the_truth(
     bad = np.isfinite(measured) & (rng.uniform(size=truth.shape) < wrong)
     measured[bad] = rng.uniform(1, 90, int(bad.sum()))
     given = DepthInput(given.rgb, measured, given.filled, given.sky)
-    prediction = Prediction((scale * goal + shift).astype(np.float32), space)  # type: ignore[arg-type]
+    prediction = Prediction((scale * goal + shift).astype(np.float32), space)
     found = align_to_lidar(prediction, given, RULES)
     assert found.fit.used
     assert found.dense is not None
@@ -71,7 +72,8 @@ def test_an_affine_map_of_the_truth_comes_back_as_the_truth(
 
 
 def test_wrong_returns_from_behind_do_not_pull() -> None:
-    """Two fifths of the returns lie 40 % behind the surface, as what shows through gaps does: noise that has one sign."""
+    """Two fifths of the returns lie 40 % behind the surface, as what shows through gaps does: noise that has one
+    sign."""
     given, truth = street()
     measured = given.measured.copy()
     bad = np.isfinite(measured) & (np.random.default_rng(2).uniform(size=truth.shape) < 0.4)
@@ -121,7 +123,7 @@ def test_the_map_for_the_network_has_no_holes_and_no_sky() -> None:
         lidar_cue(DepthInput(given.rgb, given.measured, np.full_like(truth, np.nan), given.sky))
 
 
-# --- folders ----------------------------------------------------------------------------------------------------------
+# --- folders --------------------------------------------------------------------------------------
 
 
 def test_what_is_missing_or_wrong_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,8 +152,12 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, monkeypatch: pytest.M
     with pytest.raises(InputError, match="another kind"):
         kind_of(tmp_path / "d")
     assert set(KINDS) == {
-        "prompt_depth_anything", "depth_anything", "MarigoldDepthPipeline", "MarigoldPipeline", "depthlab",
-    }  # fmt: skip
+        "prompt_depth_anything",
+        "depth_anything",
+        "MarigoldDepthPipeline",
+        "MarigoldPipeline",
+        "depthlab",
+    }
 
 
 @real_packages

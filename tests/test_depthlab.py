@@ -1,4 +1,5 @@
-"""DepthLab: the conversion of its published files, what its networks are given, and its denoising against a twin written out."""
+"""DepthLab: the conversion of its published files, what its networks are given, and its denoising against a twin
+written out."""
 
 from __future__ import annotations
 
@@ -53,8 +54,11 @@ def converted(published: tuple[Path, dict[str, Any]], tmp_path_factory: pytest.T
     to = tmp_path_factory.mktemp("weights") / "depthlab"
     conversion.convert_folder(published[0], to, None, 20_000)
     assert json.loads((to / "model.json").read_text())["sampling"] == {
-        "processing_px": 768, "steps": 50, "strength": 0.8, "normalize_scale": 1.0,
-    }  # fmt: skip
+        "processing_px": 768,
+        "steps": 50,
+        "strength": 0.8,
+        "normalize_scale": 1.0,
+    }
     return describe(to, sampling={"processing_px": 48, "steps": 5, "strength": 0.8, "normalize_scale": 1.0})
 
 
@@ -65,7 +69,7 @@ def describe(folder: Path, **other: object) -> Path:
     return folder
 
 
-# --- conversion -------------------------------------------------------------------------------------------------------
+# --- conversion -----------------------------------------------------------------------------------
 
 
 def test_conversion_keeps_every_value(published: tuple[Path, dict[str, Any]], converted: Path) -> None:
@@ -95,7 +99,8 @@ def same(found: dict[str, Tensor], expected: dict[str, Tensor]) -> bool:
 
 
 def test_files_of_other_ages_give_the_same(published: tuple[Path, dict[str, Any]], tmp_path: Path) -> None:
-    """CLIP as a pickle, with the table that it once held and a default said twice; the autoencoder's attention under its old names."""
+    """CLIP as a pickle, with the table that it once held and a default said twice; the autoencoder's attention under
+    its old names."""
     folder, made = tmp_path / "copy", published[1]
     shutil.copytree(published[0], folder)
     clip = made["clip"].state_dict()
@@ -175,22 +180,37 @@ def json_edit(file: str, **values: object) -> Callable[[Path], None]:
 
 
 BAD = {
-    "a missing file": (lambda f: (f / "DepthLab" / "reference_unet.pth").unlink(), r"missing[\s\S]*reference_unet\.pth"),
-    "no base": (lambda f: (f / "marigold-depth-v1-0" / "model_index.json").unlink(), r"is missing[\s\S]*marigold-depth-v1-0"),
+    "a missing file": (
+        lambda f: (f / "DepthLab" / "reference_unet.pth").unlink(),
+        r"missing[\s\S]*reference_unet\.pth",
+    ),
+    "no base": (
+        lambda f: (f / "marigold-depth-v1-0" / "model_index.json").unlink(),
+        r"is missing[\s\S]*marigold-depth-v1-0",
+    ),
     "two encoders": (lambda f: shutil.copytree(f / "CLIP", f / "CLIP2"), r"more than once[\s\S]*CLIP, CLIP2"),
     "no encoder weights": (lambda f: (f / "CLIP" / "model.safetensors").unlink(), "pytorch_model.bin"),
     "code": (edited("mapping_layer.pth", lambda s: s.update(x=Hostile())), r"was not loaded[\s\S]*mkdir"),
     "a missing tensor": (edited("denoising_unet.pth", lambda s: s.pop("conv_out.bias")), r"1 missing: conv_out\.bias"),
-    "an unknown tensor": (edited("reference_unet.pth", lambda s: s.update({"conv_out.bias": torch.ones(4)})),
-                          r"1 unexpected: conv_out\.bias"),
-    "another shape": (edited("denoising_unet.pth", lambda s: s.update({"conv_in.weight": torch.ones(8, 8, 3, 3)})),
-                      r"conv_in\.weight \(8, 8, 3, 3\) instead of \(8, 12, 3, 3\)"),
+    "an unknown tensor": (
+        edited("reference_unet.pth", lambda s: s.update({"conv_out.bias": torch.ones(4)})),
+        r"1 unexpected: conv_out\.bias",
+    ),
+    "another shape": (
+        edited("denoising_unet.pth", lambda s: s.update({"conv_in.weight": torch.ones(8, 8, 3, 3)})),
+        r"conv_in\.weight \(8, 8, 3, 3\) instead of \(8, 12, 3, 3\)",
+    ),
     "no number": (edited("mapping_layer.pth", lambda s: s["mapping_layer.bias"].fill_(math.nan)), "not finite"),
-    "a later schedule": (json_edit("marigold-depth-v1-0/scheduler/scheduler_config.json", rescale_betas_zero_snr=True),
-                         "later Marigold"),
+    "a later schedule": (
+        json_edit("marigold-depth-v1-0/scheduler/scheduler_config.json", rescale_betas_zero_snr=True),
+        "later Marigold",
+    ),
     "another scale": (json_edit("marigold-depth-v1-0/vae/config.json", scaling_factor=0.13), "scaling_factor"),
-    "no such network": (json_edit("marigold-depth-v1-0/unet/config.json", down_block_types=["Odd", "Odd"]), "as it is described"),
-}  # fmt: skip
+    "no such network": (
+        json_edit("marigold-depth-v1-0/unet/config.json", down_block_types=["Odd", "Odd"]),
+        "as it is described",
+    ),
+}
 
 
 @pytest.mark.parametrize("name", BAD)
@@ -235,16 +255,19 @@ def test_a_converted_folder_that_changed_is_refused(converted: Path, tmp_path: P
 
 def test_packages_that_are_missing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     told = {
-        "kind": "depthlab", "schema": 1, "scheduler": {}, "parts": {n: {"config": {}, "files": {}} for n in depthlab.PARTS},
+        "kind": "depthlab",
+        "schema": 1,
+        "scheduler": {},
+        "parts": {n: {"config": {}, "files": {}} for n in depthlab.PARTS},
         "sampling": {"processing_px": 48, "steps": 5, "strength": 0.8, "normalize_scale": 1},
-    }  # fmt: skip
+    }
     (tmp_path / "model.json").write_text(json.dumps(told))
     tiny_networks.hide(monkeypatch, "diffusers")
     with pytest.raises(ResourceError, match=r"mudg\[models\]"):
         load_depth_network(tmp_path)
 
 
-# --- what the networks are given --------------------------------------------------------------------------------------
+# --- what the networks are given ------------------------------------------------------------------
 
 
 def test_known_depth_at_another_size_is_the_nearest_return_there() -> None:
@@ -312,7 +335,7 @@ def test_the_image_encoders_image_is_the_packages(height: int, width: int) -> No
     np.testing.assert_allclose(clip_crop(rgb, 224).numpy(), expected.numpy(), atol=1e-5)
 
 
-# --- denoising --------------------------------------------------------------------------------------------------------
+# --- denoising ------------------------------------------------------------------------------------
 
 
 def attend(attn: Any, x: Tensor, context: Tensor) -> Tensor:
@@ -326,7 +349,8 @@ def attend(attn: Any, x: Tensor, context: Tensor) -> Tensor:
 
 
 def spelled_out(unet: Any, bank: dict[str, Tensor], *, reads: bool) -> Any:
-    """A U-Net whose transformer blocks are written out: one that fills the bank, or one whose second half of a batch reads it."""
+    """A U-Net whose transformer blocks are written out: one that fills the bank, or one whose second half of a batch
+    reads it."""
     for name, block in unet.named_modules():
         if type(block).__name__ != "BasicTransformerBlock":
             continue

@@ -24,7 +24,7 @@ CAMERAS = {"front": "front", "front_left": "front_left"}
 
 
 def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["dgp"](source, out, ImportOptions(**options))  # type: ignore[arg-type]
+    return IMPORTERS["dgp"](source, out, ImportOptions(**options))
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +91,7 @@ BROKEN: dict[str, tuple[str, Callable[[dict[str, Any]], object], str]] = {
 def test_broken_records_are_refused_in_words(name: str, folder: Path, tmp_path: Path) -> None:
     file, change, words = BROKEN[name]
     copy = shutil.copytree(folder, tmp_path / "scene")
-    made.edit(copy / file, change)  # type: ignore[arg-type]
+    made.edit(copy / file, change)
     roundtrip.assert_refused(ingest, copy, tmp_path / "out", words)
 
 
@@ -159,8 +159,12 @@ def test_real_scene(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
             size = (frame.view.camera.width, frame.view.camera.height)
             counts[frame.view.camera.name] = int(((z > 0.5) & (uv >= 0).all(1) & (uv < size).all(1)).sum())
     assert counts == {
-        "camera_01": 5562, "camera_05": 12691, "camera_06": 12210, "camera_07": 11174, "camera_08": 10431,
+        "camera_01": 5562,
+        "camera_05": 12691,
+        "camera_06": 12210,
+        "camera_07": 11174,
+        "camera_08": 10431,
         "camera_09": 9770,
-    }  # fmt: skip
+    }
     nearest = min(scene.tracks, key=lambda t: float(np.linalg.norm(invert(t.world_from_object[1])[:3, 3])))
     assert nearest.label in ("car", "truck")

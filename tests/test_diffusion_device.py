@@ -1,4 +1,5 @@
-"""Diffusion models, their training and the networks of annotate on a device: the same numbers, and nothing crosses on the way."""
+"""Diffusion models, their training and the networks of annotate on a device: the same numbers, and nothing crosses on
+the way."""
 
 from __future__ import annotations
 
@@ -50,7 +51,8 @@ from mudg.steps.learn import Learn
 from mudg.steps.synthesize import Synthesize
 
 NEAR = 1e-4
-"""Relative to the largest value: attention sums in another order there. Measured: 1e-7 for the small model, 2e-5 with guidance 7.5."""
+"""Relative to the largest value: attention sums in another order there. Measured: 1e-7 for the small model, 2e-5 with
+guidance 7.5."""
 
 
 def far_apart(one: torch.Tensor, other: torch.Tensor) -> float:
@@ -98,7 +100,7 @@ def small():
     return model
 
 
-# sampling -------------------------------------------------------------------------------------------------------------
+# sampling -----------------------------------------------------------------------------------------
 
 
 def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(small):
@@ -114,12 +116,16 @@ def test_a_clip_of_the_small_model_is_the_same_on_a_device_and_crosses_once(smal
     noise = [sum(clip.latents[m].numel() for m in clip.latents)] * 3  # a draw at the start and one between steps
     assert sorted(crossed.to_device) == sorted([*(x.numel() for c in (condition, fine) for x in tensors_of(c)), *noise])
     names = ("rgb", "depth", "semantics", "confidence", "log_error")
-    back = [getattr(c, name).numel() for c in (clip, finished) for name in names] + [z.numel() for z in clip.latents.values()]
+    back = [getattr(c, name).numel() for c in (clip, finished) for name in names] + [
+        z.numel() for z in clip.latents.values()
+    ]
     fits = [4] * len(clip.depth_fits)
     assert sorted(crossed.to_host) == sorted(back + fits)
 
 
-@pytest.mark.parametrize("changes", [{"sampler": "dpm_solver", "steps": 4}, pytest.param({"align": False}, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    "changes", [{"sampler": "dpm_solver", "steps": 4}, pytest.param({"align": False}, marks=pytest.mark.slow)]
+)
 def test_other_requests_and_a_second_window_too(small, changes):
     condition = made_up_clip(2).condition
     first = generated(small, condition, SampleRequest(1, 5))
@@ -167,7 +173,7 @@ def test_depth_is_fitted_alike_on_a_device():
     assert fit.used and fit.residual == pytest.approx(here.residual, rel=1e-9)
 
 
-# training -------------------------------------------------------------------------------------------------------------
+# training -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +228,7 @@ def test_a_published_type_model_learns_on_a_device(tmp_path):
     assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 1e-3
 
 
-# verbs ----------------------------------------------------------------------------------------------------------------
+# verbs --------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -236,17 +242,27 @@ def street(tmp_path_factory):
 @pytest.mark.slow
 def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
     files.save(small, tmp_path / "model", "", {})
-    config = SynthesizeConfig(shifts_m=(1.0, -1.0), model=str(tmp_path / "model"), steps=2, device="cpu", precision="float32", processes=1)
+    config = SynthesizeConfig(
+        shifts_m=(1.0, -1.0), model=str(tmp_path / "model"), steps=2, device="cpu", precision="float32", processes=1
+    )
     here = Synthesize(scene=street / "scene", fused=street / "fuse", out=tmp_path / "here", settings=config).run()
     with pretend_device():
         elsewhere = replace(config, device="pretend", processes=0)
-        there = Synthesize(scene=street / "scene", fused=street / "fuse", out=tmp_path / "there", settings=elsewhere).run()
+        there = Synthesize(
+            scene=street / "scene", fused=street / "fuse", out=tmp_path / "there", settings=elsewhere
+        ).run()
         with pytest.raises(UsageError, match="one process makes all trajectories"):
             Synthesize(
-                scene=street / "scene", fused=street / "fuse", out=tmp_path / "more", settings=replace(elsewhere, processes=2)
+                scene=street / "scene",
+                fused=street / "fuse",
+                out=tmp_path / "more",
+                settings=replace(elsewhere, processes=2),
             ).run()
         again = Synthesize(
-            scene=street / "scene", fused=street / "fuse", out=tmp_path / "here", settings=replace(elsewhere, processes=1)
+            scene=street / "scene",
+            fused=street / "fuse",
+            out=tmp_path / "here",
+            settings=replace(elsewhere, processes=1),
         ).run()
     assert again == here  # where a result was computed is no part of what it is
     for name in ("front_shift+1.0", "front_shift-1.0"):
@@ -258,16 +274,23 @@ def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
 
 
 def in_float16(folder):
-    return SynthesizeConfig(shifts_m=(1.0,), model=str(write_tiny(folder)), steps=2, guidance=1.0, device="cpu", precision="float16")
+    return SynthesizeConfig(
+        shifts_m=(1.0,), model=str(write_tiny(folder)), steps=2, guidance=1.0, device="cpu", precision="float16"
+    )
 
 
 def test_float16_is_refused_on_the_cpu_and_for_other_models(street, tmp_path):
     config, given, out = in_float16(tmp_path), (street / "scene", street / "fuse"), tmp_path / "out"
-    with pytest.raises(UsageError, match=r"float16 is for published-type models on CUDA devices(.|\n)*a published-type model on cpu"):
+    with pytest.raises(
+        UsageError, match=r"float16 is for published-type models on CUDA devices(.|\n)*a published-type model on cpu"
+    ):
         Synthesize(scene=given[0], fused=given[1], out=out, settings=config).run()
     with pretend_device(), pytest.raises(UsageError, match="another model on pretend"):
         Synthesize(
-            scene=given[0], fused=given[1], out=out, settings=replace(config, model="embedded-tiny", guidance=None, device="pretend")
+            scene=given[0],
+            fused=given[1],
+            out=out,
+            settings=replace(config, model="embedded-tiny", guidance=None, device="pretend"),
         ).run()
     assert not out.exists()
 
@@ -275,7 +298,9 @@ def test_float16_is_refused_on_the_cpu_and_for_other_models(street, tmp_path):
 @pytest.mark.slow
 def test_weights_and_views_of_published_type_models_are_in_float16_on_cards(street, tmp_path):
     config, given, out = in_float16(tmp_path), (street / "scene", street / "fuse"), tmp_path / "out"
-    here = Synthesize(scene=given[0], fused=given[1], out=tmp_path / "here", settings=replace(config, precision="float32")).run()
+    here = Synthesize(
+        scene=given[0], fused=given[1], out=tmp_path / "here", settings=replace(config, precision="float32")
+    ).run()
     with pretend_device():
         assert loading.load_any(replace(config, device="pretend")).dtype == torch.float16
         there = Synthesize(scene=given[0], fused=given[1], out=out, settings=replace(config, device="pretend")).run()
@@ -289,9 +314,13 @@ def test_the_shipped_labeller_on_a_device_writes_the_same_labels(street, tmp_pat
     config = AnnotateConfig(device="cpu", processes=1, depth=False)
     scenes = [read_scene(Annotate(scene=street / "scene", out=tmp_path / "here", settings=config).run())]
     with pretend_device(), copies() as crossed:
-        scenes.append(read_scene(Annotate(
-            scene=street / "scene", out=tmp_path / "there", settings=replace(config, device="pretend")
-        ).run()))
+        scenes.append(
+            read_scene(
+                Annotate(
+                    scene=street / "scene", out=tmp_path / "there", settings=replace(config, device="pretend")
+                ).run()
+            )
+        )
     for one, other in zip(*(scene.frames for scene in scenes), strict=True):
         here, there = (read_label(scene, f, "semantics") for scene, f in zip(scenes, (one, other)))
         assert np.mean(here != there) < 1e-2
@@ -317,7 +346,9 @@ class Plain(torch.nn.Module):
 def test_pretrained_networks_compute_on_the_device_and_answer_on_the_cpu():
     rng = np.random.default_rng(0)
     rgb = rng.integers(0, 255, (20, 30, 3), np.uint8)
-    asked = DepthInput(rgb, np.full((20, 30), np.nan, np.float32), np.ones((20, 30), np.float32), np.zeros((20, 30), bool))
+    asked = DepthInput(
+        rgb, np.full((20, 30), np.nan, np.float32), np.ones((20, 30), np.float32), np.zeros((20, 30), bool)
+    )
     preparation = Preparation(20, 30, 1, True, (0.5,) * 3, (0.5,) * 3)
 
     def answers(place: Place):
@@ -340,13 +371,21 @@ def test_annotate_on_a_device_writes_the_same_labels(street, tmp_path):
     tiny_networks.segformer(tmp_path / "net")
     tiny_networks.depth_anything(tmp_path / "depth")
     config = AnnotateConfig(
-        labeller="network", weights=str(tmp_path / "net"), depth_network=str(tmp_path / "depth"), device="cpu", processes=1
+        labeller="network",
+        weights=str(tmp_path / "net"),
+        depth_network=str(tmp_path / "depth"),
+        device="cpu",
+        processes=1,
     )
     scenes = [read_scene(Annotate(scene=street / "scene", out=tmp_path / "here", settings=config).run())]
     with pretend_device():
-        scenes.append(read_scene(Annotate(
-            scene=street / "scene", out=tmp_path / "there", settings=replace(config, device="pretend")
-        ).run()))
+        scenes.append(
+            read_scene(
+                Annotate(
+                    scene=street / "scene", out=tmp_path / "there", settings=replace(config, device="pretend")
+                ).run()
+            )
+        )
     for one, other in zip(*(scene.frames for scene in scenes), strict=True):
         assert set(one.labels) == set(other.labels)
         classes, depth = (

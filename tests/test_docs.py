@@ -1,8 +1,9 @@
 """The documentation: examples run, and every flag, setting, path and link that a page names exists.
 
-A page's examples are its blocks marked ``console`` (lines that start with ``$``) and ``python``. A page stands alone: its examples make
-all that they read, in one folder that all pages share, so what two pages make in the same way is made once. The ``python`` blocks of a page
-share their names. One that needs something absent is preceded by a comment ``<!-- not run: reason -->``.
+A page's examples are its blocks marked ``console`` (lines that start with ``$``) and ``python``. A page stands alone:
+its examples make all that they read, in one folder that all pages share, so what two pages make in the same way is made
+once. The ``python`` blocks of a page share their names. One that needs something absent is preceded by a comment ``<!--
+not run: reason -->``.
 """
 
 from __future__ import annotations
@@ -29,19 +30,47 @@ FLAGS: dict[str, list[str]] = {
     for verb, flags in json.loads((REPOSITORY / "tests" / "house" / "cli.json").read_text(encoding="utf-8")).items()
 }
 
-FOREIGN_FLAGS = {"--nproc-per-node": "torchrun", "--nnodes": "torchrun", "--rdzv-conf": "torchrun", "--standalone": "torchrun",
-                 "--version": "mudg", "--dist": "pytest", "--help": "every verb", "--help-all": "mudg run, mudg demo",
-                 **dict.fromkeys(("--rm", "--network", "--gpus", "--build-arg", "--user"), "docker"),
-                 **dict.fromkeys(("--rdzv-backend", "--rdzv-endpoint", "--rdzv-id", "--max-restarts", "--signals-to-handle",
-                                  "--shutdown-timeout"), "torchrun"),
-                 **dict.fromkeys(("--nodes", "--ntasks-per-node", "--signal"), "sbatch")}  # fmt: skip
-FOLDERS = ("benchmarks fleet steps viewer scoring exporting editing diffusion baselines gaussians labels formats city scene networks "
-           "core native base bench docs tests tools build_backend src").split()
+FOREIGN_FLAGS = {
+    "--nproc-per-node": "torchrun",
+    "--nnodes": "torchrun",
+    "--rdzv-conf": "torchrun",
+    "--standalone": "torchrun",
+    "--version": "mudg",
+    "--dist": "pytest",
+    "--help": "every verb",
+    "--help-all": "mudg run, mudg demo",
+    **dict.fromkeys(("--rm", "--network", "--gpus", "--build-arg", "--user"), "docker"),
+    **dict.fromkeys(
+        (
+            "--rdzv-backend",
+            "--rdzv-endpoint",
+            "--rdzv-id",
+            "--max-restarts",
+            "--signals-to-handle",
+            "--shutdown-timeout",
+        ),
+        "torchrun",
+    ),
+    **dict.fromkeys(("--nodes", "--ntasks-per-node", "--signal"), "sbatch"),
+}
+FOLDERS = (
+    "benchmarks fleet steps viewer scoring exporting editing diffusion baselines gaussians labels formats city scene"
+    " networks core native base bench docs tests tools build_backend src"
+).split()
 GROUPS = "virtual loss densify poses objects appearance start optimizer compute network codec city".split()
 
 
 FILE_ENDINGS = tuple(".py .json .jsonl .yaml .txt .md .png .jpg .mp4 .html .pt .ckpt .safetensors".split())
-FOREIGN_NAMES = ("PromptDepthAnything", "DepthLab", "DynamiCrafter", "DeepSpeed", "SegFormer", "MergedPointCloud", "RayCluster", "RayJob")
+FOREIGN_NAMES = (
+    "PromptDepthAnything",
+    "DepthLab",
+    "DynamiCrafter",
+    "DeepSpeed",
+    "SegFormer",
+    "MergedPointCloud",
+    "RayCluster",
+    "RayJob",
+)
 
 
 SLOW = ("docs/bench_shift.md", "docs/paper_tables.md", "docs/results.md", "docs/training.md")
@@ -83,7 +112,7 @@ def has_example(text: str) -> bool:
     )
 
 
-# --- examples run -------------------------------------------------------------------------------------------------------
+# --- examples run ---------------------------------------------------------------------------------
 
 
 def run_command(command: str) -> None:
@@ -160,7 +189,7 @@ def test_a_broken_example_fails(broken: str, tmp_path: Path, monkeypatch: pytest
         run_page(broken, set())
 
 
-# --- what pages name exists ---------------------------------------------------------------------------------------------
+# --- what pages name exists -----------------------------------------------------------------------
 
 
 def code_in(text: str) -> Iterator[str]:
@@ -226,8 +255,13 @@ def unknown_names(text: str) -> list[str]:
 
 def unknown_paths(text: str) -> list[str]:
     """Files of the source tree that do not exist: Python and C++ paths, and folders that end in a slash."""
-    roots = (REPOSITORY, REPOSITORY / "src" / "mudg", REPOSITORY / "src", REPOSITORY / "docs",
-             REPOSITORY / "src" / "mudg" / "data")  # fmt: skip
+    roots = (
+        REPOSITORY,
+        REPOSITORY / "src" / "mudg",
+        REPOSITORY / "src",
+        REPOSITORY / "docs",
+        REPOSITORY / "src" / "mudg" / "data",
+    )
     names = {
         p.name for folder in ("src", "tests", "docs", "bench", "tools") for p in (REPOSITORY / folder).rglob("*.py")
     }
@@ -302,7 +336,9 @@ def test_the_numbers_of_the_readme_are_those_of_the_results() -> None:
         for cell, heading in zip(cells, ("| recorded path, held-out", "| 2 m |", "| 3 m |", "| 4 m |"), strict=True):
             if cell:
                 table = rows_after(results, heading)
-                column = table[heading.strip("| ") if heading.endswith("|") else "recorded path, held-out frames"].index(columns[measure])
+                column = table[
+                    heading.strip("| ") if heading.endswith("|") else "recorded path, held-out frames"
+                ].index(columns[measure])
                 assert table[method][column] == cell, f"{measure} of {method} ({heading}): README {cell}"
                 checked += 1
     assert checked == 39
@@ -328,12 +364,16 @@ def test_what_does_not_exist_is_found(tmp_path: Path) -> None:
     assert unknown_settings("`virtual.probabilty`") == ["virtual.probabilty"]
     assert not unknown_settings("`virtual.probability`")
     assert unknown_names("`losses.no_such` `NoSuch(a=1)` `SceneModel.no_such`") == [
-        "losses.no_such", "NoSuch(a=1)", "SceneModel.no_such",
-    ]  # fmt: skip
+        "losses.no_such",
+        "NoSuch(a=1)",
+        "SceneModel.no_such",
+    ]
     assert not unknown_names("`losses.object_map` `SceneModel.without_nodes` `run.json`")
     assert unknown_paths("`gaussians/no_such.py` `no_such.py` `diffusion/no_such/`") == [
-        "gaussians/no_such.py", "no_such.py", "diffusion/no_such/",
-    ]  # fmt: skip
+        "gaussians/no_such.py",
+        "no_such.py",
+        "diffusion/no_such/",
+    ]
     assert not unknown_paths("`gaussians/fit.py` `src/mudg/app.py` `diffusion/`")
     page = tmp_path / "page.md"
     page.write_text("# One head\n[a](other.md) [b](#one-head) [c](#two)", encoding="utf-8")

@@ -26,7 +26,9 @@ from mudg.steps.ingest import Ingest
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
 CPU = torch.device("cpu")
-USUAL = FitConfig(method="street_gaussians", iterations=4, semantics=False, start=StartConfig(gaussians=800), checkpoint_every=100)
+USUAL = FitConfig(
+    method="street_gaussians", iterations=4, semantics=False, start=StartConfig(gaussians=800), checkpoint_every=100
+)
 SMOOTH = replace(USUAL, drawing=DrawingConfig(antialias=True))
 
 
@@ -35,7 +37,9 @@ def prepared(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A scene of three frames and its clouds."""
     root = tmp_path_factory.mktemp("drawing")
     city = CityConfig(n_frames=3, width=72, height=48, cameras=("front",), lidar_azimuth_step_deg=1.0)
-    scene = Ingest(log="city", out=root / "scene", settings=IngestConfig(city=city, contact_sheet=False, test_every=0)).run()
+    scene = Ingest(
+        log="city", out=root / "scene", settings=IngestConfig(city=city, contact_sheet=False, test_every=0)
+    ).run()
     return scene, Fuse(scene=scene, out=root / "fuse", settings=FuseConfig()).run()
 
 
@@ -60,14 +64,19 @@ def test_renders_draw_as_the_fit_did(fits: dict[str, Path], prepared: tuple[Path
     model, view = fit.load_model(fits["smooth"]), read_scene(prepared[0]).frames[1].view
     assert raster_of(model) == RasterConfig(near_m=NEAR_M, antialias=True)
     gaussians = compose(model, view.time_s)
-    drawn = {smooth: rasterize(gaussians, view, RasterConfig(near_m=NEAR_M, antialias=smooth)).alpha for smooth in (False, True)}
+    drawn = {
+        smooth: rasterize(gaussians, view, RasterConfig(near_m=NEAR_M, antialias=smooth)).alpha
+        for smooth in (False, True)
+    }
     as_noted = rasterize(gaussians, view, raster_of(model)).alpha
     assert torch.equal(as_noted, drawn[True])
     assert not torch.equal(drawn[True], drawn[False])  # else this test shows nothing
     assert raster_of(fit.load_model(fits["usual"])) == RasterConfig(near_m=NEAR_M)
 
 
-def test_a_finished_fit_goes_on_only_as_it_was_drawn(fits: dict[str, Path], prepared: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_finished_fit_goes_on_only_as_it_was_drawn(
+    fits: dict[str, Path], prepared: tuple[Path, Path], tmp_path: Path
+) -> None:
     out = fitted(SMOOTH, prepared, tmp_path / "on", fits["smooth"])
     assert json.loads((out / "model.json").read_text())["facts"]["drawing"] == {"antialias": True}
     with pytest.raises(UsageError, match="drawn with other settings"):

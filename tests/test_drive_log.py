@@ -1,4 +1,5 @@
-"""Logs with sensors on their own clocks: choosing frames, the split, missing files, boxes brought to the sweeps' times."""
+"""Logs with sensors on their own clocks: choosing frames, the split, missing files, boxes brought to the sweeps'
+times."""
 
 from __future__ import annotations
 
@@ -28,7 +29,8 @@ def points(count: int = 3) -> SweepPoints:
 
 
 def made(folder: Path, *, offset_s: float = 0.03) -> DriveLog:
-    """Camera a at 10 Hz, b at 10 Hz a little later, c with one image only; sweeps at 20 Hz; the vehicle drives 10 m/s."""
+    """Camera a at 10 Hz, b at 10 Hz a little later, c with one image only; sweeps at 20 Hz; the vehicle drives 10
+    m/s."""
     folder.mkdir()
     Image.new("RGB", (32, 16), (9, 99, 199)).save(folder / "image.png")
 
@@ -53,8 +55,14 @@ def made(folder: Path, *, offset_s: float = 0.03) -> DriveLog:
 
 def test_nearest_index_gives_ties_to_the_earlier() -> None:
     assert nearest_index(np.array([0.0, 1.0, 4.0]), np.array([-5, 0.4, 0.5, 0.6, 2.5, 2.6, 99])).tolist() == [
-        0, 0, 0, 1, 1, 2, 2,
-    ]  # fmt: skip
+        0,
+        0,
+        0,
+        1,
+        1,
+        2,
+        2,
+    ]
     assert nearest_index(np.array([3.0]), np.array([-1.0, 9.0])).tolist() == [0, 0]
 
 
@@ -129,7 +137,7 @@ def test_stamps_in_another_unit_are_refused(stamp: int, per_second: int) -> None
     common.check_epoch(np.array([1_532_402_927 * per_second, 1_532_402_947 * per_second]), per_second, "table")
 
 
-# --- tracks ---------------------------------------------------------------------------------------------------------
+# --- tracks ---------------------------------------------------------------------------------------
 
 
 def tracks_of(*keys: tuple[float, float], max_gap_s: float = 1.0) -> tuple[list[Track], list[str]]:
@@ -206,7 +214,7 @@ def test_clip_keeps_one_key_beyond_each_end() -> None:
     kept = clip_track(track, 1.2, 2.0)
     assert kept is not None
     assert kept.times_s.tolist() == [1.0, 1.5, 2.0]
-    assert clip_track(track, 1.2, 2.1).times_s.tolist() == [1.0, 1.5, 2.0, 2.5]  # type: ignore[union-attr]
+    assert clip_track(track, 1.2, 2.1).times_s.tolist() == [1.0, 1.5, 2.0, 2.5]
     assert clip_track(track, 4.1, 5.0) is None
     assert clip_track(track, -3.0, -0.1) is None
 
@@ -219,7 +227,8 @@ def test_unknown_categories_keep_their_last_word() -> None:
 
 
 def drawn(speed: float, delays: list[float], x0: float = 20.0) -> tuple[Track, list[SweepPoints]]:
-    """A car along x, boxes drawn around returns taken ``delays`` after each sweep's time; sweeps every 0.1 s at the origin."""
+    """A car along x, boxes drawn around returns taken ``delays`` after each sweep's time; sweeps every 0.1 s at the
+    origin."""
     poses, sweeps = [], []
     for number, late in enumerate(delays):
         x = x0 + speed * (0.1 * number + late)

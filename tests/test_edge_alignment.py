@@ -1,4 +1,5 @@
-"""LiDAR against image edges: the given calibration is told from one turned by a degree, on cities and on a real drive."""
+"""LiDAR against image edges: the given calibration is told from one turned by a degree, on cities and on a real
+drive."""
 
 from __future__ import annotations
 

@@ -45,7 +45,9 @@ from mudg.steps.settings.presets import DEMO_CITY
 SIZE = (4.0, 2.0, 1.5)
 
 
-def straight(speed: float = 10.0, seconds: float = 4.0, rate: float = 10.0, y: float = 0.0, start: float = 0.0) -> Motion:
+def straight(
+    speed: float = 10.0, seconds: float = 4.0, rate: float = 10.0, y: float = 0.0, start: float = 0.0
+) -> Motion:
     """Along x, box centre 0.75 m above z = 0."""
     times = np.arange(round(seconds * rate) + 1) / rate
     return Motion.recorded(times, np.stack([geometry.yaw_matrix(0.0, (start + speed * t, y, 0.75)) for t in times]))
@@ -57,7 +59,7 @@ def slope(rise: float = 0.1) -> HeightMap:
     return HeightMap.from_points(np.stack([x, y, rise * y], -1).reshape(-1, 3))
 
 
-# -- paths ---------------------------------------------------------------------------------------------------------------
+# -- paths -----------------------------------------------------------------------------------------
 
 
 def test_a_displacement_at_all_times_is_exact() -> None:
@@ -168,18 +170,23 @@ def test_angles_wrap_around() -> None:
     assert edit.azimuths(geometry.yaw_matrix(math.pi / 2)[None], np.array([[0.0, 5, 0]]))[0] == pytest.approx(0.0)
 
 
-# -- fitted scenes -------------------------------------------------------------------------------------------------------
+# -- fitted scenes ---------------------------------------------------------------------------------
 
 
-def gaussians(count: int, seed: int, center: tuple[float, float, float], spread: float, train_id: int) -> dict[str, torch.Tensor]:
+def gaussians(
+    count: int, seed: int, center: tuple[float, float, float], spread: float, train_id: int
+) -> dict[str, torch.Tensor]:
     g = torch.Generator().manual_seed(seed)
     logits = torch.full((count, 3), -5.0)
     logits[:, (ID["road"], ID["sky"], ID["car"]).index(train_id)] = 5.0
     return {
-        "means": torch.randn(count, 3, generator=g) * spread + torch.tensor(center), "quats": torch.randn(count, 4, generator=g),
-        "log_scales": torch.randn(count, 3, generator=g) * 0.2 - 1.5, "logits": torch.full((count,), 2.0),
-        "sh_dc": torch.randn(count, 1, 3, generator=g), "semantics": logits,
-    }  # fmt: skip
+        "means": torch.randn(count, 3, generator=g) * spread + torch.tensor(center),
+        "quats": torch.randn(count, 4, generator=g),
+        "log_scales": torch.randn(count, 3, generator=g) * 0.2 - 1.5,
+        "logits": torch.full((count,), 2.0),
+        "sh_dc": torch.randn(count, 1, 3, generator=g),
+        "semantics": logits,
+    }
 
 
 def toy(kind: type[RigidNode] = RigidNode) -> SceneModel:
@@ -190,11 +197,15 @@ def toy(kind: type[RigidNode] = RigidNode) -> SceneModel:
     ground["sh_dc"][:] = (0.4 - 0.5) / SH_C0
     parts = [ground, gaussians(40, 2, (12, -4, 0.8), 0.3, ID["car"]), gaussians(50, 3, (0, 0, 0), 0.4, ID["car"])]
     owner = torch.tensor([0] * 640 + [1] * 50, dtype=torch.int32)
-    table = Table({name: torch.cat([p[name] for p in parts]) for name in parts[0]},
-                  {"node": owner, CERTAINTY: torch.full((690,), 0.5, dtype=torch.float16)})  # fmt: skip
+    table = Table(
+        {name: torch.cat([p[name] for p in parts]) for name in parts[0]},
+        {"node": owner, CERTAINTY: torch.full((690,), 0.5, dtype=torch.float16)},
+    )
     motion = straight(5.0, 2.0, start=8.0)
     node = kind("car-1", "car", SIZE, motion.times_s, motion.poses)
-    return SceneModel(table, (StaticNode(), node), SkyNode.uniform(16), (ID["road"], ID["sky"], ID["car"]), 0, {"method": "test"})
+    return SceneModel(
+        table, (StaticNode(), node), SkyNode.uniform(16), (ID["road"], ID["sky"], ID["car"]), 0, {"method": "test"}
+    )
 
 
 def view(time_s: float = 0.5) -> View:
@@ -253,7 +264,10 @@ def test_removing_an_object_leaves_the_picture_without_it() -> None:
     model = toy()
     made = carried(model, "- remove: {ids: [car-1]}")
     rows = model.table.labels["node"] == 0
-    bare = Table({k: v.detach()[rows] for k, v in model.table.columns.items()}, {k: v[rows] for k, v in model.table.labels.items()})
+    bare = Table(
+        {k: v.detach()[rows] for k, v in model.table.columns.items()},
+        {k: v[rows] for k, v in model.table.labels.items()},
+    )
     alone = SceneModel(bare, (StaticNode(),), model.sky, model.classes, 0, {})
     assert torch.equal(picture(made), picture(alone))
     assert made.node_names() == ()
@@ -290,7 +304,13 @@ def test_a_parked_car_is_cut_out_of_the_background() -> None:
         plan = planned(f"- move: {{id: {name}, along_m: 1, ground: false}}", hidden)
         with pytest.raises(UsageError, match=name):
             edited_model(model, plan)
-    empty = Track("nobody", "car", np.array(SIZE), parked().times_s, parked().world_from_object @ geometry.yaw_matrix(0, (0, 0, 50)))
+    empty = Track(
+        "nobody",
+        "car",
+        np.array(SIZE),
+        parked().times_s,
+        parked().world_from_object @ geometry.yaw_matrix(0, (0, 0, 50)),
+    )
     with pytest.raises(UsageError, match="nothing of the fitted background"):
         edited.cut_out(model, empty)
 
@@ -322,8 +342,13 @@ def test_an_asset_keeps_the_shape_of_the_middle_of_its_track() -> None:
 
 def test_objects_of_other_methods_are_edited_or_refused() -> None:
     curved = toy(BezierNode)
-    curved = replace(curved, table=Table({**{k: v.detach() for k, v in curved.table.columns.items()}, "curve": torch.zeros(690, 4, 3)},
-                                         curved.table.labels))  # fmt: skip
+    curved = replace(
+        curved,
+        table=Table(
+            {**{k: v.detach() for k, v in curved.table.columns.items()}, "curve": torch.zeros(690, 4, 3)},
+            curved.table.labels,
+        ),
+    )
     with pytest.raises(InputError, match="curves"):
         carried(curved, "- stop: {id: car-1, at_s: 0.5}")
     assert carried(curved, "- remove: {ids: [car-1]}").node_names() == ()
@@ -373,7 +398,9 @@ def test_an_asset_takes_the_light_of_the_scene() -> None:
     asset = edited.asset_of(toy(), "car-1", light_rgb=here)
     lit, gain = edited.matched_light(asset, there)
     assert gain == pytest.approx([2**-0.75, 1, 2**0.75])
-    before, after = (edited.linear_of((0.5 + SH_C0 * a.columns["sh_dc"].double().numpy()).clip(0)) for a in (asset, lit))
+    before, after = (
+        edited.linear_of((0.5 + SH_C0 * a.columns["sh_dc"].double().numpy()).clip(0)) for a in (asset, lit)
+    )
     assert after == pytest.approx(before * gain, rel=1e-4, abs=1e-6)
     assert edited.matched_light(asset, None)[1] == pytest.approx([1, 1, 1])
     assert edited.matched_light(edited.asset_of(toy(), "car-1"), there)[1] == pytest.approx([1, 1, 1])
@@ -423,7 +450,9 @@ def test_objects_take_the_light_of_another_street() -> None:
 
     def shown(scene: SceneModel, name: str) -> float:
         rows = scene.table.labels["node"] == scene.nodes.index(scene.dynamic_object(name))
-        return float(edited.linear_of((0.5 + SH_C0 * scene.table["sh_dc"].detach()[rows].double().numpy()).clip(0)).mean())
+        return float(
+            edited.linear_of((0.5 + SH_C0 * scene.table["sh_dc"].detach()[rows].double().numpy()).clip(0)).mean()
+        )
 
     plain, cloud_plain = made(", match_light: false", ", match_light: false")
     full, cloud_full = made("", "")
@@ -456,7 +485,8 @@ def test_a_contact_shadow_darkens_the_ground_by_its_strength() -> None:
 
 
 def test_a_directed_shadow_lies_where_the_sun_casts_it() -> None:
-    """A sun at 45 degrees in the direction +y: the shadow reaches one height of the box to the right, however the box is turned."""
+    """A sun at 45 degrees in the direction +y: the shadow reaches one height of the box to the right, however the box
+    is turned."""
     length, width, height = SIZE
     for yaw in (0.0, 0.7):
         local = geometry.yaw_matrix(-yaw)[:3, :3] @ np.array([0.0, 1.0, 1.0]) / math.sqrt(2)
@@ -545,7 +575,9 @@ def test_the_ready_scripts_fit_the_demo(repository: Path) -> None:
     scripts = sorted((repository / "docs" / "examples" / "edits").glob("*.yaml"))
     assert len(scripts) == 3
     city = CityWorld(CityConfig(seed=DEMO_CITY, n_frames=24))
-    actors = {t.id: Actor(t.label, tuple(t.size_m), Motion.recorded(t.times_s, t.world_from_object)) for t in city.tracks()}
+    actors = {
+        t.id: Actor(t.label, tuple(t.size_m), Motion.recorded(t.times_s, t.world_from_object)) for t in city.tracks()
+    }
     ego = city.ego_path()
     world = EditWorld(actors, Motion.recorded(ego.times_s, ego.world_from_ego))
     asset = edited.asset_of(toy(), "car-1")
@@ -574,7 +606,9 @@ def test_the_city_is_drawn_again_with_an_object_elsewhere() -> None:
 
 
 def test_the_city_is_drawn_again_with_another_look() -> None:
-    city, other = (CityWorld(CityConfig(seed=seed, n_frames=4, width=64, height=40)) for seed in (DEMO_CITY, DEMO_CITY + 1))
+    city, other = (
+        CityWorld(CityConfig(seed=seed, n_frames=4, width=64, height=40)) for seed in (DEMO_CITY, DEMO_CITY + 1)
+    )
     frame = city.frame_views("front")[1]
     truth = city.render(frame)
     number = int(np.bincount(truth.instance.ravel())[1:].argmax()) + 1
@@ -583,7 +617,9 @@ def test_the_city_is_drawn_again_with_another_look() -> None:
     look = next(posed for posed in other.objects if posed.row[0] == rec.VAN)
     drawn = city.recast(name, look)
     assert np.allclose(drawn.tracks()[number - 1].size_m, look.size)
-    assert np.allclose(drawn.tracks()[number - 1].world_from_object[:, :2, 3], city.tracks()[number - 1].world_from_object[:, :2, 3])
+    assert np.allclose(
+        drawn.tracks()[number - 1].world_from_object[:, :2, 3], city.tracks()[number - 1].world_from_object[:, :2, 3]
+    )
     seen = drawn.render(frame)
     assert (seen.instance == number).any() and (seen.rgb != truth.rgb).any()
     assert np.array_equal(city.render(frame).rgb, truth.rgb)  # the city itself stays
@@ -610,7 +646,9 @@ def test_another_street_lies_where_the_vehicle_drives() -> None:
     assert made.node_names() == ("car-1",)
     assert (picture(made) - picture(model)).abs().max() < 0.02  # the sky was turned by whole texels
     assert torch.allclose(made.table["means"], model.table["means"], atol=1e-4)
-    alone = edited_model(model, planned("- background: {run: other, keep: [ego]}", world, background=lambda name: street))
+    alone = edited_model(
+        model, planned("- background: {run: other, keep: [ego]}", world, background=lambda name: street)
+    )
     assert alone.node_names() == ()
     with pytest.raises(InputError, match="own path"):
         planned("- background: {run: other, keep: [objects]}", world)
@@ -628,6 +666,10 @@ def test_scripts_run_on_a_fitted_scene_alone(tmp_path: Path) -> None:
 
 def test_weather_without_classes_is_refused() -> None:
     bare = toy()
-    bare = replace(bare, classes=(), table=Table({k: v for k, v in bare.table.columns.items() if k != "semantics"}, bare.table.labels))
+    bare = replace(
+        bare,
+        classes=(),
+        table=Table({k: v for k, v in bare.table.columns.items() if k != "semantics"}, bare.table.labels),
+    )
     with pytest.raises(InputError, match="classes"):
         carry_out(parse_edits("- weather: {wet: 0.5}", "e"), bare)

@@ -1,4 +1,5 @@
-"""Edits of a recorded drive: the lead car of KITTI's 2011_09_26 taken away and moved. Pictures stay in the test's folder."""
+"""Edits of a recorded drive: the lead car of KITTI's 2011_09_26 taken away and moved. Pictures stay in the test's
+folder."""
 
 from __future__ import annotations
 
@@ -29,7 +30,11 @@ LEAD = "0"
 @pytest.fixture(scope="module")
 def drive(shared_data: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("kitti")
-    Ingest(log=shared_data("kitti_2011_09_26"), out=root / "raw", settings=IngestConfig(resolution="320", contact_sheet=False)).run()
+    Ingest(
+        log=shared_data("kitti_2011_09_26"),
+        out=root / "raw",
+        settings=IngestConfig(resolution="320", contact_sheet=False),
+    ).run()
     Annotate(scene=root / "raw", out=root / "scene", settings=AnnotateConfig()).run()  # classes tell what is ground
     Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     config = fit_config(method="street_gaussians", iterations=100, start__gaussians=6000, densify__max_gaussians=8000)
@@ -50,7 +55,9 @@ def test_the_lead_car_of_a_recorded_drive(drive: Path, tmp_path: Path, text: str
         before, after = read_points(old, a), read_points(new, b)
         pose = lead.pose_at(a.time_s)
         assert pose is not None
-        here = np.linalg.norm(geometry.transform_points(geometry.invert(pose) @ a.world_from_lidar, before.xyz)[:, :2], axis=1)
+        here = np.linalg.norm(
+            geometry.transform_points(geometry.invert(pose) @ a.world_from_lidar, before.xyz)[:, :2], axis=1
+        )
         azimuth = np.arctan2(before.xyz[:, 1], before.xyz[:, 0])
         beside = (here > 12) & (np.abs(azimuth) > 0.5)
         kept = {tuple(p) for p in after.xyz}

@@ -1,4 +1,5 @@
-"""``mudg edit`` on fits and whole runs: what it writes is taken by the other commands, bad scripts leave nothing behind."""
+"""``mudg edit`` on fits and whole runs: what it writes is taken by the other commands, bad scripts leave nothing
+behind."""
 
 from __future__ import annotations
 
@@ -64,11 +65,18 @@ def images(folder: Path, name: str = "front_recorded") -> list[torch.Tensor]:
 
 
 def rendered(scene: Path, model: Path, out: Path, edits: Path | None = None) -> list[torch.Tensor]:
-    return images(RenderViews(scene=scene, model=model, edits=edits, out=out, settings=RenderConfig(shifts_m=(0.0,), video=False)).run())
+    return images(
+        RenderViews(
+            scene=scene, model=model, edits=edits, out=out, settings=RenderConfig(shifts_m=(0.0,), video=False)
+        ).run()
+    )
 
 
 def test_an_edited_fit_renders_as_render_with_edits_does(run: Path, tmp_path: Path) -> None:
-    text = "- move: {id: car, left_m: 1.5, along_m: 1}\n- lane_change: {id: ego, left_m: 0.4, start_s: 0, duration_s: 0.8, ground: false}"
+    text = (
+        "- move: {id: car, left_m: 1.5, along_m: 1}\n- lane_change: {id: ego, left_m: 0.4, start_s: 0, duration_s: 0.8,"
+        " ground: false}"
+    )
     edits, model = script(tmp_path, text), run / "fit" / "street_gaussians"
     made = Edit(source=model, script=edits, scene=run / "scene", out=tmp_path / "edited", settings=EditConfig()).run()
     before = rendered(run / "scene", model, tmp_path / "a")
@@ -88,22 +96,25 @@ def test_an_edited_fit_renders_as_render_with_edits_does(run: Path, tmp_path: Pa
 
 
 def test_renders_show_weather_and_light(run: Path, tmp_path: Path) -> None:
-    """Fog of 20 m: colours come nearer to those of the fog, more so far away; depth and classes stay. An edited fit and a script on the
-    way show the same."""
+    """Fog of 20 m: colours come nearer to those of the fog, more so far away; depth and classes stay. An edited fit and
+    a script on the way show the same."""
     edits, model = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), run / "fit" / "street_gaussians"
     config = RenderConfig(shifts_m=(0.0,), video=False)
-    plain = read_observations(RenderViews(
-        scene=run / "scene", model=model, out=tmp_path / "plain", settings=config
-    ).run() / "front_recorded")[1]
-    foggy = read_observations(RenderViews(
-        scene=run / "scene", model=model, edits=edits, out=tmp_path / "foggy", settings=config
-    ).run() / "front_recorded")[1]
+    plain = read_observations(
+        RenderViews(scene=run / "scene", model=model, out=tmp_path / "plain", settings=config).run() / "front_recorded"
+    )[1]
+    foggy = read_observations(
+        RenderViews(scene=run / "scene", model=model, edits=edits, out=tmp_path / "foggy", settings=config).run()
+        / "front_recorded"
+    )[1]
     made = Edit(source=model, script=edits, scene=run / "scene", out=tmp_path / "edited", settings=EditConfig()).run()
-    again = read_observations(RenderViews(
-        scene=run / "scene", model=made, out=tmp_path / "again", settings=config
-    ).run() / "front_recorded")[1]
+    again = read_observations(
+        RenderViews(scene=run / "scene", model=made, out=tmp_path / "again", settings=config).run() / "front_recorded"
+    )[1]
     assert torch.equal(foggy.rgb, again.rgb) and not torch.equal(foggy.rgb, plain.rgb)
-    assert torch.equal(foggy.depth.nan_to_num(), plain.depth.nan_to_num()) and torch.equal(foggy.semantics, plain.semantics)
+    assert torch.equal(foggy.depth.nan_to_num(), plain.depth.nan_to_num()) and torch.equal(
+        foggy.semantics, plain.semantics
+    )
     solid = torch.isfinite(plain.depth[0]) & (plain.depth[0] > 0)
     far = solid & (plain.depth[0] > plain.depth[0][solid].median())
     spread = lambda seen, where: float(seen.rgb[:, where].std(1).mean())  # noqa: E731
@@ -130,7 +141,9 @@ def test_an_edited_run_is_one_like_any_other(run: Path, tmp_path: Path) -> None:
         counts = []
         for scene, sweep, shift in ((old, a, np.eye(4)), (new, b, step)):
             pose = car_pose(sweep.time_s) @ shift
-            local = geometry.transform_points(geometry.invert(pose) @ sweep.world_from_lidar, read_points(scene, sweep).xyz)
+            local = geometry.transform_points(
+                geometry.invert(pose) @ sweep.world_from_lidar, read_points(scene, sweep).xyz
+            )
             counts.append(int(((np.abs(local) < half + 0.02).all(1) & (local[:, 2] > 0.15 - half[2])).sum()))
         assert 0.6 * counts[0] < counts[1] < 1.5 * counts[0]  # beams meet it at its new place
     became = store.read_json(out / "edit.json")["lidar"]
@@ -141,17 +154,24 @@ def test_an_edited_run_is_one_like_any_other(run: Path, tmp_path: Path) -> None:
     assert "car" in fused.objects
     assert read_fused(out / "fuse").objects.keys() == {"car"}
     again = Edit(
-        source=out, script=script(tmp_path, "- remove: {ids: [car]}", "more.yaml"), out=tmp_path / "twice", settings=EditConfig()
+        source=out,
+        script=script(tmp_path, "- remove: {ids: [car]}", "more.yaml"),
+        out=tmp_path / "twice",
+        settings=EditConfig(),
     ).run()
     assert read_scene(again / "scene").tracks == ()
     assert read_fused(again / "fuse").objects == {}
 
 
 def test_sweeps_of_an_edited_run_are_in_fog_and_its_images_as_recorded(run: Path, tmp_path: Path, capsys) -> None:
-    """Fog takes returns of far surfaces and adds some of its own, nearer than what stands there, on beams of the recording."""
+    """Fog takes returns of far surfaces and adds some of its own, nearer than what stands there, on beams of the
+    recording."""
     log.set_quiet(False)
     out = Edit(
-        source=run, script=script(tmp_path, "- weather: {fog: {visibility_m: 12}}"), out=tmp_path / "foggy", settings=EditConfig()
+        source=run,
+        script=script(tmp_path, "- weather: {fog: {visibility_m: 12}}"),
+        out=tmp_path / "foggy",
+        settings=EditConfig(),
     ).run()
     assert "LiDAR sweeps are in fog and rain" in capsys.readouterr().err
     old, new = read_scene(run / "scene"), read_scene(out / "scene")
@@ -183,7 +203,11 @@ def test_the_vehicle_of_a_run_changes_lanes(run: Path, tmp_path: Path) -> None:
 
 def test_bad_scripts_leave_nothing(run: Path, tmp_path: Path) -> None:
     model, out = run / "fit" / "street_gaussians", tmp_path / "out"
-    for text in ("- mve: {id: car}", "- move: {id: nobody}", "- lane_change: {id: car, left_m: 9, start_s: 0, duration_s: 0.2}"):
+    for text in (
+        "- mve: {id: car}",
+        "- move: {id: nobody}",
+        "- lane_change: {id: car, left_m: 9, start_s: 0, duration_s: 0.2}",
+    ):
         edits = script(tmp_path, text)
         with pytest.raises(InputError, match="line 1"):
             Edit(source=model, script=edits, out=out, settings=EditConfig()).run()
@@ -191,7 +215,9 @@ def test_bad_scripts_leave_nothing(run: Path, tmp_path: Path) -> None:
             rendered(run / "scene", model, out, edits)
         assert not out.exists()
     with pytest.raises(UsageError, match="input"):
-        Edit(source=run, script=script(tmp_path, "- remove: {ids: [car]}"), out=run / "edited", settings=EditConfig()).run()
+        Edit(
+            source=run, script=script(tmp_path, "- remove: {ids: [car]}"), out=run / "edited", settings=EditConfig()
+        ).run()
     with pytest.raises(InputError, match="no fitted scene"):
         Edit(source=run / "scene", script=tmp_path / "edits.yaml", out=out, settings=EditConfig()).run()
     assert not out.exists()
@@ -212,7 +238,9 @@ def test_results_are_reused_refused_and_resumed(run: Path, tmp_path: Path, monke
     whole = Edit(source=run, script=edits, out=tmp_path / "whole", settings=EditConfig()).run()
     assert store.digest(out) == store.digest(whole)
     stamp = (out / "edit.json").stat().st_mtime_ns
-    Edit(source=run, script=script(tmp_path, "# the same\n- remove: {class: car}"), out=out, settings=EditConfig()).run()
+    Edit(
+        source=run, script=script(tmp_path, "# the same\n- remove: {class: car}"), out=out, settings=EditConfig()
+    ).run()
     assert (out / "edit.json").stat().st_mtime_ns == stamp
     with pytest.raises(UsageError, match="another configuration"):
         Edit(source=run, script=script(tmp_path, "- stop: {id: car, at_s: 0.2}"), out=out, settings=EditConfig()).run()
@@ -228,7 +256,10 @@ def test_objects_go_from_one_run_to_another(run: Path, tmp_path: Path, capsys: p
     with pytest.raises(UsageError, match="no dynamic object"):
         mudg.export_asset(run, "nobody", out=tmp_path / "x.safetensors")
     text = """
-- insert: {asset: {file: shelf/red.safetensors}, id: second, near: {id: ego, at_s: 0, ahead_m: 14, left_m: 2, yaw_deg: 180}}
+- insert:
+    asset: {file: shelf/red.safetensors}
+    id: second
+    near: {id: ego, at_s: 0, ahead_m: 14, left_m: 2, yaw_deg: 180}
 - replace: {id: car, by: {run: RUN, id: car}}
 """.replace("RUN", str(run))
     out = tmp_path / "out"
@@ -239,7 +270,9 @@ def test_objects_go_from_one_run_to_another(run: Path, tmp_path: Path, capsys: p
     assert fused.objects.keys() == {"car", "second"}
     pose = scene.track("second").pose_at(0.5)
     assert pose[2, 3] == pytest.approx(CAR_SIZE[2] / 2, abs=0.05)  # on the ground, which is flat
-    assert geometry.yaw_of(pose) == pytest.approx(np.pi, abs=1e-6) or geometry.yaw_of(pose) == pytest.approx(-np.pi, abs=1e-6)
+    assert geometry.yaw_of(pose) == pytest.approx(np.pi, abs=1e-6) or geometry.yaw_of(pose) == pytest.approx(
+        -np.pi, abs=1e-6
+    )
     kinds = {note["kind"] for note in store.read_json(out / "edit.json")["notes"]}
     assert "seldom-seen side" in kinds  # the recording saw its back only
 
@@ -248,7 +281,9 @@ def test_the_street_of_another_run(run: Path, tmp_path: Path) -> None:
     """Its own street put in again changes nothing but the sky's texels."""
     model = run / "fit" / "street_gaussians"
     edits = script(tmp_path, f"- background: {{run: {run}}}")
-    made = Edit(source=model, script=edits, scene=run / "scene", fused=run / "fuse", out=tmp_path / "out", settings=EditConfig()).run()
+    made = Edit(
+        source=model, script=edits, scene=run / "scene", fused=run / "fuse", out=tmp_path / "out", settings=EditConfig()
+    ).run()
     before, after = (rendered(run / "scene", folder, tmp_path / name) for folder, name in ((model, "a"), (made, "b")))
     for one, two in zip(before, after, strict=True):
         assert (one - two).abs().mean() < 0.01
@@ -259,9 +294,12 @@ def test_the_street_of_another_run(run: Path, tmp_path: Path) -> None:
     old, new = (read_fused(folder / "fuse") for folder in (run, whole))
     assert np.abs(old.static.xyz - new.static.xyz).max() < 1e-3 and new.objects.keys() == old.objects.keys()
     alone = Edit(
-        source=model, script=script(tmp_path, f"- background: {{run: {model}}}"), scene=run / "scene", out=tmp_path / "fit",
+        source=model,
+        script=script(tmp_path, f"- background: {{run: {model}}}"),
+        scene=run / "scene",
+        out=tmp_path / "fit",
         settings=EditConfig(),
-    ).run()  # fmt: skip
+    ).run()
     assert (alone / "model.json").is_file()  # a fit knows its scene, and with it where its street lies
 
 
@@ -279,8 +317,13 @@ def test_streets_of_recordings_are_closed_and_those_of_generated_cities_stay(run
     assert closed(scene, ", close_street: false") == () and closed(city, ", close_street: true") == ("car",)
     kinds = lambda drive: [note["kind"] for note in drive.notes]  # noqa: E731
     assert kinds(carried(None, ", close_street: true")) == ["street not closed"]
-    assert "street not closed" not in kinds(carried(None)) + kinds(carried(scene)) + kinds(carried(city, ", close_street: true"))
-    rows = [len(drive.model(model).table) for drive in (carried(scene), carried(city), carried(scene, ", close_street: false"))]
+    assert "street not closed" not in kinds(carried(None)) + kinds(carried(scene)) + kinds(
+        carried(city, ", close_street: true")
+    )
+    rows = [
+        len(drive.model(model).table)
+        for drive in (carried(scene), carried(city), carried(scene, ", close_street: false"))
+    ]
     assert rows[1] == rows[2] != rows[0]
 
 
@@ -292,7 +335,9 @@ def test_from_python(run: Path, tmp_path: Path) -> None:
     assert stopped.object_pose("car", 0.9)[0, 3] < fitted.object_pose("car", 0.9)[0, 3] - 0.5
     made = mudg.edit(run / "fit" / "street_gaussians", edits, out=tmp_path / "out", scene=run / "scene")
     view = scene.frames[2].view
-    pictures = [s.render(view.camera, view.world_from_cam, view.time_s).rgb for s in (stopped, mudg.FittedScene.read(made))]
+    pictures = [
+        s.render(view.camera, view.world_from_cam, view.time_s).rgb for s in (stopped, mudg.FittedScene.read(made))
+    ]
     assert np.array_equal(*pictures)
     assert fitted.export_asset("car", tmp_path / "car.safetensors", scene).is_file()
 

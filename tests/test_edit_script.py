@@ -77,7 +77,11 @@ def test_what_is_wrong_is_told_with_its_place(text: str, where: str, said: str) 
 def test_the_digest_is_that_of_what_is_said_and_read(tmp_path: Path) -> None:
     file = tmp_path / "edits.yaml"
     digests = []
-    for text in ("- move: {id: a, along_m: 3}", "# the same\n- move:\n    along_m: 3.0\n    id: a\n", "- move: {id: a, along_m: 4}"):
+    for text in (
+        "- move: {id: a, along_m: 3}",
+        "# the same\n- move:\n    along_m: 3.0\n    id: a\n",
+        "- move: {id: a, along_m: 4}",
+    ):
         store.write_text(file, text)
         digests.append(read_edits(file).digest())
     assert digests[0] == digests[1] != digests[2]
@@ -97,7 +101,10 @@ def test_a_script_without_settings_asks_for_the_settings_of_weather_and_light() 
     assert conditions_of(parse_edits("- weather: {}\n- light: {}", "e").canonical()) == Conditions()
     whole = conditions_of(parse_edits("- weather: {fog: {}, rain: {}, snow: {}}", "e").canonical())
     assert whole.weather == WeatherSettings(fog=FogSettings(), rain=RainSettings(), snow=SnowSettings())
-    assert conditions_of(parse_edits("- light: {time: dusk}\n- light: {time: night}", "e").canonical()).light.time == "night"
+    assert (
+        conditions_of(parse_edits("- light: {time: dusk}\n- light: {time: night}", "e").canonical()).light.time
+        == "night"
+    )
     with pytest.raises(InputError, match=r"weather.snow.wind_m_s"):
         parse_edits("- weather: {snow: {wind_m_s: [1, 2, 3]}}", "e")
     with pytest.raises(InputError, match=r"light.headlights"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +27,9 @@ CAMERA = Camera("front", 120, 80, 90.0, 90.0, 60.0, 40.0)
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 RASTER = RasterConfig(near_m=0.2)
 TIMES = np.arange(4) / 3
-ACTOR = Actor("car", SIZE, Motion.recorded(TIMES, np.stack([geometry.yaw_matrix(0.0, (8 + t, 0, 0.75)) for t in TIMES])))
+ACTOR = Actor(
+    "car", SIZE, Motion.recorded(TIMES, np.stack([geometry.yaw_matrix(0.0, (8 + t, 0, 0.75)) for t in TIMES]))
+)
 VIEWS = [View(CAMERA, geometry.from_rotation_translation(FORWARD, (t, 0, 1.2)), float(t)) for t in TIMES]
 
 
@@ -42,10 +45,13 @@ def behind(label: str = "car", flank: float | None = None) -> SceneModel:
     colors = np.where(means[:, 2:] < 0, [0.8, 0.1, 0.1], [0.1, 0.1, 0.8])
     count = len(means)
     columns = {
-        "means": torch.from_numpy(means.astype(np.float32)), "quats": torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
-        "log_scales": torch.log(torch.tensor([0.02, 0.05, 0.05])).repeat(count, 1), "logits": torch.full((count,), 5.0),
-        "sh_dc": torch.from_numpy((colors - 0.5) / SH_C0).float()[:, None], "semantics": torch.tensor([[-5.0, 5.0]]).repeat(count, 1),
-    }  # fmt: skip
+        "means": torch.from_numpy(means.astype(np.float32)),
+        "quats": torch.tensor([1.0, 0, 0, 0]).repeat(count, 1),
+        "log_scales": torch.log(torch.tensor([0.02, 0.05, 0.05])).repeat(count, 1),
+        "logits": torch.full((count,), 5.0),
+        "sh_dc": torch.from_numpy((colors - 0.5) / SH_C0).float()[:, None],
+        "semantics": torch.tensor([[-5.0, 5.0]]).repeat(count, 1),
+    }
     labels = {"node": torch.ones(count, dtype=torch.int32), CERTAINTY: torch.ones(count, dtype=torch.float16)}
     node = RigidNode("car", label, list(SIZE), ACTOR.motion.times_s, ACTOR.motion.poses)
     return SceneModel(Table(columns, labels), (StaticNode(), node), None, (ID["road"], ID["car"]), 0)
@@ -68,7 +74,9 @@ def test_flanks_continue_the_colours_of_the_rear() -> None:
     assert places[:, 0].min() < -1.6 and places[:, 0].max() > 1.8
     low, high = places[:, 2] < -0.2, places[:, 2] > 0.2
     assert low.any() and high.any()
-    assert np.allclose(colors[low], [0.8, 0.1, 0.1], atol=1e-3) and np.allclose(colors[high], [0.1, 0.1, 0.8], atol=1e-3)
+    assert np.allclose(colors[low], [0.8, 0.1, 0.1], atol=1e-3) and np.allclose(
+        colors[high], [0.1, 0.1, 0.8], atol=1e-3
+    )
     assert np.abs(places[high, 0]).max() < places[low, 0].max()  # a car is shorter above
 
 
@@ -81,15 +89,24 @@ def test_only_gaps_of_vehicles_are_closed() -> None:
 
 
 def test_what_views_show_is_not_made_up() -> None:
-    beside = [View(CAMERA, geometry.from_rotation_translation(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), (8 + t, -5, 0.8)), float(t))
-              for t in TIMES]  # fmt: skip
+    beside = [
+        View(
+            CAMERA,
+            geometry.from_rotation_translation(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), (8 + t, -5, 0.8)),
+            float(t),
+        )
+        for t in TIMES
+    ]
     model = behind()
-    right = lambda views: (made(model, with_closed_sides(model, ["car"], views, RASTER))[0][:, 1] < 0).sum()  # noqa: E731
+
+    def right(views: Sequence[View]) -> int:
+        return int((made(model, with_closed_sides(model, ["car"], views, RASTER))[0][:, 1] < 0).sum())
+
     assert right([*VIEWS, *beside]) < 0.2 * right(VIEWS)  # the right flank was seen to be empty; measured: 0
 
 
 def test_only_what_is_seen_from_another_side_is_closed() -> None:
-    sources = EditSources(lambda s: None, lambda n: None)  # type: ignore[arg-type,return-value]
+    sources = EditSources(lambda s: None, lambda n: None)
 
     def sides(text: str) -> set[str]:
         plan = plan_edits(parse_edits(text, "sides"), EditWorld({"car": ACTOR}), sources)
@@ -101,7 +118,7 @@ def test_only_what_is_seen_from_another_side_is_closed() -> None:
 
 
 def test_sides_are_closed_where_the_vehicle_takes_another_path() -> None:
-    sources = EditSources(lambda s: None, lambda n: None)  # type: ignore[arg-type,return-value]
+    sources = EditSources(lambda s: None, lambda n: None)
     ego = Motion.recorded(np.array(TIMES, float), np.stack([geometry.yaw_matrix(0.0)] * len(TIMES)))
     away = [View(CAMERA, geometry.yaw_matrix(0.0, (0, 2.0, 0)) @ view.world_from_cam, view.time_s) for view in VIEWS]
 

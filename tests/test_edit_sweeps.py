@@ -72,7 +72,7 @@ def changed(
 ) -> tuple[SweepPoints, SweepPoints, dict[str, int], EditPlan]:
     plan = plan_edits(
         parse_edits(text, "e"), EditWorld(boxes, None, ground()), EditSources(lambda s: None, lambda n: None)
-    )  # type: ignore[arg-type,return-value]
+    )
     points, sweep = recorded(boxes), Sweep("0", "lidar", 0.5, SENSOR, "")
     static = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world")
     made, counts = edited_points(points, sweep, plan, FusedCloud(static, surfaces))

@@ -1,4 +1,5 @@
-"""The street where an object is gone: what nobody saw goes, hidden ground is closed, shadows are brightened, nothing else changes."""
+"""The street where an object is gone: what nobody saw goes, hidden ground is closed, shadows are brightened, nothing
+else changes."""
 
 from __future__ import annotations
 
@@ -51,8 +52,11 @@ def level(xy: np.ndarray) -> np.ndarray:
 ROAD = level(grid((2, 30, 0.3), (-7, 7, 0.3)))
 
 
-def street(actor: Actor, road: np.ndarray, grey: np.ndarray, buildings: np.ndarray, spots: np.ndarray | None = None) -> SceneModel:
-    """Level road of given greys, white Gaussians of buildings, black ones of road users in the background, and the car: its rear, black."""
+def street(
+    actor: Actor, road: np.ndarray, grey: np.ndarray, buildings: np.ndarray, spots: np.ndarray | None = None
+) -> SceneModel:
+    """Level road of given greys, white Gaussians of buildings, black ones of road users in the background, and the car:
+    its rear, black."""
     spots = np.zeros((0, 3)) if spots is None else spots
     rear = np.column_stack([np.full(20 * 15, -2.0), grid((-0.95, 1, 0.1), (-0.7, 0.8, 0.1))])
     means = np.concatenate([road, buildings, spots, rear])
@@ -62,10 +66,13 @@ def street(actor: Actor, road: np.ndarray, grey: np.ndarray, buildings: np.ndarr
     classes = torch.full((len(means), 3), -5.0)
     classes[torch.arange(len(means)), torch.from_numpy(kind)] = 5.0
     columns = {
-        "means": torch.from_numpy(means.astype(np.float32)), "quats": torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
-        "log_scales": torch.full((len(means), 3), -2.0), "logits": torch.full((len(means),), 4.0),
-        "sh_dc": torch.from_numpy((greys - 0.5) / SH_C0).float()[:, None, None].repeat(1, 1, 3), "semantics": classes,
-    }  # fmt: skip
+        "means": torch.from_numpy(means.astype(np.float32)),
+        "quats": torch.tensor([1.0, 0, 0, 0]).repeat(len(means), 1),
+        "log_scales": torch.full((len(means), 3), -2.0),
+        "logits": torch.full((len(means),), 4.0),
+        "sh_dc": torch.from_numpy((greys - 0.5) / SH_C0).float()[:, None, None].repeat(1, 1, 3),
+        "semantics": classes,
+    }
     labels = {"node": torch.from_numpy(owner.astype(np.int32)), CERTAINTY: torch.ones(len(means), dtype=torch.float16)}
     car = RigidNode("car", "car", list(SIZE), actor.motion.times_s, actor.motion.poses)
     return SceneModel(Table(columns, labels), (StaticNode(), car), None, CLASSES, 0)
@@ -101,15 +108,22 @@ def test_what_views_show_of_a_gaussian() -> None:
     with_car, without = (shown_by(model, views[0], RASTER, absent)[0] for absent in ((), ("car",)))
     assert with_car[wall] < 0.01 < 1 < without[wall]
     assert torch.equal(without[wall + 1 :], torch.zeros(len(model.table) - wall - 1))
-    first, last, both = (noted(model, seen, RASTER).table.labels[SHOWN] for seen in (views[:1], views[-1:], [views[0], views[-1]]))
-    assert torch.equal(first, with_car) and torch.equal(both, torch.maximum(first, last)) and not torch.equal(first, last)
+    first, last, both = (
+        noted(model, seen, RASTER).table.labels[SHOWN] for seen in (views[:1], views[-1:], [views[0], views[-1]])
+    )
+    assert (
+        torch.equal(first, with_car) and torch.equal(both, torch.maximum(first, last)) and not torch.equal(first, last)
+    )
 
 
 def test_what_no_view_saw_goes_and_hidden_ground_is_closed() -> None:
     actor, views = lead()
     unseen = np.abs(ROAD[:, 1]) < 0.12 * ROAD[:, 0] - 0.3
     dark = np.where(unseen & (ROAD[:, 0] > 9), 0.0, LIT)  # what a fit left behind the car
-    behind, beside = grid((14, 14.5, 0.3), (-0.6, 0.7, 0.3), (0.2, 1.0, 0.3)), np.array([[20.0, 6.0, 2.0], [12.0, 4.0, 1.0]])
+    behind, beside = (
+        grid((14, 14.5, 0.3), (-0.6, 0.7, 0.3), (0.2, 1.0, 0.3)),
+        np.array([[20.0, 6.0, 2.0], [12.0, 4.0, 1.0]]),
+    )
     in_path, around = np.array([[9.0, 0.2, 0.9]]), np.array([[10.0, 1.25, 0.6], [10.0, -3.0, 0.6]])
     model = street(actor, ROAD, dark, np.concatenate([behind, beside, in_path]), around)
     before = grey_of(model)
@@ -117,7 +131,9 @@ def test_what_no_view_saw_goes_and_hidden_ground_is_closed() -> None:
     assert same_places(means_of(made, "building"), beside)
     assert same_places(means_of(made, "car"), around[1:])  # the first is a part of the car that the box leaves out
     new, means = made_up(made), made.table["means"].detach().numpy()
-    assert new.sum() > 50 and np.allclose(means[new, 2], 0, atol=0.05) and np.allclose(grey_of(made)[new], LIT, atol=0.02)
+    assert (
+        new.sum() > 50 and np.allclose(means[new, 2], 0, atol=0.05) and np.allclose(grey_of(made)[new], LIT, atol=0.02)
+    )
     assert ((means[new, 0] > 13) & (np.abs(means[new, 1]) < 0.5)).any()  # the middle of what was hidden
     assert np.allclose(grey_of(made)[~new & (np.abs(means[:, 1]) < 4) & (means[:, 2] < 0.1)], LIT, atol=1e-5)
     assert SHOWN not in made.table.labels and np.array_equal(grey_of(model), before)  # the original stays
@@ -128,8 +144,11 @@ def test_what_a_view_saw_stays() -> None:
     behind = grid((14, 14.5, 0.3), (-0.6, 0.7, 0.3), (0.2, 1.0, 0.3))
     model = street(actor, ROAD, np.full(len(ROAD), LIT), behind)
     aside = View(CAMERA, geometry.from_rotation_translation(FORWARD, (6.0, -4.0, 3.0)), 0.0)
-    turned = replace(aside, world_from_cam=aside.world_from_cam @ geometry.from_rotation_translation(
-        geometry.yaw_matrix(0.0)[:3, :3], (0.0, 0, 0)))  # fmt: skip
+    turned = replace(
+        aside,
+        world_from_cam=aside.world_from_cam
+        @ geometry.from_rotation_translation(geometry.yaw_matrix(0.0)[:3, :3], (0.0, 0, 0)),
+    )
     made = cleared(model, actor, [*views, turned])
     only = cleared(model, actor, views)
     assert same_places(means_of(made, "building"), behind) and not len(means_of(only, "building"))
@@ -196,15 +215,19 @@ def test_colours_continue_without_markings() -> None:
 @pytest.mark.parametrize("usual", [False, True])
 def test_a_script_says_whose_traces_go(usual: bool) -> None:
     actor, _ = lead()
-    sources = EditSources(lambda s: None, lambda n: None, close_street=usual)  # type: ignore[arg-type,return-value]
+    sources = EditSources(lambda s: None, lambda n: None, close_street=usual)
 
     def closed(text: str) -> set[str]:
         return plan_edits(parse_edits(text, "e"), EditWorld({"a": actor, "b": actor}, ego=actor.motion), sources).closed
 
     verbs = {
-        "remove": "ids: [a]", "move": "id: a, along_m: 9", "stop": "id: a, at_s: 0.5", "speed": "id: a, factor: 0.5",
-        "lane_change": "id: a, left_m: 1, start_s: 0, duration_s: 1, most_lateral_m_s2: 9", "path": "id: a, points: [[0, 0, 0], [1, 9, 0]]",
-    }  # fmt: skip
+        "remove": "ids: [a]",
+        "move": "id: a, along_m: 9",
+        "stop": "id: a, at_s: 0.5",
+        "speed": "id: a, factor: 0.5",
+        "lane_change": "id: a, left_m: 1, start_s: 0, duration_s: 1, most_lateral_m_s2: 9",
+        "path": "id: a, points: [[0, 0, 0], [1, 9, 0]]",
+    }
     for verb, text in verbs.items():
         for asked in (True, False):
             assert closed(f"- {verb}: {{{text}, close_street: {str(asked).lower()}}}") == ({"a"} if asked else set())
@@ -217,8 +240,12 @@ def test_a_script_says_whose_traces_go(usual: bool) -> None:
 
 def test_sky_that_the_car_always_hid_continues_the_sky_that_was_seen() -> None:
     actor, views = lead()
-    views = [View(CAMERA, geometry.from_rotation_translation(FORWARD, (v.center_world[0], 0, 0.5)), v.time_s) for v in views]
-    model = replace(street(actor, ROAD, np.full(len(ROAD), LIT), np.zeros((0, 3))), sky=SkyNode.uniform(64, (0.5, 0.6, 0.9)))
+    views = [
+        View(CAMERA, geometry.from_rotation_translation(FORWARD, (v.center_world[0], 0, 0.5)), v.time_s) for v in views
+    ]
+    model = replace(
+        street(actor, ROAD, np.full(len(ROAD), LIT), np.zeros((0, 3))), sky=SkyNode.uniform(64, (0.5, 0.6, 0.9))
+    )
     assert model.sky is not None
     with torch.no_grad():
         model.sky.table["panorama"][:, :, 30:32, 62:66] = 0.0  # ahead, up to 6 degrees above the horizon

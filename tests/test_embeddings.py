@@ -30,7 +30,9 @@ def images(count: int, side: int, seed: int = 0) -> torch.Tensor:
 def attended(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, heads: int) -> torch.Tensor:
     """Attention head by head and token by token, float64."""
     width = x.shape[1]
-    query, key, value = (x @ weight[i * width : (i + 1) * width].T + bias[i * width : (i + 1) * width] for i in range(3))
+    query, key, value = (
+        x @ weight[i * width : (i + 1) * width].T + bias[i * width : (i + 1) * width] for i in range(3)
+    )
     out = torch.zeros_like(x)
     for head in range(heads):
         own = slice(head * width // heads, (head + 1) * width // heads)
@@ -54,15 +56,28 @@ def patches(image: torch.Tensor, kernel: torch.Tensor, size: int) -> torch.Tenso
 
 
 def test_dinov2_against_a_twin_in_float64() -> None:
-    state = {name: value.double() for name, value in toy_vit.dino_state(side=4).items()}  # 56 pixels: its own 4 x 4 places
+    # 56 pixels: its own 4 x 4 places
+    state = {name: value.double() for name, value in toy_vit.dino_state(side=4).items()}
     image = images(1, 56)[0].double()
     x = patches(image, state["patch_embed.proj.weight"], 14) + state["patch_embed.proj.bias"]
     x = torch.cat([state["cls_token"][0], x]) + state["pos_embed"][0]
     for number in range(2):
         block = f"blocks.{number}"
-        y = attended(normed(x, state, f"{block}.norm1", 1e-6), state[f"{block}.attn.qkv.weight"], state[f"{block}.attn.qkv.bias"], 2)
-        x = x + (y @ state[f"{block}.attn.proj.weight"].T + state[f"{block}.attn.proj.bias"]) * state[f"{block}.ls1.gamma"]
-        y = normed(x, state, f"{block}.norm2", 1e-6) @ state[f"{block}.mlp.fc1.weight"].T + state[f"{block}.mlp.fc1.bias"]
+        y = attended(
+            normed(x, state, f"{block}.norm1", 1e-6),
+            state[f"{block}.attn.qkv.weight"],
+            state[f"{block}.attn.qkv.bias"],
+            2,
+        )
+        x = (
+            x
+            + (y @ state[f"{block}.attn.proj.weight"].T + state[f"{block}.attn.proj.bias"])
+            * state[f"{block}.ls1.gamma"]
+        )
+        y = (
+            normed(x, state, f"{block}.norm2", 1e-6) @ state[f"{block}.mlp.fc1.weight"].T
+            + state[f"{block}.mlp.fc1.bias"]
+        )
         y = y * 0.5 * (1 + torch.erf(y / 2**0.5))
         x = x + (y @ state[f"{block}.mlp.fc2.weight"].T + state[f"{block}.mlp.fc2.bias"]) * state[f"{block}.ls2.gamma"]
     expected = normed(x, state, "norm", 1e-6)[0]
@@ -82,7 +97,8 @@ def test_positions_are_resized_by_the_published_factor() -> None:
     read = found[0, 1:, 0].reshape(16, 16)[:, 3]
     expected = (torch.arange(16) + 0.5) * 37 / 16.1 - 0.5
     assert (read - expected)[2:-2].abs().max() < 0.06  # measured 0.048, by the cubic kernel itself
-    assert (expected - ((torch.arange(16) + 0.5) * 37 / 16 - 0.5)).abs().max() > 0.2  # by the size they would lie elsewhere
+    # by the size they would lie elsewhere
+    assert (expected - ((torch.arange(16) + 0.5) * 37 / 16 - 0.5)).abs().max() > 0.2
     assert torch.equal(network.positions(37, 37), state["pos_embed"])
 
 
@@ -97,14 +113,29 @@ def test_sizes_name_the_network() -> None:
 def test_clip_against_a_twin_in_float64_under_both_names() -> None:
     state = {name.removeprefix("visual."): value.double() for name, value in toy_vit.clip_state().items()}
     image = images(1, 42)[0].double()
-    x = torch.cat([state["class_embedding"][None], patches(image, state["conv1.weight"], 14)]) + state["positional_embedding"]
+    x = (
+        torch.cat([state["class_embedding"][None], patches(image, state["conv1.weight"], 14)])
+        + state["positional_embedding"]
+    )
     x = normed(x, state, "ln_pre", 1e-5)
     for number in range(2):
         block = f"transformer.resblocks.{number}"
-        y = attended(normed(x, state, f"{block}.ln_1", 1e-5), state[f"{block}.attn.in_proj_weight"], state[f"{block}.attn.in_proj_bias"], 2)
+        y = attended(
+            normed(x, state, f"{block}.ln_1", 1e-5),
+            state[f"{block}.attn.in_proj_weight"],
+            state[f"{block}.attn.in_proj_bias"],
+            2,
+        )
         x = x + y @ state[f"{block}.attn.out_proj.weight"].T + state[f"{block}.attn.out_proj.bias"]
-        y = normed(x, state, f"{block}.ln_2", 1e-5) @ state[f"{block}.mlp.c_fc.weight"].T + state[f"{block}.mlp.c_fc.bias"]
-        x = x + (y / (1 + torch.exp(-1.702 * y))) @ state[f"{block}.mlp.c_proj.weight"].T + state[f"{block}.mlp.c_proj.bias"]
+        y = (
+            normed(x, state, f"{block}.ln_2", 1e-5) @ state[f"{block}.mlp.c_fc.weight"].T
+            + state[f"{block}.mlp.c_fc.bias"]
+        )
+        x = (
+            x
+            + (y / (1 + torch.exp(-1.702 * y))) @ state[f"{block}.mlp.c_proj.weight"].T
+            + state[f"{block}.mlp.c_proj.bias"]
+        )
     expected = normed(x[0], state, "ln_post", 1e-5) @ state["proj"]
     for names in (toy_vit.clip_state(), toy_vit.transformers_names(toy_vit.clip_state())):
         network = clip_image.ClipImageFeatures(names)
@@ -134,16 +165,22 @@ def test_other_weights_are_refused_and_named() -> None:
 
 def test_prepared_images_have_the_statistics_of_the_networks() -> None:
     white = np.full((50, 80, 3), 255, np.uint8)
-    assert dinov2.prepared(white)[:, 100, 100].tolist() == pytest.approx([(1 - m) / d for m, d in zip(dinov2.MEAN, dinov2.DEVIATION)])
+    assert dinov2.prepared(white)[:, 100, 100].tolist() == pytest.approx(
+        [(1 - m) / d for m, d in zip(dinov2.MEAN, dinov2.DEVIATION)]
+    )
     assert clip_image.prepared(white)[0, 100, 100].item() == pytest.approx((1 - 0.48145466) / 0.26862954)
     assert clip_image.prepared(white).shape == (3, 336, 336)
     picture = toy_views.colors(0)
-    expected = functional.interpolate(torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255, (336, 336), mode="bicubic")
-    found = clip_image.prepared(picture) * torch.tensor(clip_image.DEVIATION).view(3, 1, 1) + torch.tensor(clip_image.MEAN).view(3, 1, 1)
+    expected = functional.interpolate(
+        torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255, (336, 336), mode="bicubic"
+    )
+    found = clip_image.prepared(picture) * torch.tensor(clip_image.DEVIATION).view(3, 1, 1) + torch.tensor(
+        clip_image.MEAN
+    ).view(3, 1, 1)
     assert (found - expected[0]).abs().max() < 1e-6
 
 
-# ---- distances -----------------------------------------------------------------------------------------------------------
+# ---- distances -----------------------------------------------------------------------------------
 
 
 def test_polynomial_distance_by_hand_and_its_symmetries() -> None:
@@ -169,7 +206,7 @@ def test_consistency_by_hand() -> None:
     assert subject_consistency(rows[:1]) is None
 
 
-# ---- in the scorer -------------------------------------------------------------------------------------------------------
+# ---- in the scorer -------------------------------------------------------------------------------
 
 
 def darker(_index: int, seen: Observation) -> Observation:
@@ -181,7 +218,7 @@ def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> 
     methods = {
         "a": toy_views.write_views(scene, tmp_path / "a", "a", (2.0,)),
         "b": toy_views.write_views(scene, tmp_path / "b", "b", (2.0,), darker),
-    }  # fmt: skip
+    }
     store.write_safetensors(tmp_path / "dino.safetensors", toy_vit.dino_state())
     store.write_safetensors(tmp_path / "clip.safetensors", toy_vit.clip_state())
     rng = np.random.default_rng(0)
@@ -190,9 +227,12 @@ def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> 
         rows = rng.standard_normal((6, 3)).astype(np.float32) + np.float32(moved)
         store.write_safetensors(tmp_path / "video" / f"{name}.safetensors", {"features": rows})
     config = ScoreConfig(
-        dino_weights=str(tmp_path / "dino.safetensors"), clip_weights=str(tmp_path / "clip.safetensors"),
-        video_features=str(tmp_path / "video"), perceptual_views=0, error_pictures=False,
-    )  # fmt: skip
+        dino_weights=str(tmp_path / "dino.safetensors"),
+        clip_weights=str(tmp_path / "clip.safetensors"),
+        video_features=str(tmp_path / "video"),
+        perceptual_views=0,
+        error_pictures=False,
+    )
     out = Score(scene=scene, views=methods, out=tmp_path / "score", settings=config).run()
     document = store.read_json(out / "metrics.json")
     values = {r["method"]: r["values"] for r in document["results"]}
@@ -217,7 +257,8 @@ def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> 
     assert row["clip"] == {"n": 4, "n_reference": 4}
     text = (out / "metrics.md").read_text()
     assert "Floor: the truth itself: FD-DINOv2" in text and "a network of 2 blocks of 128" in text
-    assert len(list((out / "features").glob("*.safetensors"))) == 4  # two networks, two methods; the recorded set is a's
+    # two networks, two methods; the recorded set is a's
+    assert len(list((out / "features").glob("*.safetensors"))) == 4
 
 
 def test_programs_are_not_read_as_video_features(tmp_path: Path) -> None:
@@ -227,14 +268,19 @@ def test_programs_are_not_read_as_video_features(tmp_path: Path) -> None:
     program.write_bytes(b"PK")
     with pytest.raises(InputError, match="no such folder of features"):
         Score(
-            scene=scene, views={"a": views}, out=tmp_path / "score", settings=ScoreConfig(video_features=str(program), perceptual_views=0)
+            scene=scene,
+            views={"a": views},
+            out=tmp_path / "score",
+            settings=ScoreConfig(video_features=str(program), perceptual_views=0),
         ).run()
 
 
 def test_malformed_video_features_are_refused(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
     views = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
-    store.write_safetensors(tmp_path / "video" / "recorded" / "front.safetensors", {"features": np.zeros((3, 2, 2), np.float32)})
+    store.write_safetensors(
+        tmp_path / "video" / "recorded" / "front.safetensors", {"features": np.zeros((3, 2, 2), np.float32)}
+    )
     config = ScoreConfig(video_features=str(tmp_path / "video"), perceptual_views=0)
     with pytest.raises(InputError, match=r"front.safetensors"):
         Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=config).run()

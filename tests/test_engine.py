@@ -24,14 +24,19 @@ from mudg.steps.outputs import Output
 from mudg.steps.step import Flag
 
 LINES = {
-    "annotate": "annotate TOY/scene", "fuse": "fuse TOY/scene", "fit": "fit TOY/scene --fused TOY/fuse --observations TOY/views",
+    "annotate": "annotate TOY/scene",
+    "fuse": "fuse TOY/scene",
+    "fit": "fit TOY/scene --fused TOY/fuse --observations TOY/views",
     "synthesize": "synthesize TOY/scene --fused TOY/fuse --fitted TOY/fit --edits TOY/edits.yaml",
-    "adapt": "adapt TOY/scene --fused TOY/fuse --fitted TOY/fit", "render": "render TOY/scene --model TOY/fit --edits TOY/edits.yaml",
-    "score": "score TOY/scene --views a=TOY/views b=TOY/more --fused TOY/fuse", "edit": "edit TOY/fit TOY/edits.yaml --scene TOY/scene",
+    "adapt": "adapt TOY/scene --fused TOY/fuse --fitted TOY/fit",
+    "render": "render TOY/scene --model TOY/fit --edits TOY/edits.yaml",
+    "score": "score TOY/scene --views a=TOY/views b=TOY/more --fused TOY/fuse",
+    "edit": "edit TOY/fit TOY/edits.yaml --scene TOY/scene",
     "export": "export colmap TOY/fit --scene TOY/scene --edits TOY/edits.yaml",
-    "asset export": "asset export TOY/fit car-001 --scene TOY/scene", "asset import": "asset import TOY/edits.yaml --kind scene",
+    "asset export": "asset export TOY/fit car-001 --scene TOY/scene",
+    "asset import": "asset import TOY/edits.yaml --kind scene",
     "ingest": "ingest TOY/scene",
-}  # fmt: skip
+}
 """A command line of every verb whose result has inputs."""
 ANSWERS = """
 import contextlib, io, json, sys
@@ -62,7 +67,9 @@ def inputs_in(line: str) -> list[str]:
 
 def test_every_result_with_inputs_is_tried_below() -> None:
     classes = {verb: steps.step_class(verb) for verb in steps.VERBS}
-    assert {verb for verb, cls in classes.items() if issubclass(cls, Result) and cls.prepare is not Result.prepare} == LINES.keys()
+    assert {
+        verb for verb, cls in classes.items() if issubclass(cls, Result) and cls.prepare is not Result.prepare
+    } == LINES.keys()
 
 
 def test_a_wrong_path_is_refused_before_torch_loads_whatever_the_verb(toy: Path, tmp_path: Path) -> None:
@@ -87,7 +94,9 @@ def test_an_output_that_touches_an_input_is_refused(verb: str, toy: Path, capsys
     assert {path: path.stat().st_mtime_ns for path in toy.rglob("*")} == before
 
 
-@pytest.mark.parametrize("line", [*LINES.values(), "ingest city --city.seed 7 --no-contact-sheet", "run city --fast --seed 4"])
+@pytest.mark.parametrize(
+    "line", [*LINES.values(), "ingest city --city.seed 7 --no-contact-sheet", "run city --fast --seed 4"]
+)
 def test_the_words_of_a_step_are_read_as_the_same_step(line: str) -> None:
     words = line.split()
     verb, rest = app.find_verb([*words, "--out", "OUT"])
@@ -101,7 +110,7 @@ def test_steps_of_batches_say_only_what_their_settings_do_not() -> None:
     assert stage_lines()["score"] == ("score", "{scene}", "--fused", "{fuse}", "--views", "fit={render}")
 
 
-# ---- a step that writes one line of each input ---------------------------------------------------------------------------
+# ---- a step that writes one line of each input ---------------------------------------------------
 
 
 class Lines(Output):
@@ -152,7 +161,12 @@ def lines(tmp_path: Path) -> Lines:
 def test_a_finished_result_is_reused_and_names_what_it_was_made_of(lines: Lines, tmp_path: Path) -> None:
     assert lines.run() == tmp_path / "out"
     record = store.read_json(tmp_path / "out" / "run.json")
-    assert (record["verb"], record["state"], record["summary"], record["files"]) == ("lines", "complete", {"files": 2}, ["*.txt", "begun/"])
+    assert (record["verb"], record["state"], record["summary"], record["files"]) == (
+        "lines",
+        "complete",
+        {"files": 2},
+        ["*.txt", "begun/"],
+    )
     assert record["inputs"] == {"first": store.digest(tmp_path / "a"), "more": store.digest(tmp_path / "b")}
     replace(lines, stop=pytest.fail).run()
     with pytest.raises(UsageError, match="end: '' there, '!' asked"):
@@ -166,7 +180,9 @@ def test_a_finished_result_is_reused_and_names_what_it_was_made_of(lines: Lines,
         lines.run()
 
 
-def test_another_result_is_replaced_only_on_demand_and_only_when_the_new_one_is_finished(lines: Lines, tmp_path: Path) -> None:
+def test_another_result_is_replaced_only_on_demand_and_only_when_the_new_one_is_finished(
+    lines: Lines, tmp_path: Path
+) -> None:
     lines.run()
 
     def interrupted(number: int) -> None:
@@ -202,9 +218,13 @@ def test_an_interrupted_step_says_so_lets_go_and_goes_on(lines: Lines, tmp_path:
 def test_what_cannot_be_done_is_refused_before_anything_is_written(lines: Lines, tmp_path: Path) -> None:
     (tmp_path / "empty").write_text("")
     for change, error in (
-        ({"end": "wrong"}, UsageError), ({"first": tmp_path / "none"}, InputError), ({"more": (tmp_path / "none",)}, InputError),
-        ({"first": tmp_path / "empty"}, InputError), ({"out": tmp_path / "a"}, UsageError), ({"out": tmp_path}, UsageError),
-    ):  # fmt: skip
+        ({"end": "wrong"}, UsageError),
+        ({"first": tmp_path / "none"}, InputError),
+        ({"more": (tmp_path / "none",)}, InputError),
+        ({"first": tmp_path / "empty"}, InputError),
+        ({"out": tmp_path / "a"}, UsageError),
+        ({"out": tmp_path}, UsageError),
+    ):
         with pytest.raises(error):
             replace(lines, **change).run()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a", "b", "empty"]

@@ -78,8 +78,13 @@ def baked(model: SceneModel, name: str, time_s: float = T) -> SplatCloud:
     if name != "usda":
         return formats.read_cloud(content, f"x.{name}")[0]
     splats = slow.read_usd_splats(slow.parse_usda(content.decode())["World"]["scene"]["splats"])
-    columns = ([s.place for s in splats], [s.turn for s in splats], np.log([s.size for s in splats]),
-               np.log([s.opacity / (1 - s.opacity) for s in splats]), [s.sh for s in splats])  # fmt: skip
+    columns = (
+        [s.place for s in splats],
+        [s.turn for s in splats],
+        np.log([s.size for s in splats]),
+        np.log([s.opacity / (1 - s.opacity) for s in splats]),
+        [s.sh for s in splats],
+    )
     return SplatCloud(*(np.asarray(values, np.float32) for values in columns))
 
 
@@ -116,7 +121,7 @@ def test_nodes_of_every_kind_stand_where_the_model_puts_them(kind: type[RigidNod
     columns = {key: value.detach() for key, value in model.table.columns.items()}
     columns["sh_rest"] = torch.randn(len(model.table), 8, 3, generator=torch.Generator().manual_seed(2))
     model = replace(model, table=type(model.table)(columns, model.table.labels), sh_degree=2)
-    keys = model.nodes[1].times_s  # type: ignore[union-attr]
+    keys = model.nodes[1].times_s
     for time_s in (float(keys[3]), float((keys[3] + keys[4]) / 2)):
         scene = scenes.splat_scene(model, time_s)
         now = compose(model, time_s)
@@ -152,13 +157,22 @@ def test_the_sky_as_gaussians_looks_as_the_sky() -> None:
     for yaw in (0.0, 2.0, 4.0):
         up = geometry.yaw_matrix(yaw) @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
         view = View(camera, up, T)
-        truth = render_view(replace(empty, table=type(alone.table)({k: v.detach()[:1] * 0 - 50 for k, v in alone.table.columns.items()},
-                                    {"node": torch.zeros(1, dtype=torch.int32)})), view, RasterConfig(backend="cpu")).rgb  # fmt: skip
+        truth = render_view(
+            replace(
+                empty,
+                table=type(alone.table)(
+                    {k: v.detach()[:1] * 0 - 50 for k, v in alone.table.columns.items()},
+                    {"node": torch.zeros(1, dtype=torch.int32)},
+                ),
+            ),
+            view,
+            RasterConfig(backend="cpu"),
+        ).rgb
         shown = render_view(replace(empty, sky=None), view, RasterConfig(backend="cpu")).rgb
         assert float(psnr(shown, truth)) > 28
 
 
-# -- the verb ------------------------------------------------------------------------------------------------------------
+# -- the verb --------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -228,7 +242,7 @@ def test_an_output_inside_the_fit_is_refused(fit: Path) -> None:
         Export(format="ply", source=fit, out=fit / "a.ply", settings=ExportConfig()).run()
 
 
-# -- imports -------------------------------------------------------------------------------------------------------------
+# -- imports ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["ply", "spz", "splat", "sog", "glb", "compressed-ply"])
@@ -251,7 +265,13 @@ def test_a_file_becomes_an_object_that_scripts_insert(name: str, fit: Path, tmp_
     assert abs(np.ptp(means[:, 0]) / np.ptp(car.means[:, 1]) - scale) < 0.02 * scale  # what lay along y lies along x
     script = tmp_path / "edits.yaml"
     script.write_text("- insert: {asset: {file: a.safetensors}, id: van-9, path: [[0, 9, 2, 0]]}\n")
-    Export(format="ply", source=fit, edits=script, out=tmp_path / "inserted.ply", settings=ExportConfig(time_s=T, nodes=("van-9",))).run()
+    Export(
+        format="ply",
+        source=fit,
+        edits=script,
+        out=tmp_path / "inserted.ply",
+        settings=ExportConfig(time_s=T, nodes=("van-9",)),
+    ).run()
     assert (tmp_path / "inserted.ply").is_file()
 
 
@@ -268,7 +288,9 @@ def test_a_file_becomes_a_scene(tmp_path: Path) -> None:
         and np.array_equal(again.class_ids, cloud.class_ids)
     )
     with pytest.raises(UsageError, match="settings of objects"):
-        AssetImport(file=tmp_path / "a.ply", out=tmp_path / "fit2", settings=ImportConfig(kind="scene", label="car")).run()
+        AssetImport(
+            file=tmp_path / "a.ply", out=tmp_path / "fit2", settings=ImportConfig(kind="scene", label="car")
+        ).run()
 
 
 def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> None:
@@ -279,7 +301,9 @@ def test_a_street_of_a_file_lies_where_the_vehicle_begins(tmp_path: Path) -> Non
     cloud = replace(toy_splats.cloud(3300), means=means, logits=np.full(3300, 3, np.float32))
     (tmp_path / "a.ply").write_bytes(formats.ply.to_bytes(cloud))
     AssetImport(
-        file=tmp_path / "a.ply", out=tmp_path / "street", settings=ImportConfig(kind="scene", axes="world", origin_m=(100, 0, 0))
+        file=tmp_path / "a.ply",
+        out=tmp_path / "street",
+        settings=ImportConfig(kind="scene", axes="world", origin_m=(100, 0, 0)),
     ).run()
     found = background_of(find_run(tmp_path / "street"), "street")
     assert abs(np.median(found.ground_xyz[:, 2]) - 7) < 0.02 and len(found.ground_xyz) > 500
@@ -311,7 +335,7 @@ def test_what_cannot_be_imported_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "a.safetensors").exists()
 
 
-# -- cameras -------------------------------------------------------------------------------------------------------------
+# -- cameras ---------------------------------------------------------------------------------------
 
 
 def test_nerfstudio_cameras_look_where_ours_do(tmp_path: Path) -> None:
@@ -407,7 +431,7 @@ def test_starting_points_of_cameras(tmp_path: Path) -> None:
     assert files["points.ply"].endswith(struct.pack("<3f3B", 4, 5, 6, 6, 5, 4))
 
 
-# -- messages ------------------------------------------------------------------------------------------------------------
+# -- messages --------------------------------------------------------------------------------------
 
 
 def records(content: bytes, place: int, end: int):

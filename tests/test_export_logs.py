@@ -1,4 +1,5 @@
-"""Logs as messages of ROS 2 and recordings of rerun: read by a reader that was written from the standards, and put back together."""
+"""Logs as messages of ROS 2 and recordings of rerun: read by a reader that was written from the standards, and put back
+together."""
 
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ class CdrReader:
 
     @staticmethod
     def lines(text: str) -> list[tuple[str, str]]:
-        return [tuple(line.split()) for line in text.strip().splitlines()]  # type: ignore[misc]
+        return [tuple(line.split()) for line in text.strip().splitlines()]
 
     def read(self, content: bytes) -> dict[str, Any]:
         assert content[:4] == b"\x00\x01\x00\x00"
@@ -161,7 +162,8 @@ def test_a_bag_holds_the_log(exported: tuple[Scene, Path]) -> None:
 
 
 def test_points_of_the_world_fall_on_their_pixels_through_frames_and_calibration(exported: tuple[Scene, Path]) -> None:
-    """As ROS computes it: map <- base_link <- camera by /tf and /tf_static, then OpenCV's pixels, whose centres are whole numbers."""
+    """As ROS computes it: map <- base_link <- camera by /tf and /tf_static, then OpenCV's pixels, whose centres are
+    whole numbers."""
     scene, folder = exported
     found, _ = bag(folder / "out")
     fixed = {t["child_frame_id"]: t for t in found["/tf_static"][0][1]["transforms"]}
@@ -206,8 +208,15 @@ def test_transforms_come_first_and_sensors_that_move_hang_on_the_map(tmp_path: P
 
 
 def test_golden_bytes_of_a_transform() -> None:
-    value = {"transforms": [{"header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}, "child_frame_id": "a",
-                             "transform": {"translation": {"x": 1.5}, "rotation": {"w": 1.0}}}]}  # fmt: skip
+    value = {
+        "transforms": [
+            {
+                "header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"},
+                "child_frame_id": "a",
+                "transform": {"translation": {"x": 1.5}, "rotation": {"w": 1.0}},
+            }
+        ]
+    }
     golden = (
         "00010000 01000000 01000000 02000000 04000000 6d617000 02000000 61000000 00000000"
         "000000000000f83f 0000000000000000 0000000000000000"
@@ -244,7 +253,7 @@ def test_the_same_log_gives_the_same_bag_in_bounded_memory(
     assert hashlib.sha256((folder / "out" / "log_0.mcap").read_bytes()).hexdigest() == first
     read: list[str] = []
     log = log_of(scene)
-    log.picture = lambda frame: read.append(frame.id) or b"x" * 1000  # type: ignore[func-returns-value]
+    log.picture = lambda frame: read.append(frame.id) or b"x" * 1000
     monkeypatch.setattr(mcap, "CHUNK_BYTES", 1)
     for block in mcap.McapBlocks(ros2.Ros2Messages(log), "x", ros2.dialect()):
         assert b"x" * 1000 not in block or len(read) == 1  # one picture at a time, written before the next is read
@@ -264,7 +273,7 @@ def test_what_has_no_log_or_is_damaged_is_refused(tmp_path: Path) -> None:
     assert not (tmp_path / "bag" / "metadata.yaml").exists() and not (tmp_path / "bag" / "log_0.mcap").exists()
 
 
-# -- rerun ---------------------------------------------------------------------------------------------------------------
+# -- rerun -----------------------------------------------------------------------------------------
 
 
 def test_rerun_names_its_extra_where_it_is_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -278,11 +287,17 @@ def test_rerun_names_its_extra_where_it_is_missing(tmp_path: Path, monkeypatch: 
 
 def test_a_recording_of_rerun_holds_log_and_gaussians(tmp_path: Path) -> None:
     pytest.importorskip("rerun")
-    from rerun.chunk import RrdReader  # type: ignore[import-not-found]
+    from rerun.chunk import RrdReader
 
     scene = street(tmp_path / "scene")
     save_model(toy(), tmp_path / "fit")
-    Export(format="rerun", source=tmp_path / "fit", scene=tmp_path / "scene", out=tmp_path / "a.rrd", settings=ExportConfig()).run()
+    Export(
+        format="rerun",
+        source=tmp_path / "fit",
+        scene=tmp_path / "scene",
+        out=tmp_path / "a.rrd",
+        settings=ExportConfig(),
+    ).run()
     columns: dict[tuple[str, str], list[Any]] = {}
     for chunk in RrdReader(tmp_path / "a.rrd").stream().to_chunks():
         batch = chunk.to_record_batch()
@@ -295,7 +310,13 @@ def test_a_recording_of_rerun_holds_log_and_gaussians(tmp_path: Path) -> None:
     assert np.allclose(np.squeeze(mounted), [f.view.center_world for f in scene.frames])
     assert len(columns["/world/gaussians/background", "Points3D:positions"][0]) == 640
     assert len(columns["/world/gaussians/background", "Points3D:radii"][0]) == 640
-    car = columns["/world/gaussians/car\\-1" if ("/world/gaussians/car\\-1", "Points3D:positions") in columns
-                  else "/world/gaussians/car-1", "Points3D:positions"]  # fmt: skip
+    car = columns[
+        (
+            "/world/gaussians/car\\-1"
+            if ("/world/gaussians/car\\-1", "Points3D:positions") in columns
+            else "/world/gaussians/car-1"
+        ),
+        "Points3D:positions",
+    ]
     assert len(car[0]) == 50 and len(columns["/world/objects/car-1", "Boxes3D:half_sizes"]) == 1
     assert len(columns["/world/lidar/lidar", "Points3D:positions"]) == 3

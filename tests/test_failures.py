@@ -1,4 +1,5 @@
-"""Memory, disks, files and processes that fail: every command ends in words and with an exit code, and nothing waits for ever."""
+"""Memory, disks, files and processes that fail: every command ends in words and with an exit code, and nothing waits
+for ever."""
 
 from __future__ import annotations
 
@@ -40,25 +41,28 @@ def array_error() -> BaseException:
     return failed.value
 
 
-# ---- in words ----------------------------------------------------------------------------------------------------------
+# ---- in words ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("error", "what", "asked"), [
-    (array_error, "not enough memory", "4.00 EiB for an array with shape (1073741824, 1073741824)"),
-    (allocation_error, "not enough memory", "TiB"),
-    (lambda: MemoryError(), "not enough memory", ""),
-    (lambda: ImportError("libtorch_cpu.so: failed to map segment from shared object"), "not enough memory", ""),
-    (lambda: OSError(errno.ENOMEM, "Cannot allocate memory"), "not enough memory", ""),
-    (lambda: OSError(errno.ENOSPC, "No space left on device", "runs/x"), "disk is full", ""),
-    (lambda: OSError(errno.EIO, "Input/output error", "runs/x"), "could not be read or written", ""),
-    (lambda: OSError(errno.EMFILE, "Too many open files", "runs/x"), "too many files", ""),
-    (lambda: OSError(errno.EXDEV, "Invalid cross-device link", "a", None, "b"), "system refused", ""),
-    (lambda: BrokenProcessPool("gone"), "ended without a word", ""),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("error", "what", "asked"),
+    [
+        (array_error, "not enough memory", "4.00 EiB for an array with shape (1073741824, 1073741824)"),
+        (allocation_error, "not enough memory", "TiB"),
+        (lambda: MemoryError(), "not enough memory", ""),
+        (lambda: ImportError("libtorch_cpu.so: failed to map segment from shared object"), "not enough memory", ""),
+        (lambda: OSError(errno.ENOMEM, "Cannot allocate memory"), "not enough memory", ""),
+        (lambda: OSError(errno.ENOSPC, "No space left on device", "runs/x"), "disk is full", ""),
+        (lambda: OSError(errno.EIO, "Input/output error", "runs/x"), "could not be read or written", ""),
+        (lambda: OSError(errno.EMFILE, "Too many open files", "runs/x"), "too many files", ""),
+        (lambda: OSError(errno.EXDEV, "Invalid cross-device link", "a", None, "b"), "system refused", ""),
+        (lambda: BrokenProcessPool("gone"), "ended without a word", ""),
+    ],
+)
 def test_errors_of_the_system_are_put_in_words(
     error: object, what: str, asked: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    made = error()  # type: ignore[operator]
+    made = error()
     told = failures.in_words(made, "smaller views (--width-px)")
     assert isinstance(told, ResourceError) and what in told.what and told.remedy
     assert asked in told.expected
@@ -100,7 +104,7 @@ def test_an_allocation_that_cannot_succeed_is_not_tried(monkeypatch: pytest.Monk
     memory.require(8 << 40, "one view", "")
 
 
-# ---- streams -----------------------------------------------------------------------------------------------------------
+# ---- streams -------------------------------------------------------------------------------------
 
 
 def run_mudg(redirections: str, *words: str, limit: str = "") -> subprocess.CompletedProcess[str]:
@@ -110,10 +114,18 @@ def run_mudg(redirections: str, *words: str, limit: str = "") -> subprocess.Comp
 
 
 @needs_full_device
-@pytest.mark.parametrize(("redirections", "words", "code"), [
-    (">/dev/full", ("--help",), 5), (">/dev/full", ("fit", "--help"), 5), ("2>/dev/full", ("fit", "nothing"), 2),
-    ("2>&-", ("nonsense",), 2), (">&-", ("--version",), 5), ("2>/dev/full", ("--version",), 0),
-], ids=str)  # fmt: skip
+@pytest.mark.parametrize(
+    ("redirections", "words", "code"),
+    [
+        (">/dev/full", ("--help",), 5),
+        (">/dev/full", ("fit", "--help"), 5),
+        ("2>/dev/full", ("fit", "nothing"), 2),
+        ("2>&-", ("nonsense",), 2),
+        (">&-", ("--version",), 5),
+        ("2>/dev/full", ("--version",), 0),
+    ],
+    ids=str,
+)
 def test_streams_that_cannot_be_written_end_nothing_badly(redirections: str, words: tuple[str, ...], code: int) -> None:
     done = run_mudg(redirections, *words)
     assert done.returncode == code, done.stderr
@@ -143,7 +155,7 @@ def test_too_little_address_space_is_said_before_anything_is_loaded() -> None:
     assert "at least 1.0 GiB of address space" in done.stderr and "ulimit -v" in done.stderr
 
 
-# ---- processes ---------------------------------------------------------------------------------------------------------
+# ---- processes -----------------------------------------------------------------------------------
 
 
 def die(how: str) -> str:
@@ -182,14 +194,14 @@ def test_a_worker_that_dies_while_it_is_sent_work_ends_the_work_of_all() -> None
 @pytest.mark.slow
 def test_workers_without_memory_to_start_end_the_work(tmp_path: Path) -> None:
     script = (
-        "import sys; sys.path[:0] = sys.argv[1:]\nimport test_failures as t\nfrom mudg.base.processes import run_in_processes\n"
-        "import resource\nfrom mudg.base import failures\n"
-        "if __name__ == '__main__':\n"
-        "    resource.setrlimit(resource.RLIMIT_AS, (500 << 20, 8 << 30))\n"
-        "    try:\n        list(run_in_processes(t.die, [('',)] * 2, 2))\n"
-        "    except Exception as error:\n        sys.exit(55 if failures.in_words(error) else 1)\n"
+        "import sys; sys.path[:0] = sys.argv[1:]\nimport test_failures as t\nfrom mudg.base.processes import"
+        " run_in_processes\nimport resource\nfrom mudg.base import failures\nif __name__ == '__main__':\n   "
+        " resource.setrlimit(resource.RLIMIT_AS, (500 << 20, 8 << 30))\n    try:\n        list(run_in_processes(t.die,"
+        " [('',)] * 2, 2))\n    except Exception as error:\n        sys.exit(55 if failures.in_words(error) else 1)\n"
     )
     (tmp_path / "parent.py").write_text(script)
     places = [str(Path(__file__).parent), *(path for path in sys.path if path)]
-    done = subprocess.run([sys.executable, str(tmp_path / "parent.py"), *places], capture_output=True, text=True, timeout=120, check=False)
+    done = subprocess.run(
+        [sys.executable, str(tmp_path / "parent.py"), *places], capture_output=True, text=True, timeout=120, check=False
+    )
     assert done.returncode == 55, done.stderr[-2000:]

@@ -1,4 +1,5 @@
-"""Kills and full disks at every point of every verb: the repeated command ends in the result of an undisturbed run, to the bit."""
+"""Kills and full disks at every point of every verb: the repeated command ends in the result of an undisturbed run, to
+the bit."""
 
 from __future__ import annotations
 
@@ -25,7 +26,8 @@ from mudg.steps.learn import Learn
 
 OUTPUT = VerbOutput("small", 1, ("*.txt", "rows/*.txt"))
 SWEPT = [name for name in VERBS if name not in ("learn", "bench", "film")]
-"""Verbs that do their work in this process; ``learn`` has its own sweep below, the others write through the same store."""
+"""Verbs that do their work in this process; ``learn`` has its own sweep below, the others write through the same
+store."""
 POINTS = int(os.environ.get("MUDG_TEST_POINTS", "24"))
 """At how many operations of each verb it is stopped; a number above all of them means at every one."""
 
@@ -60,7 +62,7 @@ def leftovers(folder: Path) -> list[str]:
     return [path.name for path in folder.iterdir() if ".part" in path.name]
 
 
-# ---- the store and the run folder ----------------------------------------------------------------------------------------
+# ---- the store and the run folder ----------------------------------------------------------------
 
 
 EVERY = pytest.mark.parametrize("step", [5, pytest.param(1, marks=pytest.mark.slow)])
@@ -84,7 +86,8 @@ def test_a_small_run_killed_at_every_point_is_repeated_to_the_same_bytes(tmp_pat
 
 @EVERY
 def test_a_replacement_killed_at_every_point_is_never_lost(tmp_path: Path, step: int) -> None:
-    """Old or new, whole, is there at any moment; somebody else's file always is; the repeated command ends in the new one."""
+    """Old or new, whole, is there at any moment; somebody else's file always is; the repeated command ends in the new
+    one."""
     new = contents(small_run(tmp_path / "whole", 2)) | {"mine.md": b"mine"}
 
     def replaced(place: Path) -> Path:
@@ -97,7 +100,9 @@ def test_a_replacement_killed_at_every_point_is_never_lost(tmp_path: Path, step:
     for number in range(1, total + 1, step):
         place = replaced(tmp_path / f"kill{number}")
         assert in_child(lambda place=place: small_run(place / "out", 2, overwrite=True), killed(number), place) == -9
-        standing = [f for f in (place / "out", Replacement.at(place / "out").retired) if (f / "manifest.json").is_file()]
+        standing = [
+            f for f in (place / "out", Replacement.at(place / "out").retired) if (f / "manifest.json").is_file()
+        ]
         assert any(_verifies(folder) for folder in standing), f"nothing whole after a kill at point {number}"
         small_run(place / "out", 2, overwrite=True)
         assert contents(place / "out") == new, f"after a kill at point {number}"
@@ -129,14 +134,15 @@ def test_a_full_or_broken_disk_at_every_write_leaves_what_resumes(tmp_path: Path
     assert len(said) > 15 / step and all(os.strerror(code) in words for words in said)
 
 
-# ---- every verb ----------------------------------------------------------------------------------------------------------
+# ---- every verb ----------------------------------------------------------------------------------
 
 
 def same_result(name: str, out: Path, whole: Path) -> None:
     """Equal to the bit, but for what shows how a run went."""
     history = HISTORY.get(name, set()) | {"manifest.json"} if name in HISTORY else set()
     found, wanted = (
-        {n: c for n, c in contents(folder).items() if n not in history and Path(n).name != "state.json"} for folder in (out, whole)
+        {n: c for n, c in contents(folder).items() if n not in history and Path(n).name != "state.json"}
+        for folder in (out, whole)
     )
     assert found.keys() == wanted.keys()
     assert [n for n in found if found[n] != wanted[n] and n != "manifest.json"] == []
@@ -146,8 +152,8 @@ def same_result(name: str, out: Path, whole: Path) -> None:
 @pytest.mark.parametrize("stopped", [killed, terminated])
 @pytest.mark.parametrize("name", SWEPT)
 def test_a_verb_stopped_at_any_point_is_repeated_to_the_same_bytes(
-    name: str, stopped: Any, world: dict[str, Path], tmp_path: Path  # noqa: F811
-) -> None:  # fmt: skip
+    name: str, stopped: Any, world: dict[str, Path], tmp_path: Path
+) -> None:
     given = {key: path for key, path in world.items() if key not in ("poses", "weights")}
 
     def work(out: Path) -> Any:
@@ -171,7 +177,7 @@ def test_a_verb_stopped_at_any_point_is_repeated_to_the_same_bytes(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SWEPT)
-def test_a_verb_on_a_full_disk_resumes_when_there_is_space(name: str, world: dict[str, Path], tmp_path: Path) -> None:  # noqa: F811
+def test_a_verb_on_a_full_disk_resumes_when_there_is_space(name: str, world: dict[str, Path], tmp_path: Path) -> None:
     given = {key: path for key, path in world.items() if key not in ("poses", "weights")}
     VERBS[name].call(given, tmp_path / "whole", 1, False)
     found = counted(lambda: VERBS[name].call(given, tmp_path / "x" / "counted", 1, False), tmp_path / "x")
@@ -189,7 +195,7 @@ def test_a_verb_on_a_full_disk_resumes_when_there_is_space(name: str, world: dic
     assert all("No space left" in words for words in said)
 
 
-# ---- training ------------------------------------------------------------------------------------------------------------
+# ---- training ------------------------------------------------------------------------------------
 
 
 def small_training(clips: Path, out: Path) -> Path:
@@ -200,7 +206,8 @@ def small_training(clips: Path, out: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def training(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, bytes], int]:
-    """Clips; the weights, scores and last checkpoint of an undisturbed training on them; the number of its operations on the disk."""
+    """Clips; the weights, scores and last checkpoint of an undisturbed training on them; the number of its operations
+    on the disk."""
     root = tmp_path_factory.mktemp("training").resolve()
     write_clips(root / "clips")
     total = len(counted(lambda: small_training(root / "clips", root / "x" / "out"), root / "x"))
@@ -209,12 +216,15 @@ def training(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, 
 
 
 def learned(out: Path) -> dict[str, bytes]:
-    """What a training leaves, without its history: earlier checkpoints, of which being asked to stop makes one more, and how it went."""
+    """What a training leaves, without its history: earlier checkpoints, of which being asked to stop makes one more,
+    and how it went."""
     last = max((out / "steps").glob("step_*")).name
     return {
-        name: content for name, content in contents(out).items()
-        if name not in HISTORY["learn"] | {"manifest.json"} and (not name.startswith("steps/") or name.startswith(f"steps/{last}/"))
-    }  # fmt: skip
+        name: content
+        for name, content in contents(out).items()
+        if name not in HISTORY["learn"] | {"manifest.json"}
+        and (not name.startswith("steps/") or name.startswith(f"steps/{last}/"))
+    }
 
 
 @pytest.mark.slow
@@ -222,7 +232,8 @@ def learned(out: Path) -> dict[str, bytes]:
 def test_a_training_stopped_at_every_point_is_repeated_to_the_same_bytes(
     stopped: Any, training: tuple[Path, dict[str, bytes], int], tmp_path: Path
 ) -> None:
-    """Killed, and asked to stop: the repeated command ends in the weights and scores of an undisturbed training, to the bit."""
+    """Killed, and asked to stop: the repeated command ends in the weights and scores of an undisturbed training, to the
+    bit."""
     clips, whole, total = training
     for number in range(1, total + 1):
         place = tmp_path / f"stop{number}"
@@ -235,11 +246,13 @@ def test_a_training_stopped_at_every_point_is_repeated_to_the_same_bytes(
         assert found.keys() == whole.keys(), number
         assert [name for name in found if found[name] != whole[name]] == [], number
         store.verify_manifest(place / "out")
-        assert not leftovers(place) and not [p for p in place.rglob("*") if ".part" in p.name or p.name.startswith(".tmp")], number
+        assert not leftovers(place) and not [
+            p for p in place.rglob("*") if ".part" in p.name or p.name.startswith(".tmp")
+        ], number
         shutil.rmtree(place)
 
 
-# ---- soak ----------------------------------------------------------------------------------------------------------------
+# ---- soak ----------------------------------------------------------------------------------------
 
 
 def open_files() -> set[str]:
@@ -273,7 +286,11 @@ def test_two_hundred_runs_with_kills_leak_nothing(tmp_path: Path, monkeypatch: p
     for _ in range(200):
         value = rng.choice((1, 2))
         if rng.random() < 0.6:
-            in_child(lambda value=value: small_run(place / "out", value, overwrite=True), killed(rng.randint(1, 2 * total)), place)
+            in_child(
+                lambda value=value: small_run(place / "out", value, overwrite=True),
+                killed(rng.randint(1, 2 * total)),
+                place,
+            )
         else:
             small_run(place / "out", value, overwrite=True)
             assert contents(place / "out") == whole[value]

@@ -59,7 +59,7 @@ def biases(finisher):
     return finisher.leave.bias.split(Finisher.SIZES)
 
 
-# tiles ----------------------------------------------------------------------------------------------------------------
+# tiles --------------------------------------------------------------------------------------------
 
 
 @drawn(strategies.integers(1, 3000), strategies.integers(1, 700))
@@ -71,7 +71,9 @@ def test_spans_cover_the_length_without_overlap(length, longest):
     assert max(last - first for first, last in found) <= max(longest, finishing.STRIDE_PX) + finishing.STRIDE_PX
 
 
-@pytest.mark.parametrize(("blocks", "size", "tile_px"), [((1, 1), (93, 131), 40), ((2, 2), (64, 117), 17), ((1, 3), (141, 50), 64)])
+@pytest.mark.parametrize(
+    ("blocks", "size", "tile_px"), [((1, 1), (93, 131), 40), ((2, 2), (64, 117), 17), ((1, 3), (141, 50), 64)]
+)
 @torch.no_grad()
 def test_tiles_equal_the_whole_image(blocks, size, tile_px):
     finisher, given, made = random_finisher(blocks), some_pixels(*size), some_made(24, 32)
@@ -106,7 +108,9 @@ def test_the_margin_is_not_wider_than_needed(monkeypatch):
 def test_memory_is_that_of_a_tile(monkeypatch):
     finisher, seen = random_finisher(), []
     forward = finisher.forward
-    monkeypatch.setattr(finisher, "forward", lambda made, given, *rest: (seen.append(given.color.shape), forward(made, given, *rest))[1])
+    monkeypatch.setattr(
+        finisher, "forward", lambda made, given, *rest: (seen.append(given.color.shape), forward(made, given, *rest))[1]
+    )
     finish_in_tiles(finisher, some_made(24, 32), some_pixels(150, 202), 40)
     longest = 40 + 2 * finisher.margin_px + 2 * finishing.STRIDE_PX
     assert len(seen) == 4 * 6
@@ -127,7 +131,7 @@ def test_enlarging_is_what_interpolation_does():
         assert torch.equal(getattr(part, f.name), getattr(whole.crop(slice(6, 30), slice(15, 39)), f.name)), f.name
 
 
-# what it makes --------------------------------------------------------------------------------------------------------
+# what it makes ------------------------------------------------------------------------------------
 
 
 @torch.no_grad()
@@ -179,12 +183,17 @@ def test_an_unknown_class_takes_no_share():
 
 
 def test_a_finisher_needs_renders_and_a_refiner():
-    for change in ({"renders": False}, {"refine_widths": (), "refine_blocks": ()}, {"finish_blocks": ()}, {"finish_widths": (8,)}):
+    for change in (
+        {"renders": False},
+        {"refine_widths": (), "refine_blocks": ()},
+        {"finish_blocks": ()},
+        {"finish_widths": (8,)},
+    ):
         with pytest.raises(UsageError):
             replace(FINISHING, **change)
 
 
-# clips ----------------------------------------------------------------------------------------------------------------
+# clips --------------------------------------------------------------------------------------------
 
 
 def test_clips_are_finished_at_any_size():
@@ -204,7 +213,8 @@ def test_clips_are_finished_at_any_size():
 
 
 def test_the_finisher_starts_from_the_stated_error_not_from_the_confidence():
-    """Disagreement with measured depth lowers the confidence once, at the new size, and not a second time through the error."""
+    """Disagreement with measured depth lowers the confidence once, at the new size, and not a second time through the
+    error."""
     model = mdm.MDM(FINISHING).eval()
     clip = model.sample(some_condition(), SampleRequest(1))
     doubted = replace(clip, confidence=clip.confidence * 0.1)
@@ -215,7 +225,7 @@ def test_the_finisher_starts_from_the_stated_error_not_from_the_confidence():
     assert torch.equal(diffusion.depth_agreement(done.depth, fine), torch.ones_like(done.depth))
 
 
-# training -------------------------------------------------------------------------------------------------------------
+# training -----------------------------------------------------------------------------------------
 
 
 def gradients(model, clips):
@@ -230,8 +240,11 @@ def test_patches_teach_the_finisher_alone():
     without, before = gradients(model, plain)
     with_them, after = gradients(model, [with_patch(clip) for clip in plain])
     assert {name for name in with_them.terms if name not in without.terms} == {
-        "fine_rgb", "fine_depth", "fine_semantics", "fine_error",
-    }  # fmt: skip
+        "fine_rgb",
+        "fine_depth",
+        "fine_semantics",
+        "fine_error",
+    }
     for name, gradient in after.items():
         if name.startswith("finisher."):
             assert before[name] is None
@@ -243,7 +256,11 @@ def test_patches_teach_the_finisher_alone():
 
 def test_patches_of_several_scales_and_of_some_clips_only_are_learnt_from_together():
     model = randomised(FINISHING)
-    clips = [with_patch(made_up_clip(0), side=12, scale=2), made_up_clip(1), with_patch(made_up_clip(2), 4, 20, side=8, scale=3)]
+    clips = [
+        with_patch(made_up_clip(0), side=12, scale=2),
+        made_up_clip(1),
+        with_patch(made_up_clip(2), 4, 20, side=8, scale=3),
+    ]
     loss, found = gradients(model, clips)
     assert "fine_rgb" in loss.terms
     assert all(found[name] is not None for name in found if name.startswith("finisher."))
@@ -255,15 +272,19 @@ PLACES = [(6, 10, 12), (0, 0, 48), (80, 144, 48), (40, 72, 32), (33, 91, 24), (1
 
 @pytest.mark.parametrize(("row", "column", "side"), PLACES)
 def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch, row, column, side):
-    """Condition and latents of the clips are ramps of places; what the finisher is given are the places of the patch."""
+    """Condition and latents of the clips are ramps of places; what the finisher is given are the places of the
+    patch."""
     model, seen = randomised(FINISHING), []
     clips = [made_up_clip(0, 192, 128), with_patch(made_up_clip(1, 192, 128), row, column, side, scale=2)]
     frames, (height, width) = 4, (128, 192)
     ramp = torch.stack(torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij"))
-    of_clips = torch.stack([torch.cat([ramp, torch.full((1, height, width), float(n))]) for n in range(2)]).repeat_interleave(frames, 0)
+    of_clips = torch.stack(
+        [torch.cat([ramp, torch.full((1, height, width), float(n))]) for n in range(2)]
+    ).repeat_interleave(frames, 0)
 
     def refined(latents, pixels, frames):
-        assert torch.equal(latents["rgb"][:, :3], functional.avg_pool2d(pixels.color, 2))  # latents and condition are of one place
+        # latents and condition are of one place
+        assert torch.equal(latents["rgb"][:, :3], functional.avg_pool2d(pixels.color, 2))
         one = pixels.color[:, :1]
         return Refined(pixels.color, one, functional.one_hot(one[:, 0].long() * 0, 19).permute(0, 3, 1, 2), one)
 
@@ -291,12 +312,17 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch, row,
 
 @pytest.mark.parametrize(("row", "column", "side"), [PLACES[1], PLACES[6]])
 def test_refining_the_surroundings_of_a_patch_is_as_good_as_refining_its_image(row, column, side):
-    """With the shipped weights, and half of the condition noise: losses of the whole image, put together from what `refine` and
-    `enlarged` make of it. One cell beside the place, the colour's would be 0.04 to 0.12 of their value apart."""
+    """With the shipped weights, and half of the condition noise: losses of the whole image, put together from what
+    `refine` and `enlarged` make of it. One cell beside the place, the colour's would be 0.04 to 0.12 of their value
+    apart."""
     model, frames, generator = files.load("embedded"), 4, torch.Generator().manual_seed(row)
     clip = with_patch(made_up_clip(3, 192, 128), row, column, side, scale=2)
     clip = replace(clip, fine=replace(clip.fine, clip=replace(clip.fine.clip, rgb=clip.fine.clip.rgb * 0.9)))
-    encoded, truth, settings = model.encode_condition([clip.condition]), model.encode_truth([clip]), LossSettings(None, 1.0, 0.2)
+    encoded, truth, settings = (
+        model.encode_condition([clip.condition]),
+        model.encode_truth([clip]),
+        LossSettings(None, 1.0, 0.2),
+    )
     stated = {m: z + 0.2 * torch.randn(z.shape, generator=generator) for m, z in truth.latents.items()}
     with torch.no_grad():
         terms = model._finisher_terms(stated, encoded, [clip], settings)

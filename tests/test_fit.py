@@ -57,7 +57,13 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 
 def settings(method: str = "street_gaussians", **changes) -> FitConfig:
-    small = {"iterations": 24, "start__gaussians": 900, "densify__max_gaussians": 1500, "checkpoint_every": 1000, "preview_every": 1000}
+    small = {
+        "iterations": 24,
+        "start__gaussians": 900,
+        "densify__max_gaussians": 1500,
+        "checkpoint_every": 1000,
+        "preview_every": 1000,
+    }
     return fit_config(method=method, **{**small, **changes})
 
 
@@ -78,13 +84,19 @@ def mean_psnr(folder: Path, left_m: float = 0.0) -> float:
 def learnt(world, tmp_path_factory) -> Path:
     """What 150 steps give."""
     return Fit(
-        scene=world["scene"], fused=world["fuse"], out=tmp_path_factory.mktemp("learnt") / "fit", settings=settings(iterations=150)
+        scene=world["scene"],
+        fused=world["fuse"],
+        out=tmp_path_factory.mktemp("learnt") / "fit",
+        settings=settings(iterations=150),
     ).run()
 
 
 def test_it_learns(world, learnt, tmp_path):
     """Some 150 steps from round grey blobs must clearly beat the start, in colour, depth and semantics."""
-    start, end = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "start", settings=settings(iterations=1)).run(), learnt
+    start, end = (
+        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "start", settings=settings(iterations=1)).run(),
+        learnt,
+    )
     assert mean_psnr(end) > mean_psnr(start) + 5.0
     assert mean_psnr(end) > 21.0
     view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
@@ -113,13 +125,16 @@ def test_same_in_same_out(world, tmp_path):
     first = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "a", settings=settings(iterations=12)).run()
     second = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "b", settings=settings(iterations=12)).run()
     assert fitted_bytes(first) == fitted_bytes(second)
-    other = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "c", settings=settings(iterations=12, seed=1)).run()
+    other = Fit(
+        scene=world["scene"], fused=world["fuse"], out=tmp_path / "c", settings=settings(iterations=12, seed=1)
+    ).run()
     assert fitted_bytes(other) != fitted_bytes(first)
 
 
 @pytest.mark.parametrize("densify", ["gradient", "mcmc"])
 def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, densify):
-    """Ctrl-C and SIGTERM before and after virtual views join, a densification and an opacity reset; learnt poses and all. Bit for bit."""
+    """Ctrl-C and SIGTERM before and after virtual views join, a densification and an opacity reset; learnt poses and
+    all. Bit for bit."""
     config = settings("mudg_s", iterations=26, poses__learn=True, densify__kind=densify)
     schedule, stops = fit.densify_schedule(config), [4, 9, 10, 12]
     if densify == "gradient":
@@ -128,7 +143,13 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
         assert [step for step in range(1, 27) if schedule.reset_due(step)] == [12]
     assert [step for step in range(1, 27) if schedule.due(step)] == ([10] if densify == "gradient" else [10, 20])
     assert config.virtual.start * config.iterations == pytest.approx(3.9)
-    step = Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "whole", settings=config)
+    step = Fit(
+        scene=world["scene"],
+        fused=world["fuse"],
+        observations=(world["virtual"],),
+        out=tmp_path / "whole",
+        settings=config,
+    )
     whole = step.run()
 
     adam_step, parts = fit.adam_step, tmp_path / "parts"
@@ -169,14 +190,22 @@ def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_
 
 
 def test_the_kinds_of_densification_differ_and_none_keeps_the_rows(world, tmp_path):
-    configs = {kind: settings(iterations=44, densify__max_gaussians=1600, densify__kind=kind) for kind in ("gradient", "mcmc", "none")}
-    made = {kind: Fit(
-        scene=world["scene"], fused=world["fuse"], out=tmp_path / kind, settings=config
-    ).run() for kind, config in configs.items()}
+    configs = {
+        kind: settings(iterations=44, densify__max_gaussians=1600, densify__kind=kind)
+        for kind in ("gradient", "mcmc", "none")
+    }
+    made = {
+        kind: Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / kind, settings=config).run()
+        for kind, config in configs.items()
+    }
     rows = {kind: len(fit.load_model(folder).table) for kind, folder in made.items()}
-    start = len(fit.load_model(Fit(
-        scene=world["scene"], fused=world["fuse"], out=tmp_path / "start", settings=settings(iterations=1)
-    ).run()).table)
+    start = len(
+        fit.load_model(
+            Fit(
+                scene=world["scene"], fused=world["fuse"], out=tmp_path / "start", settings=settings(iterations=1)
+            ).run()
+        ).table
+    )
     assert rows["none"] == start
     assert start < rows["mcmc"] <= 1600
     assert start < rows["gradient"] <= 1600
@@ -190,7 +219,14 @@ def test_regularisers_are_means_of_opacity_and_scale():
     opacity = torch.tensor([0.2, 0.6], requires_grad=True)
     one = torch.zeros(2, 1)
     gaussians = Gaussians(
-        torch.zeros(2, 3), torch.ones(2, 4), table, opacity, torch.zeros(2, 1, 3), extra=None, node=one[:, 0].int(), sh_rest=None
+        torch.zeros(2, 3),
+        torch.ones(2, 4),
+        table,
+        opacity,
+        torch.zeros(2, 1, 3),
+        extra=None,
+        node=one[:, 0].int(),
+        sh_rest=None,
     )
     assert fit.regularisers(gaussians, settings()) == {}
     terms = fit.regularisers(gaussians, settings(loss__opacity_weight=0.5, loss__scale_weight=2.0))
@@ -204,9 +240,16 @@ def test_regularisers_are_means_of_opacity_and_scale():
 
 def test_densification_grows_within_its_cap(world, tmp_path):
     folder = Fit(
-        scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(iterations=60, densify__max_gaussians=1600)
+        scene=world["scene"],
+        fused=world["fuse"],
+        out=tmp_path / "fit",
+        settings=settings(iterations=60, densify__max_gaussians=1600),
     ).run()
-    rows = [line["rows"] for line in map(store.parse_json, (folder / "log.jsonl").read_text().splitlines(), ["log"] * 99) if "rows" in line]
+    rows = [
+        line["rows"]
+        for line in map(store.parse_json, (folder / "log.jsonl").read_text().splitlines(), ["log"] * 99)
+        if "rows" in line
+    ]
     assert max(rows) > 1500
     assert max(rows) <= 1600
     assert len(fit.load_model(folder).table) > 0
@@ -224,9 +267,12 @@ def test_virtual_views_do_not_feed_densification(world, monkeypatch, tmp_path):
     monkeypatch.setattr(fit, "rasterize", spy)
     monkeypatch.setattr(fit.DensifyStats, "observe", observe)
     Fit(
-        scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "fit",
+        scene=world["scene"],
+        fused=world["fuse"],
+        observations=(world["virtual"],),
+        out=tmp_path / "fit",
         settings=settings("mudg_s", virtual__probability=0.5, virtual__start=0.0, checkpoint_every=999),
-    ).run()  # fmt: skip
+    ).run()
     assert {absgrad for width, absgrad in kinds if width == 30} == {False}
     assert any(absgrad for width, absgrad in kinds if width == SIZE[0])
 
@@ -234,12 +280,16 @@ def test_virtual_views_do_not_feed_densification(world, monkeypatch, tmp_path):
 def test_perfect_virtual_views_help_off_the_path(world, learnt, tmp_path):
     config = settings("mudg_s", iterations=150, virtual__probability=0.4)
     guided = Fit(
-        scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "guided", settings=config
+        scene=world["scene"],
+        fused=world["fuse"],
+        observations=(world["virtual"],),
+        out=tmp_path / "guided",
+        settings=config,
     ).run()
     assert mean_psnr(guided, left_m=2.0) > mean_psnr(learnt, left_m=2.0) + 0.3
 
 
-# ---- what must be refused ---------------------------------------------------------------------------------------------
+# ---- what must be refused ------------------------------------------------------------------------
 
 
 def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeypatch):
@@ -252,7 +302,9 @@ def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeyp
 
     stepped = []
     adam_step = fit.adam_step
-    monkeypatch.setattr(fit, "adam_step", lambda model, step, *rest: (stepped.append(step), adam_step(model, step, *rest)))
+    monkeypatch.setattr(
+        fit, "adam_step", lambda model, step, *rest: (stepped.append(step), adam_step(model, step, *rest))
+    )
     monkeypatch.setattr(fit.losses, "sky_map", poisoned)
     with pytest.raises(NumericsError, match=r"'sky' is not finite[\s\S]*front/00000\d, step 5"):
         Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings()).run()
@@ -286,7 +338,11 @@ def test_mudg_s_without_virtual_views_is_a_usage_error(world, tmp_path):
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no finished virtual views"):
         Fit(
-            scene=world["scene"], fused=world["fuse"], observations=(tmp_path / "empty",), out=tmp_path / "fit", settings=settings("mudg_s")
+            scene=world["scene"],
+            fused=world["fuse"],
+            observations=(tmp_path / "empty",),
+            out=tmp_path / "fit",
+            settings=settings("mudg_s"),
         ).run()
 
 
@@ -295,8 +351,13 @@ def test_views_of_several_folders_are_those_of_one_folder_with_all(world, tmp_pa
     for name in names:
         shutil.copytree(world["virtual"] / name, tmp_path / f"of {name}" / name)
     several = [tmp_path / f"of {name}" if number else world["virtual"] / name for number, name in enumerate(names)]
-    step = Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "whole",
-               settings=settings("mudg_s", iterations=4, virtual__start=0.0))  # fmt: skip
+    step = Fit(
+        scene=world["scene"],
+        fused=world["fuse"],
+        observations=(world["virtual"],),
+        out=tmp_path / "whole",
+        settings=settings("mudg_s", iterations=4, virtual__start=0.0),
+    )
     together = replace(step, out=tmp_path / "together").run()
     apart = replace(step, out=tmp_path / "apart", observations=tuple(several)).run()
     assert fitted_bytes(apart) == fitted_bytes(together)
@@ -312,11 +373,20 @@ def test_a_generated_view_of_which_no_pixel_counts_is_no_number(world, tmp_path)
     with ObservationWriter(tmp_path / "virtual" / "front_shift+2.0", "front_shift+2.0", "mudg_r") as writer:
         writer.add(replace(truth(view), kind="virtual", mask=torch.zeros(1, 20, 30, dtype=torch.bool)))
     config = settings(
-        "mudg_s", iterations=2, virtual__probability=1.0, virtual__start=0.0, virtual__stop=1.0, virtual__beside=False,
+        "mudg_s",
+        iterations=2,
+        virtual__probability=1.0,
+        virtual__start=0.0,
+        virtual__stop=1.0,
+        virtual__beside=False,
         virtual__gaussians=0,
-    )  # fmt: skip
+    )
     folder = Fit(
-        scene=world["scene"], fused=world["fuse"], observations=(tmp_path / "virtual",), out=tmp_path / "fit", settings=config
+        scene=world["scene"],
+        fused=world["fuse"],
+        observations=(tmp_path / "virtual",),
+        out=tmp_path / "fit",
+        settings=config,
     ).run()
     last = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()][-1]
     assert last["view"].startswith("front_shift") and "psnr" not in last and "loss_virtual_color" in last
@@ -330,7 +400,13 @@ def test_recorded_observations_are_refused_as_virtual_views(world, tmp_path):
     with ObservationWriter(sets / "front_recorded", "front_recorded", "truth", "recorded") as writer:
         writer.add(replace(truth(view), kind="recorded"))
     with pytest.raises(InputError, match=r"recorded views[\s\S]*front_recorded[\s\S]*mudg synthesize"):
-        Fit(scene=world["scene"], fused=world["fuse"], observations=(sets,), out=tmp_path / "fit", settings=settings("mudg_s")).run()
+        Fit(
+            scene=world["scene"],
+            fused=world["fuse"],
+            observations=(sets,),
+            out=tmp_path / "fit",
+            settings=settings("mudg_s"),
+        ).run()
     assert not (tmp_path / "fit").exists()
 
 
@@ -341,7 +417,7 @@ def test_unknown_camera_and_no_fit(world, tmp_path):
         fit.load_model(tmp_path)
 
 
-# ---- odd scenes -------------------------------------------------------------------------------------------------------
+# ---- odd scenes ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", ["gs3d", "street_gaussians"])
@@ -349,13 +425,19 @@ def test_scenes_without_tracks_or_labels_or_with_one_frame_work(tmp_path, method
     write_scene(tmp_path / "scene", frames=1, width=SIZE[0], height=SIZE[1], labels=False, tracks=False)
     cloud = fused_cloud(1, semantics=False)
     write_fused(tmp_path / "fuse", type(cloud)(cloud.static, {}), {})
-    folder = Fit(scene=tmp_path / "scene", fused=tmp_path / "fuse", out=tmp_path / "fit", settings=settings(method, iterations=60)).run()
+    folder = Fit(
+        scene=tmp_path / "scene",
+        fused=tmp_path / "fuse",
+        out=tmp_path / "fit",
+        settings=settings(method, iterations=60),
+    ).run()
     model, view = fit.load_model(folder), view_at(0.0, camera(width=SIZE[0], height=SIZE[1]))
     seen, exact = fit.render_view(model, view, RasterConfig()), truth(view)
     assert seen.semantics is None
     ground = (exact.semantics != ID["sky"])[None]  # gs3d has no sky
     plain = exact.rgb[:, ground[0]].mean(1)[:, None, None].expand_as(exact.rgb)
-    assert metrics.psnr(seen.rgb, exact.rgb, ground) > metrics.psnr(plain, exact.rgb, ground) + 1  # measured: 1.3 and 8.7 dB more
+    # measured: 1.3 and 8.7 dB more
+    assert metrics.psnr(seen.rgb, exact.rgb, ground) > metrics.psnr(plain, exact.rgb, ground) + 1
 
 
 def test_view_order_is_a_function_of_seed_and_step_and_fair():
@@ -394,11 +476,14 @@ def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path
     usual = settings("mudg_s", iterations=30, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
     folders = [
         Fit(
-            scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / str(n),
+            scene=world["scene"],
+            fused=world["fuse"],
+            observations=(world["virtual"],),
+            out=tmp_path / str(n),
             settings=replace(usual, virtual=replace(usual.virtual, **changes)),
-        ).run()  # fmt: skip
+        ).run()
         for n, changes in enumerate(({}, {"lidar_weight": 0.0}, {"ssim_weight": 0.0}))
-    ]  # fmt: skip
+    ]
     assert len({fitted_bytes(folder)["gaussians.safetensors"] for folder in folders}) == len(folders)
     for folder in folders:
         assert all(torch.isfinite(value).all() for value in fit.load_model(folder).table.columns.values())
@@ -411,7 +496,13 @@ def test_virtual_views_of_the_published_fit_have_the_published_terms_alone(world
     paper = run_preset("paper").fit
     virtual = replace(paper.virtual, perception="filters", start=0.0, probability=0.5)
     config = replace(settings("mudg_s", iterations=12), loss=paper.loss, virtual=virtual)
-    Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "fit", settings=config).run()
+    Fit(
+        scene=world["scene"],
+        fused=world["fuse"],
+        observations=(world["virtual"],),
+        out=tmp_path / "fit",
+        settings=config,
+    ).run()
     assert seen[True] == {"virtual_perceptual", "virtual_depth", "virtual_semantics"}
     assert {"color", "lidar", "sky"} <= seen[False] and "semantics" not in seen[False]
 
@@ -436,7 +527,8 @@ def test_a_point_behind_a_nearer_one_is_no_depth_of_this_camera():
 
 
 def test_what_only_virtual_views_see():
-    """A wall 6 m ahead with a box before it: from the side, what the box hid is unseen, the rest of the wall is seen."""
+    """A wall 6 m ahead with a box before it: from the side, what the box hid is unseen, the rest of the wall is
+    seen."""
     cam = camera(width=SIZE[0], height=SIZE[1])
     ahead = View(cam, geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
     side = View(cam, geometry.yaw_matrix(0.0, (0.0, 1.5, 0.0)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES), 0.0)
@@ -445,9 +537,12 @@ def test_what_only_virtual_views_see():
     witness = np.where(np.abs((column - cam.cx) / cam.fx * 3) < 0.45, 3.0, 6.0).astype(np.float32)
     recorded = fit_trust._Witness(ahead, np.repeat(witness[None], cam.height, 0))
     shown = fit_views.StoredView(
-        "side", side, "virtual", np.zeros((cam.height, cam.width, 3), np.uint8),
+        "side",
+        side,
+        "virtual",
+        np.zeros((cam.height, cam.width, 3), np.uint8),
         depth=np.full((cam.height, cam.width), 6.0, np.float32),
-    )  # fmt: skip
+    )
     unseen = fit_trust._unseen(shown, [recorded], [])[cam.height // 2]
     wall_y = 1.5 - (column - cam.cx) / cam.fx * 6
     in_image = np.abs(wall_y) < 0.95 * cam.cx / cam.fx * 6

@@ -52,13 +52,20 @@ def world(tmp_path_factory) -> dict[str, Path]:
     with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
         for view in path.views:
             writer.add(truth(view.resized(30, 20)))
-    Fit(scene=root / "scene", fused=root / "fuse", out=root / "plain", settings=settings("street_gaussians", iterations=80)).run()
+    Fit(
+        scene=root / "scene",
+        fused=root / "fuse",
+        out=root / "plain",
+        settings=settings("street_gaussians", iterations=80),
+    ).run()
     return {name: root / name for name in ("scene", "fuse", "virtual", "plain")}
 
 
 def go_on(world: dict[str, Path], out: Path, config: FitConfig | None = None, **changes) -> Path:
     named = {"observations": (world["virtual"],), "start_from": world["plain"], **changes}
-    return Fit(**{"scene": world["scene"], "fused": world["fuse"], "out": out, "settings": config or settings(), **named}).run()
+    return Fit(
+        **{"scene": world["scene"], "fused": world["fuse"], "out": out, "settings": config or settings(), **named}
+    ).run()
 
 
 def psnr_beside(folder: Path) -> float:
@@ -130,7 +137,7 @@ def test_a_fit_without_virtual_views_goes_on_too(world, tmp_path):
     assert fit.load_model(made).facts["method"] == "street_gaussians"
 
 
-# ---- what is carried over --------------------------------------------------------------------------------------------
+# ---- what is carried over ------------------------------------------------------------------------
 
 
 def test_classes_that_only_virtual_views_show_are_added(world):
@@ -164,7 +171,7 @@ def test_learnt_corrections_of_cameras_are_kept(world, tmp_path):
     go_on(world, tmp_path / "more", settings(iterations=2, **changes), start_from=plain)
 
 
-# ---- what is refused -------------------------------------------------------------------------------------------------
+# ---- what is refused -----------------------------------------------------------------------------
 
 
 def test_another_scene_cloud_or_method_is_refused(world, tmp_path):

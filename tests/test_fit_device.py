@@ -1,4 +1,5 @@
-"""Fit, render and score on a device that is not the CPU: the same numbers, what is copied there and back, and going on elsewhere.
+"""Fit, render and score on a device that is not the CPU: the same numbers, what is copied there and back, and going on
+elsewhere.
 
 The pretend device runs the plain-torch twins, so that the CPU that it is compared with runs them too.
 """
@@ -84,9 +85,16 @@ def early_densification(monkeypatch):
 
 def settings(method: str, device: str, **changes) -> FitConfig:
     small = {
-        "iterations": 6, "start__gaussians": 120, "densify__max_gaussians": 400, "checkpoint_every": 1000, "preview_every": 1000,
-        "raster": "torch", "loss__semantic_every": 2, "virtual__probability": 0.5, "virtual__gaussians": 50,
-    }  # fmt: skip
+        "iterations": 6,
+        "start__gaussians": 120,
+        "densify__max_gaussians": 400,
+        "checkpoint_every": 1000,
+        "preview_every": 1000,
+        "raster": "torch",
+        "loss__semantic_every": 2,
+        "virtual__probability": 0.5,
+        "virtual__gaussians": 50,
+    }
     return fit_config(method=method, device=device, **{**small, **changes})
 
 
@@ -119,7 +127,9 @@ def assert_same_fit(mine: Path, theirs: Path) -> None:
 
 
 def fitted(world: dict[str, Path], out: Path, config: FitConfig, **more: Path) -> Path:
-    return Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=out, settings=config, **more).run()
+    return Fit(
+        scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=out, settings=config, **more
+    ).run()
 
 
 CASES = {
@@ -174,14 +184,16 @@ def test_a_fit_goes_on_on_the_other_device(world, tmp_path, monkeypatch):
     assert_same_fit(there, here)
 
 
-# ---- what is copied ---------------------------------------------------------------------------------------------------
+# ---- what is copied ------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def plain_fit(world, tmp_path_factory) -> Path:
     """A short fit on the CPU, with the native library."""
     config = fit_config(method="street_gaussians", iterations=30, start__gaussians=120, device="cpu")
-    return Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path_factory.mktemp("fit") / "out", settings=config).run()
+    return Fit(
+        scene=world["scene"], fused=world["fuse"], out=tmp_path_factory.mktemp("fit") / "out", settings=config
+    ).run()
 
 
 class Steps:
@@ -210,8 +222,16 @@ class Steps:
 @pytest.mark.parametrize("method", [pytest.param("street_gaussians", marks=pytest.mark.slow), "mudg_s"])
 def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path, monkeypatch, method):
     steps, pixels = Steps(), {SIZE[0] * SIZE[1], 30 * 20}
-    config = settings(method, "pretend", densify__kind="none", iterations=5, start__gaussians=60, poses__learn=True, poses__rounds=0,
-                      virtual__gaussians=0)  # fmt: skip
+    config = settings(
+        method,
+        "pretend",
+        densify__kind="none",
+        iterations=5,
+        start__gaussians=60,
+        poses__learn=True,
+        poses__rounds=0,
+        virtual__gaussians=0,
+    )
     monkeypatch.setattr(fit, "densify_schedule", lambda *_given: None)
     monkeypatch.setattr(fit, "add_certainty", lambda state, config: None)
     with pretend_device(), transfers() as seen:
@@ -235,7 +255,8 @@ def test_a_step_copies_a_view_there_and_one_row_of_numbers_back(world, tmp_path,
 
 
 def test_densification_brings_no_rows_back(plain_fit):
-    """Rows are chosen, copied, moved and dropped there; counts come back, and the only large thing that goes there is noise."""
+    """Rows are chosen, copied, moved and dropped there; counts come back, and the only large thing that goes there is
+    noise."""
     draw = torch.Generator().manual_seed(0)
     gradient = DensifySettings(1, 9, 1, max_rows=5000, prune_opacity=0.1)
     chain_of_copies = McmcSettings(1, 9, 1, max_rows=5000, dead_opacity=0.2)
@@ -267,7 +288,8 @@ def test_densification_brings_no_rows_back(plain_fit):
 
 
 def test_what_is_not_finite_is_found_in_one_look(world):
-    """On another device nothing is looked at before the whole step is there, and the first fault is named as on the CPU."""
+    """On another device nothing is looked at before the whole step is there, and the first fault is named as on the
+    CPU."""
     with pretend_device() as there:
         table = Table({"means": torch.zeros(3, 3), "logits": torch.zeros(3)}).to(there)
         model = SceneModel(table, (StaticNode(),), None, (), 0)
@@ -286,7 +308,7 @@ def test_what_is_not_finite_is_found_in_one_look(world):
             check.refuse()
 
 
-# ---- parts ------------------------------------------------------------------------------------------------------------
+# ---- parts ---------------------------------------------------------------------------------------
 
 
 def test_a_table_moves_with_moments_labels_and_nothing_else():
@@ -392,7 +414,7 @@ def test_perceptual_distances_are_those_of_the_cpu(tmp_path, kind):
         torch.testing.assert_close(made.cpu(), here, atol=1e-6, rtol=1e-5)
 
 
-# ---- which device -----------------------------------------------------------------------------------------------------
+# ---- which device --------------------------------------------------------------------------------
 
 
 def test_auto_draws_with_cuda_only_if_gsplat_can(monkeypatch):
@@ -443,7 +465,7 @@ def test_benchmarks_hand_their_device_to_every_step(monkeypatch):
     assert loop.at_once(replace(config, device="cpu")) == os.cpu_count()
 
 
-# ---- render and score -------------------------------------------------------------------------------------------------
+# ---- render and score ----------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -456,7 +478,10 @@ def test_render_and_score_on_another_device(world, plain_fit, tmp_path, monkeypa
             scene=world["scene"], model=plain_fit, out=tmp_path / "there", settings=replace(drawn, device="pretend")
         ).run()
         assert (
-            RenderViews(scene=world["scene"], model=plain_fit, out=here, settings=replace(drawn, device="pretend")).run() == here
+            RenderViews(
+                scene=world["scene"], model=plain_fit, out=here, settings=replace(drawn, device="pretend")
+            ).run()
+            == here
         )  # a result is one on any device
     mine, theirs = (read_observations(folder / "front_recorded") for folder in (there, here))
     for index in range(len(mine)):
@@ -466,7 +491,12 @@ def test_render_and_score_on_another_device(world, plain_fit, tmp_path, monkeypa
     with twins():
         Score(scene=world["scene"], views={"fit": here}, out=tmp_path / "score_here", settings=config).run()
     with pretend_device(), transfers() as seen:
-        Score(scene=world["scene"], views={"fit": here}, out=tmp_path / "score_there", settings=replace(config, device="pretend")).run()
+        Score(
+            scene=world["scene"],
+            views={"fit": here},
+            out=tmp_path / "score_there",
+            settings=replace(config, device="pretend"),
+        ).run()
     assert {copy.where.partition(":")[0] for copy in seen if copy.values > NUMBERS} == {"networks/featnets.py"}
     found = [store.read_json(tmp_path / name / "metrics.json") for name in ("score_here", "score_there")]
     values = [document["by_distance"][0]["values"] for document in found]

@@ -31,9 +31,11 @@ def test_the_loss_is_the_scorers_distance_where_all_is_certain():
     codec = CodecFeatures(files.load("embedded").codec)
     render, truth = random(5, 3, 24, 32).float(), random(6, 3, 24, 32).float()
     loss = perception_of(VirtualConfig(perception="codec"))(render, truth, torch.ones(1, 24, 32))
-    pair = Pair(rgb=render, truth_rgb=truth, **dict.fromkeys(
-        ("depth", "semantics", "truth_depth", "truth_depth_valid", "truth_semantics")
-    ))  # fmt: skip
+    pair = Pair(
+        rgb=render,
+        truth_rgb=truth,
+        **dict.fromkeys(("depth", "semantics", "truth_depth", "truth_depth_valid", "truth_semantics")),
+    )
     assert loss.item() == pytest.approx(PerceptualDistance(codec)(pair), rel=1e-6)
 
 

@@ -1,4 +1,5 @@
-"""The path of the full-size model, from a published checkpoint to a table of the paper, on toys: one command line after another."""
+"""The path of the full-size model, from a published checkpoint to a table of the paper, on toys: one command line after
+another."""
 
 import dataclasses
 import os
@@ -17,7 +18,10 @@ from mudg.diffusion.published import model as published_files
 from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.steps.settings.presets import PRESETS
 
-TOY = "import sys; from toy_published import TINY; from mudg.diffusion.published import convert; convert.PublishedConfig = lambda: TINY\n"
+TOY = (
+    "import sys; from toy_published import TINY; from mudg.diffusion.published import convert; convert.PublishedConfig"
+    " = lambda: TINY\n"
+)
 """Before `convert` alone: checkpoints hold the toy network. Everything else is told by the model's folder."""
 MAIN = "from mudg.app import main; import sys; sys.exit(main(sys.argv[1:]))"
 OWN = {"synthesize.model", "fit.iterations", "fit.virtual.lpips_weights"}
@@ -33,8 +37,12 @@ def mudg(tmp_path):
     def run(line, before=""):
         done = subprocess.run(
             [sys.executable, "-c", before + MAIN, *line.split()],
-            cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=1800,
-        )  # fmt: skip
+            cwd=tmp_path,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=1800,
+        )
         return done.returncode, done.stderr + done.stdout
 
     return run
@@ -48,7 +56,9 @@ def done(result):
 @pytest.mark.slow
 def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
     torch.save({"state_dict": tiny_checkpoint()}, tmp_path / "512-mdm-checkpoint.ckpt")
-    store.write_safetensors(tmp_path / "lpips.safetensors", {name: value.numpy() for name, value in lpips_state().items()})
+    store.write_safetensors(
+        tmp_path / "lpips.safetensors", {name: value.numpy() for name, value in lpips_state().items()}
+    )
     city = "--city.n-frames 6 --city.width 64 --city.height 48 --city.cameras front --city.lidar-azimuth-step-deg 1"
     done(mudg(f"ingest city log/scene {city}"))
     done(mudg("fuse log/scene --out log/fuse"))
@@ -58,20 +68,35 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
     assert (start.config.width, start.config.height) == (512, 320) and start.config.net == TINY.net
 
     training = (
-        "--data.scenes log --data.window 4 --data.stride 2 --data.held-out-every 0 --data.no-augment --steps 1 --score.every 100 "
-        "--optimizer.batch-frames 4 --optimizer.full-window-share 1 --optimizer.lr 1e-5 --compute.workers 0 --precision float32"
+        "--data.scenes log --data.window 4 --data.stride 2 --data.held-out-every 0 --data.no-augment --steps 1"
+        " --score.every 100 --optimizer.batch-frames 4 --optimizer.full-window-share 1 --optimizer.lr 1e-5"
+        " --compute.workers 0 --precision float32"
     )
     done(mudg(f"learn --start models/start --data.width 32 --data.height 32 {training} --out one"))
-    done(mudg(f"learn --start one/model --data.width 36 --data.height 32 --frozen temporal_transformers {training} --out two"))
+    done(
+        mudg(
+            f"learn --start one/model --data.width 36 --data.height 32 --frozen temporal_transformers {training}"
+            " --out two"
+        )
+    )
     one, two = (published_files.load(tmp_path / name / "model") for name in ("one", "two"))
     assert ((one.config.width, one.config.height), (two.config.width, two.config.height)) == ((32, 32), (36, 32))
-    kept, before, after = two.temporal_parameters("transformers"), one.trained_part().state_dict(), two.trained_part().state_dict()
+    kept, before, after = (
+        two.temporal_parameters("transformers"),
+        one.trained_part().state_dict(),
+        two.trained_part().state_dict(),
+    )
     assert {name for name in before if torch.equal(before[name], after[name])} == kept
 
     code, words = mudg("adapt log/scene --fused log/fuse --fitted log/fuse --model two/model --out adapted")
     assert code in (2, 3) and "renders" in words and not (tmp_path / "adapted").exists()
 
-    done(mudg("synthesize log/scene --fused log/fuse --model two/model --steps 50 --overlap 2 --shifts-m 2 --no-full-size --out virtual"))
+    done(
+        mudg(
+            "synthesize log/scene --fused log/fuse --model two/model --steps 50 --overlap 2 --shifts-m 2 --no-full-size"
+            " --out virtual"
+        )
+    )
     (views,) = list_observation_sets(tmp_path / "virtual").values()
     seen = read_observations(views)
     assert len(seen) == 6
@@ -80,11 +105,21 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
         assert bool(torch.isfinite(frame.rgb).all()) and float(frame.rgb.std()) > 0.01
     assert [bool(seen[n].mask.any()) for n in range(6)] == [False] + [True] * 5  # frame 0 shows the recorded pose
 
-    done(mudg("fit log/scene --fused log/fuse --observations virtual --method mudg_s --iterations 10 --start.gaussians 500 --out fit"))
+    done(
+        mudg(
+            "fit log/scene --fused log/fuse --observations virtual --method mudg_s --iterations 10 --start.gaussians"
+            " 500 --out fit"
+        )
+    )
     assert store.read_json(tmp_path / "fit" / "run.json")["summary"]["steps"] == 10
 
-    done(mudg("bench paper city:development --table mudg3 --preset paper --model two/model --fit.virtual.lpips-weights lpips.safetensors "
-              "--iterations 10 --logs 1 --frames 0:5 --resolution 64x48 --no-videos --processes 1 --out table"))  # fmt: skip
+    done(
+        mudg(
+            "bench paper city:development --table mudg3 --preset paper --model two/model --fit.virtual.lpips-weights"
+            " lpips.safetensors --iterations 10 --logs 1 --frames 0:5 --resolution 64x48 --no-videos --processes 1"
+            " --out table"
+        )
+    )
     document = store.read_json(tmp_path / "table" / "bench.json")
     for row in ("street_gaussians", "only_I", "only_I_D", "only_I_S", "mudg_s"):
         assert document["cells"][row]["0"]["psnr"]["mean"] > 5.0

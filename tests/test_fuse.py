@@ -19,7 +19,7 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError, IntegrityError
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.types import FusedCloud, Photo, PointCloud, SweepPoints, Track, View
-from mudg.core.fusion import (  # fmt: skip
+from mudg.core.fusion import (
     STATIC,
     CloudAccumulator,
     FusionReport,
@@ -59,7 +59,7 @@ def color_share(cloud: PointCloud, chosen: np.ndarray, kind: int) -> float:
     return float((cloud.rgb[chosen] == COLORS[kind]).all(1).mean())
 
 
-# --- movers ---------------------------------------------------------------------------------------------------------
+# --- movers ---------------------------------------------------------------------------------------
 
 
 def track_through(centers: Any, yaws: Any = None, size: Any = (4.5, 1.8, 1.5)) -> Track:
@@ -129,7 +129,7 @@ def test_box_is_grown_but_not_below_its_floor_margin() -> None:
     assert points_in_box(points, size, 0.1, 0.1).tolist() == [True, False, True, True, False, True, False, False]
 
 
-# --- separation -----------------------------------------------------------------------------------------------------
+# --- separation -----------------------------------------------------------------------------------
 
 
 def test_separation_finds_the_cars_points_and_leaves_the_road() -> None:
@@ -178,7 +178,7 @@ def test_in_overlapping_boxes_the_smaller_wins() -> None:
     assert separate(sweep, [truck, bicycle], RULES)[0].tolist() == [1, 0]
 
 
-# --- colours and occlusion ------------------------------------------------------------------------------------------
+# --- colours and occlusion ------------------------------------------------------------------------
 
 
 def test_without_the_test_the_wall_behind_a_panel_takes_its_colour_and_with_it_does_not() -> None:
@@ -325,7 +325,7 @@ def test_beam_gap_is_measured() -> None:
     assert measure_beam_gap(np.zeros((0, 3), np.float32), 0.7) == 0.7
 
 
-# --- voxels and memory ----------------------------------------------------------------------------------------------
+# --- voxels and memory ----------------------------------------------------------------------------
 
 
 def test_voxel_filter_keeps_the_sample_seen_from_nearest_and_the_majority_class() -> None:
@@ -395,11 +395,23 @@ def test_small_training_size_is_fast() -> None:
     for n in range(10):
         elevation = np.deg2rad(np.repeat(np.linspace(-25, 15, 60), 1000))
         azimuth, reach = np.tile(np.linspace(-np.pi, np.pi, 1000), 60), rng.uniform(5, 60, 60_000)
-        xyz = np.stack([reach * np.cos(elevation) * np.cos(azimuth), reach * np.cos(elevation) * np.sin(azimuth),
-                        reach * np.sin(elevation)], 1).astype(np.float32)  # fmt: skip
+        xyz = np.stack(
+            [
+                reach * np.cos(elevation) * np.cos(azimuth),
+                reach * np.cos(elevation) * np.sin(azimuth),
+                reach * np.sin(elevation),
+            ],
+            1,
+        ).astype(np.float32)
         points = SweepPoints(xyz, np.zeros(60_000, np.float32), np.linspace(-0.05, 0.05, 60_000).astype(np.float32))
-        shots = [Photo(View(view.camera, yaw_matrix(a) @ view.world_from_cam, 0.1 * n), np.zeros((128, 192, 3), np.uint8),
-                      np.zeros((128, 192), np.uint8)) for a in (0.0, 0.8, -0.8)]  # fmt: skip
+        shots = [
+            Photo(
+                View(view.camera, yaw_matrix(a) @ view.world_from_cam, 0.1 * n),
+                np.zeros((128, 192, 3), np.uint8),
+                np.zeros((128, 192), np.uint8),
+            )
+            for a in (0.0, 0.8, -0.8)
+        ]
         sweeps.append(SweepShots(0.1 * n, np.eye(4), points, shots))
     tracks = [
         track_through(np.c_[np.linspace(5 + k, 9 + k, 12), np.full(12, 2.0 * k - 9), np.zeros(12)]) for k in range(10)
@@ -415,7 +427,7 @@ def _cpu_seconds(act: Callable[[], object]) -> float:
     return time.process_time() - began
 
 
-# --- the stage ------------------------------------------------------------------------------------------------------
+# --- the stage ------------------------------------------------------------------------------------
 
 
 def test_what_is_written(tmp_path: Path) -> None:
@@ -455,13 +467,14 @@ def test_a_changed_cloud_is_noticed(tmp_path: Path) -> None:
         read_fused(tmp_path)
 
 
-# --- the real sequence ----------------------------------------------------------------------------------------------
+# --- the real sequence ----------------------------------------------------------------------------
 
 PROTOCOL_DB = {"no poses": 12.87, "ego poses": 14.10, "ego poses + boxes": 16.63}
 
 
 class KittiCheck:
-    """Frame 8 seen through the coloured points of the other 15 frames: nearest point wins, one pixel a point, floored."""
+    """Frame 8 seen through the coloured points of the other 15 frames: nearest point wins, one pixel a point,
+    floored."""
 
     def __init__(self, source: Path, out: Path) -> None:
         self.scene = IMPORTERS["kitti"](source, out, ImportOptions())
@@ -482,10 +495,15 @@ class KittiCheck:
             return View(self.camera, pose(n) @ self.lidar_from_cam, self.scene.frames[n].view.time_s)
 
         sweeps = (
-            SweepShots(self.scene.sweeps[n].time_s, pose(n), read_points(self.scene, self.scene.sweeps[n]),
-                       [Photo(view(n), self.images[n])])
-            for n in range(16) if n != 8
-        )  # fmt: skip
+            SweepShots(
+                self.scene.sweeps[n].time_s,
+                pose(n),
+                read_points(self.scene, self.scene.sweeps[n]),
+                [Photo(view(n), self.images[n])],
+            )
+            for n in range(16)
+            if n != 8
+        )
         cloud, _ = fuse_sweeps(sweeps, self.scene.tracks if mode.endswith("boxes") else (), rules)
         target = view(8)
         self.last = (cloud, target)

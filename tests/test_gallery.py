@@ -24,21 +24,35 @@ METRICS = [
 
 def scores_of(scene: str, psnr: float) -> dict[str, Any]:
     rows = [
-        {"method": "mudg_s", "distance_m": d, "trajectories": [], "values": {"psnr": psnr - d, "abs_rel": "no truth" if d else 0.1}}
+        {
+            "method": "mudg_s",
+            "distance_m": d,
+            "trajectories": [],
+            "values": {"psnr": psnr - d, "abs_rel": "no truth" if d else 0.1},
+        }
         for d in (0.0, 2.0)
-    ]  # fmt: skip
+    ]
     rows.append({"method": "mudg_r", "distance_m": 0.0, "trajectories": [], "values": {"psnr": "not produced"}})
     return {
-        "scene": {"id": scene, "dataset": "toy", "frames": 12, "cameras": {"front": [48, 32]}}, "by_distance": rows, "metrics": METRICS,
-        "methods": [{"name": "mudg_s", "title": "Gaussians with diffusion"}, {"name": "mudg_r", "title": "Diffusion output"}],
-    }  # fmt: skip
+        "scene": {"id": scene, "dataset": "toy", "frames": 12, "cameras": {"front": [48, 32]}},
+        "by_distance": rows,
+        "metrics": METRICS,
+        "methods": [
+            {"name": "mudg_s", "title": "Gaussians with diffusion"},
+            {"name": "mudg_r", "title": "Diffusion output"},
+        ],
+    }
 
 
 def run_of(folder: Path, scene: str = "city-1", psnr: float = 25.0, state: str = "complete") -> Path:
-    store.write_json(folder / "run.json", {"asked": {"verb": "run"}, "state": state, "steps": {"fit": {"seconds": 65.2}}})
+    store.write_json(
+        folder / "run.json", {"asked": {"verb": "run"}, "state": state, "steps": {"fit": {"seconds": 65.2}}}
+    )
     store.write_json(folder / "score" / "metrics.json", scores_of(scene, psnr))
     store.write_text(folder / "report.html", "the report")
-    store.write_image(folder / "render" / "mudg_s" / "front_recorded" / "rgb" / "000000.png", np.full((32, 48, 3), 90, np.uint8))
+    store.write_image(
+        folder / "render" / "mudg_s" / "front_recorded" / "rgb" / "000000.png", np.full((32, 48, 3), 90, np.uint8)
+    )
     return folder
 
 
@@ -61,9 +75,10 @@ def test_a_page_has_a_card_and_the_scores_of_every_run(tmp_path: Path) -> None:
     assert "1 min 5 s" in page and "12 frames of 1 cameras" in page
     rows = re.findall(r'<tr><th scope="row">(.*?)</th><td>(.*?)</td><td>(.*?)</td><td>(.*?)</td>', page)
     assert rows == [
-        (run, scene, "Gaussians with diffusion", place) for run, scene in (("a b", "city-1"), ("c", "city-2"), ("score", "kitti"))
+        (run, scene, "Gaussians with diffusion", place)
+        for run, scene in (("a b", "city-1"), ("c", "city-2"), ("score", "kitti"))
         for place in ("recorded path", "2 m aside")
-    ]  # fmt: skip
+    ]
     assert 'data-value="27.0">27.00<' in page and 'data-value="">' in page
     assert "default-src 'none'" in page
 
@@ -115,21 +130,35 @@ def test_the_table_sorts_and_filters_in_a_browser(tmp_path: Path) -> None:
     gallery.run([tmp_path / name for name in "xyz"], tmp_path / "all.html")
     browser = Browser(tmp_path / "profile", size=(390, 844))
     try:
-        browser.open((tmp_path / "all.html").as_uri(), "document.readyState === 'complete' && !!document.getElementById('scores')")
-        shown = "[...document.querySelectorAll('#scores tbody tr')].filter(r => !r.hidden).map(r => r.cells[0].innerText).join('')"
-        click = lambda column: browser.run(f"document.querySelectorAll('#scores th button')[{column}].click()")  # noqa: E731
+        browser.open(
+            (tmp_path / "all.html").as_uri(),
+            "document.readyState === 'complete' && !!document.getElementById('scores')",
+        )
+        shown = (
+            "[...document.querySelectorAll('#scores tbody tr')].filter(r => !r.hidden).map(r =>"
+            " r.cells[0].innerText).join('')"
+        )
+
+        def click(column: int) -> None:
+            browser.run(f"document.querySelectorAll('#scores th button')[{column}].click()")
+
         click(4)
         assert browser.run(shown) == "xzxyzy"  # 23 and 24 aside, 25, 25.5 aside, 26, 27.5
         click(4)
         assert browser.run(shown) == "yzyxzx"
         click(5)
         assert browser.run(shown)[3:] == "yzx"  # rows without a number stay last
-        browser.run("const f = document.getElementById('filter'); f.value = 'CITY-Z'; f.dispatchEvent(new Event('input'))")
+        browser.run(
+            "const f = document.getElementById('filter'); f.value = 'CITY-Z'; f.dispatchEvent(new Event('input'))"
+        )
         assert browser.run(shown) == "zz"
         assert browser.run("[...document.querySelectorAll('.cards li')].filter(c => !c.hidden).length") == 1
-        browser.run("const p = document.getElementById('place'); p.value = '2 m aside'; p.dispatchEvent(new Event('change'))")
+        browser.run(
+            "const p = document.getElementById('place'); p.value = '2 m aside'; p.dispatchEvent(new Event('change'))"
+        )
         assert browser.run(shown) == "z"
-        assert browser.run("document.documentElement.scrollWidth <= innerWidth")  # a phone scrolls the table, not the page
+        # a phone scrolls the table, not the page
+        assert browser.run("document.documentElement.scrollWidth <= innerWidth")
         assert not browser.errors and all(request.startswith("file:") for request in browser.requests)
     finally:
         browser.close()

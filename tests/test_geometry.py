@@ -104,10 +104,13 @@ def test_pose_at_is_exact_at_keys_interpolates_both_neighbours_and_never_extrapo
 @pytest.mark.parametrize(
     ("matrix", "word"),
     [
-        (np.eye(3), "shape"), (np.full((4, 4), np.nan), "NaN"), (np.diag([1, 1, -1, 1.0]), "reflection"),
-        (np.diag([2.0, 2, 2, 1]), "orthonormal"), (np.eye(4) + np.eye(4, k=-3), "last row"),
+        (np.eye(3), "shape"),
+        (np.full((4, 4), np.nan), "NaN"),
+        (np.diag([1, 1, -1, 1.0]), "reflection"),
+        (np.diag([2.0, 2, 2, 1]), "orthonormal"),
+        (np.eye(4) + np.eye(4, k=-3), "last row"),
     ],
-)  # fmt: skip
+)
 def test_rigid_problem_names_the_fault(matrix: np.ndarray, word: str) -> None:
     assert word in str(geometry.rigid_problem(matrix))
     if matrix.shape == (4, 4):

@@ -1,4 +1,5 @@
-"""The ground plane, and the map of what is reachable from the driven path: known streets, tilted, noisy, with and without kerbs."""
+"""The ground plane, and the map of what is reachable from the driven path: known streets, tilted, noisy, with and
+without kerbs."""
 
 from __future__ import annotations
 
@@ -15,7 +16,8 @@ KERB_AT_M = 4.0
 def street(
     rng: np.random.Generator, kerb_m: float = 0.12, slope: tuple[float, float] = (0.0, 0.0), count: int = 60_000
 ) -> tuple[NDArray[np.float32], NDArray[np.float64]]:
-    """Returns of a straight street along x, sidewalks from 4 m on both sides, walls at 9 m; and the path along its middle."""
+    """Returns of a straight street along x, sidewalks from 4 m on both sides, walls at 9 m; and the path along its
+    middle."""
     flat = np.c_[rng.uniform(-30, 30, count), rng.uniform(-9, 9, count)]
     z = np.where(np.abs(flat[:, 1]) > KERB_AT_M, kerb_m, 0) + rng.normal(0, 0.015, count)
     wall = np.c_[rng.uniform(-30, 30, count // 4), np.full(count // 4, 9.0), rng.uniform(0, 6, count // 4)]
@@ -57,6 +59,7 @@ def test_distance_to_path_goes_on_beyond_its_ends() -> None:
     points = np.array([[5.0, 3, 9], [40, -4, 0], [-30, 2, 0]])
     assert np.abs(distance_to_path(points, path) - [3, 4, 2]).max() < 0.3
     assert distance_to_path(points, path[:1])[1] == pytest.approx(np.hypot(40, 4))
+
 
 def test_a_vehicle_that_stood_has_the_direction_of_its_heading() -> None:
     pose = yaw_matrix(np.pi / 2, (3.0, 4.0, 1.0))
@@ -117,7 +120,9 @@ def test_a_lowered_kerb_joins_a_sidewalk_but_not_directly() -> None:
 
 def test_the_order_of_returns_changes_nothing() -> None:
     xyz, path = street(np.random.default_rng(9))
-    one, other = (map_ground(points, path, path[0]) for points in (xyz, xyz[np.random.default_rng(1).permutation(len(xyz))]))
+    one, other = (
+        map_ground(points, path, path[0]) for points in (xyz, xyz[np.random.default_rng(1).permutation(len(xyz))])
+    )
     assert one is not None
     assert other is not None
     assert (one.reachable == other.reachable).mean() > 0.999

@@ -56,16 +56,25 @@ def _parameters(count: int = 90, seed: int = 0, degree: int = 3, channels: int =
     scales[::7, 0] *= 0.02
     values = {
         "means": np.stack([z * rng.uniform(-0.9, 0.9, count), z * rng.uniform(-0.6, 0.6, count), z], 1),
-        "quats": rng.standard_normal((count, 4)), "scales": scales,
+        "quats": rng.standard_normal((count, 4)),
+        "scales": scales,
         "opacity": np.where(rng.random(count) < 0.4, rng.uniform(0.6, 0.9999, count), rng.uniform(0.001, 0.5, count)),
-        "sh": 0.3 * rng.standard_normal((count, (degree + 1) ** 2, 3)), "extra": rng.standard_normal((count, channels)),
-    }  # fmt: skip
+        "sh": 0.3 * rng.standard_normal((count, (degree + 1) ** 2, 3)),
+        "extra": rng.standard_normal((count, channels)),
+    }
     return {name: torch.tensor(value, dtype=torch.float32) for name, value in values.items()}
 
 
 def _gaussians(p: Parameters) -> Gaussians:
-    return Gaussians(p["means"], p["quats"], p["scales"], p["opacity"], p["sh"], p.get("extra"),
-                     torch.zeros(len(p["means"]), dtype=torch.int32))  # fmt: skip
+    return Gaussians(
+        p["means"],
+        p["quats"],
+        p["scales"],
+        p["opacity"],
+        p["sh"],
+        p.get("extra"),
+        torch.zeros(len(p["means"]), dtype=torch.int32),
+    )
 
 
 def _leaves(p: Parameters, dtype: torch.dtype = torch.float32) -> Parameters:
@@ -77,8 +86,8 @@ def _compare(
 ) -> dict[str, float]:
     """Draw by gsplat and by another backend with gsplat's cap of alpha; differences of everything that comes back.
 
-    Images: largest difference over the largest value. Gradients: relative L2 norm. Pixels where an alpha falls to different
-    sides of a cut are left out; they are counted as "band".
+    Images: largest difference over the largest value. Gradients: relative L2 norm. Pixels where an alpha falls to
+    different sides of a cut are left out; they are counted as "band".
     """
     single = torch.float64 if other == "torch" else torch.float32
     ours, theirs = _leaves(p), _leaves(p, single)
@@ -153,7 +162,8 @@ def test_harmonics_of_every_degree_agree(gsplat: ModuleType, degree: int) -> Non
 
 
 def test_the_most_feature_channels_and_none(gsplat: ModuleType) -> None:
-    """32 channels with colour and depth: gsplat would draw more in two passes, and absolute gradients only of the last."""
+    """32 channels with colour and depth: gsplat would draw more in two passes, and absolute gradients only of the
+    last."""
     _hold(_compare(_parameters(40, channels=raster.MAX_EXTRA_CHANNELS), _views()[0], RasterConfig(), "torch"))
     p = _parameters(20)
     del p["extra"]
@@ -168,11 +178,12 @@ def test_harmonics_in_two_tensors(gsplat: ModuleType) -> None:
 
 
 def test_what_the_cap_of_alpha_changes(gsplat: ModuleType) -> None:
-    """gsplat caps alpha at 0.999, the other backends at `alpha_max`, 0.99: an opaque Gaussian lets a hundredth through."""
+    """gsplat caps alpha at 0.999, the other backends at `alpha_max`, 0.99: an opaque Gaussian lets a hundredth
+    through."""
     p = _parameters(1, degree=0, channels=1) | {"means": torch.tensor([[0.0, 0, 5]])}
     p |= {"scales": torch.full((1, 3), 2.0), "opacity": torch.ones(1)}
     view = View(Camera("front", 15, 15, 15.0, 15.0, 7.5, 7.5), np.eye(4), 0.0)
-    drawn = [float(rasterize(_gaussians(p), view, RasterConfig(backend=b)).alpha.max()) for b in ("gsplat", "torch")]  # type: ignore[arg-type]
+    drawn = [float(rasterize(_gaussians(p), view, RasterConfig(backend=b)).alpha.max()) for b in ("gsplat", "torch")]
     assert drawn == pytest.approx([0.999, 0.99], abs=1e-6)
 
 
@@ -196,7 +207,7 @@ def test_gradients_of_two_backward_passes_add_up(gsplat: ModuleType) -> None:
     out = rasterize(_gaussians(p), _views()[0], RasterConfig(backend="gsplat"), absgrad=True)
     loss = out.rgb.square().sum() + out.depth.sum()
     loss.backward(retain_graph=True)
-    once = [t.clone() for t in (p["means"].grad, out.trace.means2d.grad, out.trace.abs_grad2d)]  # type: ignore[union-attr]
+    once = [t.clone() for t in (p["means"].grad, out.trace.means2d.grad, out.trace.abs_grad2d)]
     loss.backward()
     for first, both in zip(once, (p["means"].grad, out.trace.means2d.grad, out.trace.abs_grad2d)):
         torch.testing.assert_close(both, 2 * first)
@@ -228,8 +239,12 @@ def test_a_dropped_picture_frees_its_graph_at_once(gsplat: ModuleType, primitive
     gc.disable()
     try:
         config = RasterConfig(backend="gsplat", primitive=primitive)
-        out = rasterize(_gaussians(p | {"means": _Canary.apply(p["means"], alive)}), _views()[0], config,
-                        absgrad=primitive == "ellipsoid")  # fmt: skip
+        out = rasterize(
+            _gaussians(p | {"means": _Canary.apply(p["means"], alive)}),
+            _views()[0],
+            config,
+            absgrad=primitive == "ellipsoid",
+        )
         del alive
         assert graph() is not None
         del out
@@ -247,14 +262,23 @@ def test_no_gradient_is_recorded_where_none_is_wanted(gsplat: ModuleType) -> Non
         assert not rasterize(_gaussians(_leaves(_parameters(20))), _views()[0], config).trace.means2d.requires_grad
 
 
-# ---- what would make gsplat fail -----------------------------------------------------------------------------------
+# ---- what would make gsplat fail -----------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("name", "value"),
-    [("quats", 0.0), ("quats", 1e-30), ("quats", 1e30), ("scales", 0.0), ("scales", 1e30), ("means", 1e38), ("means", -1e38),
-     ("opacity", 0.0), ("opacity", 1.0)],
-)  # fmt: skip
+    [
+        ("quats", 0.0),
+        ("quats", 1e-30),
+        ("quats", 1e30),
+        ("scales", 0.0),
+        ("scales", 1e30),
+        ("means", 1e38),
+        ("means", -1e38),
+        ("opacity", 0.0),
+        ("opacity", 1.0),
+    ],
+)
 @pytest.mark.parametrize("projection", ["linear", "unscented"])
 def test_absurd_values_never_spread(gsplat: ModuleType, projection: Any, name: str, value: float) -> None:
     p = _parameters(30)
@@ -274,7 +298,7 @@ def test_a_gaussian_at_the_very_centre_of_the_camera(gsplat: ModuleType) -> None
     p["means"][4] = 0.0
     p = _leaves(p)
     rasterize(_gaussians(p), view, RasterConfig(backend="gsplat")).rgb.sum().backward()
-    assert torch.isfinite(p["means"].grad).all()  # type: ignore[arg-type]
+    assert torch.isfinite(p["means"].grad).all()
 
 
 def test_values_that_are_not_finite(gsplat: ModuleType) -> None:
@@ -296,7 +320,7 @@ def test_values_that_are_not_finite(gsplat: ModuleType) -> None:
         harmless[name][unseen] = torch.nan
         leaves = _leaves(harmless)
         rasterize(_gaussians(leaves), view, config).rgb.sum().backward()
-        assert torch.isfinite(leaves["means"].grad).all()  # type: ignore[arg-type]
+        assert torch.isfinite(leaves["means"].grad).all()
 
 
 @pytest.mark.parametrize("settings", [{}, {"packed": True}, {"projection": "unscented"}, {"primitive": "disc"}])
@@ -319,7 +343,7 @@ def test_other_number_formats_are_refused(gsplat: ModuleType) -> None:
         rasterize(_gaussians(p), _views()[0], RasterConfig(backend="gsplat"))
 
 
-# ---- what only gsplat has ------------------------------------------------------------------------------------------
+# ---- what only gsplat has ------------------------------------------------------------------------
 
 
 def _facing(count: int = 12) -> tuple[Parameters, View]:
@@ -353,7 +377,7 @@ def test_discs_hand_out_the_gradient_that_densification_needs(gsplat: ModuleType
     out.rgb.square().sum().backward()
     assert out.trace.means2d.grad is not None
     assert (out.trace.means2d.grad[out.trace.visible].norm(dim=1) > 0).all()
-    assert leaves["scales"].grad[:, 2].abs().max() == 0  # type: ignore[index]
+    assert leaves["scales"].grad[:, 2].abs().max() == 0
 
 
 def test_unscented_projection_draws_small_gaussians_like_the_linear_one(gsplat: ModuleType) -> None:
@@ -374,7 +398,7 @@ def test_depth_has_its_gradient_in_every_mode(gsplat: ModuleType) -> None:
     for settings in ({}, {"projection": "unscented"}, {"primitive": "disc"}):
         p, view = _facing(1)
         leaves = _leaves(p)
-        out = rasterize(_gaussians(leaves), view, RasterConfig(backend="gsplat", **settings))  # type: ignore[arg-type]
+        out = rasterize(_gaussians(leaves), view, RasterConfig(backend="gsplat", **settings))
         row, column = divmod(int(out.alpha.argmax()), 50)
         out.depth[0, row, column].backward()
         assert float(out.depth[0, row, column].detach()) == pytest.approx(float(p["means"][0, 2]), rel=1e-5)
@@ -404,20 +428,27 @@ def test_settings_of_gsplat_are_refused_elsewhere() -> None:
     p, view = _parameters(3), _views()[0]
     for backend in ("auto", "torch"):
         with pytest.raises(UsageError, match="packed=True"):
-            rasterize(_gaussians(p), view, RasterConfig(backend=backend, packed=True))  # type: ignore[arg-type]
+            rasterize(_gaussians(p), view, RasterConfig(backend=backend, packed=True))
         with pytest.raises(UsageError, match="unscented"):
-            rasterize(_gaussians(p), view, RasterConfig(backend=backend, projection="unscented"))  # type: ignore[arg-type]
+            rasterize(_gaussians(p), view, RasterConfig(backend=backend, projection="unscented"))
         with pytest.raises(UsageError, match="primitive='disc'"):
-            rasterize(_gaussians(p), view, RasterConfig(backend=backend, primitive="disc"))  # type: ignore[arg-type]
+            rasterize(_gaussians(p), view, RasterConfig(backend=backend, primitive="disc"))
 
 
 def test_settings_that_contradict_each_other_are_refused() -> None:
-    for wrong in ({"shutter": "top_to_bottom"}, {"projection": "unscented", "primitive": "disc"},
-                  {"projection": "unscented", "packed": True}, {"projection": "unscented", "antialias": True},
-                  {"primitive": "disc", "packed": True}, {"primitive": "disc", "antialias": True},
-                  {"primitive": "cube"}, {"projection": "flat"}, {"shutter": "slow"}):  # fmt: skip
+    for wrong in (
+        {"shutter": "top_to_bottom"},
+        {"projection": "unscented", "primitive": "disc"},
+        {"projection": "unscented", "packed": True},
+        {"projection": "unscented", "antialias": True},
+        {"primitive": "disc", "packed": True},
+        {"primitive": "disc", "antialias": True},
+        {"primitive": "cube"},
+        {"projection": "flat"},
+        {"shutter": "slow"},
+    ):
         with pytest.raises(UsageError):
-            RasterConfig(**wrong)  # type: ignore[arg-type]
+            RasterConfig(**wrong)
 
 
 def test_a_rolling_shutter_needs_its_poses(gsplat: ModuleType) -> None:
@@ -439,7 +470,7 @@ def test_gradients_that_gsplat_does_not_have_are_refused(gsplat: ModuleType) -> 
         rasterize(g, view, unscented, world_from_cam=torch.eye(4).requires_grad_())
 
 
-# ---- whether it can be used ----------------------------------------------------------------------------------------
+# ---- whether it can be used ----------------------------------------------------------------------
 
 
 def _pretend_installed(monkeypatch: pytest.MonkeyPatch, folder: Any, version: str = "1.5.3", cuda: bool = True) -> None:

@@ -1,4 +1,5 @@
-"""Edits that a diffusion model repairs: what its condition shows of an edited drive, what is pasted, what the guard keeps."""
+"""Edits that a diffusion model repairs: what its condition shows of an edited drive, what is pasted, what the guard
+keeps."""
 
 from __future__ import annotations
 
@@ -74,7 +75,9 @@ def photo_with_box(time_s: float, y: float) -> Photo:
 def observed(rgb: torch.Tensor, ids: torch.Tensor) -> Observation:
     height, width = ids.shape
     one = torch.ones(1, height, width)
-    return Observation(view_at(), rgb, torch.where(ids == ID["sky"], torch.nan, 9.0)[None], ids, one, one > 0, "virtual", "made")
+    return Observation(
+        view_at(), rgb, torch.where(ids == ID["sky"], torch.nan, 9.0)[None], ids, one, one > 0, "virtual", "made"
+    )
 
 
 def test_the_condition_of_a_removed_object_is_that_of_a_log_that_never_had_it() -> None:
@@ -91,13 +94,17 @@ def test_the_condition_of_a_removed_object_is_that_of_a_log_that_never_had_it() 
         assert torch.equal(getattr(given, name), getattr(never, name)), name
     seen = build_conditions(cloud, [], [target], [replace(p, usable=None) for p in with_box], RULES)[0]
     assert not torch.equal(seen.color, never.color)  # the box would be in the picture
-    assert float((given.backdrop - never.backdrop).abs().max()) < 0.2 < float((seen.backdrop - never.backdrop).abs().max())
+    assert (
+        float((given.backdrop - never.backdrop).abs().max()) < 0.2 < float((seen.backdrop - never.backdrop).abs().max())
+    )
 
 
 def test_what_nobody_saw_continues_its_surroundings_and_does_not_count_as_seen() -> None:
     plan = drive("- remove: {ids: [box]}")
     photos = photos_of_edited([photo_with_box(0.0, -2.0)], plan)
-    made = build_conditions(FusedCloud(wall(12.0, stripes), {}), [], [view_at()], photos, RULES, vacated_at=vacated_at(plan))[0]
+    made = build_conditions(
+        FusedCloud(wall(12.0, stripes), {}), [], [view_at()], photos, RULES, vacated_at=vacated_at(plan)
+    )[0]
     hole = vacated_at(plan)(view_at()).mask
     assert 0 < float(hole.float().mean()) < 0.4
     assert not bool((made.warped[0, 0] | made.valid[0, 0])[hole].any())
@@ -108,8 +115,8 @@ def test_what_nobody_saw_continues_its_surroundings_and_does_not_count_as_seen()
 
 @pytest.mark.parametrize("usual", [0.9, 0.3])
 def test_what_photographs_determined_behind_a_removed_object_is_kept(usual: float) -> None:
-    """A red render that is as certain in the left half of what stood there as anywhere in the view, however certain that is, and hardly
-    in the right half."""
+    """A red render that is as certain in the left half of what stood there as anywhere in the view, however certain
+    that is, and hardly in the right half."""
     plan = drive("- remove: {ids: [box]}")
     vacated = vacated_at(plan)(view_at())
     columns = torch.nonzero(vacated.stood.any(0))[:, 0]
@@ -120,14 +127,20 @@ def test_what_photographs_determined_behind_a_removed_object_is_kept(usual: floa
     def render(view: View) -> RenderPlanes:
         one = torch.ones(1, view.camera.height, view.camera.width)
         certainty = torch.where(right, 0.1 * usual, usual)[None]
-        return RenderPlanes(torch.tensor([1.0, 0, 0]).view(3, 1, 1) * one, 12 * one, one, certainty, (2 * one).to(torch.uint8))
+        return RenderPlanes(
+            torch.tensor([1.0, 0, 0]).view(3, 1, 1) * one, 12 * one, one, certainty, (2 * one).to(torch.uint8)
+        )
 
     photos = photos_of_edited([photo_with_box(0.0, -2.0)], plan)
     cloud = FusedCloud(wall(12.0, stripes), {})
     made = build_conditions(cloud, [], [view_at()], photos, RULES, render_at=render, vacated_at=vacated_at(plan))[0]
     red = (made.color[0] == torch.tensor([1.0, 0, 0]).view(3, 1, 1)).all(0)
     assert made.renders is not None
-    assert bool(red[left].all()) and bool(made.warped[0, 0][left].all()) and bool((made.renders.certainty[0, 0][left] == usual).all())
+    assert (
+        bool(red[left].all())
+        and bool(made.warped[0, 0][left].all())
+        and bool((made.renders.certainty[0, 0][left] == usual).all())
+    )
     unknown = vacated.mask & ~left
     assert not bool(red[unknown].any()) and not bool(made.warped[0, 0][unknown].any())
     assert bool((made.renders.certainty[0, 0][unknown] == 0).all())
@@ -207,8 +220,12 @@ def test_pasting_changes_nothing_outside_of_the_mask() -> None:
     made = pasted(one, two, weight)
     for name in ("rgb", "depth", "semantics", "confidence", "mask"):
         mine, theirs = getattr(one, name), getattr(made, name)
-        assert torch.equal(mine[..., ~torch.from_numpy(mask)].nan_to_num(-1), theirs[..., ~torch.from_numpy(mask)].nan_to_num(-1)), name
-    assert torch.equal(made.rgb[:, 14, 20], two.rgb[:, 14, 20]) and torch.equal(made.semantics[14, 20], two.semantics[14, 20])
+        assert torch.equal(
+            mine[..., ~torch.from_numpy(mask)].nan_to_num(-1), theirs[..., ~torch.from_numpy(mask)].nan_to_num(-1)
+        ), name
+    assert torch.equal(made.rgb[:, 14, 20], two.rgb[:, 14, 20]) and torch.equal(
+        made.semantics[14, 20], two.semantics[14, 20]
+    )
     nothing = pasted(one, two, torch.zeros(32, 48))
     assert torch.equal(nothing.rgb, one.rgb) and torch.equal(nothing.semantics, one.semantics)
 
@@ -228,14 +245,23 @@ def test_a_removed_car_does_not_come_back_and_an_inserted_one_does_not_vanish() 
     assert torch.equal(guarded(touched, wanted, observed(gray, car), behind), right | (left & torch.from_numpy(behind)))
 
 
-# -- through the commands ------------------------------------------------------------------------------------------------
+# -- through the commands --------------------------------------------------------------------------
 
 FRAMES = 4
 SMALL = MDMConfig(
-    widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=3, embed_width=16,
-    codec=CodecConfig(decoder_width=8, decoder_blocks=1), patch=2, refine_widths=(16, 32), refine_blocks=(1, 1), area_px=48 * 32,
+    widths=(16, 32),
+    blocks=(1, 1),
+    spatial_attention=(False, True),
+    temporal_attention=(False, True),
+    window=3,
+    embed_width=16,
+    codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+    patch=2,
+    refine_widths=(16, 32),
+    refine_blocks=(1, 1),
+    area_px=48 * 32,
     renders=True,
-)  # fmt: skip
+)
 
 
 @pytest.fixture(scope="module")
@@ -268,7 +294,9 @@ def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
     condition = build_conditions(FusedCloud(wall(12.0, stripes), {}), [], views, photos, RULES)[0]
     freedom = torch.zeros(2, 1, 32, 48)
     freedom[..., 8:24, 8:24] = 1.0
-    begun = StartClip(condition.color.flip(-1), condition.depth, torch.full((2, 1, 32, 48), ID["road"], dtype=torch.uint8), freedom)
+    begun = StartClip(
+        condition.color.flip(-1), condition.depth, torch.full((2, 1, 32, 48), ID["road"], dtype=torch.uint8), freedom
+    )
     free = model.sample(condition, SampleRequest(2))
     same = model.sample(condition, SampleRequest(2, start=replace(begun, freedom=torch.ones_like(freedom))))
     held = model.sample(condition, SampleRequest(2, start=begun))
@@ -281,19 +309,30 @@ def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
 
 
 def test_synthesize_shows_the_edited_drive(run: Path, tmp_path: Path) -> None:
-    config = SynthesizeConfig(shifts_m=(0.0,), model=str(run / "model"), steps=1, full_size=False, processes=1, precision="float32")
+    config = SynthesizeConfig(
+        shifts_m=(0.0,), model=str(run / "model"), steps=1, full_size=False, processes=1, precision="float32"
+    )
     edits, parts = script(tmp_path, "- remove: {ids: [car]}"), (run / "scene", run / "fuse")
     plain = Synthesize(scene=parts[0], fused=parts[1], out=tmp_path / "plain", settings=config).run()
     made = Synthesize(scene=parts[0], fused=parts[1], edits=edits, out=tmp_path / "made", settings=config).run()
     fitted = Synthesize(
-        scene=parts[0], fused=parts[1], edits=edits, fitted=run / "fit" / "street_gaussians", out=tmp_path / "fitted", settings=config
+        scene=parts[0],
+        fused=parts[1],
+        edits=edits,
+        fitted=run / "fit" / "street_gaussians",
+        out=tmp_path / "fitted",
+        settings=config,
     ).run()
     pictures = [[v.rgb for v in views_of(folder)] for folder in (plain, made, fitted)]
     assert not any(torch.equal(a, b) for a, b in zip(pictures[0], pictures[1], strict=True))
     assert not any(torch.equal(a, b) for a, b in zip(pictures[1], pictures[2], strict=True))
     with pytest.raises(InputError, match="no object of this id"):
         Synthesize(
-            scene=parts[0], fused=parts[1], edits=script(tmp_path, "- remove: {ids: [cat]}"), out=tmp_path / "bad", settings=config
+            scene=parts[0],
+            fused=parts[1],
+            edits=script(tmp_path, "- remove: {ids: [cat]}"),
+            out=tmp_path / "bad",
+            settings=config,
         ).run()
     assert not (tmp_path / "bad").exists()
 
@@ -314,9 +353,16 @@ def test_renders_are_repaired_where_the_edit_touches_them(
     with pytest.raises(UsageError, match="--fused"):
         RenderViews(scene=run / "scene", model=fitted, edits=edits, out=tmp_path / "none", settings=repaired).run()
     before, physical, made = (
-        views_of(RenderViews(
-            scene=run / "scene", fused=run / "fuse", model=fitted, edits=file, out=tmp_path / name, settings=settings
-        ).run())
+        views_of(
+            RenderViews(
+                scene=run / "scene",
+                fused=run / "fuse",
+                model=fitted,
+                edits=file,
+                out=tmp_path / name,
+                settings=settings,
+            ).run()
+        )
         for name, settings, file in (("before", config, None), ("physical", config, edits), ("made", repaired, edits))
     )
     assert len(made) == FRAMES
@@ -337,9 +383,11 @@ def test_weather_is_that_of_the_formulas_with_another_model(run: Path, tmp_path:
     plain = RenderConfig(shifts_m=(0.0,), video=False)
     asked = replace(plain, harmonize=HarmonizeConfig(on=True, model=str(run / "model"), steps=2, weather=1.0))
     physical, kept = (
-        views_of(RenderViews(
-            scene=run / "scene", fused=run / "fuse", model=fitted, edits=edits, out=tmp_path / name, settings=config
-        ).run())
+        views_of(
+            RenderViews(
+                scene=run / "scene", fused=run / "fuse", model=fitted, edits=edits, out=tmp_path / name, settings=config
+            ).run()
+        )
         for name, config in (("physical", plain), ("asked", asked))
     )
     assert "no published-type model" in capsys.readouterr().err
@@ -352,7 +400,9 @@ def test_a_correction_keeps_the_detail_of_the_render() -> None:
     small = torch.nn.functional.interpolate(render_.rgb[None], size=(16, 24), mode="area")[0]
     assert torch.allclose(corrected(render_, small).rgb, render_.rgb, atol=1e-6)
     assert torch.allclose(corrected(render_, small + 0.1).rgb, render_.rgb + 0.1, atol=1e-6)
-    assert torch.allclose(corrected(render_, 1 - render_.rgb).rgb, 1 - render_.rgb, atol=1e-6), "at the model's own size: what it made"
+    assert torch.allclose(corrected(render_, 1 - render_.rgb).rgb, 1 - render_.rgb, atol=1e-6), (
+        "at the model's own size: what it made"
+    )
 
 
 @pytest.mark.slow
@@ -371,41 +421,64 @@ def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Pa
         differ += int((image != read_image(other, rendered)).any(-1).sum())
     assert differ > 0
     photos = recorded_images(scene, SynthesizeConfig())
-    assert all(np.array_equal(~p.usable, read_label(scene, f, "rendered")) for p, f in zip(photos, scene.frames_in("train"), strict=True))
+    assert all(
+        np.array_equal(~p.usable, read_label(scene, f, "rendered"))
+        for p, f in zip(photos, scene.frames_in("train"), strict=True)
+    )
     config = fit_config(method="street_gaussians", iterations=4, start__gaussians=900, densify__max_gaussians=1500)
     again = Fit(
-        scene=out / "scene", fused=out / "fuse", start_from=out / "fit" / "street_gaussians", out=tmp_path / "again", settings=config
+        scene=out / "scene",
+        fused=out / "fuse",
+        start_from=out / "fit" / "street_gaussians",
+        out=tmp_path / "again",
+        settings=config,
     ).run()
     assert "car" not in fit.load_model(again).node_names()
     with pytest.raises(InputError, match="another scene"):
         Fit(
-            scene=run / "scene", fused=run / "fuse", start_from=out / "fit" / "street_gaussians", out=tmp_path / "wrong", settings=config
+            scene=run / "scene",
+            fused=run / "fuse",
+            start_from=out / "fit" / "street_gaussians",
+            out=tmp_path / "wrong",
+            settings=config,
         ).run()
     with pytest.raises(UsageError, match="no images"):
         Edit(
-            source=run / "fit" / "street_gaussians", script=edits, scene=run / "scene", out=tmp_path / "alone",
+            source=run / "fit" / "street_gaussians",
+            script=edits,
+            scene=run / "scene",
+            out=tmp_path / "alone",
             settings=EditConfig(harmonize=harmonize),
-        ).run()  # fmt: skip
+        ).run()
 
 
 @pytest.mark.slow
 def test_the_benchmark_compares_ways_of_every_edit(tmp_path: Path) -> None:
-    """Every edit has its ways; what the model does stays inside the edit. (Which way is better, 60 steps do not tell.)"""
+    """Every edit has its ways; what the model does stays inside the edit. (Which way is better, 60 steps do not
+    tell.)"""
     config = BenchConfig(cities="development", count=1, pose_iterations=60, harmonize=True, device="cpu")
     out = bench.run("edit", config, tmp_path / "out")
     rows = {(row["edit"], row["way"]): row for row in store.read_json(out / "bench.json")["diffusion"]["rows"]}
     ways = ("fit", "+ diffusion", "+ refit")
-    assert rows.keys() == {*((name, way) for name in ("remove", "move 3 m ahead", "insert") for way in ways), ("remove", "never there")}
+    assert rows.keys() == {
+        *((name, way) for name in ("remove", "move 3 m ahead", "insert") for way in ways),
+        ("remove", "never there"),
+    }
     for name in ("remove", "move 3 m ahead", "insert"):
         plain, repaired = rows[name, "fit"], rows[name, "+ diffusion"]
         assert repaired["inside"] != plain["inside"]
         assert repaired["outside"] < plain["outside"] + 0.01
-    assert all(np.isfinite(row[name]) for key, row in rows.items() if key[0] == "remove" for name in ("inside", "uncovered", "perceptual"))
+    assert all(
+        np.isfinite(row[name])
+        for key, row in rows.items()
+        if key[0] == "remove"
+        for name in ("inside", "uncovered", "perceptual")
+    )
     assert rows["remove", "never there"]["uncovered"] not in {rows["remove", way]["uncovered"] for way in ways}
     assert "+ refit" in (out / "bench.md").read_text(encoding="utf-8")
 
 
-# -- published-type models -----------------------------------------------------------------------------------------------
+# -- published-type models -------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -427,8 +500,9 @@ def watched(monkeypatch) -> list[Condition]:
 
 
 def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own_distances() -> None:
-    """Koschmieder's law: a black wall 12 m ahead has 1 - exp(-3 r / visibility) of the light of what is far away. So have its points,
-    although their depth at the network's size is mixed with gaps, and its photograph, whose distance a render knows."""
+    """Koschmieder's law: a black wall 12 m ahead has 1 - exp(-3 r / visibility) of the light of what is far away. So
+    have its points, although their depth at the network's size is mixed with gaps, and its photograph, whose distance a
+    render knows."""
     views = [view_at()]
     photo = Photo(views[0], np.zeros((32, 48, 3), np.uint8))
     ids = torch.full((1, 32, 48), ID["building"], dtype=torch.uint8)
@@ -459,16 +533,26 @@ def test_points_and_reference_of_the_published_condition_are_in_fog_at_their_own
 
 
 @pytest.mark.slow
-def test_weather_is_generated_by_a_published_type_model(run: Path, published: str, tmp_path: Path, monkeypatch, capsys) -> None:
-    """Its points and its reference are in the fog; beside the recorded path the first frame, which is the reference, stays as rendered."""
+def test_weather_is_generated_by_a_published_type_model(
+    run: Path, published: str, tmp_path: Path, monkeypatch, capsys
+) -> None:
+    """Its points and its reference are in the fog; beside the recorded path the first frame, which is the reference,
+    stays as rendered."""
     log.set_quiet(False)
     edits, fitted = script(tmp_path, "- weather: {fog: {visibility_m: 8}}"), run / "fit" / "street_gaussians"
 
     def rendered(name: str, **settings: Any) -> dict[str, list[Observation]]:
-        harmonize = HarmonizeConfig(on=bool(settings), model=published, steps=1, weather=1.0) if settings else HarmonizeConfig()
+        harmonize = (
+            HarmonizeConfig(on=bool(settings), model=published, steps=1, weather=1.0) if settings else HarmonizeConfig()
+        )
         config = replace(RenderConfig(shifts_m=(0.0, 1.0), video=False), harmonize=harmonize)
         out = RenderViews(
-            scene=run / "scene", fused=run / "fuse" if settings else None, model=fitted, edits=edits, out=tmp_path / name, settings=config
+            scene=run / "scene",
+            fused=run / "fuse" if settings else None,
+            model=fitted,
+            edits=edits,
+            out=tmp_path / name,
+            settings=config,
         ).run()
         return {path: views_of(out, path) for path in ("front_recorded", "front_shift+1.0")}
 
@@ -489,12 +573,20 @@ def test_weather_is_generated_by_a_published_type_model(run: Path, published: st
 
 
 @pytest.mark.slow
-def test_views_are_generated_in_weather_by_a_published_type_model(run: Path, published: str, tmp_path: Path, monkeypatch) -> None:
-    edits, folders, fitted = script(tmp_path, "- light: {time: night}"), (run / "scene", run / "fuse"), run / "fit" / "street_gaussians"
+def test_views_are_generated_in_weather_by_a_published_type_model(
+    run: Path, published: str, tmp_path: Path, monkeypatch
+) -> None:
+    edits, folders, fitted = (
+        script(tmp_path, "- light: {time: night}"),
+        (run / "scene", run / "fuse"),
+        run / "fit" / "street_gaussians",
+    )
     config = SynthesizeConfig(shifts_m=(1.0,), model=published, steps=1, precision="float32")
     given = watched(monkeypatch)
     Synthesize(scene=folders[0], fused=folders[1], out=tmp_path / "day", settings=config).run()
-    Synthesize(scene=folders[0], fused=folders[1], fitted=fitted, edits=edits, out=tmp_path / "night", settings=config).run()
+    Synthesize(
+        scene=folders[0], fused=folders[1], fitted=fitted, edits=edits, out=tmp_path / "night", settings=config
+    ).run()
     day, night = given
     assert float(night.reference.mean()) < 0.6 * float(day.reference.mean())
     assert float(night.color.mean()) < 0.6 * float(day.color.mean())
@@ -513,9 +605,11 @@ def test_a_removed_car_is_repaired_by_a_published_type_model(
     def rendered(name: str, harmonize: HarmonizeConfig) -> list[Observation]:
         config = replace(RenderConfig(shifts_m=(0.0,), video=False), harmonize=harmonize)
         fused = run / "fuse" if harmonize.on else None
-        return views_of(RenderViews(
-            scene=run / "scene", fused=fused, model=fitted, edits=edits, out=tmp_path / name, settings=config
-        ).run())
+        return views_of(
+            RenderViews(
+                scene=run / "scene", fused=fused, model=fitted, edits=edits, out=tmp_path / name, settings=config
+            ).run()
+        )
 
     before = rendered("plain", HarmonizeConfig())
     made = rendered("made", HarmonizeConfig(on=True, model=published, steps=1))
@@ -525,15 +619,26 @@ def test_a_removed_car_is_repaired_by_a_published_type_model(
     assert all(float(mask.float().mean()) < 0.5 for mask in changed)
 
 
-@pytest.mark.parametrize(("settings", "message"), [
-    ({"weather": 0.5}, "makes views from noise"), ({"uncovered": 0.3}, "--harmonize.uncovered"), ({"short": True}, "at least 4 frames"),
-])  # fmt: skip
-def test_what_published_type_models_cannot_harmonise_is_refused_first(run: Path, published: str, tmp_path: Path, settings, message) -> None:
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"weather": 0.5}, "makes views from noise"),
+        ({"uncovered": 0.3}, "--harmonize.uncovered"),
+        ({"short": True}, "at least 4 frames"),
+    ],
+)
+def test_what_published_type_models_cannot_harmonise_is_refused_first(
+    run: Path, published: str, tmp_path: Path, settings, message
+) -> None:
     edits, fitted, scene = script(tmp_path, "- remove: {ids: [car]}"), run / "fit" / "street_gaussians", run / "scene"
     if settings.pop("short", False):
         scene = tmp_path / "scene"
         write_scene(scene, frames=3, cameras=("front",), width=60, height=40)
-    config = RenderConfig(shifts_m=(0.0,), video=False, harmonize=HarmonizeConfig(on=True, model=published, steps=1, **settings))
+    config = RenderConfig(
+        shifts_m=(0.0,), video=False, harmonize=HarmonizeConfig(on=True, model=published, steps=1, **settings)
+    )
     with pytest.raises(UsageError, match=message):
-        RenderViews(scene=scene, fused=run / "fuse", model=fitted, edits=edits, out=tmp_path / "out", settings=config).run()
+        RenderViews(
+            scene=scene, fused=run / "fuse", model=fitted, edits=edits, out=tmp_path / "out", settings=config
+        ).run()
     assert not (tmp_path / "out").exists()

@@ -24,7 +24,10 @@ def drawn(sizes: PlaneSizes, count: int, dtype: torch.dtype = torch.float32) -> 
 def test_planes_of_coordinates_give_their_product_everywhere():
     """Each plane holds a linear function of its axes, so that the bilinear value is that function."""
     sizes = PlaneSizes(1, 2, 3, 4, 1)
-    numbers, slopes = torch.zeros(sizes.numbers), ((1.0, 2.0), (0.5, -1.0), (0.2, 0.3), (-1.0, 1.5), (0.7, 0.1), (0.4, -0.6))
+    numbers, slopes = (
+        torch.zeros(sizes.numbers),
+        ((1.0, 2.0), (0.5, -1.0), (0.2, 0.3), (-1.0, 1.5), (0.7, 0.1), (0.4, -0.6)),
+    )
     for index, (_, plane) in enumerate(sizes.planes(numbers)):
         along, across = torch.linspace(-1, 1, plane.shape[1]), torch.linspace(-1, 1, plane.shape[0])
         a, b = slopes[index % 6]

@@ -1,4 +1,5 @@
-"""Files that would never end, or grow when read: pipes, devices and sockets where files should be, and YAML that multiplies."""
+"""Files that would never end, or grow when read: pipes, devices and sockets where files should be, and YAML that
+multiplies."""
 
 from __future__ import annotations
 
@@ -47,7 +48,7 @@ def ends_within(seconds: float) -> Iterator[None]:
         signal.signal(signal.SIGALRM, before)
 
 
-# ---- the store ---------------------------------------------------------------------------------------------------------
+# ---- the store -----------------------------------------------------------------------------------
 
 
 def test_only_regular_files_are_opened(tmp_path: Path) -> None:
@@ -63,7 +64,14 @@ def test_only_regular_files_are_opened(tmp_path: Path) -> None:
     cases |= {"socket": "a socket"} if (tmp_path / "socket").exists() else {}
     with ends_within(5):
         for name, words in cases.items():
-            for read in (store.read_bytes, store.read_json, store.sha256_file, store.open_file, store.regular, store.read_safetensors):
+            for read in (
+                store.read_bytes,
+                store.read_json,
+                store.sha256_file,
+                store.open_file,
+                store.regular,
+                store.read_safetensors,
+            ):
                 with pytest.raises(InputError, match=words) as refused:
                     read(tmp_path / name)
                 assert str(tmp_path / name) in refused.value.where
@@ -74,11 +82,22 @@ def test_only_regular_files_are_opened(tmp_path: Path) -> None:
     assert store.read_bytes(tmp_path / "good") == b"content"
 
 
-@pytest.mark.parametrize("words", [
-    ["fuse", "SCENE", "--out", "OUT", "--config", "PIPE"], ["fuse", "PIPE", "--out", "OUT"], ["fuse", "--list", "PIPE", "--out", "OUT"],
-    ["doctor", "PIPE"], ["ingest", "PIPE", "OUT"], ["edit", "FIT", "PIPE", "--out", "OUT"], ["run", "PIPE", "--out", "OUT"],
-], ids=" ".join)  # fmt: skip
-def test_the_command_line_waits_for_no_pipe(words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["fuse", "SCENE", "--out", "OUT", "--config", "PIPE"],
+        ["fuse", "PIPE", "--out", "OUT"],
+        ["fuse", "--list", "PIPE", "--out", "OUT"],
+        ["doctor", "PIPE"],
+        ["ingest", "PIPE", "OUT"],
+        ["edit", "FIT", "PIPE", "--out", "OUT"],
+        ["run", "PIPE", "--out", "OUT"],
+    ],
+    ids=" ".join,
+)
+def test_the_command_line_waits_for_no_pipe(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     os.mkfifo(tmp_path / "PIPE")
     (tmp_path / "FIT").mkdir()
     with ends_within(20):
@@ -87,7 +106,7 @@ def test_the_command_line_waits_for_no_pipe(words: list[str], tmp_path: Path, ca
     assert "Traceback" not in capsys.readouterr().err
 
 
-# ---- logs --------------------------------------------------------------------------------------------------------------
+# ---- logs ----------------------------------------------------------------------------------------
 
 
 def replaced_one_by_one(folder: Path) -> Iterator[str]:
@@ -111,13 +130,18 @@ def test_no_import_waits_for_a_pipe(kind: str, tmp_path: Path) -> None:
         log = kitti_folders.write_raw_drive(tmp_path / "in" / "day")
     else:
         street = ToyStreet(times=[0.0, 0.1])
-        log = write_custom.write_log(street.write(tmp_path / "street", width=24, height=16, labels=False), tmp_path / "in" / "day")
+        log = write_custom.write_log(
+            street.write(tmp_path / "street", width=24, height=16, labels=False), tmp_path / "in" / "day"
+        )
     refused = []
     for name in replaced_one_by_one(tmp_path / "in"):
         with ends_within(20):
             try:
                 Ingest(
-                    log=log, out=tmp_path / "out", overwrite=True, settings=IngestConfig(format=kind, workers=1, contact_sheet=False)
+                    log=log,
+                    out=tmp_path / "out",
+                    overwrite=True,
+                    settings=IngestConfig(format=kind, workers=1, contact_sheet=False),
                 ).run()
             except MudgError:
                 refused.append(name)
@@ -125,7 +149,7 @@ def test_no_import_waits_for_a_pipe(kind: str, tmp_path: Path) -> None:
     assert refused
 
 
-# ---- YAML --------------------------------------------------------------------------------------------------------------
+# ---- YAML ----------------------------------------------------------------------------------------
 
 
 MULTIPLYING = "x0: &a0 [1, 1, 1, 1, 1, 1, 1, 1, 1]\n" + "".join(
@@ -151,7 +175,8 @@ HOSTILE = {
     "documents": ("a: 1\n" + "---\n" * 20_000, "one YAML document.*line 2"),
     "values": ("a: [" + "1," * 22_000 + "]", "too many values.*line 1"),
     "merged mappings": (
-        "a: &a {" + ",".join(f"k{n}: 1" for n in range(999)) + "}\nb:\n" + "- {<<: *a}\n" * 5000, "too many values.*line 12",
+        "a: &a {" + ",".join(f"k{n}: 1" for n in range(999)) + "}\nb:\n" + "- {<<: *a}\n" * 5000,
+        "too many values.*line 12",
     ),
     "a merged text": ("a: {<<: b}", "no mapping.*line 1"),
     "a key twice": ("a: 1\nb: 1\na: 2", "'a' is given twice.*line 3"),
@@ -193,9 +218,15 @@ def test_hostile_yaml_is_refused_at_once(name: str, tmp_path: Path, capsys: pyte
 
 
 LARGE = {
-    "edits": "- remove: {ids: [car-001]}\n", "numbers": "- 1\n", "texts": "- 'a'\n", "maps": "- {a: {b: {c: {d: 1}}}}\n",
-    "dashes": "- " * 30 + "1\n", "brackets": "- [[[[[[[[[[[[[[[[[[[[]]]]]]]]]]]]]]]]]]]]\n", "aliases": "- *a\n", "comments": "#\n",
-}  # fmt: skip
+    "edits": "- remove: {ids: [car-001]}\n",
+    "numbers": "- 1\n",
+    "texts": "- 'a'\n",
+    "maps": "- {a: {b: {c: {d: 1}}}}\n",
+    "dashes": "- " * 30 + "1\n",
+    "brackets": "- [[[[[[[[[[[[[[[[[[[[]]]]]]]]]]]]]]]]]]]]\n",
+    "aliases": "- *a\n",
+    "comments": "#\n",
+}
 
 
 @pytest.mark.parametrize("kind", LARGE)
@@ -221,12 +252,33 @@ def test_the_slow_parser_refuses_the_same(name: str, monkeypatch: pytest.MonkeyP
         parse_yaml(text, "here")
 
 
-@pytest.mark.parametrize(("text", "value"), [
-    ("1:30", "1:30"), ("2026-13-45", "2026-13-45"), ("2026-01-02", "2026-01-02"), ("0x10", "0x10"), ("010", "010"), ("0b1", "0b1"),
-    ("-3", -3), ("1_000", 1000), ("0", 0), ("1.5", 1.5), ("-.5", -0.5), ("1.0e-05", 1e-05), ("-.inf", -math.inf), ("'1'", "1"), ("~", None),
-    ("yes", True), ("Off", False), ("a b", "a b"), ("'null'", "null"), ("", None),
-    ("|\n a\n b\n", "a\nb\n"), ("[a, {b: }]", ["a", {"b": None}]),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [
+        ("1:30", "1:30"),
+        ("2026-13-45", "2026-13-45"),
+        ("2026-01-02", "2026-01-02"),
+        ("0x10", "0x10"),
+        ("010", "010"),
+        ("0b1", "0b1"),
+        ("-3", -3),
+        ("1_000", 1000),
+        ("0", 0),
+        ("1.5", 1.5),
+        ("-.5", -0.5),
+        ("1.0e-05", 1e-05),
+        ("-.inf", -math.inf),
+        ("'1'", "1"),
+        ("~", None),
+        ("yes", True),
+        ("Off", False),
+        ("a b", "a b"),
+        ("'null'", "null"),
+        ("", None),
+        ("|\n a\n b\n", "a\nb\n"),
+        ("[a, {b: }]", ["a", {"b": None}]),
+    ],
+)
 def test_plain_values_are_read(text: str, value: object) -> None:
     """Numbers are decimal; dates and times of day are texts."""
     read = parse_yaml(f"k: {text}", "here")["k"]
@@ -236,7 +288,9 @@ def test_plain_values_are_read(text: str, value: object) -> None:
 def test_plain_yaml_with_aliases_is_read() -> None:
     deep = "a: " + "[" * (DEEPEST - 1) + "]" * (DEEPEST - 1)
     assert parse_yaml("a: &x {b: [1, 2]}\nc: *x\nd: {<<: *x, e: 3}", "here") == {
-        "a": {"b": [1, 2]}, "c": {"b": [1, 2]}, "d": {"b": [1, 2], "e": 3},
-    }  # fmt: skip
+        "a": {"b": [1, 2]},
+        "c": {"b": [1, 2]},
+        "d": {"b": [1, 2], "e": 3},
+    }
     assert parse_yaml(deep, "here")
     assert parse_yaml("", "here") is None

@@ -1,4 +1,5 @@
-"""Commands where the place is hostile: a current folder that is gone, limits of the shell, scenes that claim to be others."""
+"""Commands where the place is hostile: a current folder that is gone, limits of the shell, scenes that claim to be
+others."""
 
 from __future__ import annotations
 
@@ -66,17 +67,36 @@ def test_a_limit_of_the_shell_below_our_own_is_kept(tmp_path: Path) -> None:
 @pytest.fixture(scope="module")
 def city(tmp_path_factory: pytest.TempPathFactory) -> Any:
     tiny = CityConfig(n_frames=2, width=32, height=24, cameras=("front",), lidar_beams=4)
-    scene = read_scene(Ingest(
-        log="city", out=tmp_path_factory.mktemp("city") / "scene", settings=IngestConfig(city=tiny, contact_sheet=False)
-    ).run())
+    scene = read_scene(
+        Ingest(
+            log="city",
+            out=tmp_path_factory.mktemp("city") / "scene",
+            settings=IngestConfig(city=tiny, contact_sheet=False),
+        ).run()
+    )
     assert truth_of(scene).exact
     return scene
 
 
-@pytest.mark.parametrize("change", [
-    {"city": 3}, {"city": None}, {"city": []}, {"city": {}}, {"city": {"n_frames": -1}}, {"city": {"unknown": 1}},
-    {"generator_version": None}, {"n_frames": 2000}, {"seed": 1}, {"seed": 10**18}, {"light": "no"}, {"textures": "/nowhere"}, {},
-], ids=str)  # fmt: skip
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"city": 3},
+        {"city": None},
+        {"city": []},
+        {"city": {}},
+        {"city": {"n_frames": -1}},
+        {"city": {"unknown": 1}},
+        {"generator_version": None},
+        {"n_frames": 2000},
+        {"seed": 1},
+        {"seed": 10**18},
+        {"light": "no"},
+        {"textures": "/nowhere"},
+        {},
+    ],
+    ids=str,
+)
 def test_a_scene_that_claims_to_be_another_city_has_no_truth(change: dict[str, Any], city: Any) -> None:
     recipe = city.source.recipe
     own = {"city", "generator_version"} & set(change)

@@ -1,4 +1,5 @@
-"""Small images whose headers claim 60,000 x 60,000 pixels: refused by every reader of pictures, without the memory that they claim."""
+"""Small images whose headers claim 60,000 x 60,000 pixels: refused by every reader of pictures, without the memory that
+they claim."""
 
 from __future__ import annotations
 
@@ -53,7 +54,10 @@ READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "texture": ("RGB", photos.surface),
     "label": ("L", lambda path: labels._decode_grey(path.read_bytes(), "here")),
     "label of KITTI-360": ("L", kitti360._grey),
-    "label of Waymo": ("I;16", lambda path: waymo.panoptic_ids(SimpleNamespace(divisor=1000, png=path.read_bytes()), CAMERA, "here")),
+    "label of Waymo": (
+        "I;16",
+        lambda path: waymo.panoptic_ids(SimpleNamespace(divisor=1000, png=path.read_bytes()), CAMERA, "here"),
+    ),
 }
 
 

@@ -38,7 +38,7 @@ def test_every_item_is_done_once_and_a_generator_is_read_lazily(workers: int) ->
         with lock:
             done.append(n)
 
-    assert common.for_each(items(), work, workers=workers, title="t") == 20  # type: ignore[arg-type]
+    assert common.for_each(items(), work, workers=workers, title="t") == 20
     assert sorted(done) == list(range(20))
     assert max(ahead) <= 2 * workers
 
@@ -113,12 +113,13 @@ def test_poses_are_cleaned_or_refused_in_words() -> None:
 
 
 def smooth_picture(camera: Camera, lens: images.Lens | None = None) -> np.ndarray:
-    """A picture of a smooth function of the ray; with a lens, as that lens sees it (the map is inverted by iteration)."""
+    """A picture of a smooth function of the ray; with a lens, as that lens sees it (the map is inverted by
+    iteration)."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     seen = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1).reshape(-1, 2)
     xy = seen.copy()
     for _ in range(60 if lens is not None else 0):
-        xy += seen - lens(xy)  # type: ignore[misc]
+        xy += seen - lens(xy)
     values = [np.sin(3 * xy[:, 0]), np.cos(4 * xy[:, 1]), xy[:, 0] * xy[:, 1]]
     return (
         np.rint(127 + 100 * np.stack(values, -1).clip(-1, 1)).astype(np.uint8).reshape(camera.height, camera.width, 3)

@@ -1,4 +1,5 @@
-"""FID's network: its layers against a twin in numpy and its traps one by one, its input rules against other implementations."""
+"""FID's network: its layers against a twin in numpy and its traps one by one, its input rules against other
+implementations."""
 
 from __future__ import annotations
 
@@ -30,7 +31,7 @@ def picture(height: int = 64, width: int = 96, seed: int = 0) -> np.ndarray:
     return np.array(Image.fromarray(rough).resize((width, height), Image.Resampling.BILINEAR))
 
 
-# ---- names and shapes ------------------------------------------------------------------------------------------------
+# ---- names and shapes ----------------------------------------------------------------------------
 
 
 def test_the_published_file_has_these_tensors() -> None:
@@ -49,10 +50,16 @@ def test_the_published_file_has_these_tensors() -> None:
 
 
 SIZES = {
-    "Mixed_5b": (192, 35, 256, 35), "Mixed_5c": (256, 35, 288, 35), "Mixed_5d": (288, 35, 288, 35), "Mixed_6a": (288, 35, 768, 17),
-    "Mixed_6b": (768, 17, 768, 17), "Mixed_6e": (768, 17, 768, 17), "Mixed_7a": (768, 17, 1280, 8), "Mixed_7b": (1280, 8, 2048, 8),
+    "Mixed_5b": (192, 35, 256, 35),
+    "Mixed_5c": (256, 35, 288, 35),
+    "Mixed_5d": (288, 35, 288, 35),
+    "Mixed_6a": (288, 35, 768, 17),
+    "Mixed_6b": (768, 17, 768, 17),
+    "Mixed_6e": (768, 17, 768, 17),
+    "Mixed_7a": (768, 17, 1280, 8),
+    "Mixed_7b": (1280, 8, 2048, 8),
     "Mixed_7c": (2048, 8, 2048, 8),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", SIZES)
@@ -66,8 +73,12 @@ def test_taps_have_their_widths_and_do_not_depend_on_the_batch(network: inceptio
     taps = ("64", "192", "768", "2048", "logits_unbiased")
     found = network(images, taps)
     assert {tap: tuple(x.shape) for tap, x in found.items()} == {
-        "64": (2, 64), "192": (2, 192), "768": (2, 768), "2048": (2, 2048), "logits_unbiased": (2, 1008)
-    }  # fmt: skip
+        "64": (2, 64),
+        "192": (2, 192),
+        "768": (2, 768),
+        "2048": (2, 2048),
+        "logits_unbiased": (2, 1008),
+    }
     alone = network(images[1:])
     assert list(alone) == ["2048"]
     assert torch.allclose(alone["2048"], found["2048"][1:], atol=1e-5)
@@ -81,7 +92,7 @@ def test_other_sizes_are_refused(network: inception.InceptionFeatures) -> None:
         network(torch.zeros(1, 3, 224, 224))
 
 
-# ---- layers ----------------------------------------------------------------------------------------------------------
+# ---- layers --------------------------------------------------------------------------------------
 
 
 def convolved(x: np.ndarray, state: dict[str, torch.Tensor], name: str) -> np.ndarray:
@@ -117,10 +128,16 @@ def test_the_last_blocks_against_a_twin_in_numpy(network, state, name: str, pool
     one = x[0].double().numpy()
     middle = of(one, "branch3x3_1")
     double = of(of(one, "branch3x3dbl_1"), "branch3x3dbl_2")
-    expected = np.concatenate([
-        of(one, "branch1x1"), of(middle, "branch3x3_2a"), of(middle, "branch3x3_2b"), of(double, "branch3x3dbl_3a"),
-        of(double, "branch3x3dbl_3b"), of(neighbours(one, pool), "branch_pool"),
-    ])  # fmt: skip
+    expected = np.concatenate(
+        [
+            of(one, "branch1x1"),
+            of(middle, "branch3x3_2a"),
+            of(middle, "branch3x3_2b"),
+            of(double, "branch3x3dbl_3a"),
+            of(double, "branch3x3dbl_3b"),
+            of(neighbours(one, pool), "branch_pool"),
+        ]
+    )
     assert np.abs(network.block(name, x)[0].numpy() - expected).max() < 1e-4 * np.abs(expected).max()
 
 
@@ -185,7 +202,7 @@ def test_float64_agrees(state) -> None:
     assert float((single - double).abs().max() / double.abs().max()) < 1e-5
 
 
-# ---- weights that do not fit -----------------------------------------------------------------------------------------
+# ---- weights that do not fit ---------------------------------------------------------------------
 
 
 def test_counts_of_batches_are_left_alone(network, state) -> None:
@@ -209,7 +226,7 @@ def test_other_weights_are_refused_and_named(state) -> None:
             inception.InceptionFeatures({**state, "Conv2d_1a_3x3.bn.running_var": torch.full((32,), value)})
 
 
-# ---- rules of input --------------------------------------------------------------------------------------------------
+# ---- rules of input ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rule", inception.RULES)

@@ -46,7 +46,9 @@ def test_a_kitti_folder_is_recognised_and_equals_a_direct_import(tmp_path: Path)
 
 def test_flags_reach_the_importer(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    scene = read_scene(Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig(frames="1:6", test_every=2, untwist="no")).run())
+    scene = read_scene(
+        Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig(frames="1:6", test_every=2, untwist="no")).run()
+    )
     assert len(scene.frames) == 5
     assert sorted(i for i, s in scene.split.items() if s == "test") == ["front/000002", "front/000004"]
     assert not read_points(scene, scene.sweeps[0]).dt_s.any()
@@ -68,7 +70,9 @@ def test_the_number_of_workers_changes_nothing_and_is_no_other_configuration(tmp
     drive = made.write_raw_drive(tmp_path / "day")
     out = Ingest(log=drive, out=tmp_path / "one", settings=IngestConfig(workers=1)).run()
     listed = store.read_json(out / "manifest.json")["files"]
-    again = store.read_json(Ingest(log=drive, out=tmp_path / "three", settings=IngestConfig(workers=3)).run() / "manifest.json")["files"]
+    again = store.read_json(
+        Ingest(log=drive, out=tmp_path / "three", settings=IngestConfig(workers=3)).run() / "manifest.json"
+    )["files"]
     assert {n: f for n, f in listed.items() if not n.startswith("run.")} == {
         n: f for n, f in again.items() if not n.startswith("run.")
     }
@@ -158,8 +162,12 @@ def test_of_a_folder_with_many_logs_only_the_chosen_one_counts(tmp_path: Path) -
     assert "input 'source' changed" in caught.value.got
     listed = files_of("kitti", root, ImportOptions(sequence="0003")).files
     assert {path.relative_to(root).as_posix() for path in listed} == {
-        "image_02/0003", "velodyne/0003", "label_02/0003.txt", "calib/0003.txt", "oxts/0003.txt",
-    }  # fmt: skip
+        "image_02/0003",
+        "velodyne/0003",
+        "label_02/0003.txt",
+        "calib/0003.txt",
+        "oxts/0003.txt",
+    }
 
 
 def test_of_large_releases_the_tables_and_the_names_of_files_count(tmp_path: Path) -> None:

@@ -1,4 +1,5 @@
-"""Views in a scratch file are those in memory, to the bit; threads that read ahead change nothing and leave nothing behind."""
+"""Views in a scratch file are those in memory, to the bit; threads that read ahead change nothing and leave nothing
+behind."""
 
 from __future__ import annotations
 
@@ -40,7 +41,8 @@ OPTIONAL = ("channels", "sky", "mask", "lidar", "depth", "confidence")
 
 
 def threads_at_work() -> int:
-    """Threads of this process but for the one that looks at memory (`base/memory.py`): it ends a moment after the last meter."""
+    """Threads of this process but for the one that looks at memory (`base/memory.py`): it ends a moment after the last
+    meter."""
     return sum(thread.name != "memory meter" for thread in threading.enumerate())
 
 
@@ -271,7 +273,7 @@ def test_a_mapped_array_that_the_disk_has_no_room_for_is_an_error_in_words(tmp_p
         scratch.mapped_array(tmp_path, (100,), np.uint8)
 
 
-# ---- whole fits ------------------------------------------------------------------------------------------------------
+# ---- whole fits ----------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -288,9 +290,14 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 def settings():
     return fit_config(
-        method="mudg_s", iterations=24, start__gaussians=600, densify__max_gaussians=1000, checkpoint_every=1000, preview_every=12,
+        method="mudg_s",
+        iterations=24,
+        start__gaussians=600,
+        densify__max_gaussians=1000,
+        checkpoint_every=1000,
+        preview_every=12,
         poses__learn=True,
-    )  # fmt: skip
+    )
 
 
 def result_of(folder: Path) -> dict[str, bytes]:
@@ -299,7 +306,13 @@ def result_of(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_fit_from_a_file_of_views_is_the_same_fit_also_when_resumed(world, tmp_path, monkeypatch):
-    step = Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "whole", settings=settings())
+    step = Fit(
+        scene=world["scene"],
+        fused=world["fuse"],
+        observations=(world["virtual"],),
+        out=tmp_path / "whole",
+        settings=settings(),
+    )
     usual = replace(step, out=tmp_path / "usual").run()
     monkeypatch.setattr(kept, "IN_MEMORY_BYTES", 0)
     before, adam_step, folder, asked = threads_at_work(), fit.adam_step, tmp_path / "filed", []
@@ -332,7 +345,12 @@ def test_a_wrong_frame_is_named_by_the_thread_that_reads_it(world, tmp_path):
     image.write_bytes(image.read_bytes()[:200])
     before = threads_at_work()
     with pytest.raises(fit_views.InputError, match=image.name):
-        Fit(scene=scene, fused=world["fuse"], out=tmp_path / "fit", settings=replace(settings(), method="street_gaussians")).run()
+        Fit(
+            scene=scene,
+            fused=world["fuse"],
+            out=tmp_path / "fit",
+            settings=replace(settings(), method="street_gaussians"),
+        ).run()
     assert threads_at_work() == before
 
 
@@ -366,7 +384,7 @@ def test_sweeps_are_let_go_and_depths_stay_the_same(world, monkeypatch):
         assert len(cache._read) == 1
 
 
-# ---- what goes over all views ----------------------------------------------------------------------------------------
+# ---- what goes over all views --------------------------------------------------------------------
 
 
 def test_a_sky_is_the_same_however_its_pixels_are_divided():
@@ -402,8 +420,12 @@ def test_points_of_unseen_surfaces_are_bounded(world, monkeypatch):
 
 def test_few_points_of_unseen_surfaces_still_cover_them():
     """10,000 points on a square of 10 m: 100 of them are spread over all of it and are as large as their distance."""
-    grid = np.stack(np.meshgrid(np.arange(0, 10, 0.1), np.arange(0, 10, 0.1), [0.0]), -1).reshape(-1, 3).astype(np.float32)
-    points = StartPoints(grid, np.zeros((len(grid), 3), np.uint8), np.zeros(len(grid), np.uint8), np.full(len(grid), 0.05, np.float32))
+    grid = (
+        np.stack(np.meshgrid(np.arange(0, 10, 0.1), np.arange(0, 10, 0.1), [0.0]), -1).reshape(-1, 3).astype(np.float32)
+    )
+    points = StartPoints(
+        grid, np.zeros((len(grid), 3), np.uint8), np.zeros(len(grid), np.uint8), np.full(len(grid), 0.05, np.float32)
+    )
     few = trust._spread(points, 100, np.random.default_rng(0))
     all_of_them = trust._spread(points, len(grid), np.random.default_rng(0))
     assert 40 <= len(few) <= 100

@@ -1,4 +1,5 @@
-"""KITTI importer: every layout against folders written from an exact drive, and the real pieces against known answers."""
+"""KITTI importer: every layout against folders written from an exact drive, and the real pieces against known
+answers."""
 
 from __future__ import annotations
 
@@ -22,14 +23,14 @@ from mudg.scene.read import read_image, read_points
 
 
 def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["kitti"](source, out, ImportOptions(**options))  # type: ignore[arg-type]
+    return IMPORTERS["kitti"](source, out, ImportOptions(**options))
 
 
 def worst(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.abs(np.asarray(a) - np.asarray(b)).max())
 
 
-# --- calibration ----------------------------------------------------------------------------------------------------
+# --- calibration ----------------------------------------------------------------------------------
 
 
 def test_camera_projects_as_the_projection_matrix_does_with_pixel_centres_at_half(tmp_path: Path) -> None:
@@ -67,7 +68,7 @@ def test_rounded_rotation_becomes_exact_and_a_scaled_one_is_refused(tmp_path: Pa
         read_calibration_text(path)
 
 
-# --- raw drives -----------------------------------------------------------------------------------------------------
+# --- raw drives -----------------------------------------------------------------------------------
 
 
 def test_raw_drive_poses_images_times_and_calibration(tmp_path: Path) -> None:
@@ -143,7 +144,7 @@ def test_timestamps_keep_nanoseconds_across_a_minute(tmp_path: Path) -> None:
     assert second - first == pytest.approx(0.103501789, abs=1e-6)
 
 
-# --- other layouts --------------------------------------------------------------------------------------------------
+# --- other layouts --------------------------------------------------------------------------------
 
 
 def test_odometry_sequence(tmp_path: Path) -> None:
@@ -239,7 +240,7 @@ def test_frame_range_words() -> None:
             parse_frame_range(wrong)
 
 
-# --- real pieces ----------------------------------------------------------------------------------------------------
+# --- real pieces ----------------------------------------------------------------------------------
 
 
 def test_real_sequence_imports_with_one_command(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
@@ -287,14 +288,19 @@ def test_real_object_frame_points_and_box_counts(shared_data: Callable[[str], Pa
     names = ("pedestrian", "cyclist", "car", "van", "truck", "person_sitting", "tram", "misc")
     boxes = [
         f"{names[item['bbox_label_3d']]} 0 0 0 {row(item['bbox'])} {h} {w} {length} {x} {y} {z} {turn}"
-        for item in record["instances"] if item["bbox_label_3d"] >= 0
+        for item in record["instances"]
+        if item["bbox_label_3d"] >= 0
         for x, y, z, length, h, w, turn in [item["bbox_3d"]]
-    ]  # fmt: skip
-    calibration = f"P2: {row(camera['cam2img'][:3])}\nR0_rect: {row(np.eye(3))}\nTr_velo_to_cam: {row(camera['lidar2cam'][:3])}\n"
+    ]
+    calibration = (
+        f"P2: {row(camera['cam2img'][:3])}\nR0_rect: {row(np.eye(3))}\nTr_velo_to_cam: {row(camera['lidar2cam'][:3])}\n"
+    )
     for name, suffix, content in (
-        ("image_2", "png", (source / "000008.png").read_bytes()), ("velodyne", "bin", (source / "000008.bin").read_bytes()),
-        ("label_2", "txt", "\n".join(boxes).encode()), ("calib", "txt", calibration.encode()),
-    ):  # fmt: skip
+        ("image_2", "png", (source / "000008.png").read_bytes()),
+        ("velodyne", "bin", (source / "000008.bin").read_bytes()),
+        ("label_2", "txt", "\n".join(boxes).encode()),
+        ("calib", "txt", calibration.encode()),
+    ):
         (folder / name).mkdir(parents=True)
         (folder / name / f"000008.{suffix}").write_bytes(content)
     scene = ingest(folder, tmp_path / "out")
@@ -309,19 +315,23 @@ def test_real_object_frame_points_and_box_counts(shared_data: Callable[[str], Pa
         assert (np.abs(local) <= track.size_m / 2).all(1).sum() == pytest.approx(expected, rel=0.08)
 
 
-# --- empty lines ------------------------------------------------------------------------------------------------------
+# --- empty lines ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("frames", [None, (0, 12)])
 @pytest.mark.parametrize("stream", ["velodyne_points", "oxts", "image_02"])
-def test_an_empty_line_is_a_missing_time_and_moves_nothing(stream: str, frames: tuple[int, int] | None, tmp_path: Path) -> None:
+def test_an_empty_line_is_a_missing_time_and_moves_nothing(
+    stream: str, frames: tuple[int, int] | None, tmp_path: Path
+) -> None:
     """Drive 0009 of 2011_09_26 lacks four scans, and the file of their times has empty lines for them."""
     folder = made.write_raw_drive(tmp_path / "day", made.Drive(tuple(range(14))), twisted=False)
     suffix = {"velodyne_points": "bin", "oxts": "txt", "image_02": "png"}[stream]
     for number in (4, 5):
         (folder / stream / "data" / f"{number:010d}.{suffix}").unlink()
     path = folder / stream / "timestamps.txt"
-    path.write_text("\n".join("" if n in (4, 5) else line for n, line in enumerate(path.read_text().splitlines())) + "\n")
+    path.write_text(
+        "\n".join("" if n in (4, 5) else line for n, line in enumerate(path.read_text().splitlines())) + "\n"
+    )
     scene = ingest(folder, tmp_path / "out", skip_missing=True, frames=frames, untwist="no")
     numbers = [n for n in range(*(frames or (0, 14))) if stream == "oxts" or n not in (4, 5)]
     first = invert(made.world_from_imu(0.0))
@@ -355,7 +365,8 @@ def test_an_empty_line_of_a_pose_file_is_a_missing_pose(tmp_path: Path) -> None:
     first = invert(made.world_from_velo(0.0))
     for sweep in scene.sweeps:
         exact = first @ made.world_from_velo(sweep.time_s)
-        assert worst(sweep.world_from_lidar[:3, 3], exact[:3, 3]) < 0.03  # frame 3 lies between its neighbours: 1.6 m of the arc
+        # frame 3 lies between its neighbours: 1.6 m of the arc
+        assert worst(sweep.world_from_lidar[:3, 3], exact[:3, 3]) < 0.03
     at_gap = [round(sweep.time_s, 6) for sweep in scene.sweeps]
     assert at_gap == [0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7]
 

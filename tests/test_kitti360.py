@@ -44,7 +44,7 @@ def source(pristine: Path, tmp_path: Path) -> Path:
 
 
 def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["kitti360"](source, out, ImportOptions(**{"untwist": "no", **options}))  # type: ignore[arg-type]
+    return IMPORTERS["kitti360"](source, out, ImportOptions(**{"untwist": "no", **options}))
 
 
 def parts(source: Path) -> dict[str, Path]:
@@ -57,7 +57,7 @@ def parts(source: Path) -> dict[str, Path]:
     }
 
 
-# --- what is read -----------------------------------------------------------------------------------------------------
+# --- what is read ---------------------------------------------------------------------------------
 
 
 def test_round_trip(truth: Scene, pristine: Path, tmp_path: Path) -> None:
@@ -138,7 +138,8 @@ def test_time_stamps_of_recorded_scans_only_and_empty_lines(source: Path, pristi
 
 
 def test_scans_are_untwisted_clockwise(truth: Scene, source: Path, tmp_path: Path) -> None:
-    """Posts measured by a sensor that turns from left to right stand where they are; turned the other way they do not."""
+    """Posts measured by a sensor that turns from left to right stand where they are; turned the other way they do
+    not."""
     first = truth.ego.pose_at(0.0)
     assert first is not None
     mount = invert(first) @ truth.sweeps[0].world_from_lidar
@@ -223,9 +224,11 @@ def write_fisheye(source: Path) -> None:
     image = np.round((ray + 1) * 127).clip(0, 254).astype(np.uint8)
     for name in ("image_02", "image_03"):
         (source / "calibration" / f"{name}.yaml").write_text(
-            "%YAML:1.0\n---\nmodel_type: MEI\ncamera_name: " + name + f"\nimage_width: {side}\nimage_height: {side}\n"
-            f"mirror_parameters:\n   xi: {xi:.16e}\ndistortion_parameters:\n   k1: {k1}\n   k2: {k2}\n   p1: 0.0\n   p2: 0.0\n"
-            f"projection_parameters:\n   gamma1: {gamma}\n   gamma2: {gamma}\n   u0: 71.6\n   v0: 70.5\n"
+            "%YAML:1.0\n---\nmodel_type: MEI\ncamera_name: "
+            + name
+            + f"\nimage_width: {side}\nimage_height: {side}\nmirror_parameters:\n   xi:"
+            f" {xi:.16e}\ndistortion_parameters:\n   k1: {k1}\n   k2: {k2}\n   p1: 0.0\n   p2:"
+            f" 0.0\nprojection_parameters:\n   gamma1: {gamma}\n   gamma2: {gamma}\n   u0: 71.6\n   v0: 70.5\n"
         )
         folder = source / "data_2d_raw" / made.DRIVE / name / "data_rgb"
         folder.mkdir(parents=True)
@@ -270,7 +273,7 @@ def test_semantics_are_taken_where_there_are_some(source: Path, tmp_path: Path) 
         ingest(source, tmp_path / "bad")
 
 
-# --- boxes ------------------------------------------------------------------------------------------------------------
+# --- boxes ----------------------------------------------------------------------------------------
 
 
 def boxes_of(tmp_path: Path, *objects: str) -> tuple[list, dict[str, int]]:
@@ -288,7 +291,7 @@ def test_the_same_box_by_any_axes(tmp_path: Path, axes: np.ndarray) -> None:
     pose, size = yaw_matrix(0.4, (3.0, 4.0, 1.0)), np.array([4.5, 1.8, 1.5])
     turned = pose.copy()
     turned[:3, :3] = pose[:3, :3] @ axes
-    ((box,), _) = boxes_of(tmp_path, made.box_xml(1, turned, np.abs(axes.T @ size)))
+    (box,), _ = boxes_of(tmp_path, made.box_xml(1, turned, np.abs(axes.T @ size)))
     assert box.size_m == pytest.approx((4.5, 1.8, 1.5))
     expected = made.SOURCE_FROM_WORLD @ pose
     assert np.abs(box.world_from_box[:3, 3] - expected[:3, 3]).max() < 1e-6
@@ -358,7 +361,7 @@ def test_spoilt_box_files(source: Path, tmp_path: Path, change: Callable[[str], 
     assert not (tmp_path / "out").exists()
 
 
-# --- refusals ---------------------------------------------------------------------------------------------------------
+# --- refusals -------------------------------------------------------------------------------------
 
 
 def spoil_text(name: str, pattern: str, instead: str) -> Callable[[Path], None]:
@@ -417,7 +420,7 @@ def cut(name: str, size: int) -> Callable[[Path], None]:
         (spoil_text("calibration/perspective.txt", r"R_rect_01: \S+", "R_rect_01: 2.0"), "rigid|scaled"),
         (lambda s: shutil.rmtree(s / "calibration"), "file not found"),
     ],
-)  # fmt: skip
+)
 def test_spoilt_logs_are_refused_in_words(
     source: Path, tmp_path: Path, spoil: Callable[[Path], object], words: str
 ) -> None:

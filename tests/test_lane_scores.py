@@ -45,7 +45,8 @@ def test_lines_beside_behind_and_far_away_are_left_out() -> None:
     mask = street_scores.lane_truth(VIEW, [across])  # cut at 10 m to each side: 300 px of 384
     assert not mask[:, :10].any() or np.flatnonzero(mask.any(0)).min() == 0
     through = np.stack([np.linspace(-5, 30, 141), np.full(141, -0.5), np.zeros(141)], 1)
-    assert street_scores.lane_truth(VIEW, [through])[-1].any()  # runs out of the lower edge, not to the horizon's other side
+    # runs out of the lower edge, not to the horizon's other side
+    assert street_scores.lane_truth(VIEW, [through])[-1].any()
     assert not street_scores.lane_truth(VIEW, [through])[:175].any()
 
 
@@ -85,7 +86,8 @@ def test_the_rule_finds_bright_stripes_on_the_road_only() -> None:
     assert not street_scores.bright_stripes(rgb, ~mask & False).any()
     assert not street_scores.bright_stripes(road_with_line(0.05)[0], everywhere).any()  # too faint
     assert not street_scores.bright_stripes(road_with_line(-0.2)[0], everywhere)[:, 98:106].any()  # dark
-    assert not street_scores.bright_stripes(road_with_line(0.3, 100, 60)[0], everywhere).any()  # a bright field is no line
+    # a bright field is no line
+    assert not street_scores.bright_stripes(road_with_line(0.3, 100, 60)[0], everywhere).any()
     rgb[:, 30, 200:202] += 0.2  # a speck
     assert not street_scores.bright_stripes(rgb, everywhere)[:, 190:].any()
 
@@ -120,7 +122,9 @@ def test_lane_gradients_fall_when_a_line_moves_or_fades() -> None:
 
     def correlation(other: np.ndarray) -> float:
         gray = street_scores.gray_of
-        return street_scores.edge_correlation(street_scores.edges_of(gray(other)), street_scores.edges_of(gray(rgb)), band)
+        return street_scores.edge_correlation(
+            street_scores.edges_of(gray(other)), street_scores.edges_of(gray(rgb)), band
+        )
 
     assert correlation(rgb) == pytest.approx(1.0)
     assert correlation(0.5 * rgb + 0.2) == pytest.approx(1.0)  # brightness and contrast do not matter

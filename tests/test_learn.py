@@ -50,7 +50,8 @@ def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, whol
     assert saved is not None and saved.step == 2  # the step that was under way was finished
     assert json.loads((tmp_path / "parts" / "run.json").read_text())["state"] == "interrupted"
     assert not (tmp_path / "parts" / "model").exists()
-    parts = Learn(out=tmp_path / "parts", settings=with_settings(config, log_every=1)).run()  # how often is written down may change
+    # how often is written down may change
+    parts = Learn(out=tmp_path / "parts", settings=with_settings(config, log_every=1)).run()
     first, second = weights(whole), weights(parts)
     assert all(torch.equal(first[name], second[name]) for name in first)
     scores = [json.loads((p.parent / "metrics.json").read_text()) for p in (whole, parts)]

@@ -1,4 +1,5 @@
-"""Training under torchrun whose processes are killed, warned and changed in number: the losses of an uninterrupted run."""
+"""Training under torchrun whose processes are killed, warned and changed in number: the losses of an uninterrupted
+run."""
 
 import contextlib
 import hashlib
@@ -46,24 +47,60 @@ def start(processes, clips, out, fault="", restarts=0, **changes):
 def torchrun(nodes, processes, clips, out, fault="", **changes):
     """Command and environment of a training with `processes` on this node."""
     flags = {
-        "out": out, "steps": STEPS, "data.clips": clips, "data.cities": 3, "data.first-cities": 2, "data.held-out": 1,
-        "data.width": WIDTH, "data.height": HEIGHT, "data.window": WINDOW, "data.clips-per-city": 2, "network.widths": "16 32",
-        "network.blocks": "1 1", "network.spatial-attention": "False True", "network.temporal-attention": "False True",
-        "network.refine-widths": "8 16", "network.refine-blocks": "1 1", "network.finish-widths": "8 16", "network.finish-blocks": "1 1",
-        "codec.steps": 2, "codec.batch": 2, "codec.fit-batches": 1, "optimizer.batch-frames": 16, "optimizer.warmup-steps": 1,
-        "score.steps": 1, "score.every": 100, "precision": "float32", "compute.workers": 0, "compute.log-every": 1,
-        "compute.checkpoint-every": 2, "compute.checkpoints-kept": 3, **changes,
-    }  # fmt: skip
+        "out": out,
+        "steps": STEPS,
+        "data.clips": clips,
+        "data.cities": 3,
+        "data.first-cities": 2,
+        "data.held-out": 1,
+        "data.width": WIDTH,
+        "data.height": HEIGHT,
+        "data.window": WINDOW,
+        "data.clips-per-city": 2,
+        "network.widths": "16 32",
+        "network.blocks": "1 1",
+        "network.spatial-attention": "False True",
+        "network.temporal-attention": "False True",
+        "network.refine-widths": "8 16",
+        "network.refine-blocks": "1 1",
+        "network.finish-widths": "8 16",
+        "network.finish-blocks": "1 1",
+        "codec.steps": 2,
+        "codec.batch": 2,
+        "codec.fit-batches": 1,
+        "optimizer.batch-frames": 16,
+        "optimizer.warmup-steps": 1,
+        "score.steps": 1,
+        "score.every": 100,
+        "precision": "float32",
+        "compute.workers": 0,
+        "compute.log-every": 1,
+        "compute.checkpoint-every": 2,
+        "compute.checkpoints-kept": 3,
+        **changes,
+    }
     words = [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]
     here = Path(__file__).parent
     command = [
-        sys.executable, "-m", "torch.distributed.run", "--rdzv-backend", "c10d", *nodes, "--nproc-per-node", str(processes),
-        str(here / "learn_on_nodes.py"), "learn", *words,
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--rdzv-backend",
+        "c10d",
+        *nodes,
+        "--nproc-per-node",
+        str(processes),
+        str(here / "learn_on_nodes.py"),
+        "learn",
+        *words,
+    ]
     environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join([str(here), *sys.path]), "GLOO_SOCKET_IFNAME": "lo", "OMP_NUM_THREADS": "1", "FAULT": fault,
+        "PYTHONPATH": os.pathsep.join([str(here), *sys.path]),
+        "GLOO_SOCKET_IFNAME": "lo",
+        "OMP_NUM_THREADS": "1",
+        "FAULT": fault,
         "TORCH_DISABLE_SHARE_RDZV_TCP_STORE": "1",
-    }  # fmt: skip
+    }
     return command, environment
 
 
@@ -101,7 +138,8 @@ def test_two_processes_then_one_then_four(clips, tmp_path):
 
 
 def test_a_node_that_vanishes_leaves_the_training_to_the_other(clips, tmp_path):
-    """Two nodes, each with its own torchrun; all of the second is killed without a word. `--nnodes 1:2` lets the first go on alone."""
+    """Two nodes, each with its own torchrun; all of the second is killed without a word. `--nnodes 1:2` lets the first
+    go on alone."""
     steps = 30
     whole, out = tmp_path / "whole", tmp_path / "out"
     assert start(1, clips, whole, steps=steps).returncode == 0
@@ -109,9 +147,17 @@ def test_a_node_that_vanishes_leaves_the_training_to_the_other(clips, tmp_path):
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     nodes = (
-        "--nnodes", "1:2", "--rdzv-id", "training", "--rdzv-endpoint", f"127.0.0.1:{port}", "--max-restarts", "3",
-        "--rdzv-conf", "last_call_timeout=5,keep_alive_interval=1,keep_alive_max_attempt=3",
-    )  # fmt: skip
+        "--nnodes",
+        "1:2",
+        "--rdzv-id",
+        "training",
+        "--rdzv-endpoint",
+        f"127.0.0.1:{port}",
+        "--max-restarts",
+        "3",
+        "--rdzv-conf",
+        "last_call_timeout=5,keep_alive_interval=1,keep_alive_max_attempt=3",
+    )
     said = [(tmp_path / f"node{number}").open("w+") for number in range(2)]
     running = []
     for number, end in enumerate(("is_host=true", "is_host=false")):
@@ -152,7 +198,8 @@ def max_difference(one, other, steps=STEPS):
 
 
 def test_checkpoints_are_cut_anew_bit_equal(tmp_path):
-    """Saved by 1, 2 and 4 processes, sharded and in replicas, read by each other number: the same bytes of everything."""
+    """Saved by 1, 2 and 4 processes, sharded and in replicas, read by each other number: the same bytes of
+    everything."""
     here, sums = Path(__file__).parent, {}
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(here), *sys.path]),
@@ -162,8 +209,18 @@ def test_checkpoints_are_cut_anew_bit_equal(tmp_path):
     before = ""
     for processes, layout in ((1, "fsdp"), (2, "fsdp"), (4, "fsdp"), (4, "hsdp"), (2, "fsdp"), (1, "fsdp")):
         into = tmp_path / f"{len(sums)}"
-        command = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", str(processes),
-                   str(here / "reshard_together.py"), layout, before, str(into)]  # fmt: skip
+        command = [
+            sys.executable,
+            "-m",
+            "torch.distributed.run",
+            "--standalone",
+            "--nproc-per-node",
+            str(processes),
+            str(here / "reshard_together.py"),
+            layout,
+            before,
+            str(into),
+        ]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
         sums[into] = done.stdout.split()[-1]

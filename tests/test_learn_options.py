@@ -41,10 +41,17 @@ def unrefined(tmp_path_factory):
     """A model without refiner, of another network than the settings describe by default."""
     model = MDM(
         MDMConfig(
-            widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), patch=2,
-            refine_widths=(), refine_blocks=(), window=WINDOW, area_px=192 * 128,
+            widths=(16, 32),
+            blocks=(1, 1),
+            spatial_attention=(False, True),
+            temporal_attention=(False, True),
+            patch=2,
+            refine_widths=(),
+            refine_blocks=(),
+            window=WINDOW,
+            area_px=192 * 128,
         )
-    )  # fmt: skip
+    )
     learn_models.draw_weights(model.net, 3, "weights")
     learn_models.draw_weights(model.codec, 3, "codec")
     folder = tmp_path_factory.mktemp("unrefined") / "model"

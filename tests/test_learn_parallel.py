@@ -25,7 +25,8 @@ from mudg.diffusion.training.state import TrainingState, read_rows
 from mudg.steps.learn import Learn
 
 SAME = 2e-6
-"""Relative. The same sums in another order; measured for 1 -> 2 ddp -> 2 fsdp -> 1 over 6 steps: 7e-8 (pytest -s shows it)."""
+"""Relative. The same sums in another order; measured for 1 -> 2 ddp -> 2 fsdp -> 1 over 6 steps: 7e-8 (pytest -s shows
+it)."""
 ALONE = Ranks(0, 1, torch.device("cpu"))
 
 
@@ -95,16 +96,44 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
 def torchrun(clips, out, **changes):
     """The command that trains on two processes started by torch's launcher."""
     flags = {
-        "out": out, "steps": 2, "data.clips": clips, "data.cities": 3, "data.first-cities": 2, "data.held-out": 1,
-        "data.width": WIDTH, "data.height": HEIGHT, "data.window": WINDOW, "network.widths": "16 32", "network.blocks": "1 1",
-        "network.spatial-attention": "False True", "network.temporal-attention": "False True", "network.refine-widths": "8 16",
-        "network.refine-blocks": "1 1", "codec.steps": 2, "codec.batch": 2, "codec.fit-batches": 1, "optimizer.batch-frames": 8,
-        "score.steps": 1, "compute.workers": 0, "compute.log-every": 1, "compute.parallel": "fsdp", **changes,
-    }  # fmt: skip
+        "out": out,
+        "steps": 2,
+        "data.clips": clips,
+        "data.cities": 3,
+        "data.first-cities": 2,
+        "data.held-out": 1,
+        "data.width": WIDTH,
+        "data.height": HEIGHT,
+        "data.window": WINDOW,
+        "network.widths": "16 32",
+        "network.blocks": "1 1",
+        "network.spatial-attention": "False True",
+        "network.temporal-attention": "False True",
+        "network.refine-widths": "8 16",
+        "network.refine-blocks": "1 1",
+        "codec.steps": 2,
+        "codec.batch": 2,
+        "codec.fit-batches": 1,
+        "optimizer.batch-frames": 8,
+        "score.steps": 1,
+        "compute.workers": 0,
+        "compute.log-every": 1,
+        "compute.parallel": "fsdp",
+        **changes,
+    }
     words = [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]
     return [
-        sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", "-m", "mudg", "learn", *words,
-    ]  # fmt: skip
+        sys.executable,
+        "-m",
+        "torch.distributed.run",
+        "--standalone",
+        "--nproc-per-node",
+        "2",
+        "-m",
+        "mudg",
+        "learn",
+        *words,
+    ]
 
 
 @pytest.mark.slow

@@ -67,7 +67,8 @@ def corner(clip):
 
 @pytest.mark.slow
 def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
-    """Stage 1 moves all of the network; stage 2, larger, all but the temporal transformers; `synthesize` reads the result."""
+    """Stage 1 moves all of the network; stage 2, larger, all but the temporal transformers; `synthesize` reads the
+    result."""
     one = Learn(out=tmp_path / "one", settings=published_settings(converted, clips, steps=1, batch_frames=4)).run()
     large = write_clips(tmp_path / "large", 36, 32, points=True)
     config = published_settings(
@@ -94,7 +95,8 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 1
     view = SynthesizeConfig(shifts_m=(1.0,), model=str(two), steps=1, guidance=1.0, precision="float32")
     made = read_observations(
-        Synthesize(scene=street / "scene", fused=street / "fuse", out=tmp_path / "made", settings=view).run() / "front_shift+1.0"
+        Synthesize(scene=street / "scene", fused=street / "fuse", out=tmp_path / "made", settings=view).run()
+        / "front_shift+1.0"
     )
     assert len(made) == 5 and bool(torch.isfinite(made[4].rgb).all())
 
@@ -131,7 +133,9 @@ def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
         for clip in drawn
     ]
     with torch.no_grad():
-        terms, without = (model(some, BatchPart(0, 0, 0, 4), LossSettings(None, 1.0, 0.2)).terms for some in (drawn, nothing))
+        terms, without = (
+            model(some, BatchPart(0, 0, 0, 4), LossSettings(None, 1.0, 0.2)).terms for some in (drawn, nothing)
+        )
     assert {"depth", "semantics"} & set(terms)
     assert all(terms[m] > 0 and without[m] == 0 for m in ("depth", "semantics") if m in terms)
 
@@ -194,7 +198,8 @@ def test_the_reference_is_left_out_once(converted, clips, tmp_path, monkeypatch)
 
 @pytest.mark.parametrize(("share", "frame", "matters"), [(1.0, False, True), (1.0, True, False), (0.0, True, True)])
 def test_what_goes_without_the_reference(converted, clips, share, frame, matters):
-    """Left out of tokens and frame, another reference image changes nothing; left out of the tokens alone, frame 0 still shows it."""
+    """Left out of tokens and frame, another reference image changes nothing; left out of the tokens alone, frame 0
+    still shows it."""
     settings = published_settings(converted, clips)
     model, _ = learn_models.starting_model(settings)
     (clip,) = (corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 1, 4, "batch"))
@@ -212,7 +217,9 @@ def test_the_scope_of_dropout_changes_no_clip_that_keeps_its_reference(converted
     (clip,) = (corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 1, 4, "batch"))
     with torch.no_grad():
         losses = {
-            (share, frame): float(model([clip], BatchPart(0, 0, 0, 1), LossSettings(None, 1.0, share, frame_dropout=frame)).total)
+            (share, frame): float(
+                model([clip], BatchPart(0, 0, 0, 1), LossSettings(None, 1.0, share, frame_dropout=frame)).total
+            )
             for share in (0.0, 1.0)
             for frame in (False, True)
         }
@@ -244,7 +251,7 @@ def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
         Learn(out=tmp_path / "other", settings=published_settings(converted, warped)).run()
 
 
-# clips ----------------------------------------------------------------------------------------------------------------
+# clips --------------------------------------------------------------------------------------------
 
 
 def test_clips_of_logs_show_points_alone(street, tmp_path):
@@ -268,12 +275,17 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     assert bool((given.depth == 0).any()) and not bool(given.warped.any())
     assert torch.allclose(given.color, wanted.color, atol=1 / 500)
     points = wanted.measured
-    assert torch.isin(filled, points.depth[points.valid].half().float()).all()  # depth that was measured, none mixed with gaps
+    # depth that was measured, none mixed with gaps
+    assert torch.isin(filled, points.depth[points.valid].half().float()).all()
     assert torch.equal(given.measured.valid, points.valid)
     assert torch.allclose(given.measured.depth[points.valid], points.depth[points.valid], rtol=1e-3)
     cut = crop.cropped(given, slice(3, 9), slice(1, 8)).measured
     assert torch.equal(cut.depth, given.measured.depth[..., 3:9, 1:8])
-    seen = next(v for n in range(20) if not torch.equal((v := clip_shards.vary(read, np.random.default_rng(n))).depth, read.depth))
+    seen = next(
+        v
+        for n in range(20)
+        if not torch.equal((v := clip_shards.vary(read, np.random.default_rng(n))).depth, read.depth)
+    )
     assert torch.equal(seen.condition.measured.depth, given.measured.depth.flip(-1))
     thinner = from_log.make_clip(log, window, 0)
     assert not torch.equal(thinner.condition.depth, clip.condition.depth)  # to train on: a share of the points

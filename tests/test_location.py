@@ -1,4 +1,5 @@
-"""Locations: the same calls on this machine and in an object store; nothing half there, nothing silently wrong, no secret shown."""
+"""Locations: the same calls on this machine and in an object store; nothing half there, nothing silently wrong, no
+secret shown."""
 
 from __future__ import annotations
 
@@ -82,18 +83,23 @@ def content(folder: Path) -> dict[str, bytes]:
     return {path.relative_to(folder).as_posix(): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-# ---- addresses -------------------------------------------------------------------------------------------------------
+# ---- addresses -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("given", "text"),
     [
-        ("s3://bucket/a//b/", "s3://bucket/a/b"), (Path("s3://bucket/a"), "s3://bucket/a"), ("S3://bucket", "s3://bucket"),
+        ("s3://bucket/a//b/", "s3://bucket/a/b"),
+        (Path("s3://bucket/a"), "s3://bucket/a"),
+        ("S3://bucket", "s3://bucket"),
         ("abfs://box@account.dfs.core.windows.net/x", "abfs://box@account.dfs.core.windows.net/x"),
-        ("file:///data/my%20runs", "/data/my runs"), (Path("file:///data"), "/data"), ("runs//a/", "runs/a"), ("C:/runs", "C:/runs"),
+        ("file:///data/my%20runs", "/data/my runs"),
+        (Path("file:///data"), "/data"),
+        ("runs//a/", "runs/a"),
+        ("C:/runs", "C:/runs"),
         ("gs://bucket/a:b", "gs://bucket/a:b"),
     ],
-)  # fmt: skip
+)
 def test_an_address_has_one_spelling(given: str | Path, text: str) -> None:
     assert str(Location.of(given)) == text
     assert Location.of(Location.of(given)) == Location.of(given)
@@ -102,10 +108,15 @@ def test_an_address_has_one_spelling(given: str | Path, text: str) -> None:
 @pytest.mark.parametrize(
     "given",
     [
-        "s3://key:hunter2@bucket/x", "s3://key:hun/hunter2@bucket/x", "s3://hunter2@bucket/x", "s3://bucket/x?X-Amz-Signature=hunter2",
-        "abfs://box:hunter2@account/x", "gs://:hunter2@bucket", Path("s3://key:hunter2@bucket/x"),
+        "s3://key:hunter2@bucket/x",
+        "s3://key:hun/hunter2@bucket/x",
+        "s3://hunter2@bucket/x",
+        "s3://bucket/x?X-Amz-Signature=hunter2",
+        "abfs://box:hunter2@account/x",
+        "gs://:hunter2@bucket",
+        Path("s3://key:hunter2@bucket/x"),
     ],
-)  # fmt: skip
+)
 def test_an_address_with_a_secret_is_refused_and_not_shown(given: str | Path) -> None:
     with pytest.raises(UsageError) as caught:
         Location.of(given)
@@ -140,7 +151,7 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
     location._file_system.cache_clear()
 
 
-# ---- single files ----------------------------------------------------------------------------------------------------
+# ---- single files --------------------------------------------------------------------------------
 
 
 def test_files_are_saved_read_listed_and_removed(root: Location) -> None:
@@ -191,7 +202,7 @@ def test_a_lost_answer_to_an_exclusive_write_is_no_defeat(before: Callable[..., 
     assert not Location.of("memory://bucket/claim").save(b"theirs", only_if_absent=True)
 
 
-# ---- failures --------------------------------------------------------------------------------------------------------
+# ---- failures ------------------------------------------------------------------------------------
 
 
 class Answer(OSError):
@@ -209,18 +220,30 @@ class NoCredentialsError(Exception):
 @pytest.mark.parametrize(
     ("error", "words"),
     [
-        (ConnectionRefusedError("no"), "cannot be reached"), (TimeoutError(), "cannot be reached"), (Answer(503), "does not answer"),
-        (Answer(429), "does not answer"), (Answer(403), "refused access"), (Answer(400), "cannot do"),
+        (ConnectionRefusedError("no"), "cannot be reached"),
+        (TimeoutError(), "cannot be reached"),
+        (Answer(503), "does not answer"),
+        (Answer(429), "does not answer"),
+        (Answer(403), "refused access"),
+        (Answer(400), "cannot do"),
         (NoCredentialsError("none"), "no credentials"),
     ],
-)  # fmt: skip
-def test_failures_are_told(error: Exception, words: str, before: Callable[..., None], monkeypatch: pytest.MonkeyPatch) -> None:
+)
+def test_failures_are_told(
+    error: Exception, words: str, before: Callable[..., None], monkeypatch: pytest.MonkeyPatch
+) -> None:
     def fail(name: str, args: tuple[Any, ...], options: dict[str, Any]) -> None:
         raise error
 
     before(fail)
     monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "wJalrXUtnFEMI")
-    for call in (lambda at: at.load(), lambda at: at.save(b"1"), lambda at: at.names(), lambda at: at.exists(), lambda at: at.tree()):
+    for call in (
+        lambda at: at.load(),
+        lambda at: at.save(b"1"),
+        lambda at: at.names(),
+        lambda at: at.exists(),
+        lambda at: at.tree(),
+    ):
         with pytest.raises(ResourceError, match=words) as caught:
             call(Location.of("memory://bucket/x"))
         assert caught.value.where == "memory://bucket/x" and caught.value.remedy
@@ -236,7 +259,7 @@ def test_a_mistake_of_the_program_is_not_hidden(before: Callable[..., None]) -> 
         Location.of("memory://bucket/x").load()
 
 
-# ---- folders ---------------------------------------------------------------------------------------------------------
+# ---- folders -------------------------------------------------------------------------------------
 
 
 def test_a_folder_goes_there_and_back(root: Location, tmp_path: Path) -> None:

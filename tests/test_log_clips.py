@@ -167,9 +167,18 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     for name, folder in (("scene", log[1].scene), ("fuse", log[1].fused)):
         (run / name).symlink_to(folder)
     config = tiny(
-        "", start=str(first), scenes=(str(run),), steps=2, score_every=1, log_every=1, stride=2, held_out_every=4, window=4,
-        width=64, height=32,
-    )  # fmt: skip
+        "",
+        start=str(first),
+        scenes=(str(run),),
+        steps=2,
+        score_every=1,
+        log_every=1,
+        stride=2,
+        held_out_every=4,
+        window=4,
+        width=64,
+        height=32,
+    )
     made = Learn(out=tmp_path / "tuned", settings=config).run()
     index = json.loads((tmp_path / "tuned" / "clips" / "log_clips.json").read_text())
     assert index["rules"]["width"] == 64 and index["rules"]["height"] == 32  # the camera's aspect of 2
@@ -188,8 +197,8 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
 
 @pytest.fixture(scope="module")
 def annotated(tmp_path_factory):
-    """A street whose frames have made labels: dense depth with a confidence that falls from left to right, twice as far as it is, so
-    that it cannot be mistaken for the sweep; the vehicle's bonnet below."""
+    """A street whose frames have made labels: dense depth with a confidence that falls from left to right, twice as far
+    as it is, so that it cannot be mistaken for the sweep; the vehicle's bonnet below."""
     root = tmp_path_factory.mktemp("annotated")
     street = ToyStreet(times=[0.1 * n for n in range(8)])
     bare = street.write(root / "bare", width=120, height=60, labels=False)
@@ -201,9 +210,13 @@ def annotated(tmp_path_factory):
             ego[-6:] = True
             sure = np.broadcast_to(np.linspace(1, 0, depth.shape[1]), depth.shape)
             labels = {
-                "semantics": ids, "semantics_confidence": np.where(sky, 0.2, 1.0), "depth": np.where(sky, 100.0, 2 * depth),
-                "depth_confidence": sure, "sky": sky, "ego": ego,
-            }  # fmt: skip
+                "semantics": ids,
+                "semantics_confidence": np.where(sky, 0.2, 1.0),
+                "depth": np.where(sky, 100.0, 2 * depth),
+                "depth_confidence": sure,
+                "sky": sky,
+                "ego": ego,
+            }
             writer.copy_frame(bare, frame, labels)
         writer.finish()
     Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig(min_object_points=1)).run()
@@ -224,7 +237,9 @@ def test_annotated_depth_is_learned_with_its_confidence(annotated, tmp_path, pub
     assert torch.allclose(clip.depth[measured], sweep.depth[measured], rtol=1e-3)
     assert bool((clip.depth_weight[measured] == 1).all())
     for number, view in enumerate(clip.condition.views):
-        _, _, exact = street.image(View(view.camera, view.world_from_cam, opened.frame(window.frames[number]).view.time_s))
+        _, _, exact = street.image(
+            View(view.camera, view.world_from_cam, opened.frame(window.frames[number]).view.time_s)
+        )
         guessed = torch.from_numpy(np.isfinite(exact)) & ~measured[number, 0]
         guessed[-6:], guessed[:, -1] = False, False  # where nothing is known
         assert torch.allclose(clip.depth[number, 0][guessed], 2 * torch.from_numpy(exact).float()[guessed], rtol=1e-3)
@@ -234,7 +249,11 @@ def test_annotated_depth_is_learned_with_its_confidence(annotated, tmp_path, pub
         assert bool(bonnet.any()) and not bool(clip.depth_weight[number, 0][bonnet].any())
         sky = torch.from_numpy(~np.isfinite(exact)) & ~measured[number, 0]
         assert bool((clip.depth[number, 0][sky & (column > 0.1)] == clip_shards.FAR_M).all())
-    turned = next(v for n in range(20) if not torch.equal((v := clip_shards.vary(clip, np.random.default_rng(n))).depth, clip.depth))
+    turned = next(
+        v
+        for n in range(20)
+        if not torch.equal((v := clip_shards.vary(clip, np.random.default_rng(n))).depth, clip.depth)
+    )
     assert torch.equal(turned.depth_weight, clip.depth_weight.flip(-1))
 
 
@@ -247,7 +266,9 @@ def test_the_weight_of_depth_scales_its_loss(annotated):
 
     def term(confidence):
         truth = model.pixel_truth([replace(clip, depth_confidence=torch.full_like(clip.depth, confidence))])
-        return float(losses.depth_code_error(torch.zeros_like(truth.depth_code), truth.depth_code, truth.depth_known, 1.0))
+        return float(
+            losses.depth_code_error(torch.zeros_like(truth.depth_code), truth.depth_code, truth.depth_known, 1.0)
+        )
 
     assert term(0.25) == pytest.approx(term(1.0) / 4, rel=1e-4) and term(1.0) > 0
     cells = model.encode_truth([replace(clip, depth_confidence=torch.full_like(clip.depth, 0.5))]).depth_known

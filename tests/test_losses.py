@@ -21,7 +21,9 @@ def image(seed: int, shape: tuple[int, ...] = (3, 14, 17), dtype: torch.dtype = 
 
 
 def check_gradient(function, *inputs: Tensor) -> None:
-    assert torch.autograd.gradcheck(function, [x.clone().requires_grad_() for x in inputs], eps=1e-6, atol=1e-6, rtol=1e-4)
+    assert torch.autograd.gradcheck(
+        function, [x.clone().requires_grad_() for x in inputs], eps=1e-6, atol=1e-6, rtol=1e-4
+    )
 
 
 def test_ssim_of_equal_images_is_one():
@@ -88,7 +90,9 @@ def test_trimmed_mean_leaves_the_largest_out():
 
 def test_sparse_depth_reads_the_right_pixels():
     depth = torch.arange(1.0, 13.0, dtype=torch.float64).view(1, 3, 4)
-    loss = losses.sparse_depth(depth, torch.tensor([1 * 4 + 2, 2 * 4 + 3]), torch.tensor([7.0, 10.0], dtype=torch.float64), keep=1.0)
+    loss = losses.sparse_depth(
+        depth, torch.tensor([1 * 4 + 2, 2 * 4 + 3]), torch.tensor([7.0, 10.0], dtype=torch.float64), keep=1.0
+    )
     assert float(loss) == pytest.approx((0 / 7 + 2 / 10) / 2)
 
 
@@ -155,7 +159,7 @@ def test_shapes_must_agree():
         losses.l1_map(torch.zeros(3, 2, 2), torch.zeros(1, 2, 2))
 
 
-# ---- the filter bank ------------------------------------------------------------------------------------------------
+# ---- the filter bank -----------------------------------------------------------------------------
 
 
 def distance(a: Tensor, b: Tensor) -> float:
@@ -172,13 +176,19 @@ def stripes(phase: float, width_px: float = 6.0) -> Tensor:
 def test_filter_bank_zero_for_equal_images_and_gradient():
     x = image(3, (3, 16, 20))
     assert distance(x, x) == 0.0
-    bank, weight = FilterBank(scales=2), torch.rand(1, 16, 20, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    bank, weight = (
+        FilterBank(scales=2),
+        torch.rand(1, 16, 20, generator=torch.Generator().manual_seed(1), dtype=torch.float64),
+    )
     target = bank(image(4, (3, 16, 20)))
     check_gradient(lambda p: losses.feature_distance(bank(p), target, weight), x)
 
 
 def test_slopes_are_those_of_a_convolution():
-    smooth, slope = torch.tensor([1.0, 2, 1], dtype=torch.float64) / 4, torch.tensor([-1.0, 0, 1], dtype=torch.float64) / 2
+    smooth, slope = (
+        torch.tensor([1.0, 2, 1], dtype=torch.float64) / 4,
+        torch.tensor([-1.0, 0, 1], dtype=torch.float64) / 2,
+    )
     kernels = torch.stack([torch.outer(smooth, slope), torch.outer(slope, smooth)])[:, None]
     plane, upstream = image(5, (1, 14, 19))[None].requires_grad_(), image(6, (2, 12, 17))[None]
     wanted, found = functional.conv2d(plane, kernels), featnets._Slope.apply(plane)
@@ -217,7 +227,7 @@ def test_filter_bank_weight_silences_pixels():
     assert distance(a, b) > 0.05
 
 
-# diffusion model ------------------------------------------------------------------------------------------------------
+# diffusion model ----------------------------------------------------------------------------------
 
 
 def test_pixel_terms_at_known_values():
@@ -240,7 +250,9 @@ def test_latent_terms_at_known_values():
     truth, weight = torch.zeros(2, 1, 4, 2, 2), torch.tensor([1.0, 5.0]).view(2, 1, 1, 1, 1)
     assert float(losses.latent_error(truth + 0.1, truth, weight)) == pytest.approx(0.03, rel=1e-5)
     half = torch.tensor([1.0, 0.0]).view(2, 1, 1, 1, 1)  # the second clip's depth is not known
-    assert float(losses.latent_depth_error(truth + 0.1, truth, weight, half)) == pytest.approx(0.5 * 5 * 0.005, rel=1e-5)
+    assert float(losses.latent_depth_error(truth + 0.1, truth, weight, half)) == pytest.approx(
+        0.5 * 5 * 0.005, rel=1e-5
+    )
     shares = torch.zeros(1, 1, 3, 1, 2)
     shares[:, :, 0, :, 0] = 1.0  # one cell of class 0, one without a class
     stated = torch.full_like(shares, math.log(1 / 3))

@@ -39,10 +39,13 @@ def scene(
     logits = torch.full((count,), math.log(opacity / (1 - opacity))) + 0.3 * torch.randn(count, generator=generator)
     logits[list(dead)] = NOWHERE
     columns = {
-        "means": 0.3 * torch.randn(count, 3, generator=generator), "quats": torch.randn(count, 4, generator=generator),
-        "log_scales": -2 + 0.3 * torch.randn(count, 3, generator=generator), "logits": logits,
-        "sh_dc": tag[:, None, None].repeat(1, 1, 3), "semantics": tag[:, None].repeat(1, 2),
-    }  # fmt: skip
+        "means": 0.3 * torch.randn(count, 3, generator=generator),
+        "quats": torch.randn(count, 4, generator=generator),
+        "log_scales": -2 + 0.3 * torch.randn(count, 3, generator=generator),
+        "logits": logits,
+        "sh_dc": tag[:, None, None].repeat(1, 1, 3),
+        "semantics": tag[:, None].repeat(1, 2),
+    }
     owner = torch.tensor([0] * static + [1] * moving, dtype=torch.int32)
     poses = [geometry.yaw_matrix(0.0), geometry.yaw_matrix(0.0, (1, 0, 0))]
     node = RigidNode("car", "car", (4.0, 2.0, 1.5), [0.0, 1.0], poses)
@@ -57,7 +60,7 @@ def tags(model: SceneModel) -> list[int]:
     return [int(value) for value in model.table["sh_dc"][:, 0, 0].tolist()]
 
 
-# ---- the stack ---------------------------------------------------------------------------------------------------------
+# ---- the stack -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("opacity", [0.01, 0.3, 0.9, 0.999])
@@ -88,10 +91,14 @@ def test_a_rendered_stack_keeps_alpha_and_colour(members: int) -> None:
     def drawn(count: int, alpha: float, scale_m: float) -> torch.Tensor:
         one = torch.ones(count, 1)
         gaussians = Gaussians(
-            means=one * torch.tensor([[0.0, 0.0, 4.0]]), quats=one * torch.tensor([[1.0, 0, 0, 0]]),
-            scales=torch.full((count, 3), scale_m), opacity=torch.full((count,), alpha), sh=one[:, None] * torch.tensor([0.3, -0.2, 1.0]),
-            extra=None, node=torch.zeros(count, dtype=torch.int32),
-        )  # fmt: skip
+            means=one * torch.tensor([[0.0, 0.0, 4.0]]),
+            quats=one * torch.tensor([[1.0, 0, 0, 0]]),
+            scales=torch.full((count, 3), scale_m),
+            opacity=torch.full((count,), alpha),
+            sh=one[:, None] * torch.tensor([0.3, -0.2, 1.0]),
+            extra=None,
+            node=torch.zeros(count, dtype=torch.int32),
+        )
         render = rasterize(gaussians, view, RasterConfig(backend="torch", blur_px2=0.0))
         return torch.cat([render.alpha, render.rgb])
 
@@ -103,7 +110,7 @@ def test_a_rendered_stack_keeps_alpha_and_colour(members: int) -> None:
     assert (wrong[0, 4].sum() - one[0, 4].sum()).abs() > 3 * (stack[0, 4].sum() - one[0, 4].sum()).abs()
 
 
-# ---- the draw ----------------------------------------------------------------------------------------------------------
+# ---- the draw ------------------------------------------------------------------------------------
 
 
 def test_systematic_draws_have_the_wanted_number_and_stay_within_one_of_their_expectation() -> None:
@@ -128,7 +135,7 @@ def test_the_order_of_place_is_that_of_the_places() -> None:
     assert order_of_place(means).tolist() == [3, 2, 1, 0]
 
 
-# ---- relocation --------------------------------------------------------------------------------------------------------
+# ---- relocation ----------------------------------------------------------------------------------
 
 
 def test_nothing_dead_and_no_growth_changes_nothing() -> None:
@@ -250,7 +257,7 @@ def test_what_left_its_box_or_grew_too_large_is_dead() -> None:
     assert not {3, 9} & set(tags(model))
 
 
-# ---- the random step ---------------------------------------------------------------------------------------------------
+# ---- the random step -----------------------------------------------------------------------------
 
 
 def test_the_random_step_has_the_shape_of_the_covariance_and_fades_with_opacity() -> None:

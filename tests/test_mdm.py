@@ -19,10 +19,19 @@ from mudg.networks import codec
 from mudg.networks.codec import CodecConfig
 
 TINY = MDMConfig(
-    widths=(16, 24), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), head_width=8,
-    embed_width=16, patch=1, codec=CodecConfig(decoder_width=8, decoder_blocks=1), refine_widths=(8, 16), refine_blocks=(1, 1),
-    window=8, area_px=24576,
-)  # fmt: skip
+    widths=(16, 24),
+    blocks=(1, 1),
+    spatial_attention=(False, True),
+    temporal_attention=(False, True),
+    head_width=8,
+    embed_width=16,
+    patch=1,
+    codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+    refine_widths=(8, 16),
+    refine_blocks=(1, 1),
+    window=8,
+    area_px=24576,
+)
 PLAIN = replace(TINY, refine_widths=(), refine_blocks=())
 
 
@@ -32,10 +41,16 @@ def some_condition(frames=3, height=16, width=24, seed=0):
     views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
     draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
     return Condition(
-        views, draw(frames, 3, height, width), 3 + 60 * draw(frames, 1, height, width), draw(frames, 1, height, width) > 0.5,
-        draw(3, height, width), draw(frames, 1, height, width) > 0.3, draw(frames, 3, height, width),
-        some_ids(generator, frames, height, width), some_ids(generator, frames, height, width),
-    )  # fmt: skip
+        views,
+        draw(frames, 3, height, width),
+        3 + 60 * draw(frames, 1, height, width),
+        draw(frames, 1, height, width) > 0.5,
+        draw(3, height, width),
+        draw(frames, 1, height, width) > 0.3,
+        draw(frames, 3, height, width),
+        some_ids(generator, frames, height, width),
+        some_ids(generator, frames, height, width),
+    )
 
 
 def some_ids(generator, frames, height, width):

@@ -1,4 +1,5 @@
-"""What reaches a terminal: names and values of foreign files cannot forge a line, say something to the terminal, or fill it."""
+"""What reaches a terminal: names and values of foreign files cannot forge a line, say something to the terminal, or
+fill it."""
 
 from __future__ import annotations
 
@@ -38,17 +39,23 @@ SOURCES = {
     "pickled": lambda text: pickle.loads(pickle.dumps(InputError("bad", got=text, remedy=text))),
     "a record": lambda text: _raised(lambda: parse_record(Named, {"name": text}, f"{text}: ")),
     "an unknown field": lambda text: _raised(lambda: parse_record(Named, {text: 1}, "file: ")),
-    "a key that is no text": lambda text: _raised(lambda: parse_record(Named, {1: text, None: text, (text,): 1}, f"{text}: ")),
-    "a missing field": lambda text: _raised(lambda: parse_record(Named, dict.fromkeys([f"{text}{n}" for n in range(9)]), "file: ")),
+    "a key that is no text": lambda text: _raised(
+        lambda: parse_record(Named, {1: text, None: text, (text,): 1}, f"{text}: ")
+    ),
+    "a missing field": lambda text: _raised(
+        lambda: parse_record(Named, dict.fromkeys([f"{text}{n}" for n in range(9)]), "file: ")
+    ),
     "an edit": lambda text: _raised(lambda: parse_edits(json.dumps([{text[:9999]: {}}]), "file")),
-    "a field of an edit": lambda text: _raised(lambda: parse_edits(json.dumps([{"move": {text[:9999]: 1, "id": text[:9999]}}]), "file")),
+    "a field of an edit": lambda text: _raised(
+        lambda: parse_edits(json.dumps([{"move": {text[:9999]: 1, "id": text[:9999]}}]), "file")
+    ),
     "JSON": lambda text: _raised(lambda: store.parse_json(f'{{"{text}": 1, "{text}": 1}}'.replace("\n", " "), text)),
 }
 
 
 def _raised(call: object) -> MudgError:
     with pytest.raises(MudgError) as refused:
-        call()  # type: ignore[operator]
+        call()
     return refused.value
 
 
@@ -63,16 +70,22 @@ def test_values_in_errors_are_short_and_plain(source: str) -> None:
 
 
 def test_lines_of_a_remedy_and_short_values_stay_as_they_are() -> None:
-    error = UsageError("a b", where="/x y/ü.json: a[0]", expected="one of a, b", got="'c'", remedy="rename:\n    a -> b\n    c -> d")
-    assert str(error) == (
-        "a b\n  where: /x y/ü.json: a[0]\n  expected: one of a, b\n  got: 'c'\n  what to do: rename:\n    a -> b\n    c -> d"
+    error = UsageError(
+        "a b", where="/x y/ü.json: a[0]", expected="one of a, b", got="'c'", remedy="rename:\n    a -> b\n    c -> d"
+    )
+    assert (
+        str(error) == "a b\n  where: /x y/ü.json: a[0]\n  expected: one of a, b\n  got: 'c'\n"
+        "  what to do: rename:\n    a -> b\n  "
+        "  c -> d"
     )
 
 
 @pytest.mark.parametrize("terminal", [False, True])
 def test_messages_and_progress_cannot_be_forged(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     written = io.StringIO()
-    plain_console = Console(file=written, force_terminal=terminal, width=200, color_system=None, highlight=False, soft_wrap=True)
+    plain_console = Console(
+        file=written, force_terminal=terminal, width=200, color_system=None, highlight=False, soft_wrap=True
+    )
     monkeypatch.setattr(log, "_console", lambda: plain_console)
     monkeypatch.setattr(log, "_quiet", False)
     log.info(f"a {FORGED}", "second line")
@@ -89,7 +102,9 @@ def test_messages_and_progress_cannot_be_forged(terminal: bool, monkeypatch: pyt
 
 def test_no_verb_prints_what_a_track_is_called_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Ids of tracks may hold anything; the same id twice is an error that names it."""
-    ToyStreet(car_start=(12.0, 0.0), times=[0.0, 0.1]).write(scene := tmp_path / "scene", width=24, height=16, labels=False)
+    ToyStreet(car_start=(12.0, 0.0), times=[0.0, 0.1]).write(
+        scene := tmp_path / "scene", width=24, height=16, labels=False
+    )
     tracks = store.read_json(scene / "tracks.json")
     for track in tracks["tracks"]:
         track["id"] += FORGED
@@ -104,10 +119,19 @@ def test_no_verb_prints_what_a_track_is_called_as_it_is(tmp_path: Path, capsys: 
         assert not OBEYED.search(said.out + said.err), ascii(said.out + said.err)
 
 
-@pytest.mark.parametrize("text", [
-    '{"a": "\\ud800"}', '{"a": "\\udc00\\ud800"}', '{"\\ud800": 1}', b'{"a": "\xed\xa0\x80"}', '{"a": 1e999}', '{"a": -1e400}',
-    f'{{"a": {"9" * 400}}}', f'{{"a": {"1" * 250}e100}}',
-])  # fmt: skip
+@pytest.mark.parametrize(
+    "text",
+    [
+        '{"a": "\\ud800"}',
+        '{"a": "\\udc00\\ud800"}',
+        '{"\\ud800": 1}',
+        b'{"a": "\xed\xa0\x80"}',
+        '{"a": 1e999}',
+        '{"a": -1e400}',
+        f'{{"a": {"9" * 400}}}',
+        f'{{"a": {"1" * 250}e100}}',
+    ],
+)
 def test_json_that_no_file_or_float_can_hold_is_refused(text: str | bytes) -> None:
     with pytest.raises(InputError, match="not valid JSON"):
         store.parse_json(text, "here")
@@ -115,6 +139,9 @@ def test_json_that_no_file_or_float_can_hold_is_refused(text: str | bytes) -> No
 
 def test_json_at_the_limits_is_read() -> None:
     assert store.parse_json('{"a": "\\ud83d\\ude00", "b": 1e308, "c": "1e999", "d": 123}', "here") == {
-        "a": "\U0001f600", "b": 1e308, "c": "1e999", "d": 123,
-    }  # fmt: skip
+        "a": "\U0001f600",
+        "b": 1e308,
+        "c": "1e999",
+        "d": 123,
+    }
     assert store.parse_json('"ü"'.encode("utf-16"), "here") == "ü"

@@ -16,7 +16,9 @@ from mudg.core.metrics import METRICS, Pair
 
 
 def pair(**given) -> Pair:
-    empty = dict.fromkeys(("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics"))
+    empty = dict.fromkeys(
+        ("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics")
+    )
     return Pair(**{**empty, **given})
 
 
@@ -81,15 +83,27 @@ def test_prediction_outside_the_classes_is_wrong_not_ignored():
 
 def test_miou_is_pooled_over_the_trajectory_not_averaged_over_views():
     metric = metrics.Segmentation("miou")
-    metric.add(metric.source(pair(semantics=torch.zeros(1, 9, dtype=torch.long), truth_semantics=torch.zeros(1, 9, dtype=torch.long))))
-    metric.add(metric.source(pair(semantics=torch.ones(1, 1, dtype=torch.long), truth_semantics=torch.zeros(1, 1, dtype=torch.long))))
+    metric.add(
+        metric.source(
+            pair(semantics=torch.zeros(1, 9, dtype=torch.long), truth_semantics=torch.zeros(1, 9, dtype=torch.long))
+        )
+    )
+    metric.add(
+        metric.source(
+            pair(semantics=torch.ones(1, 1, dtype=torch.long), truth_semantics=torch.zeros(1, 1, dtype=torch.long))
+        )
+    )
     assert metric.value() == pytest.approx(0.9)
 
 
 def test_rmse_is_pooled_over_pixels():
     metric = metrics.DepthError("rmse_m")
     valid = torch.ones(1, 1, 3, dtype=torch.bool)
-    metric.add(metric.source(pair(depth=torch.full((1, 1, 3), 12.0), truth_depth=torch.full((1, 1, 3), 10.0), truth_depth_valid=valid)))
+    metric.add(
+        metric.source(
+            pair(depth=torch.full((1, 1, 3), 12.0), truth_depth=torch.full((1, 1, 3), 10.0), truth_depth_valid=valid)
+        )
+    )
     metric.add(metric.source(pair(depth=torch.full((1, 1, 1), 10.0), truth_depth=torch.full((1, 1, 1), 10.0))))
     assert metric.value() == pytest.approx(math.sqrt(3 * 4 / 4))
 
@@ -98,7 +112,11 @@ def test_absent_modalities_are_said_in_words():
     accumulators = metrics.build_all()
     rgb = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0))
     for metric in accumulators.values():
-        metric.add(metric.source(pair(rgb=rgb, truth_rgb=rgb, truth_depth=torch.ones(1, 16, 16), truth_semantics=torch.zeros(16, 16))))
+        metric.add(
+            metric.source(
+                pair(rgb=rgb, truth_rgb=rgb, truth_depth=torch.ones(1, 16, 16), truth_semantics=torch.zeros(16, 16))
+            )
+        )
     table = metrics.results(accumulators)
     assert table["psnr"] == 100.0
     assert table["ssim"] == pytest.approx(1.0, abs=1e-6)
@@ -123,7 +141,9 @@ def test_a_full_mask_and_none_give_the_same_similarity():
     assert metrics.psnr(made, truth, full) == metrics.psnr(made, truth)
     half = full.clone()
     half[..., 20:] = False
-    assert metrics.ssim(made, truth, half) == pytest.approx(float(ssim_map(made, truth)[..., :20].double().mean()), abs=1e-6)
+    assert metrics.ssim(made, truth, half) == pytest.approx(
+        float(ssim_map(made, truth)[..., :20].double().mean()), abs=1e-6
+    )
 
 
 def test_metrics_of_one_source_share_one_measurement(monkeypatch):
@@ -156,9 +176,15 @@ def test_large_images_are_measured_in_pieces_with_the_same_result(monkeypatch):
     def numbers() -> list[float]:
         depths = metrics.depth_errors(depth, true_depth, mask)
         return [
-            metrics.psnr(made, true), metrics.psnr(made, true, mask), depths.abs_rel, depths.rmse_m, depths.delta1, depths.pixels,
-            flicker.change(made, true, moved), *metrics.confusion(ids, true_ids, mask).flatten().tolist(),
-        ]  # fmt: skip
+            metrics.psnr(made, true),
+            metrics.psnr(made, true, mask),
+            depths.abs_rel,
+            depths.rmse_m,
+            depths.delta1,
+            depths.pixels,
+            flicker.change(made, true, moved),
+            *metrics.confusion(ids, true_ids, mask).flatten().tolist(),
+        ]
 
     whole = numbers()
     monkeypatch.setattr(metrics, "PIECE_VALUES", 100)

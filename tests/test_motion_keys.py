@@ -48,7 +48,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
     return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
 
 
-# --- gaps -------------------------------------------------------------------------------------------------------------
+# --- gaps -----------------------------------------------------------------------------------------
 
 
 def curve_log(truth: Scene, root: Path, path: EgoPath) -> Path:
@@ -76,9 +76,12 @@ def test_frames_in_a_gap_of_a_curve_are_refused_left_out_or_bridged(truth: Scene
     assert any("vehicle poses have a gap" in f.message for f in custom.check_log(log))
 
     left = IMPORTERS["custom"](log, tmp_path / "left", ImportOptions(skip_missing=True))
-    whole = IMPORTERS["custom"](curve_log(truth, tmp_path / "all", arc(-0.5, 2.5, 0.05)), tmp_path / "whole", ImportOptions())
+    whole = IMPORTERS["custom"](
+        curve_log(truth, tmp_path / "all", arc(-0.5, 2.5, 0.05)), tmp_path / "whole", ImportOptions()
+    )
     times = {round(f.view.time_s, 6) for f in whole.frames}
-    inside = {t for t in times if LOST_S[0] + 0.3 < t - 0.5 < LOST_S[1] - 0.3}  # seconds count from the first pose, 0.5 s before
+    # seconds count from the first pose, 0.5 s before
+    inside = {t for t in times if LOST_S[0] + 0.3 < t - 0.5 < LOST_S[1] - 0.3}
     assert inside and {round(f.view.time_s, 6) for f in left.frames} == times - inside
     assert "no pose for 1.30 s" in warnings(left, "ego path")
 
@@ -131,9 +134,12 @@ def test_lost_rows_of_argoverse2_and_nuplan(truth: Scene, tmp_path: Path) -> Non
         return on_arc(5 * time_s) @ invert(truth.ego.pose_at(time_s))
 
     frames = tuple(
-        replace(f, view=replace(f.view, world_from_cam=moved(f.view.time_s) @ f.view.world_from_cam, time_s=5 * f.view.time_s))
+        replace(
+            f,
+            view=replace(f.view, world_from_cam=moved(f.view.time_s) @ f.view.world_from_cam, time_s=5 * f.view.time_s),
+        )
         for f in truth.frames
-    )  # fmt: skip
+    )
     sweeps = tuple(
         replace(s, time_s=5 * s.time_s, world_from_lidar=moved(s.time_s) @ s.world_from_lidar) for s in truth.sweeps
     )
@@ -163,7 +169,7 @@ def test_lost_rows_of_argoverse2_and_nuplan(truth: Scene, tmp_path: Path) -> Non
         assert 0 < len(left.frames) < len(truth.frames)
 
 
-# --- flips ------------------------------------------------------------------------------------------------------------
+# --- flips ----------------------------------------------------------------------------------------
 
 
 def poses_of(headings: list[float], step_m: float) -> np.ndarray:
@@ -224,17 +230,20 @@ def test_flips_of_boxes_in_another_format(truth: Scene, tmp_path: Path) -> None:
     database = write_nuplan.write_nuplan(truth, tmp_path / "log")
     with sqlite3.connect(database) as connection:
         connection.execute(
-            "UPDATE lidar_box SET yaw = yaw + 3.14159265358979 WHERE rowid IN (SELECT max(rowid) FROM lidar_box GROUP BY track_token)"
+            "UPDATE lidar_box SET yaw = yaw + 3.14159265358979 WHERE rowid IN (SELECT max(rowid) FROM lidar_box GROUP"
+            " BY track_token)"
         )
     connection.close()
     scene = IMPORTERS["nuplan"](database, tmp_path / "scene", ImportOptions())
-    plain = IMPORTERS["nuplan"](write_nuplan.write_nuplan(truth, tmp_path / "plain"), tmp_path / "other", ImportOptions())
+    plain = IMPORTERS["nuplan"](
+        write_nuplan.write_nuplan(truth, tmp_path / "plain"), tmp_path / "other", ImportOptions()
+    )
     assert len(scene.tracks) == len(plain.tracks) > 3
     for one, other in zip(scene.tracks, plain.tracks, strict=True):
         assert np.allclose(one.world_from_object, other.world_from_object, atol=1e-8)
 
 
-# --- jumps ------------------------------------------------------------------------------------------------------------
+# --- jumps ----------------------------------------------------------------------------------------
 
 
 def test_doctor_names_what_no_vehicle_does(tmp_path: Path) -> None:
@@ -251,8 +260,12 @@ def test_doctor_names_what_no_vehicle_does(tmp_path: Path) -> None:
 
     assert "it jumps by 1.5 m after 0.900 s (key 9" in changed(lambda p: p[10:, :3, 3].__iadd__([0, 0, 1.5]))
     turn = yaw_matrix(np.pi / 2 - SPEED_M_S * 0.1 / RADIUS_M)[:3, :3]  # with what the curve has anyway
-    assert "it turns by 90 degrees within 0.10 s after 0.900 s (key 9" in changed(lambda p: p[10:, :3, :3].__imatmul__(turn))
-    assert "heading flips by 180 degrees 2 times, first after 0.900 s (key 9)" in changed(lambda p: p[10, :3, :2].__imul__(-1))
+    assert "it turns by 90 degrees within 0.10 s after 0.900 s (key 9" in changed(
+        lambda p: p[10:, :3, :3].__imatmul__(turn)
+    )
+    assert "heading flips by 180 degrees 2 times, first after 0.900 s (key 9)" in changed(
+        lambda p: p[10, :3, :2].__imul__(-1)
+    )
     times = plain.times_s
     faster = np.stack([yaw_matrix(0.0, (8 * t + 15 * max(0.0, t - 1.0) ** 2, 0, 0)) for t in times])
     words = warnings(replace(scene, ego=EgoPath(times, faster)), "ego path")
@@ -262,7 +275,7 @@ def test_doctor_names_what_no_vehicle_does(tmp_path: Path) -> None:
     assert "it jumps by 6.0 m after 0.900 s (key 9" in warnings(replace(scene, tracks=(track,)), "track swapped")
 
 
-# --- float32 ----------------------------------------------------------------------------------------------------------
+# --- float32 --------------------------------------------------------------------------------------
 
 
 @roundtrip.needs_native
@@ -271,7 +284,10 @@ def test_earth_centred_coordinates_keep_their_digits(truth: Scene, tmp_path: Pat
     far = np.array([6_378_137.25, -4_200_000.5, 310.0])
 
     def move(log: dict[str, Any]) -> None:
-        for record in (*(e["world_from_ego"] for e in log["ego"]), *(b["world_from_object"] for t in log["tracks"] for b in t["boxes"])):
+        for record in (
+            *(e["world_from_ego"] for e in log["ego"]),
+            *(b["world_from_object"] for t in log["tracks"] for b in t["boxes"]),
+        ):
             for row, value in zip(record, far, strict=False):
                 row[3] += value
 
@@ -281,5 +297,7 @@ def test_earth_centred_coordinates_keep_their_digits(truth: Scene, tmp_path: Pat
     first = json.loads((log / "log.json").read_text())["ego"][0]["world_from_ego"]
     assert f"({first[0][3]:.3f}, {first[1][3]:.3f}, {first[2][3]:.3f})" in "\n".join(scene.source.notes)
     assert not warnings(scene, "world")
-    away = replace(scene, ego=EgoPath(scene.ego.times_s, np.stack([write_custom.far(p) for p in scene.ego.world_from_ego])))
+    away = replace(
+        scene, ego=EgoPath(scene.ego.times_s, np.stack([write_custom.far(p) for p in scene.ego.world_from_ego]))
+    )
     assert "float32 rounds points there to 500 mm" in warnings(away, "world")

@@ -43,7 +43,7 @@ def isa(request: pytest.FixtureRequest) -> Any:
     native.set_isa("")
 
 
-# ---- loading -------------------------------------------------------------------------------------------------------
+# ---- loading -------------------------------------------------------------------------------------
 
 
 @needs_native
@@ -118,7 +118,7 @@ def test_unknown_instruction_sets_and_no_threads_are_refused() -> None:
         native.set_threads(0)
 
 
-# ---- the pool ------------------------------------------------------------------------------------------------------
+# ---- the pool ------------------------------------------------------------------------------------
 
 
 @needs_native
@@ -172,7 +172,7 @@ assert library.mudg_parallel_sum(100000, 100) == expected
     assert done.returncode == 0, done.stderr
 
 
-# ---- photometric loss ----------------------------------------------------------------------------------------------
+# ---- photometric loss ----------------------------------------------------------------------------
 
 
 def _images(shape: tuple[int, int, int], seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -248,7 +248,7 @@ def test_photometric_refuses_what_does_not_fit() -> None:
         native_ops.photometric(torch.zeros(3, 4, 4), torch.zeros(3, 4, 4), 1.5)
 
 
-# ---- means over boxes ----------------------------------------------------------------------------------------------
+# ---- means over boxes ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (3, 2, 9), (1, 4, 40, 33), (2, 5, 129)])
@@ -274,15 +274,27 @@ def test_box_mean_keeps_constants_and_wants_odd_sizes() -> None:
 
 
 def adam(
-    parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int, chosen: Tensor | None = None
-) -> None:  # fmt: skip
+    parameter: Tensor,
+    gradient: Tensor,
+    moment1: Tensor,
+    moment2: Tensor,
+    rate: float,
+    step: int,
+    chosen: Tensor | None = None,
+) -> None:
     """A step on one column."""
     native_ops.adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step, chosen)
 
 
 def twin(
-    parameter: Tensor, gradient: Tensor, moment1: Tensor, moment2: Tensor, rate: float, step: int, chosen: Tensor | None = None
-) -> None:  # fmt: skip
+    parameter: Tensor,
+    gradient: Tensor,
+    moment1: Tensor,
+    moment2: Tensor,
+    rate: float,
+    step: int,
+    chosen: Tensor | None = None,
+) -> None:
     """The same in plain torch."""
     torch_adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step, chosen)
 
@@ -298,17 +310,19 @@ def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.Mon
     torch.testing.assert_close(parameter, torch.full((4, 3), 0.9))
     torch.testing.assert_close(native_ops.box_mean(prediction, 3), native_ops.torch_box_mean(prediction, 3))
     cover, labels = torch.rand(1, 20, 20), torch.ones(20, 20, dtype=torch.int64)
-    torch.testing.assert_close(native_ops.over(prediction, cover, target), native_ops.torch_over(prediction, cover, target))
+    torch.testing.assert_close(
+        native_ops.over(prediction, cover, target), native_ops.torch_over(prediction, cover, target)
+    )
     got = native_ops.class_loss(prediction, labels, cover[0], 2.0)
     torch.testing.assert_close(got, losses.class_loss(prediction, labels, cover[0], 2.0))
 
 
-# ---- cross entropy of classes, pictures over the sky -----------------------------------------------------------------
+# ---- cross entropy of classes, pictures over the sky ---------------------------------------------
 
 
 def _gradients(value: Tensor, *inputs: Tensor) -> list[Tensor]:
     value.backward()
-    return [t.grad.double() for t in inputs]  # type: ignore[union-attr]
+    return [t.grad.double() for t in inputs]
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1), (2, 3, 5), (5, 16, 16), (17, 33, 41), (19, 70, 61)])
@@ -334,22 +348,38 @@ def test_class_loss_equals_its_float64_twin(isa: str, shape: tuple[int, int, int
 def test_class_loss_shows_a_logit_that_is_not_finite(isa: str, bad: float) -> None:
     logits = torch.zeros(6, 20, 20)
     logits[4, 7, 3] = bad
-    assert not math.isfinite(native_ops.class_loss(logits, torch.zeros(20, 20, dtype=torch.int64), torch.ones(20, 20), 400.0).item())
+    assert not math.isfinite(
+        native_ops.class_loss(logits, torch.zeros(20, 20, dtype=torch.int64), torch.ones(20, 20), 400.0).item()
+    )
 
 
 @pytest.mark.parametrize(
     "sizes",
-    [((3, 1, 1), (1, 1)), ((3, 7, 9), (3, 2)), ((1, 32, 64), (8, 16)), ((3, 33, 50), (5, 13)), ((2, 9, 12), (9, 12)), ((3, 6, 5), (9, 11))],
+    [
+        ((3, 1, 1), (1, 1)),
+        ((3, 7, 9), (3, 2)),
+        ((1, 32, 64), (8, 16)),
+        ((3, 33, 50), (5, 13)),
+        ((2, 9, 12), (9, 12)),
+        ((3, 6, 5), (9, 11)),
+    ],
 )
-def test_picture_over_the_sky_equals_its_float64_twin(isa: str, sizes: tuple[tuple[int, int, int], tuple[int, int]]) -> None:
+def test_picture_over_the_sky_equals_its_float64_twin(
+    isa: str, sizes: tuple[tuple[int, int, int], tuple[int, int]]
+) -> None:
     generator = torch.Generator().manual_seed(2)
     (channels, height, width), small = sizes
-    inputs = [torch.rand(shape, generator=generator) for shape in ((channels, height, width), (1, height, width), (channels, *small))]
+    inputs = [
+        torch.rand(shape, generator=generator)
+        for shape in ((channels, height, width), (1, height, width), (channels, *small))
+    ]
     upstream = torch.randn(channels, height, width, generator=generator)
     mine, exact = [t.clone().requires_grad_() for t in inputs], [t.double().requires_grad_() for t in inputs]
     got, want = native_ops.over(*mine), native_ops.torch_over(*exact)
     torch.testing.assert_close(got.double(), want, rtol=1e-6, atol=2e-6)
-    for found, true in zip(_gradients((got * upstream).sum(), *mine), _gradients((want * upstream).sum(), *exact), strict=True):
+    for found, true in zip(
+        _gradients((got * upstream).sum(), *mine), _gradients((want * upstream).sum(), *exact), strict=True
+    ):
         torch.testing.assert_close(found, true, rtol=2e-5, atol=2e-5)
 
 
@@ -379,7 +409,7 @@ def test_class_loss_and_sky_refuse_what_does_not_fit() -> None:
         native_ops.over(logits, torch.zeros(1, 4, 5), torch.zeros(3, 2, 2))
 
 
-# ---- Adam ----------------------------------------------------------------------------------------------------------
+# ---- Adam ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("shape", [(1,), (1000,), (257, 3), (40, 16, 3), (0, 4)])

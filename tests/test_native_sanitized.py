@@ -23,7 +23,9 @@ sys.exit(pytest.main(["-q", "-x", "-s", "-p", "no:cacheprovider", "-m", "not slo
 
 
 def _runtime(command: tuple[str, ...], name: str) -> str:
-    found = subprocess.run([*command, f"-print-file-name={name}"], capture_output=True, text=True, check=False).stdout.strip()
+    found = subprocess.run(
+        [*command, f"-print-file-name={name}"], capture_output=True, text=True, check=False
+    ).stdout.strip()
     return found if os.path.isabs(found) and Path(found).exists() else ""
 
 
@@ -48,12 +50,24 @@ def test_kernels_are_clean_under_the_sanitizers(tmp_path: Path, monkeypatch: pyt
     library = tmp_path / mudg_compile.LIBRARY_NAME
     mudg_compile.compile_library(compiler, library, tmp_path / "objects")
     environment = {
-        **os.environ, "LD_PRELOAD": " ".join(runtime), "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0", "OMP_NUM_THREADS": "1",
-        "UBSAN_OPTIONS": "print_stacktrace=1", "MUDG_THREADS": "2",
-    }  # fmt: skip
+        **os.environ,
+        "LD_PRELOAD": " ".join(runtime),
+        "ASAN_OPTIONS": "detect_leaks=0:abort_on_error=0",
+        "OMP_NUM_THREADS": "1",
+        "UBSAN_OPTIONS": "print_stacktrace=1",
+        "MUDG_THREADS": "2",
+    }
     tests = [str(ROOT / "tests" / name) for name in ("test_raster.py", "test_raster_proofs.py", "test_native.py")]
-    # Loading other libraries on purpose, and forking, is what these tests do; the sanitizers have nothing to say to that.
+    # Loading other libraries on purpose, and forking, is what these tests do; the sanitizers have nothing to say to
+    # that.
     skipped = "not library and not five_million and not forked and not environment and not version"
-    done = subprocess.run([sys.executable, "-c", RUN, str(library), *tests, "-k", skipped], cwd=ROOT, env=environment,
-                          capture_output=True, text=True, timeout=1800, check=False)  # fmt: skip
+    done = subprocess.run(
+        [sys.executable, "-c", RUN, str(library), *tests, "-k", skipped],
+        cwd=ROOT,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=1800,
+        check=False,
+    )
     assert done.returncode == 0, (done.stdout + done.stderr)[-20000:]

@@ -1,4 +1,5 @@
-"""NCore recordings both ways: what is written means the same to NVIDIA's own functions, comes back as it was, and damage is told."""
+"""NCore recordings both ways: what is written means the same to NVIDIA's own functions, comes back as it was, and
+damage is told."""
 
 from __future__ import annotations
 
@@ -74,7 +75,7 @@ def loaded(recording: Path) -> Any:
     return v4.SequenceLoaderV4(v4.SequenceComponentGroupsReader(sorted(recording.glob("*.json"))))
 
 
-# --- what it means to the package -----------------------------------------------------------------------------------
+# --- what it means to the package -----------------------------------------------------------------
 
 
 @needs_package
@@ -149,7 +150,7 @@ def _about(axis: int, angle: float) -> np.ndarray:
     return turn
 
 
-# --- both ways --------------------------------------------------------------------------------------------------------
+# --- both ways ------------------------------------------------------------------------------------
 
 
 @needs_package
@@ -173,7 +174,8 @@ def test_the_same_log_gives_the_same_bytes(truth: Scene, recording: Path, tmp_pa
 
 @needs_package
 def test_shutters_masks_classes_and_sensors_that_move(truth: Scene, tmp_path: Path) -> None:
-    """What the city does not have: a rolling shutter, a camera that shakes on the vehicle, the own bonnet, classes of points."""
+    """What the city does not have: a rolling shutter, a camera that shakes on the vehicle, the own bonnet, classes of
+    points."""
     rng = np.random.default_rng(2)
     cameras = {**truth.cameras, "front": replace(truth.cameras["front"], readout_s=0.03)}
     bonnet = np.zeros((64, 96), bool)
@@ -212,7 +214,8 @@ def test_shutters_masks_classes_and_sensors_that_move(truth: Scene, tmp_path: Pa
 
 @needs_package
 def test_other_peoples_recordings(truth: Scene, tmp_path: Path) -> None:
-    """Stores per sensor, single-precision poses, boxes told in a sensor's frame, a lens, two returns: as NVIDIA's converters write."""
+    """Stores per sensor, single-precision poses, boxes told in a sensor's frame, a lens, two returns: as NVIDIA's
+    converters write."""
     v4, data = package().v4, package().data
     interval = package().transformations.HalfClosedInterval(1_000_000, 1_400_001)
     writer = v4.SequenceComponentGroupsWriter(tmp_path, "clip", "clip-7", interval, {}, store_type="directory")
@@ -224,11 +227,19 @@ def test_other_peoples_recordings(truth: Scene, tmp_path: Path) -> None:
     poses.store_static_pose("camera:front wide", "rig", mount)
     poses.store_static_pose("top", "rig", geometry.from_rotation_translation(np.eye(3), (0, 0, 2.0)).astype(np.float32))
     intrinsics = writer.register_component_writer(v4.IntrinsicsComponent.Writer, "mine")
-    intrinsics.store_camera_intrinsics("camera:front wide", data.OpenCVPinholeCameraModelParameters(
-        resolution=np.array([96, 64], np.uint64), shutter_type=data.ShutterType.ROLLING_LEFT_TO_RIGHT, external_distortion_parameters=None,
-        principal_point=np.array([48, 32], np.float32), focal_length=np.array([80, 80], np.float32),
-        radial_coeffs=np.array([-0.2, 0.02, 0, 0, 0, 0], np.float32), tangential_coeffs=np.zeros(2, np.float32),
-        thin_prism_coeffs=np.zeros(4, np.float32)))  # fmt: skip
+    intrinsics.store_camera_intrinsics(
+        "camera:front wide",
+        data.OpenCVPinholeCameraModelParameters(
+            resolution=np.array([96, 64], np.uint64),
+            shutter_type=data.ShutterType.ROLLING_LEFT_TO_RIGHT,
+            external_distortion_parameters=None,
+            principal_point=np.array([48, 32], np.float32),
+            focal_length=np.array([80, 80], np.float32),
+            radial_coeffs=np.array([-0.2, 0.02, 0, 0, 0, 0], np.float32),
+            tangential_coeffs=np.zeros(2, np.float32),
+            thin_prism_coeffs=np.zeros(4, np.float32),
+        ),
+    )
     camera = writer.register_component_writer(v4.CameraSensorComponent.Writer, "camera:front wide", "front")
     image = open_files(truth.root).read(truth.frames[0].image.path)
     for end in (1_100_000, 1_300_000):
@@ -291,8 +302,13 @@ def test_lenses_are_the_packages_own_and_fit_a_pinhole_camera(kind: str) -> None
     }
     if kind == "opencv-pinhole":
         radial, tangential = np.array([-0.1, 0.01, 0, 0, 0, 0], np.float32), np.array([1e-3, -2e-3], np.float32)
-        model = data.OpenCVPinholeCameraModelParameters(**common, focal_length=focal, radial_coeffs=radial, tangential_coeffs=tangential,
-                                                        thin_prism_coeffs=np.zeros(4, np.float32))  # fmt: skip
+        model = data.OpenCVPinholeCameraModelParameters(
+            **common,
+            focal_length=focal,
+            radial_coeffs=radial,
+            tangential_coeffs=tangential,
+            thin_prism_coeffs=np.zeros(4, np.float32),
+        )
         wanted = brown_conrady(*map(float, radial[:2]), *map(float, tangential))
     elif kind == "opencv-fisheye":
         bend = np.array([0.02, -0.003, 0, 0], np.float32)
@@ -300,10 +316,12 @@ def test_lenses_are_the_packages_own_and_fit_a_pinhole_camera(kind: str) -> None
         wanted = equidistant(*map(float, bend))
     else:
         model = data.FThetaCameraModelParameters(
-            **common, reference_poly=data.FThetaCameraModelParameters.PolynomialType.ANGLE_TO_PIXELDIST, max_angle=1.2,
+            **common,
+            reference_poly=data.FThetaCameraModelParameters.PolynomialType.ANGLE_TO_PIXELDIST,
+            max_angle=1.2,
             pixeldist_to_angle_poly=np.array([0, 1 / 442, 0, 0, 0, 0], np.float32),
             angle_to_pixeldist_poly=np.array([0, 442, 0, 0, 0, 0], np.float32),
-        )  # fmt: skip
+        )
         wanted = equidistant()
     like = model.paraxial_pinhole_geometry()
     (fx, fy), (cx, cy) = like.focal_length.tolist(), like.principal_point.tolist()
@@ -326,8 +344,12 @@ def _origin(scene: Scene, path: np.ndarray, keys: np.ndarray) -> np.ndarray:
 
 def test_names_of_sensors_are_apart() -> None:
     assert sensor_ids(["front", "rig"], ["front", "world", "top"]) == {
-        "camera/front": "front", "camera/rig": "camera_rig", "lidar/front": "lidar_front", "lidar/world": "lidar_world", "lidar/top": "top",
-    }  # fmt: skip
+        "camera/front": "front",
+        "camera/rig": "camera_rig",
+        "lidar/front": "lidar_front",
+        "lidar/world": "lidar_world",
+        "lidar/top": "top",
+    }
 
 
 def test_a_path_that_is_too_short_goes_on_and_then_stands() -> None:
@@ -340,7 +362,7 @@ def test_a_path_that_is_too_short_goes_on_and_then_stands() -> None:
     assert np.allclose(longer.at(np.array([100, 200])), keys.poses)
 
 
-# --- choices and refusals -----------------------------------------------------------------------------------------------
+# --- choices and refusals -------------------------------------------------------------------------
 
 
 def test_the_package_is_asked_for_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -405,12 +427,12 @@ def test_the_commands(truth: Scene, tmp_path: Path, capsys: pytest.CaptureFixtur
     assert app.main(["ingest", str(tmp_path / "out"), str(tmp_path / "back"), "--no-contact-sheet"]) == 0
 
 
-# --- damage -----------------------------------------------------------------------------------------------------------
+# --- damage ---------------------------------------------------------------------------------------
 
 
 def _itar(members: dict[str, bytes], metadata: dict[str, Any], index: dict[str, Any] | None = None) -> bytes:
     """A store made by hand."""
-    import cbor2  # type: ignore[import-not-found]
+    import cbor2
 
     members = {
         **members,
@@ -432,9 +454,14 @@ def _itar(members: dict[str, bytes], metadata: dict[str, Any], index: dict[str, 
 
 ROOT = {
     ".zgroup": {"zarr_format": 2},
-    ".zattrs": {"version": "v4", "sequence_id": "a", "sequence_timestamp_interval_us": {"start": 0, "stop": 9}, "generic_meta_data": {},
-                "component_group_name": ""},
-}  # fmt: skip
+    ".zattrs": {
+        "version": "v4",
+        "sequence_id": "a",
+        "sequence_timestamp_interval_us": {"start": 0, "stop": 9},
+        "generic_meta_data": {},
+        "component_group_name": "",
+    },
+}
 ARRAY = {
     "zarr_format": 2,
     "shape": [4],
@@ -448,7 +475,7 @@ ARRAY = {
 
 
 def _hostile(kind: str) -> bytes:
-    import cbor2  # type: ignore[import-not-found]
+    import cbor2
 
     metadata, members = {**ROOT, "x/.zarray": dict(ARRAY)}, {"x/0": bytes(16)}
     if kind == "index bomb":
@@ -488,12 +515,19 @@ def _hostile(kind: str) -> bytes:
 
 
 SAID = {
-    "index bomb": "unpack to more", "metadata bomb": "unpack to more", "huge array": "larger than its file",
-    "array without chunks": "chunk of an array is missing", "pickled array": "packed in a way", "another codec": "packed in a way",
-    "chunk that says it is larger": "larger than its file|another size|damaged", "member outside": "outside of the file",
-    "index of another kind": "index", "deep metadata": "are damaged", "nothing in it": "cannot be read|no poses",
+    "index bomb": "unpack to more",
+    "metadata bomb": "unpack to more",
+    "huge array": "larger than its file",
+    "array without chunks": "chunk of an array is missing",
+    "pickled array": "packed in a way",
+    "another codec": "packed in a way",
+    "chunk that says it is larger": "larger than its file|another size|damaged",
+    "member outside": "outside of the file",
+    "index of another kind": "index",
+    "deep metadata": "are damaged",
+    "nothing in it": "cannot be read|no poses",
     "a million lists": "cannot be read|no poses",
-}  # fmt: skip
+}
 
 
 @needs_package
@@ -560,7 +594,7 @@ def test_every_chunk_of_the_grid_must_be_there(
 
 def altered(recording: Path, folder: Path, change: Callable[[dict[str, Any]], object]) -> Path:
     """A recording whose metadata say something else."""
-    import cbor2  # type: ignore[import-not-found]
+    import cbor2
 
     (path,) = recording.glob("*.itar")
     found = container._members_of_tar(path)
@@ -579,7 +613,9 @@ def test_components_and_entries_of_others_are_named_once(
     assert "passed over" not in capsys.readouterr().err
     folder = tmp_path / "log"
     folder.mkdir()
-    altered(recording, folder, lambda metadata: metadata.update({f"thermal/{n}/.zgroup": {"zarr_format": 2} for n in "ab"}))
+    altered(
+        recording, folder, lambda metadata: metadata.update({f"thermal/{n}/.zgroup": {"zarr_format": 2} for n in "ab"})
+    )
     listed = json.loads(next(recording.glob("*.json")).read_text())
     listed["component_stores"][0]["sha256"] = ""
     (folder / "a.json").write_text(json.dumps(listed))
@@ -625,7 +661,7 @@ BAD = {
     "no intrinsics": (lambda metadata: metadata.pop(FRONT), "cannot be read"),
     "a lens of another kind": (lambda m: m[FRONT].update(camera_model_type="x"), "Unknown camera model"),
     "no camera": (lambda m: [m.pop(name) for name in list(m) if name.startswith("cameras/")], "no camera"),
-}  # fmt: skip
+}
 
 
 @needs_package
@@ -638,7 +674,8 @@ def test_recordings_that_contradict_themselves_are_refused(case: str, recording:
 
 @needs_package
 def test_frames_in_a_gap_of_a_curve_are_refused_or_left_out(recording: Path, tmp_path: Path) -> None:
-    """12 m/s on a circle of 3 m, without the keys from 1.15 to 1.45 s: a straight line is half a metre off in the middle."""
+    """12 m/s on a circle of 3 m, without the keys from 1.15 to 1.45 s: a straight line is half a metre off in the
+    middle."""
     keys = [at for at in range(1_000_000, 1_500_001, 25_000) if not 1_150_000 < at < 1_450_000]
 
     def on_circle(metadata: dict[str, Any]) -> None:
@@ -659,7 +696,7 @@ def test_frames_in_a_gap_of_a_curve_are_refused_or_left_out(recording: Path, tmp
 
 @needs_package
 def test_rays_of_distance_0_are_no_points_and_are_counted(recording: Path, tmp_path: Path) -> None:
-    import zarr  # type: ignore[import-not-found]
+    import zarr
 
     whole = ingest(recording, tmp_path / "whole")
     store = as_folder(recording, tmp_path)
@@ -669,15 +706,17 @@ def test_rays_of_distance_0_are_no_points_and_are_counted(recording: Path, tmp_p
     values[:, :100] = 0.0
     distance[:] = values
     scene = ingest(tmp_path, tmp_path / "out")
-    assert sum(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps) == sum(
-        len(read_points(whole, sweep).xyz) for sweep in whole.sweeps
-    ) - 100
+    assert (
+        sum(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps)
+        == sum(len(read_points(whole, sweep).xyz) for sweep in whole.sweeps) - 100
+    )
     assert any("100 " in note and "return" in note for note in scene.source.notes), scene.source.notes
 
 
 @needs_package
 def test_every_cut_and_flipped_bytes_end_in_words(recording: Path, tmp_path: Path) -> None:
-    """Cut at some lengths and flipped in metadata and data: an error in words, or (pixels and points have no checksum) a scene."""
+    """Cut at some lengths and flipped in metadata and data: an error in words, or (pixels and points have no checksum)
+    a scene."""
     (store,) = recording.glob("*.itar")
     content, rng = store.read_bytes(), np.random.default_rng(3)
     target = tmp_path / "log" / store.name

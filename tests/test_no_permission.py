@@ -1,4 +1,5 @@
-"""A user who is not root, before files and folders that others have closed: errors in words, and what can go on goes on."""
+"""A user who is not root, before files and folders that others have closed: errors in words, and what can go on goes
+on."""
 
 from __future__ import annotations
 
@@ -37,7 +38,8 @@ def open_folder() -> Iterator[Path]:
 
 
 def as_nobody(work: Callable[[], object], said: Path) -> int:
-    """Do the work in a copy of this process that is not root's; returns its exit code. What it says on stderr goes to a file."""
+    """Do the work in a copy of this process that is not root's; returns its exit code. What it says on stderr goes to a
+    file."""
     child = os.fork()
     if child == 0:
         code = 99
@@ -93,7 +95,9 @@ def closed_settings(root: Path) -> list[str]:
         (closed_settings, 3, "file cannot be read"),
     ],
 )
-def test_what_is_closed_is_said(close: Callable[[Path], list[str]], code: int, words: str, open_folder: Path, tmp_path: Path) -> None:
+def test_what_is_closed_is_said(
+    close: Callable[[Path], list[str]], code: int, words: str, open_folder: Path, tmp_path: Path
+) -> None:
     toy_views.write_scene(open_folder / "scene", lidar=True)
     for scene in ("scene", "none"):  # what it imports may lie where nobody else reads
         app.main(["fuse", str(open_folder / scene), "--out", str(tmp_path / "out")])
@@ -105,7 +109,8 @@ def test_what_is_closed_is_said(close: Callable[[Path], list[str]], code: int, w
 
 def test_a_closed_folder_is_listed_and_the_other_runs_are_shown(open_folder: Path, tmp_path: Path) -> None:
     run_of(open_folder / "runs" / "good")
-    gallery.run([open_folder / "runs", tmp_path / "none"], tmp_path / "all.html")  # what it imports may lie where nobody else reads
+    # what it imports may lie where nobody else reads
+    gallery.run([open_folder / "runs", tmp_path / "none"], tmp_path / "all.html")
     run_of(open_folder / "runs" / "closed").chmod(0)
     (open_folder / "pages").mkdir()
     (open_folder / "pages").chmod(0o777)

@@ -45,10 +45,13 @@ def track(name: str = "car", t0: float = 0.0) -> Track:
 def columns(count: int, seed: int, classes: int = 3, degree: int = 0) -> dict[str, torch.Tensor]:
     g = torch.Generator().manual_seed(seed)
     made = {
-        "means": torch.randn(count, 3, generator=g), "quats": torch.randn(count, 4, generator=g),
-        "log_scales": torch.randn(count, 3, generator=g) - 2, "logits": torch.randn(count, generator=g),
-        "sh_dc": torch.randn(count, 1, 3, generator=g), "semantics": torch.randn(count, classes, generator=g),
-    }  # fmt: skip
+        "means": torch.randn(count, 3, generator=g),
+        "quats": torch.randn(count, 4, generator=g),
+        "log_scales": torch.randn(count, 3, generator=g) - 2,
+        "logits": torch.randn(count, generator=g),
+        "sh_dc": torch.randn(count, 1, 3, generator=g),
+        "semantics": torch.randn(count, classes, generator=g),
+    }
     if degree:
         made["sh_rest"] = torch.randn(count, (degree + 1) ** 2 - 1, 3, generator=g)
     return made
@@ -61,10 +64,17 @@ def model(learn_poses: bool = False, degree: int = 0) -> SceneModel:
         {"node": torch.tensor([0] * 5 + [1] * 4 + [2] * 3, dtype=torch.int32)},
     )
     objects = (RigidNode.from_track(track("car"), learn_poses), RigidNode.from_track(track("van", 5.0), learn_poses))
-    return SceneModel(table, (StaticNode(), *objects), SkyNode.uniform(16), (ID["road"], ID["sky"], ID["car"]), degree, {"method": "test"})
+    return SceneModel(
+        table,
+        (StaticNode(), *objects),
+        SkyNode.uniform(16),
+        (ID["road"], ID["sky"], ID["car"]),
+        degree,
+        {"method": "test"},
+    )
 
 
-# ---- poses ----------------------------------------------------------------------------------------------------------
+# ---- poses ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("time_s", [0.0, 0.2, 0.5, 0.77, 1.0, 1.5, 2.0])
@@ -164,10 +174,14 @@ def test_left_product_matrix_is_the_rotation_product(values):
     if a.norm() < 0.1 or b.norm() < 0.1:
         return
     product = quaternions.left_product_matrix(a) @ b
-    assert torch.allclose(quaternions.rotation_matrix(product), quaternions.rotation_matrix(a) @ quaternions.rotation_matrix(b), atol=1e-10)
+    assert torch.allclose(
+        quaternions.rotation_matrix(product),
+        quaternions.rotation_matrix(a) @ quaternions.rotation_matrix(b),
+        atol=1e-10,
+    )
 
 
-# ---- composing ------------------------------------------------------------------------------------------------------
+# ---- composing -----------------------------------------------------------------------------------
 
 
 def test_compose_places_objects_and_hides_absent_ones():
@@ -225,7 +239,7 @@ def test_removing_a_track_equals_composing_without_it():
         scene.without_nodes(["tram"])
 
 
-# ---- sky ------------------------------------------------------------------------------------------------------------
+# ---- sky -----------------------------------------------------------------------------------------
 
 
 def looking(yaw: float, width: int = 40, height: int = 30) -> View:
@@ -246,10 +260,13 @@ def test_sky_shows_the_colour_of_the_direction(yaw):
     rows, cols = 90, 180
     elevation = math.pi / 2 - (np.arange(rows) + 0.5) * math.pi / rows
     longitude = -math.pi + (np.arange(cols) + 0.5) * 2 * math.pi / cols
-    painted = np.stack([
-        np.cos(elevation)[:, None] * np.cos(longitude), np.cos(elevation)[:, None] * np.sin(longitude),
-        np.repeat(np.sin(elevation)[:, None], cols, 1),
-    ])  # fmt: skip
+    painted = np.stack(
+        [
+            np.cos(elevation)[:, None] * np.cos(longitude),
+            np.cos(elevation)[:, None] * np.sin(longitude),
+            np.repeat(np.sin(elevation)[:, None], cols, 1),
+        ]
+    )
     sky.table.columns["panorama"].detach().copy_(torch.from_numpy(painted).float()[None])
     view = looking(yaw)
     shown = sky_picture(sky, view).detach().numpy()
@@ -286,10 +303,13 @@ def test_semantics_of_uncovered_pixels_are_sky():
     logits[0] = 3.0
     alpha = torch.tensor([[[1.0, 0.0], [0.9, 0.1]]])
     channel = scene_model.composite_semantics(scene, logits, alpha).argmax(0)
-    assert [[scene.classes[c] for c in row] for row in channel.tolist()] == [[ID["road"], ID["sky"]], [ID["road"], ID["sky"]]]
+    assert [[scene.classes[c] for c in row] for row in channel.tolist()] == [
+        [ID["road"], ID["sky"]],
+        [ID["road"], ID["sky"]],
+    ]
 
 
-# ---- state ----------------------------------------------------------------------------------------------------------
+# ---- state ---------------------------------------------------------------------------------------
 
 
 def test_state_round_trip_keeps_everything():
@@ -319,13 +339,15 @@ def test_damaged_state_is_refused():
         SceneModel.from_state({**values, "nodes": values["nodes"][:1]}, groups)
 
 
-# ---- the table -------------------------------------------------------------------------------------------------------
+# ---- the table -----------------------------------------------------------------------------------
 
 
 def tagged_table(count: int = 6) -> Table:
     """Every column, moment and label of row i holds the number i."""
     number = torch.arange(count, dtype=torch.float32)
-    table = Table({"a": number.clone(), "b": number[:, None].repeat(1, 3)}, {"node": torch.arange(count, dtype=torch.int32)})
+    table = Table(
+        {"a": number.clone(), "b": number[:, None].repeat(1, 3)}, {"node": torch.arange(count, dtype=torch.int32)}
+    )
     for moments, factor in ((table.moment1, 10), (table.moment2, 100)):
         moments["a"] = factor * number
         moments["b"] = factor * number[:, None].repeat(1, 3)
@@ -353,7 +375,9 @@ def test_take_moves_everything_together(rows):
 
 def test_append_gives_zero_moments_and_wants_every_column():
     table = tagged_table(2)
-    table.append({"a": torch.tensor([7.0]), "b": torch.full((1, 3), 7.0)}, {"node": torch.tensor([7], dtype=torch.int32)})
+    table.append(
+        {"a": torch.tensor([7.0]), "b": torch.full((1, 3), 7.0)}, {"node": torch.tensor([7], dtype=torch.int32)}
+    )
     assert table["a"].tolist() == [0, 1, 7]
     assert table.moment1["a"].tolist() == [0, 10, 0]
     assert table.labels["node"].tolist() == [0, 1, 7]
@@ -387,7 +411,7 @@ def test_sparse_adam_leaves_other_rows_alone():
         assert not same[2] or name.startswith("label"), name
 
 
-# ---- starting values -------------------------------------------------------------------------------------------------
+# ---- starting values -----------------------------------------------------------------------------
 
 
 def test_voxel_filter_keeps_one_per_cell():
@@ -420,7 +444,7 @@ def test_box_grid_lies_on_the_box():
     assert (rgb == [10, 20, 30]).all()
 
 
-# ---- noise of tracks -------------------------------------------------------------------------------------------------
+# ---- noise of tracks -----------------------------------------------------------------------------
 
 
 def wavy_track(noise_m: float, noise_rad: float = 0.0, keys: int = 40) -> tuple[Track, Track]:
@@ -439,7 +463,7 @@ def key_error(node: RigidNode, exact: Track) -> float:
 def test_second_differences_are_the_acceleration_at_uneven_times():
     times = np.array([0.0, 0.1, 0.35, 0.4, 1.0])
     matrix = motion.second_differences(times)
-    assert np.abs(matrix @ (3 - 2 * times) ).max() < 1e-9
+    assert np.abs(matrix @ (3 - 2 * times)).max() < 1e-9
     assert np.abs(matrix @ (1.5 * times**2) - 3.0).max() < 1e-9
     assert motion.second_differences(times[:2]).shape == (0, 2)
 
@@ -493,7 +517,9 @@ def test_settling_again_changes_nothing_and_short_tracks_stay():
     once = node.offsets["shift"].detach().clone()
     node.settle()
     assert torch.allclose(node.offsets["shift"], once, atol=1e-6)
-    short = RigidNode("s", "car", (4, 2, 1.5), [0.0, 0.5], np.stack([pose(0, 0, 0, 0), pose(1, 0.3, 0, 0.1)]), learn_pose=True)
+    short = RigidNode(
+        "s", "car", (4, 2, 1.5), [0.0, 0.5], np.stack([pose(0, 0, 0, 0), pose(1, 0.3, 0, 0.1)]), learn_pose=True
+    )
     short.settle()
     assert not short.offsets["shift"].any()
 
@@ -511,7 +537,7 @@ def test_pose_matrix_is_the_learnt_pose():
     assert node.pose_matrix(2.5) is None
 
 
-# ---- deformable ------------------------------------------------------------------------------------------------------
+# ---- deformable ----------------------------------------------------------------------------------
 
 
 def walker(label: str = "pedestrian") -> nodes.DeformableNode:
@@ -523,7 +549,11 @@ def walker(label: str = "pedestrian") -> nodes.DeformableNode:
 
 def test_only_those_with_limbs_deform():
     keys = np.stack([pose(0, 0, 0, 0), pose(1, 0, 0, 0)])
-    for label, deformable, kind in (("car", True, "rigid"), ("cyclist", True, "deformable"), ("cyclist", False, "rigid")):
+    for label, deformable, kind in (
+        ("car", True, "rigid"),
+        ("cyclist", True, "deformable"),
+        ("cyclist", False, "rigid"),
+    ):
         assert nodes.object_node(Track("x", label, [1, 1, 1], [0.0, 1.0], keys), deformable=deformable).kind == kind
 
 
@@ -541,7 +571,9 @@ def test_displacement_interpolates_the_grid_in_space_and_time():
     """Control points displaced by a linear function of their place displace every row by that function."""
     node = walker()
     up, across, along = node.offsets["deform"].shape[2:]
-    z, y, x = torch.meshgrid(*(torch.linspace(-0.5, 0.5, n) * s for n, s in zip((up, across, along), (1.8, 0.6, 0.8))), indexing="ij")
+    z, y, x = torch.meshgrid(
+        *(torch.linspace(-0.5, 0.5, n) * s for n, s in zip((up, across, along), (1.8, 0.6, 0.8))), indexing="ij"
+    )
     with torch.no_grad():
         for key in range(5):
             node.offsets["deform"][key] = key * torch.stack([0.1 * x + 0.2 * z, 0.3 * y, 0.05 + 0.0 * z])
@@ -578,17 +610,21 @@ def test_deformation_settles_between_its_neighbours_and_poses_stay():
     assert node.parameters() is node.offsets
 
 
-# ---- time ------------------------------------------------------------------------------------------------------------
+# ---- time ----------------------------------------------------------------------------------------
 
 
 class Flickering(StaticNode):
-    """Gaussians that drift, show around a moment of their own, and redden: every change over time that a node may make."""
+    """Gaussians that drift, show around a moment of their own, and redden: every change over time that a node may
+    make."""
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows:
         """See ``Node``."""
         apart_s = time_s - rows.own["shows_at_s"]
         return replace(
-            rows, means=rows.means + apart_s[:, None], opacity=rows.opacity * torch.exp(-(apart_s**2)), sh_dc=rows.sh_dc + time_s
+            rows,
+            means=rows.means + apart_s[:, None],
+            opacity=rows.opacity * torch.exp(-(apart_s**2)),
+            sh_dc=rows.sh_dc + time_s,
         )
 
 
@@ -622,7 +658,7 @@ def test_colours_over_time_of_older_scenes_are_refused():
         SceneModel.from_state(values, older)
 
 
-# ---- colours that depend on the direction of view ---------------------------------------------------------------------
+# ---- colours that depend on the direction of view ------------------------------------------------
 
 
 @pytest.mark.parametrize("degree", [1, 2, 3])
@@ -633,7 +669,9 @@ def test_turned_harmonics_are_those_of_the_turned_direction(degree: int) -> None
     sh = torch.randn(1, (degree + 1) ** 2, 3, generator=g, dtype=torch.float64)
     matrix = core_harmonics.mixing(turn, degree)
     both = torch.cat([sh[:, :1], core_harmonics.turned(sh[:, 1:], matrix.double())], 1)
-    seen, own = (torch_twin.sh_colors(h.expand(50, -1, -1), d, degree) for h, d in ((both, directions), (sh, directions @ turn)))
+    seen, own = (
+        torch_twin.sh_colors(h.expand(50, -1, -1), d, degree) for h, d in ((both, directions), (sh, directions @ turn))
+    )
     assert torch.allclose(seen, own, atol=1e-6)
     assert torch.allclose(matrix @ matrix.T, torch.eye(len(matrix)), atol=1e-6)
 
@@ -652,7 +690,9 @@ def test_an_object_and_a_camera_that_turn_together_show_the_same_picture(backend
         scene = SceneModel(table, (StaticNode(), still), None, (0, 10, 13), 3, {})
         camera = Camera("front", 32, 24, 30.0, 30.0, 16.0, 12.0)
         behind = geometry.from_rotation_translation(np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]]), (-6, 0, 0.5))
-        return rasterize(compose(scene, 0.4), View(camera, place @ behind, 0.4), RasterConfig(backend=backend)).rgb.detach()
+        return rasterize(
+            compose(scene, 0.4), View(camera, place @ behind, 0.4), RasterConfig(backend=backend)
+        ).rgb.detach()
 
     here, there = np.eye(4), pose(3, -2, 1, 2.1, 0.3)
     assert (picture(here) - picture(there)).abs().max() < 2e-4
@@ -663,4 +703,6 @@ def test_scenes_say_in_which_frame_their_harmonics_are() -> None:
     assert values["harmonics"] == "node" and "harmonics" not in model().state()[0]
     for other in ({}, {"harmonics": "world"}):
         with pytest.raises(InputError, match="not in the frames of its objects"):
-            SceneModel.from_state({**{name: value for name, value in values.items() if name != "harmonics"}, **other}, groups)
+            SceneModel.from_state(
+                {**{name: value for name, value in values.items() if name != "harmonics"}, **other}, groups
+            )

@@ -101,9 +101,14 @@ def test_a_perfect_denoiser_gives_its_answer_at_any_number_of_steps(steps, eta):
     answer = torch.linspace(-1, 1, 24).view(1, 2, 3, 4)
     generator = torch.Generator().manual_seed(0)
     made = noise.ddim(
-        lambda x, t: answer, torch.randn(answer.shape, generator=generator), Schedule(), noise.trailing_steps(1000, steps),
-        prediction="x0", eta=eta, draw=lambda: torch.randn(answer.shape, generator=generator),
-    )  # fmt: skip
+        lambda x, t: answer,
+        torch.randn(answer.shape, generator=generator),
+        Schedule(),
+        noise.trailing_steps(1000, steps),
+        prediction="x0",
+        eta=eta,
+        draw=lambda: torch.randn(answer.shape, generator=generator),
+    )
     assert torch.equal(made, answer)
 
 
@@ -119,9 +124,14 @@ def test_sampler_keeps_a_gaussian():
         generator = torch.Generator().manual_seed(3)
         start = torch.randn(20000, generator=generator)
         made = noise.ddim(
-            denoise, start, schedule, noise.trailing_steps(1000, 200), prediction="x0", eta=eta,
+            denoise,
+            start,
+            schedule,
+            noise.trailing_steps(1000, 200),
+            prediction="x0",
+            eta=eta,
             draw=lambda g=generator: torch.randn(20000, generator=g),
-        )  # fmt: skip
+        )
         assert float(made.std()) == pytest.approx(spread, abs=tolerance)
 
 
@@ -244,8 +254,12 @@ def test_every_sampler_takes_its_settings_and_no_other():
     every = {name for names in noise.SAMPLER_SETTINGS.values() for name in names}
     for sampler, function in noise.SAMPLERS.items():
         own = set(inspect.signature(function).parameters) - {
-            "denoise", "start", "schedule", "step_indices", "prediction"
-        }  # fmt: skip
+            "denoise",
+            "start",
+            "schedule",
+            "step_indices",
+            "prediction",
+        }
         assert own == set(noise.SAMPLER_SETTINGS[sampler])
         noise.check_sampler(sampler, own)
         for name in every - own:
@@ -258,8 +272,8 @@ def test_every_sampler_takes_its_settings_and_no_other():
 
 @pytest.mark.parametrize("prediction", ["x0", "v"])
 def test_second_order_solver_follows_the_flow_under_the_dynamic_rescale(prediction):
-    """Data of one Gaussian, scaled as in training: the flow still maps x_T to mean + spread x_T, whose error falls with the square of
-    the step; the sample has no factor left, where that of ddim keeps the last step's."""
+    """Data of one Gaussian, scaled as in training: the flow still maps x_T to mean + spread x_T, whose error falls with
+    the square of the step; the sample has no factor left, where that of ddim keeps the last step's."""
     schedule, mean, spread = Schedule(ScheduleConfig(base_scale=0.7)), 0.7, 0.4
     start = torch.linspace(-2, 2, 9, dtype=torch.float64).view(1, 9)
 

@@ -57,16 +57,26 @@ from mudg.steps.settings.run import RunConfig
 from mudg.steps.synthesize import Synthesize
 
 SMALL = MDMConfig(
-    widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=4, embed_width=16,
-    codec=CodecConfig(decoder_width=8, decoder_blocks=1), patch=2, refine_widths=(8, 16), refine_blocks=(1, 1), area_px=24576,
+    widths=(16, 32),
+    blocks=(1, 1),
+    spatial_attention=(False, True),
+    temporal_attention=(False, True),
+    window=4,
+    embed_width=16,
+    codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+    patch=2,
+    refine_widths=(8, 16),
+    refine_blocks=(1, 1),
+    area_px=24576,
     renders=True,
-)  # fmt: skip
+)
 CITY = CityConfig(seed=3, n_frames=3, width=48, height=32, cameras=("front",), lidar_beams=8, lidar_azimuth_step_deg=4)
 
 
 @dataclass(frozen=True)
 class Verb:
-    """One verb: ``call(given, out, variant, overwrite)``, with the inputs by name; variants 1 and 2 differ in the settings."""
+    """One verb: ``call(given, out, variant, overwrite)``, with the inputs by name; variants 1 and 2 differ in the
+    settings."""
 
     call: Callable[[dict[str, Path], Path, int, bool], Any]
     inputs: tuple[str, ...]
@@ -84,24 +94,40 @@ def _annotate(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
 
 def _synthesize(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
     config = SynthesizeConfig(
-        cameras=("front",), shifts_m=(1.0, -1.0), model=str(g["model"]), steps=v, width_px=48, full_size=False, precision="float32",
+        cameras=("front",),
+        shifts_m=(1.0, -1.0),
+        model=str(g["model"]),
+        steps=v,
+        width_px=48,
+        full_size=False,
+        precision="float32",
         processes=1,
-    )  # fmt: skip
-    return Synthesize(scene=g["scene"], fused=g["fused"], fitted=g["fitted"], out=out, overwrite=o, settings=config).run()
+    )
+    return Synthesize(
+        scene=g["scene"], fused=g["fused"], fitted=g["fitted"], out=out, overwrite=o, settings=config
+    ).run()
 
 
 def _fit(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
-    config = fit_config(method="mudg_s", iterations=6, seed=v, start__gaussians=200, checkpoint_every=2, preview_every=3)
-    return Fit(scene=g["scene"], fused=g["fused"], observations=(g["views"],), out=out, overwrite=o, settings=config).run()
+    config = fit_config(
+        method="mudg_s", iterations=6, seed=v, start__gaussians=200, checkpoint_every=2, preview_every=3
+    )
+    return Fit(
+        scene=g["scene"], fused=g["fused"], observations=(g["views"],), out=out, overwrite=o, settings=config
+    ).run()
 
 
 def _score(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
     config = ScoreConfig(width_px=24 * v, perceptual_views=0)
-    return Score(scene=g["scene"], fused=g["fused"], views={"a": g["views"]}, truth=None, out=out, overwrite=o, settings=config).run()
+    return Score(
+        scene=g["scene"], fused=g["fused"], views={"a": g["views"]}, truth=None, out=out, overwrite=o, settings=config
+    ).run()
 
 
 def _bench(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
-    return bench.run("mdm", BenchConfig(model=str(g["model"]), seed=v, precision="float32", threads=1), out, overwrite=o)
+    return bench.run(
+        "mdm", BenchConfig(model=str(g["model"]), seed=v, precision="float32", threads=1), out, overwrite=o
+    )
 
 
 def _paths(scene: Path, v: int) -> tuple[Any, ...]:
@@ -114,9 +140,10 @@ VERBS: dict[str, Verb] = {
     "ingest a scene": Verb(lambda g, *rest: _ingest({"log": g["scene"]}, *rest), ("scene",)),
     "ingest a zip": Verb(lambda g, *rest: _ingest({"log": g["zip"]}, *rest), ("zip",)),
     "annotate": Verb(_annotate, ("plain scene", "weights")),
-    "fuse": Verb(lambda g, out, v, o: Fuse(
-        scene=g["scene"], out=out, overwrite=o, settings=FuseConfig(voxel_m=0.1 * v)
-    ).run(), ("scene",)),
+    "fuse": Verb(
+        lambda g, out, v, o: Fuse(scene=g["scene"], out=out, overwrite=o, settings=FuseConfig(voxel_m=0.1 * v)).run(),
+        ("scene",),
+    ),
     "learn": Verb(
         lambda g, out, v, o: Learn(out=out, overwrite=o, settings=tiny(g["clips"], seed=v)).run(), ("clips",)
     ),
@@ -130,36 +157,49 @@ VERBS: dict[str, Verb] = {
     ),
     "score": Verb(_score, ("scene", "views", "fused")),
     "truth": Verb(
-        lambda g, out, v, o: DrawTruth(scene=g["city"], trajectories=_paths(g["city"], v), out=out, overwrite=o).run(), ("city",)
+        lambda g, out, v, o: DrawTruth(scene=g["city"], trajectories=_paths(g["city"], v), out=out, overwrite=o).run(),
+        ("city",),
     ),
     "film": Verb(
         lambda g, out, v, o: page.Film(
-            views={"truth": (g["views"],), **({"b": (g["views"],)} if v == 2 else {})}, paths=_paths(g["scene"], 1), out=out, overwrite=o
+            views={"truth": (g["views"],), **({"b": (g["views"],)} if v == 2 else {})},
+            paths=_paths(g["scene"], 1),
+            out=out,
+            overwrite=o,
         ).run(),
         ("views",),
     ),
     "fill": Verb(
         lambda g, out, v, o: chain.FillViews(
             scene=g["scene"], fused=g["fused"], paths=_paths(g["scene"], v), out=out, overwrite=o
-        ).run(), ("scene", "fused")
+        ).run(),
+        ("scene", "fused"),
     ),
     "exact": Verb(
         lambda g, out, v, o: chain.ExactViews(
             truth=g["views"], paths=_paths(g["scene"], 1)[: 3 - v], out=out, overwrite=o
-        ).run(), ("views",)
+        ).run(),
+        ("views",),
     ),
     "bench": Verb(_bench, ("model",)),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     """One input of every kind, small."""
     root = tmp_path_factory.mktemp("world")
-    given = {"scene": toy_views.write_scene(root / "scene", lidar=True), "zip": write_zip(root / "scene", root / "scene.zip")}
+    given = {
+        "scene": toy_views.write_scene(root / "scene", lidar=True),
+        "zip": write_zip(root / "scene", root / "scene.zip"),
+    }
     street = ToyStreet(times=[0.0, 0.1])
     street.write(root / "plain", width=60, height=40, labels=False)
-    given |= {"plain scene": root / "plain", "log": kitti_folders.write_raw_drive(root / "day"), "clips": write_clips(root / "clips")}
+    given |= {
+        "plain scene": root / "plain",
+        "log": kitti_folders.write_raw_drive(root / "day"),
+        "clips": write_clips(root / "clips"),
+    }
     given["fused"] = Fuse(scene=given["scene"], out=root / "fused", settings=FuseConfig()).run()
     given["views"] = toy_views.write_views(given["scene"], root / "views", "a", (0.0, 1.0))
     config = fit_config(method="street_gaussians", iterations=2, start__gaussians=200)
@@ -167,7 +207,9 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     torch.manual_seed(0)
     files.save(MDM(SMALL), root / "model", "", {})
     given["model"] = root / "model"
-    given["city"] = Ingest(log=ingest.CITY, out=root / "city", settings=IngestConfig(city=CITY, contact_sheet=False)).run()
+    given["city"] = Ingest(
+        log=ingest.CITY, out=root / "city", settings=IngestConfig(city=CITY, contact_sheet=False)
+    ).run()
     return given
 
 
@@ -193,7 +235,7 @@ def copied(world: dict[str, Path], names: tuple[str, ...], root: Path) -> dict[s
     return given
 
 
-# ---- inputs and outputs apart ------------------------------------------------------------------------------------------
+# ---- inputs and outputs apart --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", VERBS)
@@ -221,9 +263,11 @@ def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, 
         shutil.copytree(path, scenes / name)
     listed = tmp_path / "list.txt"
     for text, out in (
-        ("scenes/a\nscenes/b\n", scenes), ("scenes/a name=b\n", scenes / "a"), ("scenes/a name=scenes\n", tmp_path),
+        ("scenes/a\nscenes/b\n", scenes),
+        ("scenes/a name=b\n", scenes / "a"),
+        ("scenes/a name=scenes\n", tmp_path),
         ("scenes/a name=b\nscenes/b name=c\n", scenes),
-    ):  # fmt: skip
+    ):
         listed.write_text(text)
         before = tree(tmp_path)
         with pytest.raises(UsageError, match="an input"):
@@ -247,7 +291,9 @@ def test_files_of_a_log_that_lie_beside_it_count(world: dict[str, Path], tmp_pat
         Ingest(log=drive, out=calibration, overwrite=True, settings=IngestConfig()).run()
 
 
-def test_clips_of_a_training_lie_in_its_folder_only_where_they_do_by_default(world: dict[str, Path], tmp_path: Path) -> None:
+def test_clips_of_a_training_lie_in_its_folder_only_where_they_do_by_default(
+    world: dict[str, Path], tmp_path: Path
+) -> None:
     out = tmp_path / "out"
     shutil.copytree(world["clips"], out / "clips")
     for clips in (out, out / "steps", tmp_path, out / "clips" / "deep"):
@@ -319,7 +365,7 @@ def test_the_comparison_of_methods_leaves_other_folders_alone(tmp_path: Path) ->
         assert (folder / name).read_text() == "{}"
 
 
-# ---- replaced by a finished result only --------------------------------------------------------------------------------
+# ---- replaced by a finished result only ----------------------------------------------------------
 
 
 @contextmanager
@@ -372,7 +418,11 @@ def quick_bench(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("quick_bench")
 @pytest.mark.parametrize("name", VERBS)
 def test_an_interrupted_replacement_keeps_the_old_result_and_continues(
-    name: str, world: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    name: str,
+    world: dict[str, Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
     given = {key: path for key, path in world.items() if key not in ("poses", "weights")}
     call, out = VERBS[name].call, tmp_path / "out"
@@ -409,7 +459,9 @@ def test_a_failed_import_over_another_scene_leaves_that(world: dict[str, Path], 
     out = Ingest(log=world["log"], out=tmp_path / "out", settings=IngestConfig(test_every=2, contact_sheet=False)).run()
     before = tree(out)
     with pytest.raises(UsageError, match="no such camera"):
-        Ingest(log=world["log"], out=out, overwrite=True, settings=IngestConfig(cameras=("frnt",), contact_sheet=False)).run()
+        Ingest(
+            log=world["log"], out=out, overwrite=True, settings=IngestConfig(cameras=("frnt",), contact_sheet=False)
+        ).run()
     assert tree(tmp_path / "out") == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
@@ -429,7 +481,9 @@ def test_a_user_file_in_the_folder_of_a_failing_import_stays(
     assert [p.name for p in out.iterdir()] == ["mine.md"]
 
 
-def test_a_model_is_replaced_by_a_whole_one_and_other_files_stay(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_model_is_replaced_by_a_whole_one_and_other_files_stay(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     torch.save({"state_dict": tiny_checkpoint()}, tmp_path / "512.ckpt")
 
     def converted(dtype: str, *, overwrite: bool) -> Path:

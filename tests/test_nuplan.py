@@ -48,16 +48,16 @@ def log(source: Path) -> Path:
 
 
 def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["nuplan"](source, out, ImportOptions(**options))  # type: ignore[arg-type]
+    return IMPORTERS["nuplan"](source, out, ImportOptions(**options))
 
 
-# --- what is read -----------------------------------------------------------------------------------------------------
+# --- what is read ---------------------------------------------------------------------------------
 
 
 def test_round_trip(truth: Scene, pristine: Path, tmp_path: Path) -> None:
     scene = ingest(log(pristine), tmp_path / "out", workers=2)
     roundtrip.assert_same_log(scene, truth, labels={"car": "vehicle"}, intensity=0.002)  # intensity has 8 bits
-    assert np.abs(scene.ego.pose_at(0.0)[:3, 3]).max() < 1e-9  # type: ignore[index]
+    assert np.abs(scene.ego.pose_at(0.0)[:3, 3]).max() < 1e-9
     assert "nuPlan" in scene.source.licence
     assert sorted(name for name, part in scene.split.items() if part == "test") == ["front/000004", "front_left/000004"]
     for path in (log(pristine), pristine, pristine.parent):
@@ -73,8 +73,11 @@ def test_scenes_frames_cameras_and_logs_are_chosen(truth: Scene, pristine: Path,
     assert [sweep.time_s for sweep in part.sweeps] == pytest.approx([0.0, 0.1])
     assert len(part.frames) == 4
     assert all(len(track.times_s) == 2 for track in part.tracks)
-    for options, words in (({"sequence": "scene-0009"}, "no such scene"), ({"cameras": ("CAM_B0",)}, "no such camera"),
-                           ({"untwist": "no"}, "no use for --untwist")):  # fmt: skip
+    for options, words in (
+        ({"sequence": "scene-0009"}, "no such scene"),
+        ({"cameras": ("CAM_B0",)}, "no such camera"),
+        ({"untwist": "no"}, "no use for --untwist"),
+    ):
         with pytest.raises(UsageError, match=words):
             ingest(log(pristine), tmp_path / "no", **options)
     with pytest.raises(InputError, match="no clouds to import"):
@@ -148,7 +151,7 @@ def test_nothing_is_written_beside_the_database(pristine: Path, tmp_path: Path) 
     assert [path.name for path in log(pristine).parent.iterdir()] == [log(pristine).name]
 
 
-# --- bait and damage --------------------------------------------------------------------------------------------------
+# --- bait and damage ------------------------------------------------------------------------------
 
 
 class Asks:
@@ -213,12 +216,18 @@ def cut(source: Path, size: int) -> None:
         (sql("UPDATE ego_pose SET timestamp = timestamp / 1000"), "no vehicle poses at the time"),
         (sql("UPDATE lidar_pc SET timestamp = timestamp / 1000"), "another unit"),
         (sql("UPDATE image SET timestamp = timestamp / 1000"), "no moment has images"),
-        (sql("UPDATE lidar_pc SET timestamp = 'soon' WHERE token = ?", made.token("cloud", 1)), "no whole number|numbers"),
+        (
+            sql("UPDATE lidar_pc SET timestamp = 'soon' WHERE token = ?", made.token("cloud", 1)),
+            "no whole number|numbers",
+        ),
         (sql("UPDATE ego_pose SET qw = qw * 1.5, qx = qx * 1.5, qy = qy * 1.5, qz = qz * 1.5"), "length 1"),
         (sql("UPDATE ego_pose SET x = NULL"), "not a finite number"),
         (sql("UPDATE lidar_pc SET ego_pose_token = x'00'"), "point cloud has no vehicle pose"),
         (sql("UPDATE lidar_pc SET lidar_token = x'00'"), "LiDAR that is not there"),
-        (sql("UPDATE lidar_box SET track_token = x'00' WHERE token = ?", made.token("box", "car-001", 1)), "names a track"),
+        (
+            sql("UPDATE lidar_box SET track_token = x'00' WHERE token = ?", made.token("box", "car-001", 1)),
+            "names a track",
+        ),
         (sql("DELETE FROM category"), "names a track or class that is not there"),
         (sql("UPDATE lidar_box SET length = 0"), "size makes no sense"),
         (sql("UPDATE lidar_box SET yaw = 'north'"), "not a finite number"),
@@ -232,11 +241,14 @@ def cut(source: Path, size: int) -> None:
         (sql("UPDATE camera SET intrinsic = 'text'"), "no pickled list"),
         (sql("UPDATE camera SET width = 40"), "size"),
         (rewritten("MergedPointCloud", lambda c: c[:700]), "cut off|bytes"),
-        (rewritten("MergedPointCloud", lambda c: re.sub(rb"(WIDTH|POINTS) \d+", rb"\1 99999999999", c)), "POINTS|points|bytes"),
+        (
+            rewritten("MergedPointCloud", lambda c: re.sub(rb"(WIDTH|POINTS) \d+", rb"\1 99999999999", c)),
+            "POINTS|points|bytes",
+        ),
         (rewritten("MergedPointCloud", lambda c: c.replace(b"FIELDS x y z", b"FIELDS a y z")), "no coordinates"),
         (rewritten("CAM_F0", lambda c: c[:300]), "cannot be decoded"),
     ],
-)  # fmt: skip
+)
 def test_spoilt_logs_are_refused_in_words(
     source: Path, tmp_path: Path, spoil: Callable[[Path], object], words: str
 ) -> None:
@@ -296,25 +308,62 @@ def test_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:
     assert any("Hover Board" in note for note in scene.source.notes)
 
 
-# --- values of other types --------------------------------------------------------------------------------------------
+# --- values of other types ------------------------------------------------------------------------
 
 COLUMNS = (
-    "log.logfile", "ego_pose.token", "ego_pose.timestamp", "ego_pose.x", "ego_pose.qw", "camera.token", "camera.channel",
-    "camera.translation", "camera.intrinsic", "camera.distortion", "camera.width", "image.camera_token", "image.filename_jpg",
-    "image.timestamp", "lidar.token", "lidar.channel", "lidar.rotation", "lidar_pc.token", "lidar_pc.lidar_token",
+    "log.logfile",
+    "ego_pose.token",
+    "ego_pose.timestamp",
+    "ego_pose.x",
+    "ego_pose.qw",
+    "camera.token",
+    "camera.channel",
+    "camera.translation",
+    "camera.intrinsic",
+    "camera.distortion",
+    "camera.width",
+    "image.camera_token",
+    "image.filename_jpg",
+    "image.timestamp",
+    "lidar.token",
+    "lidar.channel",
+    "lidar.rotation",
+    "lidar_pc.token",
+    "lidar_pc.lidar_token",
     "lidar_pc.ego_pose_token",
-    "lidar_pc.filename", "lidar_pc.timestamp", "lidar_box.track_token", "lidar_box.yaw", "lidar_box.width", "track.token",
-    "track.category_token", "category.name", "scene.name",
-)  # fmt: skip
+    "lidar_pc.filename",
+    "lidar_pc.timestamp",
+    "lidar_box.track_token",
+    "lidar_box.yaw",
+    "lidar_box.width",
+    "track.token",
+    "track.category_token",
+    "category.name",
+    "scene.name",
+)
 VALUES = (
-    "CAST(x'ff80' AS TEXT)", "6000000000", "-1", "1.5", "NULL", "'text'", "''", "x'00ff'", "zeroblob(3000000)", "zeroblob(500000)", "9e999",
-)  # fmt: skip
+    "CAST(x'ff80' AS TEXT)",
+    "6000000000",
+    "-1",
+    "1.5",
+    "NULL",
+    "'text'",
+    "''",
+    "x'00ff'",
+    "zeroblob(3000000)",
+    "zeroblob(500000)",
+    "9e999",
+)
 
 
 def without_types(database: Path, table: str) -> sqlite3.Connection:
     """The database with a table whose columns take values of any type."""
     connection = sqlite3.connect(database)
-    for question in (f"CREATE TABLE other AS SELECT * FROM {table}", f"DROP TABLE {table}", f"ALTER TABLE other RENAME TO {table}"):
+    for question in (
+        f"CREATE TABLE other AS SELECT * FROM {table}",
+        f"DROP TABLE {table}",
+        f"ALTER TABLE other RENAME TO {table}",
+    ):
         connection.execute(question)
     return connection
 

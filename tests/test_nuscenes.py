@@ -1,4 +1,5 @@
-"""nuScenes importer: a release written from a known log, broken releases, the reader of large tables, and the real key frame."""
+"""nuScenes importer: a release written from a known log, broken releases, the reader of large tables, and the real key
+frame."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ Rows = list[dict[str, Any]]
 
 def ingest(source: Path, out: Path, **options: object) -> Scene:
     given = {"sequence": "scene-0007", "cameras": ("front", "front_left"), **options}
-    return IMPORTERS["nuscenes"](source, out, ImportOptions(**given))  # type: ignore[arg-type]
+    return IMPORTERS["nuscenes"](source, out, ImportOptions(**given))
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def release(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.write_nuscenes(truth, tmp_path_factory.mktemp("release"))
 
 
-# --- round trips ----------------------------------------------------------------------------------------------------
+# --- round trips ----------------------------------------------------------------------------------
 
 
 @needs_native
@@ -137,7 +138,7 @@ def test_scene_must_be_chosen_and_releases_side_by_side_are_told_apart(release: 
     assert any("v1.0-trainval" in note for note in scene.source.notes)
 
 
-# --- what is wrong is said ------------------------------------------------------------------------------------------
+# --- what is wrong is said ------------------------------------------------------------------------
 
 
 def first(rows: Rows, **values: object) -> dict[str, Any]:
@@ -149,42 +150,64 @@ def of_scene(rows: Rows) -> dict[str, Any]:
 
 
 def all_stamps(factor: float) -> Callable[[Rows], None]:
-    return lambda rows: [row.update(timestamp=int(row["timestamp"] * factor)) for row in rows]  # type: ignore[func-returns-value]
+    return lambda rows: [row.update(timestamp=int(row["timestamp"] * factor)) for row in rows]
 
 
 BROKEN: dict[str, tuple[str, Callable[[Rows], object], str]] = {
     "dangling ego pose": ("sample_data", lambda r: of_scene(r).update(ego_pose_token="f" * 32), "points nowhere"),
     "dangling calibration": (
-        "sample_data", lambda r: of_scene(r).update(calibrated_sensor_token="f" * 32), "points nowhere"),
+        "sample_data",
+        lambda r: of_scene(r).update(calibrated_sensor_token="f" * 32),
+        "points nowhere",
+    ),
     "dangling sample": ("sample", lambda r: first(r, prev="").update(next="f" * 32), "points nowhere"),
     "dangling instance": ("sample_annotation", lambda r: r[0].update(instance_token="f" * 32), "points nowhere"),
     "chain in a circle": ("sample", lambda r: r[0].update(next=r[0]["prev"] or r[0]["token"]), "circle"),
     "milliseconds": ("sample", all_stamps(1e-3), "another unit"),
     "nanoseconds": ("sample_data", all_stamps(1e3), "another unit"),
     "chain backwards in time": (
-        "sample", lambda r: r[1].update(timestamp=r[1]["timestamp"] + 10**6), "do not increase"),
+        "sample",
+        lambda r: r[1].update(timestamp=r[1]["timestamp"] + 10**6),
+        "do not increase",
+    ),
     "a sweep of another day": (
-        "sample_data", lambda r: of_scene(r).update(timestamp=made.START_US + 86_400 * 10**6), "hours|outside"),
+        "sample_data",
+        lambda r: of_scene(r).update(timestamp=made.START_US + 86_400 * 10**6),
+        "hours|outside",
+    ),
     "width and length swapped": (
-        "sample_annotation", lambda r: [x.update(size=[x["size"][i] for i in (1, 0, 2)]) for x in r], "swapped"),
+        "sample_annotation",
+        lambda r: [x.update(size=[x["size"][i] for i in (1, 0, 2)]) for x in r],
+        "swapped",
+    ),
     "size of zero": ("sample_annotation", lambda r: r[0].update(size=[0.0, 4.0, 1.5]), "makes no sense"),
-    "scaled rotation": (
-        "ego_pose", lambda r: r[0].update(rotation=[2 * v for v in r[0]["rotation"]]), "length 1"),
+    "scaled rotation": ("ego_pose", lambda r: r[0].update(rotation=[2 * v for v in r[0]["rotation"]]), "length 1"),
     "quaternions x y z w": (
-        "ego_pose", lambda r: [x.update(rotation=[*x["rotation"][1:], x["rotation"][0]]) for x in r], "upright"),
+        "ego_pose",
+        lambda r: [x.update(rotation=[*x["rotation"][1:], x["rotation"][0]]) for x in r],
+        "upright",
+    ),
     "three rotation values": ("ego_pose", lambda r: r[0].update(rotation=[1, 0, 0]), "missing or malformed"),
     "translation is a text": ("ego_pose", lambda r: r[0].update(translation=["1", 2, 3]), "missing or malformed"),
     "intrinsics sheared": (
-        "calibrated_sensor", lambda r: [x["camera_intrinsic"][0].__setitem__(1, 5.0) for x in r if x["camera_intrinsic"]],
-        "intrinsics are malformed"),
+        "calibrated_sensor",
+        lambda r: [x["camera_intrinsic"][0].__setitem__(1, 5.0) for x in r if x["camera_intrinsic"]],
+        "intrinsics are malformed",
+    ),
     "file outside the release": (
-        "sample_data", lambda r: of_scene(r).update(filename="../../etc/passwd"), "file name contains"),
+        "sample_data",
+        lambda r: of_scene(r).update(filename="../../etc/passwd"),
+        "file name contains",
+    ),
     "missing timestamp": ("sample_data", lambda r: of_scene(r).pop("timestamp"), "missing or malformed"),
     "two records with one token": ("sample_data", lambda r: r.append(of_scene(r)), "two records"),
     "other image size": (
-        "sample_data", lambda r: [x.update(width=97) for x in r if "CAM_FRONT/" in x["filename"]], "camera's size"),
+        "sample_data",
+        lambda r: [x.update(width=97) for x in r if "CAM_FRONT/" in x["filename"]],
+        "camera's size",
+    ),
     "no camera": ("sensor", lambda r: [x.update(channel="X") for x in r if "CAM" in x["channel"]], "no such camera"),
-}  # fmt: skip
+}
 
 
 @needs_native
@@ -196,7 +219,7 @@ def test_broken_tables_are_refused_in_words(name: str, release: Path, tmp_path: 
     for folder in ("samples", "sweeps"):
         if (release / folder).is_dir():
             (copy / folder).symlink_to(release / folder)
-    made.edit(copy, table, lambda rows: [change(rows), None][1])  # type: ignore[func-returns-value]
+    made.edit(copy, table, lambda rows: [change(rows), None][1])
     with pytest.raises((InputError, UsageError), match=words) as caught:
         ingest(copy, tmp_path / "out")
     assert caught.value.where
@@ -255,12 +278,14 @@ def test_default_cameras_must_all_be_there_and_unknown_categories_are_named(
     assert "vehicle.hovercraft" in capsys.readouterr().err
 
 
-# --- the reader of tables -------------------------------------------------------------------------------------------
+# --- the reader of tables -------------------------------------------------------------------------
 
 ODD = [
     {"token": f"t{n}", "group": f"g{n % 3}", "text": text, "list": [n, [1.5, -2e-3]], "null": None}
-    for n, text in enumerate(['plain', 'a } b', '{"group": "g1"}', 'end },\n{ "group": "g0" ', '\\" ] [ {', '\u00e9\u4e2d', ''])
-]  # fmt: skip
+    for n, text in enumerate(
+        ["plain", "a } b", '{"group": "g1"}', 'end },\n{ "group": "g0" ', '\\" ] [ {', "\u00e9\u4e2d", ""]
+    )
+]
 
 
 @pytest.mark.parametrize("buffer_bytes", [1, 7, 64, 1000, 1 << 20])
@@ -303,7 +328,7 @@ def test_malformed_tables_are_refused(tmp_path: Path, read: Callable[[Path], Row
         read(path)
 
 
-# --- sweeps and cameras -----------------------------------------------------------------------------------------------
+# --- sweeps and cameras ---------------------------------------------------------------------------
 
 
 def test_point_times_follow_columns_or_azimuth(tmp_path: Path) -> None:
@@ -331,7 +356,7 @@ def test_intrinsics_get_half_a_pixel() -> None:
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (1266.4, 1266.5, 816.8, 492.0)
 
 
-# --- real data --------------------------------------------------------------------------------------------------------
+# --- real data ------------------------------------------------------------------------------------
 
 
 def test_real_boxes_hold_the_points_that_were_counted_in_them(shared_data: Callable[[str], Path]) -> None:
@@ -352,7 +377,8 @@ def test_real_boxes_hold_the_points_that_were_counted_in_them(shared_data: Calla
 
 
 def test_real_camera_times_agree_with_the_turn(shared_data: Callable[[str], Path]) -> None:
-    """Each camera is triggered when the beam passes it: point times at its azimuth must be its time before the stamp."""
+    """Each camera is triggered when the beam passes it: point times at its azimuth must be its time before the
+    stamp."""
     source = shared_data("nuscenes_one_sample")
     sample = json.loads((source / "info.json").read_bytes())["data_list"][0]
     rows = np.fromfile(next(source.glob("*.pcd.bin")), "<f4").reshape(-1, 5)

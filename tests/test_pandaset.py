@@ -48,7 +48,7 @@ def source(pristine: Path, tmp_path: Path) -> Path:
 
 
 def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["pandaset"](source, out, ImportOptions(**options))  # type: ignore[arg-type]
+    return IMPORTERS["pandaset"](source, out, ImportOptions(**options))
 
 
 def world_points(scene: Scene, sensor: str, index: int) -> np.ndarray:
@@ -56,7 +56,7 @@ def world_points(scene: Scene, sensor: str, index: int) -> np.ndarray:
     return transform_points(sweep.world_from_lidar, read_points(scene, sweep).xyz.astype(np.float64))
 
 
-# --- what is read -----------------------------------------------------------------------------------------------------
+# --- what is read ---------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("new", [False, True])
@@ -95,8 +95,11 @@ def test_cameras_frames_and_sequences_are_chosen(truth: Scene, pristine: Path, t
         ingest(tmp_path / "all", tmp_path / "no")
     assert "002, 016" in caught.value.expected
     assert ingest(tmp_path / "all", tmp_path / "yes", sequence="016", frames=(0, 1)).id == "016"
-    for options, words in (({"sequence": "../001"}, "no such sequence"), ({"cameras": ("top",)}, "no such camera"),
-                           ({"boxes": Path("x")}, "no use for --boxes")):  # fmt: skip
+    for options, words in (
+        ({"sequence": "../001"}, "no such sequence"),
+        ({"cameras": ("top",)}, "no such camera"),
+        ({"boxes": Path("x")}, "no use for --boxes"),
+    ):
         with pytest.raises(UsageError, match=words):
             ingest(tmp_path / "all", tmp_path / "no", **{"sequence": "002", **options})
 
@@ -159,7 +162,7 @@ def _points_inside(truth: Scene, track: Track) -> int:
 def test_siblings_are_one_object(truth: Scene, source: Path, tmp_path: Path) -> None:
     """An object with a box per LiDAR is one track; the turning LiDAR's box wins, and either alone will do."""
     for index, sweep in enumerate(truth.sweeps):
-        table = {name: list(column) for name, column in cuboids(truth, sweep.time_s).items()}  # type: ignore[call-overload]
+        table = {name: list(column) for name, column in cuboids(truth, sweep.time_s).items()}
         row = table["uuid"].index("car-001")
         table["cuboids.sibling_id"][row], table["cuboids.sensor_id"][row] = "other", 0
         for column in table.values():
@@ -177,7 +180,8 @@ def test_siblings_are_one_object(truth: Scene, source: Path, tmp_path: Path) -> 
 
 
 def test_published_poses_of_a_sequence_give_a_vehicle_that_drives_forward(source: Path, tmp_path: Path) -> None:
-    """Two poses of sequence 002 as published: x of the vehicle is its motion, its front camera looks ahead, 1.8 m up."""
+    """Two poses of sequence 002 as published: x of the vehicle is its motion, its front camera looks ahead, 1.8 m
+    up."""
     lidar = [
         ((0.0, 0.0, 0.0), (0.9227878803693977, 0.004463029824737836, 0.017858463809403605, -0.3848683989086472)),
         (
@@ -186,10 +190,15 @@ def test_published_poses_of_a_sequence_give_a_vehicle_that_drives_forward(source
         ),
     ]
     camera = [
-        ((0.6558286953029124, 0.555863909647736, 1.8011768068489773),
-         (0.6548767857613946, -0.6514903276121121, 0.27678883380008457, -0.26473513174921903)),
-        ((14.293106553533605, 14.122942595987043, 1.7937735), (0.65556671, -0.6515317593, 0.2746473378642303, -0.26515560256)),
-    ]  # fmt: skip
+        (
+            (0.6558286953029124, 0.555863909647736, 1.8011768068489773),
+            (0.6548767857613946, -0.6514903276121121, 0.27678883380008457, -0.26473513174921903),
+        ),
+        (
+            (14.293106553533605, 14.122942595987043, 1.7937735),
+            (0.65556671, -0.6515317593, 0.2746473378642303, -0.26515560256),
+        ),
+    ]
     for path, poses in ((source / "lidar", lidar), (source / "camera" / "front_camera", camera)):
         entries = [
             {"position": dict(zip("xyz", place, strict=True)), "heading": dict(zip("wxyz", turn, strict=True))}
@@ -224,7 +233,7 @@ def test_swapped_sizes_are_refused(source: Path, tmp_path: Path, truth: Scene) -
 def test_unknown_classes_are_said(source: Path, tmp_path: Path, truth: Scene) -> None:
     for index, sweep in enumerate(truth.sweeps):
         table = cuboids(truth, sweep.time_s)
-        table["label"] = ["Hover Board", *table["label"][1:]]  # type: ignore[index]
+        table["label"] = ["Hover Board", *table["label"][1:]]
         write_frame(source / "annotations" / "cuboids" / f"{index:02d}.pkl.gz", table)
     scene = ingest(source, tmp_path / "out")
     words = " | ".join(scene.source.notes)
@@ -254,7 +263,7 @@ def test_classes_of_points_become_train_ids(source: Path, tmp_path: Path) -> Non
         index, solid = int(sweep.id[-6:]), sweep.sensor == "pandar_gt"
         mine = (read_frame(source / "lidar" / f"{index:02d}.pkl.gz")["d"] == 1) == solid
         expected = [ids[number] for number in numbers[index][mine].tolist()]
-        assert read_points(scene, sweep).classes.tolist() == expected  # type: ignore[union-attr]
+        assert read_points(scene, sweep).classes.tolist() == expected
     assert any("not known here are unlabelled: Hover Board" in note for note in scene.source.notes)
     assert set(CLASS_OF.values()) <= {"", *CLASSES}
 
@@ -289,7 +298,7 @@ def test_boxes_and_path_reach_the_images_taken_before_the_end_of_the_first_turn(
     assert all(track.pose_at(first) is not None for track in scene.tracks)
 
 
-# --- bait and damage --------------------------------------------------------------------------------------------------
+# --- bait and damage ------------------------------------------------------------------------------
 
 
 class Asks:
@@ -371,14 +380,19 @@ def times_scaled(factor: float) -> Callable[[Path], None]:
         (json_entry("lidar/timestamps.json", lambda v: v.pop()), "does not cover"),
         (json_entry("lidar/timestamps.json", lambda v: v.__setitem__(2, v[1])), "do not increase"),
         (json_entry("lidar/timestamps.json", lambda v: v.__setitem__(2, "soon")), "not numbers"),
-        (json_entry("camera/front_camera/timestamps.json", lambda v: v.__setitem__(slice(None), [x + 50 for x in v])), "share a clock"),
+        (
+            json_entry(
+                "camera/front_camera/timestamps.json", lambda v: v.__setitem__(slice(None), [x + 50 for x in v])
+            ),
+            "share a clock",
+        ),
         (json_entry("lidar/poses.json", lambda v: v[2]["heading"].update(w=3.0)), "length 1"),
         (json_entry("lidar/poses.json", lambda v: v[2]["position"].pop("x")), "pose is incomplete"),
         (json_entry("camera/front_camera/poses.json", lambda v: v[2]["heading"].update(w=None)), "pose"),
         (json_entry("camera/front_camera/intrinsics.json", lambda v: v.pop("fy")), "intrinsics are incomplete"),
         (lambda s: (s / "camera/front_camera/poses.json").write_text("[{"), "not valid JSON"),
     ],
-)  # fmt: skip
+)
 def test_spoilt_logs_are_refused_in_words(
     source: Path, tmp_path: Path, spoil: Callable[[Path], object], words: str
 ) -> None:
@@ -424,13 +438,13 @@ def test_the_writer_of_these_tests_turns_yaw_as_documented() -> None:
     """Yaw 0 looks along y, and a quarter turn left of it along -x."""
     track = Track("a", "car", [4, 2, 1.5], [0.0], invert(SOURCE_FROM_WORLD)[None] @ yaw_matrix(np.pi / 2))
     scene = type("Log", (), {"tracks": (track,)})()
-    assert cuboids(scene, 0.0)["yaw"] == pytest.approx([0.0])  # type: ignore[arg-type]
+    assert cuboids(scene, 0.0)["yaw"] == pytest.approx([0.0])
     assert yaw_of(yaw_matrix(np.pi)) == pytest.approx(np.pi)
     heading = pose_entry(yaw_matrix(np.pi / 2))["heading"]
     assert (heading["w"], heading["z"]) == pytest.approx((np.sqrt(0.5), np.sqrt(0.5)))
 
 
-# --- real data --------------------------------------------------------------------------------------------------------
+# --- real data ------------------------------------------------------------------------------------
 
 
 def test_real_points_lie_in_the_boxes_of_their_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> None:

@@ -19,8 +19,9 @@ def image(seed: int, height: int, width: int) -> np.ndarray:
 def test_area_and_bicubic_are_pillows_filters() -> None:
     rgb = image(0, 31, 47)
     for resize, rule in (
-        (pictures.resize_area, Image.Resampling.BOX), (pictures.resize_bicubic, Image.Resampling.BICUBIC),
-    ):  # fmt: skip
+        (pictures.resize_area, Image.Resampling.BOX),
+        (pictures.resize_bicubic, Image.Resampling.BICUBIC),
+    ):
         assert np.array_equal(resize(rgb, 20, 17), np.asarray(Image.fromarray(rgb).resize((20, 17), rule)))
         assert np.array_equal(resize(rgb, 47, 31), rgb)
     assert pictures.resize_bicubic(rgb, 47, 31) is not rgb

@@ -24,8 +24,15 @@ GOLDEN = Path(__file__).parent / "golden"
 def made(rng: np.random.Generator, depth: int) -> Any:
     """Some plain value."""
     kind = int(rng.integers(0, 10 if depth else 7))
-    leaves = (None, bool(rng.integers(2)), int(rng.integers(-(2**62), 2**62)) ** 3, float(rng.normal()), "gr\u00fcn\U0001f697",
-              b"\x00\xff", int(rng.integers(-300, 70000)))  # fmt: skip
+    leaves = (
+        None,
+        bool(rng.integers(2)),
+        int(rng.integers(-(2**62), 2**62)) ** 3,
+        float(rng.normal()),
+        "gr\u00fcn\U0001f697",
+        b"\x00\xff",
+        int(rng.integers(-300, 70000)),
+    )
     if kind < 7:
         return leaves[kind]
     inner = [made(rng, depth - 1) for _ in range(int(rng.integers(0, 4)))]
@@ -91,7 +98,7 @@ def test_the_writer_of_these_tests_writes_what_pandas_does(new: bool) -> None:
     }
 
 
-# --- nothing is run ---------------------------------------------------------------------------------------------------
+# --- nothing is run -------------------------------------------------------------------------------
 
 
 class Asks:
@@ -159,7 +166,7 @@ def test_allowed_names_cannot_be_bent_into_a_call() -> None:
             pandas_frame.parse_frame(content, "x")
 
 
-# --- damage and absurd sizes ------------------------------------------------------------------------------------------
+# --- damage and absurd sizes ----------------------------------------------------------------------
 
 
 def test_every_beginning_of_a_frame_is_refused() -> None:
@@ -187,10 +194,17 @@ def test_flipped_bytes_give_a_table_or_an_error_in_words() -> None:
 def array_pickle(shape: bytes, kind: bytes, data: bytes) -> bytes:
     """An array in protocol 4 with any shape (as opcodes) and bytes."""
     return (
-        b"\x80\x04\x8c\x15numpy.core.multiarray\x8c\x0c_reconstruct\x93\x8c\x05numpy\x8c\x07ndarray\x93K\x00\x85C\x01b\x87R"
-        b"(K\x01" + shape + b"\x8c\x05numpy\x8c\x05dtype\x93\x8c\x02" + kind + b"\x89\x88\x87R(K\x03\x8c\x01<NNNJ\xff\xff\xff"
-        b"\xffJ\xff\xff\xff\xffK\x00tb\x89C" + bytes([len(data)]) + data + b"tb."
-    )  # fmt: skip
+        b"\x80\x04\x8c\x15numpy.core.multiarray\x8c\x0c_reconstruct\x93"
+        b"\x8c\x05numpy\x8c\x07ndarray\x93K\x00\x85C\x01b\x87R"
+        b"(K\x01"
+        + shape
+        + b"\x8c\x05numpy\x8c\x05dtype\x93\x8c\x02"
+        + kind
+        + b"\x89\x88\x87R(K\x03\x8c\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89C"
+        + bytes([len(data)])
+        + data
+        + b"tb."
+    )
 
 
 def test_the_array_of_this_test_is_one() -> None:

@@ -54,7 +54,7 @@ def test_fast_is_a_name_for_a_preset_and_default_is_the_default() -> None:
         with pytest.raises(UsageError, match="another name of --preset fast"):
             words("--fast", "--preset", other)
     with pytest.raises(UsageError, match="no such preset"):
-        run_preset("best")  # type: ignore[arg-type]
+        run_preset("best")
 
 
 def test_defaults_then_preset_then_file_then_flags(tmp_path: Path) -> None:
@@ -99,7 +99,9 @@ def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_
         Run(source="city", out=out, settings=other).run()
     with pytest.raises(InputError, match="no diffusion model here"):
         Run(
-            source="city", out=out, settings=replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path / "none")))
+            source="city",
+            out=out,
+            settings=replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path / "none"))),
         ).run()
     with pytest.raises(UsageError, match="LPIPS needs a weight file"):
         mudg.run("city", out=out, preset="paper", synthesize={"model": "embedded"})

@@ -72,7 +72,9 @@ def test_after_an_error_no_call_begins_any_more(tmp_path: Path) -> None:
 
 def test_calls_end_in_any_order_and_all_are_told(tmp_path: Path) -> None:
     places = folders(tmp_path, *"abcde")
-    assert sorted(run_in_processes(begin_and_fail, [(place, False) for place in places], 3)) == [(n, None) for n in range(5)]
+    assert sorted(run_in_processes(begin_and_fail, [(place, False) for place in places], 3)) == [
+        (n, None) for n in range(5)
+    ]
     assert all((place / "begun").exists() for place in places)
     assert list(run_in_processes(begin_and_fail, [], 2)) == []
 
@@ -138,7 +140,8 @@ BESIDE = "with calls_beside(t.call, calls, 2):\n        time.sleep(600)"
 def stopped_command(
     tmp_path: Path, number: int, *, group: bool, calling: str = IN_TURN, first: str = "steps", after_s: float = 0.2
 ) -> tuple[int, str, list[int]]:
-    """A command with two workers, two calls that have begun and three that wait, is sent a signal: exit code, what it said, workers."""
+    """A command with two workers, two calls that have begun and three that wait, is sent a signal: exit code, what it
+    said, workers."""
     names = [first, "cleanup", "never", "never", "never"]
     given = folders(tmp_path, *(f"{index}{name}" for index, name in enumerate(names)))
     script = (
@@ -151,7 +154,8 @@ def stopped_command(
         f"    {calling}\n"
         "    return {}\n"
         "if __name__ == '__main__':\n"
-        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # ignored in what a script starts in the background
+        # ignored in what a script starts in the background
+        "    signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "    Doctor.run = work\n"
         "    sys.exit(app.main(['doctor']))\n"
     )
@@ -174,7 +178,11 @@ def stopped_command(
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
 @pytest.mark.parametrize(
     ("number", "group", "code"),
-    [(signal.SIGTERM, False, 143), pytest.param(signal.SIGINT, False, 130, marks=pytest.mark.slow), (signal.SIGINT, True, 130)],
+    [
+        (signal.SIGTERM, False, 143),
+        pytest.param(signal.SIGINT, False, 130, marks=pytest.mark.slow),
+        (signal.SIGINT, True, 130),
+    ],
 )
 def test_a_command_that_is_stopped_stops_its_workers(tmp_path: Path, number: int, group: bool, code: int) -> None:
     got, said, workers = stopped_command(tmp_path, number, group=group)

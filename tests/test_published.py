@@ -53,9 +53,12 @@ def some_condition(frames=4, height=8, width=12, seed=0):
     views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
     draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
     return Condition(
-        views, draw(frames, 3, height, width), 3 + 60 * draw(frames, 1, height, width), draw(frames, 1, height, width) > 0.5,
+        views,
+        draw(frames, 3, height, width),
+        3 + 60 * draw(frames, 1, height, width),
+        draw(frames, 1, height, width) > 0.5,
         draw(3, height, width),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -63,18 +66,23 @@ def model():
     return tiny_model()
 
 
-# golden values --------------------------------------------------------------------------------------------------------
+# golden values ------------------------------------------------------------------------------------
 
 
 @torch.no_grad()
 def test_denoising_network_equals_the_reference():
     values, theirs = golden("published_unet"), json.loads((GOLDEN / "published_unet.json").read_text())
     config = VideoUNetConfig(
-        channels_in=theirs["in_channels"], channels_out=theirs["out_channels"], width=theirs["model_channels"],
-        multipliers=tuple(theirs["channel_mult"]), blocks=theirs["num_res_blocks"],
+        channels_in=theirs["in_channels"],
+        channels_out=theirs["out_channels"],
+        width=theirs["model_channels"],
+        multipliers=tuple(theirs["channel_mult"]),
+        blocks=theirs["num_res_blocks"],
         attention=tuple(2**level in theirs["attention_resolutions"] for level in range(len(theirs["channel_mult"]))),
-        head_width=theirs["num_head_channels"], context_width=theirs["context_dim"], dropout=theirs["dropout"],
-    )  # fmt: skip
+        head_width=theirs["num_head_channels"],
+        context_width=theirs["context_dim"],
+        dropout=theirs["dropout"],
+    )
     net = fill(VideoUNet(config), "net.", "model.diffusion_model.")
     text, image = values["context"][:, :77], values["context"][:, 77:].unflatten(1, (16, 16))
     made = net(values["x"].transpose(1, 2), values["timesteps"], values["labels"], values["fps"], text, image)
@@ -100,7 +108,7 @@ def test_resampler_equals_the_reference():
     assert error(made.flatten(1, 2), values["y"]) < TOLERANCE
 
 
-# towers ---------------------------------------------------------------------------------------------------------------
+# towers -------------------------------------------------------------------------------------------
 
 
 def twin_block(x, block, mask):
@@ -172,7 +180,7 @@ def test_the_tokens_of_the_caption_are_padded_with_zeros():
     assert int(ids[9:].abs().sum()) == 0
 
 
-# modalities -----------------------------------------------------------------------------------------------------------
+# modalities ---------------------------------------------------------------------------------------
 
 
 def test_modalities_have_no_eight_bit_step(model):
@@ -186,7 +194,9 @@ def test_modalities_have_no_eight_bit_step(model):
     assert torch.allclose(back, depth.clamp(0, 100), atol=1e-4)
     ids = torch.arange(19).repeat(2).view(1, 2, 19)
     assert torch.equal(nearest_class(codec.semantic_image(ids)), ids)
-    mixed = 0.6 * codec.semantic_image(torch.tensor([[[0]]])) + 0.4 * codec.semantic_image(torch.tensor([[[palette.ID["pole"]]]]))
+    mixed = 0.6 * codec.semantic_image(torch.tensor([[[0]]])) + 0.4 * codec.semantic_image(
+        torch.tensor([[[palette.ID["pole"]]]])
+    )
     assert nearest_class(mixed).tolist() == [[[0]]]
     assert torch.equal(codec.semantic_image(torch.tensor([[[255]]])), torch.full((1, 3, 1, 1), -1.0))
 
@@ -232,7 +242,7 @@ def test_missing_is_zero_and_the_reference_is_frame_zero():
     assert torch.allclose(continued[0, 2], filled[0, 2], atol=1e-5)
 
 
-# sampling -------------------------------------------------------------------------------------------------------------
+# sampling -----------------------------------------------------------------------------------------
 
 
 def test_cuts_of_the_work_do_not_change_the_sample(model):
@@ -287,10 +297,13 @@ def test_guidance_is_that_of_the_schedule_module(model):
 def test_every_input_of_the_network_matters(model):
     generator = torch.Generator().manual_seed(0)
     given = {
-        "x": torch.randn(1, 4, 12, 8, 12, generator=generator), "t": torch.tensor([300]), "label": torch.tensor([0]),
-        "fps": torch.tensor([10]), "text": torch.randn(1, 77, 16, generator=generator),
+        "x": torch.randn(1, 4, 12, 8, 12, generator=generator),
+        "t": torch.tensor([300]),
+        "label": torch.tensor([0]),
+        "fps": torch.tensor([10]),
+        "text": torch.randn(1, 77, 16, generator=generator),
         "image": torch.randn(1, 4, 2, 16, generator=generator),
-    }  # fmt: skip
+    }
     with torch.no_grad():
         before = model.net(**given)
         for name, value in given.items():
@@ -317,7 +330,7 @@ def test_other_numbers_of_frames_are_refused(model):
         model.sample(some_condition(height=10), SampleRequest(1))
 
 
-# training -------------------------------------------------------------------------------------------------------------
+# training -----------------------------------------------------------------------------------------
 
 
 def batch_of(model, count=6):
@@ -329,7 +342,9 @@ def batch_of(model, count=6):
     return model.encode_truth(rgb, depth, ids, torch.Generator().manual_seed(2)), encoded
 
 
-@pytest.mark.parametrize(("stage", "temporal"), [(1, "transformers"), pytest.param(2, "transformers", marks=pytest.mark.slow), (2, "all")])
+@pytest.mark.parametrize(
+    ("stage", "temporal"), [(1, "transformers"), pytest.param(2, "transformers", marks=pytest.mark.slow), (2, "all")]
+)
 def test_a_training_step_moves_what_its_stage_says(stage, temporal):
     model = tiny_model()
     truth, encoded = batch_of(model, 3)
@@ -375,7 +390,8 @@ def test_checkpointing_gives_the_same_gradients():
 
 
 def test_loss_is_the_velocity_error_and_repeats(model):
-    """Against the same numbers computed here, from the same draws, with the network's passes replaced by a known function."""
+    """Against the same numbers computed here, from the same draws, with the network's passes replaced by a known
+    function."""
     truth, encoded = batch_of(model)
     seen = {}
 
@@ -392,7 +408,9 @@ def test_loss_is_the_velocity_error_and_repeats(model):
     eps = (seen["x"] - alpha * scale * x0) / sigma
     wanted = (alpha * eps - sigma * scale * x0).square().mean()
     assert float(losses.total.detach()) == pytest.approx(float(wanted), rel=1e-4)
-    one, two = (float(model.velocity_loss(truth, encoded, torch.Generator().manual_seed(9)).total.detach()) for _ in range(2))
+    one, two = (
+        float(model.velocity_loss(truth, encoded, torch.Generator().manual_seed(9)).total.detach()) for _ in range(2)
+    )
     assert one == two
 
 
@@ -422,7 +440,7 @@ def test_shares_of_modalities_and_missing_context(model):
     assert float((no_text & no_reference).float().mean()) == pytest.approx(0.05, abs=0.015)
 
 
-# files, command, memory -----------------------------------------------------------------------------------------------
+# files, command, memory ---------------------------------------------------------------------------
 
 
 def test_configuration_is_strict():
@@ -431,7 +449,9 @@ def test_configuration_is_strict():
     with pytest.raises(InputError, match="unknown field 'lens'"):
         parse_dataclass(PublishedConfig, {**values, "lens": 3}, "model.json")
     with pytest.raises(InputError, match="'width' is missing"):
-        parse_dataclass(PublishedConfig, {**values, "net": {k: v for k, v in values["net"].items() if k != "width"}}, "model.json")
+        parse_dataclass(
+            PublishedConfig, {**values, "net": {k: v for k, v in values["net"].items() if k != "width"}}, "model.json"
+        )
     with pytest.raises(InputError, match="not a whole number"):
         parse_dataclass(PublishedConfig, {**values, "fps": "10"}, "model.json")
     with pytest.raises(UsageError, match="context"):
@@ -474,7 +494,10 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
         assert bool(found[n].mask.all()) == (n > 0)  # frame 0 shows the recorded place, not the shifted one
     with pytest.raises(ResourceError, match="memory budget"):
         Synthesize(
-            scene=street / "scene", fused=street / "fused", out=tmp_path / "none", settings=replace(config, memory_budget_gb=0.5)
+            scene=street / "scene",
+            fused=street / "fused",
+            out=tmp_path / "none",
+            settings=replace(config, memory_budget_gb=0.5),
         ).run()
 
 

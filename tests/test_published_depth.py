@@ -1,4 +1,5 @@
-"""Generated depth of published-type models against what points measured: an exact generator is left alone, a distorted one is found out.
+"""Generated depth of published-type models against what points measured: an exact generator is left alone, a distorted
+one is found out.
 
 Exact depth is the ray-traced city's, or LiDAR points projected in float64.
 """
@@ -30,17 +31,22 @@ DISTORTIONS = ((0.5, 0.0), (0.8, 0.0), (1.25, 0.0), (2.0, 0.0), (1.0, 3.0), (1.0
 
 
 def standing_in(monkeypatch, depth):
-    """A published-type model whose networks are gone: its generated depth is `depth` f32[T,1,H,W], all else is empty."""
+    """A published-type model whose networks are gone: its generated depth is `depth` f32[T,1,H,W], all else is
+    empty."""
     model = tiny_model()
     frames, _, height, width = depth.shape
     factor = model.codec.factor
     cells = torch.zeros(1, frames, 1, height // factor, width // factor)
     latents = PublishedLatents(cells, cells, cells, cells + 1)
-    nothing = SimpleNamespace(rgb=torch.zeros(frames, 3, height, width), depth=depth, semantics=torch.zeros(frames, height, width).long())
+    nothing = SimpleNamespace(
+        rgb=torch.zeros(frames, 3, height, width), depth=depth, semantics=torch.zeros(frames, height, width).long()
+    )
     monkeypatch.setattr(model, "encode_condition", lambda *_: latents)
     monkeypatch.setattr(model, "image_tokens", torch.nn.Identity())
     model.image_tokens.queries = torch.zeros(1)
-    monkeypatch.setattr(model, "_denoise", lambda *_: (dict.fromkeys(("rgb", "depth", "semantics"), cells[0]), cells[0]))
+    monkeypatch.setattr(
+        model, "_denoise", lambda *_: (dict.fromkeys(("rgb", "depth", "semantics"), cells[0]), cells[0])
+    )
     monkeypatch.setattr(model.codec, "decode", lambda *_: nothing)
     return model
 
@@ -55,7 +61,9 @@ def city_of(width, height):
     return world, fuse_sweeps(shots, world.tracks(), FusionRules(min_object_points=40))[0], photos
 
 
-LARGE = [pytest.param(sizes, marks=pytest.mark.slow) for sizes in (((1242, 375), (1024, 576)), ((640, 193), (512, 320)))]
+LARGE = [
+    pytest.param(sizes, marks=pytest.mark.slow) for sizes in (((1242, 375), (1024, 576)), ((640, 193), (512, 320)))
+]
 
 
 @pytest.fixture(scope="module", params=[*LARGE, ((384, 256), (256, 144))], ids=str)
@@ -64,7 +72,9 @@ def exact(request):
     recorded, (width, height) = request.param
     world, cloud, photos = city_of(*recorded)
     views = world.frame_views("front")
-    condition = build_conditions(cloud, world.tracks(), views, photos, ConditionRules(width, height, *recorded, published=True))[0]
+    condition = build_conditions(
+        cloud, world.tracks(), views, photos, ConditionRules(width, height, *recorded, published=True)
+    )[0]
     depth = np.stack([world.render(view.resized(width, height)).depth for view in views])[:, None]
     return condition, torch.from_numpy(np.nan_to_num(depth, nan=100.0, posinf=100.0)).float().clamp(max=100)
 
@@ -114,12 +124,18 @@ def kitti(shared_data, tmp_path_factory):
 
 
 def points_at(cloud, view):
-    """Depth f64[H,W] of the nearest static point of every pixel, by pinhole arithmetic in float64, gaps taking the nearest pixel's."""
+    """Depth f64[H,W] of the nearest static point of every pixel, by pinhole arithmetic in float64, gaps taking the
+    nearest pixel's."""
     camera = view.camera
-    x, y, z = (np.linalg.inv(view.world_from_cam) @ np.c_[cloud.static.xyz.astype(np.float64), np.ones(len(cloud.static))].T)[:3]
+    x, y, z = (
+        np.linalg.inv(view.world_from_cam) @ np.c_[cloud.static.xyz.astype(np.float64), np.ones(len(cloud.static))].T
+    )[:3]
     ahead = z > 1
     x, y, z = x[ahead], y[ahead], z[ahead]
-    column, row = np.floor(camera.fx * x / z + camera.cx).astype(int), np.floor(camera.fy * y / z + camera.cy).astype(int)
+    column, row = (
+        np.floor(camera.fx * x / z + camera.cx).astype(int),
+        np.floor(camera.fy * y / z + camera.cy).astype(int),
+    )
     inside = (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height) & (z < 100)
     depth = np.full((camera.height, camera.width), np.inf)
     np.minimum.at(depth, (row[inside], column[inside]), z[inside])

@@ -1,4 +1,5 @@
-"""Sampling of the published kind of model: how often which network runs, what is shared, and what fits into which memory."""
+"""Sampling of the published kind of model: how often which network runs, what is shared, and what fits into which
+memory."""
 
 from __future__ import annotations
 
@@ -26,16 +27,19 @@ def model():
 
 
 def same(one, other):
-    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in ("rgb", "depth", "semantics", "confidence"))
+    return all(
+        torch.equal(getattr(one, name), getattr(other, name)) for name in ("rgb", "depth", "semantics", "confidence")
+    )
 
 
-# passes ---------------------------------------------------------------------------------------------------------------
+# passes -------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("steps", [50, 20, 8])
 @pytest.mark.parametrize("guidance", [None, 1.0])
 def test_passes_for_a_clip(model, monkeypatch, steps, guidance):
-    """The numbers of docs/published.md: the denoising network once per step, with everything in one batch; the rest once per clip."""
+    """The numbers of docs/published.md: the denoising network once per step, with everything in one batch; the rest
+    once per clip."""
     rows: dict[str, list[int]] = {}
 
     def watch(owner, name="forward", answer=None):
@@ -81,7 +85,9 @@ def test_keys_belong_to_their_layers(model):
     text, image = torch.randn(2, 77, 16, generator=draw), torch.randn(2, 4, 2, 16, generator=draw)
     plain = model.net(x, at, label, fps, text, image)
     assert torch.equal(plain, model.net(x, at, label, fps, text, image, model.net.context_keys(text, image)))
-    assert not torch.equal(plain, model.net(x, at, label, fps, text, image, model.net.context_keys(text.flip(0), image)))
+    assert not torch.equal(
+        plain, model.net(x, at, label, fps, text, image, model.net.context_keys(text.flip(0), image))
+    )
 
 
 @pytest.mark.slow
@@ -98,7 +104,7 @@ def test_a_compiled_network_makes_the_same(model):
     torch._dynamo.reset()
 
 
-# memory ---------------------------------------------------------------------------------------------------------------
+# memory -------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -121,14 +127,20 @@ def test_inputs_that_die_hide_nothing():
 
 
 @pytest.mark.parametrize(
-    ("card_gb", "together", "frames"), [(16, (True, False), 8), (24, (True, True), 16), (40, (True, True), 16), (80, (True, True), 16)]
+    ("card_gb", "together", "frames"),
+    [(16, (True, False), 8), (24, (True, True), 16), (40, (True, True), 16), (80, (True, True), 16)],
 )
 @pytest.mark.slow
 def test_what_fits_on_a_card(full, card_gb, together, frames):
-    """At 576x1024; and a whole clip, from condition to pixels, run on the meta device as the plan says, takes no more."""
+    """At 576x1024; and a whole clip, from condition to pixels, run on the meta device as the plan says, takes no
+    more."""
     model, needs = full
     split, peak_bytes = memory_plan.choose(needs, card_gb * 10**9)
-    assert ((split.modalities_together, split.guidance_together), split.frames_at_once, split.offload) == (together, frames, False)
+    assert ((split.modalities_together, split.guidance_together), split.frames_at_once, split.offload) == (
+        together,
+        frames,
+        False,
+    )
     assert peak_bytes <= card_gb * 10**9
     if card_gb > 24:
         return  # as with 24
@@ -147,7 +159,9 @@ def test_the_tower_goes_where_that_avoids_a_smaller_cut(full):
     asked, _ = memory_plan.choose(needs, 80_000_000_000, offload=(True,))
     assert asked.offload and asked.guidance_together
     _, least = memory_plan.choose(needs, 1)
-    assert least == pytest.approx(needs.parameters - needs.tower + needs.clip + needs.one_video + memory_plan.RESERVE_BYTES, rel=0.1)
+    assert least == pytest.approx(
+        needs.parameters - needs.tower + needs.clip + needs.one_video + memory_plan.RESERVE_BYTES, rel=0.1
+    )
 
 
 def test_frames_go_through_the_autoencoder_in_any_number(model):

@@ -88,10 +88,10 @@ def test_verbs_check_settings_as_the_command_does(notebook: dict[str, Any], tmp_
 def test_what_a_notebook_gets_wrong_is_refused_in_words(notebook: dict[str, Any], tmp_path: Path) -> None:
     scene, view = notebook["folder"] / "scene", notebook["view"]
     for said, wrong in (
-        ("--views", lambda: mudg.score(scene, ["views"], out=tmp_path / "a")),  # type: ignore[arg-type]
+        ("--views", lambda: mudg.score(scene, ["views"], out=tmp_path / "a")),
         ("--shifts-m", lambda: mudg.run("city", out=tmp_path / "a", shifts_m=2.0)),
         ("--cameras", lambda: mudg.run("city", out=tmp_path / "a", cameras="front")),
-        ("--seed", lambda: mudg.run("city", out=tmp_path / "a", seed="x")),  # type: ignore[arg-type]
+        ("--seed", lambda: mudg.run("city", out=tmp_path / "a", seed="x")),
         (
             r"loss: \{ssim_weight: \.\.\.\}",
             lambda: mudg.fit(scene, scene, out=tmp_path / "a", **{"loss.ssim_weight": 0.1}),

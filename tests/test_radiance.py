@@ -32,11 +32,13 @@ from mudg.steps.fitted import FittedScene
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
 
-TINY = {
-    "method": "emernerf", "iterations": 8, "preview_every": 100, "checkpoint_every": 4,
-    **SMALL_RADIANCE,
-}  # fmt: skip
-FEW_RAYS = {"radiance__rays": 8, "radiance__lidar_rays": 8, "radiance__proposal_samples": (6, 4), "radiance__samples": 4}
+TINY = {"method": "emernerf", "iterations": 8, "preview_every": 100, "checkpoint_every": 4, **SMALL_RADIANCE}
+FEW_RAYS = {
+    "radiance__rays": 8,
+    "radiance__lidar_rays": 8,
+    "radiance__proposal_samples": (6, 4),
+    "radiance__samples": 4,
+}
 
 
 def drawn(*shape: int, name: str = "values", dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -45,16 +47,20 @@ def drawn(*shape: int, name: str = "values", dtype: torch.dtype = torch.float64)
 
 def tiny_field() -> RadianceField:
     sizes = loop.sizes_of(fit_config(**TINY).radiance)
-    return RadianceField(sizes, Extent((1.0, 2.0, 3.0), (10.0, 20.0, 5.0), 0.0, 2.0, 0.2), ("front",), {"method": "emernerf"})
+    return RadianceField(
+        sizes, Extent((1.0, 2.0, 3.0), (10.0, 20.0, 5.0), 0.0, 2.0, 0.2), ("front",), {"method": "emernerf"}
+    )
 
 
-# ---- space and rays --------------------------------------------------------------------------------------------------
+# ---- space and rays ------------------------------------------------------------------------------
 
 
 def test_the_box_fills_the_inner_half_and_infinity_is_the_border():
     center, half = torch.tensor([1.0, 2.0, 3.0]), torch.tensor([10.0, 20.0, 5.0])
     places = torch.tensor([[1.0, 2, 3], [11, 2, 3], [1, -18, 3], [21, 2, 3], [1, 2, 1e9], [21, 22, 3]])
-    wanted = torch.tensor([[0.5, 0.5, 0.5], [0.75, 0.5, 0.5], [0.5, 0.25, 0.5], [0.875, 0.5, 0.5], [0.5, 0.5, 1.0], [0.875, 0.6875, 0.5]])
+    wanted = torch.tensor(
+        [[0.5, 0.5, 0.5], [0.75, 0.5, 0.5], [0.5, 0.25, 0.5], [0.875, 0.5, 0.5], [0.5, 0.5, 1.0], [0.875, 0.6875, 0.5]]
+    )
     assert torch.allclose(sampling.contract(places, center, half), wanted)
 
 
@@ -111,7 +117,10 @@ def test_proposals_that_agree_cost_nothing_and_others_do():
     weights = drawn(3, 8, name="weights")
     weights = weights / weights.sum(1, keepdim=True)
     assert float(sampling.interlevel_loss(edges, weights, edges, weights, 0.0)) < 1e-6
-    even, flat = torch.linspace(0, 1, 9, dtype=torch.float64).expand(2, -1), torch.full((2, 8), 0.125, dtype=torch.float64)
+    even, flat = (
+        torch.linspace(0, 1, 9, dtype=torch.float64).expand(2, -1),
+        torch.full((2, 8), 0.125, dtype=torch.float64),
+    )
     assert float(sampling.interlevel_loss(even, flat, even, flat, 0.03)) == pytest.approx(0.0, abs=1e-12)
     assert float(sampling.interlevel_loss(edges, weights, edges, weights.flip(1), 0.0)) > 1e-2
 
@@ -123,11 +132,16 @@ def test_only_the_proposal_learns_from_the_interlevel_loss():
     assert weights.grad is None and proposal.grad.abs().sum() > 0
 
 
-# ---- the field -------------------------------------------------------------------------------------------------------
+# ---- the field -----------------------------------------------------------------------------------
 
 
 def test_flow_aggregation_equals_a_loop_and_moves_its_flow():
-    xyz, time, flow, share = drawn(6, 3), drawn(6, 1, name="t"), drawn(6, 6, name="f").requires_grad_(), drawn(6, 1, name="n")
+    xyz, time, flow, share = (
+        drawn(6, 3),
+        drawn(6, 1, name="t"),
+        drawn(6, 6, name="f").requires_grad_(),
+        drawn(6, 1, name="n"),
+    )
 
     def feature(places: torch.Tensor, times: torch.Tensor) -> torch.Tensor:
         return torch.cat([places.square().sum(1, keepdim=True), times * places[:, :1]], 1)
@@ -135,8 +149,11 @@ def test_flow_aggregation_equals_a_loop_and_moves_its_flow():
     found, step = aggregated(feature, xyz, time, flow, share, 0.1), 0.1
     for i in range(6):
         n = share[i]
-        terms = [feature(xyz[i : i + 1], time[i : i + 1]), 0.5 * feature((xyz[i] + n * flow[i, :3])[None], (time[i] + n * step)[None]),
-                 0.5 * feature((xyz[i] + n * flow[i, 3:])[None], (time[i] - n * step)[None])]  # fmt: skip
+        terms = [
+            feature(xyz[i : i + 1], time[i : i + 1]),
+            0.5 * feature((xyz[i] + n * flow[i, :3])[None], (time[i] + n * step)[None]),
+            0.5 * feature((xyz[i] + n * flow[i, 3:])[None], (time[i] - n * step)[None]),
+        ]
         assert torch.allclose(found[i], sum(terms)[0] / 2)
     found.sum().backward()
     assert (flow.grad.abs() > 0).all()
@@ -145,7 +162,9 @@ def test_flow_aggregation_equals_a_loop_and_moves_its_flow():
 def test_each_proposal_round_asks_its_own_network(monkeypatch):
     field, asked = tiny_field(), []
     real = field.proposed_density
-    monkeypatch.setattr(field, "proposed_density", lambda level, xyz: (asked.append((level, len(xyz))), real(level, xyz))[1])
+    monkeypatch.setattr(
+        field, "proposed_density", lambda level, xyz: (asked.append((level, len(xyz))), real(level, xyz))[1]
+    )
     rays, _ = view_rays(view_at(0.0, _camera(4, 2)), field.extent, 0)
     marching.march(field, rays, Budget((16, 12), 8, 0.1, 1000.0))
     assert asked == [(0, 8 * 16), (1, 8 * 12)]
@@ -158,7 +177,9 @@ def test_color_loss_reaches_every_field_and_proposals_learn_only_when_asked():
     draws = RayDraws.of(len(rays), budget, seeds.torch_generator(0, 1, "draws"), torch.device("cpu"))
     marched = marching.march(field, rays, budget, draws)
     marching.colors(field, rays, marched)[0].square().mean().backward()
-    reached = {name for name, value in field.named_parameters() if value.grad is not None and value.grad.abs().sum() > 0}
+    reached = {
+        name for name, value in field.named_parameters() if value.grad is not None and value.grad.abs().sum() > 0
+    }
     for part in ("static.table", "dynamic.table", "flow.net.weights.0", "color.out", "shadow", "sky", "appearance"):
         assert any(name.startswith(part) for name in reached), part
     assert not any(name.startswith("proposals") for name in reached)
@@ -201,7 +222,7 @@ def _camera(width: int, height: int):
     return camera("front", width, height)
 
 
-# ---- the fit ---------------------------------------------------------------------------------------------------------
+# ---- the fit -------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -239,7 +260,9 @@ def test_resumed_equals_uninterrupted(world, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "take_step", stopped)
     with pytest.raises(KeyboardInterrupt):
         Fit(scene=world / "scene", out=tmp_path / "fit", settings=fit_config(**TINY)).run()
-    monkeypatch.setattr(loop, "take_step", lambda state, config, step: (calls.append(step), real(state, config, step))[1])
+    monkeypatch.setattr(
+        loop, "take_step", lambda state, config, step: (calls.append(step), real(state, config, step))[1]
+    )
     Fit(scene=world / "scene", out=tmp_path / "fit", settings=fit_config(**TINY)).run()
     assert calls == [1, 2, 3, 4, 5, 6, 5, 6, 7, 8]
     assert same(parameters(world / "fit"), parameters(tmp_path / "fit"))
@@ -251,12 +274,15 @@ def started(world: Path, device: torch.device | str = "cpu", **changes: object) 
         path = world / "none"
 
     config = fit_config(**TINY | changes)
-    return loop.prepare(config, read_scene(world / "scene"), Folder(), torch.device(device)), config  # type: ignore[arg-type]
+    return loop.prepare(config, read_scene(world / "scene"), Folder(), torch.device(device)), config
 
 
 def test_a_short_fit_lowers_its_losses(world):
     state, config = started(world, iterations=80, radiance__rays=128, radiance__lidar_rays=128, radiance__samples=16)
-    lines = [{name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()} for step in range(1, 81)]
+    lines = [
+        {name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()}
+        for step in range(1, 81)
+    ]
     for name in ("color", "lidar"):
         assert sum(line[name] for line in lines[-10:]) < 0.8 * sum(line[name] for line in lines[:10]), name
 
@@ -265,7 +291,10 @@ def test_a_short_fit_lowers_its_losses(world):
 def test_a_step_on_another_device_is_the_same(world):
     with pretend_device() as there:
         state, config = started(world, there, **FEW_RAYS)
-        elsewhere = [{name: float(value.detach().cpu()) for name, value in loop.take_step(state, config, step).items()} for step in (1, 2)]
+        elsewhere = [
+            {name: float(value.detach().cpu()) for name, value in loop.take_step(state, config, step).items()}
+            for step in (1, 2)
+        ]
     state, config = started(world, **FEW_RAYS)
     for step, found in zip((1, 2), elsewhere):
         for name, value in loop.take_step(state, config, step).items():
@@ -283,7 +312,10 @@ def test_what_is_not_finite_never_reaches_the_parameters(world):
 
 def test_renders_as_observations_without_classes(world, tmp_path):
     out = RenderViews(
-        scene=world / "scene", model=world / "fit", out=tmp_path / "render", settings=RenderConfig(shifts_m=(0.0, 2.0), video=True)
+        scene=world / "scene",
+        model=world / "fit",
+        out=tmp_path / "render",
+        settings=RenderConfig(shifts_m=(0.0, 2.0), video=True),
     ).run()
     seen = read_observations(out / "front_shift+2.0")[1]
     assert seen.source == "emernerf" and seen.semantics is None
@@ -292,7 +324,10 @@ def test_renders_as_observations_without_classes(world, tmp_path):
     assert len(known) and (known > 0).all()
     with pytest.raises(UsageError, match="no objects"):
         RenderViews(
-            scene=world / "scene", model=world / "fit", out=tmp_path / "other", settings=RenderConfig(remove_tracks=("car",))
+            scene=world / "scene",
+            model=world / "fit",
+            out=tmp_path / "other",
+            settings=RenderConfig(remove_tracks=("car",)),
         ).run()
 
 
@@ -312,7 +347,11 @@ def test_what_needs_gaussians_refuses_a_radiance_field(world, tmp_path):
         FittedScene.read(world / "fit", "cpu")
     with pytest.raises(InputError, match="radiance field"):
         Synthesize(
-            scene=world / "scene", fused=world / "fuse", fitted=world / "fit", out=tmp_path / "virtual", settings=SynthesizeConfig()
+            scene=world / "scene",
+            fused=world / "fuse",
+            fitted=world / "fit",
+            out=tmp_path / "virtual",
+            settings=SynthesizeConfig(),
         ).run()
     with pytest.raises(InputError, match="no radiance field"):
         load_field_of_gaussians(tmp_path)
@@ -329,13 +368,15 @@ def load_field_of_gaussians(folder: Path) -> None:
 
 def test_published_sizes_are_settings_of_the_same_code(tmp_path):
     page = (Path(__file__).parents[1] / "docs" / "baselines.md").read_text(encoding="utf-8")
-    (tmp_path / "emernerf.yaml").write_text(page.partition("--config emernerf.yaml")[2].split("```yaml\n")[1].split("```")[0])
+    (tmp_path / "emernerf.yaml").write_text(
+        page.partition("--config emernerf.yaml")[2].split("```yaml\n")[1].split("```")[0]
+    )
     config = configuration.load(FitConfig, None, tmp_path / "emernerf.yaml")
     assert config.iterations == 25_000 and config.radiance.static_grid == (10, 4, 16, 8192, 20)
     assert isinstance(loop.sizes_of(config.radiance), FieldSizes)
 
 
-# ---- rays ------------------------------------------------------------------------------------------------------------
+# ---- rays ----------------------------------------------------------------------------------------
 
 
 def test_pixels_and_lidar_are_rays_of_the_world(world):

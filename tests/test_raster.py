@@ -69,24 +69,37 @@ def _axis_view(width: int, height: int, focal: float = 20.0) -> View:
     return View(Camera("front", width, height, focal, focal, width / 2, height / 2), np.eye(4), 0.0)
 
 
-def _parameters(count: int, seed: int = 0, degree: int = 3, channels: int = 5, dtype: torch.dtype = torch.float32) -> Parameters:
-    """A cloud in front of `_view`, with large, small, flat, faint and nearly opaque Gaussians, some behind the camera."""
+def _parameters(
+    count: int, seed: int = 0, degree: int = 3, channels: int = 5, dtype: torch.dtype = torch.float32
+) -> Parameters:
+    """A cloud in front of `_view`, with large, small, flat, faint and nearly opaque Gaussians, some behind the
+    camera."""
     rng = np.random.default_rng(seed)
     z = np.exp(rng.uniform(np.log(1.5), np.log(40), count)) * np.where(rng.random(count) < 0.08, -1, 1)
     xyz = np.stack([z * rng.uniform(-0.7, 0.7, count), z * rng.uniform(-0.6, 0.6, count), z], 1)
     scales = np.abs(z)[:, None] * np.exp(rng.uniform(np.log(0.004), np.log(0.12), (count, 3)))
     scales[::7, 0] *= 0.02
     values = {
-        "means": xyz, "quats": rng.standard_normal((count, 4)), "scales": scales,
+        "means": xyz,
+        "quats": rng.standard_normal((count, 4)),
+        "scales": scales,
         "opacity": np.where(rng.random(count) < 0.4, rng.uniform(0.6, 0.998, count), rng.uniform(0.01, 0.5, count)),
-        "sh": 0.3 * rng.standard_normal((count, (degree + 1) ** 2, 3)), "extra": rng.standard_normal((count, channels)),
-    }  # fmt: skip
+        "sh": 0.3 * rng.standard_normal((count, (degree + 1) ** 2, 3)),
+        "extra": rng.standard_normal((count, channels)),
+    }
     return {name: torch.tensor(value, dtype=torch.float32).to(dtype) for name, value in values.items()}
 
 
 def _gaussians(p: Parameters) -> Gaussians:
-    return Gaussians(p["means"], p["quats"], p["scales"], p["opacity"], p["sh"], p.get("extra"),
-                     torch.zeros(len(p["means"]), dtype=torch.int32))  # fmt: skip
+    return Gaussians(
+        p["means"],
+        p["quats"],
+        p["scales"],
+        p["opacity"],
+        p["sh"],
+        p.get("extra"),
+        torch.zeros(len(p["means"]), dtype=torch.int32),
+    )
 
 
 def _leaves(p: Parameters, dtype: torch.dtype = torch.float32) -> Parameters:
@@ -96,9 +109,13 @@ def _leaves(p: Parameters, dtype: torch.dtype = torch.float32) -> Parameters:
 def _one(mean: tuple[float, float, float], scale: float, opacity: float, rgb: tuple[float, float, float]) -> Parameters:
     sh = (torch.tensor(rgb) - 0.5) / 0.2820947917738781
     return {
-        "means": torch.tensor([mean]), "quats": torch.tensor([[1.0, 0, 0, 0]]), "scales": torch.full((1, 3), scale),
-        "opacity": torch.tensor([opacity]), "sh": sh[None, None], "extra": torch.tensor([[2.0]]),
-    }  # fmt: skip
+        "means": torch.tensor([mean]),
+        "quats": torch.tensor([[1.0, 0, 0, 0]]),
+        "scales": torch.full((1, 3), scale),
+        "opacity": torch.tensor([opacity]),
+        "sh": sh[None, None],
+        "extra": torch.tensor([[2.0]]),
+    }
 
 
 @pytest.fixture(params=["torch", pytest.param("cpu", marks=needs_native)])
@@ -106,7 +123,7 @@ def config(request: pytest.FixtureRequest) -> RasterConfig:
     return RasterConfig(backend=request.param)
 
 
-# ---- known answers -------------------------------------------------------------------------------------------------
+# ---- known answers -------------------------------------------------------------------------------
 
 
 def test_one_gaussian_on_the_axis_has_the_alpha_of_the_formula(config: RasterConfig) -> None:
@@ -180,7 +197,7 @@ def test_means2d_are_those_of_the_one_projection(config: RasterConfig) -> None:
     assert (trace.means2d.numpy()[~seen] == 0).all()
 
 
-# ---- against the float64 specification -----------------------------------------------------------------------------
+# ---- against the float64 specification -----------------------------------------------------------
 
 
 def _weighted(out: Render, weights: dict[str, Tensor]) -> Tensor:
@@ -196,11 +213,25 @@ def test_native_agrees_with_the_float64_reference(isa: str, antialias: bool, see
     pose64 = pose32.detach().double().requires_grad_()
     color32 = torch.tensor([0.2, 0.5, 0.7], requires_grad=True)
     color64 = color32.detach().double().requires_grad_()
-    got = rasterize(_gaussians(single), view, replace(CPU, antialias=antialias), background=color32, world_from_cam=pose32, absgrad=True)
-    want = rasterize(_gaussians(double), view, replace(TORCH, antialias=antialias), background=color64, world_from_cam=pose64, absgrad=True)
+    got = rasterize(
+        _gaussians(single),
+        view,
+        replace(CPU, antialias=antialias),
+        background=color32,
+        world_from_cam=pose32,
+        absgrad=True,
+    )
+    want = rasterize(
+        _gaussians(double),
+        view,
+        replace(TORCH, antialias=antialias),
+        background=color64,
+        world_from_cam=pose64,
+        absgrad=True,
+    )
 
-    # A pixel on the very edge of the alpha cut or of the stopping rule may fall to either side: such pixels (the stated band)
-    # may be at most 0.5 % and are left out of the rest.
+    # A pixel on the very edge of the alpha cut or of the stopping rule may fall to either side: such pixels (the stated
+    # band) may be at most 0.5 % and are left out of the rest.
     names = ("rgb", "depth", "alpha", "extra")
     errors = []
     for n in names:
@@ -214,7 +245,10 @@ def test_native_agrees_with_the_float64_reference(isa: str, antialias: bool, see
     _weighted(want, weights).backward()
     pairs = {name: (single[name].grad, double[name].grad) for name in GROUPS}
     pairs |= {"pose": (pose32.grad, pose64.grad), "background": (color32.grad, color64.grad)}
-    pairs |= {"means2d": (got.trace.means2d.grad, want.trace.means2d.grad), "abs": (got.trace.abs_grad2d, want.trace.abs_grad2d)}
+    pairs |= {
+        "means2d": (got.trace.means2d.grad, want.trace.means2d.grad),
+        "abs": (got.trace.abs_grad2d, want.trace.abs_grad2d),
+    }
     for name, (mine, reference) in pairs.items():
         assert mine is not None
         assert reference is not None
@@ -244,7 +278,7 @@ def test_reference_gradients_match_finite_differences() -> None:
     assert torch.autograd.gradcheck(draw, inputs, eps=1e-7, atol=1e-4, rtol=1e-4, fast_mode=True)
 
 
-# ---- invariants ----------------------------------------------------------------------------------------------------
+# ---- invariants ----------------------------------------------------------------------------------
 
 
 def _everything(p: Parameters, view: View, config: RasterConfig) -> list[Tensor]:
@@ -327,7 +361,7 @@ def test_any_number_of_channels_gives_the_same_numbers(channels: int) -> None:
     (a.extra[:channels].square().sum() + a.rgb.sum()).backward()
     (b.extra.square().sum() + b.rgb.sum()).backward()
     torch.testing.assert_close(full["means"].grad, part["means"].grad, rtol=1e-4, atol=1e-4)
-    torch.testing.assert_close(full["extra"].grad[:, :channels], part["extra"].grad, rtol=1e-5, atol=1e-5)  # type: ignore[index]
+    torch.testing.assert_close(full["extra"].grad[:, :channels], part["extra"].grad, rtol=1e-5, atol=1e-5)
 
 
 def test_no_features_means_none(config: RasterConfig) -> None:
@@ -356,13 +390,13 @@ def test_several_graphs_may_be_alive_and_end_in_any_order() -> None:
     alone = []
     for scene in scenes:
         rasterize(_gaussians(scene), view, CPU).rgb.square().sum().backward()
-        alone.append(scene["means"].grad.clone())  # type: ignore[union-attr]
+        alone.append(scene["means"].grad.clone())
         scene["means"].grad = None
     losses = [rasterize(_gaussians(scene), view, CPU).rgb.square().sum() for scene in scenes]
     for index in (1, 2, 0):
         losses[index].backward()
     for scene, expected in zip(scenes, alone):
-        assert torch.equal(scene["means"].grad, expected)  # type: ignore[arg-type]
+        assert torch.equal(scene["means"].grad, expected)
 
 
 @needs_native
@@ -388,7 +422,7 @@ def test_backward_twice_adds_up_and_editing_an_input_is_refused(config: RasterCo
     p = _leaves(_parameters(50))
     loss = rasterize(_gaussians(p), _view(), config).rgb.sum()
     loss.backward(retain_graph=True)
-    once = p["means"].grad.clone()  # type: ignore[union-attr]
+    once = p["means"].grad.clone()
     loss.backward(retain_graph=True)
     torch.testing.assert_close(p["means"].grad, 2 * once)
     if config.backend == "torch":
@@ -407,12 +441,15 @@ def test_no_gradient_is_recorded_where_none_is_wanted(config: RasterConfig) -> N
         assert not rasterize(_gaussians(_leaves(_parameters(50))), _view(), config).rgb.requires_grad
 
 
-# ---- several views at once -----------------------------------------------------------------------------------------
+# ---- several views at once -----------------------------------------------------------------------
 
 
 def _three_views() -> tuple[View, ...]:
     view = _view()
-    nearer, other = view.world_from_cam.copy(), Camera("left", view.camera.width, view.camera.height, 30.0, 31.0, 20.0, 22.0)
+    nearer, other = (
+        view.world_from_cam.copy(),
+        Camera("left", view.camera.width, view.camera.height, 30.0, 31.0, 20.0, 22.0),
+    )
     nearer[:3, 3] += [0.1, 0.05, 0.4]
     return view, View(view.camera, nearer, 0.1), View(other, view.world_from_cam, 0.0)
 
@@ -431,13 +468,15 @@ def test_several_views_at_once_equal_the_single_ones(config: RasterConfig, backg
     _weighted(batch, weights).backward()
     for index, view in enumerate(views):
         behind = given[index] if given is not None and background in ("each", "pictures") else given
-        single = rasterize(_gaussians(alone), view, config, background=behind, world_from_cam=single_poses[index], absgrad=True)
+        single = rasterize(
+            _gaussians(alone), view, config, background=behind, world_from_cam=single_poses[index], absgrad=True
+        )
         _weighted(single, {n: w[index] for n, w in weights.items()}).backward()
         for name in weights:
             assert torch.equal(getattr(batch, name)[index], getattr(single, name)), name
         for name in ("means2d", "radii", "visible", "abs_grad2d"):
             assert torch.equal(getattr(batch.trace, name)[index], getattr(single.trace, name)), name
-        assert torch.equal(batch.trace.means2d.grad[index], single.trace.means2d.grad)  # type: ignore[index,arg-type]
+        assert torch.equal(batch.trace.means2d.grad[index], single.trace.means2d.grad)
     torch.testing.assert_close(batch_poses.grad, single_poses.grad, rtol=1e-6, atol=1e-6)
     for name in GROUPS:  # sums over the views, in another order
         mine, theirs = together[name].grad, alone[name].grad
@@ -466,7 +505,9 @@ def test_views_that_do_not_fit_together_are_refused() -> None:
         rasterize(g, [_view(), _view()], TORCH, background=torch.zeros(3, 3))
 
 
-def test_a_rolling_shutter_is_named_and_old_lens_coefficients_change_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_rolling_shutter_is_named_and_old_lens_coefficients_change_nothing(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     plain, p = _view(), _parameters(20)
     camera = replace(plain.camera, name="rolling test", distortion=(0.1, -0.2), readout_s=0.03)
     out = rasterize(_gaussians(p), View(camera, plain.world_from_cam, 0.0), TORCH)
@@ -475,7 +516,7 @@ def test_a_rolling_shutter_is_named_and_old_lens_coefficients_change_nothing(cap
     assert torch.equal(out.rgb, rasterize(_gaussians(p), plain, TORCH).rgb)
 
 
-# ---- odd sizes and poison ------------------------------------------------------------------------------------------
+# ---- odd sizes and poison ------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (1, 40), (33, 1), (16, 16), (17, 15)])
@@ -520,12 +561,30 @@ def test_parameters_that_are_not_finite_are_refused_by_name(config: RasterConfig
 
 @pytest.mark.parametrize(
     ("name", "bad"),
-    [("means", 1e38), ("means", -1e38), ("means", 1e-40), ("quats", 0.0), ("quats", 1e-30), ("quats", 1e38), ("scales", 0.0),
-     ("scales", 1e-40), ("scales", 1e38), ("scales", 1e15), ("scales", -0.5), ("opacity", 0.0), ("opacity", 1.0), ("opacity", 1 / 255),
-     ("opacity", 1e-40), ("opacity", -1.0), ("opacity", 7.0)],
-)  # fmt: skip
+    [
+        ("means", 1e38),
+        ("means", -1e38),
+        ("means", 1e-40),
+        ("quats", 0.0),
+        ("quats", 1e-30),
+        ("quats", 1e38),
+        ("scales", 0.0),
+        ("scales", 1e-40),
+        ("scales", 1e38),
+        ("scales", 1e15),
+        ("scales", -0.5),
+        ("opacity", 0.0),
+        ("opacity", 1.0),
+        ("opacity", 1 / 255),
+        ("opacity", 1e-40),
+        ("opacity", -1.0),
+        ("opacity", 7.0),
+    ],
+)
 @pytest.mark.parametrize("antialias", [False, True])
-def test_finite_poison_is_drawn_or_culled_and_never_spreads(config: RasterConfig, name: str, bad: float, antialias: bool) -> None:
+def test_finite_poison_is_drawn_or_culled_and_never_spreads(
+    config: RasterConfig, name: str, bad: float, antialias: bool
+) -> None:
     p = _leaves(_parameters(60))
     with torch.no_grad():
         p[name][::3] = bad
@@ -562,14 +621,14 @@ def test_a_long_needle_across_the_image_matches_the_reference() -> None:
     torch.testing.assert_close(got.alpha.double()[clear], want.alpha[clear], atol=2e-5, rtol=0)
 
 
-# ---- the front door ------------------------------------------------------------------------------------------------
+# ---- the front door ------------------------------------------------------------------------------
 
 
 def test_bad_requests_are_refused_in_words() -> None:
     depths = ({"near_m": 0.0}, {"near_m": 5.0, "far_m": 1.0})
     for wrong in (*depths, {"alpha_max": 1.0}, {"blur_px2": -1.0}, {"sh_degree": 4}, {"backend": "cuda"}):
         with pytest.raises(UsageError):
-            RasterConfig(**wrong)  # type: ignore[arg-type]
+            RasterConfig(**wrong)
     p = _parameters(5)
     with pytest.raises(InputError, match="coefficients"):
         rasterize(_gaussians({**p, "sh": p["sh"][:, :4]}), _view(), replace(TORCH, sh_degree=2))
@@ -643,7 +702,7 @@ def test_the_gsplat_adapter_maps_every_argument() -> None:
     config = RasterConfig(near_m=0.2, far_m=90.0, blur_px2=0.1, antialias=True)
     pose = torch.tensor(view.world_from_cam, dtype=torch.float32)
     request = raster.Request(_gaussians(p), (view,), False, config, 2, (torch.tensor([0.0, 0.0, 1.0]),), (pose,), True)
-    out = gsplat_cuda.render(request, module=fake)  # type: ignore[arg-type]
+    out = gsplat_cuda.render(request, module=fake)
     (_, degree, directions), (_, draw) = fake.calls
     assert degree == 2
     # Everything is handed over relative to the camera, so that float32 serves far from the world's origin.
@@ -682,7 +741,7 @@ def test_gsplat_draws_several_views_in_one_call() -> None:
     fake, views = _FakeGsplat(), (_view(6, 4), _axis_view(6, 4))
     p = _leaves(_parameters(7, degree=1, channels=2))
     request = raster.Request(_gaussians(p), views, True, RasterConfig(), 1, (None, torch.ones(3)), (None, None), True)
-    out = gsplat_cuda.render(request, module=fake)  # type: ignore[arg-type]
+    out = gsplat_cuda.render(request, module=fake)
     assert [name for name, *_ in fake.calls] == ["sh", "sh", "draw"]
     draw = fake.calls[2][1]
     for index, view in enumerate(views):
@@ -690,7 +749,9 @@ def test_gsplat_draws_several_views_in_one_call() -> None:
         cam_from_world = torch.tensor(view.cam_from_world, dtype=torch.float32)
         torch.testing.assert_close(seen, p["means"] @ cam_from_world[:3, :3].T + cam_from_world[:3, 3])
         np.testing.assert_allclose(draw["Ks"][index].numpy(), view.camera.matrix, rtol=1e-6)
-        torch.testing.assert_close(fake.calls[index][2], p["means"] - torch.tensor(view.world_from_cam[:3, 3], dtype=torch.float32))
+        torch.testing.assert_close(
+            fake.calls[index][2], p["means"] - torch.tensor(view.world_from_cam[:3, 3], dtype=torch.float32)
+        )
     assert out.rgb.shape == (2, 3, 4, 6)
     assert out.depth.shape == out.alpha.shape == (2, 1, 4, 6)
     torch.testing.assert_close(out.rgb[1] - out.rgb[0], torch.full((3, 4, 6), 0.75))
@@ -707,12 +768,19 @@ def test_gsplat_draws_several_views_in_one_call() -> None:
 def test_five_million_gaussians() -> None:
     generator = torch.Generator().manual_seed(0)
     count = 5_000_000
-    means = torch.rand(count, 3, generator=generator) * torch.tensor([60.0, 30.0, 90.0]) - torch.tensor([30.0, 15.0, 0.0])
-    p = {"means": means, "quats": torch.randn(count, 4, generator=generator), "scales": torch.full((count, 3), 0.03),
-         "opacity": torch.full((count,), 0.2), "sh": torch.zeros(count, 1, 3)}  # fmt: skip
+    means = torch.rand(count, 3, generator=generator) * torch.tensor([60.0, 30.0, 90.0]) - torch.tensor(
+        [30.0, 15.0, 0.0]
+    )
+    p = {
+        "means": means,
+        "quats": torch.randn(count, 4, generator=generator),
+        "scales": torch.full((count, 3), 0.03),
+        "opacity": torch.full((count,), 0.2),
+        "sh": torch.zeros(count, 1, 3),
+    }
     leaves = _leaves(p)
     out = rasterize(_gaussians(leaves), _axis_view(480, 320, 400.0), CPU)
     out.rgb.sum().backward()
     assert torch.isfinite(out.rgb).all()
-    assert torch.isfinite(leaves["means"].grad).all()  # type: ignore[arg-type]
+    assert torch.isfinite(leaves["means"].grad).all()
     assert int(out.trace.visible.sum()) > 100_000

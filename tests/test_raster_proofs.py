@@ -1,4 +1,5 @@
-"""Proofs of the rasteriser's numbers: finite differences without cut-offs, the published formulas written out, memory."""
+"""Proofs of the rasteriser's numbers: finite differences without cut-offs, the published formulas written out,
+memory."""
 
 from __future__ import annotations
 
@@ -47,12 +48,13 @@ def _gaussians(parts: dict[str, Tensor], dtype: torch.dtype = torch.float64) -> 
     return Gaussians(**cast, node=torch.zeros(len(cast["means"]), dtype=torch.int32))
 
 
-# ---- finite differences --------------------------------------------------------------------------------------------
+# ---- finite differences --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gradients_match_finite_differences_without_cut_offs(monkeypatch: pytest.MonkeyPatch, antialias: bool) -> None:
-    """With the alpha cut at 1e-12 and no stop the picture is smooth in everything, so that every derivative can be checked."""
+    """With the alpha cut at 1e-12 and no stop the picture is smooth in everything, so that every derivative can be
+    checked."""
     monkeypatch.setattr(torch_twin, "ALPHA_MIN", 1e-12)
     monkeypatch.setattr(torch_twin, "STOP_TRANSMITTANCE", 0.0)
     view, values = _view(), _values(6, 2, 2)
@@ -74,11 +76,12 @@ def test_gradients_match_finite_differences_without_cut_offs(monkeypatch: pytest
     assert torch.autograd.gradcheck(draw, (*inputs, pose, background), eps=1e-6, atol=2e-5, rtol=1e-4, fast_mode=False)
 
 
-# ---- the published formulas, written out ---------------------------------------------------------------------------
+# ---- the published formulas, written out ---------------------------------------------------------
 
 
 def _dense(parts: dict[str, Tensor], view: View, blur: float = 0.3) -> dict[str, NDArray[np.float64]]:
-    """Every Gaussian at every pixel, front to back, by Zwicker et al. 2001 and Kerbl et al. 2023; degree 1 of harmonics."""
+    """Every Gaussian at every pixel, front to back, by Zwicker et al. 2001 and Kerbl et al. 2023; degree 1 of
+    harmonics."""
     camera, p = view.camera, {name: value.numpy().astype(np.float64) for name, value in parts.items()}
     rotation, center = view.world_from_cam[:3, :3].T, view.world_from_cam[:3, 3]
     ys, xs = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
@@ -92,7 +95,8 @@ def _dense(parts: dict[str, Tensor], view: View, blur: float = 0.3) -> dict[str,
             continue
         axes = geometry.matrix_from_quaternion(p["quats"][i] / np.linalg.norm(p["quats"][i]))
         covariance = axes @ np.diag(p["scales"][i] ** 2) @ axes.T
-        slack_x, slack_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy  # 1.3 times the field of view
+        # 1.3 times the field of view
+        slack_x, slack_y = 0.15 * camera.width / camera.fx, 0.15 * camera.height / camera.fy
         tx = z * np.clip(x / z, -camera.cx / camera.fx - slack_x, (camera.width - camera.cx) / camera.fx + slack_x)
         ty = z * np.clip(y / z, -camera.cy / camera.fy - slack_y, (camera.height - camera.cy) / camera.fy + slack_y)
         jacobian = np.array([[camera.fx / z, 0, -camera.fx * tx / z**2], [0, camera.fy / z, -camera.fy * ty / z**2]])
@@ -105,7 +109,11 @@ def _dense(parts: dict[str, Tensor], view: View, blur: float = 0.3) -> dict[str,
         alpha[done] = 0
         direction = (p["means"][i] - center) / np.linalg.norm(p["means"][i] - center)
         sh, c1 = p["sh"][i], 0.4886025119029199
-        color = 0.5 + 0.28209479177387814 * sh[0] + c1 * (-direction[1] * sh[1] + direction[2] * sh[2] - direction[0] * sh[3])
+        color = (
+            0.5
+            + 0.28209479177387814 * sh[0]
+            + c1 * (-direction[1] * sh[1] + direction[2] * sh[2] - direction[0] * sh[3])
+        )
         values = np.concatenate([np.maximum(color, 0), [z], p["extra"][i]])
         total += values[:, None, None] * (alpha * left)
         left = left * (1 - alpha)
@@ -129,7 +137,7 @@ def test_pictures_follow_the_published_formulas(backend: Any, seed: int) -> None
     assert want["alpha"].max() > 0.9
 
 
-# ---- memory --------------------------------------------------------------------------------------------------------
+# ---- memory --------------------------------------------------------------------------------------
 
 
 @needs_native

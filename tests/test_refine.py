@@ -13,7 +13,9 @@ def some(count=4, height=16, width=24, seed=0):
     generator = torch.Generator().manual_seed(seed)
     codec = PatchCodec(CodecConfig(decoder_width=8, decoder_blocks=1))
     refiner = Refiner(sum(codec.channels.values()), (16, 24), (1, 1))
-    latents = {m: torch.randn(count, c, height // 2, width // 2, generator=generator) for m, c in codec.channels.items()}
+    latents = {
+        m: torch.randn(count, c, height // 2, width // 2, generator=generator) for m, c in codec.channels.items()
+    }
     image = lambda c: torch.rand(count, c, height, width, generator=generator) * 2 - 1  # noqa: E731
     ids = lambda: torch.randint(0, 19, (count, 1, height, width), generator=generator, dtype=torch.uint8)  # noqa: E731
     given = ConditionPixels(image(3), image(3), image(1), image(1) > 0, image(1) > 0, ids(), ids())
@@ -29,7 +31,9 @@ def test_open_gates_hand_the_condition_through():
         made = refiner(codec, latents, given, 4)
         _, _, base = codec.decode_raw(latents)
     assert torch.allclose(made.depth_code, given.depth_code, atol=1e-5)
-    assert torch.allclose(made.rgb, given.color + torch.sigmoid(torch.tensor(-4.0)) * (given.backdrop - given.color), atol=1e-5)
+    assert torch.allclose(
+        made.rgb, given.color + torch.sigmoid(torch.tensor(-4.0)) * (given.backdrop - given.color), atol=1e-5
+    )
     shown = given.ids.squeeze(1).long()
     gained = (made.scores - base).gather(1, shown.unsqueeze(1))
     assert float(gained.min()) > network.COPY_SCORE - 0.01

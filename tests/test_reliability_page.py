@@ -16,5 +16,8 @@ def test_every_promise_of_the_matrix_has_its_test() -> None:
     for row in rows:
         (name,) = re.findall(r"`tests/([\w/]+\.py)::(\w+)` \|$", row)
         assert re.search(rf"^def {name[1]}\(", (TESTS / name[0]).read_text(encoding="utf-8"), re.MULTILINE), row
-        slow = re.search(rf"slow(?:\n@pytest\.mark\.parametrize[^\n]*)*\ndef {name[1]}\(", (TESTS / name[0]).read_text(encoding="utf-8"))
+        slow = re.search(
+            rf"slow(?:\n@pytest\.mark\.parametrize[^\n]*)*\ndef {name[1]}\(",
+            (TESTS / name[0]).read_text(encoding="utf-8"),
+        )
         assert bool(slow) == ("*slow*" in row) or name[0] in ("test_run.py", "test_fit.py"), row

@@ -42,7 +42,10 @@ def world(tmp_path_factory) -> dict[str, Path]:
 @pytest.fixture(scope="module")
 def rendered(world, tmp_path_factory) -> Path:
     return RenderViews(
-        scene=world["scene"], model=world["model"], out=tmp_path_factory.mktemp("r") / "out", settings=RenderConfig(shifts_m=SHIFTS)
+        scene=world["scene"],
+        model=world["model"],
+        out=tmp_path_factory.mktemp("r") / "out",
+        settings=RenderConfig(shifts_m=SHIFTS),
     ).run()
 
 
@@ -70,7 +73,10 @@ def test_observations_hold_all_modalities(rendered):
 
 
 def test_views_lie_where_the_trajectory_says(rendered):
-    recorded, left = read_observations(rendered / "front_recorded").views, read_observations(rendered / "front_shift+2.0").views
+    recorded, left = (
+        read_observations(rendered / "front_recorded").views,
+        read_observations(rendered / "front_shift+2.0").views,
+    )
     for a, b in zip(recorded, left):
         assert np.linalg.norm(b.center_world - a.center_world) == pytest.approx(2.0, abs=1e-9)
         assert b.time_s == a.time_s
@@ -100,9 +106,15 @@ def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_
         first, second = read_observations(whole / name), read_observations(parts / name)
         for index in range(FRAMES):
             for field in ("rgb", "depth", "semantics", "confidence"):
-                assert torch.equal(*(torch.nan_to_num(getattr(o[index], field)) for o in (first, second))), (name, index, field)
+                assert torch.equal(*(torch.nan_to_num(getattr(o[index], field)) for o in (first, second))), (
+                    name,
+                    index,
+                    field,
+                )
     calls.clear()
-    assert RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "parts", settings=config).run() == parts
+    assert (
+        RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "parts", settings=config).run() == parts
+    )
     assert not calls
 
 
@@ -117,7 +129,10 @@ def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
     assert seen.semantics[row, column] != ID["car"]
     with pytest.raises(UsageError, match="no dynamic object 'tram'"):
         RenderViews(
-            scene=world["scene"], model=world["model"], out=tmp_path / "other", settings=RenderConfig(remove_tracks=("tram",))
+            scene=world["scene"],
+            model=world["model"],
+            out=tmp_path / "other",
+            settings=RenderConfig(remove_tracks=("tram",)),
         ).run()
 
 

@@ -1,4 +1,5 @@
-"""Renders of a fitted scene in the condition: what they tell, how they are stored and varied, how a model takes them up."""
+"""Renders of a fitted scene in the condition: what they tell, how they are stored and varied, how a model takes them
+up."""
 
 from dataclasses import asdict, replace
 
@@ -57,7 +58,7 @@ def test_planes_have_one_shape():
         replace(condition, renders=made)
 
 
-# the condition --------------------------------------------------------------------------------------------------------
+# the condition ------------------------------------------------------------------------------------
 
 
 def test_renders_tell_the_depth_beyond_the_reach_of_measured_pixels():
@@ -84,8 +85,8 @@ def test_renders_tell_the_depth_beyond_the_reach_of_measured_pixels():
 
 @pytest.mark.parametrize(("alpha", "depth"), [(1.0, 40.0), (1.0, 4.0), (0.8, 40.0), (1.0, 12.5)])
 def test_the_outline_of_a_measured_surface_is_that_of_the_render(alpha, depth):
-    """A board 12 m away, measured on every third row and column. Beside it the render's surface stands, if it covers the pixel and is
-    another one; between measured pixels the board goes on, whatever the render shows there."""
+    """A board 12 m away, measured on every third row and column. Beside it the render's surface stands, if it covers
+    the pixel and is another one; between measured pixels the board goes on, whatever the render shows there."""
     cloud, view = FusedCloud(wall(12.0, stripes, y_range=(-2, 2), z_range=(-1, 1), step=0.9), {}), view_at()
     made = build_conditions(cloud, [], [view], [], RULES, render_at=lambda view: flat_render(view, depth, alpha))[0]
     measured = made.valid[0, 0].numpy()
@@ -104,10 +105,14 @@ def test_ground_between_measured_rows_is_level():
     """Rings of road points 1.6 m below the camera, half a metre apart: between them the depth is that of the plane."""
     x, y = np.meshgrid(np.arange(3.0, 9.0, 0.5), np.arange(-10, 10, 0.02))
     xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.6)], 1).astype(np.float32)
-    cloud = PointCloud(xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=np.full(x.size, palette.ID["road"], np.uint8))
+    cloud = PointCloud(
+        xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=np.full(x.size, palette.ID["road"], np.uint8)
+    )
     view = view_at()
     falls = ((torch.arange(32) + 0.5 - 16) / 40)[:, None].expand(32, 48)
-    made = build_conditions(FusedCloud(cloud, {}), [], [view], [], RULES, render_at=lambda view: flat_render(view, 1000.0, 0.0))[0]
+    made = build_conditions(
+        FusedCloud(cloud, {}), [], [view], [], RULES, render_at=lambda view: flat_render(view, 1000.0, 0.0)
+    )[0]
     between = ~made.valid[0, 0] & (falls > 1.6 / 6.0) & (falls < 1.6 / 4.4)
     assert int(between.sum()) > 40
     exact = 1.6 / falls[between]
@@ -116,8 +121,8 @@ def test_ground_between_measured_rows_is_level():
 
 
 def test_what_a_render_shows_in_the_box_of_an_object_moves_with_it():
-    """A car 10 m ahead of which one point was measured; the render shows all of it. A photograph of one second earlier, when the car was
-    elsewhere, must not colour it."""
+    """A car 10 m ahead of which one point was measured; the render shows all of it. A photograph of one second earlier,
+    when the car was elsewhere, must not colour it."""
     corner = PointCloud(np.array([[-1.9, 0.0, 0.0]], np.float32), np.full((1, 3), 90, np.uint8), "object")
     poses = np.stack([np.eye(4)] * 2)
     poses[0, :3, 3], poses[1, :3, 3] = (12.0, -6.0, 0.0), (12.0, 0.0, 0.0)
@@ -136,15 +141,19 @@ def test_what_a_render_shows_in_the_box_of_an_object_moves_with_it():
 
 @pytest.mark.parametrize(("alpha", "depth", "expected"), [(0.4, 40.0, "far"), (0.6, 40.0, 40.0), (1.0, 5000.0, "far")])
 def test_what_the_render_hardly_covers_is_far_away(alpha, depth, expected):
-    made = build_conditions(NOTHING, [], [view_at()], [], RULES, render_at=lambda view: flat_render(view, depth, alpha))[0]
+    made = build_conditions(
+        NOTHING, [], [view_at()], [], RULES, render_at=lambda view: flat_render(view, depth, alpha)
+    )[0]
     assert not bool(made.valid.any())
     assert bool((made.depth == (RULES.far_m if expected == "far" else expected)).all())
 
 
-@pytest.mark.parametrize(("recorded", "above"), [(None, "far"), ("sky", "far"), ("building", "wall"), ("unlabelled", "far")])
+@pytest.mark.parametrize(
+    ("recorded", "above"), [(None, "far"), ("sky", "far"), ("building", "wall"), ("unlabelled", "far")]
+)
 def test_a_hole_below_the_horizon_is_no_sky(recorded, above):
-    """A wall measured on a band of rows only; the render covers nothing. Below the horizon the wall goes on, above it there is sky,
-    unless the recorded image shows a surface in that direction."""
+    """A wall measured on a band of rows only; the render covers nothing. Below the horizon the wall goes on, above it
+    there is sky, unless the recorded image shows a surface in that direction."""
     points = wall(12.0, stripes, z_range=(-3, -2))
     points = replace(points, semantics=np.full(len(points), 2, np.uint8))
     view = view_at()
@@ -158,24 +167,32 @@ def test_a_hole_below_the_horizon_is_no_sky(recorded, above):
     depth, ids, shown = made.depth[0, 0], made.semantics[0, 0], made.renders
     below, top = slice(20, None), slice(0, 12)
     assert not bool(made.valid[0, 0][-4:].any())
-    assert bool((depth[below] < 12.01).all()) and bool((ids[below] == 2).all()) and bool((shown.semantics[0, 0][below] == 2).all())
+    assert (
+        bool((depth[below] < 12.01).all())
+        and bool((ids[below] == 2).all())
+        and bool((shown.semantics[0, 0][below] == 2).all())
+    )
     assert not torch.allclose(shown.color[0][:, below], torch.tensor([0.5, 0.7, 1.0]).view(3, 1, 1), atol=0.1)
     if above == "far":
-        assert bool((depth[top] == rules.far_m).all()) and torch.equal(shown.color[0][:, top], empty(view).color[:, top])
+        assert bool((depth[top] == rules.far_m).all()) and torch.equal(
+            shown.color[0][:, top], empty(view).color[:, top]
+        )
     else:
         assert bool((depth[top] < 12.01).all()) and bool((ids[top] == 2).all())
 
 
 def test_ground_that_no_image_shows_is_level():
-    """Road points from 8 m on, 1.6 m below the camera, rows as dense as pixels; nearer road is neither measured nor rendered: it goes
-    on at the same height, its truth. Of another class it keeps the depth of the nearest pixel."""
+    """Road points from 8 m on, 1.6 m below the camera, rows as dense as pixels; nearer road is neither measured nor
+    rendered: it goes on at the same height, its truth. Of another class it keeps the depth of the nearest pixel."""
     x, y = np.meshgrid(np.arange(8, 14, 0.04), np.arange(-10, 10, 0.04))
     xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.6)], 1).astype(np.float32)
     view = view_at()
     falls = ((torch.arange(32) + 0.5 - 16) / 40)[:, None].expand(32, 48)
     empty = lambda view: flat_render(view, 1000.0, 0.0, label=palette.ID["sky"])  # noqa: E731
     for name in ("road", "building"):
-        cloud = PointCloud(xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=np.full(x.size, palette.ID[name], np.uint8))
+        cloud = PointCloud(
+            xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=np.full(x.size, palette.ID[name], np.uint8)
+        )
         made = build_conditions(FusedCloud(cloud, {}), [], [view], [], RULES, render_at=empty)[0]
         hole = ~made.valid[0, 0] & (falls > 0.25)
         assert int(hole.sum()) > 100
@@ -241,11 +258,16 @@ def test_renders_at_the_small_size_are_means_and_picks():
 
     def render_at(view):
         plain = flat_render(view)
-        depth, ids = torch.where(chequered > 0, 10.0, 30.0)[None], torch.where(chequered > 0, 3, 7)[None].to(torch.uint8)
+        depth, ids = (
+            torch.where(chequered > 0, 10.0, 30.0)[None],
+            torch.where(chequered > 0, 3, 7)[None].to(torch.uint8),
+        )
         shown = {name: getattr(plain, name) * chequered for name in ("color", "alpha", "certainty")}
         return RenderPlanes(depth=depth, semantics=ids, **shown)
 
-    small, _ = build_conditions(NOTHING, [], [view_at(camera=big)], [], replace(RULES, fine_width=96, fine_height=64), render_at=render_at)
+    small, _ = build_conditions(
+        NOTHING, [], [view_at(camera=big)], [], replace(RULES, fine_width=96, fine_height=64), render_at=render_at
+    )
     shown = small.renders
     assert torch.allclose(shown.alpha, torch.tensor(0.5)) and torch.allclose(shown.certainty, torch.tensor(0.25))
     assert torch.allclose(shown.color[:, 0], torch.tensor(0.4))
@@ -258,7 +280,7 @@ def test_the_published_condition_has_no_renders():
     assert made.renders is None and not bool(made.depth.any())
 
 
-# training clips -------------------------------------------------------------------------------------------------------
+# training clips -----------------------------------------------------------------------------------
 
 
 def same_planes(read, planes, frames):
@@ -278,7 +300,11 @@ def test_shards_give_back_renders_and_patches(tmp_path):
     same_planes(read.condition.renders, first.condition.renders, frames)
     assert other.condition.renders is None
     for found, clip in ((read, first), (other, second)):
-        assert (found.fine.row, found.fine.column, found.fine.scale) == (clip.fine.row, clip.fine.column, clip.fine.scale)
+        assert (found.fine.row, found.fine.column, found.fine.scale) == (
+            clip.fine.row,
+            clip.fine.column,
+            clip.fine.scale,
+        )
         same_planes(found.fine.clip.condition.renders, clip.fine.clip.condition.renders, frames)
         assert torch.allclose(found.fine.clip.rgb, clip.fine.clip.rgb[frames], atol=0.5 / 255 + 1e-6)
         assert torch.equal(found.fine.clip.semantics, clip.fine.clip.semantics[frames])
@@ -318,7 +344,9 @@ def test_clip_and_patch_are_varied_in_the_same_way():
         pairs = [(getattr(part.condition, n), getattr(made.condition, n)) for n in ("semantics", "backdrop_semantics")]
         if rendered:
             for name in ("color", "depth", "alpha", "certainty"):
-                assert torch.equal(getattr(part.condition.renders, name), finer(getattr(made.condition.renders, name), fine)), name
+                assert torch.equal(
+                    getattr(part.condition.renders, name), finer(getattr(made.condition.renders, name), fine)
+                ), name
             pairs.append((part.condition.renders.semantics, made.condition.renders.semantics))
         for of_patch, of_clip in pairs:  # the holes lie elsewhere, the mistakes are the same
             both = (of_patch != 255) & (finer(of_clip, fine) != 255)
@@ -375,7 +403,9 @@ def test_clips_of_a_fitted_city_show_its_full_size_in_their_patches():
     for number, clip in enumerate(made):
         fine = clip.fine
         assert (fine.scale, *fine.clip.rgb.shape[-2:]) == (3, 60, 60)
-        view = from_city.shifted_view(log.world, log.world.frame_views("front")[from_city.start_of(rules, city, number)], clip.shift_m)
+        view = from_city.shifted_view(
+            log.world, log.world.frame_views("front")[from_city.start_of(rules, city, number)], clip.shift_m
+        )
         truth = torch.from_numpy(log.truth(view).rgb).permute(2, 0, 1).float()
         rows, columns = (slice(3 * start, 3 * start + 60) for start in (fine.row, fine.column))
         assert torch.equal(fine.clip.rgb[0], truth[:, rows, columns])
@@ -394,7 +424,7 @@ def test_images_of_held_out_moments_are_not_given():
     assert from_city.given_images(replace(rules, fitted=False), from_city.HELD_OUT, log) == log.recorded
 
 
-# the model ------------------------------------------------------------------------------------------------------------
+# the model ----------------------------------------------------------------------------------------
 
 
 def shut(model, value=-40.0):
@@ -412,7 +442,8 @@ def test_an_extended_model_is_the_earlier_one_but_for_the_gates_of_renders(patch
     after = extended(before, replace(WITH_RENDERS, patch=patch)).eval()
     plain, request = some_condition(), SampleRequest(2, seed=3)
     old, new = before.sample(plain, request), after.sample(plain, request)
-    # without renders its gates take sigmoid(-8) of the denoiser's and sigmoid(-4) of the refiner's colour from the condition's own
+    # without renders its gates take sigmoid(-8) of the denoiser's and sigmoid(-4) of the refiner's colour from the
+    # condition's own
     assert float((old.rgb - new.rgb).abs().max()) < 0.05
     shut(after)
     for condition in (plain, with_renders(plain), with_renders(plain, 6)):
@@ -445,7 +476,9 @@ def test_no_render_is_told_from_an_empty_one():
     model = randomised(WITH_RENDERS)
     plain = some_condition()
     nothing = torch.zeros_like(plain.depth)
-    empty = RenderPlanes(plain.color, plain.depth, nothing, nothing, torch.full_like(plain.valid, 255, dtype=torch.uint8))
+    empty = RenderPlanes(
+        plain.color, plain.depth, nothing, nothing, torch.full_like(plain.valid, 255, dtype=torch.uint8)
+    )
     missing, blank = model.encode_condition(plain), model.encode_condition(replace(plain, renders=empty))
     assert bool((missing.pixels.alpha == stacked.NO_RENDER).all()) and bool((blank.pixels.alpha == 0).all())
     differ = (missing.planes != blank.planes).flatten(3).any(3).any(1)[0]

@@ -218,7 +218,7 @@ def test_panels_show_what_they_say(tmp_path: Path) -> None:
     course = next(c for c in scores["trajectories"] if c["shift_m"] == 0)
     columns = report._columns(course, folders)
     assert columns.has_truth
-    panels = {c: (report._rows(columns, c)) for c in columns.sets}
+    panels = {c: report._rows(columns, c) for c in columns.sets}
     assert panels["truth"] == ("rgb", "depth", "semantics")
     assert panels["mudg_s"] == ("rgb", "depth", "semantics", "error")
     assert "mudg_r" not in panels
@@ -240,7 +240,7 @@ def test_a_shifted_view_of_a_log_shows_the_recorded_path_beside_it(tmp_path: Pat
     assert not columns.has_truth
     assert columns.sets["truth"].trajectory == "front_recorded"
     assert list(columns.indices["truth"]) == [0, 1, 2, 3]
-    panels = {c: (report._rows(columns, c)) for c in columns.sets}
+    panels = {c: report._rows(columns, c) for c in columns.sets}
     assert all("error" not in rows for rows in panels.values())
     atlas = next(report._frames(columns, list(folders), (toy_views.WIDTH, toy_views.HEIGHT)))
     assert np.array_equal(atlas[: toy_views.HEIGHT, : toy_views.WIDTH], toy_views.colors(0))
@@ -308,14 +308,20 @@ def test_the_budget_makes_videos_smaller(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize(
-    ("shifts_m", "left", "right"), [((0.0, 2.0), "left", "m"), ((0.0, -2.0), "", "right, m"), ((-2.0, 2.0), "left", "right, m")]
+    ("shifts_m", "left", "right"),
+    [((0.0, 2.0), "left", "m"), ((0.0, -2.0), "", "right, m"), ((-2.0, 2.0), "left", "right, m")],
 )
 def test_a_chart_names_the_sides_that_it_shows(shifts_m: tuple[float, ...], left: str, right: str) -> None:
     scores = {
-        "methods": [{"name": "a"}], "trajectories": [{"name": str(s), "shift_m": s} for s in shifts_m],
+        "methods": [{"name": "a"}],
+        "trajectories": [{"name": str(s), "shift_m": s} for s in shifts_m],
         "results": [{"method": "a", "trajectory": str(s), "values": {"psnr": 20.0 + s}} for s in shifts_m],
-    }  # fmt: skip
+    }
     figure = report_page._chart(scores, {"name": "psnr", "title": "PSNR", "unit": "dB", "better": "higher"})
-    drawn = report_html._environment().from_string('{% from "macros.html.j2" import chart %}{{ chart(figure) }}').render(figure=figure)
+    drawn = (
+        report_html._environment()
+        .from_string('{% from "macros.html.j2" import chart %}{{ chart(figure) }}')
+        .render(figure=figure)
+    )
     words = re.findall(r"<text [^>]*>(left|right, m|m)</text>", drawn)
     assert words == [word for word in (left, right) if word]

@@ -1,4 +1,5 @@
-"""Outputs that are one file: with their own description at any moment, one writer at a time, verified when a command is repeated."""
+"""Outputs that are one file: with their own description at any moment, one writer at a time, verified when a command is
+repeated."""
 
 from __future__ import annotations
 
@@ -63,7 +64,9 @@ def pair(out: Path) -> dict[str, bytes]:
     if not out.exists():
         return {}
     content = out.read_bytes()
-    assert json.loads(about.read_text())["sha256"] == hashlib.sha256(content).hexdigest(), "the description is of another file"
+    assert json.loads(about.read_text())["sha256"] == hashlib.sha256(content).hexdigest(), (
+        "the description is of another file"
+    )
     return {out.name: content, about.name: about.read_bytes()}
 
 
@@ -73,7 +76,9 @@ def folder_of(out: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize("nth", [15, pytest.param(5, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_killed_at_any_moment_and_repeated_ends_in_the_same_pair(name: str, nth: int, toy: Path, tmp_path: Path) -> None:
+def test_a_command_killed_at_any_moment_and_repeated_ends_in_the_same_pair(
+    name: str, nth: int, toy: Path, tmp_path: Path
+) -> None:
     work = tmp_path / "counted"
     work.mkdir()
     with points(lambda *_: None, work) as done:
@@ -119,7 +124,9 @@ def test_replacing_killed_at_any_moment_loses_neither(name: str, nth: int, toy: 
 
 
 @pytest.mark.parametrize("name", [name for name in COMMANDS if name != "mcap"])
-def test_another_result_is_replaced_on_demand_only(name: str, toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_another_result_is_replaced_on_demand_only(
+    name: str, toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out, _, other = COMMANDS[name]
     assert command(name, toy, tmp_path)() == 0
     before = pair(tmp_path / out)
@@ -132,7 +139,9 @@ def test_another_result_is_replaced_on_demand_only(name: str, toy: Path, tmp_pat
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_files_without_a_description_and_altered_ones(name: str, toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_files_without_a_description_and_altered_ones(
+    name: str, toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / COMMANDS[name][0]
     about = out.with_name(f"{out.name}.json")
     assert command(name, toy, tmp_path)() == 0
@@ -156,7 +165,9 @@ def test_files_without_a_description_and_altered_ones(name: str, toy: Path, tmp_
 
 @pytest.mark.parametrize("nth", [9, pytest.param(2, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", ["ply", "asset", "page"])
-def test_a_full_disk_at_any_write_leaves_what_the_next_try_completes(name: str, nth: int, toy: Path, tmp_path: Path) -> None:
+def test_a_full_disk_at_any_write_leaves_what_the_next_try_completes(
+    name: str, nth: int, toy: Path, tmp_path: Path
+) -> None:
     out = COMMANDS[name][0]
     work = tmp_path / "counted"
     work.mkdir()
@@ -196,18 +207,21 @@ def test_a_large_page_stopped_and_repeated(toy: Path, tmp_path: Path, monkeypatc
         page(tmp_path / "x")
 
 
-# ---- any number of threads -----------------------------------------------------------------------------------------------
+# ---- any number of threads -----------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
 def crowd(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fit of 95,003 Gaussians: torch divides them among its threads, and rounds otherwise where a part does not fill a vector."""
+    """A fit of 95,003 Gaussians: torch divides them among its threads, and rounds otherwise where a part does not fill
+    a vector."""
     root = tmp_path_factory.mktemp("crowd").resolve()
     scene, _, _, small = write_toy_run(root, degree=0)
     rng = np.random.default_rng(0)
     rows = torch.from_numpy(rng.integers(0, 720, 95_003))
-    columns = {name: values[rows] + 0.01 * torch.from_numpy(rng.standard_normal(values[rows].shape, np.float32))
-               for name, values in small.table.columns.items()}  # fmt: skip
+    columns = {
+        name: values[rows] + 0.01 * torch.from_numpy(rng.standard_normal(values[rows].shape, np.float32))
+        for name, values in small.table.columns.items()
+    }
     some = torch.randn(4096, generator=torch.Generator().manual_seed(0)) * 2
     whole, alone = torch.sigmoid(some), torch.stack([torch.sigmoid(one) for one in some])  # in vectors, and one by one
     odd = some[whole != alone] if (whole != alone).any() else some
@@ -234,7 +248,7 @@ def test_any_number_of_threads_writes_the_same_bytes(name: str, crowd: Path, tmp
     assert len(made) == 1
 
 
-# ---- several at a time ---------------------------------------------------------------------------------------------------
+# ---- several at a time ---------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -338,7 +352,9 @@ def test_of_many_that_start_together_one_takes_the_lock(tmp_path: Path) -> None:
         (tmp_path / "end").unlink()
 
 
-def test_a_folder_that_another_process_filled_meanwhile_is_not_taken_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_another_process_filled_meanwhile_is_not_taken_over(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Between a look into the folder and its lock another command can have finished there."""
     output = VerbOutput("small", 1, ("*.txt",))
 

@@ -1,4 +1,5 @@
-"""Beams without a return: zeros, NaN and points at a sensor's own place are left out of every format's clouds, and counted."""
+"""Beams without a return: zeros, NaN and points at a sensor's own place are left out of every format's clouds, and
+counted."""
 
 from __future__ import annotations
 
@@ -190,7 +191,8 @@ def test_zeros_in_every_form_of_cloud(suffix: str, tmp_path: Path, tmp_path_fact
 
 
 def test_zeros_that_a_format_moved_lie_at_the_sensor_when_they_were_measured(tmp_path: Path) -> None:
-    """A sensor 2 m ahead of a vehicle at 20 m/s: a beam at dt was 20 dt away from the sweep's origin. Worked out by hand."""
+    """A sensor 2 m ahead of a vehicle at 20 m/s: a beam at dt was 20 dt away from the sweep's origin. Worked out by
+    hand."""
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 20.0
     ego, pose = EgoPath(np.array([0.0, 1.0]), poses), np.eye(4)

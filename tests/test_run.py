@@ -70,9 +70,17 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 CHAIN = [
-    "ingest", "fuse", "fit:street_gaussians", "synthesize", "fit:mudg_s", "render:street_gaussians", "render:mudg_s",
-    "score", "viewer", "report",
-]  # fmt: skip
+    "ingest",
+    "fuse",
+    "fit:street_gaussians",
+    "synthesize",
+    "fit:mudg_s",
+    "render:street_gaussians",
+    "render:mudg_s",
+    "score",
+    "viewer",
+    "report",
+]
 
 
 def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None:
@@ -92,8 +100,14 @@ def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None
     ledger = store.read_json(tmp_path / "out" / "run.json")
     assert ledger["state"] == "complete"
     assert all(step["state"] == "complete" for step in ledger["steps"].values())
-    files = [path for path in (tmp_path / "out").rglob("*") if path.is_file() and path.name not in ("run.json", "run.yaml")]
-    assert sum(step["written_bytes"] for step in ledger["steps"].values()) == sum(path.stat().st_size for path in files) > 0
+    files = [
+        path for path in (tmp_path / "out").rglob("*") if path.is_file() and path.name not in ("run.json", "run.yaml")
+    ]
+    assert (
+        sum(step["written_bytes"] for step in ledger["steps"].values())
+        == sum(path.stat().st_size for path in files)
+        > 0
+    )
 
 
 def test_a_forecast_is_said_before_the_first_long_step(
@@ -111,10 +125,15 @@ def test_a_forecast_is_said_before_the_first_long_step(
     assert verbs["ingest"].settings.resolution == "480"
 
 
-def test_two_runs_in_one_folder_at_a_time(tmp_path: Path, verbs: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_two_runs_in_one_folder_at_a_time(
+    tmp_path: Path, verbs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
     out = tmp_path / "out"
     Run(source="city", out=out, settings=RunConfig()).run()
-    record, sleeper = (out / "run.json").read_bytes(), subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    record, sleeper = (
+        (out / "run.json").read_bytes(),
+        subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE),
+    )
     try:
         store.write_json(out / "lock", {"pid": sleeper.pid, "host": socket.gethostname()})
         with pytest.raises(ResourceError, match="another process is working in this folder"):
@@ -132,21 +151,32 @@ def test_a_recorded_log_is_adapted_to(tmp_path: Path, verbs: dict[str, Any]) -> 
     assert verbs["calls"] == [*CHAIN[:3], "adapt", *CHAIN[3:]]
     adapt = verbs["adapt"]
     fitted = tmp_path / "out" / "fit" / "street_gaussians"
-    assert adapt.settings.model == "embedded" and adapt.settings.cameras == RunConfig().synthesize.cameras and adapt.fitted == fitted
+    assert (
+        adapt.settings.model == "embedded"
+        and adapt.settings.cameras == RunConfig().synthesize.cameras
+        and adapt.fitted == fitted
+    )
     assert verbs["synthesize"].settings.model == str(tmp_path / "out" / "adapt" / "model")
     assert verbs["synthesize"].fitted == fitted
 
 
-@pytest.mark.parametrize(("when", "teaches", "model", "renders"), [
-    ("off", (False, ""), "embedded", True), ("auto", (True, ""), "embedded", True), ("auto", (False, "too short"), "embedded", True),
-    ("auto", (False, ""), "embedded-tiny", False),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("when", "teaches", "model", "renders"),
+    [
+        ("off", (False, ""), "embedded", True),
+        ("auto", (True, ""), "embedded", True),
+        ("auto", (False, "too short"), "embedded", True),
+        ("auto", (False, ""), "embedded-tiny", False),
+    ],
+)
 def test_no_adaptation_where_it_is_not_wanted_or_not_possible(
     tmp_path: Path, verbs: dict[str, Any], when: Any, teaches: tuple[bool, str], model: str, renders: bool
 ) -> None:
     verbs["teaches"] = teaches
     plain = RunConfig(adaptation=when)
-    Run(source="city", out=tmp_path / "out", settings=replace(plain, synthesize=replace(plain.synthesize, model=model))).run()
+    Run(
+        source="city", out=tmp_path / "out", settings=replace(plain, synthesize=replace(plain.synthesize, model=model))
+    ).run()
     assert verbs["calls"] == CHAIN
     assert verbs["synthesize"].settings.model == model
     assert (verbs["synthesize"].fitted is not None) == renders

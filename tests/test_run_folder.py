@@ -1,4 +1,5 @@
-"""A verb's output folder: reused, continued, replaced when the new result is finished; nobody else's files are touched."""
+"""A verb's output folder: reused, continued, replaced when the new result is finished; nobody else's files are
+touched."""
 
 from __future__ import annotations
 
@@ -35,7 +36,7 @@ def contents(folder: Path) -> dict[str, str]:
     return {name: path.read_text() for name, path in sorted(found.items()) if name != "run.json"}
 
 
-# reused, continued, refused -------------------------------------------------------------------------------------------
+# reused, continued, refused -----------------------------------------------------------------------
 
 
 def test_run_folder_is_reused_only_when_it_verifies(tmp_path: Path) -> None:
@@ -97,13 +98,20 @@ def test_lock_of_a_live_process_is_respected_and_of_a_dead_one_taken_over(tmp_pa
     assert not run(tmp_path / "r").complete
 
 
-# somebody else's files ------------------------------------------------------------------------------------------------
+# somebody else's files ----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    "state", [None, "{", "[]", '{"schema": 1}', '{"schema": 3, "verb": "fit", "key": "k", "state": "complete"}',
-              '{"schema": 1, "state": "complete", "asked": {"verb": "run"}}'],
-)  # fmt: skip
+    "state",
+    [
+        None,
+        "{",
+        "[]",
+        '{"schema": 1}',
+        '{"schema": 3, "verb": "fit", "key": "k", "state": "complete"}',
+        '{"schema": 1, "state": "complete", "asked": {"verb": "run"}}',
+    ],
+)
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_a_folder_of_somebody_elses_files_is_refused(tmp_path: Path, state: str | None, overwrite: bool) -> None:
     folder = tmp_path / "r"
@@ -157,8 +165,12 @@ def test_only_files_of_the_old_result_are_removed_and_others_named_and_kept(
     kept = ["link", "photos/2024/a.jpg", "rows/mine.md", *(["out.txt.kept1", "rows/9.txt"] if done else [])]
     assert all(name in said for name in kept)
     assert {name for name in contents(folder) if "link" not in name} == {
-        "manifest.json", "out.txt", "rows/2.txt", "run.yaml", *kept[1:]
-    }  # fmt: skip
+        "manifest.json",
+        "out.txt",
+        "rows/2.txt",
+        "run.yaml",
+        *kept[1:],
+    }
     assert (folder / "link" / "b.jpg").read_text() == "far away"
     assert new.path == new.out == folder
     store.verify_manifest(folder)
@@ -178,7 +190,10 @@ def test_a_manifest_names_nothing_outside_its_folder(tmp_path: Path) -> None:
     folder = finished(tmp_path / "r").path
     (tmp_path / "precious").write_text("x")
     manifest = store.read_json(folder / "manifest.json")
-    manifest["files"] |= {"../precious": {"bytes": 1, "sha256": "0"}, str(tmp_path / "precious"): {"bytes": 1, "sha256": "0"}}
+    manifest["files"] |= {
+        "../precious": {"bytes": 1, "sha256": "0"},
+        str(tmp_path / "precious"): {"bytes": 1, "sha256": "0"},
+    }
     store.write_json(folder / "manifest.json", manifest)
     finished(folder, 2, overwrite=True)
     assert (tmp_path / "precious").read_text() == "x"
@@ -197,9 +212,15 @@ def test_an_older_unfinished_run_that_did_not_note_its_files_is_known_by_its_ver
 
 @pytest.mark.parametrize(
     ("name", "temporary"),
-    [(".run.abcd_f12.part.json", True), (".scene.123-456.part/images/a.png", True), (".r.new.part", False), ("a.part", False),
-     (".bashrc", False), ("film.part.mp4", False)],
-)  # fmt: skip
+    [
+        (".run.abcd_f12.part.json", True),
+        (".scene.123-456.part/images/a.png", True),
+        (".r.new.part", False),
+        ("a.part", False),
+        (".bashrc", False),
+        ("film.part.mp4", False),
+    ],
+)
 def test_names_of_temporary_files(name: str, temporary: bool) -> None:
     assert is_temporary(name) is temporary
 
@@ -209,7 +230,7 @@ def test_names_that_writers_give_are_known_as_temporary(tmp_path: Path) -> None:
         assert is_temporary(path.name)
 
 
-# replaced when the new result is finished -----------------------------------------------------------------------------
+# replaced when the new result is finished ---------------------------------------------------------
 
 
 def test_the_old_result_stands_until_the_new_one_is_finished(tmp_path: Path) -> None:
@@ -271,7 +292,9 @@ def test_seconds_of_an_interrupted_replacement_count(tmp_path: Path) -> None:
     assert run(folder, 2, overwrite=True).spent_before().seconds == 40.0
 
 
-def test_a_folder_that_cannot_be_renamed_is_refused_before_the_work(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_that_cannot_be_renamed_is_refused_before_the_work(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = finished(tmp_path / "r").path
     monkeypatch.setattr(os.path, "ismount", lambda path: Path(path) == folder)
     with pytest.raises(ResourceError, match="mount point"):
@@ -287,7 +310,7 @@ def _refuse(*_: object, **__: object) -> None:
     raise PermissionError("read-only")
 
 
-# crashes --------------------------------------------------------------------------------------------------------------
+# crashes ------------------------------------------------------------------------------------------
 
 
 class Crash(BaseException):
@@ -295,7 +318,8 @@ class Crash(BaseException):
 
 
 def crashed(folder: Path, monkeypatch: pytest.MonkeyPatch, stop: tuple[str, int]) -> None:
-    """Replace result 1 by result 2, and crash before the n-th call of a method of ``Path`` below ``folder``'s parent."""
+    """Replace result 1 by result 2, and crash before the n-th call of a method of ``Path`` below ``folder``'s
+    parent."""
     new = run(folder, 2, overwrite=True)
     store.write_text(new.path / "out.txt", "result 2")
     store.write_text(new.path / "rows" / "2.txt", "row")
@@ -321,7 +345,9 @@ def crashed(folder: Path, monkeypatch: pytest.MonkeyPatch, stop: tuple[str, int]
     monkeypatch.undo()
 
 
-@pytest.mark.parametrize("stop", [("rename", n) for n in (1, 2, 3)] + [("unlink", n) for n in range(1, 6)] + [("rmdir", 1)])
+@pytest.mark.parametrize(
+    "stop", [("rename", n) for n in (1, 2, 3)] + [("unlink", n) for n in range(1, 6)] + [("rmdir", 1)]
+)
 @pytest.mark.parametrize(("value", "overwrite"), [(2, True), (1, False)])
 def test_a_crash_at_any_point_of_the_exchange_loses_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: tuple[str, int], value: int, overwrite: bool
@@ -351,7 +377,9 @@ def test_a_reader_between_the_renames_is_told_what_happened(tmp_path: Path, monk
         store.digest(folder)
 
 
-def test_the_old_result_comes_back_where_the_new_one_does_not_verify(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_old_result_comes_back_where_the_new_one_does_not_verify(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = finished(tmp_path / "r").path
     crashed(folder, monkeypatch, ("rename", 2))
     (store.staging_path(folder) / "out.txt").write_text("damaged")
@@ -359,7 +387,9 @@ def test_the_old_result_comes_back_where_the_new_one_does_not_verify(tmp_path: P
     assert contents(folder)["out.txt"] == "result 1"
 
 
-def test_a_folder_made_by_hand_between_the_renames_is_not_mistaken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_made_by_hand_between_the_renames_is_not_mistaken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     folder = finished(tmp_path / "r").path
     crashed(folder, monkeypatch, ("rename", 2))
     folder.mkdir()
@@ -400,7 +430,7 @@ def test_a_reader_of_a_folder_of_results_does_not_see_staging_folders(tmp_path: 
     assert Replacement.at(tmp_path / "root" / "a").staging.is_dir()
 
 
-# inputs and outputs apart ---------------------------------------------------------------------------------------------
+# inputs and outputs apart -------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -417,14 +447,22 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 OVERLAPS = [
-    ("data/scene", "data/scene", "is also"), ("data/scene/", "link", "is also"), ("link", "data/scene", "is also"),
-    ("data/../data/scene", "data/scene", "is also"), ("other/up/scene", "data/scene", "is also"),
-    ("data", "data/scene", "holds"), (".", "link", "holds"), ("data/scene/new", "data/scene", "lies in"),
-    ("link/a/b/c", "data/scene", "lies in"), ("other/../link/new", "data/scene", "lies in"),
-    ("other/up/scene/new", "link", "lies in"), ("data/scene", "data/scene/weights", "holds"),
-    ("data/scene/weights", "data/scene/weights", "is also"), ("data/scene", "weights_link", "holds"),
+    ("data/scene", "data/scene", "is also"),
+    ("data/scene/", "link", "is also"),
+    ("link", "data/scene", "is also"),
+    ("data/../data/scene", "data/scene", "is also"),
+    ("other/up/scene", "data/scene", "is also"),
+    ("data", "data/scene", "holds"),
+    (".", "link", "holds"),
+    ("data/scene/new", "data/scene", "lies in"),
+    ("link/a/b/c", "data/scene", "lies in"),
+    ("other/../link/new", "data/scene", "lies in"),
+    ("other/up/scene/new", "link", "lies in"),
+    ("data/scene", "data/scene/weights", "holds"),
+    ("data/scene/weights", "data/scene/weights", "is also"),
+    ("data/scene", "weights_link", "holds"),
     ("link/images", "data", "lies in"),
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize(("out", "given", "relation"), OVERLAPS)
@@ -439,14 +477,22 @@ def test_overlaps_are_found_through_links_and_dots(places: Path, out: str, given
 
 @pytest.mark.parametrize(
     ("out", "given"),
-    [("other", "data/scene"), ("data/scene2", "data/scene"), ("data/new/deep", "link"), ("data/scene/images", "data/scene/weights"),
-     ("data/sc", "data/scene"), ("nowhere", "nothing there")],
-)  # fmt: skip
+    [
+        ("other", "data/scene"),
+        ("data/scene2", "data/scene"),
+        ("data/new/deep", "link"),
+        ("data/scene/images", "data/scene/weights"),
+        ("data/sc", "data/scene"),
+        ("nowhere", "nothing there"),
+    ],
+)
 def test_neighbours_do_not_overlap(places: Path, out: str, given: str) -> None:
     refuse_overlap(out, {"scene": given})
 
 
-def test_upper_and_lower_case_are_one_where_the_file_system_says_so(places: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_upper_and_lower_case_are_one_where_the_file_system_says_so(
+    places: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     real = Path.stat
 
     def careless(self: Path, **named: Any) -> os.stat_result:

@@ -1,4 +1,5 @@
-"""The folder of a run stands for each of its parts; wrong paths are refused at once; help of every command and of its parts."""
+"""The folder of a run stands for each of its parts; wrong paths are refused at once; help of every command and of its
+parts."""
 
 from __future__ import annotations
 
@@ -59,7 +60,7 @@ def test_a_run_stands_for_its_parts(line: str, paths: list[str], called: list[Re
     assert [path.relative_to(folder).as_posix() for path in paths_of(called[0]).values() if path is not None] == paths
 
 
-def test_a_run_in_python_doctor_and_render(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:  # noqa: F811
+def test_a_run_in_python_doctor_and_render(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert len(FittedScene.read(run, "cpu")) == len(FittedScene.read(run / "fit" / "street_gaussians", "cpu"))
     assert app.main(["doctor", str(run)]) == 0 and "can be used" in capsys.readouterr().out
     line = ["render", str(run), "--shifts-m", "0", "--no-video", "--quiet", "--out"]
@@ -101,7 +102,9 @@ for line in json.loads(sys.argv[1]):
 def test_wrong_paths_are_refused_before_anything_heavy_is_loaded(tmp_path: Path) -> None:
     write_toy_run(tmp_path)
     lines = [line.replace("TOY", str(tmp_path)).replace("OUT", str(tmp_path / "out")) for line, _, _ in WRONG_PATHS]
-    done = subprocess.run([sys.executable, "-c", ANSWERS, json.dumps(lines)], capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", ANSWERS, json.dumps(lines)], capture_output=True, text=True, check=True
+    )
     answers = [json.loads(answer) for answer in done.stdout.splitlines()]
     for (line, code, said), (left, message, torch_loaded) in zip(WRONG_PATHS, answers, strict=True):
         assert left == code and said.replace("TOY", str(tmp_path)) in message, (line, message)
@@ -151,7 +154,9 @@ def test_help_all_works_for_every_verb(verb: str) -> None:
     ],
 )
 @pytest.mark.parametrize("asked", ["--help", "--help-all"])
-def test_parts_of_verbs_have_pages_of_their_own(page: str, shown: tuple[str, ...], others: tuple[str, ...], asked: str) -> None:
+def test_parts_of_verbs_have_pages_of_their_own(
+    page: str, shown: tuple[str, ...], others: tuple[str, ...], asked: str
+) -> None:
     said = help_of(page, asked)
     assert f"usage: mudg {page}" in said and "--quiet" in said
     listed = {line.split()[0].replace("[no-]", "") for line in said.splitlines() if line.startswith("  --")}

@@ -44,7 +44,7 @@ def rng(step):
     return seeds.numpy_rng(0, step, "test")
 
 
-# lists ----------------------------------------------------------------------------------------------------------------
+# lists --------------------------------------------------------------------------------------------
 
 
 def test_scenes_are_drawn_by_the_weights_of_their_data_sets():
@@ -72,7 +72,8 @@ def test_without_weights_every_scene_counts_the_same():
 
 def test_lists_are_read_in_three_formats(tmp_path):
     (tmp_path / "l.yaml").write_text(
-        "data_sets: {k: 2.0}\nscenes:\n- a\n- {path: b, data_set: k, weight: 2, held_out: true}\n- {path: c, data_set: k}\n"
+        "data_sets: {k: 2.0}\nscenes:\n- a\n- {path: b, data_set: k, weight: 2, held_out: true}\n- {path: c, data_set:"
+        " k}\n"
     )
     (tmp_path / "l.json").write_text('["a", {"path": "b", "data_set": "k"}]')
     (tmp_path / "l.txt").write_text("# scenes\na\nb\tk\t2.5\n\n")
@@ -162,13 +163,14 @@ def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path, monkeypatch):
         Learn(out=tmp_path / "both", settings=tiny(clips, scenes=(text,))).run()
 
 
-# streamed clips -------------------------------------------------------------------------------------------------------
+# streamed clips -----------------------------------------------------------------------------------
 
 
 def test_streamed_clips_give_the_same_losses(clips, address, tmp_path):
     Learn(out=tmp_path / "local", settings=tiny(clips, log_every=1, steps=2)).run()
     Learn(
-        out=tmp_path / "streamed", settings=tiny(address.text, log_every=1, steps=2, cache=str(tmp_path / "cache"), cache_gb=1e-6)
+        out=tmp_path / "streamed",
+        settings=tiny(address.text, log_every=1, steps=2, cache=str(tmp_path / "cache"), cache_gb=1e-6),
     ).run()
     assert losses_of(tmp_path / "local") == losses_of(tmp_path / "streamed")
     assert len(list((tmp_path / "cache").rglob("*.safetensors"))) == 1  # all others had to go
@@ -180,7 +182,9 @@ def test_streamed_clips_give_the_same_losses(clips, address, tmp_path):
 def test_the_command_takes_an_address_of_clips(address, tmp_path, capsys):
     recipe = tmp_path / "recipe.yaml"
     recipe.write_text(configuration.dump_yaml(tiny(address.text, steps=2)))
-    assert app.main(["learn", "--config", str(recipe), "--out", str(tmp_path / "a"), "--quiet"]) == 0, capsys.readouterr().err
+    assert app.main(["learn", "--config", str(recipe), "--out", str(tmp_path / "a"), "--quiet"]) == 0, (
+        capsys.readouterr().err
+    )
     assert app.main(["learn", "--data.textures", "s3://bucket/textures", "--out", str(tmp_path / "c"), "--quiet"]) == 2
     assert "a path of this machine" in capsys.readouterr().err
 
@@ -248,7 +252,10 @@ def test_a_listed_log_is_cut_when_it_is_drawn(tmp_path, monkeypatch):
 
     monkeypatch.setattr(scene_list.from_log, "write_log", write_log)
     scenes = SceneList([ListedScene(path="log=fused")], {}, 0, "list")
-    make = lambda: ListedShards(scenes, ShardCache(tmp_path / "cache", 10**9), from_log.LogClipRules(48, 32), 0.0)  # noqa: E731
+
+    def make() -> ListedShards:
+        return ListedShards(scenes, ShardCache(tmp_path / "cache", 10**9), from_log.LogClipRules(48, 32), 0.0)
+
     shards = make()
     assert len(shards.opened(0).shards) == 3 and calls == {"scene": 1}
     assert shards.path(2).is_file() and shards.path(1).is_file() and calls == {"scene": 2, "write": 1}

@@ -31,9 +31,15 @@ from mudg.steps.fit import Fit
 
 SIZE, FRAMES = (60, 40), 6
 EVERYTHING = {
-    "poses__learn": True, "poses__start": 0.3, "objects__deformable": True, "objects__mirror_start": True,
-    "appearance__exposure": "image", "appearance__cameras": True, "appearance__virtual": True, "loss__object_weight": 0.1,
-}  # fmt: skip
+    "poses__learn": True,
+    "poses__start": 0.3,
+    "objects__deformable": True,
+    "objects__mirror_start": True,
+    "appearance__exposure": "image",
+    "appearance__cameras": True,
+    "appearance__virtual": True,
+    "loss__object_weight": 0.1,
+}
 
 
 def walker_track(times) -> Track:
@@ -75,8 +81,14 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 
 def settings(method: str = "mudg_s", **changes) -> FitConfig:
-    small = {"iterations": 30, "start__gaussians": 700, "densify__max_gaussians": 1200, "checkpoint_every": 1000, "preview_every": 1000,
-             "virtual__probability": 0.4}  # fmt: skip
+    small = {
+        "iterations": 30,
+        "start__gaussians": 700,
+        "densify__max_gaussians": 1200,
+        "checkpoint_every": 1000,
+        "preview_every": 1000,
+        "virtual__probability": 0.4,
+    }
     return fit_config(method=method, **{**small, **EVERYTHING, **changes})
 
 
@@ -86,7 +98,13 @@ def fitted_bytes(folder: Path) -> dict[str, bytes]:
 
 def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, tmp_path, monkeypatch):
     config = settings()
-    step = Fit(scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "whole", settings=config)
+    step = Fit(
+        scene=world["scene"],
+        fused=world["fuse"],
+        observations=(world["virtual"],),
+        out=tmp_path / "whole",
+        settings=config,
+    )
     whole = step.run()
     adam_step = fit.adam_step
 
@@ -117,7 +135,11 @@ def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, 
 
 def test_a_saved_scene_renders_as_the_fitted_one(world, tmp_path):
     folder = Fit(
-        scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=tmp_path / "fit", settings=settings(iterations=6)
+        scene=world["scene"],
+        fused=world["fuse"],
+        observations=(world["virtual"],),
+        out=tmp_path / "fit",
+        settings=settings(iterations=6),
     ).run()
     model = fit.load_model(folder)
     fit.save_model(model, tmp_path)
@@ -146,21 +168,28 @@ def test_a_generator_that_paints_too_dark_does_not_darken_the_recorded_path(worl
             virtual__beside=False,  # where the recorded path gives steps away, it suffers most
         )
         folder = Fit(
-            scene=world["scene"], fused=world["fuse"], observations=(tmp_path / "dark",), out=tmp_path / str(own), settings=config
+            scene=world["scene"],
+            fused=world["fuse"],
+            observations=(tmp_path / "dark",),
+            out=tmp_path / str(own),
+            settings=config,
         ).run()
         view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
         psnr[own] = metrics.psnr(fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb, truth(view).rgb)
     assert psnr[True] > psnr[False] + 0.3, psnr
 
 
-# ---- odd scenes -------------------------------------------------------------------------------------------------------
+# ---- odd scenes ----------------------------------------------------------------------------------
 
 
 def test_everything_on_without_tracks_and_with_one_frame(tmp_path):
     write_scene(tmp_path / "scene", frames=1, width=SIZE[0], height=SIZE[1], labels=False, tracks=False)
     write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(1, semantics=False).static, {}), {})
     folder = Fit(
-        scene=tmp_path / "scene", fused=tmp_path / "fuse", out=tmp_path / "fit", settings=settings("street_gaussians", iterations=4)
+        scene=tmp_path / "scene",
+        fused=tmp_path / "fuse",
+        out=tmp_path / "fit",
+        settings=settings("street_gaussians", iterations=4),
     ).run()
     view = view_at(0.0, camera(width=48, height=32))
     seen, exact = fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb, truth(view).rgb
@@ -178,7 +207,10 @@ def test_an_object_seen_once_whose_track_has_one_key(world, tmp_path, label):
     few = PointCloud(points.xyz[:3], points.rgb[:3], "object", None)
     write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(2).static, {"car": few}), {})
     folder = Fit(
-        scene=tmp_path / "scene", fused=tmp_path / "fuse", out=tmp_path / "fit", settings=settings("street_gaussians", iterations=8)
+        scene=tmp_path / "scene",
+        fused=tmp_path / "fuse",
+        out=tmp_path / "fit",
+        settings=settings("street_gaussians", iterations=8),
     ).run()
     model = fit.load_model(folder)
     moving = model.table.labels["node"] > 0
@@ -201,7 +233,11 @@ def test_no_sky_at_all_and_nothing_but_sky(world, share):
     behind = state.model.sky.coarse_picture(view).detach()
     exact = truth(view).rgb
     plain = exact.mean((1, 2), keepdim=True).expand_as(exact)
-    assert float(behind.std((1, 2)).max()) < 1e-6 if share == 0 else metrics.psnr(behind, exact) > metrics.psnr(plain, exact) + 4.0
+    assert (
+        float(behind.std((1, 2)).max()) < 1e-6
+        if share == 0
+        else metrics.psnr(behind, exact) > metrics.psnr(plain, exact) + 4.0
+    )
 
 
 def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
@@ -215,7 +251,9 @@ def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
 
     monkeypatch.setattr(fit_views.StoredView, "as_tensors", poisoned)
     with pytest.raises(NumericsError, match=r"view front/000002, step \d"):
-        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings("street_gaussians")).run()
+        Fit(
+            scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings("street_gaussians")
+        ).run()
 
 
 def test_a_virtual_picture_that_is_not_finite_is_refused_when_written(tmp_path):
@@ -228,7 +266,7 @@ def test_a_virtual_picture_that_is_not_finite_is_refused_when_written(tmp_path):
         writer.add(seen)
 
 
-# ---- starting points ---------------------------------------------------------------------------------------------------
+# ---- starting points -----------------------------------------------------------------------------
 
 
 def test_mirrored_points_appear_where_nothing_was_measured():

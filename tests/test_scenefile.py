@@ -40,8 +40,11 @@ def random_image(seed: int) -> np.ndarray:
 
 def some_points(count: int = 7) -> SweepPoints:
     rng = np.random.default_rng(count)
-    return SweepPoints(rng.normal(size=(count, 3)).astype(np.float32) * 10, rng.random(count).astype(np.float32),
-                       rng.uniform(-0.05, 0.05, count).astype(np.float32))  # fmt: skip
+    return SweepPoints(
+        rng.normal(size=(count, 3)).astype(np.float32) * 10,
+        rng.random(count).astype(np.float32),
+        rng.uniform(-0.05, 0.05, count).astype(np.float32),
+    )
 
 
 def fill(writer: SceneWriter, frames: int = 3) -> None:
@@ -58,7 +61,7 @@ def small_scene(root: Path) -> Scene:
         return writer.finish()
 
 
-# --- round trips ----------------------------------------------------------------------------------------------------
+# --- round trips ----------------------------------------------------------------------------------
 
 
 def test_everything_comes_back_exactly(tmp_path: Path) -> None:
@@ -223,7 +226,7 @@ def test_the_index_is_opened_once_and_again_after_a_change(tmp_path: Path) -> No
     assert open_files(tmp_path / "scene") is not first
 
 
-# --- completely or not at all ---------------------------------------------------------------------------------------
+# --- completely or not at all ---------------------------------------------------------------------
 
 
 def test_a_failure_while_writing_leaves_nothing(tmp_path: Path) -> None:
@@ -295,7 +298,7 @@ def test_every_byte_is_covered_by_the_manifest(tmp_path: Path) -> None:
     assert len(read_points(read_scene(tmp_path / "scene"), scene.sweeps[1]).xyz) == 6
 
 
-# --- the writer refuses ---------------------------------------------------------------------------------------------
+# --- the writer refuses ---------------------------------------------------------------------------
 
 
 def bad_frames() -> dict[str, tuple[str, Callable[[SceneWriter], None]]]:
@@ -356,7 +359,7 @@ def test_writer_refuses(case: str, tmp_path: Path) -> None:
 def test_what_could_not_be_read_back_is_not_put_in_place(tmp_path: Path) -> None:
     with SceneWriter(tmp_path / "s", "s", Source("t", "n", {"seed": 1})) as writer:
         fill(writer)
-        writer.set_split({"front/000000": "val"})  # type: ignore[dict-item]
+        writer.set_split({"front/000000": "val"})
         with pytest.raises(InputError, match="'train' or 'test'"):
             writer.finish()
     with SceneWriter(tmp_path / "t", "t", Source("t", "n", {"when": object()})) as writer:
@@ -374,7 +377,7 @@ def test_times_must_increase_per_camera(tmp_path: Path) -> None:
             writer.finish()
 
 
-# --- the reader refuses ---------------------------------------------------------------------------------------------
+# --- the reader refuses ---------------------------------------------------------------------------
 
 
 def edited(root: Path, change: Callable[[dict[str, Any]], object], name: str = "scene.json") -> Path:
@@ -468,8 +471,13 @@ def test_poses_may_be_given_as_rows(tmp_path: Path) -> None:
 def test_json_must_be_strict(tmp_path: Path) -> None:
     root = edited(tmp_path / "scene", lambda d: None)
     good = (root / "scene.json").read_text()
-    for text, words in ((good[: len(good) // 2], "JSON"), (good.replace("0.1", "NaN", 1), "NaN"), ("[]", "not an object"),
-                        (good.replace('"id"', '"id": "x", "id"', 1), "twice"), ("", "JSON")):  # fmt: skip
+    for text, words in (
+        (good[: len(good) // 2], "JSON"),
+        (good.replace("0.1", "NaN", 1), "NaN"),
+        ("[]", "not an object"),
+        (good.replace('"id"', '"id": "x", "id"', 1), "twice"),
+        ("", "JSON"),
+    ):
         (root / "scene.json").write_text(text)
         with pytest.raises(InputError, match=words):
             read_scene(root)
@@ -545,7 +553,7 @@ def test_not_a_scene(tmp_path: Path) -> None:
         read_scene(tmp_path / "a.zip")
 
 
-# --- doctor ---------------------------------------------------------------------------------------------------------
+# --- doctor ---------------------------------------------------------------------------------------
 
 
 def test_check_finds_nothing_wrong_with_a_good_scene(tmp_path: Path) -> None:
@@ -590,7 +598,19 @@ def test_check_names_what_is_odd(tmp_path: Path) -> None:
     findings = check_scene(tmp_path / "s")
     assert not [f for f in findings if f.where.startswith("track 3")]  # a barrier may be wider than long
     assert not [f for f in findings if f.level == "error"]
-    for words in ("moves at 400 m/s", "down direction", "vehicle moves at 500 m/s", "width and length swapped", "moves at 180 m/s",
-                  "not seen for 5.0 s", "lie outside the time", "no points", "intensity reaches 90", "none of its points falls",
-                  "one flat colour", "no sweep within", "no frame is held out"):  # fmt: skip
+    for words in (
+        "moves at 400 m/s",
+        "down direction",
+        "vehicle moves at 500 m/s",
+        "width and length swapped",
+        "moves at 180 m/s",
+        "not seen for 5.0 s",
+        "lie outside the time",
+        "no points",
+        "intensity reaches 90",
+        "none of its points falls",
+        "one flat colour",
+        "no sweep within",
+        "no frame is held out",
+    ):
         assert any(words in f.message for f in findings), words

@@ -48,7 +48,9 @@ def scene(tmp_path: Path) -> Path:
 def test_known_colour_error_gives_known_psnr(tmp_path: Path, scene: Path) -> None:
     plain = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), brighter(5))
     worse = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,), brighter(20))
-    out = Score(scene=scene, views={"street_gaussians": plain, "mudg_s": worse}, out=tmp_path / "score", settings=PLAIN).run()
+    out = Score(
+        scene=scene, views={"street_gaussians": plain, "mudg_s": worse}, out=tmp_path / "score", settings=PLAIN
+    ).run()
     document = store.read_json(out / "metrics.json")
     for method, step in (("street_gaussians", 5), ("mudg_s", 20)):
         assert value(document, method, "front_recorded", "psnr") == pytest.approx(20 * math.log10(255 / step), abs=1e-4)
@@ -61,7 +63,9 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
         return seen if index % 2 else dataclasses.replace(seen, rgb=torch.zeros_like(seen.rgb))
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), spoil_training_frames)
-    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
+    document = store.read_json(
+        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
+    )
     assert document["results"][0]["views"] == 2
     assert value(document, "a", "front_recorded", "psnr") == 100.0  # equal pictures
 
@@ -69,7 +73,9 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
 def test_without_held_out_frames_all_count_and_the_rules_say_so(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", test_every=0)
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
+    document = store.read_json(
+        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
+    )
     assert document["results"][0]["views"] == 4
     assert any("No frame was held out" in rule for rule in document["rules"])
 
@@ -90,7 +96,9 @@ def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Pat
         return dataclasses.replace(seen, depth=None, semantics=None)
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), color_only)
-    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
+    document = store.read_json(
+        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
+    )
     assert value(document, "a", "front_recorded", "abs_rel") == "not produced"
     assert value(document, "a", "front_recorded", "miou") == "not produced"
     assert value(document, "a", "front_recorded", "psnr") == 100.0
@@ -99,7 +107,9 @@ def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Pat
 def test_labels_that_the_log_lacks_are_no_truth(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", labels=False)
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
+    document = store.read_json(
+        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
+    )
     assert value(document, "a", "front_recorded", "miou") == score_tables.NO_TRUTH
     assert value(document, "a", "front_recorded", "abs_rel") == score_tables.NO_TRUTH
 
@@ -109,7 +119,9 @@ def test_missing_depth_counts_as_the_limit(tmp_path: Path, scene: Path) -> None:
         return dataclasses.replace(seen, depth=torch.full_like(seen.depth, torch.nan))
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), no_depth_anywhere)
-    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
+    document = store.read_json(
+        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
+    )
     true = toy_views.depths()[np.isfinite(toy_views.depths())].astype(np.float64)
     expected = float(np.mean((80.0 - true) / true))
     assert value(document, "a", "front_recorded", "abs_rel") == pytest.approx(expected, rel=1e-4)
@@ -184,20 +196,25 @@ def test_two_runs_give_the_same_bytes(tmp_path: Path, scene: Path) -> None:
 
 
 def test_large_images_score_as_small_ones_do(tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Views one after the other and methods beside each other, perceptual distances in bands; the images are not halved."""
-    views = {name: toy_views.write_views(scene, tmp_path / name, name, (0.0,), brighter(9 * len(name))) for name in ("a", "bb")}
-    small = store.read_json(Score(
-        scene=scene, views=views, out=tmp_path / "small", settings=ScoreConfig()
-    ).run() / "metrics.json")["results"]
+    """Views one after the other and methods beside each other, perceptual distances in bands; the images are not
+    halved."""
+    views = {
+        name: toy_views.write_views(scene, tmp_path / name, name, (0.0,), brighter(9 * len(name)))
+        for name in ("a", "bb")
+    }
+    small = store.read_json(
+        Score(scene=scene, views=views, out=tmp_path / "small", settings=ScoreConfig()).run() / "metrics.json"
+    )["results"]
     monkeypatch.setattr(score, "WHOLE_PIXELS", 0)
     monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
-    large = store.read_json(Score(
-        scene=scene, views=views, out=tmp_path / "large", settings=ScoreConfig()
-    ).run() / "metrics.json")["results"]
+    large = store.read_json(
+        Score(scene=scene, views=views, out=tmp_path / "large", settings=ScoreConfig()).run() / "metrics.json"
+    )["results"]
     assert [one["method"] for one in small] == [one["method"] for one in large] == ["a", "bb"]
     for one, other in zip(small, large, strict=True):
         assert isinstance(one["values"]["perceptual"], float)
-        assert one["values"].pop("perceptual") == pytest.approx(other["values"].pop("perceptual"), abs=2e-6)  # rounded to six places
+        # rounded to six places
+        assert one["values"].pop("perceptual") == pytest.approx(other["values"].pop("perceptual"), abs=2e-6)
         assert one == other
 
 
@@ -231,7 +248,8 @@ def test_distances_average_both_sides_and_mark_the_best() -> None:
 
 
 def test_baseline_fills_holes_with_the_nearest_point(scene: Path) -> None:
-    """Two walls of points, red at 10 m on the left and green at 20 m on the right; between them the nearer edge wins."""
+    """Two walls of points, red at 10 m on the left and green at 20 m on the right; between them the nearer edge
+    wins."""
     view = View(toy_views.CAMERA, toy_views.EGO_FROM_CAM, 0.0)
     rows, columns = np.mgrid[2 : toy_views.HEIGHT : 4, 4:12:4]
     left = geometry.unproject(view, np.stack([columns, rows], -1).reshape(-1, 2) + 0.5, np.full(rows.size, 10.0))
@@ -268,8 +286,14 @@ def test_baseline_of_a_view_that_sees_nothing() -> None:
 
 def test_lidar_is_the_depth_truth_of_a_log_without_depth_labels(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", labels=False, lidar=True)
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), lambda _i, seen: dataclasses.replace(
-        seen, depth=torch.full_like(seen.depth, 12.0)
-    ))  # fmt: skip
-    document = store.read_json(Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json")
+    views = toy_views.write_views(
+        scene,
+        tmp_path / "a",
+        "a",
+        (0.0,),
+        lambda _i, seen: dataclasses.replace(seen, depth=torch.full_like(seen.depth, 12.0)),
+    )
+    document = store.read_json(
+        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
+    )
     assert value(document, "a", "front_recorded", "rmse_m") == pytest.approx(2.0, abs=1e-4)  # the wall stands at 10 m

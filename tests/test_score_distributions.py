@@ -1,4 +1,5 @@
-"""FID and KID in the scorer: what is compared with what, floors, refusals, kept features, and what is said where there is no number."""
+"""FID and KID in the scorer: what is compared with what, floors, refusals, kept features, and what is said where there
+is no number."""
 
 from __future__ import annotations
 
@@ -208,7 +209,12 @@ def test_weights_are_checked_before_the_work(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
     views = {"a": toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))}
     with pytest.raises(InputError, match="nothing.pth"):
-        Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig(fid_weights=str(tmp_path / "nothing.pth"))).run()
+        Score(
+            scene=scene,
+            views=views,
+            out=tmp_path / "score",
+            settings=ScoreConfig(fid_weights=str(tmp_path / "nothing.pth")),
+        ).run()
     other = tmp_path / "other.safetensors"
     store.write_safetensors(other, {"conv1.weight": np.zeros(3, np.float32)})
     with pytest.raises(InputError, match="Conv2d_1a_3x3.conv.weight"):

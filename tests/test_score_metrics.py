@@ -1,4 +1,5 @@
-"""Perceptual distance, flicker and dynamic objects: order of known degradations, known values, and what the scorer does with them."""
+"""Perceptual distance, flicker and dynamic objects: order of known degradations, known values, and what the scorer does
+with them."""
 
 from __future__ import annotations
 
@@ -72,7 +73,8 @@ def jpeg(rgb, quality):
 
 
 def scrambled(rgb, seed=0):
-    """Blocks of 4x4 pixels change places within 32x32: colours and their local statistics stay, what is drawn does not."""
+    """Blocks of 4x4 pixels change places within 32x32: colours and their local statistics stay, what is drawn does
+    not."""
     blocks = rgb.reshape(3, 4, 8, 4, 6, 8, 4).permute(1, 4, 2, 5, 0, 3, 6).reshape(24, 64, 3, 4, 4)
     order = torch.stack([torch.randperm(64, generator=torch.Generator().manual_seed(seed + n)) for n in range(24)])
     moved = torch.stack([cell[o] for cell, o in zip(blocks, order)])
@@ -138,7 +140,9 @@ def test_lpips_distance_by_hand():
 @pytest.mark.parametrize("size", [1.0, 1e-3, 1e-9, 1e-12])
 def test_features_are_normalised_as_published(size):
     """The published formula in float64, also where 1e-10 is not small beside the features."""
-    x, y = (size * torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(n), dtype=torch.float64) for n in (0, 1))
+    x, y = (
+        size * torch.randn(5, 3, 4, generator=torch.Generator().manual_seed(n), dtype=torch.float64) for n in (0, 1)
+    )
     x[:, 1, 1] = 0
     units = [v / ((v**2).sum(0, keepdim=True).sqrt() + 1e-10) for v in (x, y)]
     expected = float(((units[0] - units[1]) ** 2).sum(0).mean())
@@ -171,10 +175,19 @@ def lpips_twin(made, truth, state):
     """LPIPS in float64 from torch's layers and the paper's equation, written down a second time."""
     conv = torch.nn.Conv2d
     trunk = torch.nn.Sequential(
-        conv(3, 64, 11, 4, 2), torch.nn.ReLU(), torch.nn.MaxPool2d(3, 2), conv(64, 192, 5, padding=2), torch.nn.ReLU(),
-        torch.nn.MaxPool2d(3, 2), conv(192, 384, 3, padding=1), torch.nn.ReLU(), conv(384, 256, 3, padding=1), torch.nn.ReLU(),
-        conv(256, 256, 3, padding=1), torch.nn.ReLU(),
-    ).double()  # fmt: skip
+        conv(3, 64, 11, 4, 2),
+        torch.nn.ReLU(),
+        torch.nn.MaxPool2d(3, 2),
+        conv(64, 192, 5, padding=2),
+        torch.nn.ReLU(),
+        torch.nn.MaxPool2d(3, 2),
+        conv(192, 384, 3, padding=1),
+        torch.nn.ReLU(),
+        conv(384, 256, 3, padding=1),
+        torch.nn.ReLU(),
+        conv(256, 256, 3, padding=1),
+        torch.nn.ReLU(),
+    ).double()
     trunk.load_state_dict({name.split(".", 2)[2]: v.double() for name, v in state.items() if name.startswith("net.")})
     x = torch.stack([made, truth]).double() * 2 - 1
     x = (x - torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)) / torch.tensor(
@@ -207,11 +220,12 @@ def test_incomplete_lpips_weights_are_refused_and_named(tmp_path):
         LpipsFeatures(lpips_state())(torch.zeros(3, 20, 64))
 
 
-# ---- flicker and dynamic objects ----------------------------------------------------------------------------------------------
+# ---- flicker and dynamic objects -----------------------------------------------------------------
 
 
 def still_pair(number, made_noise):
-    """A wall 10 m ahead whose true picture flickers by 0.1 and the made one by ``made_noise`` (each frame against the next)."""
+    """A wall 10 m ahead whose true picture flickers by 0.1 and the made one by ``made_noise`` (each frame against the
+    next)."""
     wall = torch.rand(3, 12, 16, generator=torch.Generator().manual_seed(0)) * 0.2 + 0.4
     sign = 1.0 if number % 2 else -1.0
     view = View(Camera("front", 16, 12, 20.0, 20.0, 8.0, 6.0), np.eye(4), 0.1 * number)
@@ -271,7 +285,7 @@ def test_psnr_of_dynamic_objects_counts_their_pixels_only_and_leaves_specks_out(
     assert empty.value() is None
 
 
-# ---- in the scorer ---------------------------------------------------------------------------------------------------
+# ---- in the scorer -------------------------------------------------------------------------------
 
 
 def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_dynamic_objects(tmp_path):
@@ -282,7 +296,9 @@ def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_dynamic_
 
     plain = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
     views = {"a": plain, "b": toy_views.write_views(scene, tmp_path / "b", "b", (0.0,), grey)}
-    document = store.read_json(Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig()).run() / "metrics.json")
+    document = store.read_json(
+        Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig()).run() / "metrics.json"
+    )
     values = {r["method"]: r["values"] for r in document["results"]}
     assert values["a"]["perceptual"] == pytest.approx(0.0, abs=1e-6)
     assert values["b"]["perceptual"] > 0.05
@@ -290,7 +306,9 @@ def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_dynamic_
     assert values["a"]["lpips"] == "not computed"
     store.write_safetensors(tmp_path / "lpips.safetensors", {name: v.numpy() for name, v in lpips_state().items()})
     config = ScoreConfig(perceptual_views=0, lpips_weights=str(tmp_path / "lpips.safetensors"))
-    other = store.read_json(Score(scene=scene, views=views, out=tmp_path / "other", settings=config).run() / "metrics.json")
+    other = store.read_json(
+        Score(scene=scene, views=views, out=tmp_path / "other", settings=config).run() / "metrics.json"
+    )
     values = {r["method"]: r["values"] for r in other["results"]}
     assert values["a"]["perceptual"] == score_tables.NOT_REQUESTED
     assert values["a"]["lpips"] == pytest.approx(0.0, abs=1e-6) != values["b"]["lpips"]
@@ -303,7 +321,7 @@ def test_evenly_spread_views():
     assert score.evenly([], 4) == score.evenly(range(4), 0) == []
 
 
-# ---- the other networks of LPIPS ------------------------------------------------------------------------------------------
+# ---- the other networks of LPIPS -----------------------------------------------------------------
 
 
 class Fire(torch.nn.Module):
@@ -312,7 +330,11 @@ class Fire(torch.nn.Module):
     def __init__(self, into, between, each):
         super().__init__()
         conv = torch.nn.Conv2d
-        self.squeeze, self.expand1x1, self.expand3x3 = conv(into, between, 1), conv(between, each, 1), conv(between, each, 3, padding=1)
+        self.squeeze, self.expand1x1, self.expand3x3 = (
+            conv(into, between, 1),
+            conv(between, each, 1),
+            conv(between, each, 3, padding=1),
+        )
 
     def forward(self, x):
         x = functional.relu(self.squeeze(x))
@@ -330,9 +352,20 @@ def torchvision_trunk(name):
         return torch.nn.Sequential(*layers), (3, 8, 15, 22, 29)
     squeeze = pool(3, 2, ceil_mode=True)
     layers = [
-        conv(3, 64, 3, 2), relu(), squeeze, Fire(64, 16, 64), Fire(128, 16, 64), squeeze, Fire(128, 32, 128), Fire(256, 32, 128), squeeze,
-        Fire(256, 48, 192), Fire(384, 48, 192), Fire(384, 64, 256), Fire(512, 64, 256),
-    ]  # fmt: skip
+        conv(3, 64, 3, 2),
+        relu(),
+        squeeze,
+        Fire(64, 16, 64),
+        Fire(128, 16, 64),
+        squeeze,
+        Fire(128, 32, 128),
+        Fire(256, 32, 128),
+        squeeze,
+        Fire(256, 48, 192),
+        Fire(384, 48, 192),
+        Fire(384, 64, 256),
+        Fire(512, 64, 256),
+    ]
     return torch.nn.Sequential(*layers), (1, 4, 7, 9, 10, 11, 12)
 
 
@@ -341,11 +374,15 @@ def torchvision_trunk(name):
 def test_lpips_with_vgg_and_squeeze_equals_its_float64_twin(pictures, name, given):
     state, truth = lpips_state(name), pictures[0][:, :70, :75]
     trunk, taps = torchvision_trunk(name)
-    trunk.double().load_state_dict({key.split(".", 2)[2]: v.double() for key, v in state.items() if key.startswith("net.")})
+    trunk.double().load_state_dict(
+        {key.split(".", 2)[2]: v.double() for key, v in state.items() if key.startswith("net.")}
+    )
     made = blurred(truth, 1.0)
     x = torch.stack([made, truth]).double()
     x = x * 2 - 1 if given == "correct" else x
-    x = (x - torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)) / torch.tensor([0.458, 0.448, 0.450]).double().view(3, 1, 1)
+    x = (x - torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)) / torch.tensor(
+        [0.458, 0.448, 0.450]
+    ).double().view(3, 1, 1)
     total, stage = 0.0, 0
     with torch.no_grad():
         for number, layer in enumerate(trunk):
@@ -356,4 +393,6 @@ def test_lpips_with_vgg_and_squeeze_equals_its_float64_twin(pictures, name, give
                 stage += 1
     network = LpipsFeatures(state, "file", name, given)
     assert stage == len(network.channel_weights)
-    assert PerceptualDistance(network, network.channel_weights)(pair(rgb=made, truth_rgb=truth)) == pytest.approx(total, rel=1e-4)
+    assert PerceptualDistance(network, network.channel_weights)(pair(rgb=made, truth_rgb=truth)) == pytest.approx(
+        total, rel=1e-4
+    )

@@ -1,7 +1,7 @@
 """Segmentation networks from a folder: what is asked of the transformers package, and what is made of its answers.
 
-Networks whose answer is known, under the package's names and output fields, show that classes arrive where they belong. Tiny random
-networks of the package itself show that it is asked as it wants to be; they need the extra ``models``.
+Networks whose answer is known, under the package's names and output fields, show that classes arrive where they belong.
+Tiny random networks of the package itself show that it is asked as it wants to be; they need the extra ``models``.
 """
 
 from __future__ import annotations
@@ -106,8 +106,10 @@ def test_classes_come_out_by_name_whole_and_in_tiles(
 
 
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize(("make", "size"), [(segformer, (64, 96)), (segformer, (45, 70)), (mask2former, (64, 96)),
-                                            (mask2former, (45, 70)), (eomt, (64, 64))])  # fmt: skip
+@pytest.mark.parametrize(
+    ("make", "size"),
+    [(segformer, (64, 96)), (segformer, (45, 70)), (mask2former, (64, 96)), (mask2former, (45, 70)), (eomt, (64, 64))],
+)
 def test_real_networks_answer_as_the_package_says(
     make: Callable[[Path], Any], size: tuple[int, int], tmp_path: Path
 ) -> None:
@@ -218,7 +220,9 @@ def test_a_network_is_found_in_the_cache_by_its_name(tmp_path: Path, monkeypatch
         assert "hf download a-town/streets" in str(caught.value.remedy)
 
 
-def test_a_folder_goes_before_the_cache_and_paths_are_left_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_goes_before_the_cache_and_paths_are_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / "weights/net").mkdir(parents=True)
     monkeypatch.chdir(tmp_path)
     assert folders.find("weights/net") == Path("weights/net")

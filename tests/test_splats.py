@@ -23,10 +23,14 @@ from mudg.formats.splats.cloud import SplatCloud, SplatScene, joined
 
 GOLDEN = Path(__file__).parent / "golden" / "splats.json"
 READERS: dict[str, Callable[[bytes], list[slow.Splat]]] = {
-    "ply": slow.read_ply, "compressed-ply": slow.read_compressed, "splat": slow.read_splat, "spz": slow.read_spz, "sog": slow.read_sog,
+    "ply": slow.read_ply,
+    "compressed-ply": slow.read_compressed,
+    "splat": slow.read_splat,
+    "spz": slow.read_spz,
+    "sog": slow.read_sog,
     "glb": lambda content: slow.read_glb_mesh(*slow.open_glb(content), 0),
     "usda": lambda content: slow.read_usd_splats(slow.parse_usda(content.decode())["World"]["scene"]["splats"]),
-}  # fmt: skip
+}
 CASES = [(name, degree) for name in READERS for degree in (0, 1, 2, 3) if degree == 0 or name != "splat"]
 
 
@@ -37,8 +41,13 @@ def content_of(name: str, cloud: SplatCloud) -> bytes:
 
 
 def as_cloud(splats: list[slow.Splat]) -> SplatCloud:
-    columns = ([s.place for s in splats], [s.turn for s in splats], np.log([s.size for s in splats]), [s.opacity for s in splats],
-               [s.sh for s in splats])  # fmt: skip
+    columns = (
+        [s.place for s in splats],
+        [s.turn for s in splats],
+        np.log([s.size for s in splats]),
+        [s.opacity for s in splats],
+        [s.sh for s in splats],
+    )
     return SplatCloud(*(np.asarray(values, np.float32) for values in columns))
 
 
@@ -53,14 +62,34 @@ def steps(name: str, cloud: SplatCloud) -> dict[str, np.ndarray | float]:
     """One step of each value in a format."""
     exact = 2e-6 * np.abs(cloud.means).max()
     kinds: dict[str, dict[str, np.ndarray | float]] = {
-        "spz": {"means": 2.0**-12, "scales": 1 / 16, "opacity": 1 / 255, "dc": 1 / (255 * 0.15), "rest": 1 / 8, "turn": 0.004},
-        "splat": {"means": exact, "scales": 1e-5, "opacity": 1 / 255, "dc": 1 / (255 * slow.C0), "rest": 0, "turn": 0.02},
-    }  # fmt: skip
+        "spz": {
+            "means": 2.0**-12,
+            "scales": 1 / 16,
+            "opacity": 1 / 255,
+            "dc": 1 / (255 * 0.15),
+            "rest": 1 / 8,
+            "turn": 0.004,
+        },
+        "splat": {
+            "means": exact,
+            "scales": 1e-5,
+            "opacity": 1 / 255,
+            "dc": 1 / (255 * slow.C0),
+            "rest": 0,
+            "turn": 0.02,
+        },
+    }
     span = cloud.means.max(0) - cloud.means.min(0)
     size = cloud.log_scales.max(0) - cloud.log_scales.min(0)
     tint = (cloud.sh[:, 0].max(0) - cloud.sh[:, 0].min(0)) / 255
-    kinds["compressed-ply"] = {"means": span / np.array([2047, 1023, 2047]), "scales": size / 1023, "opacity": 1 / 255, "dc": tint + 1e-5,
-                               "rest": 8 / 256, "turn": 0.004}  # fmt: skip
+    kinds["compressed-ply"] = {
+        "means": span / np.array([2047, 1023, 2047]),
+        "scales": size / 1023,
+        "opacity": 1 / 255,
+        "dc": tint + 1e-5,
+        "rest": 8 / 256,
+        "turn": 0.004,
+    }
     log_span = np.sign(cloud.means) * np.log1p(np.abs(cloud.means))
     grown = (1 + np.abs(cloud.means).max()) * (log_span.max(0) - log_span.min(0)) / 65535
     rough = 0.06 if len(cloud) > 256 else 1e-5  # tables are fine where many values are, and coarse at their ends
@@ -119,10 +148,13 @@ def rounded(content: bytes) -> str:
 def test_golden_bytes_of_three_gaussians() -> None:
     cloud = toy_splats.cloud(3, 1, 11)
     made: dict[str, object] = {
-        "ply": ply.to_bytes(cloud).hex(), "compressed-ply": compressed_ply.to_bytes(cloud).hex(),
-        "splat": splat.to_bytes(cloud.of_degree(0)).hex(), "spz": zlib.decompress(spz.to_bytes(cloud), 31).hex(),
-        "glb": content_of("glb", cloud).hex(), "usda": content_of("usda", cloud).decode(),
-    }  # fmt: skip
+        "ply": ply.to_bytes(cloud).hex(),
+        "compressed-ply": compressed_ply.to_bytes(cloud).hex(),
+        "splat": splat.to_bytes(cloud.of_degree(0)).hex(),
+        "spz": zlib.decompress(spz.to_bytes(cloud), 31).hex(),
+        "glb": content_of("glb", cloud).hex(),
+        "usda": content_of("usda", cloud).decode(),
+    }
     archive = zipfile.ZipFile(io.BytesIO(sog.to_bytes(cloud)))
     pictures = {
         n: np.asarray(Image.open(io.BytesIO(archive.read(n)))).tobytes().hex()
@@ -132,8 +164,9 @@ def test_golden_bytes_of_three_gaussians() -> None:
     files = zipfile.ZipFile(io.BytesIO(bundle.to_bytes(toy_splats.scene(0, 1))))
     made["bundle"] = {
         name: rounded(files.read(name)) if name.endswith("json") else files.read(name).hex()
-        for name in files.namelist() if name != "sky.png"
-    }  # fmt: skip
+        for name in files.namelist()
+        if name != "sky.png"
+    }
     made["sog"] = {"meta.json": rounded(archive.read("meta.json")), **pictures}
     if os.environ.get("MUDG_UPDATE_FROZEN"):
         GOLDEN.write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
@@ -173,7 +206,7 @@ def test_joining_takes_the_highest_degree_and_keeps_classes() -> None:
     assert not both.sh[:2, 4:].any()
 
 
-# -- particular formats --------------------------------------------------------------------------------------------------
+# -- particular formats ----------------------------------------------------------------------------
 
 
 def test_the_ply_keeps_the_order_that_readers_by_position_expect() -> None:
@@ -262,8 +295,9 @@ def test_the_bundle_holds_everything() -> None:
     from safetensors.numpy import load
 
     for node, kept in zip(scene.nodes, about["nodes"], strict=True):
-        assert_close(as_cloud(slow.read_ply(archive.read(kept["file"]))),
-                     node.cloud, steps("ply", node.cloud), activated=True)  # fmt: skip
+        assert_close(
+            as_cloud(slow.read_ply(archive.read(kept["file"]))), node.cloud, steps("ply", node.cloud), activated=True
+        )
     moved = load(archive.read(about["nodes"][2]["deform"]))["displacement"]
     assert scene.nodes[2].displacement is not None and np.array_equal(moved, scene.nodes[2].displacement)
     sky = np.asarray(Image.open(io.BytesIO(archive.read("sky.png"))))

@@ -1,4 +1,5 @@
-"""Files of Gaussians that are damaged: every length, every byte of the header, values that are no numbers, bombs. Always a clear error."""
+"""Files of Gaussians that are damaged: every length, every byte of the header, values that are no numbers, bombs.
+Always a clear error."""
 
 from __future__ import annotations
 
@@ -86,7 +87,7 @@ def test_an_unknown_file_lists_what_is_read() -> None:
         formats.read_cloud(b"hello", "a.obj")
 
 
-# -- numbers -------------------------------------------------------------------------------------------------------------
+# -- numbers ---------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
@@ -135,7 +136,7 @@ def test_spz_of_version_4_with_a_wrong_table_is_refused_before_the_package_is_ne
         read(head + bytes(200), "spz")
 
 
-# -- bombs ---------------------------------------------------------------------------------------------------------------
+# -- bombs -----------------------------------------------------------------------------------------
 
 
 class within:
@@ -216,7 +217,7 @@ def test_a_picture_bomb_is_refused_before_it_is_unpacked() -> None:
         read(bad, "sog")
 
 
-# -- glTF ----------------------------------------------------------------------------------------------------------------
+# -- glTF ------------------------------------------------------------------------------------------
 
 
 def altered_glb(change: Callable[[dict[str, Any]], Any]) -> bytes:

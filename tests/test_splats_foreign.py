@@ -1,5 +1,5 @@
-"""Files of Gaussians as other programs write them: what they mean is kept, said or refused. All bytes are written here by hand
-(``foreign_splats.py``), all values worked out here."""
+"""Files of Gaussians as other programs write them: what they mean is kept, said or refused. All bytes are written here
+by hand (``foreign_splats.py``), all values worked out here."""
 
 from __future__ import annotations
 
@@ -42,17 +42,21 @@ def world(places: np.ndarray, axes: str) -> np.ndarray:
 def covariance(row: dict[str, float]) -> np.ndarray:
     """Of a row of `ROWS`, in the file's axes."""
     w, x, y, z = (row[f"rot_{n}"] for n in range(4))
-    turn = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    turn = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
     return turn @ np.diag([math.exp(2 * row[f"scale_{n}"]) for n in range(3)]) @ turn.T
 
 
 def shape(cloud: SplatCloud, index: int) -> np.ndarray:
     """Covariance of a Gaussian that was read."""
-    row = {f"rot_{n}": float(cloud.quats[index, n]) for n in range(4)} | {f"scale_{n}": float(cloud.log_scales[index, n]) for n in range(3)}
+    row = {f"rot_{n}": float(cloud.quats[index, n]) for n in range(4)} | {
+        f"scale_{n}": float(cloud.log_scales[index, n]) for n in range(3)
+    }
     return covariance(row)
 
 
@@ -69,15 +73,32 @@ def read(content: bytes, name: str = "a.ply", axes: str = "file") -> SplatCloud:
 def command(tmp_path: Path, content: bytes, suffix: str, *flags: str) -> int:
     (tmp_path / f"in{suffix}").write_bytes(content)
     out = str(tmp_path / "out")
-    return app.main(["asset", "import", str(tmp_path / f"in{suffix}"), "--kind", "scene", "--out", out, "--overwrite", "--quiet", *flags])
+    return app.main(
+        [
+            "asset",
+            "import",
+            str(tmp_path / f"in{suffix}"),
+            "--kind",
+            "scene",
+            "--out",
+            out,
+            "--overwrite",
+            "--quiet",
+            *flags,
+        ]
+    )
 
 
-# -- drawing -------------------------------------------------------------------------------------------------------------
+# -- drawing ---------------------------------------------------------------------------------------
 
 MARKED: dict[str, tuple[bytes, str, bool]] = {
     "ply Brush": (foreign.ply(head=["comment Exported from Brush", "comment SplatRenderMode: mip"]), ".ply", True),
     "ply gsplat, default": (foreign.ply(head=["comment SplatRenderMode: default"]), ".ply", False),
-    "ply, the last one counts": (foreign.ply(head=["comment SplatRenderMode: mip", "comment splatrendermode: DEFAULT"]), ".ply", False),
+    "ply, the last one counts": (
+        foreign.ply(head=["comment SplatRenderMode: mip", "comment splatrendermode: DEFAULT"]),
+        ".ply",
+        False,
+    ),
     "ply, small letters": (foreign.ply(head=["comment splatrendermode: Mip"]), ".ply", True),
     "ply Postshot 1": (foreign.ply(head=["comment antialiased 1"]), ".ply", True),
     "ply Postshot 0": (foreign.ply(head=["comment antialiased 0"]), ".ply", False),
@@ -96,9 +117,13 @@ MARKED: dict[str, tuple[bytes, str, bool]] = {
     "sog model": (foreign.sog(model="antialiased"), ".sog", True),
     "sog model default": (foreign.sog(model="default", antialias=True), ".sog", False),
     "sog 2dgs": (foreign.sog(model="2dgs"), ".sog", False),
-    "glb facts": (foreign.glb(document={"asset": {"version": "2.0", "extras": {"drawing": {"antialias": True}}}}), ".glb", True),
+    "glb facts": (
+        foreign.glb(document={"asset": {"version": "2.0", "extras": {"drawing": {"antialias": True}}}}),
+        ".glb",
+        True,
+    ),
     "glb silent": (foreign.glb(), ".glb", False),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", MARKED)
@@ -123,7 +148,9 @@ def test_an_imported_scene_is_drawn_as_its_file_says(name: str, tmp_path: Path) 
 
 
 def test_what_is_drawn_antialiased_is_exported_with_the_marks_of_each_format() -> None:
-    scene = toy_splats.SplatScene("toy", (toy_splats.SplatNode("background", toy_splats.cloud(5)),), facts={"drawing": {"antialias": True}})
+    scene = toy_splats.SplatScene(
+        "toy", (toy_splats.SplatNode("background", toy_splats.cloud(5)),), facts={"drawing": {"antialias": True}}
+    )
     names = ("ply", "compressed-ply", "spz", "sog", "glb")
     written = {name: formats.FORMATS[name].write(formats.WriteRequest(scene, 0.0)) for name in names}
     for name in ("ply", "compressed-ply"):
@@ -139,7 +166,9 @@ def test_what_is_drawn_antialiased_is_exported_with_the_marks_of_each_format() -
 @pytest.mark.parametrize("choice", ["viewer", "world"])
 def test_a_ply_with_the_axes_of_this_program_says_so(name: str, choice: str) -> None:
     cloud = toy_splats.cloud(5, 1)
-    scene = toy_splats.SplatScene("toy", (toy_splats.SplatNode("background", cloud),), formats.file_from_world(name, choice))
+    scene = toy_splats.SplatScene(
+        "toy", (toy_splats.SplatNode("background", cloud),), formats.file_from_world(name, choice)
+    )
     content = formats.FORMATS[name].write(formats.WriteRequest(scene, 0.0))
     assert (b"\ncomment Vertical Axis: z\n" in content) is (choice == "world")
     nearest = np.abs(read(content).means[:, None] - cloud.means[None]).max(2).min(0)
@@ -147,20 +176,24 @@ def test_a_ply_with_the_axes_of_this_program_says_so(name: str, choice: str) -> 
 
 
 def test_parts_of_a_bundle_state_their_axes() -> None:
-    archive = zipfile.ZipFile(io.BytesIO(formats.FORMATS["bundle"].write(formats.WriteRequest(toy_splats.scene(), None))))
+    archive = zipfile.ZipFile(
+        io.BytesIO(formats.FORMATS["bundle"].write(formats.WriteRequest(toy_splats.scene(), None)))
+    )
     parts = [name for name in archive.namelist() if name.endswith(".ply")]
     assert len(parts) == 3
     for name, node in zip(parts, toy_splats.scene().nodes, strict=True):
         assert np.allclose(read(archive.read(name)).means, node.cloud.means, atol=1e-6)
 
 
-def test_an_object_of_antialiased_gaussians_says_that_it_is_drawn_otherwise(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_object_of_antialiased_gaussians_says_that_it_is_drawn_otherwise(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "a.ply").write_bytes(MARKED["ply Brush"][0])
     assert app.main(["asset", "import", str(tmp_path / "a.ply"), "--out", str(tmp_path / "a.safetensors")]) == 0
     assert "antialiased" in capsys.readouterr().err
 
 
-# -- sizes and opacities -------------------------------------------------------------------------------------------------
+# -- sizes and opacities ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("column", ["filter_3D", "filter_3d"])
@@ -190,7 +223,12 @@ def test_flat_gaussians_of_2dgs_are_read_flat() -> None:
     assert np.abs(normal).max() < 1e-11
 
 
-LINEAR = {"opacity": [0.9, 0.2, 0.7], "scale_0": [0.1, 0.3, 0.2], "scale_1": [0.2, 0.1, 0.3], "scale_2": [0.01, 0.05, 0.2]}
+LINEAR = {
+    "opacity": [0.9, 0.2, 0.7],
+    "scale_0": [0.1, 0.3, 0.2],
+    "scale_1": [0.2, 0.1, 0.3],
+    "scale_2": [0.01, 0.05, 0.2],
+}
 
 
 def test_plain_sizes_and_opacities_are_refused_where_logarithms_and_logits_are_due() -> None:
@@ -211,15 +249,23 @@ def test_plain_sizes_and_opacities_are_refused_where_logarithms_and_logits_are_d
         ({"trbf_center": 0.5, "motion_0": 0.1}, "motion over time are not read: 'trbf_center', 'motion_0'"),
     ],
 )
-def test_values_and_columns_of_another_kind_are_named(changes: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_values_and_columns_of_another_kind_are_named(
+    changes: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     read(foreign.ply(rows(**changes)))
     assert said in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_usual_values_are_not_worth_a_word(capsys: pytest.CaptureFixture[str]) -> None:
-    for content, name in ((foreign.ply(), "a.ply"), (foreign.spz(), "a.spz"), (foreign.glb(), "a.glb"), (foreign.splat(), "a.splat"),
-                          (foreign.sog(), "a.sog"), (foreign.ply(rows(opacity=0.0, scale_0=0.0, scale_1=0.0)), "zero.ply"),
-                          (foreign.compressed_ply(-9, 9), "c.ply")):  # fmt: skip
+    for content, name in (
+        (foreign.ply(), "a.ply"),
+        (foreign.spz(), "a.spz"),
+        (foreign.glb(), "a.glb"),
+        (foreign.splat(), "a.splat"),
+        (foreign.sog(), "a.sog"),
+        (foreign.ply(rows(opacity=0.0, scale_0=0.0, scale_1=0.0)), "zero.ply"),
+        (foreign.compressed_ply(-9, 9), "c.ply"),
+    ):
         read(content, name)
     assert "warning" not in capsys.readouterr().err
 
@@ -245,7 +291,10 @@ def test_a_splat_file_of_logarithms_says_what_to_do() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({f"rot_{n}": [1.0 - n, 0.0, 1.0] for n in range(4)}, r"no quaternion[\s\S]*Gaussian 1[\s\S]*1 of 3[\s\S]*take them out"),
+        (
+            {f"rot_{n}": [1.0 - n, 0.0, 1.0] for n in range(4)},
+            r"no quaternion[\s\S]*Gaussian 1[\s\S]*1 of 3[\s\S]*take them out",
+        ),
         ({"scale_1": [0.0, 0.0, math.nan]}, r"Gaussian 2[\s\S]*1 of 3[\s\S]*take them out"),
         ({"x": [math.inf, 0.0, 0.0]}, r"Gaussian 0[\s\S]*take them out"),
     ],
@@ -260,7 +309,7 @@ def test_rotations_of_any_length_are_brought_to_1() -> None:
     assert np.allclose(read(foreign.ply(rows(**long))).quats, read(foreign.ply()).quats, atol=1e-6)
 
 
-# -- other elements and columns ------------------------------------------------------------------------------------------
+# -- other elements and columns --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("order", ["<", ">"])
@@ -308,9 +357,13 @@ def test_unknown_columns_are_listed_once_and_without_control_characters(capsys: 
 
 @pytest.mark.parametrize(
     ("changes", "missing"),
-    [({"f_dc_0": None, "red": 1.0}, "f_dc_0"), ({"rot_0": None, "quat_w": 1.0}, "rot_0"), ({"scale_1": None, "scale_2": None}, "scale_1"),
-     ({"opacity": None, "alpha": 1.0}, "opacity")],
-)  # fmt: skip
+    [
+        ({"f_dc_0": None, "red": 1.0}, "f_dc_0"),
+        ({"rot_0": None, "quat_w": 1.0}, "rot_0"),
+        ({"scale_1": None, "scale_2": None}, "scale_1"),
+        ({"opacity": None, "alpha": 1.0}, "opacity"),
+    ],
+)
 def test_gaussians_with_columns_of_other_names_get_the_right_remedy(changes: dict[str, Any], missing: str) -> None:
     with pytest.raises(InputError, match=rf"missing[\s\S]*'{missing}'[\s\S]*name the columns"):
         read(foreign.ply(rows(**changes)))
@@ -340,16 +393,24 @@ def test_fields_of_others_are_passed_over_and_listed_once(capsys: pytest.Capture
     assert "'extras', 'lod', 'means.order', 'sh0.gamma' in meta.json" in said and "warning" not in said
     assert np.allclose(sorted(np.abs(cloud.means).max(1)), [0, math.e - 1])
     assert read(foreign.compressed_ply(-1, 1, more="state"), "a.ply").opacity[0] == pytest.approx(200 / 255, abs=1e-6)
-    read(foreign.glb(kind={"lod": 2, "extras": {}}, document={"extensionsUsed": ["KHR_gaussian_splatting", "EXT_other"]}), "a.glb")
+    read(
+        foreign.glb(
+            kind={"lod": 2, "extras": {}}, document={"extensionsUsed": ["KHR_gaussian_splatting", "EXT_other"]}
+        ),
+        "a.glb",
+    )
     assert "'EXT_other', 'KHR_gaussian_splatting.lod' in the document" in capsys.readouterr().err.replace("\n", " ")
 
 
 OFFICIAL = {
-    "a.ply": foreign.ply(rows(nx=0.0, ny=0.0, nz=0.0, red=1.0)), "flat.ply": foreign.ply(rows(scale_2=None)),
+    "a.ply": foreign.ply(rows(nx=0.0, ny=0.0, nz=0.0, red=1.0)),
+    "flat.ply": foreign.ply(rows(scale_2=None)),
     "packed.ply": foreign.compressed_ply(-1, 1),
     "a.sog": foreign.sog(asset={"generator": "x"}, model="default", antialias=False),
-    "a.glb": foreign.glb(node={"name": "n", "extras": {"a": 1}}, document={"extras": {}, "materials": [], "cameras": []}),
-}  # fmt: skip
+    "a.glb": foreign.glb(
+        node={"name": "n", "extras": {"a": 1}}, document={"extras": {}, "materials": [], "cameras": []}
+    ),
+}
 
 
 @pytest.mark.parametrize("name", OFFICIAL)
@@ -366,8 +427,16 @@ MANY = {f"field{number}": 1.0 for number in range(100)}
     ("name", "content", "line"),
     [
         ("a.ply", foreign.ply(rows(foo=1.0)), "passed over: 'foo' in element vertex, which"),
-        ("a.ply", foreign.ply(after=("element foo 1\nproperty float x", b"\0" * 4)), "passed over: 'foo' in the header, which"),
-        ("a.ply", foreign.ply(before=("element foo 1\nproperty float x", b"\0" * 4)), "passed over: 'foo' in the header, which"),
+        (
+            "a.ply",
+            foreign.ply(after=("element foo 1\nproperty float x", b"\0" * 4)),
+            "passed over: 'foo' in the header, which",
+        ),
+        (
+            "a.ply",
+            foreign.ply(before=("element foo 1\nproperty float x", b"\0" * 4)),
+            "passed over: 'foo' in the header, which",
+        ),
         ("a.ply", foreign.ply(rows(**MANY)), "'field7' and 92 more in element vertex, which"),
         ("a.ply", foreign.compressed_ply(-1, 1, more="state"), "passed over: 'state' in element vertex, which"),
         ("a.sog", foreign.sog(**{ODD: 1}), r"passed over: '\x1b]0;t\x07nnnnnn"),
@@ -376,7 +445,9 @@ MANY = {f"field{number}": 1.0 for number in range(100)}
         ("a.glb", foreign.glb(document={ODD: 1, "foo": 2}), r"passed over: '\x1b]0;t\x07nnnnnn"),
     ],
 )
-def test_fields_of_others_are_named_shortly(name: str, content: bytes, line: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fields_of_others_are_named_shortly(
+    name: str, content: bytes, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     read(content, name)
     said = [one for one in capsys.readouterr().err.splitlines() if "passed over" in one]
     assert [line in one and len(one) < 700 and one.isprintable() for one in said] == [True]
@@ -388,18 +459,26 @@ def test_an_unknown_model_of_sog_is_read_with_a_word(model: Any, capsys: pytest.
     assert "not known" in capsys.readouterr().err
 
 
-# -- axes ----------------------------------------------------------------------------------------------------------------
+# -- axes ------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     ("comment", "axes"),
     [
-        ("comment Vertical Axis: z", "FLU"), ("comment Vertical axis: Z", "FLU"), ("comment up_axis = +z", "FLU"), ("comment Z-up", "FLU"),
-        ("comment Vertical Axis: -y", "RDF"), ("comment y-up", "RUB"), ("comment Vertical Axis: x", "UFL"),
-        ("comment coordinate_system: RUB", "RUB"), ("obj_info Vertical Axis: z", "FLU"), ("comment size up to z9", "RDF"),
-        ("comment Vertical Axis: y", "RDF"), ("comment made elsewhere", "RDF"),
+        ("comment Vertical Axis: z", "FLU"),
+        ("comment Vertical axis: Z", "FLU"),
+        ("comment up_axis = +z", "FLU"),
+        ("comment Z-up", "FLU"),
+        ("comment Vertical Axis: -y", "RDF"),
+        ("comment y-up", "RUB"),
+        ("comment Vertical Axis: x", "UFL"),
+        ("comment coordinate_system: RUB", "RUB"),
+        ("obj_info Vertical Axis: z", "FLU"),
+        ("comment size up to z9", "RDF"),
+        ("comment Vertical Axis: y", "RDF"),
+        ("comment made elsewhere", "RDF"),
     ],
-)  # fmt: skip
+)
 def test_axes_of_a_ply_are_those_that_its_comments_state(comment: str, axes: str) -> None:
     cloud = read(foreign.ply(head=["comment Generated by Nerfstudio 1.1.5", comment]))
     assert np.allclose(cloud.means, world(PLACES, axes))
@@ -412,7 +491,25 @@ def test_a_vertical_axis_y_that_may_mean_down_is_said_unless_brush_wrote_it(caps
     assert "--axes" not in capsys.readouterr().err
 
 
-SPZ_AXES = ["RUB", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU"]
+SPZ_AXES = [
+    "RUB",
+    "LDB",
+    "RDB",
+    "LUB",
+    "RUB",
+    "LDF",
+    "RDF",
+    "LUF",
+    "RUF",
+    "LFD",
+    "RFD",
+    "LFU",
+    "RFU",
+    "LBD",
+    "RBD",
+    "LBU",
+    "RBU",
+]
 """By the number in the extension; 0 is unspecified."""
 
 
@@ -431,7 +528,9 @@ def test_axes_of_spz_are_those_of_its_extension(code: int, version: int) -> None
         assert np.allclose(colors(cloud.sh[n, 0], cloud.sh[n, 1:4], ways), colors(dc, first, ways @ turn), atol=0.02)
 
 
-@pytest.mark.parametrize(("payload", "said"), [(struct.pack("<I", 17), "0xadbe0003"), (b"\6", "0xadbe0003"), (bytes(8), "0xadbe0003")])
+@pytest.mark.parametrize(
+    ("payload", "said"), [(struct.pack("<I", 17), "0xadbe0003"), (b"\6", "0xadbe0003"), (bytes(8), "0xadbe0003")]
+)
 def test_axes_of_spz_that_are_not_known_are_refused(payload: bytes, said: str) -> None:
     with pytest.raises(InputError, match=said):
         read(foreign.spz(3, 2, [(0xADBE0003, payload)]), "a.spz")
@@ -451,7 +550,7 @@ def test_an_extension_longer_than_the_file_is_refused() -> None:
         (foreign.spz(3, 0, bits=8), "steps of 3.91 mm"),
         pytest.param(foreign.spz(4), "--axes RDF", marks=zstandard),
     ],
-)  # fmt: skip
+)
 def test_what_an_spz_file_means_besides_is_said(content: bytes, said: str, capsys: pytest.CaptureFixture[str]) -> None:
     cloud = read(content, "a.spz")
     assert said in capsys.readouterr().err.replace("\n", " ")
@@ -495,7 +594,7 @@ def test_letters_that_are_no_axes_are_refused(flag: str, tmp_path: Path) -> None
     assert command(tmp_path, foreign.ply(), ".ply", "--axes", flag) == 2
 
 
-# -- glTF ----------------------------------------------------------------------------------------------------------------
+# -- glTF ------------------------------------------------------------------------------------------
 
 
 def by(generator: str) -> dict[str, Any]:
@@ -504,9 +603,14 @@ def by(generator: str) -> dict[str, Any]:
 
 @pytest.mark.parametrize(
     ("generator", "plain", "axes"),
-    [("splat-transform 1.10.1", False, "RDF"), ("splat-transform 2.3.1", False, "FUR"), ("splat-transform 2.7.1", True, "FUR"),
-     ("splat-transform 3.7.0", True, "FUR"), ("another 1.0", True, "FUR")],
-)  # fmt: skip
+    [
+        ("splat-transform 1.10.1", False, "RDF"),
+        ("splat-transform 2.3.1", False, "FUR"),
+        ("splat-transform 2.7.1", True, "FUR"),
+        ("splat-transform 3.7.0", True, "FUR"),
+        ("another 1.0", True, "FUR"),
+    ],
+)
 def test_a_program_that_disagrees_with_gltf_is_named_and_read_as_it_writes(
     generator: str, plain: bool, axes: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -531,8 +635,14 @@ def test_the_axes_of_a_program_that_disagrees_can_be_overridden() -> None:
         (foreign.glb(kind={"colorSpace": "ACEScg"}), r"colour space[\s\S]*srgb_rec709_display[\s\S]*ACEScg"),
         (foreign.glb(kind={"colorSpace": 3}), "colour space"),
         (foreign.glb(kind={"kernel": "gabor"}), "ellipsoids"),
-        (foreign.glb(kind={"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}), "compressed"),
-        (foreign.glb(document={"extensionsRequired": ["KHR_gaussian_splatting", "KHR_draco_mesh_compression"]}), "KHR_draco"),
+        (
+            foreign.glb(kind={"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}),
+            "compressed",
+        ),
+        (
+            foreign.glb(document={"extensionsRequired": ["KHR_gaussian_splatting", "KHR_draco_mesh_compression"]}),
+            "KHR_draco",
+        ),
         (foreign.glb(document={"extensionsRequired": "all"}), "no list"),
         (foreign.glb(view={"extensions": {"EXT_meshopt_compression": {}}}), "EXT_meshopt_compression"),
         (foreign.glb(view={"buffer": 1}), "outside the file"),
@@ -546,7 +656,13 @@ def test_what_gltf_does_not_allow_or_cannot_be_read_is_refused(content: bytes, s
 
 @pytest.mark.parametrize(
     ("space", "linear"),
-    [("srgb_rec709_display", False), ("BT.709-sRGB", False), (None, False), ("lin_rec709_display", True), ("BT.709-linear", True)],
+    [
+        ("srgb_rec709_display", False),
+        ("BT.709-sRGB", False),
+        (None, False),
+        ("lin_rec709_display", True),
+        ("BT.709-linear", True),
+    ],
 )
 def test_colour_spaces_of_the_standard_and_of_its_drafts(space: str | None, linear: bool) -> None:
     table = rows(f_dc_0=[-1.0, 0.0, 1.0], f_dc_1=[-0.5, 0.5, 1.5], f_dc_2=[0.25, -0.25, 0.75])
@@ -568,18 +684,24 @@ def test_colour_spaces_of_the_standard_and_of_its_drafts(space: str | None, line
         (foreign.glb(node={"extensions": {"EXT_mesh_gpu_instancing": {}}}), "instances"),
         (foreign.glb(turn_length=3.0), "length 1"),
         (foreign.glb(more="SH_DEGREE_4_COEF_0"), "degree 3"),
-        (foreign.glb(document={
-            "nodes": [{"mesh": 0}, {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}],
-            "scenes": [{"nodes": [0, 1]}]}), "hides"),
+        (
+            foreign.glb(
+                document={
+                    "nodes": [{"mesh": 0}, {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}],
+                    "scenes": [{"nodes": [0, 1]}],
+                }
+            ),
+            "hides",
+        ),
     ],
-)  # fmt: skip
+)
 def test_what_a_glb_file_means_besides_is_said(content: bytes, said: str, capsys: pytest.CaptureFixture[str]) -> None:
     cloud = read(content, "a.glb", "world")
     assert said in capsys.readouterr().err.replace("\n", " ")
     assert np.allclose(cloud.means, PLACES)
 
 
-# -- far away ------------------------------------------------------------------------------------------------------------
+# -- far away --------------------------------------------------------------------------------------
 
 UTM = np.array([500_123.0, 5_412_345.0, 210.0])
 ECEF = np.array([4_157_222.0, 664_789.0, 4_774_952.0])
@@ -588,7 +710,9 @@ NEAR = np.array([[0.0, 0.0, 0.0], [0.0123, -0.0456, 0.0789], [3.0017, 1.0029, -2
 
 def far_ply(offset: np.ndarray, kind: str = "double") -> bytes:
     places = offset + NEAR
-    return foreign.ply(rows(**{name: places[:, n].tolist() for n, name in enumerate("xyz")}), kinds=dict.fromkeys("xyz", kind))
+    return foreign.ply(
+        rows(**{name: places[:, n].tolist() for n, name in enumerate("xyz")}), kinds=dict.fromkeys("xyz", kind)
+    )
 
 
 @pytest.mark.parametrize("offset", [UTM, ECEF], ids=["UTM", "ECEF"])
@@ -622,17 +746,24 @@ def test_an_offset_that_stays_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
         (foreign.glb(rows(x=300_000.0)), "a.glb", "31.2 mm"),
     ],
 )
-def test_places_that_were_rounded_in_the_file_are_said(content: bytes, name: str, step: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_places_that_were_rounded_in_the_file_are_said(
+    content: bytes, name: str, step: str, capsys: pytest.CaptureFixture[str]
+) -> None:
     read(content, name)
     assert f"steps of {step}" in capsys.readouterr().err.replace("\n", " ")
 
 
 @pytest.mark.parametrize(
     ("node", "scale"),
-    [({"translation": UTM.tolist()}, 1), ({"matrix": [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, *UTM.tolist(), 1]}, 2),
-     ({"translation": UTM.tolist(), "scale": [0.5] * 3}, 0.5)],
-)  # fmt: skip
-def test_translations_of_nodes_are_added_in_double(node: dict[str, Any], scale: float, capsys: pytest.CaptureFixture[str]) -> None:
+    [
+        ({"translation": UTM.tolist()}, 1),
+        ({"matrix": [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0, *UTM.tolist(), 1]}, 2),
+        ({"translation": UTM.tolist(), "scale": [0.5] * 3}, 0.5),
+    ],
+)
+def test_translations_of_nodes_are_added_in_double(
+    node: dict[str, Any], scale: float, capsys: pytest.CaptureFixture[str]
+) -> None:
     means = read(foreign.glb(node=node), "a.glb", "world").means
     assert np.abs(means - UTM - scale * PLACES).max() < 1e-6
     assert "steps" not in capsys.readouterr().err
@@ -645,12 +776,19 @@ def test_bounds_of_chunks_in_double_keep_their_places() -> None:
 
 def test_a_far_object_keeps_its_shape(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(far_ply(UTM))
-    assert app.main(["asset", "import", str(tmp_path / "a.ply"), "--axes", "world", "--out", str(tmp_path / "a.safetensors")]) == 0
+    assert (
+        app.main(
+            ["asset", "import", str(tmp_path / "a.ply"), "--axes", "world", "--out", str(tmp_path / "a.safetensors")]
+        )
+        == 0
+    )
     means = read_asset(tmp_path / "a.safetensors").columns["means"].numpy()
     assert np.abs((means - means[0]) - NEAR).max() < 1e-6
 
 
-def test_gaussians_far_out_in_a_scene_that_is_near_move_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_gaussians_far_out_in_a_scene_that_is_near_move_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     """A sky of Gaussians, 100 km away."""
     table = [row for _ in range(20) for row in ROWS] + rows(x=1e5)[:1]
     assert command(tmp_path, foreign.ply(table), ".ply", "--axes", "world") == 0
@@ -665,9 +803,15 @@ def test_a_comment_on_an_offset_is_said(capsys: pytest.CaptureFixture[str]) -> N
 
 @pytest.mark.parametrize(
     ("name", "content", "remedy"),
-    [("a.ksplat", b"\0\1" * 99, "splat-transform"), ("a.gltf", b'{"asset": {}}', "glb"), ("meta.json", b'{"version": 2}', ".sog"),
-     ("a.usdz", b"PK\3\4" + bytes(99), "ply, spz or glb"), ("a.usda", b"#usda 1.0", "ply, spz or glb"), ("a.ckpt", b"\x80\2" * 9, "PLY")],
-)  # fmt: skip
+    [
+        ("a.ksplat", b"\0\1" * 99, "splat-transform"),
+        ("a.gltf", b'{"asset": {}}', "glb"),
+        ("meta.json", b'{"version": 2}', ".sog"),
+        ("a.usdz", b"PK\3\4" + bytes(99), "ply, spz or glb"),
+        ("a.usda", b"#usda 1.0", "ply, spz or glb"),
+        ("a.ckpt", b"\x80\2" * 9, "PLY"),
+    ],
+)
 def test_files_that_are_not_read_say_what_to_do(name: str, content: bytes, remedy: str) -> None:
     with pytest.raises(InputError, match=rf"what to do: [\s\S]*{remedy}"):
         read(content, name)

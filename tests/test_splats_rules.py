@@ -1,4 +1,5 @@
-"""Rules of glTF with KHR_gaussian_splatting and of USD with ParticleField3DGaussianSplat, checked as validators do; motion in both."""
+"""Rules of glTF with KHR_gaussian_splatting and of USD with ParticleField3DGaussianSplat, checked as validators do;
+motion in both."""
 
 from __future__ import annotations
 
@@ -45,7 +46,7 @@ def at_time(times: list[float], values: np.ndarray, time_s: float, turns: bool =
     return geometry.slerp(a, b, u) if turns else (1 - u) * a + u * b
 
 
-# -- glTF ----------------------------------------------------------------------------------------------------------------
+# -- glTF ------------------------------------------------------------------------------------------
 
 
 def gltf_problems(content: bytes) -> list[str]:
@@ -136,8 +137,10 @@ def test_a_glb_moves_as_the_scene_does(time_s: float) -> None:
         nodes=(*scene.nodes[:2], replace(scene.nodes[2], cloud=gltf.middle_shape(scene.nodes[2]), displacement=None)),
     )
     document, data = slow.open_glb(gltf.to_bytes(scene))
-    played = {(c["target"]["node"], c["target"]["path"]): document["animations"][0]["samplers"][c["sampler"]]
-              for c in document["animations"][0]["channels"]}  # fmt: skip
+    played = {
+        (c["target"]["node"], c["target"]["path"]): document["animations"][0]["samplers"][c["sampler"]]
+        for c in document["animations"][0]["channels"]
+    }
     shown = []
     for index, node in enumerate(document["nodes"]):
         cloud = slow.read_glb_mesh(document, data, node["mesh"])
@@ -159,7 +162,7 @@ def test_a_glb_moves_as_the_scene_does(time_s: float) -> None:
     assert np.abs(ordered(np.concatenate(shown)) - moment(stiff, time_s)).max() < 1e-4
 
 
-# -- USD -----------------------------------------------------------------------------------------------------------------
+# -- USD -------------------------------------------------------------------------------------------
 
 
 def usd_problems(prim: dict[str, Any]) -> list[str]:

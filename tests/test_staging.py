@@ -151,9 +151,7 @@ def test_every_kind_of_flag_is_staged(scratch: Path) -> None:
 
     def look(args: Any) -> dict[str, Any]:
         seen.update(
-            scene=args.scene.read_bytes(),
-            views=[path.read_bytes() for path in args.views.values()],
-            out=args.out,
+            scene=args.scene.read_bytes(), views=[path.read_bytes() for path in args.views.values()], out=args.out
         )
         return {}
 
@@ -181,7 +179,7 @@ def test_every_kind_of_flag_is_staged(scratch: Path) -> None:
         (("score", "a", "--views", "m=s3://me:hunter2@bucket/a", "--out", "x"), "password"),
         (("fuse", "https://me:hunter2@host/a", "--nonsense", "--out", "x"), "password"),
     ],
-)  # fmt: skip
+)
 def test_what_cannot_be_is_refused(words: tuple[str, ...], said: str, command: Callable[..., Any]) -> None:
     at("memory://bucket/theirs/x").save(b"somebody else's")
     at("memory://bucket/a/x").save(b"1")
@@ -208,4 +206,3 @@ def test_two_commands_do_not_share_a_scratch_folder(scratch: Path, scene: Path) 
     name.symlink_to(scratch / "elsewhere")
     with pytest.raises(ResourceError, match="somebody else"):
         staging.run_staged("report", args, write, scratch)
-

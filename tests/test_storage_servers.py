@@ -1,6 +1,7 @@
 """Locations on real S3 servers: `tools/storage_tests.sh` installs two of different makers, starts them and runs this.
 
-`MUDG_TEST_S3` names them: ``moto=http://127.0.0.1:5901,rclone=http://127.0.0.1:5902``. Each has a bucket named ``bucket``.
+`MUDG_TEST_S3` names them: ``moto=http://127.0.0.1:5901,rclone=http://127.0.0.1:5902``. Each has a bucket named
+``bucket``.
 """
 
 from __future__ import annotations
@@ -31,7 +32,17 @@ from mudg.fleet.records import BatchFolder
 pytestmark = [pytest.mark.cluster, pytest.mark.filterwarnings("ignore")]  # warnings of the servers' own packages
 
 SERVERS = dict(one.split("=", 1) for one in os.environ.get("MUDG_TEST_S3", "").split(",") if one)
-CITY = ("--city.n-frames", "2", "--city.width", "48", "--city.height", "32", "--city.cameras", "front", "--no-contact-sheet")
+CITY = (
+    "--city.n-frames",
+    "2",
+    "--city.width",
+    "48",
+    "--city.height",
+    "32",
+    "--city.cameras",
+    "front",
+    "--no-contact-sheet",
+)
 CONDITIONAL = {"moto": True, "rclone": False}
 
 
@@ -104,7 +115,10 @@ def test_more_objects_than_one_page_of_a_listing(root: Location) -> None:
     assert (root / "many").names() == [f"{n:04}" for n in range(1100)]
 
 
-PUSH = "import sys; from pathlib import Path; from mudg.base.location import Location; Location.of(sys.argv[1]).push(Path(sys.argv[2]))"
+PUSH = (
+    "import sys; from pathlib import Path; from mudg.base.location import Location;"
+    " Location.of(sys.argv[1]).push(Path(sys.argv[2]))"
+)
 
 
 def test_a_killed_upload_is_no_result_and_goes_on(root: Location, tmp_path: Path) -> None:
@@ -130,7 +144,9 @@ def test_a_killed_upload_is_no_result_and_goes_on(root: Location, tmp_path: Path
     assert content(tmp_path / "back") == content(made)
 
 
-def test_a_store_that_fails_now_and_then(root: Location, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_store_that_fails_now_and_then(
+    root: Location, server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Every seventh request refused, every eleventh answer lost: what the store's own package repeats is enough."""
     made = folder_of(tmp_path, *[1000] * 20, 20 << 20)
     with unreliable(SERVERS[server]) as (address, handler):
@@ -202,7 +218,7 @@ def test_memory_does_not_grow_with_the_folder(root: Location, tmp_path: Path) ->
     assert 0 < grown < 300
 
 
-# batches ----------------------------------------------------------------------------------------------------------------
+# batches ------------------------------------------------------------------------------------------
 
 STEP = """
 # step.sh SOURCE OUT NAME TALLY: copies a text, and writes a line per run
@@ -240,8 +256,21 @@ class BatchInAStore:
 
     def words(self, machine: str, *more: str) -> list[str]:
         step = ["--command", "sh", str(self.folder / "step.sh"), "{source}", "{out}", "{name}", str(self.tally)]
-        return ["batch", "run", "--list", str(self.root / "list.txt"), "--out", str(self.out), "--quiet", "--jobs", "1",
-                "--scratch", str(self.folder / machine), *more, *step]  # fmt: skip
+        return [
+            "batch",
+            "run",
+            "--list",
+            str(self.root / "list.txt"),
+            "--out",
+            str(self.out),
+            "--quiet",
+            "--jobs",
+            "1",
+            "--scratch",
+            str(self.folder / machine),
+            *more,
+            *step,
+        ]
 
     def start(
         self, machine: str, *more: str, before: tuple[str, ...] = (), **environment: str
@@ -273,7 +302,9 @@ ELSEWHERE = ("unshare", "--pid", "--fork", "--mount-proc", "--kill-child")
 """Starts a program where process numbers mean something else, as on another machine."""
 
 
-def test_a_batch_whose_list_logs_and_results_lie_in_a_store(root: Location, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_batch_whose_list_logs_and_results_lie_in_a_store(
+    root: Location, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     if subprocess.run([*ELSEWHERE, "true"], check=False, capture_output=True).returncode:
         pytest.skip("no process spaces of its own for this user (unshare --pid)")
     made = BatchInAStore(root, tmp_path, 6)
@@ -291,7 +322,9 @@ def test_a_batch_whose_list_logs_and_results_lie_in_a_store(root: Location, tmp_
     assert app.main(["batch", "status", str(made.out), "--html", "--json"]) == 0
     record = json.loads(capfd.readouterr().out)
     assert (record["finished"], record["left"], record["stages"]["command"]["failed"]) == (5, 0, 1)
-    assert record["reasons"][0]["reason"].endswith("the log holds no text") and b"s03" in (made.out / "status.html").load()
+    assert (
+        record["reasons"][0]["reason"].endswith("the log holds no text") and b"s03" in (made.out / "status.html").load()
+    )
     made.put_log("s03", "text of s03\n")
     assert app.main(["batch", "retry", str(made.out), "--reason", "3"]) == 0
     assert made.start("three").wait(120) == 0
@@ -370,7 +403,9 @@ def test_two_shards_and_a_store_that_fails_now_and_then(root: Location, server: 
     made = BatchInAStore(root, tmp_path, 8)
     with unreliable(SERVERS[server]) as (address, handler):
         variables = {"AWS_ENDPOINT_URL": address, "STEP_S": "0.2"}
-        both = [made.start(f"machine{i}", "--shard", "env/2", JOB_COMPLETION_INDEX=str(i), **variables) for i in range(2)]
+        both = [
+            made.start(f"machine{i}", "--shard", "env/2", JOB_COMPLETION_INDEX=str(i), **variables) for i in range(2)
+        ]
         assert [one.wait(300) for one in both] == [0, 0]
         print(f"{server}: {handler.count} requests, {handler.count // 7} refused, {handler.count // 11} answers lost")
         assert handler.count > 100
@@ -407,9 +442,22 @@ def test_steps_of_a_batch_from_store_to_store(root: Location, tmp_path: Path) ->
     for place, machine in ((Location.of(tmp_path / "here"), "one"), (root, "two")):
         scratch = ("--quiet", "--scratch", str(tmp_path / machine))
         for seed in ("1", "2"):
-            assert app.main(["ingest", "city", str(place / f"scenes/c{seed}"), *CITY, "--city.seed", seed, *scratch]) == 0
+            assert (
+                app.main(["ingest", "city", str(place / f"scenes/c{seed}"), *CITY, "--city.seed", seed, *scratch]) == 0
+            )
         (place / "list.txt").save(b"scenes/c1\nscenes/c2\n")
-        words = ["batch", "run", "--list", str(place / "list.txt"), "--out", str(place / "runs"), "--stages", "fuse", "--jobs", "1"]
+        words = [
+            "batch",
+            "run",
+            "--list",
+            str(place / "list.txt"),
+            "--out",
+            str(place / "runs"),
+            "--stages",
+            "fuse",
+            "--jobs",
+            "1",
+        ]
         assert app.main([*words, *scratch]) == 0
         digests.append({record.scene: record.digest for record in BatchFolder(place / "runs").records("done")})
     assert digests[0] == digests[1] and len(digests[0]) == 2

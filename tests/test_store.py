@@ -106,7 +106,9 @@ def test_checkpoints_keep_two_and_fall_back_past_a_damaged_one(tmp_path: Path) -
     assert damaged.exists()
 
 
-def test_large_checkpoints_take_a_small_share_of_the_time_and_small_ones_are_always_due(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_checkpoints_take_a_small_share_of_the_time_and_small_ones_are_always_due(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     now = [100.0]
     monkeypatch.setattr(checkpoint.time, "monotonic", lambda: now[0])
 

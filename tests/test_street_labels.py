@@ -1,4 +1,5 @@
-"""The shipped segmentation network: exact evidence on a made-up street, rules that evidence settles, files, and training that resumes."""
+"""The shipped segmentation network: exact evidence on a made-up street, rules that evidence settles, files, and
+training that resumes."""
 
 from __future__ import annotations
 
@@ -33,12 +34,26 @@ TINY = StreetNetConfig(widths=(8, 8, 8, 8, 8), blocks=(1, 1, 1, 1, 1))
 def made_up(height: int = 4, width: int = 6, **given: np.ndarray) -> Evidence:
     """Evidence of a road 10 m away, seen by every ray, without boxes."""
     zero = np.zeros((height, width), np.float32)
-    plain = Evidence(zero, zero + 10, zero, zero + 1, zero, zero == 0, zero == 0, zero, zero - 0.2, zero > 1, zero,
-                     zero.astype(np.uint8), zero > 1, np.zeros(0, np.int64))  # fmt: skip
+    plain = Evidence(
+        zero,
+        zero + 10,
+        zero,
+        zero + 1,
+        zero,
+        zero == 0,
+        zero == 0,
+        zero,
+        zero - 0.2,
+        zero > 1,
+        zero,
+        zero.astype(np.uint8),
+        zero > 1,
+        np.zeros(0, np.int64),
+    )
     return replace(plain, **given)
 
 
-# --- evidence -----------------------------------------------------------------------------------------------------------
+# --- evidence -------------------------------------------------------------------------------------
 
 
 def test_evidence_of_a_street_is_what_was_built() -> None:
@@ -54,7 +69,9 @@ def test_evidence_of_a_street_is_what_was_built() -> None:
     assert np.median(found.upwards[wall]) < 0.1
     assert np.median(found.height_m[wall]) > 0.5
     assert (found.elevation_rad == ray_elevation(given.view)).all()
-    measured = np.isfinite(visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg))
+    measured = np.isfinite(
+        visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
+    )
     assert ((found.away_deg == 0) == measured).all()
     car = truth == ID["car"]
     inside = (found.box == 1) & found.in_box
@@ -94,12 +111,19 @@ def test_the_outline_of_a_nearer_box_does_not_take_what_lies_in_a_farther_one() 
     (car,) = given.tracks
     toward = np.eye(4)
     toward[:3, 3] = -0.4 * (car.world_from_object[0, :3, 3] - given.view.center_world) * [1, 1, 0]
-    nearer = replace(car, id="nearer", label="truck", size_m=car.size_m * [0.1, 1, 1], world_from_object=toward @ car.world_from_object)
+    nearer = replace(
+        car,
+        id="nearer",
+        label="truck",
+        size_m=car.size_m * [0.1, 1, 1],
+        world_from_object=toward @ car.world_from_object,
+    )
     pose = nearer.pose_at(given.view.time_s)
     assert pose is not None
     rng = np.random.default_rng(0)
     half = nearer.size_m / 2
-    strip = rng.uniform([-half[0], -half[1], -0.4], [-half[0], -half[1] + 0.5, 0.4], (800, 3))  # of its back only this is seen
+    # of its back only this is seen
+    strip = rng.uniform([-half[0], -half[1], -0.4], [-half[0], -half[1] + 0.5, 0.4], (800, 3))
     xyz = np.concatenate([given.xyz_world, geometry.transform_points(pose, strip)]).astype(np.float32)
     found = gather(replace(given, tracks=[car, nearer], xyz_world=xyz))
     assert found.box_labels.tolist() == [ID["car"], ID["truck"]]
@@ -126,7 +150,7 @@ def test_encoding_is_finite_and_of_unit_size() -> None:
     assert {TRAIN_ID_OF[label] for label in TRAIN_ID_OF} <= {ID[name] for group in BOX_GROUPS for name in group}
 
 
-# --- what evidence settles ----------------------------------------------------------------------------------------------
+# --- what evidence settles ------------------------------------------------------------------------
 
 
 def even() -> np.ndarray:
@@ -223,7 +247,7 @@ def test_a_picture_is_looked_at_with_the_focal_length_of_training() -> None:
     assert (ids[:10] == 3).all() and (ids[30:] == 7).all()
 
 
-# --- the network --------------------------------------------------------------------------------------------------------
+# --- the network ----------------------------------------------------------------------------------
 
 
 def test_every_pixel_gets_scores_at_any_size() -> None:
@@ -283,7 +307,7 @@ def test_the_shipped_files_are_small_and_explained() -> None:
     assert "generated cities" in card
 
 
-# --- files --------------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 def test_a_network_is_read_as_it_was_written(tmp_path: Path) -> None:
@@ -300,11 +324,15 @@ def test_damaged_folders_end_in_words(tmp_path: Path) -> None:
     with pytest.raises(ResourceError, match="weights are missing"):
         street_net.load(tmp_path)
     for field, value, words in (
-        ("widths", [8, 8, 8, 8, 9], r"widths\[4\]\n.*multiple of 8"), ("widths", "8", r"widths\n.*array"),
-        ("blocks", [1] * 4, "the field 4 is missing"), ("blocks", [1, 1, 1, 1, 10**9], r"blocks\[4\]\n.*65536"),
-        ("temperature", 0, r"temperature\n.*greater than 0"), ("focal_px", "x", "value is not a number"), ("depth", 3, "unknown field"),
+        ("widths", [8, 8, 8, 8, 9], r"widths\[4\]\n.*multiple of 8"),
+        ("widths", "8", r"widths\n.*array"),
+        ("blocks", [1] * 4, "the field 4 is missing"),
+        ("blocks", [1, 1, 1, 1, 10**9], r"blocks\[4\]\n.*65536"),
+        ("temperature", 0, r"temperature\n.*greater than 0"),
+        ("focal_px", "x", "value is not a number"),
+        ("depth", 3, "unknown field"),
         ("widths", [8, 8, 8, 8, 16], "do not fit"),
-    ):  # fmt: skip
+    ):
         shutil.rmtree(tmp_path / "bad", ignore_errors=True)
         shutil.copytree(tmp_path / "good", tmp_path / "bad")
         content = json.loads((tmp_path / "bad/model.json").read_text())
@@ -320,7 +348,7 @@ def test_damaged_folders_end_in_words(tmp_path: Path) -> None:
         street_net.load(tmp_path / "good")
 
 
-# --- training -----------------------------------------------------------------------------------------------------------
+# --- training -------------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -329,8 +357,20 @@ def tools(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def options_of(work: Path, run: str, **given: object) -> Namespace:
-    plain = {"seed": 3, "cities": 1, "first_cities": 1, "all_cities_at": 1, "run": run, "start": "", "steps": 2, "batch": 1,
-             "lr": 1e-3, "balance": 0.25, "checkpoint_every": 1, "workers": 0}  # fmt: skip
+    plain = {
+        "seed": 3,
+        "cities": 1,
+        "first_cities": 1,
+        "all_cities_at": 1,
+        "run": run,
+        "start": "",
+        "steps": 2,
+        "batch": 1,
+        "lr": 1e-3,
+        "balance": 0.25,
+        "checkpoint_every": 1,
+        "workers": 0,
+    }
     return Namespace(work=work, **plain | given)
 
 

@@ -41,16 +41,30 @@ def world(tmp_path_factory):
     torch.manual_seed(0)
     model = MDM(
         MDMConfig(
-            widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), window=4,
-            embed_width=16, codec=CodecConfig(decoder_width=8, decoder_blocks=1), patch=2, refine_widths=(64, 128), refine_blocks=(2, 3),
+            widths=(16, 32),
+            blocks=(1, 1),
+            spatial_attention=(False, True),
+            temporal_attention=(False, True),
+            window=4,
+            embed_width=16,
+            codec=CodecConfig(decoder_width=8, decoder_blocks=1),
+            patch=2,
+            refine_widths=(64, 128),
+            refine_blocks=(2, 3),
             area_px=192 * 128,
         )
-    )  # fmt: skip
+    )
     files.save(model, root / "model", "", {})
     config = SynthesizeConfig(
-        cameras=("front",), shifts_m=(1.0,), model=str(root / "model"), steps=2, width_px=48, full_size=False,
-        precision="float32", processes=1,
-    )  # fmt: skip
+        cameras=("front",),
+        shifts_m=(1.0,),
+        model=str(root / "model"),
+        steps=2,
+        width_px=48,
+        full_size=False,
+        precision="float32",
+        processes=1,
+    )
     return root, config
 
 
@@ -129,7 +143,9 @@ def test_processes_give_the_same_as_one(world, tmp_path):
 
 def test_trajectories_share_what_was_read_and_prepared_and_nothing_changes(world, usual, tmp_path, monkeypatch):
     prepared, prepare = [], condition._prepare_source
-    monkeypatch.setattr(condition, "_prepare_source", lambda *given: prepared.append(given[1].view.time_s) or prepare(*given))
+    monkeypatch.setattr(
+        condition, "_prepare_source", lambda *given: prepared.append(given[1].view.time_s) or prepare(*given)
+    )
     both = made(world, tmp_path / "both", shifts_m=(2.0, 1.0))
     assert len(prepared) == len(set(prepared)) > 1
     assert synthesize._recorded_again.cache_info().currsize == 0
@@ -151,10 +167,14 @@ def test_prepared_images_are_kept_exactly():
 def test_conditions_in_files_change_nothing(world, large, tmp_path, monkeypatch):
     mapped, map_array = [], scratch.mapped_array
     monkeypatch.setattr(stacked, "LARGE_PIXELS", 0)
-    monkeypatch.setattr(scratch, "mapped_array", lambda folder, *asked: mapped.append(folder) or map_array(folder, *asked))
+    monkeypatch.setattr(
+        scratch, "mapped_array", lambda folder, *asked: mapped.append(folder) or map_array(folder, *asked)
+    )
     filed = made(world, tmp_path / "filed", full_size=True)
     assert set(mapped) == {filed}
-    assert sorted(p.relative_to(filed) for p in filed.rglob("*")) == sorted(p.relative_to(large) for p in large.rglob("*"))
+    assert sorted(p.relative_to(filed) for p in filed.rglob("*")) == sorted(
+        p.relative_to(large) for p in large.rglob("*")
+    )
     for a, b in zip(frames_of(large / "front_shift+1.0"), frames_of(filed / "front_shift+1.0"), strict=True):
         assert torch.equal(a.rgb, b.rgb)
         assert torch.equal(a.depth.nan_to_num(), b.depth.nan_to_num())
@@ -223,8 +243,12 @@ def test_further_paths_are_made_and_parts_of_the_condition_switched_off(world, u
     lane = read_observations(out / "front_lane+0.2")
     start = trajectory.recorded(read_scene(world[0] / "scene"), "front").views
     assert len(lane) == FRAMES
-    assert [round(float(torch.tensor(a.center_world - b.center_world).norm()), 3) for a, b in zip(lane.views, start)][:3] == [0.0, 0.2, 0.4]
-    outs = {parts: made(world, tmp_path / parts, condition=parts) for parts in ("reference", "points", "concat")} | {"full": usual}
+    assert [round(float(torch.tensor(a.center_world - b.center_world).norm()), 3) for a, b in zip(lane.views, start)][
+        :3
+    ] == [0.0, 0.2, 0.4]
+    outs = {parts: made(world, tmp_path / parts, condition=parts) for parts in ("reference", "points", "concat")} | {
+        "full": usual
+    }
     seen = {parts: frames_of(folder / "front_shift+1.0")[2].rgb for parts, folder in outs.items()}
     names = list(seen)
     assert all(not torch.equal(seen[a], seen[b]) for a in names for b in names if a < b)
@@ -293,10 +317,16 @@ def test_a_fitted_scene_is_part_of_the_condition(world, fitted, tmp_path, monkey
     scene, model = fitted
     given, finished = [], []
     sample, finish = MDM.sample, MDM.finish
-    monkeypatch.setattr(MDM, "sample", lambda self, condition, *rest: (given.append(condition), sample(self, condition, *rest))[1])
-    monkeypatch.setattr(MDM, "finish", lambda self, clip, fine, **more: (finished.append(fine), finish(self, clip, fine, **more))[1])
+    monkeypatch.setattr(
+        MDM, "sample", lambda self, condition, *rest: (given.append(condition), sample(self, condition, *rest))[1]
+    )
+    monkeypatch.setattr(
+        MDM, "finish", lambda self, clip, fine, **more: (finished.append(fine), finish(self, clip, fine, **more))[1]
+    )
     settings = replace(config, model=str(model), full_size=True, steps=1)
-    out = Synthesize(scene=root / "scene", fused=root / "fused", fitted=scene, out=tmp_path / "out", settings=settings).run()
+    out = Synthesize(
+        scene=root / "scene", fused=root / "fused", fitted=scene, out=tmp_path / "out", settings=settings
+    ).run()
     made = frames_of(out / "front_shift+1.0")
     assert len(made) == FRAMES and made[0].rgb.shape == (3, 64, 96)
     assert all(c.renders is not None and c.renders.color.shape[-2:] == (32, 48) for c in given)
@@ -313,7 +343,9 @@ def test_a_fitted_scene_is_part_of_the_condition(world, fitted, tmp_path, monkey
 def test_a_model_without_renders_takes_no_fitted_scene(world, fitted, tmp_path):
     root, config = world
     with pytest.raises(UsageError, match="not trained with renders"):
-        Synthesize(scene=root / "scene", fused=root / "fused", fitted=fitted[0], out=tmp_path / "out", settings=config).run()
+        Synthesize(
+            scene=root / "scene", fused=root / "fused", fitted=fitted[0], out=tmp_path / "out", settings=config
+        ).run()
     assert not (tmp_path / "out").exists()
 
 
@@ -321,4 +353,6 @@ def test_a_condition_with_parts_switched_off_has_no_renders(world, fitted, tmp_p
     root, config = world
     settings = replace(config, model=str(fitted[1]), condition="points")
     with pytest.raises(UsageError, match="switched off"):
-        Synthesize(scene=root / "scene", fused=root / "fused", fitted=fitted[0], out=tmp_path / "out", settings=settings).run()
+        Synthesize(
+            scene=root / "scene", fused=root / "fused", fitted=fitted[0], out=tmp_path / "out", settings=settings
+        ).run()

@@ -21,31 +21,62 @@ TABLE = TextTable(
 
 def test_markdown_marks_the_best():
     assert markdown(TABLE) == [
-        "|  | FID ↓ | a_b |", "|---|---|---|", "| A paper's & method | 50.00 |  |", "| the truth | 6.00 | - |",
+        "|  | FID ↓ | a_b |",
+        "|---|---|---|",
+        "| A paper's & method | 50.00 |  |",
+        "| the truth | 6.00 | - |",
         "| ours (mudg_s) | **45 %** | - |",
-    ]  # fmt: skip
+    ]
     assert markdown_table(["a", "b"], []) == ["| a | b |", "|---|---|"]
 
 
 def test_latex_escapes_gives_reasons_and_sets_published_lines_apart():
     assert latex(TABLE) == [
-        "% 2 m", "% -- a_b: no weights", r"\begin{tabular}{lrr}", r"\hline", r" & FID $\downarrow$ & a\_b \\", r"\hline",
-        r"A paper's \& method & 50.00 &  \\", r"\hline", r"the truth & 6.00 & -- \\", r"ours (mudg\_s) & \textbf{45 \%} & -- \\",
-        r"\hline", r"\end{tabular}",
-    ]  # fmt: skip
+        "% 2 m",
+        "% -- a_b: no weights",
+        r"\begin{tabular}{lrr}",
+        r"\hline",
+        r" & FID $\downarrow$ & a\_b \\",
+        r"\hline",
+        r"A paper's \& method & 50.00 &  \\",
+        r"\hline",
+        r"the truth & 6.00 & -- \\",
+        r"ours (mudg\_s) & \textbf{45 \%} & -- \\",
+        r"\hline",
+        r"\end{tabular}",
+    ]
 
 
 def test_csv_quotes_what_it_must():
-    text = csv_text(["row", "value"], [["a, \"b\"", 0.5], ["c", ""]])
-    assert list(csv.reader(io.StringIO(text))) == [["row", "value"], ["a, \"b\"", "0.5"], ["c", ""]] and "\r" not in text
+    text = csv_text(["row", "value"], [['a, "b"', 0.5], ["c", ""]])
+    assert list(csv.reader(io.StringIO(text))) == [["row", "value"], ['a, "b"', "0.5"], ["c", ""]] and "\r" not in text
 
 
 def test_a_page_escapes_cells_and_marks_lines():
     evil = TextTable(("", "n"), (TextLine("<script>", (TextCell("<b>", best=True),), "n"),), "<i>")
-    text = html.render("bench.html.j2", title="t", kicker="k", lead="l", footer="", sections=[
-        {"title": "s", "tables": [TABLE, evil], "notes": [], "below": [], "films": [], "walls": [], "log_choices": [], "shift_choices": []},
-    ])  # fmt: skip
-    assert "<script>" not in text and '<tr class="n"><th scope="row">&lt;script&gt;</th><td><strong>&lt;b&gt;</strong></td></tr>' in text
+    text = html.render(
+        "bench.html.j2",
+        title="t",
+        kicker="k",
+        lead="l",
+        footer="",
+        sections=[
+            {
+                "title": "s",
+                "tables": [TABLE, evil],
+                "notes": [],
+                "below": [],
+                "films": [],
+                "walls": [],
+                "log_choices": [],
+                "shift_choices": [],
+            }
+        ],
+    )
+    assert (
+        "<script>" not in text
+        and '<tr class="n"><th scope="row">&lt;script&gt;</th><td><strong>&lt;b&gt;</strong></td></tr>' in text
+    )
     assert '<tr class="published">' in text and "<h3>2 m</h3>" in text and "<h3>&lt;i&gt;</h3>" in text
 
 

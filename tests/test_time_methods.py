@@ -56,7 +56,11 @@ OWN = {
 }
 BOX_FREE = [name for name in RECIPES if not METHODS[name].boxes]
 MOVING = [name for name in RECIPES if name != "gs3d"]
-FITTED_ALONE = [name for name, row in METHODS.items() if row.made_by == "render" and not {"virtual", "repaired"} & {*row.supervision}]
+FITTED_ALONE = [
+    name
+    for name, row in METHODS.items()
+    if row.made_by == "render" and not {"virtual", "repaired"} & {*row.supervision}
+]
 """Methods that are fitted to recorded views and nothing else."""
 FITTED = {"gaussians", "nodes", "model", "field"}
 
@@ -77,7 +81,13 @@ def cars_that_walk(monkeypatch):
 
 
 def settings(method: str, **changes):
-    small = {"iterations": 24, "start__gaussians": 900, "densify__max_gaussians": 1500, "checkpoint_every": 1000, "preview_every": 1000}
+    small = {
+        "iterations": 24,
+        "start__gaussians": 900,
+        "densify__max_gaussians": 1500,
+        "checkpoint_every": 1000,
+        "preview_every": 1000,
+    }
     return fit_config(method=method, **{**small, **changes})
 
 
@@ -85,7 +95,7 @@ def fitted_bytes(folder: Path) -> dict[str, bytes]:
     return {name: (folder / name).read_bytes() for name in ("gaussians.safetensors", "nodes.safetensors", "model.json")}
 
 
-# ---- vibration -------------------------------------------------------------------------------------------------------
+# ---- vibration -----------------------------------------------------------------------------------
 
 
 def vibrating(count: int = 5) -> NodeRows:
@@ -102,7 +112,11 @@ def test_vibration_by_hand():
     """A quarter of a cycle after its peak a Gaussian is v l / (2 pi) away, and as faint as the normal density says."""
     node = VibrationNode("background", middle_s=10.0, frame_s=0.1)
     assert node.time_of(10.1) == pytest.approx(0.02)
-    own = {"tau": torch.tensor([0.0, 0.05]), "log_beta": torch.tensor([0.05, 0.01]).log(), "velocity": torch.tensor([[2.0, 0, 0]] * 2)}
+    own = {
+        "tau": torch.tensor([0.0, 0.05]),
+        "log_beta": torch.tensor([0.05, 0.01]).log(),
+        "velocity": torch.tensor([[2.0, 0, 0]] * 2),
+    }
     rows = NodeRows(torch.zeros(2, 3), torch.ones(2, 4), torch.tensor([0.8, 0.8]), torch.zeros(2, 1, 3), own)
     seen = node.at_time(rows, 10.25)  # t = 0.05, a quarter of the cycle 0.2
     assert seen.means[0].tolist() == pytest.approx([2.0 * 0.2 / (2 * math.pi), 0, 0])
@@ -110,7 +124,9 @@ def test_vibration_by_hand():
     assert seen.opacity.tolist() == pytest.approx([0.8 * math.exp(-0.5), 0.8])
     later = node.at_time(rows, 10.4)  # t = 0.08: three life spans after the peak of the second
     assert later.opacity[1] == 0.0
-    assert average_velocity(own["velocity"], torch.tensor([0.4, 0.0]))[:, 0].tolist() == pytest.approx([2 * math.exp(-1), 2.0])
+    assert average_velocity(own["velocity"], torch.tensor([0.4, 0.0]))[:, 0].tolist() == pytest.approx(
+        [2 * math.exp(-1), 2.0]
+    )
 
 
 def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
@@ -119,7 +135,9 @@ def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
     for i in range(len(rows.means)):
         beta, since = math.exp(rows.own["log_beta"][i]), 0.04 - 0.013 - float(rows.own["tau"][i])
         factor = math.exp(-(since**2) / (2 * beta**2))
-        assert float(seen.opacity[i]) == pytest.approx(float(rows.opacity[i]) * (factor if factor > 0.05 else 0.0), rel=1e-12)
+        assert float(seen.opacity[i]) == pytest.approx(
+            float(rows.opacity[i]) * (factor if factor > 0.05 else 0.0), rel=1e-12
+        )
         for axis in range(3):
             v = float(rows.own["velocity"][i, axis])
             moved = v * math.sin(2 * math.pi * since / 0.2) * 0.2 / (2 * math.pi) + v * math.exp(-beta / 0.4) * 0.013
@@ -127,15 +145,22 @@ def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
     held = [rows.means, rows.opacity, *(rows.own[name] for name in ("tau", "log_beta", "velocity"))]
 
     def at(means, opacity, tau, log_beta, velocity):
-        now = node.at_time(replace(rows, means=means, opacity=opacity, own={"tau": tau, "log_beta": log_beta, "velocity": velocity}), 1.2)
+        now = node.at_time(
+            replace(rows, means=means, opacity=opacity, own={"tau": tau, "log_beta": log_beta, "velocity": velocity}),
+            1.2,
+        )
         return now.means, now.opacity
 
     assert torch.autograd.gradcheck(at, [value.clone().requires_grad_() for value in held])
 
 
 def test_children_lie_on_their_parents_path():
-    columns = {"means": torch.zeros(2, 3), "tau": torch.tensor([0.1, 0.1]), "log_beta": torch.tensor([0.04, 0.005]).log(),
-               "velocity": torch.tensor([[3.0, 0, 0]] * 2)}  # fmt: skip
+    columns = {
+        "means": torch.zeros(2, 3),
+        "tau": torch.tensor([0.1, 0.1]),
+        "log_beta": torch.tensor([0.04, 0.005]).log(),
+        "velocity": torch.tensor([[3.0, 0, 0]] * 2),
+    }
     node = VibrationNode.of_times([0.0, 0.1])
     born = node.born_later(columns, torch.tensor([1.0, -2.0]), late=True)
     assert born["tau"].tolist() == pytest.approx([0.14, 0.09])
@@ -148,16 +173,26 @@ def test_children_lie_on_their_parents_path():
 
 @pytest.mark.parametrize(("step", "late", "rows"), [(10, 20, 5), (20, 20, 6)])
 def test_what_changes_in_time_is_split_in_time(step, late, rows):
-    """Of three Gaussians with small image gradients, one has a gradient of tau and a long life: it becomes two, late in the run three."""
-    columns = columns_from_points(np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8), None, (), 0, np.full(4, 0.1, np.float32))
+    """Of three Gaussians with small image gradients, one has a gradient of tau and a long life: it becomes two, late in
+    the run three."""
+    columns = columns_from_points(
+        np.zeros((4, 3), np.float32), np.zeros((4, 3), np.uint8), None, (), 0, np.full(4, 0.1, np.float32)
+    )
     columns |= starting_columns(4, torch.zeros(4), 0.2) | {"log_beta": torch.tensor([0.1, 0.1, 0.1, 0.005]).log()}
-    model = SceneModel(Table(columns, {"node": torch.zeros(4, dtype=torch.int32)}), (VibrationNode("b", 0.0, 0.1),), None, (), 0)
+    model = SceneModel(
+        Table(columns, {"node": torch.zeros(4, dtype=torch.int32)}), (VibrationNode("b", 0.0, 0.1),), None, (), 0
+    )
     stats = densify.DensifyStats(torch.zeros(4), torch.ones(4), torch.tensor([0.0, 1.0, 0.0, 0.0]))
     report = densify.densify(model, stats, step, densify.DensifySettings(1, 99, 10, growth=9.0, late=late), 0)
     assert (report["split"], report["cloned"], report["rows"]) == (1, 0, rows)
     assert len(set(model.table["tau"].tolist())) == rows - 2
-    copied = densify.densify(model, densify.DensifyStats(*(torch.ones(rows) for _ in range(3))), step,
-                             densify.DensifySettings(1, 99, 10, static_gradient=9.0, growth=9.0), 0)  # fmt: skip
+    copied = densify.densify(
+        model,
+        densify.DensifyStats(*(torch.ones(rows) for _ in range(3))),
+        step,
+        densify.DensifySettings(1, 99, 10, static_gradient=9.0, growth=9.0),
+        0,
+    )
     assert copied["cloned"] == 1
 
 
@@ -167,7 +202,9 @@ def test_the_losses_of_pvg_by_hand():
     assert inverse.flatten().tolist() == pytest.approx([0.05 + 0.0005, 0.05])
     assert losses.sparse_inverse_depth(inverse, torch.tensor([1]), torch.tensor([10.0])).item() == pytest.approx(0.05)
     rgb = torch.tensor([[[0.0, 1.0]]] * 3)
-    assert losses.edge_aware(torch.tensor([[[1.0, 3.0], [1.0, 3.0]]]), rgb.expand(3, 2, 2)).item() == pytest.approx(2 * math.exp(-1))
+    assert losses.edge_aware(torch.tensor([[[1.0, 3.0], [1.0, 3.0]]]), rgb.expand(3, 2, 2)).item() == pytest.approx(
+        2 * math.exp(-1)
+    )
     assert losses.opacity_entropy(alpha).item() == pytest.approx(-0.25 * math.log(0.5))
     assert losses.empty_sky(alpha, torch.tensor([[[True, False]]])).item() == pytest.approx(-0.5 * math.log(0.5))
 
@@ -175,7 +212,9 @@ def test_the_losses_of_pvg_by_hand():
 def test_half_of_the_steps_draw_the_state_of_another_time():
     table = Table({"means": torch.zeros(1, 3)}, {"node": torch.zeros(1, dtype=torch.int32)})
     model = SceneModel(table, (VibrationNode("b", 0, 0.1),), None, (), 0)
-    drawn = [pvg.VibrationRecipe().drawn_model(model, None, step, settings("pvg")).nodes[0].early for step in range(400)]
+    drawn = [
+        pvg.VibrationRecipe().drawn_model(model, None, step, settings("pvg")).nodes[0].early for step in range(400)
+    ]
     moved = [early for early in drawn if early]
     assert 160 < len(moved) < 240
     assert max(map(abs, moved)) <= 0.03
@@ -183,11 +222,13 @@ def test_half_of_the_steps_draw_the_state_of_another_time():
     assert model.nodes[0].early == 0.0
 
 
-# ---- deformed objects ------------------------------------------------------------------------------------------------
+# ---- deformed objects ----------------------------------------------------------------------------
 
 
 def person() -> tuple[DeformationField, DeformedNode]:
-    track = Track("walker", "pedestrian", [0.8, 0.6, 1.8], [0.0, 1.0], np.stack([geometry.yaw_matrix(0.3, (0, 0, 0))] * 2))
+    track = Track(
+        "walker", "pedestrian", [0.8, 0.6, 1.8], [0.0, 1.0], np.stack([geometry.yaw_matrix(0.3, (0, 0, 0))] * 2)
+    )
     return DeformationField.fresh((0.0, 2.0), 2, 8, 3, 5), DeformedNode.of_rigid(RigidNode.from_track(track), 2)
 
 
@@ -205,10 +246,15 @@ def test_a_flat_network_is_the_network_it_stands_for():
 
 
 def test_a_deformed_object_stays_one_through_everything_a_scene_does():
-    """At first it is rigid; then it moves as the field says, differently at other times and for other objects, saved and on its own."""
+    """At first it is rigid; then it moves as the field says, differently at other times and for other objects, saved
+    and on its own."""
     field, node = person()
-    columns = columns_from_points(np.random.default_rng(1).random((4, 3), np.float32) - 0.5, np.zeros((4, 3), np.uint8), None, (), 0)
-    scene = SceneModel(Table(columns, {"node": torch.ones(4, dtype=torch.int32)}), (StaticNode(), node, field), None, (), 0)
+    columns = columns_from_points(
+        np.random.default_rng(1).random((4, 3), np.float32) - 0.5, np.zeros((4, 3), np.uint8), None, (), 0
+    )
+    scene = SceneModel(
+        Table(columns, {"node": torch.ones(4, dtype=torch.int32)}), (StaticNode(), node, field), None, (), 0
+    )
     rigid = RigidNode.from_track(Track("w", "car", node.size_m, node.times_s, node.world_from_object))
     rows = NodeRows(columns["means"], columns["quats"], columns["logits"], columns["sh_dc"])
     assert torch.equal(compose(scene, 0.5).means, rigid.at_time(rows, 0.5).means)
@@ -228,14 +274,16 @@ def test_a_deformed_object_stays_one_through_everything_a_scene_does():
     assert torch.equal(compose(resting, 0.5).means, rigid.at_time(rows, 0.5).means)
 
 
-# ---- hexplane --------------------------------------------------------------------------------------------------------
+# ---- hexplane ------------------------------------------------------------------------------------
 
 
 def field_in_float64() -> HexPlaneNode:
     """A small field with numbers everywhere."""
     node = HexPlaneNode.fresh([-2, -3, 0, 1], [2, 3, 1, 2], PlaneSizes(2, 2, 3, 4, 5), 1)
     g = torch.Generator().manual_seed(4)
-    node.learnt = Table({name: torch.rand(value.shape, generator=g).double() - 0.4 for name, value in node.learnt.columns.items()})
+    node.learnt = Table(
+        {name: torch.rand(value.shape, generator=g).double() - 0.4 for name, value in node.learnt.columns.items()}
+    )
     return node
 
 
@@ -315,7 +363,7 @@ def test_the_losses_of_s3gaussian_by_hand():
     assert [term.item() for term in plane_smoothness(straight)] == [0.0, 0.0, 0.0]
 
 
-# ---- Bezier curves ---------------------------------------------------------------------------------------------------
+# ---- Bezier curves -------------------------------------------------------------------------------
 
 
 def test_bernstein_polynomials():
@@ -352,8 +400,13 @@ def test_an_object_on_curves_starts_where_its_box_is_and_moves_with_its_columns(
     keys = np.stack([geometry.yaw_matrix(0.4 * t, (5 * t, t**2, 0.5)) for t in times])
     track = Track("car", "car", [4.0, 2.0, 1.5], times, keys)
     node, rigid, g = BezierNode.from_track(track), RigidNode.from_track(track), torch.Generator().manual_seed(2)
-    rows = NodeRows(torch.randn(5, 3, generator=g), torch.randn(5, 4, generator=g), torch.ones(5), torch.zeros(5, 1, 3),
-                    {"curve": torch.zeros(5, 4, 3)})  # fmt: skip
+    rows = NodeRows(
+        torch.randn(5, 3, generator=g),
+        torch.randn(5, 4, generator=g),
+        torch.ones(5),
+        torch.zeros(5, 1, 3),
+        {"curve": torch.zeros(5, 4, 3)},
+    )
     for time_s in (0.0, 0.4, 1.0):
         ours, boxes = node.at_time(rows, time_s), rigid.at_time(rows, time_s)
         assert (ours.means - boxes.means).abs().max() < 2e-3
@@ -384,7 +437,7 @@ def test_an_object_on_curves_starts_where_its_box_is_and_moves_with_its_columns(
     assert torch.autograd.gradcheck(at, inputs, fast_mode=True)
 
 
-# ---- fits ------------------------------------------------------------------------------------------------------------
+# ---- fits ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("method", MOVING)
@@ -398,7 +451,9 @@ def test_a_fit_learns_reaches_every_column_and_is_read_back(world, tmp_path, mon
         adam_step(model, *rest)
 
     monkeypatch.setattr(fit, "adam_step", spy)
-    folder = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, iterations=60)).run()
+    folder = Fit(
+        scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, iterations=60)
+    ).run()
     assert OWN[method] <= reached
     model = fit.load_model(folder)
     view = view_at(0.6, camera(width=SIZE[0], height=SIZE[1]))
@@ -428,9 +483,9 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
             Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "parts", settings=config).run()
         stops.pop(0)
     monkeypatch.setattr(fit, "adam_step", adam_step)
-    assert fitted_bytes(Fit(
-        scene=world["scene"], fused=world["fuse"], out=tmp_path / "parts", settings=config
-    ).run()) == fitted_bytes(whole)
+    assert fitted_bytes(
+        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "parts", settings=config).run()
+    ) == fitted_bytes(whole)
 
 
 @pytest.fixture(scope="module")
@@ -438,7 +493,9 @@ def tracked_or_not(tmp_path_factory) -> dict[str, Path]:
     """Scenes of two cameras, one darker, that differ in their tracks alone, each with what fusing makes of it."""
     root = tmp_path_factory.mktemp("tracks")
     for name, changes in {"tracked": {}, "untracked": {"tracks": False}, "garbled": {"garbled": True}}.items():
-        write_scene(root / name, frames=4, cameras=("front", "left"), width=SIZE[0], height=SIZE[1], dark=("left",), **changes)
+        write_scene(
+            root / name, frames=4, cameras=("front", "left"), width=SIZE[0], height=SIZE[1], dark=("left",), **changes
+        )
         Fuse(scene=root / name, out=root / f"{name}-fuse", settings=FuseConfig(min_object_points=5, voxel_m=0.05)).run()
     return {path.name: path for path in root.iterdir()}
 
@@ -446,7 +503,10 @@ def tracked_or_not(tmp_path_factory) -> dict[str, Path]:
 def fitted_to(worlds: dict[str, Path], name: str, out: Path, method: str, iterations: int = 4) -> Path:
     small = SMALL_RADIANCE if method == "emernerf" else {}
     return Fit(
-        scene=worlds[name], fused=worlds[f"{name}-fuse"], out=out / name, settings=settings(method, iterations=iterations, **small)
+        scene=worlds[name],
+        fused=worlds[f"{name}-fuse"],
+        out=out / name,
+        settings=settings(method, iterations=iterations, **small),
     ).run()
 
 
@@ -467,9 +527,12 @@ def test_the_page_says_which_methods_know_boxes():
 
 @pytest.mark.parametrize("method", FITTED_ALONE)
 def test_boxes_change_a_method_if_and_only_if_it_knows_them(tracked_or_not, tmp_path, method):
-    """Without boxes: no byte of the start and of the fit depends on the tracks of the scene, nor on the clouds that they cleaned."""
+    """Without boxes: no byte of the start and of the fit depends on the tracks of the scene, nor on the clouds that
+    they cleaned."""
     folders = [fitted_to(tracked_or_not, name, tmp_path, method, 3) for name in ("tracked", "untracked", "garbled")]
-    tracked, untracked, garbled = ({f.name: f.read_bytes() for f in folder.glob("*.*") if f.stem in FITTED} for folder in folders)
+    tracked, untracked, garbled = (
+        {f.name: f.read_bytes() for f in folder.glob("*.*") if f.stem in FITTED} for folder in folders
+    )
     assert len(tracked) >= 2
     assert (tracked == untracked == garbled) is not METHODS[method].boxes
     assert (tracked != untracked != garbled) is METHODS[method].boxes
@@ -477,20 +540,29 @@ def test_boxes_change_a_method_if_and_only_if_it_knows_them(tracked_or_not, tmp_
 
 @pytest.mark.parametrize("method", FITTED_ALONE)
 def test_a_method_learns_from_what_the_table_says_and_from_nothing_else(tracked_or_not, tmp_path, monkeypatch, method):
-    """Without the depths, the sky or the classes of recorded views another scene comes out if and only if the row names them."""
+    """Without the depths, the sky or the classes of recorded views another scene comes out if and only if the row names
+    them."""
     row, load = METHODS[method], fit_views.load_recorded
     reader = rays if row.scene == "radiance" else fit
 
     def fitted_without(field: str) -> dict[str, bytes]:
         with monkeypatch.context() as patched:
-            patched.setattr(reader, "load_recorded", lambda *given: ((n, replace(view, **{field: None})) for n, view in load(*given)))
+            patched.setattr(
+                reader,
+                "load_recorded",
+                lambda *given: ((n, replace(view, **{field: None})) for n, view in load(*given)),
+            )
             if (row.scene, field) == ("radiance", "lidar"):
                 patched.setattr(radiance_loop, "lidar_rays", lambda scene: None)
             folder = fitted_to(tracked_or_not, "tracked", tmp_path / field, method, 3)
         return {file.name: file.read_bytes() for file in folder.glob("*.safetensors") if file.stem in FITTED}
 
     usual = fitted_without("depth")  # which recorded views never have
-    changed = {name for name, field in {"lidar": "lidar", "sky": "sky", "semantics": "channels"}.items() if fitted_without(field) != usual}
+    changed = {
+        name
+        for name, field in {"lidar": "lidar", "sky": "sky", "semantics": "channels"}.items()
+        if fitted_without(field) != usual
+    }
     assert {"color", *changed} == set(row.supervision)
     if row.scene == "gaussians":
         model = fit.load_model(tmp_path / "depth" / "tracked")
@@ -511,15 +583,21 @@ def test_a_static_scene_starts_with_what_moved(tracked_or_not, tmp_path):
 
 
 def test_a_cloud_without_boxes_has_the_settings_of_the_one_with_them(tracked_or_not, tmp_path):
-    Fuse(scene=tracked_or_not["tracked"], out=tmp_path / "coarse", settings=FuseConfig(voxel_m=0.8, match_colors=False)).run()
+    Fuse(
+        scene=tracked_or_not["tracked"], out=tmp_path / "coarse", settings=FuseConfig(voxel_m=0.8, match_colors=False)
+    ).run()
     scene = read_scene(tracked_or_not["tracked"])
-    fine, coarse = (fuse.fused_without_boxes(scene, folder) for folder in (tracked_or_not["tracked-fuse"], tmp_path / "coarse"))
+    fine, coarse = (
+        fuse.fused_without_boxes(scene, folder) for folder in (tracked_or_not["tracked-fuse"], tmp_path / "coarse")
+    )
     assert len(coarse.static) < len(fine.static) / 2
     assert (fine.colors.to_common.keys(), coarse.colors.to_common.keys()) == ({"left"}, set())
 
 
 @pytest.mark.parametrize("method", BOX_FREE)
-@pytest.mark.parametrize("changes", [{"poses__learn": True}, {"objects__deformable": False}, {"loss__object_weight": 0.1}])
+@pytest.mark.parametrize(
+    "changes", [{"poses__learn": True}, {"objects__deformable": False}, {"loss__object_weight": 0.1}]
+)
 def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_path, method, changes):
     with pytest.raises(UsageError, match="knows nothing of it"):
         Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, **changes)).run()
@@ -531,15 +609,27 @@ def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
     for weight in recipe_of(method).own_weights:
         with pytest.raises(UsageError, match="published weights of its own"):
             Fit(
-                scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, **{f"loss__{weight}": 0.33})
+                scene=world["scene"],
+                fused=world["fuse"],
+                out=tmp_path / "fit",
+                settings=settings(method, **{f"loss__{weight}": 0.33}),
             ).run()
     with pytest.raises(UsageError, match="densifies by gradients"):
-        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, densify__kind="mcmc")).run()
+        Fit(
+            scene=world["scene"],
+            fused=world["fuse"],
+            out=tmp_path / "fit",
+            settings=settings(method, densify__kind="mcmc"),
+        ).run()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "model.json").write_text("{}")
     with pytest.raises(UsageError, match="cannot go on"):
         Fit(
-            scene=world["scene"], fused=world["fuse"], start_from=tmp_path / "other", out=tmp_path / "fit", settings=settings(method)
+            scene=world["scene"],
+            fused=world["fuse"],
+            start_from=tmp_path / "other",
+            out=tmp_path / "fit",
+            settings=settings(method),
         ).run()
 
 
@@ -547,10 +637,18 @@ def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
 @pytest.mark.parametrize("method", MOVING)
 def test_a_fit_on_another_device_gives_the_same_numbers(world, tmp_path, method):
     small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch"}
-    here = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "here", settings=settings(method, device="cpu", **small)).run()
+    here = Fit(
+        scene=world["scene"],
+        fused=world["fuse"],
+        out=tmp_path / "here",
+        settings=settings(method, device="cpu", **small),
+    ).run()
     with pretend_device():
         there = Fit(
-            scene=world["scene"], fused=world["fuse"], out=tmp_path / "there", settings=settings(method, device="pretend", **small)
+            scene=world["scene"],
+            fused=world["fuse"],
+            out=tmp_path / "there",
+            settings=settings(method, device="pretend", **small),
         ).run()
     view = view_at(0.6, camera(width=SIZE[0], height=SIZE[1]))
     pictures = [fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb for folder in (here, there)]

@@ -29,7 +29,9 @@ def drive(poses: list[np.ndarray], cameras: dict[str, float] = YAWS) -> Scene:
         for index, pose in enumerate(poses):
             view = View(mounted[name], pose @ ego_from_cam, times[index])
             frames.append(Frame(f"{name}/{index:06d}", view, Ref(f"images/{name}/{index}.png")))
-    return Scene("drive", ".", mounted, tuple(frames), (), (), EgoPath(times, np.stack(poses)), {}, Source("test", "none"))
+    return Scene(
+        "drive", ".", mounted, tuple(frames), (), (), EgoPath(times, np.stack(poses)), {}, Source("test", "none")
+    )
 
 
 def circle(count: int = 20) -> Scene:
@@ -54,7 +56,9 @@ def test_on_a_circle_the_ego_stays_on_a_concentric_circle(shift_m):
 def test_every_camera_moves_by_the_distance_to_the_left_of_travel(camera, shift_m):
     scene = circle()
     path = scene.ego.world_from_ego[:, :3, 3]
-    for index, (old, new) in enumerate(zip(trajectory.recorded(scene, camera).views, trajectory.shifted(scene, camera, shift_m).views)):
+    for index, (old, new) in enumerate(
+        zip(trajectory.recorded(scene, camera).views, trajectory.shifted(scene, camera, shift_m).views)
+    ):
         move = new.center_world - old.center_world
         assert np.linalg.norm(move) == pytest.approx(abs(shift_m), abs=1e-12)
         if 0 < index < len(path) - 1:
@@ -74,13 +78,19 @@ def test_a_side_camera_does_not_slide_along_its_own_x_axis():
 
 def test_a_standing_car_still_has_a_left():
     scene = drive([geometry.yaw_matrix(0.7, (5.0, 1.0, 0.0))] * 4)
-    move = trajectory.shifted(scene, "front", 3.0).views[2].center_world - trajectory.recorded(scene, "front").views[2].center_world
+    move = (
+        trajectory.shifted(scene, "front", 3.0).views[2].center_world
+        - trajectory.recorded(scene, "front").views[2].center_world
+    )
     assert move.tolist() == pytest.approx([-3 * math.sin(0.7), 3 * math.cos(0.7), 0.0])
 
 
 def test_reversing_keeps_the_vehicles_left():
     scene = drive([geometry.yaw_matrix(0.0, (-float(i), 0.0, 0.0)) for i in range(4)])
-    move = trajectory.shifted(scene, "front", 1.0).views[1].center_world - trajectory.recorded(scene, "front").views[1].center_world
+    move = (
+        trajectory.shifted(scene, "front", 1.0).views[1].center_world
+        - trajectory.recorded(scene, "front").views[1].center_world
+    )
     assert move.tolist() == pytest.approx([0.0, 1.0, 0.0])
 
 
@@ -88,7 +98,10 @@ def test_a_banked_road_shifts_horizontally():
     roll = np.eye(4)
     roll[:3, :3] = [[1, 0, 0], [0, math.cos(0.2), -math.sin(0.2)], [0, math.sin(0.2), math.cos(0.2)]]
     scene = drive([roll] * 2)
-    move = trajectory.shifted(scene, "front", 2.0).views[0].center_world - trajectory.recorded(scene, "front").views[0].center_world
+    move = (
+        trajectory.shifted(scene, "front", 2.0).views[0].center_world
+        - trajectory.recorded(scene, "front").views[0].center_world
+    )
     assert move.tolist() == pytest.approx([0.0, 2.0, 0.0])
 
 

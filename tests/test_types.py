@@ -147,7 +147,7 @@ def test_scene_look_ups_name_what_there_is() -> None:
     with pytest.raises(InputError, match="track"):
         scene.track("7")
     with pytest.raises(TypeError):
-        scene.cameras["rear"] = CAMERA  # type: ignore[index]
+        scene.cameras["rear"] = CAMERA
 
 
 def test_palette_round_trip_and_margin() -> None:

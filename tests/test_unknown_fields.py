@@ -1,6 +1,8 @@
-"""Fields of other programs that this program does not know: named once per kind of file and import, short and plain; official ones never.
+"""Fields of other programs that this program does not know: named once per kind of file and import, short and plain;
+official ones never.
 
-Official fields that no writer of these tests writes are listed here from the data sets' documentation, not taken from the readers' tables.
+Official fields that no writer of these tests writes are listed here from the data sets' documentation, not taken from
+the readers' tables.
 """
 
 from __future__ import annotations
@@ -40,7 +42,7 @@ def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
     return [line for line in capsys.readouterr().err.splitlines() if "passed over" in line]
 
 
-# --- a field in every record of a file --------------------------------------------------------------------------------
+# --- a field in every record of a file ------------------------------------------------------------
 
 
 def to_calibration(root: Path, names: Sequence[str]) -> None:
@@ -61,7 +63,9 @@ def to_frames(root: Path, names: Sequence[str]) -> None:
     while place < len(content):
         (size,) = struct.unpack_from("<Q", content, place)
         payload = content[place + 12 : place + 12 + size]
-        records.append(write_waymo.record(payload + b"".join(write_waymo.text(int(name.split()[-1]), b"") for name in names)))
+        records.append(
+            write_waymo.record(payload + b"".join(write_waymo.text(int(name.split()[-1]), b"") for name in names))
+        )
         place += 16 + size
     path.write_bytes(b"".join(records))
 
@@ -115,23 +119,36 @@ def to_boxes_of_dgp(root: Path, names: Sequence[str]) -> None:
 def to_clouds(root: Path, names: Sequence[str]) -> None:
     for path in root.rglob("lidar/**/*.npz"):
         arrays: dict[str, Any] = dict(np.load(path))
-        np.savez(path, **{**arrays, **dict.fromkeys(names, np.zeros(len(arrays["xyz"])))})  # pyright: ignore[reportArgumentType]
+        np.savez(path, **{**arrays, **dict.fromkeys(names, np.zeros(len(arrays["xyz"])))})
 
 
 CASES: dict[str, tuple[Adder, Sequence[str], str, str]] = {
     "kitti": (to_calibration, ("calib_time",), "foo", "calib.txt"),
-    "kitti360": (to_objects, ("category", "semanticId_orig", "dynamicSeq", "dynamicIdx", "level_min", "level_max", "color"), "foo",
-                 "2013_05_28_drive_0003_sync.xml"),
+    "kitti360": (
+        to_objects,
+        ("category", "semanticId_orig", "dynamicSeq", "dynamicIdx", "level_min", "level_max", "color"),
+        "foo",
+        "2013_05_28_drive_0003_sync.xml",
+    ),
     "waymo v1": (to_frames, ("7", "8", "9", "10", "11"), "field 1000", "Frame messages"),
-    "waymo v2": (to_boxes_of_waymo, ("[LiDARBoxComponent].num_lidar_points_in_box", "[LiDARBoxComponent].speed.x",
-                 "[LiDARBoxComponent].difficulty_level.detection", "index"), "[LiDARBoxComponent].foo", "lidar_box/*.parquet"),
+    "waymo v2": (
+        to_boxes_of_waymo,
+        (
+            "[LiDARBoxComponent].num_lidar_points_in_box",
+            "[LiDARBoxComponent].speed.x",
+            "[LiDARBoxComponent].difficulty_level.detection",
+            "index",
+        ),
+        "[LiDARBoxComponent].foo",
+        "lidar_box/*.parquet",
+    ),
     "nuscenes": (to_rows, ("visibility_token", "num_radar_pts", "next", "prev"), "foo", "sample_annotation.json"),
     "argoverse2": (to_sweeps, ("laser_number",), "foo", "sensors/lidar/*.feather"),
     "pandaset": (to_poses, (), "foo", "poses.json"),
     "nuplan": (to_database, ("acceleration_x", "angular_rate_z"), "foo", "the table ego_pose"),
     "dgp": (to_boxes_of_dgp, ("occlusion", "truncation"), "annotations.box.foo", "bounding_box_3d/*.json"),
     "custom": (to_clouds, ("ring", "near_ir"), "foo", "*.npz"),
-}  # fmt: skip
+}
 """Format -> how fields come into a file of it; official ones; one that is none; what the file is called."""
 
 
@@ -150,12 +167,18 @@ def copied(kind: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) 
     if not isinstance(files, bad_logs.Files):
         bad_logs.write_waymo_log(files, kind, tmp_path / "log")
         return tmp_path / "log", options
-    folder = files.source if files.source.is_dir() else next(p for p in files.source.parents if (p / "sensor_blobs").is_dir())
+    folder = (
+        files.source
+        if files.source.is_dir()
+        else next(p for p in files.source.parents if (p / "sensor_blobs").is_dir())
+    )
     return Path(shutil.copytree(folder, tmp_path / "log")), options
 
 
 def source_of(kind: str, root: Path) -> Path:
-    return next(root.rglob("*.db")) if kind == "nuplan" else next(root.glob("*.tfrecord")) if kind == "waymo v1" else root
+    return (
+        next(root.rglob("*.db")) if kind == "nuplan" else next(root.glob("*.tfrecord")) if kind == "waymo v1" else root
+    )
 
 
 def test_an_official_log_is_imported_without_a_word_and_an_unknown_field_is_named_once(
@@ -192,11 +215,14 @@ def test_hostile_names_are_short_plain_and_few(
     copied: tuple[Path, ImportOptions], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root, options = copied
-    to_rows(root, ["\x1b]0;title\x07\nwarning: forged\u202e", "a" * 100_000, *(f"field{number}" for number in range(5000))])
+    to_rows(
+        root, ["\x1b]0;title\x07\nwarning: forged\u202e", "a" * 100_000, *(f"field{number}" for number in range(5000))]
+    )
     bad_logs.ingest("nuscenes", root, tmp_path / "out", options)
     (line,) = said(capsys)
     assert line.startswith(r"passed over: '\x1b]0;title\x07\nwarning: forged\u202e', 'aaaa")
-    assert line.endswith(" and 992 more in sample_annotation.json, which this program does not know")  # of the 1000 that are collected
+    # of the 1000 that are collected
+    assert line.endswith(" and 992 more in sample_annotation.json, which this program does not know")
     assert len(line) < 8 * 64 + 100 and line.isprintable() and line.count("', '") == 7
 
 
@@ -214,7 +240,9 @@ def test_silence_is_kept_and_nothing_is_collected_outside_of_an_import(
     assert said(capsys) == []
 
 
-def test_fields_that_a_custom_log_names_are_known_whatever_they_are_called(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_fields_that_a_custom_log_names_are_known_whatever_they_are_called(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     np.savez(tmp_path / "a.npz", xyz=np.ones((2, 3)), Ring=np.ones(2), helligkeit=np.ones(2), foo=np.ones(2))
     with unknown_fields.named_once():
         read_cloud(tmp_path / "a.npz", known=("helligkeit", ""))
@@ -224,10 +252,16 @@ def test_fields_that_a_custom_log_names_are_known_whatever_they_are_called(tmp_p
 def test_tracklets_of_a_raw_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = kitti_folders.write_raw_drive(tmp_path / "2011_09_26")
     path = drive / "tracklet_labels.xml"
-    official = path.read_text().replace("</poses>", "<item_version>2</item_version></poses><finished>1</finished>").replace(
-        "</rz>", "</rz><state>2</state><occlusion>0</occlusion><occlusion_kf>0</occlusion_kf><truncation>0</truncation>"
-        "<amt_occlusion>-1</amt_occlusion><amt_occlusion_kf>-1</amt_occlusion_kf><amt_border_l>-1</amt_border_l>"
-        "<amt_border_r>-1</amt_border_r><amt_border_kf>-1</amt_border_kf>")  # fmt: skip
+    official = (
+        path.read_text()
+        .replace("</poses>", "<item_version>2</item_version></poses><finished>1</finished>")
+        .replace(
+            "</rz>",
+            "</rz><state>2</state><occlusion>0</occlusion><occlusion_kf>0</occlusion_kf><truncation>0</truncation>"
+            "<amt_occlusion>-1</amt_occlusion><amt_occlusion_kf>-1</amt_occlusion_kf><amt_border_l>-1</amt_border_l>"
+            "<amt_border_r>-1</amt_border_r><amt_border_kf>-1</amt_border_kf>",
+        )
+    )
     path.write_text(official)
     IMPORTERS["kitti"](drive, tmp_path / "official", ImportOptions())
     assert said(capsys) == []
@@ -236,7 +270,7 @@ def test_tracklets_of_a_raw_drive(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert said(capsys) == ["passed over: 'bar', 'foo' in tracklet_labels.xml, which this program does not know"]
 
 
-# --- real logs --------------------------------------------------------------------------------------------------------
+# --- real logs ------------------------------------------------------------------------------------
 
 REAL = {
     "kitti": ("kitti_2011_09_26", {"frames": (0, 2)}),
@@ -254,8 +288,11 @@ def test_real_logs_hold_no_unknown_field(
     assert said(capsys) == []
 
 
-def test_parts_of_real_logs_hold_no_unknown_field(shared_data: Callable[[str], Path], capsys: pytest.CaptureFixture[str]) -> None:
-    """Files of logs that lack what a scene needs: both tables of calibration, boxes, poses and sweeps; frames; calibration text."""
+def test_parts_of_real_logs_hold_no_unknown_field(
+    shared_data: Callable[[str], Path], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Files of logs that lack what a scene needs: both tables of calibration, boxes, poses and sweeps; frames;
+    calibration text."""
     pytest.importorskip("pyarrow")
     from mudg.formats.importers import argoverse2
     from mudg.formats.importers.kitti.files import read_calibration_text, read_label_text

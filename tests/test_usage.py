@@ -16,7 +16,9 @@ from mudg.base.memory import Meter, Usage
 from mudg.base.run_folder import RunDir, VerbOutput
 
 OUTPUT = VerbOutput("work", 1, ("*.txt",))
-needs_proc = pytest.mark.skipif(usage.held_bytes() is None, reason="the system does not tell the memory of processes (/proc)")
+needs_proc = pytest.mark.skipif(
+    usage.held_bytes() is None, reason="the system does not tell the memory of processes (/proc)"
+)
 
 needs_shares = pytest.mark.skipif(
     "Pss_Anon" not in usage.system_text("/proc/self/smaps_rollup"), reason="the system tells no proportional set sizes"
@@ -91,7 +93,9 @@ def test_what_child_processes_share_counts_once(tmp_path: Path) -> None:
     mine = np.memmap(large, np.uint8, "r")
     assert mine[::4096].sum() == 0
     meter = Meter()
-    children = [subprocess.Popen([sys.executable, "-c", SHARING, large], stdin=-1, stdout=-1, text=True) for _ in range(2)]
+    children = [
+        subprocess.Popen([sys.executable, "-c", SHARING, large], stdin=-1, stdout=-1, text=True) for _ in range(2)
+    ]
     try:
         assert [child.stdout.readline() for child in children] == ["ready\n"] * 2
         sizes, held = usage.resident_sizes(), usage.held_bytes()

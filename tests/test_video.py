@@ -60,8 +60,10 @@ def test_same_frames_same_bytes(tmp_path):
 
 def test_refusals_leave_no_file(tmp_path):
     for frames, words in (
-        ([], "at least one frame"), ([*clip(2), clip(1, 16)[0]], "differ in size"), ([np.zeros((4, 4), np.uint8)], "must be u8"),
-    ):  # fmt: skip
+        ([], "at least one frame"),
+        ([*clip(2), clip(1, 16)[0]], "differ in size"),
+        ([np.zeros((4, 4), np.uint8)], "must be u8"),
+    ):
         with pytest.raises(InputError, match=words):
             video.write_mp4(tmp_path / "a.mp4", frames)
     assert list(tmp_path.iterdir()) == []

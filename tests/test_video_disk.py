@@ -1,4 +1,5 @@
-"""A video on a disk that is full, or under a limit of file size (as a quota): an error in words, and nothing half-written."""
+"""A video on a disk that is full, or under a limit of file size (as a quota): an error in words, and nothing
+half-written."""
 
 from __future__ import annotations
 
@@ -30,10 +31,16 @@ else:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of file size")
-@pytest.mark.parametrize("limit", [1000, 10_000_000, *(pytest.param(limit, marks=pytest.mark.slow) for limit in (1, 30_000))])
+@pytest.mark.parametrize(
+    "limit", [1000, 10_000_000, *(pytest.param(limit, marks=pytest.mark.slow) for limit in (1, 30_000))]
+)
 def test_a_video_that_does_not_fit_on_the_disk_ends_in_words(limit: int, tmp_path: Path) -> None:
-    ended = subprocess.run([sys.executable, "-c", WRITES.format(limit=limit), str(tmp_path / "film.mp4")],
-        capture_output=True, text=True, check=False)  # fmt: skip
+    ended = subprocess.run(
+        [sys.executable, "-c", WRITES.format(limit=limit), str(tmp_path / "film.mp4")],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout.startswith("written" if limit == 10_000_000 else "in words")
     assert [path.name for path in tmp_path.iterdir()] == (["film.mp4"] if limit == 10_000_000 else [])

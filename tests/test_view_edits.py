@@ -1,4 +1,5 @@
-"""Edits on the viewer's page: what the server carries out and saves, and that the page shows what ``mudg render --edits`` draws."""
+"""Edits on the viewer's page: what the server carries out and saves, and that the page shows what ``mudg render
+--edits`` draws."""
 
 from __future__ import annotations
 
@@ -102,9 +103,21 @@ def test_an_exact_frame_is_the_render_of_the_edited_fit(toy: Toy, tmp_path: Path
     wanted = STREET.view(0.4, 80, 48)
     pose, camera = wanted.world_from_cam, wanted.camera
     asked = FrameRequest(
-        scene=0, layer="color", time_s=0.4, hidden=[], edits=SCRIPT, camera="front", width=80, height=48, fx=camera.fx, fy=camera.fy,
-        cx=camera.cx, cy=camera.cy, eye=pose[:3, 3].tolist(), axes=pose[:3, :3].T.tolist(),
-    )  # fmt: skip
+        scene=0,
+        layer="color",
+        time_s=0.4,
+        hidden=[],
+        edits=SCRIPT,
+        camera="front",
+        width=80,
+        height=48,
+        fx=camera.fx,
+        fy=camera.fy,
+        cx=camera.cx,
+        cy=camera.cy,
+        eye=pose[:3, 3].tolist(),
+        axes=pose[:3, :3].T.tolist(),
+    )
     scene = read_scene(toy[0] / "scene")
     source = FrameSource(desk.edited, scene, 1600, torch.device("cpu"))
 
@@ -136,13 +149,20 @@ def test_a_street_is_closed_once_and_only_for_frames(toy: Toy, tmp_path: Path, m
 
     monkeypatch.setattr(desk_module, "street_left", counted)
     scene = read_scene(toy[0] / "scene")
-    desk, scripts = desk_of(toy, tmp_path / "edits.yaml"), [f"- move: {{id: car-1, left_m: {x}, close_street: true}}\n" for x in (1, 2, 3)]
+    desk, scripts = (
+        desk_of(toy, tmp_path / "edits.yaml"),
+        [f"- move: {{id: car-1, left_m: {x}, close_street: true}}\n" for x in (1, 2, 3)],
+    )
     notes = [said(desk, script)["notes"] for script in scripts]
     assert all(any("close the street" in note for note in of) for of in notes) and True not in calls
     for script in scripts:
         made, plain = desk.edited(script)[0], carry_out(parse_edits(script, "edits.yaml"), toy[2], scene).model(toy[2])
-        assert torch.equal(made.table["means"], plain.table["means"]) and torch.equal(made.table["sh_dc"], plain.table["sh_dc"])
-        assert np.array_equal(motion_of(made.dynamic_object("car-1")).poses, motion_of(plain.dynamic_object("car-1")).poses)
+        assert torch.equal(made.table["means"], plain.table["means"]) and torch.equal(
+            made.table["sh_dc"], plain.table["sh_dc"]
+        )
+        assert np.array_equal(
+            motion_of(made.dynamic_object("car-1")).poses, motion_of(plain.dynamic_object("car-1")).poses
+        )
     assert calls.count(True) == 1
     desk.edited("- remove: {ids: [car-1], close_street: true}\n")
     assert calls.count(True) == 2
@@ -155,7 +175,10 @@ def test_a_page_may_insert_objects_of_its_own_run_and_of_no_other(toy: Toy, tmp_
     (run / "fuse").mkdir()
     (run / "fuse" / "fuse.json").write_text("{}")
     desk = desk_for([toy[2]], read_scene(run / "scene"), None, run, EditFiles(out=tmp_path / "edits.yaml"))
-    script = f'- insert: {{asset: {{run: "{desk.run}", id: car-1}}, near: {{id: ego, at_s: 0.2, ahead_m: 12}}, ground: false}}\n'
+    script = (
+        f'- insert: {{asset: {{run: "{desk.run}", id: car-1}}, near: {{id: ego, at_s: 0.2, ahead_m: 12}}, ground:'
+        " false}\n"
+    )
     told = said(desk, script)
     (edited,) = desk.edited(script)
     (name,) = told["inserted"]
@@ -230,7 +253,7 @@ def test_heights_of_the_ground_are_kept_within_a_millimetre() -> None:
     assert with_ground(PageFacts({}, {}, b""), None).facts["ground"] is None
 
 
-# in a browser --------------------------------------------------------------------------------------------------------
+# in a browser -------------------------------------------------------------------------------------
 
 
 def hilly() -> HeightMap:
@@ -302,7 +325,8 @@ def test_the_page_moves_objects_as_the_program_does(
 
 PRESS = """(type, x, y, id = 1) => document.getElementById('stage').dispatchEvent(
   new PointerEvent(type, {clientX: x, clientY: y, pointerId: id, bubbles: true}))"""
-HANDLES = """(() => { const app = window.mudg, {view, area, ratio} = app.last, box = app.stage.getBoundingClientRect(), found = {};
+HANDLES = """(() => { const app = window.mudg, {view, area, ratio} = app.last;
+  const box = app.stage.getBoundingClientRect(), found = {};
   for (const [name, [x, y]] of Object.entries(app.gizmo.handles(view, app.gizmo.frame())))
     found[name] = [box.left + (x + area[0]) / ratio, box.top + (y + area[1]) / ratio];
   return found; })()"""
@@ -311,12 +335,13 @@ HANDLES = """(() => { const app = window.mudg, {view, area, ratio} = app.last, b
 @pytest.mark.slow
 def test_an_object_is_picked_moved_and_turned_with_its_handles(opened: Browser, tmp_path: Path) -> None:
     opened.run(
-        "document.getElementById('stage').setPointerCapture = () => {}; window.mudg.change({mode: 'top', height: 30, t: 0.4}); 1"
+        "document.getElementById('stage').setPointerCapture = () => {}; window.mudg.change({mode: 'top', height: 30, t:"
+        " 0.4}); 1"
     )
     opened.wait("window.mudg.sharp")
     middle = opened.run(
-        "(() => { const app = window.mudg, track = app.tracks.find((one) => one.id === 'car-1'); app.state.selected = 'car-1';"
-        f"const found = {HANDLES}; app.state.selected = null; return found.free; }})()"
+        "(() => { const app = window.mudg, track = app.tracks.find((one) => one.id === 'car-1'); app.state.selected ="
+        f" 'car-1';const found = {HANDLES}; app.state.selected = null; return found.free; }})()"
     )
     opened.run(
         f"(({PRESS})('pointerdown', {middle[0]}, {middle[1]}), ({PRESS})('pointerup', {middle[0]}, {middle[1]}), 1)"
@@ -334,7 +359,8 @@ def test_an_object_is_picked_moved_and_turned_with_its_handles(opened: Browser, 
     opened.wait("window.mudg.sharp")
     x, y = opened.run(HANDLES)["yaw"]
     opened.run(
-        f"(({PRESS})('pointerdown', {x}, {y}), ({PRESS})('pointermove', {x - 30}, {y}), ({PRESS})('pointerup', {x}, {y}), 1)"
+        f"(({PRESS})('pointerdown', {x}, {y}), ({PRESS})('pointermove', {x - 30}, {y}), ({PRESS})('pointerup', {x},"
+        f" {y}), 1)"
     )
     edits = opened.run("window.mudg.state.edits")
     assert len(edits) == 1 and abs(edits[0]["move"]["yaw_deg"]) > 3
@@ -398,7 +424,10 @@ def test_fog_and_light_are_previewed_and_saved(opened: Browser, toy: Toy, tmp_pa
     )
     opened.run("mudg.editor.set([]); 1")
     plain = opened.run(picture)
-    set_to = "(() => {{ const e = document.getElementById('{0}'); e.value = '{1}'; e.dispatchEvent(new Event('change')); }})()"
+    set_to = (
+        "(() => {{ const e = document.getElementById('{0}'); e.value = '{1}'; e.dispatchEvent(new Event('change'));"
+        " }})()"
+    )
     opened.run(set_to.format("fog", 7))
     foggy = opened.run(picture)
     opened.run(set_to.format("light", "night"))
@@ -433,7 +462,8 @@ def test_boxes_beside_the_camera_are_cut_and_not_left_out(opened: Browser) -> No
         "for (let i = 3; i < p.length; i += 4) if (p[i]) n++; return n; })()"
     )
     center = opened.run("mudg.tracks.find((one) => one.id === 'car-1').pose.at(0.4).position")
-    opened.run(f"mudg.change({{eye: [{center[0]}, {center[1] + 2}, {center[2]}]}}); 1")  # beside its middle, half of it is behind
+    # beside its middle, half of it is behind
+    opened.run(f"mudg.change({{eye: [{center[0]}, {center[1] + 2}, {center[2]}]}}); 1")
     opened.wait("mudg.sharp")
     assert opened.run(count) > 500
     opened.run("mudg.change({mode: 'recorded', boxes: false}); 1")
@@ -441,7 +471,10 @@ def test_boxes_beside_the_camera_are_cut_and_not_left_out(opened: Browser) -> No
 
 @pytest.mark.slow
 def test_a_picture_is_as_large_as_asked(opened: Browser) -> None:
-    opened.run("mudg.editor.set([]); window.kept = []; URL.createObjectURL = (blob) => { kept.push(blob); return 'data:,'; }; 1")
+    opened.run(
+        "mudg.editor.set([]); window.kept = []; URL.createObjectURL = (blob) => { kept.push(blob); return 'data:,';"
+        " }; 1"
+    )
     opened.wait("mudg.sharp")
     for times in (1, 2):
         opened.run(f"import('mudg/share').then((share) => share.savePicture(mudg, {times}))")
@@ -455,9 +488,9 @@ def test_a_picture_is_as_large_as_asked(opened: Browser) -> None:
 def test_a_drive_is_saved_as_frames(opened: Browser, tmp_path: Path) -> None:
     opened.run("mudg.editor.set([]); URL.createObjectURL = () => 'data:,'; 1")
     text = opened.run(
-        "(async () => { const { saveFrames } = await import('mudg/share'); const zip = await saveFrames(mudg, () => {});"
-        "const bytes = new Uint8Array(await zip.arrayBuffer()); let text = '';"
-        "for (const b of bytes) text += String.fromCharCode(b); return btoa(text); })()"
+        "(async () => { const { saveFrames } = await import('mudg/share'); const zip = await saveFrames(mudg, () =>"
+        " {});const bytes = new Uint8Array(await zip.arrayBuffer()); let text = '';for (const b of bytes) text +="
+        " String.fromCharCode(b); return btoa(text); })()"
     )
     with zipfile.ZipFile(io.BytesIO(base64.b64decode(text))) as archive:
         assert archive.testzip() is None

@@ -1,4 +1,5 @@
-"""Rows of the scores that need more than a true image: LiDAR points, detectors, vehicles, markings, motion, and their anchors."""
+"""Rows of the scores that need more than a true image: LiDAR points, detectors, vehicles, markings, motion, and their
+anchors."""
 
 from __future__ import annotations
 
@@ -32,7 +33,11 @@ Change = Callable[[Observation], Observation]
 
 
 def written(
-    scene: Scene, out: Path, look: Callable[[View], Observation], shifts_m: tuple[float, ...], change: Change | None = None
+    scene: Scene,
+    out: Path,
+    look: Callable[[View], Observation],
+    shifts_m: tuple[float, ...],
+    change: Change | None = None,
 ) -> Path:
     """Views of a scene as something sees them."""
     for shift_m in shifts_m:
@@ -62,7 +67,7 @@ def gray(seen: Observation) -> Observation:
     return dataclasses.replace(seen, rgb=torch.full_like(seen.rgb, 0.4), semantics=torch.zeros_like(seen.semantics))
 
 
-# ---- a log: no exact truth ---------------------------------------------------------------------------------------------
+# ---- a log: no exact truth -----------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -86,7 +91,8 @@ def log_scores(log_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dic
 def test_lidar_points_measure_depth_and_color_beside_the_path_of_a_log(log_scores: dict) -> None:
     here = "front_shift+2.0"
     assert value(log_scores, "right", here, "psnr") == score_tables.NO_TRUTH
-    assert value(log_scores, "right", here, "lidar_abs_rel") < 0.02  # measured 0.007: a point is not at its pixel's centre
+    # measured 0.007: a point is not at its pixel's centre
+    assert value(log_scores, "right", here, "lidar_abs_rel") < 0.02
     assert value(log_scores, "far", here, "lidar_abs_rel") == pytest.approx(0.1, abs=0.01)
     assert value(log_scores, "far", here, "lidar_delta1") > 0.95
     assert value(log_scores, "right", here, "lidar_psnr") > 18  # measured 21.6: edges
@@ -121,11 +127,20 @@ def test_a_still_video_does_not_flicker(log_scores: dict) -> None:
 
 def test_missing_files_name_their_flags(log_scores: dict) -> None:
     text = score_tables.markdown(log_scores)
-    for flag in ("--detections", "--lanes", "--dino-weights", "--clip-weights", "--video-features", "--lpips-vgg-weights"):
+    for flag in (
+        "--detections",
+        "--lanes",
+        "--dino-weights",
+        "--clip-weights",
+        "--video-features",
+        "--lpips-vgg-weights",
+    ):
         assert flag in text
 
 
-def boxes_json(path: Path, scene: Scene, method: str, moved: float = 0.0, confidence: float = 0.9, category: int = 2) -> Path:
+def boxes_json(
+    path: Path, scene: Scene, method: str, moved: float = 0.0, confidence: float = 0.9, category: int = 2
+) -> Path:
     """What a perfect detector would say of a method's views and of the recorded images, moved by some pixels."""
     records = []
     for prefix, views in (
@@ -152,9 +167,11 @@ def test_nta_iou_from_a_file_of_boxes(
     views = written(scene, tmp_path / "right", toy_world.truth, (2.0,))
     boxes = boxes_json(tmp_path / "boxes.json", scene, "right", moved, confidence, category)
     out = Score(
-        scene=log_scene, views={"right": views, "other": views}, out=tmp_path / "score",
+        scene=log_scene,
+        views={"right": views, "other": views},
+        out=tmp_path / "score",
         settings=dataclasses.replace(QUICK, detections=str(boxes)),
-    ).run()  # fmt: skip
+    ).run()
     document = store.read_json(out / "metrics.json")
     (row,) = (r for r in document["results"] if r["method"] == "right")
     assert row["values"]["nta_iou"] == pytest.approx(expected)
@@ -168,10 +185,13 @@ def test_nta_iou_from_a_file_of_boxes(
 
 
 def test_boxes_of_images_of_another_size_are_scaled(tmp_path: Path) -> None:
-    store.write_json(tmp_path / "boxes.json", {
-        "images": [{"id": 4, "file_name": "m/t/000001.jpg", "width": 960, "height": 320}],
-        "annotations": [{"image_id": 4, "category_id": 5, "bbox": [100, 10, 20, 30], "score": 0.7}],
-    })  # fmt: skip
+    store.write_json(
+        tmp_path / "boxes.json",
+        {
+            "images": [{"id": 4, "file_name": "m/t/000001.jpg", "width": 960, "height": 320}],
+            "annotations": [{"image_id": 4, "category_id": 5, "bbox": [100, 10, 20, 30], "score": 0.7}],
+        },
+    )
     ((name, (found,)),) = detections.read_detections(tmp_path / "boxes.json").items()
     assert name == "m/t/000001"
     assert found.box.tolist() == [50, 10, 60, 40]
@@ -198,9 +218,11 @@ def test_detected_lanes_of_a_log_are_refused(tmp_path: Path, log_scene: Path) ->
     (tmp_path / "lanes").mkdir()
     with pytest.raises(InputError, match="no lane lines"):
         Score(
-            scene=log_scene, views={"right": views}, out=tmp_path / "score",
+            scene=log_scene,
+            views={"right": views},
+            out=tmp_path / "score",
             settings=dataclasses.replace(QUICK, lanes=str(tmp_path / "lanes")),
-        ).run()  # fmt: skip
+        ).run()
 
 
 def test_boxes_with_few_points_do_not_count(tmp_path: Path, log_scene: Path) -> None:
@@ -213,7 +235,7 @@ def test_boxes_with_few_points_do_not_count(tmp_path: Path, log_scene: Path) -> 
     assert counting._tracks_at(view) == []
 
 
-# ---- a generated city: exact truth ---------------------------------------------------------------------------------------
+# ---- a generated city: exact truth ---------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -228,7 +250,8 @@ def city_run(city: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
     folder, scene = tmp_path_factory.mktemp("scores"), read_scene(city)
     world = CityWorld.from_source(scene.source)
     methods = {
-        name: written(scene, folder / name, world.observation, (2.0,), change) for name, change in {"right": None, "gray": gray}.items()
+        name: written(scene, folder / name, world.observation, (2.0,), change)
+        for name, change in {"right": None, "gray": gray}.items()
     }
     path = trajectory.shifted(scene, "front", 2.0)
     for name, masks in (("right", True), ("gray", False), ("truth", True)):
@@ -294,13 +317,14 @@ def test_paint_is_where_the_image_is_bright(city: Path) -> None:
         assert not (marking & (truth.semantics != 0)).any()
 
 
-# ---- neighbouring views --------------------------------------------------------------------------------------------------
+# ---- neighbouring views --------------------------------------------------------------------------
 
 CAMERA = Camera("front", 24, 16, 20.0, 20.0, 12.0, 8.0)
 
 
 def wall_pair(number: int, rgb: torch.Tensor, object_at: float | None = None) -> Pair:
-    """A wall 10 m ahead of a camera that stands still; ``object_at``: left column of a vehicle of 4 columns, a metre in front of it."""
+    """A wall 10 m ahead of a camera that stands still; ``object_at``: left column of a vehicle of 4 columns, a metre in
+    front of it."""
     depth, ids = torch.full((1, 16, 24), 10.0), torch.zeros(16, 24, dtype=torch.int64)
     instance = np.zeros((16, 24), np.int32)
     if object_at is not None:

@@ -33,8 +33,17 @@ def _no_memory(_asked: object) -> tuple[bytes, str]:
 
 
 def site() -> Site:
-    answers = {"echo": lambda asked: (json.dumps(asked).encode(), "application/json"), "broken": _broken, "no_memory": _no_memory}
-    return Site({"": PAGE, "small": b"small"}, answers, TOKEN, {"film": lambda asked, send: [send(b"x" * 100_000) for _ in range(100)]})
+    answers = {
+        "echo": lambda asked: (json.dumps(asked).encode(), "application/json"),
+        "broken": _broken,
+        "no_memory": _no_memory,
+    }
+    return Site(
+        {"": PAGE, "small": b"small"},
+        answers,
+        TOKEN,
+        {"film": lambda asked, send: [send(b"x" * 100_000) for _ in range(100)]},
+    )
 
 
 @pytest.fixture
@@ -84,7 +93,10 @@ REQUESTS = {
     "an address that is none, with the token": (b"GET http://[/ HTTP/1.1\r\n" + HOST + b"\r\n", b"400"),
     "a POST to an address that is none": (b"POST //[x HTTP/1.1\r\n" + HOST + b"Content-Length: 1\r\n\r\n1", b"400|403"),
     "an address of other letters": (b"GET http://\xe2\x84\x80/ HTTP/1.1\r\nHost: x\r\n\r\n", b"400|403"),
-    "an origin that is none": (POST.replace(b"Origin: http://127.0.0.1:PORT", b"Origin: http://[") + b"Content-Length: 1\r\n\r\n1", b"403"),
+    "an origin that is none": (
+        POST.replace(b"Origin: http://127.0.0.1:PORT", b"Origin: http://[") + b"Content-Length: 1\r\n\r\n1",
+        b"403",
+    ),
     "no origin": (POST.replace(b"Origin: http://127.0.0.1:PORT\r\n", b"") + b"Content-Length: 1\r\n\r\n1", b"403"),
     "a length of 5000 digits": (POST + b"Content-Length: " + b"9" * 5000 + b"\r\n\r\n1", b"400"),
     "a negative length": (POST + b"Content-Length: -1\r\n\r\n1", b"400"),
@@ -110,13 +122,20 @@ REQUESTS = {
     "many headers": (b"GET / HTTP/1.1\r\n" + b"".join(b"A%d: 1\r\n" % n for n in range(1000)) + b"\r\n", b"431|"),
     "headers without a colon": (b"GET / HTTP/1.1\r\nnonsense\r\n: x\r\n\r\n", b"403"),
     "a token that is no text": (
-        b"GET /?token=%ff%ed%a0%80 HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\nX-Mudg-Token: \xff\xfe\r\nCookie: mudg_token=\xff;;\r\n\r\n", b"403",
+        (
+            b"GET /?token=%ff%ed%a0%80 HTTP/1.1\r\nHost: 127.0.0.1:PORT\r\nX-Mudg-Token: \xff\xfe\r\nCookie:"
+            b" mudg_token=\xff;;\r\n\r\n"
+        ),
+        b"403",
     ),
     "an unknown method": (b"BREW / HTTP/1.1\r\n" + HOST + b"\r\n", b"501"),
     "a mistake of ours": (POST.replace(b"/echo", b"/broken") + b"Content-Length: 1\r\n\r\n1", b""),
     "no memory": (POST.replace(b"/echo", b"/no_memory") + b"Content-Length: 1\r\n\r\n1", b"503"),
-    "a body behind a GET": (b"GET /small HTTP/1.1\r\n" + HOST + b"Content-Length: 26\r\n\r\nGET /secret HTTP/1.1\r\n\r\n\r\n\r\n", b"200"),
-}  # fmt: skip
+    "a body behind a GET": (
+        b"GET /small HTTP/1.1\r\n" + HOST + b"Content-Length: 26\r\n\r\nGET /secret HTTP/1.1\r\n\r\n\r\n\r\n",
+        b"200",
+    ),
+}
 
 
 @pytest.mark.parametrize("name", REQUESTS)
@@ -205,7 +224,9 @@ print(time.process_time() - begun, flush=True)
 def test_a_server_with_few_files_serves_others_and_does_not_spin() -> None:
     """Measured: 0.2 s of processor time in 4 s; a loop that accepts again at once takes all of them."""
     script = FEW_FILES.format(tests=str(Path(__file__).parent))
-    with subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as child:
+    with subprocess.Popen(
+        [sys.executable, "-c", script], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as child:
         assert child.stdout is not None and child.stderr is not None
         port = int(child.stdout.readline())
         idle = []
@@ -225,7 +246,9 @@ def test_a_server_with_few_files_serves_others_and_does_not_spin() -> None:
         assert "Traceback" not in child.stderr.read()
 
 
-@pytest.mark.parametrize(("host", "port"), [("127.0.0.1", 70_000), ("127.0.0.1", -1), ("a" * 300, 0), ("", -7), ("999.1.1.1", 0)])
+@pytest.mark.parametrize(
+    ("host", "port"), [("127.0.0.1", 70_000), ("127.0.0.1", -1), ("a" * 300, 0), ("", -7), ("999.1.1.1", 0)]
+)
 def test_an_address_that_cannot_be_is_refused_in_words(host: str, port: int) -> None:
     with pytest.raises(ResourceError, match="cannot listen"):
         open_server(site(), host, port)

@@ -1,4 +1,5 @@
-"""Videos that the server of ``mudg view`` makes of the exact frames: what they show, who may ask, and how one is cancelled."""
+"""Videos that the server of ``mudg view`` makes of the exact frames: what they show, who may ask, and how one is
+cancelled."""
 
 from __future__ import annotations
 
@@ -50,10 +51,20 @@ def question(times_s: tuple[float, ...] = (0.0, 0.2, 0.4), **changes: Any) -> di
     views = [STREET.view(t, 160, 96) for t in times_s]
     camera = views[0].camera
     return {
-        "scene": 0, "layer": "color", "hidden": [], "edits": "", "camera": "front", "width": 160, "height": 96, "fx": camera.fx,
-        "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "fps": 10,
+        "scene": 0,
+        "layer": "color",
+        "hidden": [],
+        "edits": "",
+        "camera": "front",
+        "width": 160,
+        "height": 96,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "fps": 10,
         "moments": [moment(v) for v in views],
-    } | changes  # fmt: skip
+    } | changes
 
 
 def moment(view: View) -> dict[str, Any]:
@@ -172,7 +183,9 @@ def test_a_video_that_nobody_waits_for_is_given_up(toy: Toy, monkeypatch: pytest
 
     monkeypatch.setattr(frames, "render_view", noted)
     with serving(toy[1], toy[0] / "scene") as (port, token):
-        connection, answer = begin(port, "POST", "/video", question(tuple(0.001 * k for k in range(700))), **allowed(port, token))
+        connection, answer = begin(
+            port, "POST", "/video", question(tuple(0.001 * k for k in range(700))), **allowed(port, token)
+        )
         assert json.loads(answer.readline()) == {"frame": 1, "frames": 700}
         answer.close()
         assert connection.sock is None or connection.sock.shutdown(socket.SHUT_RDWR) is None
@@ -216,8 +229,8 @@ def test_the_page_saves_a_video_and_cancels_one(toy: Toy, tmp_path: Path, monkey
         try:
             one.open(f"http://127.0.0.1:{port}/?token={token}#m=recorded&c=front&t=0.2&s=1.5")
             one.run(
-                "window.saved = []; const real = URL.createObjectURL;"
-                "URL.createObjectURL = (blob) => { if (blob.type === 'video/mp4') window.saved.push(blob); return real(blob); }; 1"
+                "window.saved = []; const real = URL.createObjectURL;URL.createObjectURL = (blob) => { if (blob.type"
+                " === 'video/mp4') window.saved.push(blob); return real(blob); }; 1"
             )
             one.run(f"{CLICK}; 1")
             one.wait("window.saved.length === 1")
@@ -226,7 +239,7 @@ def test_the_page_saves_a_video_and_cancels_one(toy: Toy, tmp_path: Path, monkey
                     "saved[0].arrayBuffer().then((b) => { let text = '';"
                     "for (const v of new Uint8Array(b)) text += String.fromCharCode(v); return btoa(text); })"
                 )
-            )  # fmt: skip
+            )
             assert one.run("document.getElementById('note').textContent").startswith("Saved toy-street_color_0.20s.mp4")
             seen = pictures(content)
             assert len(seen) == 9  # 0.8 s, 10 per second
@@ -243,7 +256,8 @@ def test_the_page_saves_a_video_and_cancels_one(toy: Toy, tmp_path: Path, monkey
 
             monkeypatch.setattr(frames, "render_view", held)
             one.run(f"{CLICK}; 1")
-            one.wait("/^Cancel \\([0-2] of 9 frames\\)$/.test(document.getElementById('mp4').textContent)")  # exact frames count, too
+            # exact frames count, too
+            one.wait("/^Cancel \\([0-2] of 9 frames\\)$/.test(document.getElementById('mp4').textContent)")
             one.run(f"{CLICK}; 1")
             one.wait("document.getElementById('note').textContent === 'The video was cancelled.'")
             go_on.set()
@@ -255,7 +269,8 @@ def test_the_page_saves_a_video_and_cancels_one(toy: Toy, tmp_path: Path, monkey
             one.close()
 
 
-PIXELS = """(() => { const {area} = mudg.last, c = document.createElement('canvas'), x = c.getContext('2d'); c.width = 64; c.height = 32;
+PIXELS = """(() => { const {area} = mudg.last;
+  const c = document.createElement('canvas'), x = c.getContext('2d'); c.width = 64; c.height = 32;
   x.drawImage(SOURCE, 0, 0, 64, 32); return [...x.getImageData(0, 0, 64, 32).data].filter((_, k) => k % 4 < 3); })()"""
 
 

@@ -48,7 +48,7 @@ from mudg.viewer.settings import PageConfig
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 
 
-# what is packed ------------------------------------------------------------------------------------------------------
+# what is packed -----------------------------------------------------------------------------------
 
 
 def rotations(codes: np.ndarray) -> np.ndarray:
@@ -118,7 +118,10 @@ def test_every_gaussian_is_in_one_chunk_and_the_first_ones_matter_most() -> None
     assert 0 < len(chunks[-1]) <= size
     assert [level_of(k) for k in range(8)] == [0, 1, 1, 2, 2, 2, 2, 3]
     worth = coverage(columns_of(model), model.table.labels["node"].numpy(), path)
-    levels = [np.concatenate([c for k, c in enumerate(chunks) if level_of(k) == n]) for n in range(level_of(len(chunks) - 1) + 1)]
+    levels = [
+        np.concatenate([c for k, c in enumerate(chunks) if level_of(k) == n])
+        for n in range(level_of(len(chunks) - 1) + 1)
+    ]
     for one, following in zip(levels, levels[1:]):
         assert worth[one].min() >= worth[following].max()
 
@@ -189,7 +192,7 @@ def test_json_in_a_page_cannot_end_its_element() -> None:
     assert json.loads(text)["name"].startswith("</script>")
 
 
-# the page ------------------------------------------------------------------------------------------------------------
+# the page -----------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +225,9 @@ def folder_page(
     """A page in a folder with chunks of 64 Gaussians, and its facts."""
     monkeypatch.setattr(view, "ONE_FILE_BYTES", 1000)
     monkeypatch.setattr(view, "CHUNK", 64)
-    made = view.run_page(config or PageConfig(images=3), toy[1], root / "page.html", scene=toy[0] / "scene", overwrite=True)
+    made = view.run_page(
+        config or PageConfig(images=3), toy[1], root / "page.html", scene=toy[0] / "scene", overwrite=True
+    )
     assert made["page"] == root / "page_page" / "index.html"
     text = made["page"].read_text(encoding="utf-8")
     found = re.search(r'<script type="application/json" id="facts">(.*?)</script>', text, re.DOTALL)
@@ -238,7 +243,12 @@ def test_a_large_page_becomes_a_folder_whose_files_it_knows(
     (scene,) = facts["scenes"]
     assert len(scene["chunks"]) > 10
     assert sum(chunk["rows"] for chunk in scene["chunks"]) == scene["rows"]
-    records = [facts["log"]["file"], facts["images"]["file"], scene["file"], *(chunk["file"] for chunk in scene["chunks"])]
+    records = [
+        facts["log"]["file"],
+        facts["images"]["file"],
+        scene["file"],
+        *(chunk["file"] for chunk in scene["chunks"]),
+    ]
     for record in records:
         content = (folder / record["url"]).read_bytes()
         assert record["bytes"] == len(content)
@@ -246,7 +256,9 @@ def test_a_large_page_becomes_a_folder_whose_files_it_knows(
     assert {path.name for path in folder.iterdir()} == {"index.html", *(record["url"] for record in records)}
     assert not (tmp_path / "page.html").exists()
     (tmp_path / "again").mkdir()
-    view.run_page(PageConfig(images=0), toy[1], tmp_path / "again" / "page.html", scene=toy[0] / "scene", report="report.html")
+    view.run_page(
+        PageConfig(images=0), toy[1], tmp_path / "again" / "page.html", scene=toy[0] / "scene", report="report.html"
+    )
     index = (tmp_path / "again" / "page_page" / "index.html").read_text(encoding="utf-8")
     assert 'href="../report.html"' in index  # which lies beside the folder
 
@@ -298,7 +310,9 @@ def test_a_page_stays_within_the_memory_that_it_may_take(
     monkeypatch.setattr(view, "MEGABYTE", 1e5)
     page = view.page_of(PageConfig(images=0, memory_mb=1), shown)
     assert 9e4 < page.graphics_bytes() + page.heap_bytes() <= 1e5
-    assert f"{page.scenes[0][1].layout.visible - page.scenes[0][1].kept} left out for the budget" in view.needs_text(page, "page.html", "")
+    assert f"{page.scenes[0][1].layout.visible - page.scenes[0][1].kept} left out for the budget" in view.needs_text(
+        page, "page.html", ""
+    )
     assert view.page_of(PageConfig(images=0, memory_mb=1, budget=100), shown).scenes[0][1].kept == 100
 
 
@@ -366,8 +380,12 @@ def test_the_sign_tells_how_much_of_a_view_is_determined_and_how_much_is_empty(
     opened.run(f"mudg.settled({json.dumps(state)}).then(() => {{ mudg.onRest(); return 1; }})")
     sign = opened.run("[document.getElementById('seen-word').className, document.getElementById('seen').textContent]")
     found = opened.run("mudg.seenShare(mudg.last.view)")
-    small = opened.run("import('mudg/app').then((m) => m.scaled(mudg.last.view, Math.min(1, 96 / mudg.last.view.width)))")
-    sums = opened.run(f"Array.from(mudg.renderer.read(mudg.used().left, {json.dumps(small)}, mudg.state.t, 'confidence', new Set()))")
+    small = opened.run(
+        "import('mudg/app').then((m) => m.scaled(mudg.last.view, Math.min(1, 96 / mudg.last.view.width)))"
+    )
+    sums = opened.run(
+        f"Array.from(mudg.renderer.read(mudg.used().left, {json.dumps(small)}, mudg.state.t, 'confidence', new Set()))"
+    )
     certainty, alpha = np.array(sums).reshape(small["height"], small["width"], 4)[..., [0, 3]].transpose(2, 0, 1)
     camera = Camera("seen", *(small[key] for key in ("width", "height", "fx", "fy", "cx", "cy")))
     pose = np.eye(4)
@@ -376,7 +394,10 @@ def test_the_sign_tells_how_much_of_a_view_is_determined_and_how_much_is_empty(
     covered = np.isfinite(drawn.depth_m)
     assert (covered == (alpha >= 0.5)).mean() > 0.95
     x, y = np.meshgrid(np.arange(small["width"]) + 0.5, np.arange(small["height"]) + 0.5)
-    rays = np.stack([(x - small["cx"]) / small["fx"], (y - small["cy"]) / small["fy"], np.ones_like(x)], -1) @ pose[:3, :3].T
+    rays = (
+        np.stack([(x - small["cx"]) / small["fx"], (y - small["cy"]) / small["fy"], np.ones_like(x)], -1)
+        @ pose[:3, :3].T
+    )
     below = rays[..., 2] / np.linalg.norm(rays, axis=-1) < -0.03  # 1.7 degrees below the horizon
     ground = covered | below
     assert found["empty"] == pytest.approx((~covered & below).sum() / ground.sum(), abs=0.04)
@@ -449,7 +470,7 @@ def test_names_from_a_log_do_not_run(opened: Browser, toy: tuple[Path, Path, Sce
     assert opened.errors == []
 
 
-# a page in chunks -----------------------------------------------------------------------------------------------------
+# a page in chunks ---------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -495,7 +516,11 @@ def test_a_page_in_chunks_shows_what_one_chunk_shows(
     fresh.wait("document.documentElement.dataset.arrival === 'whole'")
     chunked = fresh.measure(["color", "depth", "class"], **AT)
     assert fresh.run("document.getElementById('arrival').hidden")
-    assert len([address for address in fresh.requests if "scene-0-0" in address]) == fresh.run("mudg.arrival.all.length") > 10
+    assert (
+        len([address for address in fresh.requests if "scene-0-0" in address])
+        == fresh.run("mudg.arrival.all.length")
+        > 10
+    )
     assert fresh.errors == []
     # one file whose chunks are the same holds the same picture to the bit
     config = PageConfig(images=3)
@@ -507,7 +532,9 @@ def test_a_page_in_chunks_shows_what_one_chunk_shows(
         assert np.array_equal(values, one[layer]), layer
     # one chunk of everything has other blocks: the same within rounding
     monkeypatch.setattr(view, "CHUNK", 65_536)
-    (web[0] / "one.html").write_bytes(whole_page(view.page_of(config, view.find_shown(config, toy[1], toy[0] / "scene", None))))
+    (web[0] / "one.html").write_bytes(
+        whole_page(view.page_of(config, view.find_shown(config, toy[1], toy[0] / "scene", None)))
+    )
     fresh.open(f"file://{web[0] / 'one.html'}")
     assert psnr(fresh.measure(["color"], **AT)["color"] / 255.0, chunked["color"] / 255.0) > 45
 
@@ -519,8 +546,13 @@ def test_a_page_in_chunks_shows_what_one_chunk_shows(
     [("missing", "404"), ("truncated", "of"), ("foreign", "its content is not what this page was made with")],
 )
 def test_a_chunk_that_fails_is_told_and_can_be_tried_again(
-    toy: tuple[Path, Path, SceneModel], web: tuple[Path, str], fresh: Browser, monkeypatch: pytest.MonkeyPatch, damage: str, told: str
-) -> None:  # fmt: skip
+    toy: tuple[Path, Path, SceneModel],
+    web: tuple[Path, str],
+    fresh: Browser,
+    monkeypatch: pytest.MonkeyPatch,
+    damage: str,
+    told: str,
+) -> None:
     folder, facts = folder_page(toy, web[0], monkeypatch)
     record = facts["scenes"][0]["chunks"][4]["file"]
     path = folder / record["url"]
@@ -542,7 +574,9 @@ def test_a_chunk_that_fails_is_told_and_can_be_tried_again(
     fresh.wait("document.documentElement.dataset.arrival === 'whole'")
     assert fresh.run("document.getElementById('arrival').hidden")
     assert fresh.run("mudg.loaded[0].present") == facts["scenes"][0]["rows"]
-    assert len(fresh.errors) and all("scene-0-004" in error or "integrity" in error for error in fresh.errors), fresh.errors
+    assert len(fresh.errors) and all("scene-0-004" in error or "integrity" in error for error in fresh.errors), (
+        fresh.errors
+    )
 
 
 @pytest.mark.slow
@@ -556,7 +590,7 @@ def test_a_folder_opened_from_the_disk_says_what_to_do(
     assert "mudg view RUN" in fresh.run("document.getElementById('problem').textContent")
 
 
-# the server ----------------------------------------------------------------------------------------------------------
+# the server ---------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -594,9 +628,20 @@ def test_the_server_draws_exact_frames(served: tuple[int, str], toy: tuple[Path,
     wanted = STREET.view(0.4, 160, 96)
     pose, camera = wanted.world_from_cam, wanted.camera
     body = {
-        "scene": 0, "layer": "color", "time_s": 0.4, "hidden": [], "camera": "front", "width": 160, "height": 96, "fx": camera.fx,
-        "fy": camera.fy, "cx": camera.cx, "cy": camera.cy, "eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist(),
-    }  # fmt: skip
+        "scene": 0,
+        "layer": "color",
+        "time_s": 0.4,
+        "hidden": [],
+        "camera": "front",
+        "width": 160,
+        "height": 96,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
+        "eye": pose[:3, 3].tolist(),
+        "axes": pose[:3, :3].T.tolist(),
+    }
     here = {"Origin": f"http://localhost:{port}", "Host": f"localhost:{port}"}
     status, content = ask(port, "POST", "/frame", body, X_Mudg_Token=token, **here)
     assert status == 200

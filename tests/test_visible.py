@@ -81,7 +81,7 @@ def test_the_filters_equal_loops(sides: str, reach: tuple[int, int]) -> None:
     rng = np.random.default_rng(0)
     nearest = rng.uniform(2, 60, (17, 23)).astype(np.float32)
     nearest[rng.random(nearest.shape) < 0.7] = np.inf
-    rule = HidingRule(ratio=0.1, slack_m=0.3, sides=sides, widen=(0.5, 0.5))  # type: ignore[arg-type]
+    rule = HidingRule(ratio=0.1, slack_m=0.3, sides=sides, widen=(0.5, 0.5))
     assert np.array_equal(nearer_depth(nearest, rule, reach), slow_nearer(nearest, rule, reach))
 
 
@@ -101,7 +101,8 @@ def test_points_of_another_shape_are_refused() -> None:
 
 
 def test_in_a_city_most_hidden_returns_go_and_nearly_all_others_stay() -> None:
-    """Measured on 12 images: 33 % of the hidden returns stay and 0.6 % of the others go; with blocks of 8x3 pixels 40 % and 1.9 %."""
+    """Measured on 12 images: 33 % of the hidden returns stay and 0.6 % of the others go; with blocks of 8x3 pixels 40 %
+    and 1.9 %."""
     world = CityWorld(CityConfig(seed=101, n_frames=4))
     kept = hidden = lost = seen = 0
     for index in range(0, 4, 2):

@@ -26,7 +26,7 @@ from mudg.formats.importers.waymo.tfrecord import TfrecordLog
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points
 
-# --- round trips ------------------------------------------------------------------------------------------------------
+# --- round trips ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -202,7 +202,7 @@ def test_panoptic_labels(form: str, bare: made.Log, tmp_path: Path) -> None:
     assert (read_label(scene, frame, "instance") == np.where(ids == 10004, 10004, 0)).all()
 
 
-# --- the real pieces --------------------------------------------------------------------------------------------------
+# --- the real pieces ------------------------------------------------------------------------------
 
 
 def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
@@ -233,18 +233,14 @@ def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> N
 
 def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_data: Callable[[str], Path]) -> None:
     path = shared_data("waymo_frame") / "pvps_data_one_frame.tfrecord"
-    label = messages.Message(
-        "Label", {**messages.FRAME.fields[6].message.fields}  # type: ignore[union-attr]
-    )  # fmt: skip
+    label = messages.Message("Label", {**messages.FRAME.fields[6].message.fields})
     per_camera = messages.Message(
         "CameraLabels", {1: messages.Field("name", "int"), 2: messages.Field("labels", "messages", label)}
     )
     message = messages.Message("Frame", {9: messages.Field("projected", "messages", per_camera)})
     (place,) = tfrecord.record_places(path)
     with path.open("rb") as file:
-        projected = messages.parse_message(tfrecord.read_record(file, path, place), message, "real")[
-            "projected"
-        ]
+        projected = messages.parse_message(tfrecord.read_record(file, path, place), message, "real")["projected"]
     log = TfrecordLog(path)
     frame = log.frames[0]
     boxes = {box.id: box for box in frame.boxes}

@@ -102,12 +102,24 @@ def spoil_intrinsics(log: made.Log) -> None:
 
 
 BOTH = {
-    spoil_scale: "pose is scaled", spoil_hand: "left-handed", spoil_unit: "not of one time", spoil_image_clock: "not of one time",
-    spoil_box: "box makes no sense", spoil_rows: "row for every beam", spoil_numbers: "not finite", spoil_image: "cannot be decoded",
-    spoil_camera: "frame lacks images or scans", spoil_laser: "frame lacks images or scans", spoil_calibration: "no calibration",
-    spoil_laser_calibration: "no calibration", spoil_pixel_poses: "differ in size", spoil_exposure: "exposure times contradict",
-    spoil_intrinsics: "intrinsics", spoil_twice: "two scans of one LiDAR", spoil_two_images: "two images of one camera",
-}  # fmt: skip
+    spoil_scale: "pose is scaled",
+    spoil_hand: "left-handed",
+    spoil_unit: "not of one time",
+    spoil_image_clock: "not of one time",
+    spoil_box: "box makes no sense",
+    spoil_rows: "row for every beam",
+    spoil_numbers: "not finite",
+    spoil_image: "cannot be decoded",
+    spoil_camera: "frame lacks images or scans",
+    spoil_laser: "frame lacks images or scans",
+    spoil_calibration: "no calibration",
+    spoil_laser_calibration: "no calibration",
+    spoil_pixel_poses: "differ in size",
+    spoil_exposure: "exposure times contradict",
+    spoil_intrinsics: "intrinsics",
+    spoil_twice: "two scans of one LiDAR",
+    spoil_two_images: "two images of one camera",
+}
 
 
 @roundtrip.needs_native
@@ -205,8 +217,13 @@ def test_damaged_files_are_named_with_record_and_byte(bare: made.Log, tmp_path: 
 @roundtrip.needs_native
 def test_files_of_another_kind_are_refused(bare: made.Log, tmp_path: Path) -> None:
     path = tmp_path / "a.tfrecord"
-    for content, word in ((b"<html>not here</html>", "not a TFRecord"), (b"\x1f\x8b" + bytes(40), "compressed"), (b"", "no frames"),
-                          (made.record(b"\x0a\x05ab"), "cannot be decoded"), (made.record(b""), "transform is incomplete")):  # fmt: skip
+    for content, word in (
+        (b"<html>not here</html>", "not a TFRecord"),
+        (b"\x1f\x8b" + bytes(40), "compressed"),
+        (b"", "no frames"),
+        (made.record(b"\x0a\x05ab"), "cannot be decoded"),
+        (made.record(b""), "transform is incomplete"),
+    ):
         path.write_bytes(content)
         with pytest.raises(InputError, match=word):
             ingest(path, tmp_path / "scene")

@@ -30,7 +30,7 @@ def random_pose(generator: np.random.Generator, reach_m: float = 3.0) -> np.ndar
     )
 
 
-# --- checksums and messages -------------------------------------------------------------------------------------------
+# --- checksums and messages -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -68,9 +68,7 @@ def test_varints_at_once_equal_varints_one_by_one() -> None:
         messages.unpack_varints(b"\x80" * 10 + b"\x01", "x")
 
 
-INNER = messages.Message(
-    "Inner", {1: messages.Field("values", "doubles"), 3: messages.Field("counts", "ints")}
-)
+INNER = messages.Message("Inner", {1: messages.Field("values", "doubles"), 3: messages.Field("counts", "ints")})
 OUTER = messages.Message(
     "Outer",
     {
@@ -96,11 +94,18 @@ def test_messages_keep_wanted_fields_skip_others_and_take_both_forms_of_lists() 
 @pytest.mark.parametrize(
     "data, word",
     [
-        (b"\x0a\x05ab", "5 bytes where 2 are left"), (b"\x0a", "inside a number"), (b"\x0a\xff\xff\xff\xff\xff\xff\xff\x7f", "are left"),
-        (b"\x80" * 11, "ten bytes"), (b"\x0b", "wire type 3"), (b"\x00\x00", "field number 0"), (b"\x10\x80", "inside a number"),
-        (b"\x08\x01", "wire type 0, not 2"), (b"\x0a\x01\xff", "no text"), (b"\x22\x03\x0a\x01\x00", "no multiple of 8"),
+        (b"\x0a\x05ab", "5 bytes where 2 are left"),
+        (b"\x0a", "inside a number"),
+        (b"\x0a\xff\xff\xff\xff\xff\xff\xff\x7f", "are left"),
+        (b"\x80" * 11, "ten bytes"),
+        (b"\x0b", "wire type 3"),
+        (b"\x00\x00", "field number 0"),
+        (b"\x10\x80", "inside a number"),
+        (b"\x08\x01", "wire type 0, not 2"),
+        (b"\x0a\x01\xff", "no text"),
+        (b"\x22\x03\x0a\x01\x00", "no multiple of 8"),
     ],
-)  # fmt: skip
+)
 def test_broken_messages_are_named(data: bytes, word: str) -> None:
     with pytest.raises(InputError, match="message cannot be decoded") as caught:
         messages.parse_message(data, OUTER, "file: record 3")
@@ -117,7 +122,7 @@ def test_no_bytes_raise_anything_but_an_input_error(data: bytes) -> None:
             continue
 
 
-# --- geometry ---------------------------------------------------------------------------------------------------------
+# --- geometry -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("uneven", [True, False])
@@ -200,7 +205,7 @@ def timed(times: np.ndarray, late: np.ndarray, velocity: np.ndarray, **changes: 
         world = yaw_matrix(0.5, velocity * (time + delay) + [20, 5, 1])
         local = invert(vehicle) @ world
         values = {"id": "-a_b", "label": "vehicle", "size_m": (4.0, 2.0, 1.5)} | changes
-        box = WaymoBox(centre=tuple(local[:3, 3]), heading=geometry.yaw_of(local), **values)  # type: ignore[arg-type]
+        box = WaymoBox(centre=tuple(local[:3, 3]), heading=geometry.yaw_of(local), **values)
         frames.append(waymo_tracks.TimedBoxes(float(time), vehicle, [box], np.array([delay]), f"frame at {time}"))
     return frames
 

@@ -75,12 +75,16 @@ def street(view: View) -> GBuffer:
 
 
 LIGHT = Surroundings(
-    np.array([0.7, 0.75, 0.8]), np.array([0.3, 0.5, 0.9]), np.array([0.8, 0.9, 1.0]), np.zeros(3), np.array([0.0, 0, 1]),
     np.array([0.7, 0.75, 0.8]),
-)  # fmt: skip
+    np.array([0.3, 0.5, 0.9]),
+    np.array([0.8, 0.9, 1.0]),
+    np.zeros(3),
+    np.array([0.0, 0, 1]),
+    np.array([0.7, 0.75, 0.8]),
+)
 
 
-# --- response ---------------------------------------------------------------------------------------------------------
+# --- response -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("curve", [tone.SRGB, tone.LINEAR, tone.gamma_curve(2.2)], ids=lambda c: c.name)
@@ -102,7 +106,7 @@ def test_a_filmic_camera_is_inverted_where_nothing_was_clipped() -> None:
     np.testing.assert_allclose(curve.decode(shown)[inside], light[inside], rtol=2e-4)
 
 
-# --- geometry ---------------------------------------------------------------------------------------------------------
+# --- geometry -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("view", [forward_view(), forward_view(0.4, 0.2)], ids=["level", "turned"])
@@ -149,7 +153,7 @@ def test_guessed_light_does_not_exceed_what_a_camera_exposes_for() -> None:
 
 @pytest.mark.parametrize(("time", "share"), [("overcast", 1.0), ("dusk", 0.5)])
 def test_new_light_is_exposed_as_a_camera_would(time: str, share: float) -> None:
-    target = relight.target_light(sunny(), LightSettings(time=time))  # type: ignore[arg-type]
+    target = relight.target_light(sunny(), LightSettings(time=time))
     assert relight.ground_level(target) == pytest.approx(share * relight.ground_level(sunny()), rel=0.01)
 
 
@@ -189,7 +193,7 @@ def test_planes_of_different_sizes_are_refused() -> None:
         replace(scene, openness=np.zeros((3, 3), np.float32))
 
 
-# --- noise ------------------------------------------------------------------------------------------------------------
+# --- noise ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9])
@@ -213,7 +217,7 @@ def test_the_hash_is_that_of_the_generated_city() -> None:
         assert int(noise.hash_bits(a, b, c, 9)) == mix((mix(text) + 9 * 0x27D4EB2F) % 2**32)
 
 
-# --- fog --------------------------------------------------------------------------------------------------------------
+# --- fog ------------------------------------------------------------------------------------------
 
 
 def test_contrast_falls_to_a_twentieth_at_the_visibility() -> None:
@@ -247,7 +251,7 @@ def test_two_layers_of_haze_are_one() -> None:
     np.testing.assert_allclose(fog.unveiled(fog.veiled(color, a, air), a, air), color, atol=1e-6)
 
 
-# --- wet ground and snow ----------------------------------------------------------------------------------------------
+# --- wet ground and snow --------------------------------------------------------------------------
 
 
 def test_water_mirrors_by_fresnel() -> None:
@@ -305,7 +309,7 @@ def test_wheels_leave_two_tracks() -> None:
     assert ground.wheel_tracks(xy, path).tolist() == [1, 1, 0, 0]
 
 
-# --- light ------------------------------------------------------------------------------------------------------------
+# --- light ----------------------------------------------------------------------------------------
 
 
 def sunny() -> Surroundings:
@@ -360,7 +364,7 @@ def test_headlights_cut_off_above_the_horizon() -> None:
     assert behind == 0
 
 
-# --- all together -----------------------------------------------------------------------------------------------------
+# --- all together ---------------------------------------------------------------------------------
 
 
 def test_defaults_change_nothing() -> None:
@@ -372,7 +376,7 @@ def test_defaults_change_nothing() -> None:
 
 
 def conditions(**weather_settings: object) -> Conditions:
-    return Conditions(weather=WeatherSettings(**weather_settings))  # type: ignore[arg-type]
+    return Conditions(weather=WeatherSettings(**weather_settings))
 
 
 CASES = {
@@ -440,9 +444,13 @@ def test_a_drive_is_edited_image_by_image() -> None:
 
 
 def test_ripples_of_the_ground_are_smoothed_farther_than_those_of_walls() -> None:
-    """Normals that sway by ten degrees over 12 pixels: on the road they become level, on a wall they stay about as they are."""
+    """Normals that sway by ten degrees over 12 pixels: on the road they become level, on a wall they stay about as they
+    are."""
     sway = np.broadcast_to(np.radians(10) * np.sin(np.arange(96) * 2 * np.pi / 12), (64, 96))
     normal = np.stack([np.sin(sway), np.zeros_like(sway), np.cos(sway)], -1).astype(np.float32)
-    found = {name: steadied(normal, np.full((64, 96), ID[name], np.uint8), 2)[16:-16, 24:-24, 0] for name in ("road", "building")}
+    found = {
+        name: steadied(normal, np.full((64, 96), ID[name], np.uint8), 2)[16:-16, 24:-24, 0]
+        for name in ("road", "building")
+    }
     assert np.abs(found["road"]).max() < np.sin(np.radians(1.5))
     assert np.abs(found["building"]).max() > np.sin(np.radians(6))

@@ -22,7 +22,7 @@ def view_at(x: float = 0.0, yaw: float = 0.0, time_s: float = 0.0, size: tuple[i
     return View(Camera("front", width, height, 50.0, 50.0, width / 2, height / 2), pose, time_s)
 
 
-# --- sizes ------------------------------------------------------------------------------------------------------------
+# --- sizes ----------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("mm_h", [2.0, 10.0, 50.0])
@@ -42,14 +42,15 @@ def test_the_published_extinction_of_rain_is_twice_the_area_of_the_drops(mm_h: f
 
 
 def test_drops_carry_the_water_of_the_rate() -> None:
-    """Flux of water over all drops, by integration: the law of drop sizes and the fall speeds belong together (known to be a bit high)."""
+    """Flux of water over all drops, by integration: the law of drop sizes and the fall speeds belong together (known to
+    be a bit high)."""
     d = np.linspace(0.25, 8, 100_000)
     speed = 9.65 - 10.3 * np.exp(-0.6 * d)
     flux = np.trapezoid(8000 * np.exp(-4.1 * 10**-0.21 * d) * math.pi / 6 * d**3 * 1e-9 * speed, d)  # m/s
     assert flux * 3.6e6 == pytest.approx(10, rel=0.2)
 
 
-# --- places -----------------------------------------------------------------------------------------------------------
+# --- places ---------------------------------------------------------------------------------------
 
 SIZE = air.ParticleSize(60.0, 0.002, 5.0)
 FALL = np.array([0.0, 0.0, -5.0])
@@ -94,7 +95,7 @@ def test_the_number_of_drops_is_that_of_the_volume() -> None:
     assert np.std(counts) == pytest.approx(math.sqrt(60 * volume), rel=0.6)
 
 
-# --- what they cover --------------------------------------------------------------------------------------------------
+# --- what they cover ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("velocity", [(0, 0, 0), (0, 0, -6.0), (15.0, 0, -6)], ids=["still", "falling", "driving"])
@@ -126,7 +127,7 @@ def test_all_drops_together_cover_what_the_density_says() -> None:
     assert np.mean(shown) == pytest.approx(air.area_per_m(sizes) * (6.0 - air.NEAREST_M), rel=0.05)
 
 
-# --- LiDAR ------------------------------------------------------------------------------------------------------------
+# --- LiDAR ----------------------------------------------------------------------------------------
 
 SENSOR = lidar.LidarSensor(range_10_m=90.0)
 COUNT = 40_000
@@ -138,7 +139,8 @@ def beams() -> tuple[np.ndarray, np.ndarray]:
 
 
 def detected_in(share: np.ndarray, at: np.ndarray, floor: np.ndarray | float = 0.0) -> float:
-    """Mean share of reflectances uniform in 0.02..1 whose hard return exceeds the threshold (or the fog's own return)."""
+    """Mean share of reflectances uniform in 0.02..1 whose hard return exceeds the threshold (or the fog's own
+    return)."""
     limit = np.maximum(SENSOR.threshold, floor)
     least = limit * math.pi * at**2 / share
     return float(np.clip((1 - np.maximum(least, 0.02)) / 0.98, 0, 1).mean())
@@ -150,7 +152,8 @@ LATE = lidar.LidarSensor(range_10_m=90.0, cross_from_m=10.0, cross_to_m=20.0)
 @pytest.mark.parametrize("sensor", [SENSOR, LATE], ids=["near", "far"])
 @pytest.mark.parametrize("visibility_m", [50.0, 150.0, 600.0, 3000.0])
 def test_shares_of_lost_hard_and_soft_returns_in_fog(visibility_m: float, sensor: lidar.LidarSensor) -> None:
-    """Against an integration of its own: the fog's return at every distance by a direct sum, the shares by the reflectances."""
+    """Against an integration of its own: the fog's return at every distance by a direct sum, the shares by the
+    reflectances."""
     ranges, reflectances = beams()
     found = lidar.in_fog(ranges, reflectances, visibility_m, 3, sensor)
     at = np.linspace(5, 120, 2001)
@@ -207,9 +210,11 @@ def test_a_sweep_in_fog_and_rain_keeps_its_beams() -> None:
     directions = rng.normal(size=(COUNT, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     points = SweepPoints(
-        (directions * ranges[:, None]).astype(np.float32), reflectances.astype(np.float32), np.zeros(COUNT, np.float32),
+        (directions * ranges[:, None]).astype(np.float32),
+        reflectances.astype(np.float32),
+        np.zeros(COUNT, np.float32),
         np.full(COUNT, 2, np.uint8),
-    )  # fmt: skip
+    )
     clear, kinds = lidar.sweep_in_weather(points, WeatherSettings(), 1, LATE)
     np.testing.assert_allclose(clear.xyz, points.xyz, rtol=1e-5, atol=1e-5)
     assert (kinds == 1).all()

@@ -57,6 +57,6 @@ def test_views_agree_and_a_drive_without_green_stays() -> None:
     view, buffer = scene()
     grey = replace(buffer, color=np.full_like(buffer.color, 0.3))
     settings = Conditions(season=SeasonSettings(leaves="bare"))
-    assert np.array_equal(season.in_season(grey, view, settings.season, 1).color, grey.color)  # type: ignore[arg-type]
+    assert np.array_equal(season.in_season(grey, view, settings.season, 1).color, grey.color)
     assert not np.array_equal(apply(buffer, settings, view, 0.0, 1).color, buffer.color)
     assert np.array_equal(apply(buffer, Conditions(), view, 0.0, 1).color, buffer.color)

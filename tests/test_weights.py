@@ -56,7 +56,7 @@ def converted(tmp_path, content, config=CONFIG):
     return published_files.load(tmp_path / "out")
 
 
-# names ----------------------------------------------------------------------------------------------------------------
+# names --------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +66,8 @@ def wanted():
 
 
 def test_every_published_tensor_is_accounted_for(published_keys, wanted):
-    """The full-size network wants exactly the published names and shapes; what is left over is on the list of the unused."""
+    """The full-size network wants exactly the published names and shapes; what is left over is on the list of the
+    unused."""
     published = weights.published_names(wanted)
     assert len(published_keys) == 2524
     assert {published[name]: shape for name, shape in wanted.items()} == {
@@ -90,7 +91,7 @@ def test_published_counts_of_parameters(published_keys):
     assert count("image_proj_model.") == 48_787_456
 
 
-# containers -----------------------------------------------------------------------------------------------------------
+# containers ---------------------------------------------------------------------------------------
 
 
 def containers(state):
@@ -149,9 +150,12 @@ def test_harmless_objects_are_ignored_without_their_code(tmp_path, monkeypatch):
         configuration.content = {"lr": 1}
         attributes = class_of("lightning_fabric.utilities.data.AttributeDict", dict, only_while_saving)(a=1)
         content = {
-            "state_dict": {"a": torch.ones(2)}, "hyper_parameters": configuration, "more": attributes,
-            "lists": collections.defaultdict(list, b=[3]), "loss": np.float64(0.5),
-        }  # fmt: skip
+            "state_dict": {"a": torch.ones(2)},
+            "hyper_parameters": configuration,
+            "more": attributes,
+            "lists": collections.defaultdict(list, b=[3]),
+            "loss": np.float64(0.5),
+        }
         path = saved(tmp_path, content)
     assert torch.equal(weights.read_checkpoint(path)["a"], torch.ones(2))
 
@@ -192,7 +196,7 @@ def test_files_without_tensors_are_refused(tmp_path):
         weights.read_checkpoint(tmp_path / "text.ckpt")
 
 
-# conversion -----------------------------------------------------------------------------------------------------------
+# conversion ---------------------------------------------------------------------------------------
 
 
 def test_conversion_keeps_every_value(whole, complete):
@@ -291,7 +295,9 @@ def test_towers_can_come_from_another_file(tmp_path, whole, complete):
 
 
 def converted_by_process(config: ConvertConfig, path: Path, to: Path, *, overwrite: bool = False) -> Path:
-    return convert.run(config, path, to, functools.partial(convert.of_diffusion, config, path, network=TINY), overwrite=overwrite)
+    return convert.run(
+        config, path, to, functools.partial(convert.of_diffusion, config, path, network=TINY), overwrite=overwrite
+    )
 
 
 @pytest.mark.slow

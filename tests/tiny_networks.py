@@ -1,4 +1,5 @@
-"""Tiny random networks of transformers and diffusers, saved as those packages save the real ones. Without the packages: skip."""
+"""Tiny random networks of transformers and diffusers, saved as those packages save the real ones. Without the packages:
+skip."""
 
 from __future__ import annotations
 
@@ -39,9 +40,13 @@ def segformer(folder: Path) -> Any:
     """SegFormer of 24 thousand parameters."""
     t = package("transformers")
     config = t.SegformerConfig(
-        depths=[1] * 4, hidden_sizes=[8, 8, 16, 16], num_attention_heads=[1, 1, 2, 2], decoder_hidden_size=16,
-        id2label=NAMES, label2id={name: n for n, name in NAMES.items()},
-    )  # fmt: skip
+        depths=[1] * 4,
+        hidden_sizes=[8, 8, 16, 16],
+        num_attention_heads=[1, 1, 2, 2],
+        decoder_hidden_size=16,
+        id2label=NAMES,
+        label2id={name: n for n, name in NAMES.items()},
+    )
     return _saved(seeded(t.SegformerForSemanticSegmentation(config)), folder)
 
 
@@ -49,14 +54,27 @@ def mask2former(folder: Path) -> Any:
     """Mask2Former on a Swin backbone."""
     t = package("transformers")
     swin = t.SwinConfig(
-        image_size=64, embed_dim=8, depths=[1] * 4, num_heads=[1, 1, 2, 2], window_size=4,
+        image_size=64,
+        embed_dim=8,
+        depths=[1] * 4,
+        num_heads=[1, 1, 2, 2],
+        window_size=4,
         out_features=["stage1", "stage2", "stage3", "stage4"],
-    )  # fmt: skip
+    )
     config = t.Mask2FormerConfig(
-        backbone_config=swin, feature_size=32, mask_feature_size=32, hidden_dim=32, encoder_feedforward_dim=32, dim_feedforward=32,
-        encoder_layers=1, decoder_layers=2, num_attention_heads=2, num_queries=6, id2label=NAMES,
+        backbone_config=swin,
+        feature_size=32,
+        mask_feature_size=32,
+        hidden_dim=32,
+        encoder_feedforward_dim=32,
+        dim_feedforward=32,
+        encoder_layers=1,
+        decoder_layers=2,
+        num_attention_heads=2,
+        num_queries=6,
+        id2label=NAMES,
         label2id={name: n for n, name in NAMES.items()},
-    )  # fmt: skip
+    )
     return _saved(seeded(t.Mask2FormerForUniversalSegmentation(config)), folder)
 
 
@@ -64,9 +82,17 @@ def eomt(folder: Path) -> Any:
     """EoMT that reads squares of 64 px."""
     t = package("transformers")
     config = t.EomtConfig(
-        hidden_size=16, num_hidden_layers=2, num_attention_heads=2, image_size=64, patch_size=16, num_queries=6, num_blocks=1,
-        num_upscale_blocks=1, id2label=NAMES, label2id={name: n for n, name in NAMES.items()},
-    )  # fmt: skip
+        hidden_size=16,
+        num_hidden_layers=2,
+        num_attention_heads=2,
+        image_size=64,
+        patch_size=16,
+        num_queries=6,
+        num_blocks=1,
+        num_upscale_blocks=1,
+        id2label=NAMES,
+        label2id={name: n for n, name in NAMES.items()},
+    )
     return _saved(seeded(t.EomtForUniversalSegmentation(config)), folder)
 
 
@@ -74,21 +100,42 @@ def depth_anything(folder: Path, *, with_lidar: bool = False, metric: bool = Fal
     """Depth Anything or PromptDepthAnything on a DINOv2 backbone, for images whose shorter side is 42 px."""
     t = package("transformers")
     backbone = t.Dinov2Config(
-        hidden_size=16, num_hidden_layers=4, num_attention_heads=2, intermediate_size=16, image_size=42, patch_size=14,
-        out_indices=[1, 2, 3, 4], reshape_hidden_states=False, apply_layernorm=True,
-    )  # fmt: skip
+        hidden_size=16,
+        num_hidden_layers=4,
+        num_attention_heads=2,
+        intermediate_size=16,
+        image_size=42,
+        patch_size=14,
+        out_indices=[1, 2, 3, 4],
+        reshape_hidden_states=False,
+        apply_layernorm=True,
+    )
     config_class = t.PromptDepthAnythingConfig if with_lidar else t.DepthAnythingConfig
     config = config_class(
-        backbone_config=backbone, reassemble_hidden_size=16, patch_size=14, neck_hidden_sizes=[8] * 4, fusion_hidden_size=8,
-        head_hidden_size=8, depth_estimation_type="metric" if metric or with_lidar else "relative", max_depth=80 if metric else 1,
-    )  # fmt: skip
+        backbone_config=backbone,
+        reassemble_hidden_size=16,
+        patch_size=14,
+        neck_hidden_sizes=[8] * 4,
+        fusion_hidden_size=8,
+        head_hidden_size=8,
+        depth_estimation_type="metric" if metric or with_lidar else "relative",
+        max_depth=80 if metric else 1,
+    )
     network_class = t.PromptDepthAnythingForDepthEstimation if with_lidar else t.DepthAnythingForDepthEstimation
     network = _saved(seeded(network_class(config), gain=1.5), folder)
     described = {
-        "size": {"height": 42, "width": 42}, "keep_aspect_ratio": True, "ensure_multiple_of": 14, "do_resize": True, "resample": 3,
-        "do_rescale": True, "rescale_factor": 1 / 255, "do_normalize": True, "image_mean": [0.485, 0.456, 0.406],
-        "image_std": [0.229, 0.224, 0.225], "do_pad": False,
-    }  # fmt: skip
+        "size": {"height": 42, "width": 42},
+        "keep_aspect_ratio": True,
+        "ensure_multiple_of": 14,
+        "do_resize": True,
+        "resample": 3,
+        "do_rescale": True,
+        "rescale_factor": 1 / 255,
+        "do_normalize": True,
+        "image_mean": [0.485, 0.456, 0.406],
+        "image_std": [0.229, 0.224, 0.225],
+        "do_pad": False,
+    }
     (folder / "preprocessor_config.json").write_text(json.dumps(described))
     return network
 
@@ -97,22 +144,46 @@ def marigold(folder: Path, *, prediction_type: str = "v_prediction", longest_px:
     """Folder of a Marigold pipeline: latents of half the size, two tokens of text."""
     t, d = package("transformers"), package("diffusers")
     unet = d.UNet2DConditionModel(
-        in_channels=8, out_channels=4, block_out_channels=(8, 16), layers_per_block=1, norm_num_groups=4, cross_attention_dim=8,
-        attention_head_dim=4, down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
+        in_channels=8,
+        out_channels=4,
+        block_out_channels=(8, 16),
+        layers_per_block=1,
+        norm_num_groups=4,
+        cross_attention_dim=8,
+        attention_head_dim=4,
+        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
         up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
-    )  # fmt: skip
+    )
     vae = d.AutoencoderKL(
-        block_out_channels=(8, 16), norm_num_groups=4, latent_channels=4, down_block_types=("DownEncoderBlock2D",) * 2,
-        up_block_types=("UpDecoderBlock2D",) * 2, layers_per_block=1,
-    )  # fmt: skip
+        block_out_channels=(8, 16),
+        norm_num_groups=4,
+        latent_channels=4,
+        down_block_types=("DownEncoderBlock2D",) * 2,
+        up_block_types=("UpDecoderBlock2D",) * 2,
+        layers_per_block=1,
+    )
     text = t.CLIPTextModel(
-        t.CLIPTextConfig(vocab_size=8, hidden_size=8, intermediate_size=8, num_hidden_layers=1, num_attention_heads=2,
-                         max_position_embeddings=8, bos_token_id=6, eos_token_id=7)
-    )  # fmt: skip
+        t.CLIPTextConfig(
+            vocab_size=8,
+            hidden_size=8,
+            intermediate_size=8,
+            num_hidden_layers=1,
+            num_attention_heads=2,
+            max_position_embeddings=8,
+            bos_token_id=6,
+            eos_token_id=7,
+        )
+    )
     scheduler = d.DDIMScheduler(
-        beta_start=0.00085, beta_end=0.012, beta_schedule="scaled_linear", clip_sample=False, set_alpha_to_one=False,
-        steps_offset=1, prediction_type=prediction_type, timestep_spacing="trailing",
-    )  # fmt: skip
+        beta_start=0.00085,
+        beta_end=0.012,
+        beta_schedule="scaled_linear",
+        clip_sample=False,
+        set_alpha_to_one=False,
+        steps_offset=1,
+        prediction_type=prediction_type,
+        timestep_spacing="trailing",
+    )
     for seed, (name, network) in enumerate({"unet": unet, "vae": vae, "text_encoder": text}.items()):
         seeded(network, seed).save_pretrained(folder / name)
     scheduler.save_pretrained(folder / "scheduler")
@@ -124,21 +195,35 @@ def marigold(folder: Path, *, prediction_type: str = "v_prediction", longest_px:
         json.dumps({"tokenizer_class": "CLIPTokenizer", "model_max_length": 8})
     )
     index = {
-        "_class_name": "MarigoldDepthPipeline", "_diffusers_version": d.__version__, "prediction_type": "depth",
-        "scale_invariant": True, "shift_invariant": True, "default_denoising_steps": 3,
-        "default_processing_resolution": longest_px, "unet": ["diffusers", "UNet2DConditionModel"],
-        "vae": ["diffusers", "AutoencoderKL"], "scheduler": ["diffusers", "DDIMScheduler"],
-        "text_encoder": ["transformers", "CLIPTextModel"], "tokenizer": ["transformers", "CLIPTokenizer"],
-    }  # fmt: skip
+        "_class_name": "MarigoldDepthPipeline",
+        "_diffusers_version": d.__version__,
+        "prediction_type": "depth",
+        "scale_invariant": True,
+        "shift_invariant": True,
+        "default_denoising_steps": 3,
+        "default_processing_resolution": longest_px,
+        "unet": ["diffusers", "UNet2DConditionModel"],
+        "vae": ["diffusers", "AutoencoderKL"],
+        "scheduler": ["diffusers", "DDIMScheduler"],
+        "text_encoder": ["transformers", "CLIPTextModel"],
+        "tokenizer": ["transformers", "CLIPTokenizer"],
+    }
     (folder / "model_index.json").write_text(json.dumps(index))
     return d.MarigoldDepthPipeline(
-        unet, vae, scheduler, text, t.CLIPTokenizer.from_pretrained(str(folder / "tokenizer")), prediction_type="depth",
-        default_denoising_steps=3, default_processing_resolution=longest_px,
-    )  # fmt: skip
+        unet,
+        vae,
+        scheduler,
+        text,
+        t.CLIPTokenizer.from_pretrained(str(folder / "tokenizer")),
+        prediction_type="depth",
+        default_denoising_steps=3,
+        default_processing_resolution=longest_px,
+    )
 
 
 def depthlab(folder: Path) -> dict[str, Any]:
-    """DepthLab's files as they are published, around a Marigold of ``marigold`` and a CLIP of vectors of six numbers; the networks."""
+    """DepthLab's files as they are published, around a Marigold of ``marigold`` and a CLIP of vectors of six numbers;
+    the networks."""
     t, d = package("transformers"), package("diffusers")
     base = marigold(folder / "marigold-depth-v1-0")
     config = {name: value for name, value in base.unet.config.items() if not name.startswith("_")}
@@ -146,15 +231,18 @@ def depthlab(folder: Path) -> dict[str, Any]:
     clip = t.CLIPModel(
         t.CLIPConfig(
             text_config={**tower, "vocab_size": 8, "max_position_embeddings": 8, "bos_token_id": 6, "eos_token_id": 7},
-            vision_config={**tower, "image_size": 28, "patch_size": 14}, projection_dim=6,
+            vision_config={**tower, "image_size": 28, "patch_size": 14},
+            projection_dim=6,
         )
-    )  # fmt: skip
+    )
     seeded(clip, 8)
     made = {
         "denoising_unet": seeded(d.UNet2DConditionModel(**{**config, "in_channels": 12}), 5),
         "reference_unet": seeded(d.UNet2DConditionModel(**{**config, "in_channels": 4}), 6),
-        "mapping_layer": seeded(torch.nn.Linear(6, 8), 7), "vae": base.vae, "clip": _saved(clip, folder / "CLIP"),
-    }  # fmt: skip
+        "mapping_layer": seeded(torch.nn.Linear(6, 8), 7),
+        "vae": base.vae,
+        "clip": _saved(clip, folder / "CLIP"),
+    }
     (folder / "DepthLab").mkdir()
     for name, prefix in (("denoising_unet", ""), ("reference_unet", ""), ("mapping_layer", "mapping_layer.")):
         state = {

@@ -35,7 +35,9 @@ def made_up_clip(seed: int, width: int = WIDTH, height: int = HEIGHT) -> Clip:
     seen = torch.where(valid, rgb, torch.rand(rgb.shape, generator=generator))
     alpha = (depth < 500).float()
     renders = RenderPlanes((rgb + 0.05).clamp(max=1), depth, alpha, 0.5 * alpha, ids[:, None].to(torch.uint8))
-    condition = Condition(views, seen, torch.where(valid, depth, 20.0).clamp(max=100), valid, rgb[0], valid, rgb, renders=renders)
+    condition = Condition(
+        views, seen, torch.where(valid, depth, 20.0).clamp(max=100), valid, rgb[0], valid, rgb, renders=renders
+    )
     return Clip(condition, rgb, depth, depth < 500, ids)
 
 
@@ -70,11 +72,14 @@ def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT, *, point
 def points_alone(clip: Clip) -> Clip:
     """The clip with the published system's condition: 0 where nothing was seen, nothing warped in."""
     c = clip.condition
-    return replace(clip, condition=Condition(c.views, c.color * c.valid, c.depth * c.valid, c.valid, c.reference), fine=None)
+    return replace(
+        clip, condition=Condition(c.views, c.color * c.valid, c.depth * c.valid, c.valid, c.reference), fine=None
+    )
 
 
 def with_settings(config: LearnConfig, **changes: Any) -> LearnConfig:
-    """The configuration with settings changed by their own names, whichever group they are in (group `score`: `score_NAME`)."""
+    """The configuration with settings changed by their own names, whichever group they are in (group `score`:
+    `score_NAME`)."""
     for name, value in changes.items():
         if name in {f.name for f in fields(config)}:
             config = replace(config, **{name: value})
@@ -94,10 +99,32 @@ GROUPS = {
 def tiny(clips: Path | str, **changes: Any) -> LearnConfig:
     """A run of four steps of a network with a few thousand weights on the clips of `write_clips`."""
     config = with_settings(
-        LearnConfig(codec=LearnCodec(steps=3, batch=2, fit_batches=1)), cities=3, first_cities=2, clips_per_city=2, held_out=1,
-        score_watched=1, clips=str(clips), workers=0, precision="float32", width=WIDTH, height=HEIGHT, window=WINDOW,
-        widths=(16, 32), blocks=(1, 1), spatial_attention=(False, True), temporal_attention=(False, True), refine_widths=(8, 16),
-        refine_blocks=(1, 1), finish_widths=(8, 16), finish_blocks=(1, 1), steps=4, batch_frames=4, full_window_share=0.5,
-        warmup_steps=1, checkpoint_every=2, score_every=100, score_steps=1,
-    )  # fmt: skip
+        LearnConfig(codec=LearnCodec(steps=3, batch=2, fit_batches=1)),
+        cities=3,
+        first_cities=2,
+        clips_per_city=2,
+        held_out=1,
+        score_watched=1,
+        clips=str(clips),
+        workers=0,
+        precision="float32",
+        width=WIDTH,
+        height=HEIGHT,
+        window=WINDOW,
+        widths=(16, 32),
+        blocks=(1, 1),
+        spatial_attention=(False, True),
+        temporal_attention=(False, True),
+        refine_widths=(8, 16),
+        refine_blocks=(1, 1),
+        finish_widths=(8, 16),
+        finish_blocks=(1, 1),
+        steps=4,
+        batch_frames=4,
+        full_window_share=0.5,
+        warmup_steps=1,
+        checkpoint_every=2,
+        score_every=100,
+        score_steps=1,
+    )
     return with_settings(config, **changes)

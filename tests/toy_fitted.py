@@ -1,4 +1,5 @@
-"""A small fitted scene made by hand, of everything that the viewer page draws: a static street, a car, a person that deforms, a sky."""
+"""A small fitted scene made by hand, of everything that the viewer page draws: a static street, a car, a person that
+deforms, a sky."""
 
 from __future__ import annotations
 
@@ -37,13 +38,19 @@ def toy_fitted(degree: int = 3, seed: int = 0) -> SceneModel:
     logits = rng.normal(-4, 1, (n, len(CLASSES)))
     logits[np.arange(n), np.repeat(classes, counts)] += 7
     columns = {
-        "means": np.concatenate(groups), "quats": rng.normal(size=(n, 4)), "log_scales": np.log(sizes), "logits": rng.normal(1.5, 1.5, n),
-        "sh_dc": ((base + rng.normal(0, 0.15, (n, 3)) - 0.5) / 0.28209479)[:, None], "semantics": logits,
-    }  # fmt: skip
+        "means": np.concatenate(groups),
+        "quats": rng.normal(size=(n, 4)),
+        "log_scales": np.log(sizes),
+        "logits": rng.normal(1.5, 1.5, n),
+        "sh_dc": ((base + rng.normal(0, 0.15, (n, 3)) - 0.5) / 0.28209479)[:, None],
+        "semantics": logits,
+    }
     if degree:
         columns["sh_rest"] = rng.normal(0, 0.08, (n, (degree + 1) ** 2 - 1, 3))
-    labels = {"node": torch.from_numpy(np.repeat([0, 0, 1, 2], counts).astype(np.int32)),
-              "certainty": torch.from_numpy(rng.uniform(0, 1, n).astype(np.float16))}  # fmt: skip
+    labels = {
+        "node": torch.from_numpy(np.repeat([0, 0, 1, 2], counts).astype(np.int32)),
+        "certainty": torch.from_numpy(rng.uniform(0, 1, n).astype(np.float16)),
+    }
     table = Table({name: torch.from_numpy(np.asarray(value, np.float32)) for name, value in columns.items()}, labels)
     sky = SkyNode.uniform(8)
     fade, tint = torch.linspace(0.9, 0.3, 8)[:, None], torch.tensor([0.6, 0.8, 1.0])[:, None, None]

@@ -24,9 +24,13 @@ TINY = PublishedConfig(
     image_tokens=ResamplerConfig(
         width=16, layers=1, head_width=8, heads=2, tokens=2, frames=4, image_width=16, context_width=16
     ),
-    image=TowerConfig(16, 2, 2), image_side=28, text=TowerConfig(16, 3, 2), schedule=ScheduleConfig(base_scale=0.7),
-    width=12, height=8,
-)  # fmt: skip
+    image=TowerConfig(16, 2, 2),
+    image_side=28,
+    text=TowerConfig(16, 3, 2),
+    schedule=ScheduleConfig(base_scale=0.7),
+    width=12,
+    height=8,
+)
 
 
 def choose_trainable(model, stage, temporal="transformers"):
@@ -51,7 +55,8 @@ def value_for(name, shape):
 
 
 def fill(module, ours, theirs):
-    """Fill a module by published names; `ours`, `theirs`: prefix of its names in the whole model and in a checkpoint."""
+    """Fill a module by published names; `ours`, `theirs`: prefix of its names in the whole model and in a
+    checkpoint."""
     state = module.state_dict()
     published = weights.published_names([ours + name for name in state])
     filled = {}
@@ -100,11 +105,31 @@ def tiny_model():
 def published_settings(start, clips, **changes):
     """A run of two steps of `learn` on clips of points alone that goes on from a folder of the tiny model."""
     settings = with_settings(
-        LearnConfig(start=str(start), steps=2, precision="float32"), clips=str(clips), cities=3, first_cities=3, clips_per_city=2,
-        held_out=1, score_watched=1, workers=0, width=32, height=32, window=4, full_window_share=1.0, batch_frames=8, lr=1e-4,
-        last_lr_share=1.0, warmup_steps=0, betas=(0.9, 0.999), clip_norm=0.5, average_decay=0.0, augment=False, log_every=1,
-        checkpoint_every=100, score_every=100, score_steps=1,
-    )  # fmt: skip
+        LearnConfig(start=str(start), steps=2, precision="float32"),
+        clips=str(clips),
+        cities=3,
+        first_cities=3,
+        clips_per_city=2,
+        held_out=1,
+        score_watched=1,
+        workers=0,
+        width=32,
+        height=32,
+        window=4,
+        full_window_share=1.0,
+        batch_frames=8,
+        lr=1e-4,
+        last_lr_share=1.0,
+        warmup_steps=0,
+        betas=(0.9, 0.999),
+        clip_norm=0.5,
+        average_decay=0.0,
+        augment=False,
+        log_every=1,
+        checkpoint_every=100,
+        score_every=100,
+        score_steps=1,
+    )
     return with_settings(settings, **changes)
 
 

@@ -1,4 +1,5 @@
-"""A made-up street whose images, sweeps and labels are exact: a ground plane, a striped wall, a panel, a car that moves.
+"""A made-up street whose images, sweeps and labels are exact: a ground plane, a striped wall, a panel, a car that
+moves.
 
 Everything is a rectangle or a box, so every ray has a closed answer. World: z up, ground at z = 0, driving along x.
 """
@@ -34,7 +35,8 @@ class ToyStreet:
 
     Args:
         wall_x: a wall across the street; its lower half (z < 2) has another colour than the upper.
-        panel_x: a low panel (z < 1.6, |y| < 1.5) before the wall; the LiDAR looks over it, the camera does not. None = none.
+        panel_x: a low panel (z < 1.6, |y| < 1.5) before the wall; the LiDAR looks over it, the camera does not. None =
+            none.
         car: centre of a car by time, or None.
         speed_m_s: of the recording vehicle.
     """

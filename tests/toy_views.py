@@ -63,9 +63,12 @@ def write_scene(root: Path, *, labels: bool = True, test_every: int = 2, lidar: 
 
 
 def write_views(
-    scene: Path, out: Path, source: str, shifts_m: tuple[float, ...],
+    scene: Path,
+    out: Path,
+    source: str,
+    shifts_m: tuple[float, ...],
     change: Callable[[int, Observation], Observation] | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Views equal to the recorded pictures, or what ``change(index, observation)`` makes of them."""
     loaded = read_scene(scene)
     for shift_m in shifts_m:

@@ -1,4 +1,5 @@
-"""Made-up weights under the names of DINOv2 and CLIP, small, for tests: no published numbers, but every part takes part."""
+"""Made-up weights under the names of DINOv2 and CLIP, small, for tests: no published numbers, but every part takes
+part."""
 
 from __future__ import annotations
 
@@ -31,7 +32,9 @@ def dino_state(seed: int = 0, width: int = 128, blocks: int = 2, side: int = 37)
     return {**state, "mask_token": torch.zeros(1, width)}
 
 
-def clip_state(seed: int = 0, width: int = 128, blocks: int = 2, patch: int = 14, side: int = 42) -> dict[str, torch.Tensor]:
+def clip_state(
+    seed: int = 0, width: int = 128, blocks: int = 2, patch: int = 14, side: int = 42
+) -> dict[str, torch.Tensor]:
     """All tensors of a small image tower under OpenAI's names."""
     return drawn(clip_image.tensor_shapes(width, blocks, patch, (side // patch) ** 2, 32), seed)
 
@@ -40,11 +43,14 @@ def transformers_names(state: Mapping[str, torch.Tensor]) -> dict[str, torch.Ten
     """The same tower as the transformers package stores it, with parts that are not read."""
     found = {"logit_scale": torch.ones(()), "text_model.final_layer_norm.weight": torch.ones(4)}
     fixed = {
-        "visual.class_embedding": "embeddings.class_embedding", "visual.positional_embedding": "embeddings.position_embedding.weight",
-        "visual.conv1.weight": "embeddings.patch_embedding.weight", "visual.ln_pre.weight": "pre_layrnorm.weight",
-        "visual.ln_pre.bias": "pre_layrnorm.bias", "visual.ln_post.weight": "post_layernorm.weight",
+        "visual.class_embedding": "embeddings.class_embedding",
+        "visual.positional_embedding": "embeddings.position_embedding.weight",
+        "visual.conv1.weight": "embeddings.patch_embedding.weight",
+        "visual.ln_pre.weight": "pre_layrnorm.weight",
+        "visual.ln_pre.bias": "pre_layrnorm.bias",
+        "visual.ln_post.weight": "post_layernorm.weight",
         "visual.ln_post.bias": "post_layernorm.bias",
-    }  # fmt: skip
+    }
     leaves = {"ln_1": "layer_norm1", "ln_2": "layer_norm2", "attn.out_proj": "self_attn.out_proj"}
     leaves |= {"mlp.c_fc": "mlp.fc1", "mlp.c_proj": "mlp.fc2"}
     for name, value in state.items():

@@ -15,7 +15,7 @@ import torch
 
 from mudg.base import geometry
 from mudg.base.palette import ID
-from mudg.base.types import (  # fmt: skip
+from mudg.base.types import (
     Camera,
     EgoPath,
     FusedCloud,
@@ -97,7 +97,9 @@ def cast(origin: np.ndarray, rays: np.ndarray, time_s: float) -> tuple[np.ndarra
     mark = (np.abs(point[:, 1] - 0.003 * point[:, 0] ** 2) < 0.15) & (point[:, 0] % 4.0 < 2.0)
     tone = np.where(mark, 0.85, tone)
     pave = 0.55 + 0.06 * np.sign(np.sin(point[:, 0] * 3.0) * np.sin(point[:, 1] * 3.0))
-    color = np.where(road[:, None], tone[:, None] * np.array([1.0, 1.0, 1.02]), pave[:, None] * np.array([1.0, 0.96, 0.9]))
+    color = np.where(
+        road[:, None], tone[:, None] * np.array([1.0, 1.0, 1.02]), pave[:, None] * np.array([1.0, 0.96, 0.9])
+    )
     rgb[ground] = color[ground]
     train_id[ground] = np.where(road, ID["road"], ID["sidewalk"])[ground]
     for box in STATIC:
@@ -140,20 +142,31 @@ def truth(view: View) -> Observation:
     shape = (cam.height, cam.width)
     depth = np.where(np.isfinite(depth), depth, np.nan).reshape(shape).astype(np.float32)
     return Observation(
-        view, torch.from_numpy(rgb.reshape(*shape, 3).transpose(2, 0, 1).astype(np.float32).copy()),
-        torch.from_numpy(depth)[None], torch.from_numpy(train_id.reshape(shape).astype(np.int64)),
-        torch.ones(1, *shape), torch.ones(1, *shape, dtype=torch.bool), "virtual", "truth",
-    )  # fmt: skip
+        view,
+        torch.from_numpy(rgb.reshape(*shape, 3).transpose(2, 0, 1).astype(np.float32).copy()),
+        torch.from_numpy(depth)[None],
+        torch.from_numpy(train_id.reshape(shape).astype(np.int64)),
+        torch.ones(1, *shape),
+        torch.ones(1, *shape, dtype=torch.bool),
+        "virtual",
+        "truth",
+    )
 
 
-def sweep_points(time_s: float, beams: int = 24, columns: int = 240) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def sweep_points(
+    time_s: float, beams: int = 24, columns: int = 240
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """One turn of a LiDAR 1.8 m above the ego origin: world points, colours, train ids, on-the-moving-car."""
     azimuth = np.linspace(-math.pi, math.pi, columns, endpoint=False)
     elevation = np.radians(np.linspace(-18, 6, beams))
     rays = np.stack(
-        [np.outer(np.cos(elevation), np.cos(azimuth)), np.outer(np.cos(elevation), np.sin(azimuth)),
-         np.outer(np.sin(elevation), np.ones(columns))], -1
-    ).reshape(-1, 3)  # fmt: skip
+        [
+            np.outer(np.cos(elevation), np.cos(azimuth)),
+            np.outer(np.cos(elevation), np.sin(azimuth)),
+            np.outer(np.sin(elevation), np.ones(columns)),
+        ],
+        -1,
+    ).reshape(-1, 3)
     pose = ego_pose(time_s)
     origin = pose[:3, 3] + np.array([0, 0, 1.8])
     rays = rays @ pose[:3, :3].T
@@ -163,11 +176,20 @@ def sweep_points(time_s: float, beams: int = 24, columns: int = 240) -> tuple[np
 
 
 def write_scene(
-    root: Path, *, frames: int = 8, cameras: tuple[str, ...] = ("front",), width: int = 96, height: int = 64,
-    labels: bool = True, tracks: bool = True, garbled: bool = False, dark: tuple[str, ...] = (),
-) -> Scene:  # fmt: skip
-    """A scene directory of ``frames`` time steps, 0.3 s apart; frame 3, 7, ... of each camera are test frames. ``garbled``: the car's
-    track is larger and elsewhere, across the houses on the left. ``dark``: cameras whose images are darker than those of others."""
+    root: Path,
+    *,
+    frames: int = 8,
+    cameras: tuple[str, ...] = ("front",),
+    width: int = 96,
+    height: int = 64,
+    labels: bool = True,
+    tracks: bool = True,
+    garbled: bool = False,
+    dark: tuple[str, ...] = (),
+) -> Scene:
+    """A scene directory of ``frames`` time steps, 0.3 s apart; frame 3, 7, ... of each camera are test frames.
+    ``garbled``: the car's track is larger and elsewhere, across the houses on the left. ``dark``: cameras whose images
+    are darker than those of others."""
     times = np.arange(frames) * 0.3
     yaws = {"front": 0.0, "left": 0.9, "right": -0.9}
     split = {}
@@ -206,12 +228,17 @@ def fused_cloud(frames: int = 8, semantics: bool = True) -> FusedCloud:
         time_s = 0.3 * index
         xyz, rgb, train_id, moving = sweep_points(time_s)
         static.append((xyz[~moving], rgb[~moving], train_id[~moving]))
-        car.append((geometry.transform_points(geometry.invert(car_pose(time_s)), xyz[moving]), rgb[moving], train_id[moving]))
+        car.append(
+            (geometry.transform_points(geometry.invert(car_pose(time_s)), xyz[moving]), rgb[moving], train_id[moving])
+        )
 
     def cloud(parts, frame) -> PointCloud:
         xyz, rgb, train_id = (np.concatenate(column) for column in zip(*parts))
         return PointCloud(
-            xyz.astype(np.float32), (rgb * 255).round().astype(np.uint8), frame, train_id.astype(np.uint8) if semantics else None
+            xyz.astype(np.float32),
+            (rgb * 255).round().astype(np.uint8),
+            frame,
+            train_id.astype(np.uint8) if semantics else None,
         )
 
     return FusedCloud(cloud(static, "world"), {"car": cloud(car, "object")})

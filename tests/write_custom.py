@@ -49,23 +49,36 @@ def write_log(scene: Scene, root: Path, suffix: str = ".npz", edit: Edit | None 
     sensors = rig(scene)
     cameras = {
         name: {
-            "width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx - 0.5, "cy": c.cy - 0.5,
+            "width": c.width,
+            "height": c.height,
+            "fx": c.fx,
+            "fy": c.fy,
+            "cx": c.cx - 0.5,
+            "cy": c.cy - 0.5,
             "ego_from_camera": sensors[name].tolist(),
         }
         for name, c in scene.cameras.items()
-    }  # fmt: skip
+    }
     lidar = scene.sweeps[0].sensor
     log: dict[str, Any] = {
-        "format": "mudg-log", "version": 1, "name": "round-trip", "licence": "none", "time_unit": "ns", "cameras": cameras,
+        "format": "mudg-log",
+        "version": 1,
+        "name": "round-trip",
+        "licence": "none",
+        "time_unit": "ns",
+        "cameras": cameras,
         "lidars": {lidar: {"ego_from_lidar": sensors[lidar].tolist(), "motion_compensated": True}},
         "ego": [
             {"time": ns(t), "world_from_ego": far(pose).tolist()}
             for t, pose in zip(scene.ego.times_s, scene.ego.world_from_ego, strict=True)
         ],
-        "images": [], "sweeps": [],
+        "images": [],
+        "sweeps": [],
         "tracks": [
             {
-                "id": track.id, "class": track.label, "size_m": track.size_m.tolist(),
+                "id": track.id,
+                "class": track.label,
+                "size_m": track.size_m.tolist(),
                 "boxes": [
                     {"time": ns(t), "world_from_object": far(pose).tolist()}
                     for t, pose in zip(track.times_s, track.world_from_object, strict=True)
@@ -73,7 +86,7 @@ def write_log(scene: Scene, root: Path, suffix: str = ".npz", edit: Edit | None 
             }
             for track in scene.tracks
         ],
-    }  # fmt: skip
+    }
     for frame in scene.frames:
         path = root / "images" / f"{frame.id}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -136,11 +149,14 @@ def write_recording(scene: Scene, root: Path) -> Path:
     sensors = rig(scene)
     described: dict[str, Any] = {
         name: {
-            "width": c.width, "height": c.height, "ego_from_sensor": sensors[name].tolist(), "D": [0, 0, 0, 0, 0],
+            "width": c.width,
+            "height": c.height,
+            "ego_from_sensor": sensors[name].tolist(),
+            "D": [0, 0, 0, 0, 0],
             "K": [[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]],
         }
         for name, c in scene.cameras.items()
-    }  # fmt: skip
+    }
     lidar = scene.sweeps[0].sensor
     described[lidar] = {"ego_from_sensor": sensors[lidar].tolist()}
     (root / "sensors.json").write_text(json.dumps(described))

@@ -25,7 +25,8 @@ READ_BACK = {"van": "car", "cyclist": "bicycle"}
 
 
 def write_dgp(truth: Scene, folder: Path, *, slowed: int = 1) -> Path:
-    """Write ``truth`` as a scene; with ``slowed`` = 10, times are written as tenths of a microsecond called microseconds."""
+    """Write ``truth`` as a scene; with ``slowed`` = 10, times are written as tenths of a microsecond called
+    microseconds."""
     mounts: dict[str, NDArray[np.float64]] = {}
     data, samples = [], []
     for index, sweep in enumerate(truth.sweeps):

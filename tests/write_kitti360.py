@@ -103,14 +103,25 @@ def matrix_xml(name: str, matrix: NDArray[np.floating]) -> str:
     """An OpenCV-style matrix."""
     rows, columns = matrix.shape
     data = "\n      ".join(numbers(row) for row in matrix)
-    return f'<{name} type_id="opencv-matrix"><rows>{rows}</rows><cols>{columns}</cols><dt>f</dt><data>\n      {data}</data></{name}>'
+    return (
+        f'<{name} type_id="opencv-matrix"><rows>{rows}</rows><cols>{columns}</cols><dt>f</dt><data>\n     '
+        f" {data}</data></{name}>"
+    )
 
 
 CUBE = np.array([[x, y, z] for x in (0.5, -0.5) for y in (0.5, -0.5) for z in (-0.5, 0.5)])
 
 
-def box_xml(number: int, pose: Matrix, size_m: NDArray[np.floating], *, semantic: int = 13, instance: int = 1,
-            timestamp: int = -1, window: tuple[int, int] = (0, 9)) -> str:  # fmt: skip
+def box_xml(
+    number: int,
+    pose: Matrix,
+    size_m: NDArray[np.floating],
+    *,
+    semantic: int = 13,
+    instance: int = 1,
+    timestamp: int = -1,
+    window: tuple[int, int] = (0, 9),
+) -> str:
     """One object."""
     transform = SOURCE_FROM_WORLD @ pose @ np.diag([*size_m, 1.0])
     return (

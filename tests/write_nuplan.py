@@ -24,14 +24,18 @@ IMAGE_DELAY_US = 16_667
 SOURCE_FROM_WORLD = yaw_matrix(0.8, (331_200.0, 4_690_300.0, 12.5))
 CAMERA_OF = {"front": "CAM_F0", "front_left": "CAM_L0"}
 TABLES = """
-CREATE TABLE log (token BLOB PRIMARY KEY, vehicle_name, date, timestamp INTEGER, logfile VARCHAR(64), location, map_version);
-CREATE TABLE ego_pose (token BLOB PRIMARY KEY, timestamp INTEGER, x FLOAT, y FLOAT, z FLOAT, qw FLOAT, qx FLOAT, qy FLOAT,
+CREATE TABLE log (
+    token BLOB PRIMARY KEY, vehicle_name, date, timestamp INTEGER, logfile VARCHAR(64), location, map_version);
+CREATE TABLE ego_pose (
+    token BLOB PRIMARY KEY, timestamp INTEGER, x FLOAT, y FLOAT, z FLOAT, qw FLOAT, qx FLOAT, qy FLOAT,
     qz FLOAT, vx FLOAT, vy FLOAT, vz FLOAT, epsg INTEGER, log_token BLOB);
-CREATE TABLE camera (token BLOB PRIMARY KEY, log_token BLOB, channel VARCHAR(64), model, translation BLOB, rotation BLOB,
+CREATE TABLE camera (
+    token BLOB PRIMARY KEY, log_token BLOB, channel VARCHAR(64), model, translation BLOB, rotation BLOB,
     intrinsic BLOB, distortion BLOB, width INTEGER, height INTEGER);
 CREATE TABLE image (token BLOB PRIMARY KEY, next_token BLOB, prev_token BLOB, ego_pose_token BLOB, camera_token BLOB,
     filename_jpg VARCHAR(128), timestamp INTEGER);
-CREATE TABLE lidar (token BLOB PRIMARY KEY, log_token BLOB, channel VARCHAR(64), model, translation BLOB, rotation BLOB);
+CREATE TABLE lidar (
+    token BLOB PRIMARY KEY, log_token BLOB, channel VARCHAR(64), model, translation BLOB, rotation BLOB);
 CREATE TABLE lidar_pc (token BLOB PRIMARY KEY, next_token BLOB, prev_token BLOB, ego_pose_token BLOB, lidar_token BLOB,
     scene_token BLOB, filename VARCHAR(128), timestamp INTEGER);
 CREATE TABLE lidar_box (token BLOB PRIMARY KEY, lidar_pc_token BLOB, track_token BLOB, next_token BLOB, prev_token BLOB,
@@ -62,9 +66,9 @@ def pcd(xyz: NDArray[np.floating], intensity: NDArray[np.floating]) -> bytes:
         rows[name] = xyz[:, axis]
     rows["intensity"] = np.round(intensity * 255)
     header = (
-        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity ring lidar_info\nSIZE 4 4 4 1 1 4\n"
-        f"TYPE F F F U U I\nCOUNT 1 1 1 1 1 1\nWIDTH {len(xyz)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(xyz)}\n"
-        "DATA binary\n"
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z intensity ring lidar_info\nSIZE 4 4 4 1"
+        f" 1 4\nTYPE F F F U U I\nCOUNT 1 1 1 1 1 1\nWIDTH {len(xyz)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS"
+        f" {len(xyz)}\nDATA binary\n"
     )
     return header.encode() + rows.tobytes() + b"\0" * 32
 
@@ -96,20 +100,43 @@ def write_nuplan(
         pose = SOURCE_FROM_WORLD @ pose
         qw, qx, qy, qz = wxyz(pose)
         time_us = us(float(time_s))
-        add("ego_pose", token=token("ego", time_us), timestamp=time_us, x=pose[0, 3], y=pose[1, 3], z=pose[2, 3],
-            qw=qw, qx=qx, qy=qy, qz=qz)  # fmt: skip
+        add(
+            "ego_pose",
+            token=token("ego", time_us),
+            timestamp=time_us,
+            x=pose[0, 3],
+            y=pose[1, 3],
+            z=pose[2, 3],
+            qw=qw,
+            qx=qx,
+            qy=qy,
+            qz=qz,
+        )
     ego = truth.ego.pose_at(truth.sweeps[0].time_s)
     assert ego is not None
     mount = invert(ego) @ truth.sweeps[0].world_from_lidar
-    add("lidar", token=token("lidar"), channel="MergedPointCloud", translation=pickle.dumps(mount[:3, 3].tolist()),
-        rotation=pickle.dumps(wxyz(mount)))  # fmt: skip
+    add(
+        "lidar",
+        token=token("lidar"),
+        channel="MergedPointCloud",
+        translation=pickle.dumps(mount[:3, 3].tolist()),
+        rotation=pickle.dumps(wxyz(mount)),
+    )
     for channel, name in (cameras or {channel: name for name, channel in CAMERA_OF.items()}).items():
         camera, frames = truth.cameras[name], truth.frames_of(name)
         mount = invert(ego) @ frames[0].view.world_from_cam
         k = [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
-        add("camera", token=token(channel), channel=channel, width=camera.width, height=camera.height,
-            translation=pickle.dumps(mount[:3, 3].tolist()), rotation=pickle.dumps(wxyz(mount)), intrinsic=pickle.dumps(k),
-            distortion=pickle.dumps(list(distortion)))  # fmt: skip
+        add(
+            "camera",
+            token=token(channel),
+            channel=channel,
+            width=camera.width,
+            height=camera.height,
+            translation=pickle.dumps(mount[:3, 3].tolist()),
+            rotation=pickle.dumps(wxyz(mount)),
+            intrinsic=pickle.dumps(k),
+            distortion=pickle.dumps(list(distortion)),
+        )
         (blobs / channel).mkdir(parents=True)
         for index, frame in enumerate(frames):
             time_us = us(frame.view.time_s)
@@ -117,8 +144,14 @@ def write_nuplan(
             buffer = io.BytesIO()
             Image.fromarray(read_image(truth, frame)).save(buffer, "JPEG" if jpeg else "PNG", quality=95, subsampling=0)
             (root / "sensor_blobs" / file).write_bytes(buffer.getvalue())
-            add("image", token=token("image", channel, index), camera_token=token(channel), filename_jpg=file,
-                timestamp=time_us - IMAGE_DELAY_US, ego_pose_token=token("ego", time_us))  # fmt: skip
+            add(
+                "image",
+                token=token("image", channel, index),
+                camera_token=token(channel),
+                filename_jpg=file,
+                timestamp=time_us - IMAGE_DELAY_US,
+                ego_pose_token=token("ego", time_us),
+            )
     for track in truth.tracks:
         add("track", token=token(track.id), category_token=token("vehicle"))
     (blobs / "MergedPointCloud").mkdir(parents=True)
@@ -127,16 +160,34 @@ def write_nuplan(
         file = f"{LOG}/MergedPointCloud/{cloud.hex()}.pcd"
         points = read_points(truth, sweep)
         (root / "sensor_blobs" / file).write_bytes(pcd(points.xyz, points.intensity))
-        add("lidar_pc", token=cloud, ego_pose_token=token("ego", time_us), lidar_token=token("lidar"), filename=file,
-            scene_token=token("scene-0000" if index < 3 else "scene-0001"), timestamp=time_us)  # fmt: skip
+        add(
+            "lidar_pc",
+            token=cloud,
+            ego_pose_token=token("ego", time_us),
+            lidar_token=token("lidar"),
+            filename=file,
+            scene_token=token("scene-0000" if index < 3 else "scene-0001"),
+            timestamp=time_us,
+        )
         for track in truth.tracks:
             pose = track.pose_at(sweep.time_s)
             assert pose is not None
             pose = SOURCE_FROM_WORLD @ pose
             length, width, height = track.size_m.tolist()
-            add("lidar_box", token=token("box", track.id, index), lidar_pc_token=cloud, track_token=token(track.id),
-                x=pose[0, 3], y=pose[1, 3], z=pose[2, 3], yaw=yaw_of(pose), length=length, width=width, height=height,
-                confidence=0.9)  # fmt: skip
+            add(
+                "lidar_box",
+                token=token("box", track.id, index),
+                lidar_pc_token=cloud,
+                track_token=token(track.id),
+                x=pose[0, 3],
+                y=pose[1, 3],
+                z=pose[2, 3],
+                yaw=yaw_of(pose),
+                length=length,
+                width=width,
+                height=height,
+                confidence=0.9,
+            )
     connection.commit()
     connection.close()
     return database

@@ -1,4 +1,5 @@
-"""Writes a scene as a nuScenes release, for round trips: tables, samples, sweeps; and edits tables for tests of bad input."""
+"""Writes a scene as a nuScenes release, for round trips: tables, samples, sweeps; and edits tables for tests of bad
+input."""
 
 from __future__ import annotations
 
@@ -52,7 +53,8 @@ def pose_row(pose: NDArray[np.float64]) -> dict[str, list[float]]:
 def write_nuscenes(
     truth: Scene, root: Path, *, key_every: int = 1, release: str = "v1.0-mini", name: str = "scene-0007"
 ) -> Path:
-    """Write ``truth`` below ``root``; every ``key_every``-th sweep is a key frame with boxes. Another scene's rows lie between.
+    """Write ``truth`` below ``root``; every ``key_every``-th sweep is a key frame with boxes. Another scene's rows lie
+    between.
 
     The LiDAR keeps the truth's axes, so that poses can be compared (the release's look along y).
     """

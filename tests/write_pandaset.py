@@ -83,7 +83,8 @@ def write_pandaset(
 
 
 def cuboids(truth: Scene, time_s: float, places: Mapping[str, np.ndarray] | None = None) -> dict[str, object]:
-    """One table of boxes: yaw counts from the y axis, x is the width. ``places``: poses of some boxes, by their tracks."""
+    """One table of boxes: yaw counts from the y axis, x is the width. ``places``: poses of some boxes, by their
+    tracks."""
     rows = []
     for track in truth.tracks:
         pose = (places or {}).get(track.id, track.pose_at(time_s))

@@ -1,8 +1,8 @@
 """Writes a scene as a Waymo log, format 1 or 2: what the importer reads, made the other way round.
 
-``log_of`` turns a scene with one spinning LiDAR into a ``Log`` of plain values, which tests may change before ``write_tfrecord`` or
-``write_parquet`` encodes it. The checksum is computed bit by bit and messages are built by hand, so nothing here shares code with
-the reader.
+``log_of`` turns a scene with one spinning LiDAR into a ``Log`` of plain values, which tests may change before
+``write_tfrecord`` or ``write_parquet`` encodes it. The checksum is computed bit by bit and messages are built by hand,
+so nothing here shares code with the reader.
 """
 
 from __future__ import annotations
@@ -62,8 +62,8 @@ def log_of(
         beams: elevations f64[H], radians, upwards.
         columns: of the range images.
         global_from_world: where the data set's world lies.
-        boxes_hold: whether boxes stand where their objects were when the LiDAR looked at them (``seen``), at the beginning of
-            the turn (``start``) or in its middle (``pose``).
+        boxes_hold: whether boxes stand where their objects were when the LiDAR looked at them (``seen``), at the
+            beginning of the turn (``start``) or in its middle (``pose``).
     """
     log = Log()
     mount = invert(truth.ego.pose_at(truth.sweeps[0].time_s)) @ truth.sweeps[0].world_from_lidar
@@ -74,10 +74,14 @@ def log_of(
         first = truth.frames_of(name)[0].view
         vehicle_from_cam = invert(truth.ego.pose_at(first.time_s)) @ first.world_from_cam
         log.cameras.append(
-            {"number": CAMERA_NUMBERS[name], "width": camera.width, "height": camera.height,
-             "intrinsic": [camera.fx, camera.fy, camera.cx, camera.cy, 0, 0, 0, 0, 0],
-             "extrinsic": vehicle_from_cam @ CAM_FROM_EGO_AXES}
-        )  # fmt: skip
+            {
+                "number": CAMERA_NUMBERS[name],
+                "width": camera.width,
+                "height": camera.height,
+                "intrinsic": [camera.fx, camera.fy, camera.cx, camera.cy, 0, 0, 0, 0, 0],
+                "extrinsic": vehicle_from_cam @ CAM_FROM_EGO_AXES,
+            }
+        )
     for index, sweep in enumerate(truth.sweeps):
         pose = global_from_world @ truth.ego.pose_at(sweep.time_s)
         frame: dict[str, Any] = {"timestamp_us": EPOCH_US + round((sweep.time_s - 0.05) * 1e6), "pose": pose}
@@ -92,17 +96,23 @@ def _image(truth: Scene, name: str, index: int, global_from_world: Matrix) -> di
     frame = truth.frames_of(name)[index]
     time = EPOCH_US / 1e6 + frame.view.time_s
     return {
-        "number": CAMERA_NUMBERS[name], "image": open_files(truth.root).read(frame.image.path),
-        "pose": global_from_world @ truth.ego.pose_at(frame.view.time_s), "velocity": np.zeros(6), "pose_time": time,
-        "shutter": SHUTTER_S, "trigger": time - (READOUT_S + SHUTTER_S) / 2, "done": time + (READOUT_S + SHUTTER_S) / 2,
+        "number": CAMERA_NUMBERS[name],
+        "image": open_files(truth.root).read(frame.image.path),
+        "pose": global_from_world @ truth.ego.pose_at(frame.view.time_s),
+        "velocity": np.zeros(6),
+        "pose_time": time,
+        "shutter": SHUTTER_S,
+        "trigger": time - (READOUT_S + SHUTTER_S) / 2,
+        "done": time + (READOUT_S + SHUTTER_S) / 2,
         "panoptic": None,
-    }  # fmt: skip
+    }
 
 
 def _scan(
     truth: Scene, index: int, mount: Matrix, beams: NDArray[np.float64], columns: int, global_from_world: Matrix
 ) -> dict[str, Any]:
-    """Range images by inverting the geometry: from where the LiDAR was when it measured a point, to beam, column and range."""
+    """Range images by inverting the geometry: from where the LiDAR was when it measured a point, to beam, column and
+    range."""
     sweep = truth.sweeps[index]
     points = read_points(truth, sweep)
     world = transform_points(sweep.world_from_lidar, points.xyz.astype(np.float64))
@@ -146,9 +156,14 @@ def _boxes(truth: Scene, moving: Sequence[Track], time_s: float, hold: str) -> l
         seen = own[track.id].pose_at(time_s + late)
         shown = now if seen is None else invert(vehicle) @ seen
         boxes.append(
-            {"id": track.id, "type": TYPE_NUMBERS[track.label], "centre": shown[:3, 3], "size": track.size_m,
-             "heading": yaw_of(now)}
-        )  # fmt: skip
+            {
+                "id": track.id,
+                "type": TYPE_NUMBERS[track.label],
+                "centre": shown[:3, 3],
+                "size": track.size_m,
+                "heading": yaw_of(now),
+            }
+        )
     return boxes
 
 
@@ -159,7 +174,7 @@ def panoptic_png(ids: NDArray[np.integer]) -> bytes:
     return buffer.getvalue()
 
 
-# --- format 1 ---------------------------------------------------------------------------------------------------------
+# --- format 1 -------------------------------------------------------------------------------------
 
 
 def crc32c_bitwise(data: bytes) -> int:
@@ -243,11 +258,24 @@ def context_message(log: Log) -> bytes:
     """The Context message."""
     out = text(1, log.name.encode())
     for camera in log.cameras:
-        out += text(2, number(1, camera["number"]) + doubles(2, camera["intrinsic"]) + transform(3, camera["extrinsic"])
-                    + number(4, camera["width"]) + number(5, camera["height"]) + number(6, 2))  # fmt: skip
+        out += text(
+            2,
+            number(1, camera["number"])
+            + doubles(2, camera["intrinsic"])
+            + transform(3, camera["extrinsic"])
+            + number(4, camera["width"])
+            + number(5, camera["height"])
+            + number(6, 2),
+        )
     for laser in log.lasers:
-        out += text(3, number(1, laser["number"]) + doubles(2, laser["inclinations"]) + double(3, laser["min"])
-                    + double(4, laser["max"]) + transform(5, laser["extrinsic"]))  # fmt: skip
+        out += text(
+            3,
+            number(1, laser["number"])
+            + doubles(2, laser["inclinations"])
+            + double(3, laser["min"])
+            + double(4, laser["max"])
+            + transform(5, laser["extrinsic"]),
+        )
     return out + text(4, text(2, b"Day") + text(3, b"location_sf") + text(4, b"sunny"))
 
 
@@ -289,7 +317,7 @@ def write_tfrecord(log: Log, path: Path) -> Path:
     return path
 
 
-# --- format 2 ---------------------------------------------------------------------------------------------------------
+# --- format 2 -------------------------------------------------------------------------------------
 
 
 def write_parquet(log: Log, root: Path) -> Path:
@@ -320,58 +348,143 @@ def write_parquet(log: Log, root: Path) -> Path:
         values = None if array is None else array.astype(np.float32).ravel()
         return {f"{prefix}.values": values, f"{prefix}.shape": None if array is None else list(array.shape)}
 
-    save("vehicle_pose", [{**key(f), "[VehiclePoseComponent].world_from_vehicle.transform": f["pose"].ravel()} for f in log.frames],
-         {"world_from_vehicle.transform": matrix})  # fmt: skip
+    save(
+        "vehicle_pose",
+        [{**key(f), "[VehiclePoseComponent].world_from_vehicle.transform": f["pose"].ravel()} for f in log.frames],
+        {"world_from_vehicle.transform": matrix},
+    )
     names = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
-    save("camera_calibration", [
-        {**key(camera_name=c["number"]),
-         **{f"[CameraCalibrationComponent].intrinsic.{n}": float(v) for n, v in zip(names, c["intrinsic"], strict=True)},
-         "[CameraCalibrationComponent].extrinsic.transform": c["extrinsic"].ravel(),
-         "[CameraCalibrationComponent].width": c["width"], "[CameraCalibrationComponent].height": c["height"],
-         "[CameraCalibrationComponent].rolling_shutter_direction": 2} for c in log.cameras
-    ], {"extrinsic.transform": matrix})  # fmt: skip
-    save("lidar_calibration", [
-        {**key(laser_name=item["number"]), "[LiDARCalibrationComponent].extrinsic.transform": item["extrinsic"].ravel(),
-         "[LiDARCalibrationComponent].beam_inclination.min": item["min"],
-         "[LiDARCalibrationComponent].beam_inclination.max": item["max"],
-         "[LiDARCalibrationComponent].beam_inclination.values": list(item["inclinations"]) or None} for item in log.lasers
-    ], {"extrinsic.transform": matrix, "beam_inclination.values": pa.list_(pa.float64())})  # fmt: skip
+    save(
+        "camera_calibration",
+        [
+            {
+                **key(camera_name=c["number"]),
+                **{
+                    f"[CameraCalibrationComponent].intrinsic.{n}": float(v)
+                    for n, v in zip(names, c["intrinsic"], strict=True)
+                },
+                "[CameraCalibrationComponent].extrinsic.transform": c["extrinsic"].ravel(),
+                "[CameraCalibrationComponent].width": c["width"],
+                "[CameraCalibrationComponent].height": c["height"],
+                "[CameraCalibrationComponent].rolling_shutter_direction": 2,
+            }
+            for c in log.cameras
+        ],
+        {"extrinsic.transform": matrix},
+    )
+    save(
+        "lidar_calibration",
+        [
+            {
+                **key(laser_name=item["number"]),
+                "[LiDARCalibrationComponent].extrinsic.transform": item["extrinsic"].ravel(),
+                "[LiDARCalibrationComponent].beam_inclination.min": item["min"],
+                "[LiDARCalibrationComponent].beam_inclination.max": item["max"],
+                "[LiDARCalibrationComponent].beam_inclination.values": list(item["inclinations"]) or None,
+            }
+            for item in log.lasers
+        ],
+        {"extrinsic.transform": matrix, "beam_inclination.values": pa.list_(pa.float64())},
+    )
     prefix = "[CameraImageComponent]."
-    save("camera_image", [
-        {**key(f, camera_name=i["number"]), f"{prefix}image": i["image"], f"{prefix}pose.transform": i["pose"].ravel(),
-         **{f"{prefix}velocity.linear_velocity.{a}": v for a, v in zip("xyz", i["velocity"][:3], strict=True)},
-         **{f"{prefix}velocity.angular_velocity.{a}": v for a, v in zip("xyz", i["velocity"][3:], strict=True)},
-         f"{prefix}pose_timestamp": i["pose_time"], f"{prefix}rolling_shutter_params.shutter": i["shutter"],
-         f"{prefix}rolling_shutter_params.camera_trigger_time": i["trigger"],
-         f"{prefix}rolling_shutter_params.camera_readout_done_time": i["done"]} for f in log.frames for i in f["images"]
-    ], {"pose.transform": matrix})  # fmt: skip
+    save(
+        "camera_image",
+        [
+            {
+                **key(f, camera_name=i["number"]),
+                f"{prefix}image": i["image"],
+                f"{prefix}pose.transform": i["pose"].ravel(),
+                **{f"{prefix}velocity.linear_velocity.{a}": v for a, v in zip("xyz", i["velocity"][:3], strict=True)},
+                **{f"{prefix}velocity.angular_velocity.{a}": v for a, v in zip("xyz", i["velocity"][3:], strict=True)},
+                f"{prefix}pose_timestamp": i["pose_time"],
+                f"{prefix}rolling_shutter_params.shutter": i["shutter"],
+                f"{prefix}rolling_shutter_params.camera_trigger_time": i["trigger"],
+                f"{prefix}rolling_shutter_params.camera_readout_done_time": i["done"],
+            }
+            for f in log.frames
+            for i in f["images"]
+        ],
+        {"pose.transform": matrix},
+    )
     prefix = "[CameraSegmentationLabelComponent]."
-    save("camera_segmentation", [
-        {**key(f, camera_name=i["number"]), f"{prefix}panoptic_label_divisor": DIVISOR, f"{prefix}panoptic_label": i["panoptic"]}
-        for f in log.frames for i in f["images"] if i["panoptic"] is not None
-    ], {})  # fmt: skip
+    save(
+        "camera_segmentation",
+        [
+            {
+                **key(f, camera_name=i["number"]),
+                f"{prefix}panoptic_label_divisor": DIVISOR,
+                f"{prefix}panoptic_label": i["panoptic"],
+            }
+            for f in log.frames
+            for i in f["images"]
+            if i["panoptic"] is not None
+        ],
+        {},
+    )
     lasers = [(f, item) for f in log.frames for item in f["lasers"]]
-    save("lidar", [
-        {**key(f, laser_name=item["number"]),
-         **flat("[LiDARComponent].range_image_return1", item["returns"][0]),
-         **flat("[LiDARComponent].range_image_return2", item["returns"][1] if len(item["returns"]) > 1 else None)}
-        for f, item in lasers
-    ], image_types)  # fmt: skip
-    save("lidar_pose", [
-        {**key(f, laser_name=item["number"]), **flat("[LiDARPoseComponent].range_image_return1", item["poses"])}
-        for f, item in lasers if item.get("poses") is not None
-    ], image_types)  # fmt: skip
+    save(
+        "lidar",
+        [
+            {
+                **key(f, laser_name=item["number"]),
+                **flat("[LiDARComponent].range_image_return1", item["returns"][0]),
+                **flat(
+                    "[LiDARComponent].range_image_return2", item["returns"][1] if len(item["returns"]) > 1 else None
+                ),
+            }
+            for f, item in lasers
+        ],
+        image_types,
+    )
+    save(
+        "lidar_pose",
+        [
+            {**key(f, laser_name=item["number"]), **flat("[LiDARPoseComponent].range_image_return1", item["poses"])}
+            for f, item in lasers
+            if item.get("poses") is not None
+        ],
+        image_types,
+    )
     prefix = "[LiDARCameraProjectionComponent]."
-    save("lidar_camera_projection", [
-        {**key(f, laser_name=item["number"]), **flat(f"{prefix}range_image_return1", item["projections"][0]),
-         **flat(f"{prefix}range_image_return2", item["projections"][1])} for f, item in lasers if item.get("projections")
-    ], image_types)  # fmt: skip
+    save(
+        "lidar_camera_projection",
+        [
+            {
+                **key(f, laser_name=item["number"]),
+                **flat(f"{prefix}range_image_return1", item["projections"][0]),
+                **flat(f"{prefix}range_image_return2", item["projections"][1]),
+            }
+            for f, item in lasers
+            if item.get("projections")
+        ],
+        image_types,
+    )
     prefix = "[LiDARBoxComponent]."
-    save("lidar_box", [
-        {**key(f, laser_object_id=b["id"]), **{f"{prefix}box.center.{a}": float(v) for a, v in zip("xyz", b["centre"], strict=True)},
-         **{f"{prefix}box.size.{a}": float(v) for a, v in zip("xyz", b["size"], strict=True)},
-         f"{prefix}box.heading": float(b["heading"]), f"{prefix}type": b["type"]} for f in log.frames for b in f["boxes"]
-    ], {"type": pa.int8()})  # fmt: skip
-    save("stats", [{**key(log.frames[0]), "[StatsComponent].time_of_day": "Day", "[StatsComponent].location": "location_sf",
-                    "[StatsComponent].weather": "sunny"}], {})  # fmt: skip
+    save(
+        "lidar_box",
+        [
+            {
+                **key(f, laser_object_id=b["id"]),
+                **{f"{prefix}box.center.{a}": float(v) for a, v in zip("xyz", b["centre"], strict=True)},
+                **{f"{prefix}box.size.{a}": float(v) for a, v in zip("xyz", b["size"], strict=True)},
+                f"{prefix}box.heading": float(b["heading"]),
+                f"{prefix}type": b["type"],
+            }
+            for f in log.frames
+            for b in f["boxes"]
+        ],
+        {"type": pa.int8()},
+    )
+    save(
+        "stats",
+        [
+            {
+                **key(log.frames[0]),
+                "[StatsComponent].time_of_day": "Day",
+                "[StatsComponent].location": "location_sf",
+                "[StatsComponent].weather": "sunny",
+            }
+        ],
+        {},
+    )
     return root

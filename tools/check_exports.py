@@ -2,9 +2,11 @@
 
     python tools/check_exports.py RUN --out FOLDER [--node-modules FOLDER]
 
-RUN: a fit, or the folder of a finished `mudg run`. FOLDER gets the files. Programs, each checked only where it is found:
+RUN: a fit, or the folder of a finished `mudg run`. FOLDER gets the files. Programs, each checked only where it is
+found:
 
-    npm install @playcanvas/splat-transform@2.7.1 gltf-validator@2.0.0-dev.3.10    reads and writes SPZ, SOG, ...; rules of glTF
+    npm install @playcanvas/splat-transform@2.7.1 gltf-validator@2.0.0-dev.3.10    reads and writes SPZ, SOG, ...; rules
+                                                                                   of glTF
     pip install usd-core mcap rosbags rerun-sdk         rules of USD; messages, bags, recordings
     pip install pycolmap nvidia-ncore zstandard         cameras; recordings of NCore; SPZ of version 4
 
@@ -46,7 +48,8 @@ AHEAD = np.random.default_rng(0).uniform([-3, -2, 8], [3, 2, 40], (50, 3))
 STEP_M = {"spz": 0.001, "ply": 1e-4, "compressed-ply": 0.02, "sog": 0.02, "splat": 1e-4}
 VALIDATE = """
 const v = require(process.argv[1]); const fs = require('fs');
-v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2])), {maxIssues: 0}).then(r => console.log(JSON.stringify(r.issues.messages)));
+v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[2])), {maxIssues: 0})
+  .then(r => console.log(JSON.stringify(r.issues.messages)));
 """
 
 
@@ -105,7 +108,8 @@ def written(run: Path, out: Path) -> dict[str, Path]:
 
 
 def against_splat_transform(tool: Path, name: str, file: Path) -> str:
-    """Our reading of a file against our reading of the PLY that their program makes of it; and that it reads back what we wrote."""
+    """Our reading of a file against our reading of the PLY that their program makes of it; and that it reads back what
+    we wrote."""
     made = file.with_name(f"theirs_{file.stem}_{name.split()[0]}.ply")
     done = subprocess.run(
         [str(tool), "-w", "-g", "cpu", str(file), str(made)], capture_output=True, text=True, check=False
@@ -123,12 +127,17 @@ def difference(ours: SplatCloud, theirs: SplatCloud, step_m: float) -> str:
     apart, rows = cKDTree(theirs.means).query(ours.means, workers=1)
     matched = theirs.take(np.asarray(rows))
     found = {
-        "m": float(apart.max()), "log size": float(np.median(np.abs(ours.log_scales - matched.log_scales))),
+        "m": float(apart.max()),
+        "log size": float(np.median(np.abs(ours.log_scales - matched.log_scales))),
         "opacity": float(np.median(np.abs(ours.opacity - matched.opacity))),
         "color": float(np.median(np.abs(ours.sh[:, 0] - matched.sh[:, 0]))),
-        "covariance": float(np.median(np.linalg.norm(covariances(ours) - covariances(matched), axis=(1, 2))
-                                      / np.linalg.norm(covariances(ours), axis=(1, 2)))),
-    }  # fmt: skip
+        "covariance": float(
+            np.median(
+                np.linalg.norm(covariances(ours) - covariances(matched), axis=(1, 2))
+                / np.linalg.norm(covariances(ours), axis=(1, 2))
+            )
+        ),
+    }
     if ours.degree:
         found["harmonics"] = float(np.median(np.abs(ours.sh[:, 1:] - matched.sh[:, 1:])))
     limits = {"harmonics": 0.05, "m": step_m, "log size": 0.01, "opacity": 0.01, "color": 0.02, "covariance": 0.05}
@@ -149,16 +158,17 @@ def of_gltf(validator: Path, file: Path) -> str:
         ["node", "-e", VALIDATE, str(validator.resolve()), str(file)], capture_output=True, text=True, check=True
     )
     issues = [
-        issue for issue in json.loads(done.stdout)
+        issue
+        for issue in json.loads(done.stdout)
         if not (issue["code"] == "MESH_PRIMITIVE_INVALID_ATTRIBUTE" and "KHR_gaussian_splatting:" in issue["pointer"])
         and issue["code"] != "UNSUPPORTED_EXTENSION"
-    ]  # fmt: skip
+    ]
     return "; ".join(f"{issue['code']} {issue['pointer']}" for issue in issues[:5])
 
 
 def of_usd(file: Path) -> str:
     """Errors of all validators, and whether the fields of particles are what we say."""
-    from pxr import Usd, UsdValidation  # type: ignore[import-not-found]
+    from pxr import Usd, UsdValidation
 
     stage = Usd.Stage.Open(str(file))
     context = UsdValidation.ValidationContext(UsdValidation.ValidationRegistry().GetOrLoadAllValidators())
@@ -178,7 +188,7 @@ def of_usd(file: Path) -> str:
 
 def of_mcap(file: Path, _scene: Scene) -> str:
     """Whether every message is read, in order."""
-    from mcap.reader import make_reader  # type: ignore[import-not-found]
+    from mcap.reader import make_reader
 
     with file.open("rb") as handle:
         reader = make_reader(handle, validate_crcs=True)
@@ -191,8 +201,8 @@ def of_mcap(file: Path, _scene: Scene) -> str:
 
 def of_bag(folder: Path, _scene: Scene) -> str:
     """Whether every message is read with the types of two releases, and written again to the same bytes."""
-    from rosbags.rosbag2 import Reader  # type: ignore[import-not-found]
-    from rosbags.typesys import Stores, get_types_from_msg, get_typestore  # type: ignore[import-not-found]
+    from rosbags.rosbag2 import Reader
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     for release in (Stores.ROS2_HUMBLE, Stores.ROS2_JAZZY):
         types, count = get_typestore(release), 0
@@ -211,7 +221,7 @@ def of_bag(folder: Path, _scene: Scene) -> str:
 
 def of_colmap(folder: Path, scene: Scene) -> str:
     """Whether every image has its pose and its pixels, and cameras are one rig."""
-    import pycolmap  # type: ignore[import-not-found]
+    import pycolmap
 
     found = pycolmap.Reconstruction(str(folder / "sparse" / "0"))
     if len(found.images) != len(scene.frames) or len(found.rigs) != 1:
@@ -264,15 +274,18 @@ def of_ncore(folder: Path, scene: Scene) -> str:
 
 
 OF_LOGS = {
-    "mcap": ("mcap", of_mcap), "ros2": ("rosbags", of_bag), "colmap": ("pycolmap", of_colmap), "colmap-text": ("pycolmap", of_colmap),
+    "mcap": ("mcap", of_mcap),
+    "ros2": ("rosbags", of_bag),
+    "colmap": ("pycolmap", of_colmap),
+    "colmap-text": ("pycolmap", of_colmap),
     "ncore": ("ncore", of_ncore),
-}  # fmt: skip
+}
 """Formats of a log: the package that reads them, and how."""
 
 
 def of_recording(file: Path) -> str:
     """Whether the recording is read, and what a viewer needs is in it."""
-    from rerun.chunk import RrdReader  # type: ignore[import-not-found]
+    from rerun.chunk import RrdReader
 
     paths = {chunk.entity_path for chunk in RrdReader(file).stream().to_chunks()}
     return "" if any(path.startswith("/world/gaussians/") for path in paths) else f"no Gaussians in {sorted(paths)[:5]}"

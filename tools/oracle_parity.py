@@ -1,11 +1,13 @@
-"""Compare the networks and distances of the scores with the packages that published numbers are made with, on made-up weights.
+"""Compare the networks and distances of the scores with the packages that published numbers are made with, on made-up
+weights.
 
     python -m venv oracle && oracle/bin/pip install torch numpy scipy pillow tqdm transformers
     oracle/bin/pip install --no-deps torchvision==0.28.0 pytorch-fid==0.3.0 torch-fidelity==0.4.0 lpips==0.1.4
     PYTHONPATH=src:tests oracle/bin/python tools/oracle_parity.py
 
-Nothing is downloaded and no published weight is needed: both sides get the same random weights, so that equal features mean equal networks.
-None of these packages is a dependency. Prints a Markdown table; ends with an error if a difference is larger than expected.
+Nothing is downloaded and no published weight is needed: both sides get the same random weights, so that equal features
+mean equal networks. None of these packages is a dependency. Prints a Markdown table; ends with an error if a difference
+is larger than expected.
 """
 
 from __future__ import annotations
@@ -122,8 +124,15 @@ def transformers() -> None:
         what = f"DINOv2 blocks, {side} pixels" + ("" if side == 518 else ": positions by size instead of by factor")
         note(what, "transformers", apart(network(image), found), limit)
     state = toy_vit.clip_state(side=112)
-    config = CLIPVisionConfig(hidden_size=128, intermediate_size=512, num_hidden_layers=2, num_attention_heads=2, image_size=112,
-        patch_size=14, projection_dim=32)  # fmt: skip
+    config = CLIPVisionConfig(
+        hidden_size=128,
+        intermediate_size=512,
+        num_hidden_layers=2,
+        num_attention_heads=2,
+        image_size=112,
+        patch_size=14,
+        projection_dim=32,
+    )
     model = CLIPVisionModelWithProjection(config).eval()
     named = {k: v for k, v in toy_vit.transformers_names(state).items() if k.startswith("vis")}
     report = model.load_state_dict(named, strict=False)
@@ -137,12 +146,14 @@ def transformers() -> None:
 def dino_names(state: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """The published names as version 5 of the transformers package has them."""
     found = {
-        "embeddings.cls_token": state["cls_token"], "embeddings.mask_token": state["mask_token"],
+        "embeddings.cls_token": state["cls_token"],
+        "embeddings.mask_token": state["mask_token"],
         "embeddings.position_embeddings": state["pos_embed"],
-        "layernorm.weight": state["norm.weight"], "layernorm.bias": state["norm.bias"],
+        "layernorm.weight": state["norm.weight"],
+        "layernorm.bias": state["norm.bias"],
         "embeddings.patch_embeddings.projection.weight": state["patch_embed.proj.weight"],
         "embeddings.patch_embeddings.projection.bias": state["patch_embed.proj.bias"],
-    }  # fmt: skip
+    }
     parts = {"attn.proj": "attention.o_proj", "ls1.gamma": "layer_scale1.lambda1", "ls2.gamma": "layer_scale2.lambda1"}
     for name, value in state.items():
         if not name.startswith("blocks."):

@@ -1,11 +1,13 @@
-"""Proves that a refactor changed nothing: runs the same commands at two commits and compares everything that they leave behind.
+"""Proves that a refactor changed nothing: runs the same commands at two commits and compares everything that they leave
+behind.
 
     python tools/same_results.py main~3 main            # all commands, about fifteen minutes on two cores
     python tools/same_results.py main . --only 'fit'    # "." is the working tree; only commands whose name matches
 
-Each side gets a checkout of its own with its own native library, one thread, and the same inputs: driving logs, clips and toy
-weights, written by the test suite of the first commit. Compared are, per command: the exit code, what was printed, and every file
-below the working folder. A finished result's key of reuse (`run.json`) must be equal, so results of one commit are reused by the other.
+Each side gets a checkout of its own with its own native library, one thread, and the same inputs: driving logs, clips
+and toy weights, written by the test suite of the first commit. Compared are, per command: the exit code, what was
+printed, and every file below the working folder. A finished result's key of reuse (`run.json`) must be equal, so
+results of one commit are reused by the other.
 
 What may differ is named in `VOLATILE` and in `neutral`: times, memory, process numbers and versions of packages.
 Exit code: 0 identical, 1 something differs (a table says what and by how much), 2 the comparison could not be made.
@@ -35,11 +37,13 @@ TIMEOUT_S = 600
 
 # Fields of JSON files that hold a time, a size in memory, a process or a machine.
 VOLATILE = re.compile(
-    r"(^|_)(seconds|s_per|elapsed|started|finished|created|time_spent|wall|cpu|processor|peak|rss|memory|pid|host|hostname|usage|ledger|machine|versions|"
+    r"(^|_)(seconds|s_per|elapsed|started|finished|"
+    r"created|time_spent|wall|cpu|processor|peak|rss|memory|pid|host|hostname|usage|ledger|machine|versions|"
     r"created_at|finished_at|started_at|steps_per_s|fps_reached|took|mudg_version)(_|$)"
 )
 SKIPPED = re.compile(r"(^|/)(log\.jsonl|.*\.lock|__pycache__(/.*)?)$")
-SEALS = re.compile(r"(^|/)(manifest\.json|run\.json)$")  # hold sums of files that hold times; what they seal is compared itself
+# hold sums of files that hold times; what they seal is compared itself
+SEALS = re.compile(r"(^|/)(manifest\.json|run\.json)$")
 TEXT = (".json", ".md", ".html", ".txt", ".yaml", ".csv", ".tex")
 
 
@@ -63,7 +67,7 @@ def commands() -> list[Command]:
     return rows
 
 
-# --- the two sides --------------------------------------------------------------------------------------------------
+# --- the two sides --------------------------------------------------------------------------------
 
 INPUTS = """
 import json, pathlib, sys
@@ -87,12 +91,15 @@ kitti_folders.write_odometry(logs / "kitti_odometry"); kitti_folders.write_track
 kitti_folders.write_object(logs / "kitti_object")
 clips = toy_clips.write_clips(root / "clips"); points = toy_clips.write_clips(root / "points", 32, 32, points=True)
 model = toy_published.write_tiny(root)
-for name, settings in (("learn", toy_clips.tiny("in/clips")), ("published", toy_published.published_settings("in/model", "in/points"))):
+for name, settings in (
+    ("learn", toy_clips.tiny("in/clips")), ("published", toy_published.published_settings("in/model", "in/points"))
+):
     (root / f"{name}.yaml").write_text(yaml.safe_dump(json.loads(json.dumps(asdict(settings)))))
 edits = root / "edits"; edits.mkdir()
 for name, text in {
     "remove": "- remove: {ids: [car-001]}", "move": "- move: {id: car-001, along_m: -2}",
-    "lane": "- lane_change: {id: ego, left_m: 1.5, start_s: 0, duration_s: 2}", "stop": "- stop: {id: car-001, at_s: 0.1}",
+    "lane": "- lane_change: {id: ego, left_m: 1.5, start_s: 0, duration_s: 2}",
+    "stop": "- stop: {id: car-001, at_s: 0.1}",
     "speed": "- speed: {id: car-001, factor: 0.5}", "weather": "- weather: {fog: {visibility_m: 40}}",
     "light": "- light: {time: dusk}", "season": "- season: {leaves: autumn}",
     "wrong_key": "- remove: {idss: [car-001]}", "wrong_id": "- remove: {ids: [car-999]}",
@@ -133,13 +140,17 @@ def check_out(commit: str, folder: Path) -> Path:
 def build(checkout: Path, built: Path | None) -> None:
     """The checkout's native library: that of another checkout where its sources are the same, else compiled."""
     native = [side / "src" / "mudg" / "native" for side in (checkout, built) if side is not None]
-    sources = [{p.name: p.read_bytes() for p in side.rglob("*") if p.suffix in (".cpp", ".h", ".hpp")} for side in native]
+    sources = [
+        {p.name: p.read_bytes() for p in side.rglob("*") if p.suffix in (".cpp", ".h", ".hpp")} for side in native
+    ]
     if built is not None and sources[0] == sources[1]:
         for path in native[1].iterdir():
             if path.is_file() and not (native[0] / path.name).exists():
                 shutil.copy2(path, native[0] / path.name)
     else:
-        subprocess.run([sys.executable, "build_backend/mudg_build.py", "--inplace"], cwd=checkout, check=True, capture_output=True)
+        subprocess.run(
+            [sys.executable, "build_backend/mudg_build.py", "--inplace"], cwd=checkout, check=True, capture_output=True
+        )
 
 
 def resolved(commit: str) -> str:
@@ -151,7 +162,9 @@ def resolved(commit: str) -> str:
 
 def write_inputs(checkout: Path, target: Path) -> None:
     """Logs, clips, toy weights and edit scripts, by the tests of the checkout."""
-    done = subprocess.run([sys.executable, "-c", INPUTS, str(target)], env=environment(checkout), capture_output=True, text=True)
+    done = subprocess.run(
+        [sys.executable, "-c", INPUTS, str(target)], env=environment(checkout), capture_output=True, text=True
+    )
     if done.returncode:
         sys.exit(f"the inputs could not be written by {checkout}:\n{done.stderr}")
 
@@ -209,10 +222,12 @@ def told(text: str, work: Path) -> str:
     """Printed text without the folder and without numbers of seconds, bytes and processes."""
     text = text.replace(str(work), "WORK")
     text = re.sub(r"\d+(\.\d+)? ?(seconds|s|ms|min|MB|MiB|GB|GiB|kB)\b", "N", text)
-    return "\n".join(line.rstrip() for line in re.sub(r"\d+:\d\d(:\d\d)?", "N", text).splitlines() if "resum" not in line)
+    return "\n".join(
+        line.rstrip() for line in re.sub(r"\d+:\d\d(:\d\d)?", "N", text).splitlines() if "resum" not in line
+    )
 
 
-# --- what is compared -----------------------------------------------------------------------------------------------
+# --- what is compared -----------------------------------------------------------------------------
 
 
 def sums(work: Path) -> dict[str, str]:
@@ -270,7 +285,13 @@ def differences(name: str, left: Outcome, right: Outcome, works: tuple[Path, Pat
         if a != b:
             lines.append(
                 f"{file}: "
-                + ("only before" if b is None else "only after" if a is None else how_much(works[0] / file, works[1] / file))
+                + (
+                    "only before"
+                    if b is None
+                    else "only after"
+                    if a is None
+                    else how_much(works[0] / file, works[1] / file)
+                )
             )
     return lines
 
@@ -292,7 +313,10 @@ def how_much(left: Path, right: Path) -> str:
             import numpy as np
             from PIL import Image
 
-            return f"pixels differ by up to {tensor_distance(np.asarray(Image.open(left)), np.asarray(Image.open(right))):.3g} levels"
+            return (
+                "pixels differ by up to"
+                f" {tensor_distance(np.asarray(Image.open(left)), np.asarray(Image.open(right))):.3g} levels"
+            )
     except (OSError, ValueError) as error:
         return f"not comparable: {error}"
     if left.suffix in TEXT:
@@ -322,7 +346,9 @@ def main() -> int:
     parser.add_argument("before", help="commit, or . for the working tree")
     parser.add_argument("after", help="commit, or . for the working tree")
     parser.add_argument(
-        "--only", default="", help="run only commands whose name matches this expression (what they read must be among them)"
+        "--only",
+        default="",
+        help="run only commands whose name matches this expression (what they read must be among them)",
     )
     parser.add_argument("--work", type=Path, help="keep both sides in this new folder (default: a temporary one)")
     options = parser.parse_args()

@@ -1,7 +1,9 @@
-"""Training and scoring images for the shipped segmentation network: generated cities with LiDAR evidence and exact classes.
+"""Training and scoring images for the shipped segmentation network: generated cities with LiDAR evidence and exact
+classes.
 
-A city is a function of (seed, number). It is looked at four times, forwards or to any side, with its sweeps put together as `mudg annotate`
-does. Field of view, mounting, number and elevations of beams, number of sweeps, and errors of boxes vary from city to city.
+A city is a function of (seed, number). It is looked at four times, forwards or to any side, with its sweeps put
+together as `mudg annotate` does. Field of view, mounting, number and elevations of beams, number of sweeps, and errors
+of boxes vary from city to city.
 """
 
 from __future__ import annotations
@@ -43,13 +45,23 @@ def city_config(seed: int, city: int, width: int, height: int) -> CityConfig:
     rng = seeds.numpy_rng(seed, city, "segmenter city configuration")
     lower, upper = (float(x) for x in ((-25, 3), (-30, 10), (-18, 3), (-25, 15), (-25, 15))[rng.integers(5)])
     return CityConfig(
-        seed=seeds.key(seed, city, "segmenter city") & 0x7FFFFFFF, n_frames=FRAMES, width=width, height=height,
-        cameras=("front",), rate_hz=float(rng.choice([10.0, 10.0, 5.0])), hfov_deg=float(rng.uniform(50, 85)), rig_variation=1.0,
-        lidar_beams=int(rng.choice([128, 64, 64, 64, 40, 32, 32, 16])), lidar_azimuth_step_deg=float(rng.choice([0.2, 0.2, 0.35])),
-        lidar_lower_deg=lower, lidar_upper_deg=upper, lidar_range_m=float(rng.choice([70, 90, 120])),
-        lidar_dropout=float(rng.uniform(0.02, 0.15)), lidar_noise_m=float(rng.uniform(0.01, 0.03)),
+        seed=seeds.key(seed, city, "segmenter city") & 0x7FFFFFFF,
+        n_frames=FRAMES,
+        width=width,
+        height=height,
+        cameras=("front",),
+        rate_hz=float(rng.choice([10.0, 10.0, 5.0])),
+        hfov_deg=float(rng.uniform(50, 85)),
+        rig_variation=1.0,
+        lidar_beams=int(rng.choice([128, 64, 64, 64, 40, 32, 32, 16])),
+        lidar_azimuth_step_deg=float(rng.choice([0.2, 0.2, 0.35])),
+        lidar_lower_deg=lower,
+        lidar_upper_deg=upper,
+        lidar_range_m=float(rng.choice([70, 90, 120])),
+        lidar_dropout=float(rng.uniform(0.02, 0.15)),
+        lidar_noise_m=float(rng.uniform(0.01, 0.03)),
         traffic=float(rng.uniform(0.6, 2.0)),
-    )  # fmt: skip
+    )
 
 
 def samples(seed: int, city: int, width: int, height: int) -> Iterator[Sample]:
@@ -73,7 +85,8 @@ def samples(seed: int, city: int, width: int, height: int) -> Iterator[Sample]:
 def shot(
     world: CityWorld, view: View, frame: int, sweeps: int, tracks: Sequence[Track]
 ) -> tuple[LabelInput, NDArray[np.uint8]]:
-    """One image of a city as a labeller gets it, with the ``sweeps`` sweeps around it, and its true classes u8[H, W]."""
+    """One image of a city as a labeller gets it, with the ``sweeps`` sweeps around it, and its true classes u8[H,
+    W]."""
     truth = world.render(view, sensor_noise=True)
     xyz, gap_deg = points_at(world, view, frame, sweeps)
     path = world.ego_path().world_from_ego[:, :3, 3]
@@ -82,7 +95,8 @@ def shot(
 
 
 def points_at(world: CityWorld, view: View, frame: int, sweeps: int) -> tuple[NDArray[np.float32], float]:
-    """Points f32[N, 3] of the sweeps around a frame, dynamic objects where they are at the view's time; and the largest beam gap, deg."""
+    """Points f32[N, 3] of the sweeps around a frame, dynamic objects where they are at the view's time; and the largest
+    beam gap, deg."""
     rules = FusionRules()
     dynamic = [track for track in world.tracks() if judge_track(track, rules).moving]
     total = world.config.n_frames

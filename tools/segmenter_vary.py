@@ -1,7 +1,7 @@
 """How training images are varied, so that what a network learns in generated cities holds for recorded images.
 
-Colours, sharpness, noise and compression are drawn anew every time; now and then every class gets colours of its own, or the image, the
-returns, the boxes or the ground plane are missing.
+Colours, sharpness, noise and compression are drawn anew every time; now and then every class gets colours of its own,
+or the image, the returns, the boxes or the ground plane are missing.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ CROP = (192, 288)
 
 @dataclass(frozen=True)
 class Rules:
-    """How often (0..1) a sample goes without its image, colours, returns, boxes, or ground plane; or the step at the kerb is lost, or found
-    where there is none."""
+    """How often (0..1) a sample goes without its image, colours, returns, boxes, or ground plane; or the step at the
+    kerb is lost, or found where there is none."""
 
     no_image: float = 0.06
     grey: float = 0.1
@@ -74,18 +74,31 @@ def disturbed(evidence: Evidence, rng: np.random.Generator, rules: Rules) -> Evi
     kept[1:] = rng.random(255) >= (1.0 if rng.random() < rules.no_boxes else rng.uniform(0, 0.5))
     kept = kept[evidence.box]
     evidence = dataclasses.replace(
-        evidence, height_m=height.astype(np.float32), reachable=reachable, raised_m=raised.astype(np.float32),
+        evidence,
+        height_m=height.astype(np.float32),
+        reachable=reachable,
+        raised_m=raised.astype(np.float32),
         rough=evidence.rough * np.float32(rng.uniform(0.5, 1.5)),
-        box=np.where(kept, evidence.box, 0).astype(np.uint8), in_box=evidence.in_box & kept,
-    )  # fmt: skip
+        box=np.where(kept, evidence.box, 0).astype(np.uint8),
+        in_box=evidence.in_box & kept,
+    )
     if rng.random() >= rules.no_returns:
         return evidence
     zero = np.zeros_like(evidence.height_m)
     return dataclasses.replace(
-        evidence, height_m=zero, depth_m=zero + np.float32(np.nan), away_deg=zero + 90, upwards=zero, beside_m=zero,
-        reachable=np.zeros_like(reachable), direct=np.zeros_like(reachable), raised_m=zero,
-        silent=np.zeros_like(evidence.silent), rough=zero, in_box=np.zeros_like(evidence.in_box),
-    )  # fmt: skip
+        evidence,
+        height_m=zero,
+        depth_m=zero + np.float32(np.nan),
+        away_deg=zero + 90,
+        upwards=zero,
+        beside_m=zero,
+        reachable=np.zeros_like(reachable),
+        direct=np.zeros_like(reachable),
+        raised_m=zero,
+        silent=np.zeros_like(evidence.silent),
+        rough=zero,
+        in_box=np.zeros_like(evidence.in_box),
+    )
 
 
 def _cropped(
@@ -119,7 +132,8 @@ def colored(
     if rng.random() < rules.recolored:  # each class its own tint, brightness and pattern
         gain = np.exp(rng.normal(0, 0.35, (256, 1)) + rng.normal(0, 0.15, (256, 3))).astype(np.float32)
         shift = (rng.normal(0, 0.08, (256, 1)) + rng.normal(0, 0.04, (256, 3))).astype(np.float32)
-        gain[list(_FLAT)] *= np.exp(rng.normal(0, 0.3, (len(_FLAT), 1)))  # a road in the sun is as bright as any sidewalk
+        # a road in the sun is as bright as any sidewalk
+        gain[list(_FLAT)] *= np.exp(rng.normal(0, 0.3, (len(_FLAT), 1)))
         touched = rng.random(256) < rng.uniform(0.2, 1)
         gain[~touched], shift[~touched], shift[UNLABELLED] = 1, 0, 0
         strength = np.where(touched, np.abs(rng.normal(0, 0.15, 256)), 0).astype(np.float32)[truth][..., None]

@@ -5,8 +5,8 @@ python tools/train_segmenter.py train WORK                       goes on from th
 python tools/train_segmenter.py score WORK --list development    mIoU on city logs, beside the geometry labeller
 python tools/train_segmenter.py ship  WORK --model FOLDER        calibrates confidences, writes model, weights and card
 
-Every draw depends on (seed, step) alone: a run that was stopped ends as one that was not, and a second run gives the same network on
-the same processor type at the same number of threads.
+Every draw depends on (seed, step) alone: a run that was stopped ends as one that was not, and a second run gives the
+same network on the same processor type at the same number of threads.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def say(line: str) -> None:
     sys.stdout.flush()
 
 
-# --- data -------------------------------------------------------------------------------------------------------------
+# --- data -----------------------------------------------------------------------------------------
 
 
 def make_data(options: argparse.Namespace) -> None:
@@ -99,11 +99,12 @@ def make_data(options: argparse.Namespace) -> None:
         say(f"city {city}")
 
 
-# --- training ---------------------------------------------------------------------------------------------------------
+# --- training -------------------------------------------------------------------------------------
 
 
 def class_weights(files: list[Path], balance: float) -> Tensor:
-    """share^-balance of each class over some files, f32[19], with mean 1 over pixels; absent classes weigh as the rarest."""
+    """share^-balance of each class over some files, f32[19], with mean 1 over pixels; absent classes weigh as the
+    rarest."""
     counts = np.zeros(256)
     for path in files[:: max(1, len(files) // 60)]:
         counts += np.bincount(segmenter_data.load(path).truth.ravel(), minlength=256)
@@ -143,7 +144,8 @@ def draw(options: argparse.Namespace, step: int) -> Batch:
 
 
 def batches(options: argparse.Namespace, first: int) -> Iterator[Batch]:
-    """The batches of all steps from ``first`` on; ``--workers`` processes make them ahead of time, which changes nothing in them."""
+    """The batches of all steps from ``first`` on; ``--workers`` processes make them ahead of time, which changes
+    nothing in them."""
     steps = range(first, options.steps)
     if options.workers == 0:
         yield from (draw(options, step) for step in steps)
@@ -195,8 +197,11 @@ def train(options: argparse.Namespace) -> None:
         average = found.tensors("average")
         moments = found.tensors("moments")
         for n, parameter in enumerate(net.parameters()):
-            optimizer.state[parameter] = {"step": torch.tensor(float(first)), "exp_avg": moments[f"{n}.first"],
-                                          "exp_avg_sq": moments[f"{n}.second"]}  # fmt: skip
+            optimizer.state[parameter] = {
+                "step": torch.tensor(float(first)),
+                "exp_avg": moments[f"{n}.first"],
+                "exp_avg_sq": moments[f"{n}.second"],
+            }
     weights = class_weights(files, options.balance)
     say(f"{options.cities} cities, {sum(p.numel() for p in net.parameters()):,} parameters, from step {first}")
     bf16 = bool(getattr(torch.cpu, "get_capabilities", dict)().get("amx_bf16", False))
@@ -220,7 +225,8 @@ def train(options: argparse.Namespace) -> None:
         done = step + 1
         if done % 20 == 0:
             say(
-                f"step {done}: loss {np.mean(losses[-20:]):.4f}, gradient {norm:.2f}, {time.process_time():.0f} s of processor time"
+                f"step {done}: loss {np.mean(losses[-20:]):.4f}, gradient {norm:.2f}, {time.process_time():.0f} s of"
+                " processor time"
             )
         if done % options.checkpoint_every == 0 or done == options.steps:
             moments = {}
@@ -248,7 +254,7 @@ def trained(options: argparse.Namespace) -> tuple[StreetNet, int, float]:
     return net.eval().to(memory_format=torch.channels_last), found.step, float(found.state["processor_s"])
 
 
-# --- scores -----------------------------------------------------------------------------------------------------------
+# --- scores ---------------------------------------------------------------------------------------
 
 
 def counted(found: NDArray[np.uint8], truth: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -302,11 +308,12 @@ def score(options: argparse.Namespace) -> None:
     store.write_text(options.work / f"{options.run}_{options.list}.txt", "\n".join(lines) + "\n")
 
 
-# --- shipping ---------------------------------------------------------------------------------------------------------
+# --- shipping -------------------------------------------------------------------------------------
 
 
 def temperature(net: StreetNet, options: argparse.Namespace) -> float:
-    """What the network's scores are divided by so that the classes are likeliest, on varied images of cities that were not trained on."""
+    """What the network's scores are divided by so that the classes are likeliest, on varied images of cities that were
+    not trained on."""
     kept, classes = [], []
     rules = segmenter_vary.Rules()
     for city in range(options.cities, options.cities + options.held_out):
@@ -333,12 +340,29 @@ def ship(options: argparse.Namespace) -> None:
     facts = {"recipe": recipe, "processor_minutes": round(seconds / 60, 1)}
     scores = options.work / f"{options.run}_{options.list}.txt"
     found = scores.read_text(encoding="utf-8") if scores.is_file() else "not computed\n"
-    street_net.save(net, Path(options.model), CARD.format(
-        parameters=sum(p.numel() for p in net.parameters()) / 1e6, images=options.cities * segmenter_data.VIEWS, seed=options.seed,
-        cities=options.cities, last=options.cities - 1, held_first=options.cities, held_last=options.cities + options.held_out - 1,
-        steps=steps, batch=options.batch, minutes=seconds / 60, temperature=net.config.temperature, list=options.list,
-        logs=options.logs, images_each=options.images, scores=found, size=options.size,
-    ), facts)  # fmt: skip
+    street_net.save(
+        net,
+        Path(options.model),
+        CARD.format(
+            parameters=sum(p.numel() for p in net.parameters()) / 1e6,
+            images=options.cities * segmenter_data.VIEWS,
+            seed=options.seed,
+            cities=options.cities,
+            last=options.cities - 1,
+            held_first=options.cities,
+            held_last=options.cities + options.held_out - 1,
+            steps=steps,
+            batch=options.batch,
+            minutes=seconds / 60,
+            temperature=net.config.temperature,
+            list=options.list,
+            logs=options.logs,
+            images_each=options.images,
+            scores=found,
+            size=options.size,
+        ),
+        facts,
+    )
     say(f"temperature {net.config.temperature}, {options.model}")
 
 

@@ -18,9 +18,10 @@ from mudg.base import store
 
 TINY: dict[str, dict[str, Any]] = {
     "ingest": {"city": {"n_frames": 4, "width": 60, "height": 40, "cameras": ["front"]}},
-    "fit": {"iterations": 4, "start": {"gaussians": 500, "voxel_m": 0.5}}, "synthesize": {"model": "embedded-tiny", "steps": 1},
+    "fit": {"iterations": 4, "start": {"gaussians": 500, "voxel_m": 0.5}},
+    "synthesize": {"model": "embedded-tiny", "steps": 1},
     "score": {"perceptual_views": 0},
-}  # fmt: skip
+}
 
 
 def main(words: Sequence[str] | None = None) -> dict[str, Any]:

@@ -1,10 +1,12 @@
-"""Seconds and peak memory of the published-type network with made-up weights: a pass, a decoding, and what a clip takes.
+"""Seconds and peak memory of the published-type network with made-up weights: a pass, a decoding, and what a clip
+takes.
 
     python bench/gpu/published_passes.py --device cuda --out full_size.json
     python bench/gpu/published_passes.py --device cuda --compile
     python bench/gpu/published_passes.py --small --device cpu
 
-A clip has 3 modalities: per step a pass of batch 6 with guidance, of batch 3 without; then 3 decodings. Clips are computed from the passes.
+A clip has 3 modalities: per step a pass of batch 6 with guidance, of batch 3 without; then 3 decodings. Clips are
+computed from the passes.
 """
 
 from __future__ import annotations

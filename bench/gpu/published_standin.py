@@ -3,10 +3,11 @@
     python bench/gpu/published_standin.py --device cuda --work runs/standin --out standin.json --picture standin.png
     python bench/gpu/published_standin.py --small --device cpu
 
-The stand-in has every part of the published model (autoencoder, image tower, resampler, video UNet with temporal and cross-attention,
-labels, velocity with a dynamic rescale, guidance), narrower, with 16 latent channels in place of 4, and for 8 frames of 96x64. The image
-tower is drawn, not trained. The condition is the published one: points alone, and a recorded reference. Trained weights are kept in
---work; an interrupted training resumes. Then the same clips, of cities it never saw, are generated with fewer passes.
+The stand-in has every part of the published model (autoencoder, image tower, resampler, video UNet with temporal and
+cross-attention, labels, velocity with a dynamic rescale, guidance), narrower, with 16 latent channels in place of 4,
+and for 8 frames of 96x64. The image tower is drawn, not trained. The condition is the published one: points alone, and
+a recorded reference. Trained weights are kept in --work; an interrupted training resumes. Then the same clips, of
+cities it never saw, are generated with fewer passes.
 """
 
 from __future__ import annotations
@@ -47,26 +48,45 @@ from mudg.networks.featnets import CodecFeatures, PerceptualDistance
 
 RULES = from_city.CityClipRules(width=96, height=64, window=8, clips=4, published=True)
 CONFIG = PublishedConfig(
-    net=VideoUNetConfig(channels_in=48, channels_out=16, width=64, multipliers=(1, 2, 4), blocks=1, attention=(True, True, False),
-                        head_width=32, first_heads=2, context_width=64),
+    net=VideoUNetConfig(
+        channels_in=48,
+        channels_out=16,
+        width=64,
+        multipliers=(1, 2, 4),
+        blocks=1,
+        attention=(True, True, False),
+        head_width=32,
+        first_heads=2,
+        context_width=64,
+    ),
     codec=AutoencoderConfig(width=32, multipliers=(1, 2, 2, 4), blocks=1, latent_channels=16, posterior="mean"),
-    image_tokens=ResamplerConfig(width=64, layers=2, head_width=32, heads=2, tokens=4, frames=8, image_width=64, context_width=64),
-    image=TowerConfig(64, 2, 2), image_side=56, text=TowerConfig(64, 3, 2), schedule=ScheduleConfig(base_scale=0.7), width=96, height=64,
-)  # fmt: skip
+    image_tokens=ResamplerConfig(
+        width=64, layers=2, head_width=32, heads=2, tokens=4, frames=8, image_width=64, context_width=64
+    ),
+    image=TowerConfig(64, 2, 2),
+    image_side=56,
+    text=TowerConfig(64, 3, 2),
+    schedule=ScheduleConfig(base_scale=0.7),
+    width=96,
+    height=64,
+)
 SMALL_RULES = replace(RULES, width=32, height=32, window=4, clips=1)
 SMALL_CONFIG = replace(
     CONFIG,
-    net=replace(CONFIG.net, width=32, multipliers=(1, 2), attention=(True, False)), codec=replace(CONFIG.codec, multipliers=(1, 2)),
-    image_tokens=replace(CONFIG.image_tokens, frames=4, layers=1), width=32, height=32,
-)  # fmt: skip
+    net=replace(CONFIG.net, width=32, multipliers=(1, 2), attention=(True, False)),
+    codec=replace(CONFIG.codec, multipliers=(1, 2)),
+    image_tokens=replace(CONFIG.image_tokens, frames=4, layers=1),
+    width=32,
+    height=32,
+)
 LATENT_DEVIATION = 1.0
 """Standard deviation that the scaled latents are brought to."""
 NETWORK_FILE = "network.safetensors"
 
 
 class Sampling(NamedTuple):
-    """How clips are generated: sampler, steps, guidance (None: the published 7.5), noise added between steps (None: all of it, as the
-    release does)."""
+    """How clips are generated: sampler, steps, guidance (None: the published 7.5), noise added between steps (None: all
+    of it, as the release does)."""
 
     sampler: str
     steps: int
@@ -75,16 +95,26 @@ class Sampling(NamedTuple):
 
 
 GRID = (
-    Sampling("ddim", 50), Sampling("ddim", 20), Sampling("ddim", 8), Sampling("ddim", 5), Sampling("ddim", 5, eta=0.0),
-    Sampling("dpm_solver", 8), Sampling("dpm_solver", 5), Sampling("ddim", 50, 1.0), Sampling("ddim", 10, 1.0),
+    Sampling("ddim", 50),
+    Sampling("ddim", 20),
+    Sampling("ddim", 8),
+    Sampling("ddim", 5),
+    Sampling("ddim", 5, eta=0.0),
+    Sampling("dpm_solver", 8),
+    Sampling("dpm_solver", 5),
+    Sampling("ddim", 50, 1.0),
+    Sampling("ddim", 10, 1.0),
     Sampling("ddim", 10, 1.0, 0.0),
-    Sampling("dpm_solver", 10, 1.0), Sampling("dpm_solver", 8, 1.0), Sampling("dpm_solver", 5, 1.0), Sampling("dpm_solver", 3, 1.0),
+    Sampling("dpm_solver", 10, 1.0),
+    Sampling("dpm_solver", 8, 1.0),
+    Sampling("dpm_solver", 5, 1.0),
+    Sampling("dpm_solver", 3, 1.0),
     Sampling("ddim", 1, 1.0, 0.0),
-)  # fmt: skip
+)
 """Rows of the table; the first is the published way, the last the regression of a clip on its condition."""
 
 
-# clips ----------------------------------------------------------------------------------------------------------------
+# clips --------------------------------------------------------------------------------------------
 
 
 def images_of(clip: Clip, model: PublishedMDM) -> Tensor:
@@ -102,7 +132,7 @@ def every_clip(folder: Path, cities: Sequence[int], window: int) -> list[Clip]:
     ]
 
 
-# autoencoder ----------------------------------------------------------------------------------------------------------
+# autoencoder --------------------------------------------------------------------------------------
 
 
 def train_codec(model: PublishedMDM, clips: Sequence[Clip], steps: int) -> None:
@@ -127,7 +157,9 @@ def train_codec(model: PublishedMDM, clips: Sequence[Clip], steps: int) -> None:
         torch.nn.utils.clip_grad_norm_(codec.parameters(), 1.0)
         optimizer.step()
         if step % 100 == 0 or step + 1 == steps:
-            log.info(f"autoencoder {step + 1}/{steps} loss {float(loss.detach()):.4f} ({time.perf_counter() - began:.0f} s)")
+            log.info(
+                f"autoencoder {step + 1}/{steps} loss {float(loss.detach()):.4f} ({time.perf_counter() - began:.0f} s)"
+            )
     codec.eval()
     with torch.no_grad():
         z = torch.cat([codec.encode(images_of(clip, model).to(model.device), frames_at_once=8) for clip in clips[:32]])
@@ -141,12 +173,15 @@ def train_codec(model: PublishedMDM, clips: Sequence[Clip], steps: int) -> None:
 def codec_psnr(model: PublishedMDM, clips: Sequence[Clip]) -> float:
     """PSNR of colour frames that went through the autoencoder."""
     with torch.no_grad():
-        made = [model.codec.decode_rgb(model.codec.encode(c.rgb.to(model.device) * 2 - 1, frames_at_once=8), 8).cpu() for c in clips]
+        made = [
+            model.codec.decode_rgb(model.codec.encode(c.rgb.to(model.device) * 2 - 1, frames_at_once=8), 8).cpu()
+            for c in clips
+        ]
     errors = [(a - c.rgb).square().mean() for a, c in zip(made, clips, strict=True)]
     return -10 * math.log10(float(torch.stack(errors).mean()))
 
 
-# network --------------------------------------------------------------------------------------------------------------
+# network ------------------------------------------------------------------------------------------
 
 
 def encode_all(model: PublishedMDM, clips: Sequence[Clip]) -> tuple[dict[str, Tensor], PublishedLatents]:
@@ -163,7 +198,8 @@ def encode_all(model: PublishedMDM, clips: Sequence[Clip]) -> tuple[dict[str, Te
 
 
 def train_network(model: PublishedMDM, clips: Sequence[Clip], steps: int, batch: int, folder: Path) -> None:
-    """Train network and resampler with `velocity_loss`, keeping a running average of the weights; resumes from `folder`."""
+    """Train network and resampler with `velocity_loss`, keeping a running average of the weights; resumes from
+    `folder`."""
     truth, encoded = encode_all(model, clips)
     part = model.trained_part()
     model.requires_grad_(False)
@@ -194,14 +230,18 @@ def train_network(model: PublishedMDM, clips: Sequence[Clip], steps: int, batch:
                 average[name].lerp_(value, 1 - decay)
         last = step + 1 == steps
         if (step + 1) % 100 == 0 or last:
-            log.info(f"network {step + 1}/{steps} loss {np.mean(losses[-100:]):.4f} ({time.perf_counter() - began:.0f} s)")
+            log.info(
+                f"network {step + 1}/{steps} loss {np.mean(losses[-100:]):.4f} ({time.perf_counter() - began:.0f} s)"
+            )
         if (step + 1) % 200 == 0 or last:
             store.write_safetensors(kept, resumable(part, average, optimizer, step + 1))
     part.load_state_dict(average)
     model.requires_grad_(False).eval()
 
 
-def resumable(part: torch.nn.Module, average: dict[str, Tensor], optimizer: torch.optim.Optimizer, step: int) -> dict[str, Tensor]:
+def resumable(
+    part: torch.nn.Module, average: dict[str, Tensor], optimizer: torch.optim.Optimizer, step: int
+) -> dict[str, Tensor]:
     """Everything that training needs to go on, by name."""
     moments = {f"adam {n} {k}": v for n, state in optimizer.state_dict()["state"].items() for k, v in state.items()}
     weights = {f"weights {n}": v for n, v in part.state_dict().items()}
@@ -222,7 +262,9 @@ def restored(path: Path, part: torch.nn.Module, optimizer: torch.optim.Optimizer
     return int(found["step"]), {n.split(" ", 1)[1]: v for n, v in found.items() if n.startswith("average ")}
 
 
-def trained(options: argparse.Namespace, config: PublishedConfig, clips: Sequence[Clip], device: torch.device) -> PublishedMDM:
+def trained(
+    options: argparse.Namespace, config: PublishedConfig, clips: Sequence[Clip], device: torch.device
+) -> PublishedMDM:
     """The stand-in; weights that lie in the folder are used again."""
     work, model = work_folder(options), drawn(config).to(device)
     if not (work / "codec").is_dir():
@@ -249,7 +291,7 @@ def drawn(config: PublishedConfig) -> PublishedMDM:
     return model
 
 
-# steps ----------------------------------------------------------------------------------------------------------------
+# steps --------------------------------------------------------------------------------------------
 
 
 def passes_of(steps: int, guidance: float | None) -> int:
@@ -260,17 +302,28 @@ def passes_of(steps: int, guidance: float | None) -> int:
 def generated_with(model: PublishedMDM, clips: Sequence[Clip], how: Sampling) -> list[GeneratedClip]:
     """The clips as they come out with a sampler."""
     return [
-        generated(model, clip.condition, SampleRequest(how.steps, index=n, sampler=how.sampler, eta=how.eta, guidance=how.guidance))
+        generated(
+            model,
+            clip.condition,
+            SampleRequest(how.steps, index=n, sampler=how.sampler, eta=how.eta, guidance=how.guidance),
+        )
         for n, clip in enumerate(clips)
     ]
 
 
 def scores_of(clips: Sequence[Clip], made: Sequence[GeneratedClip], distance: PerceptualDistance) -> dict[str, float]:
     """Mean scores of generated clips; classes are pooled."""
-    rows, matrices = zip(*(learn_score.score_clip(clip, sample) for clip, sample in zip(clips, made, strict=True)), strict=True)
-    frames = ((a, b) for clip, sample in zip(clips, made, strict=True) for a, b in zip(sample.rgb, clip.rgb, strict=True))
+    rows, matrices = zip(
+        *(learn_score.score_clip(clip, sample) for clip, sample in zip(clips, made, strict=True)), strict=True
+    )
+    frames = (
+        (a, b) for clip, sample in zip(clips, made, strict=True) for a, b in zip(sample.rgb, clip.rgb, strict=True)
+    )
     apart = [distance(Pair(a, None, None, b, None, None, None)) for a, b in frames]
-    means = {name: float(np.nanmean([row[name] for row in rows])) for name in ("psnr", "ssim", "sharpness", "abs_rel", "flicker")}
+    means = {
+        name: float(np.nanmean([row[name] for row in rows]))
+        for name in ("psnr", "ssim", "sharpness", "abs_rel", "flicker")
+    }
     ious = list(metrics.iou_of(torch.stack(matrices).sum(0)).values())
     return {"perceptual": float(np.mean(apart)), **means, "miou": sum(ious) / len(ious)}
 
@@ -284,7 +337,9 @@ def given_and_true(clips: Sequence[Clip], frame: int = 3) -> NDArray[np.uint8]:
     """Two rows: what the same clips are given, and the truth."""
     one = clips[0]
     given = _cells([c.condition.color[frame] for c in clips[:3]], one.condition.depth[frame, 0], one.semantics[frame])
-    return np.concatenate([given, _cells([c.rgb[frame] for c in clips[:3]], one.depth[frame, 0], one.semantics[frame])], 0)
+    return np.concatenate(
+        [given, _cells([c.rgb[frame] for c in clips[:3]], one.depth[frame, 0], one.semantics[frame])], 0
+    )
 
 
 def _cells(colors: Sequence[Tensor], depth: Tensor, ids: Tensor) -> NDArray[np.uint8]:
@@ -300,7 +355,9 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
     parser.add_argument("--cities", type=int, help="how many cities (400; 1 with --small)")
     parser.add_argument("--clips", type=int, default=24, help="how many clips are generated")
     parser.add_argument("--rows", type=int, default=len(GRID), help="how many rows of the table")
-    parser.add_argument("--picture", type=Path, help="PNG: what is given, the truth, and a line for every row of the table")
+    parser.add_argument(
+        "--picture", type=Path, help="PNG: what is given, the truth, and a line for every row of the table"
+    )
     options = parser.parse_args(words)
     device, work = device_of(options), work_folder(options)
     options.work = work

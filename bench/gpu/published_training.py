@@ -1,10 +1,13 @@
 """Seconds and peak memory of a training step of the published-type network: loss, gradients and AdamW, weights made up.
 
     python bench/gpu/published_training.py --device cuda --size 512x320 --batches 1 2 4 8                 # stage 1
-    python bench/gpu/published_training.py --device cuda --size 1024x576 --batches 1 2 4 --stage 2        # temporal transformers frozen
+    python bench/gpu/published_training.py --device cuda --size 1024x576 --batches 1 2 4 --stage 2        # temporal
+                                                                                                          transformers
+                                                                                                          frozen
     python bench/gpu/published_training.py --small --device cpu
 
-Weights and moments are float32, the step computes in bfloat16 on a card. A batch that does not fit is a row that says so.
+Weights and moments are float32, the step computes in bfloat16 on a card. A batch that does not fit is a row that says
+so.
 """
 
 from __future__ import annotations

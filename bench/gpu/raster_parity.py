@@ -48,7 +48,7 @@ def images_of(render: Render) -> dict[str, torch.Tensor]:
 
 def drawn(gaussians: Gaussians, view: View, backend: str, upstream: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """Forward and backward: images, and gradients as `d name`, on the CPU. Gradients are cleared."""
-    images = images_of(rasterize(gaussians, view, RasterConfig(backend=backend)))  # type: ignore[arg-type]  # one of BACKENDS
+    images = images_of(rasterize(gaussians, view, RasterConfig(backend=backend)))  # one of BACKENDS
     torch.autograd.backward(list(images.values()), [upstream[name].to(image.device) for name, image in images.items()])
     gradients = {f"d {n}": leaf.grad for n in LEAVES if (leaf := getattr(gaussians, n)) is not None}
     for name in LEAVES:
@@ -102,7 +102,7 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
         moved, there = on(gaussians, device), {name: value.to(device) for name, value in upstream.items()}
 
         def once(moved: Gaussians = moved, view: View = view, there: dict[str, torch.Tensor] = there) -> None:
-            images = images_of(rasterize(moved, view, RasterConfig(backend=backend)))  # type: ignore[arg-type]
+            images = images_of(rasterize(moved, view, RasterConfig(backend=backend)))
             torch.autograd.backward(list(images.values()), [there[name] for name in images])
 
         rows.append(

@@ -25,11 +25,20 @@ from mudg.diffusion.training import memory_plan
 from mudg.networks.clip import TowerConfig
 
 SMALL_PUBLISHED = PublishedConfig(
-    net=VideoUNetConfig(width=32, multipliers=(1, 2), blocks=1, attention=(True, False), head_width=8, first_heads=2, context_width=16),
+    net=VideoUNetConfig(
+        width=32, multipliers=(1, 2), blocks=1, attention=(True, False), head_width=8, first_heads=2, context_width=16
+    ),
     codec=AutoencoderConfig(width=32, multipliers=(1, 2), blocks=1),
-    image_tokens=ResamplerConfig(width=16, layers=1, head_width=8, heads=2, tokens=2, frames=4, image_width=16, context_width=16),
-    image=TowerConfig(16, 2, 2), image_side=28, text=TowerConfig(16, 3, 2), schedule=ScheduleConfig(base_scale=0.7), width=12, height=8,
-)  # fmt: skip
+    image_tokens=ResamplerConfig(
+        width=16, layers=1, head_width=8, heads=2, tokens=2, frames=4, image_width=16, context_width=16
+    ),
+    image=TowerConfig(16, 2, 2),
+    image_side=28,
+    text=TowerConfig(16, 3, 2),
+    schedule=ScheduleConfig(base_scale=0.7),
+    width=12,
+    height=8,
+)
 """A network of the published kind that a CPU runs in a moment."""
 
 
@@ -60,7 +69,8 @@ def generator_of(purpose: str, device: torch.device) -> torch.Generator:
 
 
 def measured(function: Callable[[], object], device: torch.device, repeats: int) -> dict[str, float | None]:
-    """Median seconds of a call after one to warm up, and the peak of the card's memory in GB (None elsewhere: not measured)."""
+    """Median seconds of a call after one to warm up, and the peak of the card's memory in GB (None elsewhere: not
+    measured)."""
     on_card = device.type == "cuda"
     function()
     if on_card:
@@ -99,10 +109,16 @@ def finish(
     """Print the rows as a table, and write them with card, versions and digests to ``--out``."""
     card = torch.cuda.get_device_name(device) if device.type == "cuda" else None
     result = {
-        "script": Path(sys.argv[0]).name, "settings": {n: str(v) for n, v in vars(options).items() if n not in ("out", "work")},
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(), "device": device.type, "card": card, "small": options.small,
-        "versions": {**environment(), "cuda": torch.version.cuda}, "digests": digests or {}, "rows": list(rows),
-    }  # fmt: skip
+        "script": Path(sys.argv[0]).name,
+        "settings": {n: str(v) for n, v in vars(options).items() if n not in ("out", "work")},
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "device": device.type,
+        "card": card,
+        "small": options.small,
+        "versions": {**environment(), "cuda": torch.version.cuda},
+        "digests": digests or {},
+        "rows": list(rows),
+    }
     for row in rows:
         cells = (
             f"{n} {v:.4g}" if isinstance(v, float) else f"{n} {'not measured' if v is None else v}"

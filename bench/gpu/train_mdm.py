@@ -3,8 +3,9 @@
     python bench/gpu/train_mdm.py --device cuda --steps 20000 --work runs/mdm --out mdm.json
     python bench/gpu/train_mdm.py --small --device cpu
 
-The recipe is the last of `src/mudg/assets/mdm_small/model.json` (`facts.recipe`). The new weights are worth shipping only if they are
-better at 2, 3 and 4 m in every modality: `held_out` of both, in the result. The model is in WORK/learned.
+The recipe is the last of `src/mudg/assets/mdm_small/model.json` (`facts.recipe`). The new weights are worth shipping
+only if they are better at 2, 3 and 4 m in every modality: `held_out` of both, in the result. The model is in
+WORK/learned.
 """
 
 from __future__ import annotations
@@ -44,13 +45,37 @@ def recipe(steps: int, textures: str, device: str, workers: int) -> LearnConfig:
 def small(config: LearnConfig) -> LearnConfig:
     """The same from nothing at a tiny size."""
     return replace(
-        config, start="", precision="float32", codec=LearnCodec(steps=2, batch=2, fit_batches=1),
-        data=replace(config.data, width=48, height=32, window=2, cities=1, first_cities=1, clips_per_city=1, held_out=1, renders=False,
-                     realism="plain"),
-        network=replace(config.network, widths=(32, 32), blocks=(1, 1), spatial_attention=(False, False), temporal_attention=(False, True),
-                        refine_widths=(8, 8), refine_blocks=(1, 1), renders=False, finish_widths=(), finish_blocks=()),
-        optimizer=replace(config.optimizer, batch_frames=2, warmup_steps=1), score=replace(config.score, every=1000, steps=1),
-    )  # fmt: skip
+        config,
+        start="",
+        precision="float32",
+        codec=LearnCodec(steps=2, batch=2, fit_batches=1),
+        data=replace(
+            config.data,
+            width=48,
+            height=32,
+            window=2,
+            cities=1,
+            first_cities=1,
+            clips_per_city=1,
+            held_out=1,
+            renders=False,
+            realism="plain",
+        ),
+        network=replace(
+            config.network,
+            widths=(32, 32),
+            blocks=(1, 1),
+            spatial_attention=(False, False),
+            temporal_attention=(False, True),
+            refine_widths=(8, 8),
+            refine_blocks=(1, 1),
+            renders=False,
+            finish_widths=(),
+            finish_blocks=(),
+        ),
+        optimizer=replace(config.optimizer, batch_frames=2, warmup_steps=1),
+        score=replace(config.score, every=1000, steps=1),
+    )
 
 
 def main(words: Sequence[str] | None = None) -> dict[str, Any]:

@@ -4,7 +4,8 @@
 
 Change the functions below to read what you have. As it stands it reads a recording of this form:
 
-    sensors.json            {"front": {"width", "height", "K": 3x3, "D": [k1, k2, p1, p2, k3], "ego_from_sensor": 4x4}, "top": {...}}
+    sensors.json            {"front": {"width", "height", "K": 3x3, "D": [k1, k2, p1, p2, k3], "ego_from_sensor": 4x4},
+                            "top": {...}}
     poses.csv               time_ns, x, y, z, qx, qy, qz, qw      vehicle in the world, metres
     images/front/<time_ns>.png
     lidar/top/<time_ns>.npy       float32 [N, 5]: x, y, z, intensity 0..255, seconds after <time_ns>
@@ -24,12 +25,18 @@ import numpy as np
 def main(recording: Path, out: Path) -> None:
     sensors = json.loads((recording / "sensors.json").read_text())
     log = {
-        "format": "mudg-log", "version": 1, "name": "my-log", "licence": "own recording", "time_unit": "ns",
+        "format": "mudg-log",
+        "version": 1,
+        "name": "my-log",
+        "licence": "own recording",
+        "time_unit": "ns",
         "cameras": {name: camera(values) for name, values in sensors.items() if "K" in values},
         "lidars": {name: lidar(values) for name, values in sensors.items() if "K" not in values},
         "ego": [ego_pose(row) for row in rows(recording / "poses.csv")],
-        "images": [], "sweeps": [], "tracks": tracks(recording / "boxes.csv"),
-    }  # fmt: skip
+        "images": [],
+        "sweeps": [],
+        "tracks": tracks(recording / "boxes.csv"),
+    }
     for name in log["cameras"]:
         for path in sorted((recording / "images" / name).iterdir(), key=lambda path: int(path.stem)):
             target = f"images/{name}/{path.name}"
@@ -54,18 +61,26 @@ def rows(path: Path) -> list[dict[str, str]]:
 def camera(values: dict) -> dict:
     (fx, _, cx), (_, fy, cy), _ = values["K"]
     return {
-        "width": values["width"], "height": values["height"], "fx": fx, "fy": fy, "cx": cx, "cy": cy,
+        "width": values["width"],
+        "height": values["height"],
+        "fx": fx,
+        "fy": fy,
+        "cx": cx,
+        "cy": cy,
         "distortion": {"model": "brown_conrady", "coefficients": values["D"]},  # leave out if images are rectified
         "ego_from_camera": values["ego_from_sensor"],  # camera axes: x right, y down, z forward
-    }  # fmt: skip
+    }
 
 
 def lidar(values: dict) -> dict:
     return {
-        "ego_from_lidar": values["ego_from_sensor"], "intensity_max": 255,
+        "ego_from_lidar": values["ego_from_sensor"],
+        "intensity_max": 255,
         "motion_compensated": True,  # false: points are moved to the sweep's time with the times below
-        "time_field": "seconds", "time_unit": "s", "time_from": "sweep",
-    }  # fmt: skip
+        "time_field": "seconds",
+        "time_unit": "s",
+        "time_from": "sweep",
+    }
 
 
 def ego_pose(row: dict[str, str]) -> dict:

@@ -5,10 +5,10 @@ Every verb of the command is a function: inputs as arguments, the output folder 
     mudg.fuse("scenes/a", out="runs/fused", voxel_m=0.08)
     mudg.fit("scenes/a", "runs/fused", out="runs/fit", method="street_gaussians", loss={"lidar_weight": 0.2})
 
-``help(mudg.fit)`` shows all settings of a verb. A group of settings is a dictionary; ``config`` names a YAML file that is read before the
-settings, as ``--config`` does. What the command refuses is refused here, with the errors of ``mudg.base.errors``. A finished result of the
-same settings and inputs is verified and reused; an interrupted one is resumed. Where a scene, clouds, a fit or views are read, the folder
-of a finished ``run`` will do.
+``help(mudg.fit)`` shows all settings of a verb. A group of settings is a dictionary; ``config`` names a YAML file that
+is read before the settings, as ``--config`` does. What the command refuses is refused here, with the errors of
+``mudg.base.errors``. A finished result of the same settings and inputs is verified and reused; an interrupted one is
+resumed. Where a scene, clouds, a fit or views are read, the folder of a finished ``run`` will do.
 
 The names below are what the package promises to keep. They are looked up on first use, so that ``import mudg`` is
 fast and loads no torch.

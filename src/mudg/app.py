@@ -26,7 +26,7 @@ INTERRUPTED = 130
 TERMINATED = 143
 
 
-# the command line ----------------------------------------------------------------------------------------------------
+# the command line ---------------------------------------------------------------------------------
 
 
 def overview() -> str:
@@ -45,9 +45,15 @@ def overview() -> str:
         lines += ["", f"{title}:", *_listed(names)]
     lines += [
         "",
-        "Settings: flags override --config FILE.yaml, which overrides the defaults. Every result holds its settings in run.yaml.",
+        (
+            "Settings: flags override --config FILE.yaml, which overrides the defaults. Every result holds its settings"
+            " in run.yaml."
+        ),
         "Repeat a command to resume it: finished results are verified and reused, interrupted ones are continued.",
-        "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerical error, 130 interrupted;",
+        (
+            "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerical error, 130"
+            " interrupted;"
+        ),
         "with --list, and of batch: 10 + number of failed scenes (99: 89 or more); 143 stopped by SIGTERM.",
     ]
     return "\n".join(lines)
@@ -65,7 +71,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             _say(f"mudg {version()}")
             return 0
         _require_current_folder()
-        # Idle threads of OpenMP and of numpy's BLAS that spin would take the cores from others; must precede torch and numpy.
+        # Idle threads of OpenMP and of numpy's BLAS that spin would take the cores from others; must precede torch and
+        # numpy.
         os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
         os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
         os.environ.setdefault("PYDANTIC_ERRORS_INCLUDE_URL", "0")  # a wrong flag is told in our words
@@ -111,7 +118,9 @@ def _require_current_folder() -> None:
         os.getcwd()
     except OSError as error:
         remedy = "change to a folder that exists"
-        raise ResourceError("the current folder is gone, or cannot be entered", got=str(error), remedy=remedy) from error
+        raise ResourceError(
+            "the current folder is gone, or cannot be entered", got=str(error), remedy=remedy
+        ) from error
 
 
 def find_verb(words: Sequence[str]) -> tuple[str, list[str]]:
@@ -132,8 +141,11 @@ def find_verb(words: Sequence[str]) -> tuple[str, list[str]]:
         return name, rest
     if inside:
         near = nearest(rest[0], [verb.split(" ")[1] for verb in inside], 0.5)
-        raise UsageError(f"mudg {name} has no {rest[0]!r}", expected="one of " + ", ".join(f"mudg {verb}" for verb in inside),
-            remedy=f"did you mean `mudg {name} {near}`?" if near else f"see mudg {name} --help")  # fmt: skip
+        raise UsageError(
+            f"mudg {name} has no {rest[0]!r}",
+            expected="one of " + ", ".join(f"mudg {verb}" for verb in inside),
+            remedy=f"did you mean `mudg {name} {near}`?" if near else f"see mudg {name} --help",
+        )
     known = list(dict.fromkeys(verb.split(" ")[0] for verb in steps.VERBS))
     near = nearest(name, known, 0.5)
     raise UsageError(
@@ -150,7 +162,13 @@ def _help(verb: str, words: Sequence[str]) -> str | None:
 
     if verb in steps.groups() and {"-h", "--help", "--help-all"} & {*words}:
         return "\n".join(
-            [f"usage: mudg {verb} WORD [flags]", "", *_listed(steps.groups()[verb]), "", f"mudg {verb} WORD --help lists its flags."]
+            [
+                f"usage: mudg {verb} WORD [flags]",
+                "",
+                *_listed(steps.groups()[verb]),
+                "",
+                f"mudg {verb} WORD --help lists its flags.",
+            ]
         )
     if verb in steps.groups():
         return None
@@ -179,7 +197,9 @@ def parse(words: Sequence[str]) -> tuple[Step, Common]:
 
     verb, rest = find_verb(words)
     if verb in steps.groups():
-        raise UsageError(f"mudg {verb} needs one more word", expected=", ".join(f"mudg {one}" for one in steps.groups()[verb]))
+        raise UsageError(
+            f"mudg {verb} needs one more word", expected=", ".join(f"mudg {one}" for one in steps.groups()[verb])
+        )
     return command.parse(steps.step_class(verb), rest)
 
 
@@ -198,7 +218,8 @@ def _run_verb(verb: str, words: Sequence[str]) -> tuple[dict[str, Any], bool]:
         return placed.answer(placed.run())
 
     with _sigterm_interrupts():
-        if any("://" in word for word in words) and not verb.startswith("batch"):  # whose workers stage in and out for every step
+        # whose workers stage in and out for every step
+        if any("://" in word for word in words) and not verb.startswith("batch"):
             from mudg.base import staging
 
             return staging.run_staged(verb, step, call, common.scratch), common.json
@@ -213,8 +234,11 @@ def _say(text: str) -> None:
         raise
     except (OSError, ValueError, AttributeError) as error:
         failures.silence(1)
-        raise ResourceError("the answer cannot be written to standard output", got=str(error),
-            remedy="what was made is complete; repeat the command to see the answer") from error  # fmt: skip
+        raise ResourceError(
+            "the answer cannot be written to standard output",
+            got=str(error),
+            remedy="what was made is complete; repeat the command to see the answer",
+        ) from error
 
 
 def _complain(text: str) -> None:

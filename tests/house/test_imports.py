@@ -86,7 +86,8 @@ def library_s() -> float:
     ids=" ".join,
 )
 def test_starting_takes_a_third_of_a_second(arguments: list[str], library_s: float) -> None:
-    """On a machine that is slow just now: less than six times what Python takes to import a piece of its own library."""
+    """On a machine that is slow just now: less than six times what Python takes to import a piece of its own
+    library."""
     allowed_s = max(0.35, 6 * library_s) * float(os.environ.get("MUDG_SLOW_MACHINE", "1"))
     assert best_of(3, [sys.executable, *arguments]) < allowed_s
 

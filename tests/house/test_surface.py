@@ -1,4 +1,5 @@
-"""What is frozen: public names in api.json, flags in cli.json, lines of each room in budget.json. A change is a decision of its commit.
+"""What is frozen: public names in api.json, flags in cli.json, lines of each room in budget.json. A change is a
+decision of its commit.
 
 ``MUDG_UPDATE_FROZEN=1 pytest tests/house`` writes the files anew.
 """
@@ -46,24 +47,32 @@ def test_public_names_are_frozen() -> None:
 def test_flags_are_frozen() -> None:
     common = [flag_name(option.name) for option in command.common_options()]
     now = {
-        verb: sorted({flag_name(one.name) for one in options(steps.step_class(verb)) if not is_word(verb, one.name)} | {*common})
+        verb: sorted(
+            {flag_name(one.name) for one in options(steps.step_class(verb)) if not is_word(verb, one.name)} | {*common}
+        )
         for verb in steps.VERBS
     }
     assert now == frozen("cli.json", now)
 
 
 def test_rooms_keep_their_line_budget() -> None:
-    """budget.json holds the lines of Python that each room may have. Who raises one says why in the message of the same commit."""
+    """budget.json holds the lines of Python that each room may have. Who raises one says why in the message of the same
+    commit."""
     package = Path(mudg.__file__).parent
     now = {
         room.name: sum(path.read_text(encoding="utf-8").count("\n") for path in room.rglob("*.py"))
-        for room in sorted(package.iterdir()) if any(room.glob("*.py"))
-    }  # fmt: skip
+        for room in sorted(package.iterdir())
+        if any(room.glob("*.py"))
+    }
     budget = frozen("budget.json", now)
     assert isinstance(budget, dict)
     assert budget.keys() == now.keys()
     assert not {room: f"{lines} lines, budget {budget[room]}" for room, lines in now.items() if lines > budget[room]}
-    assert not {room: f"{lines} lines, budget {budget[room]}: lower it" for room, lines in now.items() if lines < 0.97 * budget[room]}
+    assert not {
+        room: f"{lines} lines, budget {budget[room]}: lower it"
+        for room, lines in now.items()
+        if lines < 0.97 * budget[room]
+    }
 
 
 def is_word(verb: str, name: str) -> bool:
@@ -111,7 +120,10 @@ def test_settings_stay_within_their_budget() -> None:
 def test_a_function_shows_its_settings_and_defaults() -> None:
     fit = inspect.signature(mudg.fit)
     assert list(fit.parameters)[:2] == ["scene", "fused"]
-    assert fit.parameters["out"].kind is inspect.Parameter.KEYWORD_ONLY and fit.parameters["out"].default is inspect.Parameter.empty
+    assert (
+        fit.parameters["out"].kind is inspect.Parameter.KEYWORD_ONLY
+        and fit.parameters["out"].default is inspect.Parameter.empty
+    )
     assert fit.parameters["iterations"].default == 2000 and "Optimisation steps" in (mudg.fit.__doc__ or "")
     for verb in steps.VERBS:
         assert signature(steps.step_class(verb)).parameters

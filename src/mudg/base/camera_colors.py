@@ -1,8 +1,9 @@
 """The colours of a log's cameras: each camera has an exposure and a white balance of its own, the world has not.
 
-`ColorMap` is an affine map per channel between the colours of two cameras. `CameraColors` holds, for every camera, the map to the
-*common* colours, those of one camera of the log. Fused points and fitted scenes have common colours; images on disk, recorded and
-generated, have those of their camera. The maps are found by `core/calibration.py` and travel with the fused cloud.
+`ColorMap` is an affine map per channel between the colours of two cameras. `CameraColors` holds, for every camera, the
+map to the *common* colours, those of one camera of the log. Fused points and fitted scenes have common colours; images
+on disk, recorded and generated, have those of their camera. The maps are found by `core/calibration.py` and travel with
+the fused cloud.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class ColorMap:
-    """wanted = gain * given + offset for each channel of colours in [0, 1]; ``pairs``: how many pairs of colours it was fitted to."""
+    """wanted = gain * given + offset for each channel of colours in [0, 1]; ``pairs``: how many pairs of colours it was
+    fitted to."""
 
     gain: Triple = (1.0, 1.0, 1.0)
     offset: Triple = (0.0, 0.0, 0.0)
@@ -57,8 +59,8 @@ class ColorMap:
 
 @dataclass(frozen=True, slots=True)
 class CameraColors:
-    """Which camera's colours are the common ones ("" = all cameras have the same), and for the others the maps to them. A camera that is
-    not named has common colours."""
+    """Which camera's colours are the common ones ("" = all cameras have the same), and for the others the maps to them.
+    A camera that is not named has common colours."""
 
     reference: str = ""
     to_common: Mapping[str, ColorMap] = field(default_factory=dict)

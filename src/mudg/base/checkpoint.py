@@ -26,9 +26,14 @@ if TYPE_CHECKING:
 
 
 def write_shards(
-    folder: Path, tensors: Mapping[str, Tensor], shard_bytes: int, dtype: torch.dtype | None = None, stem: str = "weights"
+    folder: Path,
+    tensors: Mapping[str, Tensor],
+    shard_bytes: int,
+    dtype: torch.dtype | None = None,
+    stem: str = "weights",
 ) -> dict[str, str]:
-    """Write tensors, on any device, as `<stem>_NN.safetensors` of at most about `shard_bytes` each; returns file name -> sha256.
+    """Write tensors, on any device, as `<stem>_NN.safetensors` of at most about `shard_bytes` each; returns file name
+    -> sha256.
 
     Args:
         folder: a tree under a temporary name (`store.atomic_directory`).
@@ -55,7 +60,8 @@ def write_shards(
         nbytes = value.numel() * (wide or value.element_size())
         if size + nbytes > shard_bytes:
             flush()
-        # a copy of its own: safetensors refuses tensors that share memory, and a mapped file must not be written through
+        # a copy of its own: safetensors refuses tensors that share memory, and a mapped file must not be written
+        # through
         shard[name] = value.detach().to("cpu", dtype if wide else value.dtype, copy=True).contiguous()
         size += nbytes
     flush()
@@ -80,17 +86,27 @@ def read_shards(folder: Path, files: object, *, remedy: str = "make the model ag
         files: what a description says: names of files -> sha256.
 
     Raises:
-        InputError: `files` are no such names. IntegrityError: a file is missing or altered; `remedy` says what to do then.
+        InputError: `files` are no such names. IntegrityError: a file is missing or altered; `remedy` says what to do
+            then.
     """
     tensors: dict[str, Tensor] = {}
     if not isinstance(files, Mapping) or not all(isinstance(digest, str) for digest in files.values()):
-        raise InputError("the description of a model does not name its weight files", where=str(folder), expected="files: {NAME: SHA256}",
-            got=str(files), remedy=remedy)  # fmt: skip
+        raise InputError(
+            "the description of a model does not name its weight files",
+            where=str(folder),
+            expected="files: {NAME: SHA256}",
+            got=str(files),
+            remedy=remedy,
+        )
     for name, digest in files.items():
         path = folder / Path(name).name
         if not path.is_file() or store.sha256_file(path) != digest:
-            raise IntegrityError("a weight file is missing or altered", where=str(path), expected=f"sha256 {digest[:16]}...",
-                                 remedy=remedy)  # fmt: skip
+            raise IntegrityError(
+                "a weight file is missing or altered",
+                where=str(path),
+                expected=f"sha256 {digest[:16]}...",
+                remedy=remedy,
+            )
         tensors |= read_tensors(path)
     return tensors
 
@@ -102,7 +118,7 @@ def check_fit(tensors: Mapping[str, Tensor], wanted: Mapping[str, Tensor], where
         raise InputError("weights do not fit the configuration", where=str(where), got=", ".join(wrong[:6]))
 
 
-# checkpoint -----------------------------------------------------------------------------------------------------------
+# checkpoint ---------------------------------------------------------------------------------------
 
 
 _PREFIX = "step_"
@@ -139,8 +155,8 @@ def save(
 
 
 class Pace:
-    """Keeps large checkpoints to a small share of the time: one is due again when ``SHARE`` of the time since the last makes up for
-    what that took. Those of under ``FREE_S`` seconds are always due."""
+    """Keeps large checkpoints to a small share of the time: one is due again when ``SHARE`` of the time since the last
+    makes up for what that took. Those of under ``FREE_S`` seconds are always due."""
 
     SHARE, FREE_S = 0.05, 1.0
 
@@ -204,6 +220,10 @@ def latest(folder: Path) -> Checkpoint | None:
             problems.append(str(error))
             log.warn(f"checkpoint {path} does not verify and is skipped:", *str(error).splitlines())
     if problems:
-        raise IntegrityError("no checkpoint verifies", where=str(folder), got=f"{len(problems)} damaged",
-            remedy="restore the folder from a copy, or delete it to start again")  # fmt: skip
+        raise IntegrityError(
+            "no checkpoint verifies",
+            where=str(folder),
+            got=f"{len(problems)} damaged",
+            remedy="restore the folder from a copy, or delete it to start again",
+        )
     return None

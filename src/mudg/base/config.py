@@ -1,9 +1,9 @@
 """Frozen configuration: presets < YAML file < flags, unknown keys refused with the nearest name.
 
-Settings that were taken out are listed in their class: the class variable ``RETIRED`` maps each name to the setting before which it
-stood ("" = last) and to the only value that results may have been made with. That value still stands in ``to_dict``, so a result's key
-stays what it was, and files may hold it. Any other value is refused. The class variable ``FIXED`` maps a group to
-those of its fields that are no settings: they have their defaults, as if they were taken out.
+Settings that were taken out are listed in their class: the class variable ``RETIRED`` maps each name to the setting
+before which it stood ("" = last) and to the only value that results may have been made with. That value still stands in
+``to_dict``, so a result's key stays what it was, and files may hold it. Any other value is refused. The class variable
+``FIXED`` maps a group to those of its fields that are no settings: they have their defaults, as if they were taken out.
 """
 
 from __future__ import annotations
@@ -50,8 +50,8 @@ class Limits:
 def settings(cls: type[Config]) -> type[Config]:
     """Make a class a frozen dataclass whose values pydantic checks, all but those of ``Class()`` and of ``changed``.
 
-    pydantic is imported at the first check: help, which shows defaults and presets, does without. A default that is itself a
-    configuration is a ``default_factory``.
+    pydantic is imported at the first check: help, which shows defaults and presets, does without. A default that is
+    itself a configuration is a ``default_factory``.
     """
     config_type: Any = dataclasses.dataclass(frozen=True, kw_only=True)(cls)
     with_defaults: Callable[[Any], None] = config_type.__init__
@@ -101,7 +101,8 @@ def _plain(value: Any) -> Any:
 def _without_retired(
     config_type: Any, values: Mapping[str, Any], where: str, path: str = "", fixed: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Settings without those of ``RETIRED`` and ``fixed``; UsageError for one with another value than results may have."""
+    """Settings without those of ``RETIRED`` and ``fixed``; UsageError for one with another value than results may
+    have."""
     known, rest = _types_of_fields(config_type), dict[str, Any]()
     retired = getattr(config_type, "RETIRED", {}) | {name: ("", getattr(config_type(), name)) for name in fixed}
     for name, value in values.items():
@@ -110,8 +111,13 @@ def _without_retired(
             inside = fixed_of(config_type, name)
             rest[name] = _without_retired(known[name], value, where, f"{path}{name}.", inside) if group else value
         elif (former := retired[name][1]) != (list(value) if isinstance(value, tuple) else value):
-            raise UsageError(f"the setting {path}{name} was removed", where=where, expected=f"nothing, or {former!r}", got=repr(value),
-                             remedy="leave it out")  # fmt: skip
+            raise UsageError(
+                f"the setting {path}{name} was removed",
+                where=where,
+                expected=f"nothing, or {former!r}",
+                got=repr(value),
+                remedy="leave it out",
+            )
     return rest
 
 
@@ -121,15 +127,17 @@ def fixed_of(config_type: Any, group: str) -> Sequence[str]:
 
 
 def result_settings(config: Any) -> dict[str, Any]:
-    """What a result depends on: ``to_dict`` without every ``device``, so that a result made or begun on one device is reused or
-    resumed on another."""
+    """What a result depends on: ``to_dict`` without every ``device``, so that a result made or begun on one device is
+    reused or resumed on another."""
     return without_devices(to_dict(config))
 
 
 def without_devices(values: Mapping[str, Any]) -> dict[str, Any]:
     """Settings as JSON values without every ``device``, at any depth."""
     return {
-        name: without_devices(value) if isinstance(value, Mapping) else value for name, value in values.items() if name != "device"
+        name: without_devices(value) if isinstance(value, Mapping) else value
+        for name, value in values.items()
+        if name != "device"
     }
 
 
@@ -173,7 +181,9 @@ def load(
         problem = first_problem(error, f"{yaml_path or 'configuration'}: ", UsageError)
         if _holds(overrides or {}, path):
             flag = "--" + ".".join(path).replace("_", "-")
-            problem = UsageError(problem.what, where=flag, expected=problem.expected, got=problem.got, remedy=problem.remedy)
+            problem = UsageError(
+                problem.what, where=flag, expected=problem.expected, got=problem.got, remedy=problem.remedy
+            )
         raise problem from error
 
 
@@ -227,7 +237,12 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _merge(
-    base: dict[str, Any], new: Mapping[str, Any], where: str, config_type: Any, path: str = "", fixed: Sequence[str] = ()
+    base: dict[str, Any],
+    new: Mapping[str, Any],
+    where: str,
+    config_type: Any,
+    path: str = "",
+    fixed: Sequence[str] = (),
 ) -> dict[str, Any]:
     known = {name: kind for name, kind in _types_of_fields(config_type).items() if name not in fixed}
     merged = dict(base)
@@ -259,8 +274,8 @@ def _types_of_fields(config_type: Any) -> dict[str, Any]:
 
 
 def differences(old: Any, new: Any) -> list[str]:
-    """What two nested configurations differ in, one ``a.b: x there, y asked`` per value; settings that only one of them has
-    (another version named them differently) are counted in one line, which comes first."""
+    """What two nested configurations differ in, one ``a.b: x there, y asked`` per value; settings that only one of them
+    has (another version named them differently) are counted in one line, which comes first."""
     values, lonely = [], []
     _collect_differences(old, new, "", values, lonely)
     if not lonely:

@@ -60,7 +60,8 @@ def choose_device(wanted: str, purpose: str, kinds: tuple[str, ...] = ("cpu", "c
         kinds: kinds of devices that this purpose has an implementation for.
 
     Raises:
-        UsageError: a kind that is not known, or not implemented for this purpose. ResourceError: it is not on this machine.
+        UsageError: a kind that is not known, or not implemented for this purpose. ResourceError: it is not on this
+            machine.
     """
     import torch
 
@@ -71,8 +72,13 @@ def choose_device(wanted: str, purpose: str, kinds: tuple[str, ...] = ("cpu", "c
             "unknown device", where="--device", expected=f"auto, {', '.join(PROBLEMS)} or cuda:N", got=wanted
         )
     if SAME_CODE.get(kind, kind) not in kinds:
-        raise UsageError(f"{purpose}: not implemented on this device", where="--device", expected=f"auto, {', '.join(kinds)}", got=wanted,
-                         remedy=REMEDY)  # fmt: skip
+        raise UsageError(
+            f"{purpose}: not implemented on this device",
+            where="--device",
+            expected=f"auto, {', '.join(kinds)}",
+            got=wanted,
+            remedy=REMEDY,
+        )
     problem = PROBLEMS[kind](int(number or 0))
     if problem:
         raise ResourceError(
@@ -107,6 +113,7 @@ def memory_of(device: torch.device, purpose: str) -> Iterator[None]:
         yield
     except torch.OutOfMemoryError as error:
         raise ResourceError(
-            f"{purpose}: the memory of {device} ran out", got=str(error).split(". ")[0],
+            f"{purpose}: the memory of {device} ran out",
+            got=str(error).split(". ")[0],
             remedy="smaller images (--width-px), fewer Gaussians (--densify.max-gaussians), or --device cpu",
-        ) from error  # fmt: skip
+        ) from error

@@ -16,8 +16,11 @@ from typing import Final, Self
 
 MOST_LETTERS: Final = 200
 """Of a value in a message: names and values of foreign files may be megabytes long."""
-_CONTROLS: Final = re.compile("[\x00-\x1f\x7f-\x9f\xad\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]")
-"""What a terminal obeys, what turns the direction of writing, what is not seen, and halves of letters that cannot be written."""
+_CONTROLS: Final = re.compile(
+    "[\x00-\x1f\x7f-\x9f\xad\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
+)
+"""What a terminal obeys, what turns the direction of writing, what is not seen, and halves of letters that cannot be
+written."""
 _LONGEST_LINE: Final = 2000
 _CONTINUED: Final = "\n    "
 """A further line of a remedy."""
@@ -51,7 +54,9 @@ def similar_path(path: str | os.PathLike[str]) -> str:
     for part in (whole, *whole.parents):
         if not part.exists() and part.parent.is_dir():
             with contextlib.suppress(OSError):
-                near = nearest(part.name, [entry.name for entry in part.parent.iterdir() if not entry.name.startswith(".")])
+                near = nearest(
+                    part.name, [entry.name for entry in part.parent.iterdir() if not entry.name.startswith(".")]
+                )
                 return f"did you mean {part.parent / near / whole.relative_to(part)}?" if near else ""
     return ""
 

@@ -11,11 +11,20 @@ from typing import Final
 from mudg.base import memory
 from mudg.base.errors import MudgError, ResourceError
 
-SMALLER: Final = "take smaller images, fewer frames or fewer processes, close other programs, or use a machine with more memory"
+SMALLER: Final = (
+    "take smaller images, fewer frames or fewer processes, close other programs, or use a machine with more memory"
+)
 _NO_MEMORY: Final = (
-    "DefaultCPUAllocator", "not enough memory", "Cannot allocate memory", "out of memory", "failed to map segment",
-    "can't allocate memory", "can't start new thread", "bad_alloc", "error return without exception set",
-)  # fmt: skip
+    "DefaultCPUAllocator",
+    "not enough memory",
+    "Cannot allocate memory",
+    "out of memory",
+    "failed to map segment",
+    "can't allocate memory",
+    "can't start new thread",
+    "bad_alloc",
+    "error return without exception set",
+)
 """What libraries say when memory is short; the last is an import that ran out of it."""
 _DISK: Final = {
     errno.ENOSPC: ("the disk is full", "free disk space, then repeat the command to resume"),
@@ -48,8 +57,12 @@ def in_words(error: BaseException, smaller: str = "") -> MudgError | None:
         return error
     if _is_memory(error):
         free = memory.free_bytes()
-        return ResourceError("there is not enough memory", expected=_asked(error), got=f"{memory.in_words(free)} free" if free else "",
-            remedy=f"{smaller}; {SMALLER}" if smaller else SMALLER)  # fmt: skip
+        return ResourceError(
+            "there is not enough memory",
+            expected=_asked(error),
+            got=f"{memory.in_words(free)} free" if free else "",
+            remedy=f"{smaller}; {SMALLER}" if smaller else SMALLER,
+        )
     if isinstance(error, BrokenProcessPool):
         return ended_process(str(error))
     if isinstance(error, OSError):
@@ -61,20 +74,26 @@ def in_words(error: BaseException, smaller: str = "") -> MudgError | None:
 
 def ended_process(got: str = "") -> ResourceError:
     """A worker process that was killed."""
-    return ResourceError("a process ended without a word, most likely for want of memory", got=got,
-        remedy="take fewer processes, or a machine with more memory; repeat the command to resume")  # fmt: skip
+    return ResourceError(
+        "a process ended without a word, most likely for want of memory",
+        got=got,
+        remedy="take fewer processes, or a machine with more memory; repeat the command to resume",
+    )
 
 
 def _is_memory(error: BaseException) -> bool:
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
-    return isinstance(error, RuntimeError | ImportError | SystemError) and any(sign in str(error) for sign in _NO_MEMORY)
+    return isinstance(error, RuntimeError | ImportError | SystemError) and any(
+        sign in str(error) for sign in _NO_MEMORY
+    )
 
 
 def _asked(error: BaseException) -> str:
     """How much the failed allocation wanted, where the message says that."""
     text = str(error)
-    found = re.search(r"allocate ([\d.]+ [KMGTPE]i?B)\b", text)  # numpy: "... for an array with shape (3, 4) and data type float32"
+    # numpy: "... for an array with shape (3, 4) and data type float32"
+    found = re.search(r"allocate ([\d.]+ [KMGTPE]i?B)\b", text)
     if found:
         return f"{found[1]}{text[found.end() :][:120]}"
     found = re.search(r"allocate (\d+) bytes", text)
@@ -82,7 +101,8 @@ def _asked(error: BaseException) -> str:
 
 
 def silence(stream: int) -> None:
-    """Let a stream that cannot be written (1: stdout, 2: stderr) lead nowhere, so that nothing fails when the process ends."""
+    """Let a stream that cannot be written (1: stdout, 2: stderr) lead nowhere, so that nothing fails when the process
+    ends."""
     with contextlib.suppress(OSError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream)

@@ -91,9 +91,13 @@ def quaternion_from_matrix(rotation: ArrayLike) -> Matrix:
     """Unit quaternion f64[4] (w, x, y, z) with w >= 0 of a rotation [3, 3] or a rigid motion [4, 4]."""
     r = np.asarray(rotation, np.float64)[:3, :3]
     four_squares = np.array(
-        [1 + r[0, 0] + r[1, 1] + r[2, 2], 1 + r[0, 0] - r[1, 1] - r[2, 2],
-         1 - r[0, 0] + r[1, 1] - r[2, 2], 1 - r[0, 0] - r[1, 1] + r[2, 2]]
-    )  # fmt: skip
+        [
+            1 + r[0, 0] + r[1, 1] + r[2, 2],
+            1 + r[0, 0] - r[1, 1] - r[2, 2],
+            1 - r[0, 0] + r[1, 1] - r[2, 2],
+            1 - r[0, 0] - r[1, 1] + r[2, 2],
+        ]
+    )
     largest = int(four_squares.argmax())
     products = {
         0: (four_squares[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]),
@@ -107,17 +111,20 @@ def quaternion_from_matrix(rotation: ArrayLike) -> Matrix:
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Matrix:
-    """Rotation f64[3, 3] of a quaternion (w, x, y, z), which is normalised here. InputError if it is zero or not finite."""
+    """Rotation f64[3, 3] of a quaternion (w, x, y, z), which is normalised here. InputError if it is zero or not
+    finite."""
     q = np.asarray(quaternion, np.float64)
     norm = float(np.linalg.norm(q))
     if not np.isfinite(norm) or norm < 1e-12:
         raise InputError("a quaternion of length zero or not finite is no rotation", got=str(q.tolist()))
     w, x, y, z = q / norm
     return np.array(
-        [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-         [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
-    )  # fmt: skip
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def slerp(q0: ArrayLike, q1: ArrayLike, u: float) -> Matrix:
@@ -141,7 +148,8 @@ def interpolate_pose(a_from_b0: Matrix, a_from_b1: Matrix, u: float) -> Matrix:
 
 
 def pose_at(times_s: NDArray[np.float64], poses: Matrix, time_s: float, tolerance_s: float = 1e-6) -> Matrix | None:
-    """Interpolate pose keys f64[T, 4, 4] at ``time_s``; exact at the keys, None outside their span (never extrapolated)."""
+    """Interpolate pose keys f64[T, 4, 4] at ``time_s``; exact at the keys, None outside their span (never
+    extrapolated)."""
     if len(times_s) == 0 or time_s < times_s[0] - tolerance_s or time_s > times_s[-1] + tolerance_s:
         return None
     after = int(np.searchsorted(times_s, time_s))
@@ -165,8 +173,8 @@ def yaw_of(world_from_object: Matrix) -> float:
 
 
 def pinhole(intrinsics: Iterable[Any], x: Any, y: Any, z: Any) -> tuple[Any, Any]:
-    """Pixels (u, v) of camera coordinates: ``(fx x / z + cx, fy y / z + cy)``. The one pinhole formula of the package; its twins are the
-    native library's and ``core.zbuffer``'s, which repeats that one in float32.
+    """Pixels (u, v) of camera coordinates: ``(fx x / z + cx, fy y / z + cy)``. The one pinhole formula of the package;
+    its twins are the native library's and ``core.zbuffer``'s, which repeats that one in float32.
 
     Args:
         intrinsics: fx, fy, cx, cy (``Camera.intrinsics``).
@@ -227,8 +235,8 @@ def box_hull(view: View, world_from_box: Matrix, size_m: ArrayLike, near_m: floa
     """Convex outline, in pixels, of what a view shows of a box: that part of it which is at least ``near_m`` ahead.
 
     Returns:
-        The hull of the projected corners (of a cut box also of the points where its edges cross the near plane), or None if it lies
-        outside the image.
+        The hull of the projected corners (of a cut box also of the points where its edges cross the near plane), or
+        None if it lies outside the image.
     """
     from scipy.spatial import ConvexHull, QhullError  # late: most of what imports this module needs no scipy
 

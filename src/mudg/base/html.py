@@ -1,4 +1,5 @@
-"""Pages and model cards from the Jinja templates of ``assets/templates``. On pages every value is escaped; CSS and scripts lie inside."""
+"""Pages and model cards from the Jinja templates of ``assets/templates``. On pages every value is escaped; CSS and
+scripts lie inside."""
 
 from __future__ import annotations
 
@@ -13,9 +14,10 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from mudg.base import palette
 
-# tables ---------------------------------------------------------------------------------------------------------------
+# tables -------------------------------------------------------------------------------------------
 #
-# Tables of text as Markdown, LaTeX and CSV; the macro ``table`` of ``assets/templates/macros.html.j2`` is their HTML. No torch.
+# Tables of text as Markdown, LaTeX and CSV; the macro ``table`` of ``assets/templates/macros.html.j2`` is their HTML.
+# No torch.
 
 
 PUBLISHED: Final = "published"
@@ -24,9 +26,20 @@ ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
 SENSES: Final = {"higher": "higher is better", "lower": "lower is better", "one": "nearest to 1 is best"}
 """Which way the numbers of a column are better, as a sign and in words."""
 _LATEX: Final = {
-    "\\": r"\textbackslash{}", "&": r"\&", "%": r"\%", "$": r"\$", "#": r"\#", "_": r"\_", "{": r"\{", "}": r"\}",
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\to$",
-}  # fmt: skip
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "↑": r"$\uparrow$",
+    "↓": r"$\downarrow$",
+    "→": r"$\to$",
+}
 
 
 @dataclass(frozen=True)
@@ -63,7 +76,9 @@ class TextTable:
 
 def markdown(table: TextTable) -> list[str]:
     """Lines of a Markdown table; the best numbers are bold."""
-    rows = [(line.title, *(f"**{cell.text}**" if cell.best else cell.text for cell in line.cells)) for line in table.lines]
+    rows = [
+        (line.title, *(f"**{cell.text}**" if cell.best else cell.text for cell in line.cells)) for line in table.lines
+    ]
     first, *others = ("| " + " | ".join(cells) + " |" for cells in (table.heads, *rows))
     return [first, "|---" * len(table.heads) + "|", *others]
 
@@ -81,15 +96,24 @@ def cells(row: Mapping[str, Any], forms: Mapping[str, str]) -> list[str]:
 def latex(table: TextTable) -> list[str]:
     """Lines of a LaTeX ``tabular``; reasons behind cells without a number (--) are comments above it."""
     heads = table.heads[1:]
-    reasons = dict.fromkeys(f"{h}: {c.reason}" for line in table.lines for h, c in zip(heads, line.cells, strict=True) if c.reason)
+    reasons = dict.fromkeys(
+        f"{h}: {c.reason}" for line in table.lines for h, c in zip(heads, line.cells, strict=True) if c.reason
+    )
     lines = [*([f"% {table.title}"] if table.title else []), *(f"% -- {reason}" for reason in reasons)]
-    lines += [r"\begin{tabular}{l" + "r" * len(heads) + "}", r"\hline", " & ".join(map(escaped, table.heads)) + r" \\", r"\hline"]
+    lines += [
+        r"\begin{tabular}{l" + "r" * len(heads) + "}",
+        r"\hline",
+        " & ".join(map(escaped, table.heads)) + r" \\",
+        r"\hline",
+    ]
     kind = ""
     for line in table.lines:
         if kind and PUBLISHED in (kind, line.kind) and kind != line.kind:
             lines.append(r"\hline")
         kind = line.kind
-        texts = ("--" if c.reason else rf"\textbf{{{escaped(c.text)}}}" if c.best else escaped(c.text) for c in line.cells)
+        texts = (
+            "--" if c.reason else rf"\textbf{{{escaped(c.text)}}}" if c.best else escaped(c.text) for c in line.cells
+        )
         lines.append(" & ".join([escaped(line.title), *texts]) + r" \\")
     return [*lines, r"\hline", r"\end{tabular}"]
 
@@ -116,7 +140,7 @@ def best_of(better: str, numbers: Mapping[str, float]) -> list[str]:
     return [name for name, number in apart.items() if number == min(apart.values())] if len(apart) > 1 else []
 
 
-# html -----------------------------------------------------------------------------------------------------------------
+# html ---------------------------------------------------------------------------------------------
 
 
 TONES: Final = ("truth", "nearest_fill", "street_gaussians", "mudg_r", "mudg_s")

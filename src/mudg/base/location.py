@@ -1,13 +1,14 @@
-"""A path on this machine, or an address in an object store behind fsspec (S3, Google Cloud, Azure): the same calls for both.
+"""A path on this machine, or an address in an object store behind fsspec (S3, Google Cloud, Azure): the same calls for
+both.
 
     runs = Location.of("s3://bucket/runs")
     runs.names()                                    ['city', 'kitti']
     (runs / "kitti").fetch(Path("/scratch/kitti"))  staged in; every file's SHA-256 is compared
     (runs / "kitti").push(Path("/scratch/kitti"))   uploaded; the manifest is written last
 
-An uploaded folder holds ``_contents.json``: size and SHA-256 of every file, and whether all have arrived. That record alone says what a
-result is. Requests that fail are repeated by the store's own package. Credentials come from the environment, where that package looks
-for them; an address that holds some is refused and never shown.
+An uploaded folder holds ``_contents.json``: size and SHA-256 of every file, and whether all have arrived. That record
+alone says what a result is. Requests that fail are repeated by the store's own package. Credentials come from the
+environment, where that package looks for them; an address that holds some is refused and never shown.
 """
 
 from __future__ import annotations
@@ -28,9 +29,15 @@ from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageErr
 from mudg.base.run_folder import is_temporary
 
 PACKAGES: Final[Mapping[str, tuple[str, str]]] = {
-    "s3": ("s3fs", "s3"), "s3a": ("s3fs", "s3"), "gs": ("gcsfs", "gs"), "gcs": ("gcsfs", "gs"), "abfs": ("adlfs", "abfs"),
-    "abfss": ("adlfs", "abfs"), "az": ("adlfs", "abfs"), "memory": ("fsspec", "s3"),
-}  # fmt: skip
+    "s3": ("s3fs", "s3"),
+    "s3a": ("s3fs", "s3"),
+    "gs": ("gcsfs", "gs"),
+    "gcs": ("gcsfs", "gs"),
+    "abfs": ("adlfs", "abfs"),
+    "abfss": ("adlfs", "abfs"),
+    "az": ("adlfs", "abfs"),
+    "memory": ("fsspec", "s3"),
+}
 """Scheme of an address -> the package that reads it, and the extra of this program that installs it."""
 CONTENTS: Final = "_contents.json"
 _FILES_AT_ONCE: Final = 8
@@ -56,17 +63,29 @@ def checked_address(text: str) -> str:
     rest = text[len(scheme) + 3 :]
     if scheme not in PACKAGES:
         known = ", ".join(f"{one}://" for one in PACKAGES)
-        raise UsageError("no storage of this kind is known", where=f"{scheme}://", expected=f"a path, or one of {known}")
+        raise UsageError(
+            "no storage of this kind is known", where=f"{scheme}://", expected=f"a path, or one of {known}"
+        )
     head, _, tail = rest.partition("/")
-    if ("@" in head and PACKAGES[scheme][0] != "adlfs") or ":" in head:  # Azure: container@account; a password may hold a slash
-        raise UsageError("an address holds a user or a password", where=f"{scheme}://...", remedy="leave them out and set "
-            "the environment instead, e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY")  # fmt: skip
+    # Azure: container@account; a password may hold a slash
+    if ("@" in head and PACKAGES[scheme][0] != "adlfs") or ":" in head:
+        raise UsageError(
+            "an address holds a user or a password",
+            where=f"{scheme}://...",
+            remedy="leave them out and set the environment instead, e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
+        )
     if "?" in rest:
-        raise UsageError("an address holds a query, which may be a secret", where=f"{scheme}://{head.partition('?')[0]}/...",
-            expected=f"{scheme}://bucket/folder", remedy="leave the part from ? on out")  # fmt: skip
+        raise UsageError(
+            "an address holds a query, which may be a secret",
+            where=f"{scheme}://{head.partition('?')[0]}/...",
+            expected=f"{scheme}://bucket/folder",
+            remedy="leave the part from ? on out",
+        )
     parts = [part for part in tail.split("/") if part]
     if ".." in parts or "." in parts or "\0" in rest or "::" in head:
-        raise UsageError("an address is not plain", where=text[:200].replace("\0", "?"), expected=f"{scheme}://bucket/folder")
+        raise UsageError(
+            "an address is not plain", where=text[:200].replace("\0", "?"), expected=f"{scheme}://bucket/folder"
+        )
     if not head and scheme != "memory":
         raise UsageError("an address names no bucket", where=text[:200], expected=f"{scheme}://bucket/folder")
     return f"{scheme}://" + "/".join(part for part in (head, *parts) if part)
@@ -85,25 +104,39 @@ def _file_system(scheme: str, process: int) -> Any:
 
         found = fsspec.filesystem(scheme, **options)
     except ImportError as error:
-        raise ResourceError(f"a package for {scheme}:// is missing", expected=package, got=str(error).split("\n")[0],
-            remedy=f"pip install 'mudg[{extra}]'") from error  # fmt: skip
+        raise ResourceError(
+            f"a package for {scheme}:// is missing",
+            expected=package,
+            got=str(error).split("\n")[0],
+            remedy=f"pip install 'mudg[{extra}]'",
+        ) from error
     if package == "s3fs":
         found.retries = 2  # of what botocore has repeated already
     return found
 
 
-# failures in words ----------------------------------------------------------------------------------------------------
+# failures in words --------------------------------------------------------------------------------
 
 _WORDS: Final[Mapping[str, tuple[str, str]]] = {
-    "connection": ("a storage server cannot be reached",
-        "check the network and the server's address (S3: AWS_ENDPOINT_URL), then repeat the command to resume"),
+    "connection": (
+        "a storage server cannot be reached",
+        "check the network and the server's address (S3: AWS_ENDPOINT_URL), then repeat the command to resume",
+    ),
     "busy": ("a storage server does not answer as it should", "repeat the command later to resume"),
-    "refused": ("a storage server refused access", "check which account the environment names and what it may do there"),
-    "credentials": ("no credentials for a storage server",
-        "set them in the environment (S3: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE)"),
+    "refused": (
+        "a storage server refused access",
+        "check which account the environment names and what it may do there",
+    ),
+    "credentials": (
+        "no credentials for a storage server",
+        "set them in the environment (S3: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE)",
+    ),
     "certificate": ("a storage server's certificate is not trusted", "check the address, or set AWS_CA_BUNDLE"),
-    "request": ("a storage server cannot do what was asked", "check the address: the bucket's name, its region, the server's kind"),
-}  # fmt: skip
+    "request": (
+        "a storage server cannot do what was asked",
+        "check the address: the bucket's name, its region, the server's kind",
+    ),
+}
 _CREDENTIALS: Final = re.compile(r"Credential|TokenRetrieval|UnauthorizedSSO|ProfileNotFound|ClientAuthentication")
 _CONNECTION: Final = re.compile(r"Connect|Timeout|ClientPayload|ClientOSError|HTTPClientError|IncompleteRead|ServiceRe")
 
@@ -141,7 +174,8 @@ def without_secrets(text: str) -> str:
 
 @contextlib.contextmanager
 def _in_words(doing: str, where: str, missing: str = "") -> Iterator[None]:
-    """Failures of a store's package as ResourceError. missing: what is wrong where the store says that nothing is there."""
+    """Failures of a store's package as ResourceError. missing: what is wrong where the store says that nothing is
+    there."""
     try:
         yield
     except FileNotFoundError as error:
@@ -162,7 +196,7 @@ def _in_words(doing: str, where: str, missing: str = "") -> Iterator[None]:
 _NO_BUCKET: Final = "there is no such bucket, or it is not reachable for this account"
 
 
-# records of uploads ---------------------------------------------------------------------------------------------------
+# records of uploads -------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -183,13 +217,22 @@ class Upload:
     def content(self) -> bytes:
         """The record as it is stored."""
         files = {name: {"bytes": one.size, "sha256": one.sha256} for name, one in sorted(self.files.items())}
-        return store.json_text({"schema": 1, "state": "complete" if self.complete else "uploading", "files": files}, indent=None).encode()
+        return store.json_text(
+            {"schema": 1, "state": "complete" if self.complete else "uploading", "files": files}, indent=None
+        ).encode()
 
 
 def _plain(name: str, where: str) -> str:
     """A name that stays below its folder, or IntegrityError: what lies in a store may be anybody's."""
     parts = PurePosixPath(name).parts
-    if not parts or name.startswith("/") or ".." in parts or "\\" in name or "\0" in name or (os.name == "nt" and ":" in name):
+    if (
+        not parts
+        or name.startswith("/")
+        or ".." in parts
+        or "\\" in name
+        or "\0" in name
+        or (os.name == "nt" and ":" in name)
+    ):
         raise IntegrityError("a name leads out of its folder", where=where, got=repr(name)[:200])
     return name
 
@@ -205,7 +248,7 @@ def _files_below(folder: Path) -> list[str]:
     return sorted(names)
 
 
-# locations ------------------------------------------------------------------------------------------------------------
+# locations ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -269,7 +312,7 @@ class Location:
     def _path(self) -> str:
         return self.text.partition("://")[2]
 
-    # single files ------------------------------------------------------------------------------------------------------
+    # single files ---------------------------------------------------------------------------------
 
     def _kind(self) -> str:
         """``file``, ``directory``, or empty where nothing is."""
@@ -288,7 +331,9 @@ class Location:
         missing = "nothing is at this address; check it, and whether its upload was finished"
         try:
             with _in_words("reading", self.text, missing):
-                return store.read_bytes(self.local) if self.local is not None else bytes(self._files.cat_file(self._path))
+                return (
+                    store.read_bytes(self.local) if self.local is not None else bytes(self._files.cat_file(self._path))
+                )
         except IsADirectoryError as error:
             raise InputError("a folder is where a file should be", where=self.text) from error
 
@@ -309,8 +354,8 @@ class Location:
         """Write a file completely or not at all.
 
         Args:
-            only_if_absent: write only where nothing is. Of several that do so at once one gets True, if the store honours conditional
-                writes (S3: ``If-None-Match``).
+            only_if_absent: write only where nothing is. Of several that do so at once one gets True, if the store
+                honours conditional writes (S3: ``If-None-Match``).
 
         Returns:
             False if ``only_if_absent`` and somebody else made the file.
@@ -350,8 +395,11 @@ class Location:
         else:
             below = []
             with contextlib.suppress(FileNotFoundError), _in_words("listing", self.text):
-                below = [str(path).strip("/").rpartition("/")[2] for path in self._files.ls(self._path, detail=False)
-                    if str(path).strip("/") != self._path]  # fmt: skip
+                below = [
+                    str(path).strip("/").rpartition("/")[2]
+                    for path in self._files.ls(self._path, detail=False)
+                    if str(path).strip("/") != self._path
+                ]
         return sorted(name for name in below if name and not is_temporary(name))
 
     def tree(self) -> dict[str, int]:
@@ -361,11 +409,13 @@ class Location:
         with contextlib.suppress(FileNotFoundError), _in_words("listing", self.text):
             found = {str(path).strip("/"): facts for path, facts in self._files.find(self._path, detail=True).items()}
             head = f"{self._path}/"
-            sizes = {path[len(head) :]: int(facts.get("size") or 0) for path, facts in found.items() if path.startswith(head)}
+            sizes = {
+                path[len(head) :]: int(facts.get("size") or 0) for path, facts in found.items() if path.startswith(head)
+            }
             return {name: size for name, size in sorted(sizes.items()) if name and name != CONTENTS}
         return {}
 
-    # folders -----------------------------------------------------------------------------------------------------------
+    # folders --------------------------------------------------------------------------------------
 
     def uploaded(self) -> Upload | None:
         """The record of an upload to this folder; None where there is none. IntegrityError: it is damaged."""
@@ -374,11 +424,18 @@ class Location:
             return None
         try:
             values = store.parse_json(record.load(), str(record))
-            files = {str(name): Expected(int(entry["bytes"]), str(entry["sha256"])) for name, entry in values["files"].items()}
+            files = {
+                str(name): Expected(int(entry["bytes"]), str(entry["sha256"]))
+                for name, entry in values["files"].items()
+            }
             complete = values["state"] == "complete"
         except (InputError, KeyError, TypeError, AttributeError, ValueError) as error:
-            raise IntegrityError("the record of an upload is damaged", where=str(record), got=str(error).split("\n")[0],
-                remedy="upload the folder again, to another address") from error  # fmt: skip
+            raise IntegrityError(
+                "the record of an upload is damaged",
+                where=str(record),
+                got=str(error).split("\n")[0],
+                remedy="upload the folder again, to another address",
+            ) from error
         return Upload(complete, {_plain(name, str(record)): one for name, one in files.items()})
 
     def fetch(self, to: Path, *, mirror: bool = False) -> None:
@@ -388,11 +445,14 @@ class Location:
             mirror: remove files below ``to`` that are not part of the folder: those of an earlier version.
 
         Raises:
-            InputError: nothing is there, or its upload was not finished. IntegrityError: what came is not what was uploaded.
+            InputError: nothing is there, or its upload was not finished. IntegrityError: what came is not what was
+                uploaded.
         """
         to, kind = Path(to), self._kind()
         if not kind:
-            raise InputError("nothing is at this address", where=self.text, remedy="check it, and whether its upload was finished")
+            raise InputError(
+                "nothing is at this address", where=self.text, remedy="check it, and whether its upload was finished"
+            )
         wanted = self._wanted() if kind == "directory" else {"": Expected(self._size())}
         missing = [name for name, one in wanted.items() if not _is_here(to / name if name else to, one)]
         missing.sort(key=lambda name: (PurePosixPath(name).name in (store.MANIFEST, store.RUN_STATE), name))
@@ -407,18 +467,24 @@ class Location:
                     store.take_place(part, to / name if name else to)
                     bar.advance()
         if mirror and kind == "directory":
-            for path in [path for path in to.rglob("*") if not path.is_dir() and path.relative_to(to).as_posix() not in wanted]:
+            for path in [
+                path for path in to.rglob("*") if not path.is_dir() and path.relative_to(to).as_posix() not in wanted
+            ]:
                 store.remove(path)
 
     def _size(self) -> int:
         with _in_words("looking it up", self.text):
-            return self.local.stat().st_size if self.local is not None else int(self._files.info(self._path)["size"] or 0)
+            return (
+                self.local.stat().st_size if self.local is not None else int(self._files.info(self._path)["size"] or 0)
+            )
 
     def _wanted(self) -> dict[str, Expected]:
         record, sizes = self.uploaded(), self.tree()
         if record is not None:
             if not record.complete or (store.MANIFEST in record.files and store.MANIFEST not in sizes):
-                raise InputError("an upload was not finished", where=self.text, remedy="repeat the command that makes it: it resumes")
+                raise InputError(
+                    "an upload was not finished", where=self.text, remedy="repeat the command that makes it: it resumes"
+                )
             absent = sorted(set(record.files) - set(sizes))
             if absent:
                 raise IntegrityError("a file is missing", where=f"{self}/{absent[0]}")
@@ -439,8 +505,13 @@ class Location:
         at = next(one for one in (to.absolute(), *to.absolute().parents) if one.exists())
         free = shutil.disk_usage(at).free
         if missing + _LEFT_FREE > free:
-            raise ResourceError("not enough space to fetch data", where=str(to), expected=f"{memory.in_words(missing)} for {self}",
-                got=f"{memory.in_words(free)} free", remedy="free disk space, or choose a folder on a larger disk (--scratch)")  # fmt: skip
+            raise ResourceError(
+                "not enough space to fetch data",
+                where=str(to),
+                expected=f"{memory.in_words(missing)} for {self}",
+                got=f"{memory.in_words(free)} free",
+                remedy="free disk space, or choose a folder on a larger disk (--scratch)",
+            )
 
     def _get(self, parts: Mapping[str, Path]) -> None:
         if self.local is not None:
@@ -454,18 +525,22 @@ class Location:
             self._files.get(sources, [str(part) for part in parts.values()], batch_size=_FILES_AT_ONCE)
 
     def push(self, frm: Path) -> None:
-        """Upload a folder: all files, several at a time, the manifest last. Files that are there already are not sent again.
+        """Upload a folder: all files, several at a time, the manifest last. Files that are there already are not sent
+        again.
 
-        Until the manifest is there, what is at this place is no result. Files of an earlier push that are no longer part of the folder
-        are removed; files of others stay.
+        Until the manifest is there, what is at this place is no result. Files of an earlier push that are no longer
+        part of the folder are removed; files of others stay.
 
         Raises:
-            InputError: no folder. UsageError: files of others have the same names. IntegrityError: a file did not arrive.
+            InputError: no folder. UsageError: files of others have the same names. IntegrityError: a file did not
+                arrive.
         """
         frm = Path(frm)
         if not frm.is_dir():
             raise InputError("no folder to upload", where=str(frm))
-        files = {name: Expected((frm / name).stat().st_size, store.sha256_file(frm / name)) for name in _files_below(frm)}
+        files = {
+            name: Expected((frm / name).stat().st_size, store.sha256_file(frm / name)) for name in _files_below(frm)
+        }
         sizes, earlier = self.tree(), self.uploaded()
         before = earlier.files if earlier is not None else {}
         there = {name for name, one in files.items() if before.get(name) == one and sizes.get(name) == one.size}
@@ -473,14 +548,19 @@ class Location:
             return
         foreign = sorted(set(files) & set(sizes)) if earlier is None else []
         if foreign:
-            raise UsageError("the output address holds files of something else", where=self.text, got=", ".join(foreign[:8]),
-                remedy="choose an address at which nothing is")  # fmt: skip
+            raise UsageError(
+                "the output address holds files of something else",
+                where=self.text,
+                got=", ".join(foreign[:8]),
+                remedy="choose an address at which nothing is",
+            )
         manifest = {store.MANIFEST} & set(files)
         (self / store.MANIFEST).remove()  # from now on it is no result
         record = self / CONTENTS
         if earlier is not None:
             record.save(Upload(False, before).content())
-        for name in sorted(set(before) - there):  # after this, a file of the right size is one of those that are now sent
+        # after this, a file of the right size is one of those that are now sent
+        for name in sorted(set(before) - there):
             (self / name).remove()
         record.save(Upload(False, files).content())
         with log.task(f"uploading {self}", len(files)) as bar:
@@ -490,8 +570,13 @@ class Location:
         sizes = self.tree()
         for name in sorted(set(files) - manifest):
             if sizes.get(name) != files[name].size:
-                raise IntegrityError("a file did not arrive as it was sent", where=f"{self}/{name}", expected=f"{files[name].size} bytes",
-                    got=f"{sizes.get(name, 'no')} bytes", remedy="repeat the command to upload it again")  # fmt: skip
+                raise IntegrityError(
+                    "a file did not arrive as it was sent",
+                    where=f"{self}/{name}",
+                    expected=f"{files[name].size} bytes",
+                    got=f"{sizes.get(name, 'no')} bytes",
+                    remedy="repeat the command to upload it again",
+                )
         record.save(Upload(True, files).content())
         if manifest:
             (self / store.MANIFEST).save(store.read_bytes(frm / store.MANIFEST))
@@ -506,8 +591,12 @@ class Location:
         if PACKAGES[scheme_of(self.text)][0] == "s3fs":
             options = {"chunksize": max(_CHUNK, *((frm / name).stat().st_size // 9000 for name in names))}
         with _in_words("uploading", self.text, _NO_BUCKET):
-            self._files.put([str(frm / name) for name in names], [f"{self._path}/{name}" for name in names],
-                batch_size=_FILES_AT_ONCE, **options)  # fmt: skip
+            self._files.put(
+                [str(frm / name) for name in names],
+                [f"{self._path}/{name}" for name in names],
+                batch_size=_FILES_AT_ONCE,
+                **options,
+            )
 
     def put_file(self, file: Path) -> None:
         """Upload one file to this place."""
@@ -527,13 +616,22 @@ def _part(path: Path) -> Path:
 
 
 def _is_here(path: Path, wanted: Expected) -> bool:
-    return bool(wanted.sha256) and path.is_file() and path.stat().st_size == wanted.size and store.sha256_file(path) == wanted.sha256
+    return (
+        bool(wanted.sha256)
+        and path.is_file()
+        and path.stat().st_size == wanted.size
+        and store.sha256_file(path) == wanted.sha256
+    )
 
 
 def _verify(part: Path, wanted: Expected, where: str) -> None:
     size, sha256 = part.stat().st_size, store.sha256_file(part) if wanted.sha256 else ""
     if (size, sha256) != (wanted.size, wanted.sha256):
         store.remove(part)
-        raise IntegrityError("what came is not what was uploaded", where=where,
-            expected=f"{wanted.size} bytes, sha256 {wanted.sha256[:16]}...", got=f"{size} bytes, sha256 {sha256[:16]}...",
-            remedy="repeat the command; if it fails again, upload the data again")  # fmt: skip
+        raise IntegrityError(
+            "what came is not what was uploaded",
+            where=where,
+            expected=f"{wanted.size} bytes, sha256 {wanted.sha256[:16]}...",
+            got=f"{size} bytes, sha256 {sha256[:16]}...",
+            remedy="repeat the command; if it fails again, upload the data again",
+        )

@@ -19,12 +19,13 @@ from mudg.base.errors import ResourceError
 
 GIB: Final = 1 << 30
 LEAST_ADDRESS_SPACE: Final = GIB
-"""With less, torch and the libraries behind it cannot be loaded, and end the process in ways that no program can catch."""
+"""With less, torch and the libraries behind it cannot be loaded, and end the process in ways that no program can
+catch."""
 
 
 def free_bytes() -> int:
-    """Memory that this process may still take: what the machine has, at most what a control group or ``ulimit -v`` allows;
-    0 where the system does not say."""
+    """Memory that this process may still take: what the machine has, at most what a control group or ``ulimit -v``
+    allows; 0 where the system does not say."""
     return min((one for one in (machine_bytes(), _group_bytes(), _address_bytes()) if one is not None), default=0)
 
 
@@ -39,9 +40,11 @@ def require_address_space(command: str) -> None:
     left = _address_bytes()
     if left is not None and left < LEAST_ADDRESS_SPACE:
         raise ResourceError(
-            f"{command} needs more memory than it may take", expected=f"at least {in_words(LEAST_ADDRESS_SPACE)} of address space",
-            got=f"{in_words(left)} left of the limit (ulimit -v)", remedy="raise the limit with ulimit -v",
-        )  # fmt: skip
+            f"{command} needs more memory than it may take",
+            expected=f"at least {in_words(LEAST_ADDRESS_SPACE)} of address space",
+            got=f"{in_words(left)} left of the limit (ulimit -v)",
+            remedy="raise the limit with ulimit -v",
+        )
 
 
 def require(count: int, asked: str, remedy: str) -> None:
@@ -52,12 +55,17 @@ def require(count: int, asked: str, remedy: str) -> None:
     """
     free = free_bytes()
     if free and count > free:
-        raise ResourceError(f"{asked} needs more memory than there is", expected=f"about {in_words(count)}", got=f"{in_words(free)} free",
-            remedy=remedy)  # fmt: skip
+        raise ResourceError(
+            f"{asked} needs more memory than there is",
+            expected=f"about {in_words(count)}",
+            got=f"{in_words(free)} free",
+            remedy=remedy,
+        )
 
 
 def give_back() -> None:
-    """Hand the system what was freed: glibc keeps freed memory for later, up to hundreds of megabytes after a fit. Elsewhere: nothing."""
+    """Hand the system what was freed: glibc keeps freed memory for later, up to hundreds of megabytes after a fit.
+    Elsewhere: nothing."""
     if sys.platform == "linux":
         trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
         if trim is not None:
@@ -73,7 +81,10 @@ def in_words(count: float) -> str:
 
 
 def _group_bytes() -> int | None:
-    for limit, used in (("memory.max", "memory.current"), ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes")):
+    for limit, used in (
+        ("memory.max", "memory.current"),
+        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
+    ):
         texts = [system_text(f"/sys/fs/cgroup/{name}").strip() for name in (limit, used)]
         if all(text.isdigit() for text in texts) and int(texts[0]) < 1 << 60:
             return max(0, int(texts[0]) - int(texts[1]))
@@ -100,18 +111,19 @@ def system_text(path: str) -> str:
         return ""
 
 
-# usage ----------------------------------------------------------------------------------------------------------------
+# usage --------------------------------------------------------------------------------------------
 #
-# What a piece of work takes: seconds, processor seconds, and the most memory that the program and its child processes held together.
+# What a piece of work takes: seconds, processor seconds, and the most memory that the program and its child processes
+# held together.
 #
 #     meter = Meter()
 #     ...
 #     meter.stop()        Usage(seconds=12.3, processor_s=20.1, peak_bytes=812345678)
 #
-# Memory is looked at every `PERIOD_S` by one thread for all meters, at the start and at the end: a peak that lasts less is missed. It is
-# known where the system has ``/proc``, else None. A page that several of the processes share counts once (Linux: proportional set sizes).
-# Asking for these costs about 15 ms per GB, so it is done only when the resident sizes allow a new peak, and never for more than
-# `MOST_OF_TIME` of the time.
+# Memory is looked at every `PERIOD_S` by one thread for all meters, at the start and at the end: a peak that lasts less
+# is missed. It is known where the system has ``/proc``, else None. A page that several of the processes share counts
+# once (Linux: proportional set sizes). Asking for these costs about 15 ms per GB, so it is done only when the resident
+# sizes allow a new peak, and never for more than `MOST_OF_TIME` of the time.
 
 
 PERIOD_S: Final = 0.25
@@ -128,7 +140,8 @@ class Resident(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What was taken so far. processor_s: of all threads, and of child processes that have ended. peak_bytes: None = not known."""
+    """What was taken so far. processor_s: of all threads, and of child processes that have ended. peak_bytes: None =
+    not known."""
 
     seconds: float = 0.0
     processor_s: float = 0.0
@@ -141,13 +154,21 @@ class Usage:
 
     def record(self) -> dict[str, Any]:
         """As JSON values."""
-        return {"seconds": round(self.seconds, 3), "processor_s": round(self.processor_s, 3), "peak_bytes": self.peak_bytes}
+        return {
+            "seconds": round(self.seconds, 3),
+            "processor_s": round(self.processor_s, 3),
+            "peak_bytes": self.peak_bytes,
+        }
 
     @classmethod
     def of_record(cls, values: Mapping[str, Any]) -> Usage:
         """Of what `record` wrote; what is not noted is 0 or unknown."""
         peak = values.get("peak_bytes")
-        return cls(float(values.get("seconds", 0.0)), float(values.get("processor_s", 0.0)), None if peak is None else int(peak))
+        return cls(
+            float(values.get("seconds", 0.0)),
+            float(values.get("processor_s", 0.0)),
+            None if peak is None else int(peak),
+        )
 
 
 class Meter:
@@ -226,11 +247,12 @@ _SAMPLER: Final = _Sampler()
 
 
 def held_bytes(sizes: Mapping[int, Resident] | None = None) -> int | None:
-    """Memory that this process and its descendants hold now; what several of them share counts once. None where the system does not say.
+    """Memory that this process and its descendants hold now; what several of them share counts once. None where the
+    system does not say.
 
-    Own memory is the sum of proportional sizes. Of mapped files (libraries, mostly) at least the most that one process has resident
-    counts: in proportional sizes a part of them belongs to programs that are not ours. Where the system tells no such sizes (Linux
-    does), resident ones are added up.
+    Own memory is the sum of proportional sizes. Of mapped files (libraries, mostly) at least the most that one process
+    has resident counts: in proportional sizes a part of them belongs to programs that are not ours. Where the system
+    tells no such sizes (Linux does), resident ones are added up.
 
     Args:
         sizes: what `resident_sizes` said just now.

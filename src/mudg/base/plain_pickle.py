@@ -1,9 +1,9 @@
 """Reading pickles without running them: an interpreter of the opcodes that knows only plain values and arrays.
 
-Some data sets ship calibration or point clouds as pickles. Python's own reader runs whatever a pickle asks for. This one
-cannot: it never imports, looks up or calls anything that the file names. A name in the file is compared with a literal table
-of makers; each of them builds a plain value from plain values. Any other name is an error that says which one it was. The
-opcodes are cut apart by the standard library's disassembler, which executes nothing.
+Some data sets ship calibration or point clouds as pickles. Python's own reader runs whatever a pickle asks for. This
+one cannot: it never imports, looks up or calls anything that the file names. A name in the file is compared with a
+literal table of makers; each of them builds a plain value from plain values. Any other name is an error that says which
+one it was. The opcodes are cut apart by the standard library's disassembler, which executes nothing.
 
 Bounds: bytes and opcodes are limited, an array may not be longer than the bytes that are there, and nothing recurses.
 """
@@ -31,8 +31,15 @@ _MARK: Final = object()
 PERSISTENT: Final = "persistent"
 """Maker that allows a pickle to point to what lies beside it: the pointers become objects of this name."""
 _MALFORMED: Final = (
-    ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, struct.error,
-)  # fmt: skip
+    ValueError,
+    IndexError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    OverflowError,
+    RecursionError,
+    struct.error,
+)
 """What a malformed pickle makes the disassembler or an opcode raise."""
 
 
@@ -140,15 +147,16 @@ def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) 
     Args:
         content: the pickle, protocol 0 to 5.
         where: for messages.
-        makers: name in the file (``module.name``) -> function from plain values to a plain value; None = a class or name
-            that may only be mentioned: objects of it become a ``PickledObject``.
+        makers: name in the file (``module.name``) -> function from plain values to a plain value; None = a class or
+            name that may only be mentioned: objects of it become a ``PickledObject``.
 
     Raises:
         InputError: cut off, malformed, too large, or it names something that is not in ``makers``.
     """
     if len(content) > MAX_BYTES:
-        raise InputError("pickle is too large", where=where, expected=f"<= {MAX_BYTES} bytes",
-            got=f"{len(content)} bytes")  # fmt: skip
+        raise InputError(
+            "pickle is too large", where=where, expected=f"<= {MAX_BYTES} bytes", got=f"{len(content)} bytes"
+        )
     machine = _Machine(where, makers)
     try:
         for count, (opcode, argument, _place) in enumerate(pickletools.genops(content)):
@@ -158,8 +166,12 @@ def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) 
                 return machine.result()
             machine.step(opcode.name, argument)
     except _MALFORMED as error:
-        raise InputError("pickle is malformed or cut off", where=where, got=f"{type(error).__name__}: {error}"[:200],
-            remedy="copy the file again") from error  # fmt: skip
+        raise InputError(
+            "pickle is malformed or cut off",
+            where=where,
+            got=f"{type(error).__name__}: {error}"[:200],
+            remedy="copy the file again",
+        ) from error
     raise InputError("pickle is cut off", where=where, expected="an end mark", remedy="copy the file again")
 
 
@@ -220,8 +232,12 @@ class _Machine:
         elif opcode == "DUP":
             stack.append(stack[-1])
         else:
-            raise InputError("pickle uses an operation that plain data does not need", where=self._where, got=opcode,
-                remedy="the file is not what the data set ships; do not open it with Python's pickle")  # fmt: skip
+            raise InputError(
+                "pickle uses an operation that plain data does not need",
+                where=self._where,
+                got=opcode,
+                remedy="the file is not what the data set ships; do not open it with Python's pickle",
+            )
 
     def _since_mark(self) -> list[Any]:
         for index in range(len(self._stack) - 1, -1, -1):
@@ -238,9 +254,13 @@ class _Machine:
             name, module = self._stack.pop(), self._stack.pop()
         text = f"{module}.{name}"
         if text not in self._makers:
-            raise InputError(f"pickle asks for {text!r}, which is not plain data", where=self._where,
-                expected="numbers, texts, lists and arrays", got=text[:120],
-                remedy="nothing was run. If the file comes from the data set itself, convert it to a plain format")  # fmt: skip
+            raise InputError(
+                f"pickle asks for {text!r}, which is not plain data",
+                where=self._where,
+                expected="numbers, texts, lists and arrays",
+                got=text[:120],
+                remedy="nothing was run. If the file comes from the data set itself, convert it to a plain format",
+            )
         self._stack.append(Name(text))
 
     def _remember(self, opcode: str, argument: Any) -> None:

@@ -1,6 +1,7 @@
 """YAML of foreign files: plain values only, and bounded in size, depth and in what aliases stand for.
 
-Values are built from the parser's events, one after the other, so that a file is refused at the first line that goes too far.
+Values are built from the parser's events, one after the other, so that a file is refused at the first line that goes
+too far.
 """
 
 from __future__ import annotations
@@ -26,20 +27,26 @@ MOST_DIGITS: Final = 100
 """Characters of one number."""
 
 _WORDS: Final = {
-    "": None, "~": None, **dict.fromkeys(("null", "Null", "NULL")),
+    "": None,
+    "~": None,
+    **dict.fromkeys(("null", "Null", "NULL")),
     **dict.fromkeys(("yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"), True),
     **dict.fromkeys(("no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"), False),
-}  # fmt: skip
+}
 _INTEGER: Final = re.compile(r"[-+]?(0|[1-9][0-9_]*)")
-_FLOAT: Final = re.compile(r"[-+]?([0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)")
+_FLOAT: Final = re.compile(
+    r"[-+]?([0-9][0-9_]*\.[0-9_]*|\.[0-9][0-9_]*)([eE][-+]?[0-9]+)?|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)"
+)
 _DIRECTIVE: Final = re.compile(r"^%", re.MULTILINE)
 _MERGE: Final = "<<"
 Lines = dict[tuple[str | int, ...], int]
-"""Where a value stands, as keys and numbers of entries from the outermost value in -> line of its key or entry, from 1."""
+"""Where a value stands, as keys and numbers of entries from the outermost value in -> line of its key or entry, from
+1."""
 
 
 def parse_yaml(text: str | bytes, where: str, largest: int = LARGEST_BYTES) -> Any:
-    """The value that YAML text stands for: null, true or false, decimal numbers, texts, lists, and mappings whose keys are texts.
+    """The value that YAML text stands for: null, true or false, decimal numbers, texts, lists, and mappings whose keys
+    are texts.
 
     Dates, numbers in other bases and numbers with colons are texts.
 
@@ -47,7 +54,8 @@ def parse_yaml(text: str | bytes, where: str, largest: int = LARGEST_BYTES) -> A
         where: name of the file for messages. largest: bytes that it may have.
 
     Raises:
-        InputError: it is not YAML, says what a plain value is, or is larger, deeper or stands for more values than any file of its kind.
+        InputError: it is not YAML, says what a plain value is, or is larger, deeper or stands for more values than any
+            file of its kind.
     """
     return _parse(text, where, largest, None)
 
@@ -68,15 +76,26 @@ def _parse(text: str | bytes, where: str, largest: int, lines: Lines | None) -> 
         text.encode()  # refuses halves of surrogate pairs
         directive = _DIRECTIVE.search(text)
         if directive is not None:
-            raise InputError("directives of YAML are not read here", where=_at(where, text.count("\n", 0, directive.start())), got="%",
-                remedy="leave the line out")  # fmt: skip
-        for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # the same events, the first ten times faster
+            raise InputError(
+                "directives of YAML are not read here",
+                where=_at(where, text.count("\n", 0, directive.start())),
+                got="%",
+                remedy="leave the line out",
+            )
+        # the same events, the first ten times faster
+        for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
             builder.take(event)
         return builder.root
-    except (yaml.YAMLError, ValueError, OverflowError) as error:  # ValueError: bytes that are no text, letters that do not exist
+    except (
+        yaml.YAMLError,
+        ValueError,
+        OverflowError,
+    ) as error:  # ValueError: bytes that are no text, letters that do not exist
         mark, got = getattr(error, "problem_mark", None), str(getattr(error, "problem", None) or error)
         last = str(text).rstrip().count("\n")
-        line = mark.line if mark is not None else str(text).count("\n", 0, getattr(error, "position", 0)) or builder.line
+        line = (
+            mark.line if mark is not None else str(text).count("\n", 0, getattr(error, "position", 0)) or builder.line
+        )
         what = "YAML is nested too deeply" if "nesting depth" in got else "not valid YAML"
         raise InputError(what, where=_at(where, min(line, last)), got=got.replace("\n", " ")) from error
 
@@ -87,7 +106,8 @@ def _at(where: str, line: int) -> str:
 
 @dataclass(slots=True)
 class _Open:
-    """A list or mapping that is being read. count: values in it so far; key: of the value that comes next, None where a key does."""
+    """A list or mapping that is being read. count: values in it so far; key: of the value that comes next, None where a
+    key does."""
 
     value: Any
     anchor: str | None
@@ -114,7 +134,9 @@ class _Builder:
         if isinstance(event, yaml.DocumentStartEvent):
             self._documents += 1
             if self._documents > 1:
-                raise InputError("a file holds one YAML document", where=_at(self._where, line), remedy="leave out what follows ---")
+                raise InputError(
+                    "a file holds one YAML document", where=_at(self._where, line), remedy="leave out what follows ---"
+                )
         elif isinstance(event, yaml.CollectionEndEvent):
             closed = self._open.pop()
             if closed.merged:
@@ -130,11 +152,18 @@ class _Builder:
     def _node(self, event: Any, line: int) -> None:
         at = _at(self._where, line)
         if getattr(event, "tag", None) is not None:
-            raise InputError("a value says of which type it is", where=at, got=f"{event.tag}", expected="a plain value",
-                remedy="leave out the word that begins with !")  # fmt: skip
+            raise InputError(
+                "a value says of which type it is",
+                where=at,
+                got=f"{event.tag}",
+                expected="a plain value",
+                remedy="leave out the word that begins with !",
+            )
         is_alias, is_scalar = isinstance(event, yaml.AliasEvent), isinstance(event, yaml.ScalarEvent)
         if not is_alias and event.anchor is not None and len(self._anchored) + len(self._open) > MOST_ANCHORS:
-            raise InputError("YAML has too many anchors", where=at, expected=f"at most {MOST_ANCHORS}", remedy="write the values out")
+            raise InputError(
+                "YAML has too many anchors", where=at, expected=f"at most {MOST_ANCHORS}", remedy="write the values out"
+            )
         holder = self._open[-1] if self._open else None
         if holder is not None and isinstance(holder.value, dict) and holder.key is None:
             self._key(event, holder, line)
@@ -147,7 +176,9 @@ class _Builder:
         count = 1
         if is_alias:
             if any(one.anchor == event.anchor for one in self._open):
-                raise InputError("a value contains itself", where=at, got=f"*{event.anchor}", remedy="write the value out")
+                raise InputError(
+                    "a value contains itself", where=at, got=f"*{event.anchor}", remedy="write the value out"
+                )
             if event.anchor not in self._anchored:
                 raise InputError("not valid YAML", where=at, got=f"*{event.anchor} without an anchor of this name")
             value, count = self._anchored[event.anchor]
@@ -170,9 +201,20 @@ class _Builder:
         plain = isinstance(event, yaml.ScalarEvent)
         key = _scalar(event, at) if plain else None
         if not isinstance(key, str):
-            got = event.value if plain else "a list or mapping" if isinstance(event, yaml.CollectionStartEvent) else f"*{event.anchor}"
-            raise InputError("a key is no text", where=at, expected="the name of a setting", got=got or "nothing",
-                remedy="put quotes around it, if it is a name")  # fmt: skip
+            got = (
+                event.value
+                if plain
+                else "a list or mapping"
+                if isinstance(event, yaml.CollectionStartEvent)
+                else f"*{event.anchor}"
+            )
+            raise InputError(
+                "a key is no text",
+                where=at,
+                expected="the name of a setting",
+                got=got or "nothing",
+                remedy="put quotes around it, if it is a name",
+            )
         if key in holder.value and not (key == _MERGE and event.implicit[0]):
             raise InputError(f"{key!r} is given twice", where=at, remedy="keep one of them")
         if event.anchor is not None:
@@ -202,15 +244,24 @@ class _Builder:
             return
         self._open[-1].count += count
         if self._open[-1].count > self._most:
-            raise InputError("YAML stands for too many values", where=_at(self._where, line), expected=f"at most {self._most}",
-                got=f"{self._open[-1].count}" + (", repeated by aliases" if self._anchored else ""))  # fmt: skip
+            raise InputError(
+                "YAML stands for too many values",
+                where=_at(self._where, line),
+                expected=f"at most {self._most}",
+                got=f"{self._open[-1].count}" + (", repeated by aliases" if self._anchored else ""),
+            )
 
 
 def _scalar(event: yaml.ScalarEvent, at: str) -> Any:
     """The value of a word or a text."""
     text = event.value
     if len(text) > MOST_LETTERS:
-        raise InputError("a text is too long", where=at, expected=f"at most {MOST_LETTERS} letters", got=f"{len(text)}: {text[:40]}...")
+        raise InputError(
+            "a text is too long",
+            where=at,
+            expected=f"at most {MOST_LETTERS} letters",
+            got=f"{len(text)}: {text[:40]}...",
+        )
     if not text.isascii():
         text.encode()  # ValueError: half of a surrogate pair, as an escape
     if not event.implicit[0]:
@@ -221,5 +272,16 @@ def _scalar(event: yaml.ScalarEvent, at: str) -> Any:
     if number is None:
         return text
     if len(text) > MOST_DIGITS:
-        raise InputError("a number is too long", where=at, expected=f"at most {MOST_DIGITS} digits", got=f"{len(text)}: {text[:40]}...")
-    return number(text.replace("_", "").replace(".inf", "inf").replace(".nan", "nan").replace(".Inf", "inf").replace(".INF", "inf"))
+        raise InputError(
+            "a number is too long",
+            where=at,
+            expected=f"at most {MOST_DIGITS} digits",
+            got=f"{len(text)}: {text[:40]}...",
+        )
+    return number(
+        text.replace("_", "")
+        .replace(".inf", "inf")
+        .replace(".nan", "nan")
+        .replace(".Inf", "inf")
+        .replace(".INF", "inf")
+    )

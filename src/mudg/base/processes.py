@@ -1,4 +1,5 @@
-"""Processes, threads, interrupts, and errors that cross a process boundary. Everything of that kind in the package is here.
+"""Processes, threads, interrupts, and errors that cross a process boundary. Everything of that kind in the package is
+here.
 
     run_in_processes    one function over many arguments, several processes at a time
     calls_beside        the same while the caller does something else
@@ -53,12 +54,13 @@ _SAME_SIGNAL_S = 10.0
 GIB = 1 << 30
 
 
-# ---- threads and environment -----------------------------------------------------------------------------------------
+# ---- threads and environment ---------------------------------------------------------------------
 
 
 @contextlib.contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """One torch thread in this block: sums depend on the number of threads, results must not depend on how many cores are free."""
+    """One torch thread in this block: sums depend on the number of threads, results must not depend on how many cores
+    are free."""
     import torch
 
     before = torch.get_num_threads()
@@ -89,7 +91,7 @@ def child_environment(threads: int, torch_threads: int = 1) -> Iterator[None]:
                 os.environ[name] = value
 
 
-# ---- other processes ------------------------------------------------------------------------------------------------
+# ---- other processes -----------------------------------------------------------------------------
 
 
 def process_alive(pid: int) -> bool:
@@ -105,7 +107,7 @@ def process_alive(pid: int) -> bool:
     return pid > 0
 
 
-# ---- interrupts ------------------------------------------------------------------------------------------------------
+# ---- interrupts ----------------------------------------------------------------------------------
 
 
 _NOTICES = (signal.SIGUSR1,) if hasattr(signal, "SIGUSR1") else ()
@@ -113,15 +115,16 @@ _NOTICES = (signal.SIGUSR1,) if hasattr(signal, "SIGUSR1") else ()
 
 
 class Interruption:
-    """Ctrl-C, SIGTERM and SIGUSR1 wait for the end of the step, so that a checkpoint can be written; a second one does not wait.
+    """Ctrl-C, SIGTERM and SIGUSR1 wait for the end of the step, so that a checkpoint can be written; a second one does
+    not wait.
 
     SIGUSR1 is what batch systems send some time before they end a job; it then stops the program as SIGTERM does.
 
     Outside the main thread signals are left as they are.
 
     Args:
-        repeated_within_s: a signal that comes again within this time is taken for the same one. Launchers such as torchrun pass on
-            a signal that the terminal has sent already; so does the parent of a worker process (10 s).
+        repeated_within_s: a signal that comes again within this time is taken for the same one. Launchers such as
+            torchrun pass on a signal that the terminal has sent already; so does the parent of a worker process (10 s).
     """
 
     def __init__(self, repeated_within_s: float = 0.0) -> None:
@@ -164,7 +167,7 @@ class Interruption:
         raise KeyboardInterrupt
 
 
-# ---- errors as JSON values -------------------------------------------------------------------------------------------
+# ---- errors as JSON values -----------------------------------------------------------------------
 
 
 def error_record(error: MudgError) -> dict[str, Any]:
@@ -178,21 +181,24 @@ def error_from_record(record: Mapping[str, Any]) -> MudgError:
     return _ERRORS.get(record["error"], MudgError)(record["what"], **record["fields"])
 
 
-# ---- one function over many arguments --------------------------------------------------------------------------------
+# ---- one function over many arguments ------------------------------------------------------------
 
 
 def run_in_processes(
     function: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], processes: int
 ) -> Iterator[tuple[int, Result]]:
-    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each; ``processes`` = 1 is this one.
+    """Call a module's ``function`` with each of ``arguments`` in processes of one thread each; ``processes`` = 1 is
+    this one.
 
-    Where this process is stopped (Ctrl-C, SIGTERM), or the caller wants no more results, calls that run are stopped, too.
+    Where this process is stopped (Ctrl-C, SIGTERM), or the caller wants no more results, calls that run are stopped,
+    too.
 
     Yields:
         Index of the arguments and the result, as they come.
 
     Raises:
-        ResourceError: a process ended from outside. Whatever the function raises; calls that have not begun are dropped.
+        ResourceError: a process ended from outside. Whatever the function raises; calls that have not begun are
+            dropped.
     """
     if processes == 1:
         with one_torch_thread():
@@ -221,11 +227,13 @@ def run_in_processes(
 
 
 @contextlib.contextmanager
-def calls_beside(function: Callable[..., object], arguments: Sequence[tuple[Any, ...]], processes: int) -> Iterator[None]:
+def calls_beside(
+    function: Callable[..., object], arguments: Sequence[tuple[Any, ...]], processes: int
+) -> Iterator[None]:
     """Call a module's ``function`` with each of ``arguments`` in processes of one thread each while the block runs.
 
-    Once a call fails, none begins any more. At the end of the block calls that have not begun are dropped, and those that run are waited
-    for; where the block ends with an error or is stopped (Ctrl-C, SIGTERM), they are stopped, too.
+    Once a call fails, none begins any more. At the end of the block calls that have not begun are dropped, and those
+    that run are waited for; where the block ends with an error or is stopped (Ctrl-C, SIGTERM), they are stopped, too.
 
     Raises:
         ResourceError: a process ended from outside. Whatever the function raises, at the end of the block.
@@ -262,10 +270,13 @@ def calls_beside(function: Callable[..., object], arguments: Sequence[tuple[Any,
 
 
 def _in_turn(
-    pool: concurrent.futures.ProcessPoolExecutor, function: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], processes: int
+    pool: concurrent.futures.ProcessPoolExecutor,
+    function: Callable[..., Result],
+    arguments: Sequence[tuple[Any, ...]],
+    processes: int,
 ) -> Iterator[tuple[int, Result]]:
-    """Results as they come. No more calls are handed out than there are processes: the pool cannot take back one that waits in its
-    queue, and after an error it would still be begun."""
+    """Results as they come. No more calls are handed out than there are processes: the pool cannot take back one that
+    waits in its queue, and after an error it would still be begun."""
     futures: dict[concurrent.futures.Future[Result], int] = {}
     rest = iter(enumerate(arguments))
 
@@ -279,15 +290,17 @@ def _in_turn(
 
 
 def _as_completed(
-    pool: concurrent.futures.ProcessPoolExecutor, futures: Mapping[concurrent.futures.Future[Result], int],
+    pool: concurrent.futures.ProcessPoolExecutor,
+    futures: Mapping[concurrent.futures.Future[Result], int],
     next_of: Callable[[], Sequence[concurrent.futures.Future[Result]]] = tuple,
 ) -> Iterator[tuple[int, Result]]:
-    """Results as they come; ``next_of`` hands out what takes the place of a call that has ended well. The pool itself does not notice
-    every death: its own threads can be short of memory, too."""
+    """Results as they come; ``next_of`` hands out what takes the place of a call that has ended well. The pool itself
+    does not notice every death: its own threads can be short of memory, too."""
     waiting, dead_for = set(futures), 0
     while waiting:
         done, waiting = concurrent.futures.wait(waiting, _POLL_S, concurrent.futures.FIRST_COMPLETED)
-        for future in sorted(done, key=lambda one: one.exception() is None):  # errors first: after one, nothing is handed out
+        # errors first: after one, nothing is handed out
+        for future in sorted(done, key=lambda one: one.exception() is None):
             if isinstance(future.exception(), KeyboardInterrupt):
                 raise BrokenProcessPool("a worker was stopped")
             result = future.result()
@@ -310,7 +323,8 @@ def _kill(pool: concurrent.futures.ProcessPoolExecutor) -> None:
 
 
 def _stop(pool: concurrent.futures.ProcessPoolExecutor) -> None:
-    """End the calls of a pool: a fit writes its checkpoint. Who has not ended in time, or when this is interrupted, is killed."""
+    """End the calls of a pool: a fit writes its checkpoint. Who has not ended in time, or when this is interrupted, is
+    killed."""
     members = _members(pool)
     pool.shutdown(wait=False, cancel_futures=True)
     waiting, begun_s = {process.sentinel for process in members}, time.monotonic()
@@ -333,7 +347,8 @@ _stop_asked = threading.Event()
 
 
 def _stoppable(function: Callable[..., Result], items: tuple[Any, ...]) -> Result:
-    """A call in a worker; SIGTERM and Ctrl-C raise KeyboardInterrupt in it, unless it takes them itself (``Interruption``)."""
+    """A call in a worker; SIGTERM and Ctrl-C raise KeyboardInterrupt in it, unless it takes them itself
+    (``Interruption``)."""
     heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
     try:
         for number in heard:
@@ -389,7 +404,8 @@ LIFE_LINE = "MUDG_LIFE_LINE"
 
 @contextlib.contextmanager
 def life_line() -> Iterator[int]:
-    """A file number to be handed to a command (in ``LIFE_LINE``, and kept open there): it ends when this process does."""
+    """A file number to be handed to a command (in ``LIFE_LINE``, and kept open there): it ends when this process
+    does."""
     theirs, ours = os.pipe()
     try:
         yield theirs
@@ -413,7 +429,8 @@ def _exit_at_end_of(number: int) -> None:
 
 
 def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -> Generator[Result, None, None]:
-    """``compute(0)``, ``compute(1)``, ... in order, a few of them computed beforehand by other threads, each with one torch thread."""
+    """``compute(0)``, ``compute(1)``, ... in order, a few of them computed beforehand by other threads, each with one
+    torch thread."""
     with one_torch_thread(), concurrent.futures.ThreadPoolExecutor(threads) as pool:
         waiting: deque[concurrent.futures.Future[Result]] = deque()
         try:
@@ -427,13 +444,14 @@ def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -
             pool.shutdown(wait=False, cancel_futures=True)
 
 
-# ---- one call under a limit of memory --------------------------------------------------------------------------------
+# ---- one call under a limit of memory ------------------------------------------------------------
 
 
 def run_limited(
     work: Callable[[], None], limit_bytes: int, where: Path, out_of_memory: Callable[[RuntimeError], bool]
 ) -> int:
-    """Do the work in a fresh process that may take ``limit_bytes`` of address space beyond the program's own (on Linux).
+    """Do the work in a fresh process that may take ``limit_bytes`` of address space beyond the program's own (on
+    Linux).
 
     Args:
         work: a call that can be sent to another process. where: the file it reads, for messages.
@@ -451,10 +469,12 @@ def run_limited(
         try:
             return pool.submit(_limited, work, limit_bytes, where, out_of_memory).result()
         except BrokenProcessPool as error:
-            raise ResourceError("the converting process was ended from outside, most likely for want of memory",
+            raise ResourceError(
+                "the converting process was ended from outside, most likely for want of memory",
                 where=str(where),
                 expected=f"about {limit_bytes / GIB:.0f} GiB of address space, of which the file takes most",
-                remedy="close other programs, raise the limit (ulimit -v), or take a machine with more memory") from error  # fmt: skip
+                remedy="close other programs, raise the limit (ulimit -v), or take a machine with more memory",
+            ) from error
 
 
 def _limited(
@@ -475,7 +495,11 @@ def _limited(
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and not out_of_memory(error):
             raise
-        raise ResourceError("conversion needs more memory than it may take", where=str(where),
-            expected=f"<= {limit_bytes / 1e9:.1f} GB", got=(str(error).splitlines() or [""])[0][:200],
-            remedy="raise --memory-gb, unless the file should be small") from error  # fmt: skip
+        raise ResourceError(
+            "conversion needs more memory than it may take",
+            where=str(where),
+            expected=f"<= {limit_bytes / 1e9:.1f} GB",
+            got=(str(error).splitlines() or [""])[0][:200],
+            remedy="raise --memory-gb, unless the file should be small",
+        ) from error
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

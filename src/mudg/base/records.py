@@ -1,7 +1,7 @@
 """Records from JSON and YAML files, checked by pydantic; what is wrong with one becomes an error that names its place.
 
-A record is a subclass of ``StrictRecord``: no unknown fields, no conversion of types. ``parse_record`` makes one. Checks of
-single fields are plain functions that raise ``InputError`` and are attached with ``checked_by``.
+A record is a subclass of ``StrictRecord``: no unknown fields, no conversion of types. ``parse_record`` makes one.
+Checks of single fields are plain functions that raise ``InputError`` and are attached with ``checked_by``.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ _MEANINGS: Final = {
 
 
 class StrictRecord(BaseModel):
-    """A JSON object with known fields: types are not converted, unknown fields are refused and the nearest name suggested."""
+    """A JSON object with known fields: types are not converted, unknown fields are refused and the nearest name
+    suggested."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
@@ -54,7 +55,8 @@ class StrictRecord(BaseModel):
 
 
 class ForeignRecord(StrictRecord):
-    """A JSON object of a format that belongs to others: types are not converted; fields that it does not know are passed over."""
+    """A JSON object of a format that belongs to others: types are not converted; fields that it does not know are
+    passed over."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="allow")
 
@@ -67,7 +69,9 @@ class ForeignRecord(StrictRecord):
         """Names of the fields that were passed over, those of records within as ``record.field``."""
         own = [prefix + name for name in self.model_extra or ()]
         inner = {name: getattr(self, name) for name in type(self).model_fields}
-        return own + [n for name, one in inner.items() if isinstance(one, ForeignRecord) for n in one.unknown(f"{prefix}{name}.")]
+        return own + [
+            n for name, one in inner.items() if isinstance(one, ForeignRecord) for n in one.unknown(f"{prefix}{name}.")
+        ]
 
 
 @functools.cache
@@ -133,8 +137,8 @@ def parse_dataclass(kind: type[Value], values: object, where: str) -> Value:
         where: as in ``parse_record``.
 
     Raises:
-        InputError: the first field that is missing, unknown, or of a wrong type or range; sizes end at 65,536, since what they shape is
-            built before it is compared with the weights.
+        InputError: the first field that is missing, unknown, or of a wrong type or range; sizes end at 65,536, since
+            what they shape is built before it is compared with the weights.
     """
     _refuse_sizes(values, where)
     try:
@@ -149,7 +153,9 @@ def _refuse_sizes(values: object, where: str) -> None:
     parts = values.items() if isinstance(values, Mapping) else enumerate(values) if isinstance(values, list) else ()
     for name, value in parts:
         if isinstance(value, int) and abs(value) > _LARGEST_SIZE:
-            raise InputError("a size is too large", where=place(where, name), expected=f"at most {_LARGEST_SIZE}", got=str(value))
+            raise InputError(
+                "a size is too large", where=place(where, name), expected=f"at most {_LARGEST_SIZE}", got=str(value)
+            )
         _refuse_sizes(value, place(where, name))
 
 
@@ -160,7 +166,9 @@ def _compare_fields(stated: Any, complete: Mapping[str, Any], where: str) -> Non
         raise problem.located(place(where)) from problem
     for name, value in complete.items():
         if name not in stated:
-            raise InputError(f"the field {name!r} is missing", where=place(where), got=", ".join(stated) or "an empty object")
+            raise InputError(
+                f"the field {name!r} is missing", where=place(where), got=", ".join(stated) or "an empty object"
+            )
         if isinstance(value, Mapping):
             _compare_fields(stated[name], value, place(where, name))
 
@@ -198,7 +206,8 @@ def place(where: str, *steps: str | int) -> str:
 
 @contextlib.contextmanager
 def understood(what: str, where: str) -> Iterator[None]:
-    """InputError where a block that takes the content of files apart misses parts, or where they are of other types or do not fit.
+    """InputError where a block that takes the content of files apart misses parts, or where they are of other types or
+    do not fit.
 
     Args:
         what: what the files should hold, as in "a fitted scene".
@@ -208,15 +217,20 @@ def understood(what: str, where: str) -> Iterator[None]:
     except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError) as error:
         if failures.in_words(error) is not None:  # want of memory
             raise
-        raise InputError(f"this cannot be read as {what}: parts are missing, or do not fit", where=where,
-            got=f"{type(error).__name__}: {error}", remedy="make it again, or take an undamaged copy") from error  # fmt: skip
+        raise InputError(
+            f"this cannot be read as {what}: parts are missing, or do not fit",
+            where=where,
+            got=f"{type(error).__name__}: {error}",
+            remedy="make it again, or take an undamaged copy",
+        ) from error
 
 
 @contextlib.contextmanager
 def named_by(where: str) -> Iterator[None]:
     """Replace the owner that a type of ``base/types.py`` names by the record it was read from.
 
-    A refused field has the place ``view of 'front': world_from_cam`` in a constructor; ``WHERE.world_from_cam`` comes out.
+    A refused field has the place ``view of 'front': world_from_cam`` in a constructor; ``WHERE.world_from_cam`` comes
+    out.
     """
     try:
         yield

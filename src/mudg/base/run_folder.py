@@ -1,8 +1,8 @@
 """The output folder of a verb: made, continued, reused, or replaced, and never at the cost of anything else.
 
-A folder is finished when its manifest verifies and its key (verb, version, configuration, hashes of the inputs) is the one
-asked for. A finished folder of another key is replaced only on demand, and only when the new result is finished: until then that
-is made in a folder beside it (see ``run_folder.py``).
+A folder is finished when its manifest verifies and its key (verb, version, configuration, hashes of the inputs) is the
+one asked for. A finished folder of another key is replaced only on demand, and only when the new result is finished:
+until then that is made in a folder beside it (see ``run_folder.py``).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mudg.base.memory import Meter, Usage, folder_bytes
 from mudg.base.processes import process_alive
 from mudg.base.records import ForeignRecord, Number, parse_record
 
-# replacement ----------------------------------------------------------------------------------------------------------
+# replacement --------------------------------------------------------------------------------------
 #
 # Replacing a folder by one that was made beside it, so that nothing is lost on the way.
 #
@@ -39,8 +39,8 @@ from mudg.base.records import ForeignRecord, Number, parse_record
 
 
 OwnNames = Callable[[Path], Sequence[str]]
-"""Folder -> relative names of the files in it that belong to the result, in the order in which they may be removed: those last that
-the function itself reads. All other files belong to somebody else."""
+"""Folder -> relative names of the files in it that belong to the result, in the order in which they may be removed:
+those last that the function itself reads. All other files belong to somebody else."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,9 @@ class Replacement:
             ResourceError: the folder is a mount point, or its parent cannot be written.
         """
         if os.path.ismount(self.folder):
-            raise ResourceError("a mount point cannot be replaced", where=str(self.folder),
-                remedy="choose an --out inside it")  # fmt: skip
+            raise ResourceError(
+                "a mount point cannot be replaced", where=str(self.folder), remedy="choose an --out inside it"
+            )
         with store.disk_errors("the new result cannot be made beside the old one", self.folder.parent):
             self.staging.mkdir(exist_ok=True)
         return self.staging
@@ -90,9 +91,12 @@ class Replacement:
         except OSError as error:
             if self.retired.exists() and not self.folder.exists():
                 self.retired.rename(self.folder)
-            raise ResourceError("the new result cannot take the place of the old one", where=str(self.folder),
+            raise ResourceError(
+                "the new result cannot take the place of the old one",
+                where=str(self.folder),
                 got=str(error),
-                remedy=f"it is finished and lies in {self.staging}; repeat the command, or move it") from error  # fmt: skip
+                remedy=f"it is finished and lies in {self.staging}; repeat the command, or move it",
+            ) from error
         store.fsync_directory(self.folder.parent)
         self._remove_retired(own_names)
 
@@ -117,8 +121,12 @@ class Replacement:
             self.staging.rename(self.folder)
             store.fsync_directory(self.folder.parent)
         elif self.staging.exists() or not is_finished(self.folder):
-            raise UsageError("a cut-off replacement and another folder are in each other's way", where=str(self.folder),
-                got=f"the replaced result in {self.retired}", remedy="move one of them elsewhere")  # fmt: skip
+            raise UsageError(
+                "a cut-off replacement and another folder are in each other's way",
+                where=str(self.folder),
+                got=f"the replaced result in {self.retired}",
+                remedy="move one of them elsewhere",
+            )
         log.warn(f"{self.folder}: finished replacing the old result, which had been cut off")
         self._remove_retired(own_names)
 
@@ -165,7 +173,7 @@ def remove_files(folder: Path, names: Sequence[str]) -> None:
                 Path(place).rmdir()
 
 
-# run folder -----------------------------------------------------------------------------------------------------------
+# run folder ---------------------------------------------------------------------------------------
 
 
 fcntl: Any
@@ -184,7 +192,7 @@ _LONGEST_NAME, _LONGEST_PATH = 230, 3800
 """Bytes: what file systems take (255 and 4096), less what temporary names and files inside the folder add."""
 
 
-# inputs and outputs apart ---------------------------------------------------------------------------------------------
+# inputs and outputs apart -------------------------------------------------------------------------
 
 
 def refuse_overlap(out: Path | str, inputs: Mapping[str, Path | str | None]) -> None:
@@ -232,21 +240,34 @@ def _refuse_impossible(out: Path | str) -> None:
     longest = max(len(os.fsencode(part)) for part in (*Path(text).parts, Path(real).name, "."))
     if longest > _LONGEST_NAME or len(os.fsencode(real)) > _LONGEST_PATH:
         raise UsageError(
-            "the output's name is too long", where=f"{text[:120]}...", got=f"{longest} and {len(os.fsencode(real))} bytes",
-            expected=f"names of at most {_LONGEST_NAME} bytes, paths of at most {_LONGEST_PATH}", remedy="choose a shorter --out",
-        )  # fmt: skip
+            "the output's name is too long",
+            where=f"{text[:120]}...",
+            got=f"{longest} and {len(os.fsencode(real))} bytes",
+            expected=f"names of at most {_LONGEST_NAME} bytes, paths of at most {_LONGEST_PATH}",
+            remedy="choose a shorter --out",
+        )
     above = next((one for one in Path(real).parents if os.path.lexists(one)), None)
     if above is not None and not above.is_dir():
-        raise UsageError("the output lies below something that is no folder", where=text, got=str(above), remedy="choose another --out")
+        raise UsageError(
+            "the output lies below something that is no folder",
+            where=text,
+            got=str(above),
+            remedy="choose another --out",
+        )
 
 
 def _refuse(relation: str, out: str, name: str, given: Path | str) -> None:
-    raise UsageError(f"the output {relation} an input", where=f"output: {out}", got=f"{name}: {given}",
-        remedy="choose an output apart from everything that is read")  # fmt: skip
+    raise UsageError(
+        f"the output {relation} an input",
+        where=f"output: {out}",
+        got=f"{name}: {given}",
+        remedy="choose an output apart from everything that is read",
+    )
 
 
 def _line_of(path: Path) -> list[object]:
-    """What identifies a path, then each folder above it: the file system's own number, or the name of what does not exist."""
+    """What identifies a path, then each folder above it: the file system's own number, or the name of what does not
+    exist."""
     real = Path(os.path.realpath(path))
     return [_identity(one) for one in (real, *real.parents)]
 
@@ -259,7 +280,7 @@ def _identity(path: Path) -> object:
     return (found.st_dev, found.st_ino) if found.st_ino else os.path.normcase(path)
 
 
-# what is in a folder --------------------------------------------------------------------------------------------------
+# what is in a folder ------------------------------------------------------------------------------
 
 
 class _State(ForeignRecord):
@@ -281,8 +302,9 @@ class VerbOutput:
 
     Args:
         verb: its name. version: counts up when its rules change; older results are then made again.
-        files: names of its files, relative to the folder, as patterns: ``*`` stands for any part of one name, and a ``/`` at the
-            end for everything below. A file that matches none belongs to somebody else: it is not listed and never removed.
+        files: names of its files, relative to the folder, as patterns: ``*`` stands for any part of one name, and a
+            ``/`` at the end for everything below. A file that matches none belongs to somebody else: it is not listed
+            and never removed.
     """
 
     verb: str
@@ -316,8 +338,12 @@ def run_state(folder: Path) -> dict[str, Any]:
     )
     if not folder.is_dir():
         if os.path.lexists(folder):
-            raise UsageError("the output is no folder", where=str(folder), got=_what_is(folder),
-                remedy="choose the name of a folder that does not exist yet")  # fmt: skip
+            raise UsageError(
+                "the output is no folder",
+                where=str(folder),
+                got=_what_is(folder),
+                remedy="choose the name of a folder that does not exist yet",
+            )
         return {}
     if not (folder / _STATE).is_file():
         if any(not is_temporary(entry.name) and not _is_lock(entry) for entry in folder.iterdir()):
@@ -334,7 +360,8 @@ def run_state(folder: Path) -> dict[str, Any]:
 
 
 def known_input(folder: Path, name: str) -> Path | None:
-    """Where an input of a finished result lies, as seen from the result or from the root; None if unknown, gone or changed."""
+    """Where an input of a finished result lies, as seen from the result or from the root; None if unknown, gone or
+    changed."""
     try:
         state = store.read_json(folder / _STATE)
         places, digest = state["paths"][name], state["inputs"][name]
@@ -367,8 +394,8 @@ def _owner(lock: Path) -> tuple[int, str] | None:
 
 
 def own_names(output: VerbOutput, folder: Path) -> list[str]:
-    """Names of the files in a run folder that the run made, the bookkeeping last: those that its manifest lists, of an unfinished
-    one those that its verb may write.
+    """Names of the files in a run folder that the run made, the bookkeeping last: those that its manifest lists, of an
+    unfinished one those that its verb may write.
 
     Args:
         output: speaks for an unfinished run of its verb that did not note what it may write.
@@ -404,14 +431,15 @@ def _is_finished(folder: Path) -> bool:
     return True
 
 
-# a verb's output folder -----------------------------------------------------------------------------------------------
+# a verb's output folder ---------------------------------------------------------------------------
 
 
 class RunDir:
     """The output folder of one verb: resolved configuration, state, log, manifest, lock.
 
-    ``run.yaml`` is enough to repeat the run; ``run.json`` names verb, key, inputs and state. A verb writes below ``path``. That is
-    ``out``, or a folder beside it while ``out`` still holds the result that is to be replaced; from ``finish`` on it is ``out``.
+    ``run.yaml`` is enough to repeat the run; ``run.json`` names verb, key, inputs and state. A verb writes below
+    ``path``. That is ``out``, or a folder beside it while ``out`` still holds the result that is to be replaced; from
+    ``finish`` on it is ``out``.
     """
 
     def __init__(
@@ -450,13 +478,14 @@ class RunDir:
         returns at once. An unfinished run with the same key is continued, also one that is to replace another result.
 
         Args:
-            inputs: name -> digest of what is read. paths: name -> where it lies, for who asks the result later (`known_input`).
+            inputs: name -> digest of what is read. paths: name -> where it lies, for who asks the result later
+                (`known_input`).
             overwrite: replace a result of another key, or one that was altered, as soon as the new one is finished.
 
         Raises:
             UsageError: the folder holds the output of another verb or configuration, or files of somebody else.
-            IntegrityError: the finished result was altered. ResourceError: it cannot be written, or another live process is
-                working in it.
+            IntegrityError: the finished result was altered. ResourceError: it cannot be written, or another live
+                process is working in it.
         """
         out, values = Path(path), [output.verb, output.version, dict(config), dict(inputs)]
         key = hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()
@@ -482,7 +511,11 @@ class RunDir:
                 remove_files(work, own(work))
             replacement.begin()
         run = cls(out, work, output, key, inputs)
-        run._paths = {name: [os.path.relpath(path, out), str(Path(path).absolute())] for name, path in (paths or {}).items() if path}
+        run._paths = {
+            name: [os.path.relpath(path, out), str(Path(path).absolute())]
+            for name, path in (paths or {}).items()
+            if path
+        }
         run._seen = state if work == out else run_state(work)
         if work != out and staged.get("key") == key and _is_finished(work):
             _drop_lock_of_the_dead(work / _LOCK)
@@ -501,7 +534,9 @@ class RunDir:
         take_lock(self.path / _LOCK)
         if run_state(self.path) != self._seen:
             (self.path / _LOCK).unlink(missing_ok=True)
-            raise ResourceError("another process has worked in this folder meanwhile", where=str(self.path), remedy="repeat the command")
+            raise ResourceError(
+                "another process has worked in this folder meanwhile", where=str(self.path), remedy="repeat the command"
+            )
         self._write_state("running", {})
         values = {"verb": self.verb, **json.loads(store.json_text(dict(config)))}
         store.write_text(self.path / _SETTINGS, yaml.safe_dump(values, sort_keys=False))
@@ -513,10 +548,18 @@ class RunDir:
             self._meter.stop()
         spent = self.spent_before().then(self._meter.usage()).record()
         values = {
-            "schema": store.RUN_SCHEMA, "verb": self.verb, "key": self.key, "inputs": self.inputs, "state": state,
-            **spent, "written_bytes": self._written_bytes(), "files": list(self._output.files), "environment": environment(),
-            "summary": dict(summary), **({"paths": self._paths} if self._paths else {}),
-        }  # fmt: skip
+            "schema": store.RUN_SCHEMA,
+            "verb": self.verb,
+            "key": self.key,
+            "inputs": self.inputs,
+            "state": state,
+            **spent,
+            "written_bytes": self._written_bytes(),
+            "files": list(self._output.files),
+            "environment": environment(),
+            "summary": dict(summary),
+            **({"paths": self._paths} if self._paths else {}),
+        }
         store.write_json(self.path / _STATE, store.sealed(values, self.path) if state == "complete" else values)
 
     def _written_bytes(self) -> int:
@@ -535,7 +578,8 @@ class RunDir:
         store.append_line(self.path / _LOG, store.json_text(fields, indent=None))
 
     def pause(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Record an interruption: time spent so far is kept, the lock released; the same command continues. Said once."""
+        """Record an interruption: time spent so far is kept, the lock released; the same command continues. Said
+        once."""
         if self._ended:
             return
         self._ended = True
@@ -551,9 +595,10 @@ class RunDir:
                 self.path.rmdir()
 
     def finish(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Mark the folder complete: hash every file of the verb, write the manifest, release the lock, and take the place of the
-        result that is to be replaced."""
-        remove_files(self.path, [name for name in all_names(self.path) if is_temporary(name)])  # of runs that were killed
+        """Mark the folder complete: hash every file of the verb, write the manifest, release the lock, and take the
+        place of the result that is to be replaced."""
+        # of runs that were killed
+        remove_files(self.path, [name for name in all_names(self.path) if is_temporary(name)])
         names = [name for name in store.list_files(self.path) if name not in (_LOG, _STATE)]
         own = [name for name in names if name == _SETTINGS or _matches(name, self._output.files)]
         if len(own) < len(names):
@@ -591,8 +636,9 @@ def _verified(path: Path, overwrite: bool) -> bool:
         if overwrite:
             return False
         remedy = "add --overwrite to make it again, or choose another --out"
-        raise IntegrityError(error.what, where=error.where, expected=error.expected, got=error.got,
-            remedy=remedy) from error  # fmt: skip
+        raise IntegrityError(
+            error.what, where=error.where, expected=error.expected, got=error.got, remedy=remedy
+        ) from error
     return True
 
 
@@ -607,9 +653,12 @@ def _refuse_other(
     with contextlib.suppress(InputError):
         old = parse_yaml(store.read_bytes(path / _SETTINGS), str(path / _SETTINGS)) or {}
         found += differences(old, {"verb": verb, **json.loads(store.json_text(dict(config)))})
-    raise UsageError("the output folder holds the result of another configuration", where=str(path),
+    raise UsageError(
+        "the output folder holds the result of another configuration",
+        where=str(path),
         got="; ".join(found[:8]) or "another program version",
-        remedy="choose another --out, or add --overwrite to replace it")  # fmt: skip
+        remedy="choose another --out, or add --overwrite to replace it",
+    )
 
 
 def _drop_lock_of_the_dead(lock: Path) -> None:
@@ -662,20 +711,25 @@ def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
     pid, host = owner
     if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
         busy = "writing this file" if what else "working in this folder"
-        raise ResourceError(f"another process is {busy}", where=str(what or lock.parent),
+        raise ResourceError(
+            f"another process is {busy}",
+            where=str(what or lock.parent),
             got=f"pid {pid} on {host}",
-            remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}")  # fmt: skip
+            remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}",
+        )
 
 
-# result file ----------------------------------------------------------------------------------------------------------
+# result file --------------------------------------------------------------------------------------
 #
-# The output of a verb that is one file: one writer at a time, a description beside it, verified when the command is repeated.
+# The output of a verb that is one file: one writer at a time, a description beside it, verified when the command is
+# repeated.
 #
 #     OUT         the file; a verb may have a second form of it, such as the folder of a large page
 #     OUT.json    its description: verb, key of settings and inputs, SHA-256, and what else the verb says
 #
-# Whoever finds a file finds the description of just this file: an older file leaves before the new description gets its name, and the
-# new file gets its name last. What a stop leaves in between is completed, or undone, by the next command that writes there.
+# Whoever finds a file finds the description of just this file: an older file leaves before the new description gets its
+# name, and the new file gets its name last. What a stop leaves in between is completed, or undone, by the next command
+# that writes there.
 
 
 def description_path(out: Path) -> Path:
@@ -699,16 +753,24 @@ class ResultFile:
     @classmethod
     @contextlib.contextmanager
     def open(
-        cls, out: Path, verb: str, settings: Mapping[str, Any], inputs: Mapping[str, str], *,
-        forms: Sequence[Path] = (), overwrite: bool = False,
-    ) -> Iterator[ResultFile]:  # fmt: skip
+        cls,
+        out: Path,
+        verb: str,
+        settings: Mapping[str, Any],
+        inputs: Mapping[str, str],
+        *,
+        forms: Sequence[Path] = (),
+        overwrite: bool = False,
+    ) -> Iterator[ResultFile]:
         """Hold the output of a verb. Call ``refuse_overlap`` first.
 
         Args:
-            inputs: name -> digest of what is read. forms: where the result may lie (none: at ``out``). overwrite: replace what is there.
+            inputs: name -> digest of what is read. forms: where the result may lie (none: at ``out``). overwrite:
+                replace what is there.
 
         Raises:
-            UsageError: another result, or somebody else's file, is there. IntegrityError: the finished result was altered.
+            UsageError: another result, or somebody else's file, is there. IntegrityError: the finished result was
+                altered.
             ResourceError: it cannot be written, or another live process is writing it.
         """
         key = hashlib.sha256(store.json_text([verb, dict(settings), dict(inputs)], indent=None).encode()).hexdigest()
@@ -740,8 +802,13 @@ class ResultFile:
         form = form or self.out
         old = [one for one in self._forms if os.path.lexists(one)]
         values = {
-            "schema": 1, "verb": self.verb, "key": self.key, "file": form.name, "sha256": store.digest(self.staged(form)), **about
-        }  # fmt: skip
+            "schema": 1,
+            "verb": self.verb,
+            "key": self.key,
+            "file": form.name,
+            "sha256": store.digest(self.staged(form)),
+            **about,
+        }
         if self._unknown and (old != [form] or store.digest(form) != values["sha256"]):
             raise UsageError("the file exists", where=str(old[0]), remedy="choose another --out, or add --overwrite")
         with store.disk_errors("the result cannot get its name", form):
@@ -771,26 +838,38 @@ class ResultFile:
             found = store.read_json(description_path(self.out))
         except InputError:
             return {}
-        known = isinstance(found, dict) and all(isinstance(found.get(name), str) for name in ("verb", "key", "file", "sha256"))
+        known = isinstance(found, dict) and all(
+            isinstance(found.get(name), str) for name in ("verb", "key", "file", "sha256")
+        )
         return found if known else {}
 
     def _examine(self, overwrite: bool) -> None:
         about, file = self.description(), description_path(self.out)
         if os.path.lexists(self.out) and not self.out.is_file():
-            raise ResourceError("cannot write here", where=str(self.out), got="not a regular file", remedy="choose another --out")
+            raise ResourceError(
+                "cannot write here", where=str(self.out), got="not a regular file", remedy="choose another --out"
+            )
         there = [one for one in self._forms if os.path.lexists(one)]
         if about.get("key") == self.key and [one.name for one in there] == [about["file"]]:
             self.complete = store.digest(there[0]) == about["sha256"]
             if not (self.complete or overwrite):
-                raise IntegrityError("a file was altered after it was written", where=str(there[0]), expected=f"sha256 {about['sha256']}",
-                    remedy="add --overwrite to make it again, or choose another --out")  # fmt: skip
+                raise IntegrityError(
+                    "a file was altered after it was written",
+                    where=str(there[0]),
+                    expected=f"sha256 {about['sha256']}",
+                    remedy="add --overwrite to make it again, or choose another --out",
+                )
         elif not overwrite:
             self._unknown = bool(there) and not os.path.lexists(file)
             blocked = (not there and not about and os.path.lexists(file)) or (there and not self._unknown)
             if blocked:
                 got = "a result of other settings or inputs" if about else "a file of something else"
-                raise UsageError("the file exists", where=str(there[0] if there else file), got=got,
-                    remedy="choose another --out, or add --overwrite")  # fmt: skip
+                raise UsageError(
+                    "the file exists",
+                    where=str(there[0] if there else file),
+                    got=got,
+                    remedy="choose another --out, or add --overwrite",
+                )
 
     def _recover(self) -> None:
         """Complete a ``finish`` that was cut off after its description was written, undo one that was before."""
@@ -807,10 +886,15 @@ class ResultFile:
 
     def _tidy(self) -> None:
         """Remove what this and earlier, killed commands left: no other is at work here."""
-        ends = [(one, r"[a-z0-9_]{8}\.part") for one in (*self._forms, description_path(self.out), _lock_path(self.out))]
+        ends = [
+            (one, r"[a-z0-9_]{8}\.part") for one in (*self._forms, description_path(self.out), _lock_path(self.out))
+        ]
         names = [re.escape(f".{one.stem}.") + end + re.escape(one.suffix) for one, end in ends]
         for one in self._forms:
-            names += [re.escape(self._retired(one).name), rf"\.?{re.escape(self.staged(one).name.removesuffix(one.suffix))}.*"]
+            names += [
+                re.escape(self._retired(one).name),
+                rf"\.?{re.escape(self.staged(one).name.removesuffix(one.suffix))}.*",
+            ]
         left = re.compile("|".join(names))
         with contextlib.suppress(OSError):  # an error may have brought us here, and that one is to be told
             for one in [one for one in self.out.parent.iterdir() if left.fullmatch(one.name)]:

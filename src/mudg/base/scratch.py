@@ -18,7 +18,8 @@ from mudg.base.store import disk_errors
 
 
 class ScratchFile:
-    """A file without a name, for what does not fit into memory. The system removes it with the process, however that ends.
+    """A file without a name, for what does not fit into memory. The system removes it with the process, however that
+    ends.
 
     Blocks are appended by one thread; any thread may read them.
     """
@@ -49,8 +50,13 @@ class ScratchFile:
             while len(left):
                 count = self._read_into(left, begins + size - len(left))
                 if count == 0:
-                    raise ResourceError("a scratch file ended early", where=self.where, expected=f"{begins + size} bytes",
-                        got=f"{begins + size - len(left)}", remedy=remedy)  # fmt: skip
+                    raise ResourceError(
+                        "a scratch file ended early",
+                        where=self.where,
+                        expected=f"{begins + size} bytes",
+                        got=f"{begins + size - len(left)}",
+                        remedy=remedy,
+                    )
                 left = left[count:]
         return found
 
@@ -70,7 +76,8 @@ _MAPPED: weakref.WeakValueDictionary[int, np.memmap] = weakref.WeakValueDictiona
 
 
 def mapped_array(folder: Path, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[np.generic]:
-    """An array of zeros in a file without a name: the system keeps of it in memory what it can spare, and removes it with the array.
+    """An array of zeros in a file without a name: the system keeps of it in memory what it can spare, and removes it
+    with the array.
 
     Raises:
         ResourceError: the disk has no room for all of it. Writing to the array later needs none.

@@ -1,8 +1,9 @@
 """Commands on addresses: ``mudg fuse s3://bucket/scene --out s3://bucket/fused``.
 
-Every verb works on folders of this machine. Where a command names addresses, this is the one border: inputs are fetched into a scratch
-folder, the verb runs there, what it made is uploaded, its manifest last, and the scratch folder is removed. The folder's name follows
-from the command, so that the same command, stopped at any moment, goes on with what it finds there.
+Every verb works on folders of this machine. Where a command names addresses, this is the one border: inputs are fetched
+into a scratch folder, the verb runs there, what it made is uploaded, its manifest last, and the scratch folder is
+removed. The folder's name follows from the command, so that the same command, stopped at any moment, goes on with what
+it finds there.
 """
 
 from __future__ import annotations
@@ -36,21 +37,26 @@ def refuse_secrets(words: Sequence[str]) -> None:
             if scheme_of(found) in PACKAGES:
                 checked_address(found)
             elif "@" in found.partition("://")[2].partition("/")[0]:
-                raise UsageError("an address holds a user or a password", where=f"{scheme_of(found)}://...", remedy="leave them out")
+                raise UsageError(
+                    "an address holds a user or a password", where=f"{scheme_of(found)}://...", remedy="leave them out"
+                )
 
 
-def run_staged(verb: str, args: Any, call: Callable[[Any], dict[str, Any]], scratch: Path | None = None) -> dict[str, Any]:
+def run_staged(
+    verb: str, args: Any, call: Callable[[Any], dict[str, Any]], scratch: Path | None = None
+) -> dict[str, Any]:
     """Call a verb with its flags; those that are addresses are staged.
 
     Args:
-        verb: its name. args: its flags, a dataclass. call: flags of this machine's paths -> what the verb says. scratch: folder for what
-            is fetched and made (None: the system's for temporary files).
+        verb: its name. args: its flags, a dataclass. call: flags of this machine's paths -> what the verb says.
+            scratch: folder for what is fetched and made (None: the system's for temporary files).
 
     Returns:
         What the verb says, with addresses for the paths.
 
     Raises:
-        UsageError: an address where none can be, or an output that touches an input. Whatever transfers and the verb raise.
+        UsageError: an address where none can be, or an output that touches an input. Whatever transfers and the verb
+            raise.
     """
     plan = _Staging.of(verb, args, scratch)
     if not plan.inputs and not plan.outputs:
@@ -68,7 +74,7 @@ def run_staged(verb: str, args: Any, call: Callable[[Any], dict[str, Any]], scra
     return {name: plan.shown(value) for name, value in result.items()}
 
 
-# what is where --------------------------------------------------------------------------------------------------------
+# what is where ------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -82,13 +88,24 @@ class _Staging:
 
     @classmethod
     def of(cls, verb: str, args: Any, scratch: Path | None) -> _Staging:
-        found = sorted({str(one) for item in fields(args) if item.name != "settings" for one in _addresses(getattr(args, item.name))})
+        found = sorted(
+            {
+                str(one)
+                for item in fields(args)
+                if item.name != "settings"
+                for one in _addresses(getattr(args, item.name))
+            }
+        )
         key = hashlib.sha256("\n".join([verb, *found]).encode()).hexdigest()[:12]
         if scratch is not None and _address(scratch) is not None:
             raise UsageError("the scratch folder lies on this machine", where="--scratch", got=str(scratch))
         root = Path(tempfile.gettempdir()) if scratch is None else scratch
         plan = cls(args, root.absolute() / f"mudg-{verb.replace(' ', '-')}-{key}")
-        changes = {item.name: plan._placed(item.name, getattr(args, item.name)) for item in fields(args) if item.name != "settings"}
+        changes = {
+            item.name: plan._placed(item.name, getattr(args, item.name))
+            for item in fields(args)
+            if item.name != "settings"
+        }
         if plan.inputs or plan.outputs:
             plan.args = replace(args, **changes)
             plan._check()
@@ -105,7 +122,9 @@ class _Staging:
         if location is None:
             return value
         if name == "config":
-            raise UsageError("--config is a file of this machine", where="--config", got=str(location), remedy="fetch it first")
+            raise UsageError(
+                "--config is a file of this machine", where="--config", got=str(location), remedy="fetch it first"
+            )
         place = location.local
         if place is None:
             known, part = (self.outputs, "out") if name in _OUTPUTS else (self.inputs, "in")
@@ -114,15 +133,23 @@ class _Staging:
 
     def _check(self) -> None:
         if getattr(self.args, "list", None) is not None:
-            raise UsageError("a list is worked on in folders of this machine", where="--list",
-                got=str(next(iter((*self.inputs, *self.outputs)))), remedy="give paths for --list and --out")  # fmt: skip
+            raise UsageError(
+                "a list is worked on in folders of this machine",
+                where="--list",
+                got=str(next(iter((*self.inputs, *self.outputs)))),
+                remedy="give paths for --list and --out",
+            )
         for out in self.outputs:
             if out.text.count("/") < 3:
                 raise UsageError("an output is a folder or file in a bucket", where=str(out), expected=f"{out}/name")
             for given in self.inputs:
                 if f"{out}/".startswith(f"{given}/") or f"{given}/".startswith(f"{out}/"):
-                    raise UsageError("the output touches an input", where=f"output: {out}", got=f"input: {given}",
-                        remedy="choose an output apart from everything that is read")  # fmt: skip
+                    raise UsageError(
+                        "the output touches an input",
+                        where=f"output: {out}",
+                        got=f"input: {given}",
+                        remedy="choose an output apart from everything that is read",
+                    )
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -134,7 +161,10 @@ class _Staging:
             yield
         except BaseException:
             store.remove(lock)
-            log.info(f"{self.folder} keeps what was fetched and made: the same command goes on with it. Delete the folder to give it up")
+            log.info(
+                f"{self.folder} keeps what was fetched and made: the same command goes on with it. Delete the folder to"
+                " give it up"
+            )
             raise
 
     def shown(self, value: Any) -> Any:
@@ -173,7 +203,8 @@ def _address(value: Any) -> Location | None:
 def _refuse_in_settings(settings: Any, where: str) -> None:
     """UsageError for an address in a setting: settings are part of what a result is made of, and name paths.
 
-    Settings that their group names in ``STREAMED`` may be addresses: the verb itself reads there what it needs, when it needs it.
+    Settings that their group names in ``STREAMED`` may be addresses: the verb itself reads there what it needs, when it
+    needs it.
     """
     if is_dataclass(settings):
         for item in fields(settings):
@@ -186,8 +217,12 @@ def _refuse_in_settings(settings: Any, where: str) -> None:
     elif isinstance(settings, str | Path):
         found = re.match(r"([a-z0-9]+):/", str(settings))
         if found and found[1] in PACKAGES:
-            raise UsageError("a setting names a path of this machine", where=f"--{where.replace('_', '-')}", got=str(settings)[:200],
-                remedy="fetch what is there, and give its folder")  # fmt: skip
+            raise UsageError(
+                "a setting names a path of this machine",
+                where=f"--{where.replace('_', '-')}",
+                got=str(settings)[:200],
+                remedy="fetch what is there, and give its folder",
+            )
 
 
 def _make_private(folder: Path) -> None:
@@ -198,14 +233,17 @@ def _make_private(folder: Path) -> None:
             folder.mkdir(mode=0o700)
         found = folder.lstat()
         if folder.is_symlink() or not folder.is_dir() or (hasattr(os, "getuid") and found.st_uid != os.getuid()):
-            raise ResourceError("the scratch folder belongs to somebody else", where=str(folder), remedy="choose another --scratch")
+            raise ResourceError(
+                "the scratch folder belongs to somebody else", where=str(folder), remedy="choose another --scratch"
+            )
 
 
-# there and back -------------------------------------------------------------------------------------------------------
+# there and back -----------------------------------------------------------------------------------
 
 
 def _fetch_earlier(given: Location, at: Path) -> None:
-    """What the output holds already: the verb reuses it, or refuses it. What an interrupted command left here goes first."""
+    """What the output holds already: the verb reuses it, or refuses it. What an interrupted command left here goes
+    first."""
     store.make_folder(at.parent)
     if at.exists() or not given.exists():
         return
@@ -213,8 +251,11 @@ def _fetch_earlier(given: Location, at: Path) -> None:
     if record is not None and not record.complete:
         return  # an upload that was stopped; this one takes its place
     if record is None and store.MANIFEST not in (names := given.names()) and names:
-        raise UsageError("the output address holds files of something else", where=str(given),
-            remedy="choose an address at which nothing is")  # fmt: skip
+        raise UsageError(
+            "the output address holds files of something else",
+            where=str(given),
+            remedy="choose an address at which nothing is",
+        )
     log.info(f"fetching what {given} holds")
     partial = at.parent / f".{at.name}.earliers.part"
     given.fetch(partial, mirror=True)

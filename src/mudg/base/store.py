@@ -35,7 +35,7 @@ _MAX_JSON_BYTES = 512 * 1024 * 1024
 _CHUNK = 1 << 20
 
 
-# single files ---------------------------------------------------------------------------------------------------------
+# single files -------------------------------------------------------------------------------------
 
 
 def fsync_directory(path: Path) -> None:
@@ -85,7 +85,9 @@ def atomic_path(path: Path) -> Iterator[Path]:
     make_folder(path.parent)
     with disk_errors("cannot write here", path):
         if path.exists() and not path.is_file():  # a device would be replaced by a file
-            raise ResourceError("cannot write here", where=str(path), got="not a regular file", remedy="choose another --out")
+            raise ResourceError(
+                "cannot write here", where=str(path), got="not a regular file", remedy="choose another --out"
+            )
         fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
     os.close(fd)
     temporary = Path(name)
@@ -115,7 +117,8 @@ def write_blocks(path: Path, blocks: Iterable[bytes]) -> None:
 
 
 def write_image(path: Path, picture: NDArray[np.uint8] | Image.Image, **options: Any) -> None:
-    """Write a picture, u8[H, W, 3] or Pillow's, completely or not at all; the suffix names the format, ``options`` are Pillow's."""
+    """Write a picture, u8[H, W, 3] or Pillow's, completely or not at all; the suffix names the format, ``options`` are
+    Pillow's."""
     from PIL import Image
 
     with atomic_path(path) as temporary:
@@ -123,7 +126,8 @@ def write_image(path: Path, picture: NDArray[np.uint8] | Image.Image, **options:
 
 
 def write_in_tree(path: Path, content: bytes) -> None:
-    """Write a file of a tree that is still under a temporary name. ``sync_tree`` must follow before the tree is renamed.
+    """Write a file of a tree that is still under a temporary name. ``sync_tree`` must follow before the tree is
+    renamed.
 
     One journal flush for a thousand small files instead of a thousand.
     """
@@ -158,7 +162,8 @@ def sync_tree(folder: Path) -> None:
 
 
 def create_once(path: Path, content: bytes) -> bool:
-    """Write a file that does not exist yet, completely; False if it does. Of several processes that try, one succeeds."""
+    """Write a file that does not exist yet, completely; False if it does. Of several processes that try, one
+    succeeds."""
     path = Path(path)
     make_folder(path.parent)
     with disk_errors("cannot write here", path):
@@ -273,11 +278,12 @@ _BEYOND = re.compile(r"[eE]\+?[0-9]{3}|[0-9]{200}")
 
 
 def parse_json(text: str | bytes, where: str) -> Any:
-    """Parse strict JSON (no NaN, no numbers beyond floats, no duplicate keys, no halves of letters, bounded size and nesting);
-    InputError names ``where``."""
+    """Parse strict JSON (no NaN, no numbers beyond floats, no duplicate keys, no halves of letters, bounded size and
+    nesting); InputError names ``where``."""
     if len(text) > _MAX_JSON_BYTES:
-        raise InputError("JSON file is too large", where=where, expected=f"<= {_MAX_JSON_BYTES} bytes",
-            got=f"{len(text)}")  # fmt: skip
+        raise InputError(
+            "JSON file is too large", where=where, expected=f"<= {_MAX_JSON_BYTES} bytes", got=f"{len(text)}"
+        )
     try:
         if isinstance(text, bytes):
             text = text.decode(json.detect_encoding(text))
@@ -297,13 +303,17 @@ def read_json(path: Path) -> Any:
 
 
 _KINDS = (
-    (stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a named pipe"), (stat.S_ISSOCK, "a socket"), (stat.S_ISCHR, "a device"),
+    (stat.S_ISDIR, "a folder"),
+    (stat.S_ISFIFO, "a named pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
     (stat.S_ISBLK, "a device"),
-)  # fmt: skip
+)
 
 
 def regular(path: Path) -> Path:
-    """``path``, if a regular file is there: others would be waited for, or never end. For libraries that open files themselves.
+    """``path``, if a regular file is there: others would be waited for, or never end. For libraries that open files
+    themselves.
 
     Raises:
         InputError: it is missing, cannot be read, or is a folder, a named pipe, a socket or a device.
@@ -351,7 +361,8 @@ def read_text(path: Path) -> str:
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append one line to a log. A crash or a full disk can lose the last line, never an earlier one; half a line does not stay.
+    """Append one line to a log. A crash or a full disk can lose the last line, never an earlier one; half a line does
+    not stay.
 
     Raises:
         ResourceError: it cannot be written; the log is as before.
@@ -394,7 +405,8 @@ def sha256_file(path: Path) -> str:
 def write_safetensors(
     path: Path, tensors: Mapping[str, NDArray[Any] | Tensor], metadata: Mapping[str, str] | None = None
 ) -> None:
-    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically; without a copy of them in memory.
+    """Write named arrays (numpy or torch, any device) as one safetensors file, atomically; without a copy of them in
+    memory.
 
     Args:
         metadata: texts for the file's header.
@@ -452,7 +464,7 @@ def safetensors_metadata(content: bytes, where: str) -> dict[str, str]:
     return {str(key): str(value) for key, value in found.items()} if isinstance(found, dict) else {}
 
 
-# directories ----------------------------------------------------------------------------------------------------------
+# directories --------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -502,7 +514,8 @@ def list_files(folder: Path) -> list[str]:
 
 
 def write_manifest(folder: Path, names: Sequence[str] | None = None) -> str:
-    """Record size and sha256 of files below ``folder`` (None: of every file); return the digest of the record itself."""
+    """Record size and sha256 of files below ``folder`` (None: of every file); return the digest of the record
+    itself."""
     files = {}
     for name in list_files(folder) if names is None else names:
         files[name] = {"bytes": (folder / name).stat().st_size, "sha256": sha256_file(folder / name)}
@@ -527,13 +540,15 @@ def verify_manifest(folder: Path) -> str:
         if not file.is_file():
             raise IntegrityError("a file is missing", where=str(file))
         if file.stat().st_size != size or sha256_file(file) != expected:
-            raise IntegrityError("a file was altered after it was written", where=str(file),
-                expected=f"sha256 {expected[:16]}...")  # fmt: skip
+            raise IntegrityError(
+                "a file was altered after it was written", where=str(file), expected=f"sha256 {expected[:16]}..."
+            )
     return sha256_file(path)
 
 
 def sealed(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The record of a finished run, with what proves it and the other bookkeeping unaltered: digests of manifest, log and record."""
+    """The record of a finished run, with what proves it and the other bookkeeping unaltered: digests of manifest, log
+    and record."""
     log = folder / RUN_LOG
     digests = {"manifest": sha256_file(folder / MANIFEST), "log": sha256_file(log) if log.is_file() else None}
     return with_check({**values, "sealed": digests})
@@ -554,7 +569,8 @@ def _check(record: Mapping[str, Any]) -> str:
 
 
 def verify_record(folder: Path) -> None:
-    """Check the bookkeeping of a run folder: that the run is finished, and its record, log and manifest are as it wrote them.
+    """Check the bookkeeping of a run folder: that the run is finished, and its record, log and manifest are as it wrote
+    them.
 
     Nothing is checked where no record lies (foreign folders, copies).
 
@@ -572,19 +588,29 @@ def verify_record(folder: Path) -> None:
         check, digests = (record.pop("check"), record["sealed"]) if state == "complete" else ("", {})
         intact = check == (_check(record) if digests else "")
     except (InputError, KeyError, TypeError, AttributeError) as error:
-        raise IntegrityError("the record of a run is damaged", where=str(path), got=str(error).split("\n")[0],
-            remedy="make the result again in another folder") from error  # fmt: skip
+        raise IntegrityError(
+            "the record of a run is damaged",
+            where=str(path),
+            got=str(error).split("\n")[0],
+            remedy="make the result again in another folder",
+        ) from error
     if not intact:
         raise IntegrityError("the record of a run was altered after it was written", where=str(path))
     if state != "complete":
-        raise InputError("this folder holds an unfinished result", where=str(folder), got=f"state {state!r}",
-            remedy="repeat the command that makes it: it resumes")  # fmt: skip
+        raise InputError(
+            "this folder holds an unfinished result",
+            where=str(folder),
+            got=f"state {state!r}",
+            remedy="repeat the command that makes it: it resumes",
+        )
     for name, expected in {MANIFEST: digests.get("manifest", ""), RUN_LOG: digests.get("log")}.items():
         file = folder / name
         if expected is not None and not file.is_file():
             raise IntegrityError("a file of a finished result is missing", where=str(file))
         if expected and sha256_file(file) != expected:
-            raise IntegrityError("a file was altered after it was written", where=str(file), expected=f"sha256 {expected[:16]}...")
+            raise IntegrityError(
+                "a file was altered after it was written", where=str(file), expected=f"sha256 {expected[:16]}..."
+            )
 
 
 def require(path: Path) -> None:
@@ -599,7 +625,8 @@ def digest(path: Path) -> str:
     """Digest of an artefact: of its verified manifest, or of all its bytes where there is no manifest.
 
     Raises:
-        InputError: nothing is there, or an unfinished result. IntegrityError: a finished result or its bookkeeping was altered.
+        InputError: nothing is there, or an unfinished result. IntegrityError: a finished result or its bookkeeping was
+            altered.
     """
     path = Path(path)
     require(path)

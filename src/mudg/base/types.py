@@ -1,8 +1,8 @@
 """The types of the package: frozen dataclasses, checked when they are made.
 
-A constructor is the one place where a pose is proved rigid; what is refused names its owner and field, as in
-``view of 'front': world_from_cam``. Facts about the world are numpy and live on disk; what is computed on is torch. This
-module imports no torch, so that facts can be read without it.
+A constructor is the one place where a pose is proved rigid; what is refused names its owner and field, as in ``view of
+'front': world_from_cam``. Facts about the world are numpy and live on disk; what is computed on is torch. This module
+imports no torch, so that facts can be read without it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-# checks ---------------------------------------------------------------------------------------------------------------
+# checks -------------------------------------------------------------------------------------------
 #
 # What the constructors of ``base/types.py`` check. Each refusal is an InputError whose place is ``OWNER: FIELD``.
 
@@ -34,9 +34,13 @@ def rigid(value: Any, where: str) -> Matrix:
     matrix = np.array(value, np.float64)
     problem = geometry.rigid_problem(matrix)
     if problem:
-        raise InputError("pose is not a rigid motion", where=where, got=problem,
+        raise InputError(
+            "pose is not a rigid motion",
+            where=where,
+            got=problem,
             expected="f64[4, 4]: a right-handed rotation (orthonormal within 1e-4) and a translation in metres",
-            remedy="remove scale or mirroring from the matrix; check row against column order")  # fmt: skip
+            remedy="remove scale or mirroring from the matrix; check row against column order",
+        )
     matrix.setflags(write=False)
     return matrix
 
@@ -48,8 +52,13 @@ def foreign_name(value: str, where: str) -> str:
     """An id, name or class from a file of others, at most 200 bytes long."""
     size = len(value) if len(value) > MAX_NAME_BYTES else len(value.encode("utf-8", "surrogatepass"))
     if size > MAX_NAME_BYTES:
-        raise InputError("name is too long", where=where, expected=f"at most {MAX_NAME_BYTES} bytes",
-            got=f"{size} bytes, beginning {value[:40]!r}", remedy="is the file damaged, or of another format?")  # fmt: skip
+        raise InputError(
+            "name is too long",
+            where=where,
+            expected=f"at most {MAX_NAME_BYTES} bytes",
+            got=f"{size} bytes, beginning {value[:40]!r}",
+            remedy="is the file damaged, or of another format?",
+        )
     return value
 
 
@@ -71,7 +80,8 @@ def increasing_problem(times_s: NDArray[np.float64]) -> str | None:
 
 
 def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[np.float64], Matrix]:
-    """Check and freeze interpolation keys: increasing finite times f64[T], rigid poses f64[T, 4, 4] of the field ``name``."""
+    """Check and freeze interpolation keys: increasing finite times f64[T], rigid poses f64[T, 4, 4] of the field
+    ``name``."""
     times = np.array(times_s, np.float64).reshape(-1)
     matrices = np.array(poses, np.float64)
     if matrices.shape != (len(times), 4, 4):
@@ -79,9 +89,13 @@ def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[
         raise InputError("times and poses do not pair up", where=f"{owner}: {name}", expected=expected, got=got)
     problem = increasing_problem(times) if np.isfinite(times).all() else shortened(times)
     if problem is not None:
-        raise InputError("times do not increase", where=f"{owner}: times_s",
-            expected="finite seconds, strictly increasing", got=problem,
-            remedy="sort the poses by time and drop duplicates")  # fmt: skip
+        raise InputError(
+            "times do not increase",
+            where=f"{owner}: times_s",
+            expected="finite seconds, strictly increasing",
+            got=problem,
+            remedy="sort the poses by time and drop duplicates",
+        )
     if not geometry.all_rigid(matrices):
         for index, matrix in enumerate(matrices):
             rigid(matrix, f"{owner}: {name}[{index}]")
@@ -158,7 +172,7 @@ class RenderPlanes:
         return RenderPlanes(*(change(getattr(self, f.name)) for f in fields(self)))
 
 
-# types ----------------------------------------------------------------------------------------------------------------
+# types --------------------------------------------------------------------------------------------
 
 
 Matrix = NDArray[np.float64]
@@ -176,7 +190,7 @@ def _freeze(mapping: Mapping[str, Any]) -> Mapping[str, Any]:
     return MappingProxyType(dict(mapping))
 
 
-# facts ----------------------------------------------------------------------------------------------------------------
+# facts --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,8 +326,9 @@ class Frame:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Photo:
-    """A recorded image in memory: ``rgb`` u8[H, W, 3] of ``view``, ``semantics`` u8[H, W] train ids (255 = unknown) or None, ``usable``
-    bool[H, W]: pixels that show what is asked for (None = all). The image may have another size than the view's camera."""
+    """A recorded image in memory: ``rgb`` u8[H, W, 3] of ``view``, ``semantics`` u8[H, W] train ids (255 = unknown) or
+    None, ``usable`` bool[H, W]: pixels that show what is asked for (None = all). The image may have another size than
+    the view's camera."""
 
     view: View
     rgb: NDArray[np.uint8]
@@ -406,7 +421,8 @@ class Track:
         object.__setattr__(self, "world_from_object", poses)
 
     def pose_at(self, time_s: float) -> Matrix | None:
-        """World-from-object f64[4, 4] at ``time_s``, interpolated between both neighbouring keys; None outside the span."""
+        """World-from-object f64[4, 4] at ``time_s``, interpolated between both neighbouring keys; None outside the
+        span."""
         return geometry.pose_at(self.times_s, self.world_from_object, time_s)
 
 
@@ -539,7 +555,7 @@ class Scene:
         raise InputError("the scene has no such track", where=self.root, got=track_id)
 
 
-# tensors --------------------------------------------------------------------------------------------------------------
+# tensors ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -567,15 +583,16 @@ class Condition:
         depth: f32[T, 1, H, W] metres; meaningless where not valid.
         valid: bool[T, 1, H, W]: a fused point was seen here.
         reference: f32[3, H, W], the dense recorded image near views[0].
-        reference_in: where a published-type model is shown it: in the image tokens and in frame 0 of the colour (as released), in that
-            frame alone, or nowhere.
+        reference_in: where a published-type model is shown it: in the image tokens and in frame 0 of the colour (as
+            released), in that frame alone, or nowhere.
         warped: bool[T, 1, H, W] or None: the colour here was warped from a recorded image near in time.
         backdrop: f32[T, 3, H, W] in [0, 1] or None: a recorded image carried over as if all of it were far away.
-        semantics: u8[T, 1, H, W] or None: class ids that came with `color` from labelled points and images; 255 = unknown.
+        semantics: u8[T, 1, H, W] or None: class ids that came with `color` from labelled points and images; 255 =
+            unknown.
         backdrop_semantics: u8[T, 1, H, W] or None: the same for `backdrop`.
         renders: what a fitted scene shows at the views, or None.
-        measured: what the points measured, where ``depth`` is something else: the published system's network is given depth that was
-            resized with its gaps, as 0 m, mixed in. None: ``depth`` where ``valid``.
+        measured: what the points measured, where ``depth`` is something else: the published system's network is given
+            depth that was resized with its gaps, as 0 m, mixed in. None: ``depth`` where ``valid``.
     """
 
     views: tuple[View, ...]
@@ -642,9 +659,11 @@ class Clip:
         depth: f32[T, 1, H, W] metres where ``depth_valid`` bool[T, 1, H, W]; elsewhere it only fills a gap.
         semantics: i64[T, H, W] train ids, 255 = unlabelled.
         shift_m: lateral shift from the recorded path, metres, positive to the left.
-        point_color: f32[T, 3, H, W] in [0, 1] or None: colour of the nearest point, no image warped in; for scoring only.
+        point_color: f32[T, 3, H, W] in [0, 1] or None: colour of the nearest point, no image warped in; for scoring
+            only.
         fine: a rectangle at a higher resolution, or None.
-        depth_confidence: f32[T, 1, H, W] in [0, 1] or None: how far valid depth is to be believed (1 = measured); None: wholly.
+        depth_confidence: f32[T, 1, H, W] in [0, 1] or None: how far valid depth is to be believed (1 = measured); None:
+            wholly.
     """
 
     condition: Condition
@@ -715,8 +734,8 @@ class Gaussians:
         scales: f32[N, 3] metres.
         opacity: f32[N] in [0, 1].
         sh: f32[N, K, 3] spherical harmonics, K = (degree + 1)^2.
-        sh_rest: harmonics from degree 1 on, f32[N, K - 1, 3], where they are kept in a tensor of their own (``sh`` is then
-            f32[N, 1, 3]); None: ``sh`` holds all. The CPU rasteriser draws both forms without a copy.
+        sh_rest: harmonics from degree 1 on, f32[N, K - 1, 3], where they are kept in a tensor of their own (``sh`` is
+            then f32[N, 1, 3]); None: ``sh`` holds all. The CPU rasteriser draws both forms without a copy.
         extra: f32[N, C] feature channels rendered like colours, or None.
         node: i32[N] index of the scene node.
     """
@@ -742,7 +761,8 @@ class Gaussians:
 
 @dataclass(slots=True, eq=False)
 class RasterTrace:
-    """What densification needs to know about a render. Several views drawn at once add a leading dimension V to everything.
+    """What densification needs to know about a render. Several views drawn at once add a leading dimension V to
+    everything.
 
     Args:
         means2d: f32[N, 2] pixels; its gradient is kept after backward.

@@ -20,8 +20,8 @@ def version() -> str:
 
 @functools.cache
 def environment() -> dict[str, Any]:
-    """Versions and machine facts that results may depend on. Holds no host name, user name or path. Looked up once: metadata
-    is parsed anew at every question."""
+    """Versions and machine facts that results may depend on. Holds no host name, user name or path. Looked up once:
+    metadata is parsed anew at every question."""
     from importlib import metadata
 
     packages = {}

@@ -1,4 +1,5 @@
-"""Settings of weather, light, season and camera response for edited drives. Torch-free; ``mudg.core.weather`` applies them.
+"""Settings of weather, light, season and camera response for edited drives. Torch-free; ``mudg.core.weather`` applies
+them.
 
 Names and units are those of an edit script. The defaults change nothing.
 """
@@ -11,7 +12,9 @@ from pydantic import Field
 
 from mudg.base.records import StrictRecord
 
-Wind = Annotated[tuple[Annotated[float, Field(ge=-40, le=40)], Annotated[float, Field(ge=-40, le=40)]], Field(strict=False)]
+Wind = Annotated[
+    tuple[Annotated[float, Field(ge=-40, le=40)], Annotated[float, Field(ge=-40, le=40)]], Field(strict=False)
+]
 LightTime = Literal["as_recorded", "overcast", "dusk", "night"]
 ToneName = Literal["srgb", "gamma", "linear"]
 
@@ -22,9 +25,11 @@ class FogSettings(StrictRecord):
     visibility_m: Annotated[float, Field(ge=5, le=100_000)] = 150.0
     """Meteorological optical range, metres: where contrast falls to 5 %. Fog is below 1000."""
     height_m: Annotated[float, Field(ge=0, le=2000)] = 0.0
-    """Height above the ground at which fog is thinner by the factor e, metres; 0 = the same at all heights below ``top_m``."""
+    """Height above the ground at which fog is thinner by the factor e, metres; 0 = the same at all heights below
+    ``top_m``."""
     top_m: Annotated[float, Field(ge=5, le=5000)] = 300.0
-    """Upper end of fog that does not fade with height, metres above the ground. It decides how much of the sky is seen."""
+    """Upper end of fog that does not fade with height, metres above the ground. It decides how much of the sky is
+    seen."""
 
 
 class RainSettings(StrictRecord):
@@ -121,7 +126,8 @@ class Conditions(StrictRecord):
 
     @property
     def changes_air_ground_or_light(self) -> bool:
-        """Whether fog, rain, snow, wet ground or another light is asked for; seasons and exposure alone do not count."""
+        """Whether fog, rain, snow, wet ground or another light is asked for; seasons and exposure alone do not
+        count."""
         weather = self.weather
         rain, snow = weather.rain is not None and weather.rain.mm_h > 0, weather.snow
         snowy = snow is not None and (snow.mm_h > 0 or snow.cover > 0)

@@ -1,7 +1,8 @@
 """Published checkpoints: reading the containers they come in, and the map between their names and ours.
 
-The only place where a pickle is opened, and only with torch's restricted unpickler: tensors and plain containers. Of the objects
-that training frameworks leave in their files a short list is replaced by an inert stand-in; anything else is refused.
+The only place where a pickle is opened, and only with torch's restricted unpickler: tensors and plain containers. Of
+the objects that training frameworks leave in their files a short list is replaced by an inert stand-in; anything else
+is refused.
 
 `RULES` is the complete map, as text: each row says how a published tensor is called here. `{i}` stands for a number.
 """
@@ -24,23 +25,28 @@ from mudg.base import checkpoint
 from mudg.base.errors import InputError
 from mudg.base.plain_pickle import PERSISTENT, Maker, Name, PickledObject, read_pickle
 
-# torchscript ----------------------------------------------------------------------------------------------------------
+# torchscript --------------------------------------------------------------------------------------
 #
 # The tensors of a TorchScript archive, without its program.
 #
-# ``torch.jit.load`` would take in code from the file. What the networks of the scores need are the tensors alone: the archive is a zip,
-# its
-# ``data.pkl`` a pickle that names classes of the program and places in ``data/``. It is read by the interpreter of
-# ``base/plain_pickle.py``, which runs nothing; classes become plain objects, and the tensors get the names of the attributes that
-# lead to them.
+# ``torch.jit.load`` would take in code from the file. What the networks of the scores need are the tensors alone: the
+# archive is a zip, its ``data.pkl`` a pickle that names classes of the program and places in ``data/``. It is read by
+# the interpreter of ``base/plain_pickle.py``, which runs nothing; classes become plain objects, and the tensors get the
+# names of the attributes that lead to them.
 
 
 _STORAGES: Final = {
-    "torch.FloatStorage": (torch.float32, 4), "torch.HalfStorage": (torch.float16, 2), "torch.BFloat16Storage": (torch.bfloat16, 2),
-    "torch.DoubleStorage": (torch.float64, 8), "torch.LongStorage": (torch.int64, 8), "torch.IntStorage": (torch.int32, 4),
-    "torch.ShortStorage": (torch.int16, 2), "torch.CharStorage": (torch.int8, 1), "torch.ByteStorage": (torch.uint8, 1),
+    "torch.FloatStorage": (torch.float32, 4),
+    "torch.HalfStorage": (torch.float16, 2),
+    "torch.BFloat16Storage": (torch.bfloat16, 2),
+    "torch.DoubleStorage": (torch.float64, 8),
+    "torch.LongStorage": (torch.int64, 8),
+    "torch.IntStorage": (torch.int32, 4),
+    "torch.ShortStorage": (torch.int16, 2),
+    "torch.CharStorage": (torch.int8, 1),
+    "torch.ByteStorage": (torch.uint8, 1),
     "torch.BoolStorage": (torch.bool, 1),
-}  # fmt: skip
+}
 _PROGRAM: Final = "__torch__."
 _BUILDERS: Final = "torch.jit._pickle."
 _DEEPEST: Final = 64
@@ -51,10 +57,12 @@ class _Names(Mapping[str, Maker | None]):
 
     def __init__(self) -> None:
         self._known: dict[str, Maker | None] = {
-            "torch._utils._rebuild_tensor_v2": _tensor, "collections.OrderedDict": dict, **dict.fromkeys((PERSISTENT, *_STORAGES)),
+            "torch._utils._rebuild_tensor_v2": _tensor,
+            "collections.OrderedDict": dict,
+            **dict.fromkeys((PERSISTENT, *_STORAGES)),
             **{f"{_BUILDERS}build_{kind}list": lambda items: items for kind in ("int", "double", "bool", "tensor")},
             f"{_BUILDERS}restore_type_tag": lambda value, _kind: value,
-        }  # fmt: skip
+        }
 
     def __contains__(self, name: object) -> bool:
         return name in self._known or str(name).startswith(_PROGRAM)
@@ -98,8 +106,12 @@ def read_torchscript(path: Path) -> dict[str, Tensor]:
             folder = index.removesuffix("data.pkl") + "data/"
             return {name: _read(archive, folder, found, f"{path}: {name}") for name, found in _leaves(content, "", 0)}
     except (zipfile.BadZipFile, KeyError, ValueError, NotImplementedError) as error:
-        raise InputError("not a readable TorchScript archive", where=str(path), got=f"{type(error).__name__}: {error}"[:200],
-            remedy="fetch the file again and compare its size") from error  # fmt: skip
+        raise InputError(
+            "not a readable TorchScript archive",
+            where=str(path),
+            got=f"{type(error).__name__}: {error}"[:200],
+            remedy="fetch the file again and compare its size",
+        ) from error
 
 
 def _leaves(value: Any, name: str, depth: int) -> Iterator[tuple[str, PickledObject]]:
@@ -118,7 +130,13 @@ def _leaves(value: Any, name: str, depth: int) -> Iterator[tuple[str, PickledObj
 def _read(archive: zipfile.ZipFile, folder: str, found: PickledObject, where: str) -> Tensor:
     storage, offset, size, stride = found.arguments
     ((mark, kind, key, _place, count),) = storage.arguments
-    if mark != "storage" or not isinstance(kind, Name) or kind.text not in _STORAGES or not isinstance(key, str) or not key.isalnum():
+    if (
+        mark != "storage"
+        or not isinstance(kind, Name)
+        or kind.text not in _STORAGES
+        or not isinstance(key, str)
+        or not key.isalnum()
+    ):
         raise InputError("a tensor has an unknown storage", where=where, got=repr(storage.arguments)[:120])
     dtype, width = _STORAGES[kind.text]
     whole = [offset, count, *size, *stride]
@@ -127,15 +145,19 @@ def _read(archive: zipfile.ZipFile, folder: str, found: PickledObject, where: st
     reach = offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True)) + 1 if math.prod(size) else 0
     content = archive.read(folder + key)
     if len(content) != count * width or reach > count:
-        raise InputError("a tensor does not fit its storage", where=where, expected=f"{count} values", got=f"{len(content)} bytes")
-    flat = torch.from_numpy(np.frombuffer(content, np.uint8).copy()).view(dtype) if count else torch.zeros(0, dtype=dtype)
+        raise InputError(
+            "a tensor does not fit its storage", where=where, expected=f"{count} values", got=f"{len(content)} bytes"
+        )
+    flat = (
+        torch.from_numpy(np.frombuffer(content, np.uint8).copy()).view(dtype) if count else torch.zeros(0, dtype=dtype)
+    )
     return flat.as_strided(size, stride, offset).clone()
 
 
-# weights --------------------------------------------------------------------------------------------------------------
+# weights ------------------------------------------------------------------------------------------
 
 
-# names ----------------------------------------------------------------------------------------------------------------
+# names --------------------------------------------------------------------------------------------
 
 _UNET = "model.diffusion_model."
 _VAE = "first_stage_model."
@@ -144,36 +166,62 @@ _IMAGE = "embedder.model."
 _IMAGE_TOKENS = "image_proj_model."
 
 _RES = (
-    ("in_layers.0", "norm1"), ("in_layers.2", "conv1"), ("emb_layers.1", "embed"), ("out_layers.0", "norm2"),
-    ("out_layers.3", "conv2"), ("skip_connection", "skip"),
-    ("temopral_conv.conv1.0", "temporal.0.norm"), ("temopral_conv.conv1.2", "temporal.0.conv"),
-    ("temopral_conv.conv2.0", "temporal.1.norm"), ("temopral_conv.conv2.3", "temporal.1.conv"),
-    ("temopral_conv.conv3.0", "temporal.2.norm"), ("temopral_conv.conv3.3", "temporal.2.conv"),
-    ("temopral_conv.conv4.0", "temporal.3.norm"), ("temopral_conv.conv4.3", "temporal.3.conv"),
-)  # fmt: skip
+    ("in_layers.0", "norm1"),
+    ("in_layers.2", "conv1"),
+    ("emb_layers.1", "embed"),
+    ("out_layers.0", "norm2"),
+    ("out_layers.3", "conv2"),
+    ("skip_connection", "skip"),
+    ("temopral_conv.conv1.0", "temporal.0.norm"),
+    ("temopral_conv.conv1.2", "temporal.0.conv"),
+    ("temopral_conv.conv2.0", "temporal.1.norm"),
+    ("temopral_conv.conv2.3", "temporal.1.conv"),
+    ("temopral_conv.conv3.0", "temporal.2.norm"),
+    ("temopral_conv.conv3.3", "temporal.2.conv"),
+    ("temopral_conv.conv4.0", "temporal.3.norm"),
+    ("temopral_conv.conv4.3", "temporal.3.conv"),
+)
 _ATTENTION = (
-    ("to_q", "query"), ("to_k", "key"), ("to_v", "value"), ("to_out.0", "out"), ("to_k_ip", "image_key"),
+    ("to_q", "query"),
+    ("to_k", "key"),
+    ("to_v", "value"),
+    ("to_out.0", "out"),
+    ("to_k_ip", "image_key"),
     ("to_v_ip", "image_value"),
-)  # fmt: skip
+)
 _TRANSFORMER = (
-    ("norm", "norm"), ("proj_in", "enter"), ("proj_out", "out"),
+    ("norm", "norm"),
+    ("proj_in", "enter"),
+    ("proj_out", "out"),
     *((f"transformer_blocks.0.norm{n}", f"block.norm{n}") for n in (1, 2, 3)),
     *((f"transformer_blocks.0.attn{n}.{a}", f"block.attention{n}.{b}") for n in (1, 2) for a, b in _ATTENTION),
-    ("transformer_blocks.0.ff.net.0.proj", "block.feed.enter"), ("transformer_blocks.0.ff.net.2", "block.feed.out"),
-)  # fmt: skip
+    ("transformer_blocks.0.ff.net.0.proj", "block.feed.enter"),
+    ("transformer_blocks.0.ff.net.2", "block.feed.out"),
+)
 _VAE_BLOCK = (("norm1", "norm1"), ("conv1", "conv1"), ("norm2", "norm2"), ("conv2", "conv2"), ("nin_shortcut", "skip"))
 _VAE_MIDDLE = (
-    *((f"block_1.{a}", f"block1.{b}") for a, b in _VAE_BLOCK), *((f"block_2.{a}", f"block2.{b}") for a, b in _VAE_BLOCK),
-    ("attn_1.norm", "attention.norm"), ("attn_1.q", "attention.query"), ("attn_1.k", "attention.key"),
-    ("attn_1.v", "attention.value"), ("attn_1.proj_out", "attention.out"),
-)  # fmt: skip
+    *((f"block_1.{a}", f"block1.{b}") for a, b in _VAE_BLOCK),
+    *((f"block_2.{a}", f"block2.{b}") for a, b in _VAE_BLOCK),
+    ("attn_1.norm", "attention.norm"),
+    ("attn_1.q", "attention.query"),
+    ("attn_1.k", "attention.key"),
+    ("attn_1.v", "attention.value"),
+    ("attn_1.proj_out", "attention.out"),
+)
 _TOWER_BLOCK = (
-    ("ln_1.weight", "norm1.weight"), ("ln_1.bias", "norm1.bias"), ("ln_2.weight", "norm2.weight"), ("ln_2.bias", "norm2.bias"),
-    ("attn.in_proj_weight", "query_key_value.weight"), ("attn.in_proj_bias", "query_key_value.bias"),
-    ("attn.out_proj.weight", "out.weight"), ("attn.out_proj.bias", "out.bias"),
-    ("mlp.c_fc.weight", "feed_in.weight"), ("mlp.c_fc.bias", "feed_in.bias"),
-    ("mlp.c_proj.weight", "feed_out.weight"), ("mlp.c_proj.bias", "feed_out.bias"),
-)  # fmt: skip
+    ("ln_1.weight", "norm1.weight"),
+    ("ln_1.bias", "norm1.bias"),
+    ("ln_2.weight", "norm2.weight"),
+    ("ln_2.bias", "norm2.bias"),
+    ("attn.in_proj_weight", "query_key_value.weight"),
+    ("attn.in_proj_bias", "query_key_value.bias"),
+    ("attn.out_proj.weight", "out.weight"),
+    ("attn.out_proj.bias", "out.bias"),
+    ("mlp.c_fc.weight", "feed_in.weight"),
+    ("mlp.c_fc.bias", "feed_in.bias"),
+    ("mlp.c_proj.weight", "feed_out.weight"),
+    ("mlp.c_proj.bias", "feed_out.bias"),
+)
 
 
 def _at(published: str, clean: str, leaves: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
@@ -193,76 +241,111 @@ def _parameters(rows: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
 
 RULES: tuple[tuple[str, str], ...] = (
     # denoising network
-    *_parameters([
-        *((f"{_UNET}{a}.{n}", f"net.{b}.{n}") for a, b in (("time_embed", "time"), ("class_embed", "label"), ("fps_embedding", "fps"))
-          for n in (0, 2)),
-        (f"{_UNET}input_blocks.0.0", "net.down.0.conv"),
-        *_at(f"{_UNET}init_attn.0.", "net.first.", _TRANSFORMER),
-        *_block(f"{_UNET}input_blocks.{{i}}.", "net.down.{i}."),
-        (f"{_UNET}input_blocks.{{i}}.0.op", "net.down.{i}.conv"),
-        *_at(f"{_UNET}middle_block.0.", "net.middle.res1.", _RES),
-        *_at(f"{_UNET}middle_block.1.", "net.middle.spatial.", _TRANSFORMER),
-        *_at(f"{_UNET}middle_block.2.", "net.middle.temporal.", _TRANSFORMER),
-        *_at(f"{_UNET}middle_block.3.", "net.middle.res2.", _RES),
-        *_block(f"{_UNET}output_blocks.{{i}}.", "net.up.{i}."),
-        (f"{_UNET}output_blocks.{{i}}.3.conv", "net.up.{i}.grow"),
-        (f"{_UNET}output_blocks.{{i}}.1.conv", "net.up.{i}.grow"),
-        (f"{_UNET}out.0", "net.norm"), (f"{_UNET}out.2", "net.leave"),
-    ]),
+    *_parameters(
+        [
+            *(
+                (f"{_UNET}{a}.{n}", f"net.{b}.{n}")
+                for a, b in (("time_embed", "time"), ("class_embed", "label"), ("fps_embedding", "fps"))
+                for n in (0, 2)
+            ),
+            (f"{_UNET}input_blocks.0.0", "net.down.0.conv"),
+            *_at(f"{_UNET}init_attn.0.", "net.first.", _TRANSFORMER),
+            *_block(f"{_UNET}input_blocks.{{i}}.", "net.down.{i}."),
+            (f"{_UNET}input_blocks.{{i}}.0.op", "net.down.{i}.conv"),
+            *_at(f"{_UNET}middle_block.0.", "net.middle.res1.", _RES),
+            *_at(f"{_UNET}middle_block.1.", "net.middle.spatial.", _TRANSFORMER),
+            *_at(f"{_UNET}middle_block.2.", "net.middle.temporal.", _TRANSFORMER),
+            *_at(f"{_UNET}middle_block.3.", "net.middle.res2.", _RES),
+            *_block(f"{_UNET}output_blocks.{{i}}.", "net.up.{i}."),
+            (f"{_UNET}output_blocks.{{i}}.3.conv", "net.up.{i}.grow"),
+            (f"{_UNET}output_blocks.{{i}}.1.conv", "net.up.{i}.grow"),
+            (f"{_UNET}out.0", "net.norm"),
+            (f"{_UNET}out.2", "net.leave"),
+        ]
+    ),
     # autoencoder
-    *_parameters([
-        (f"{_VAE}encoder.conv_in", "codec.encoder.enter"), (f"{_VAE}encoder.norm_out", "codec.encoder.norm"),
-        (f"{_VAE}encoder.conv_out", "codec.encoder.leave"), (f"{_VAE}decoder.conv_in", "codec.decoder.enter"),
-        (f"{_VAE}decoder.norm_out", "codec.decoder.norm"), (f"{_VAE}decoder.conv_out", "codec.decoder.leave"),
-        (f"{_VAE}quant_conv", "codec.to_moments"), (f"{_VAE}post_quant_conv", "codec.from_latent"),
-        *_at(f"{_VAE}encoder.down.{{i}}.block.{{j}}.", "codec.encoder.down.{i}.blocks.{j}.", _VAE_BLOCK),
-        (f"{_VAE}encoder.down.{{i}}.downsample.conv", "codec.encoder.down.{i}.scale"),
-        *_at(f"{_VAE}encoder.mid.", "codec.encoder.middle.", _VAE_MIDDLE),
-        *_at(f"{_VAE}decoder.mid.", "codec.decoder.middle.", _VAE_MIDDLE),
-        *_at(f"{_VAE}decoder.up.{{i}}.block.{{j}}.", "codec.decoder.up.{i}.blocks.{j}.", _VAE_BLOCK),
-        (f"{_VAE}decoder.up.{{i}}.upsample.conv", "codec.decoder.up.{i}.scale"),
-    ]),
+    *_parameters(
+        [
+            (f"{_VAE}encoder.conv_in", "codec.encoder.enter"),
+            (f"{_VAE}encoder.norm_out", "codec.encoder.norm"),
+            (f"{_VAE}encoder.conv_out", "codec.encoder.leave"),
+            (f"{_VAE}decoder.conv_in", "codec.decoder.enter"),
+            (f"{_VAE}decoder.norm_out", "codec.decoder.norm"),
+            (f"{_VAE}decoder.conv_out", "codec.decoder.leave"),
+            (f"{_VAE}quant_conv", "codec.to_moments"),
+            (f"{_VAE}post_quant_conv", "codec.from_latent"),
+            *_at(f"{_VAE}encoder.down.{{i}}.block.{{j}}.", "codec.encoder.down.{i}.blocks.{j}.", _VAE_BLOCK),
+            (f"{_VAE}encoder.down.{{i}}.downsample.conv", "codec.encoder.down.{i}.scale"),
+            *_at(f"{_VAE}encoder.mid.", "codec.encoder.middle.", _VAE_MIDDLE),
+            *_at(f"{_VAE}decoder.mid.", "codec.decoder.middle.", _VAE_MIDDLE),
+            *_at(f"{_VAE}decoder.up.{{i}}.block.{{j}}.", "codec.decoder.up.{i}.blocks.{j}.", _VAE_BLOCK),
+            (f"{_VAE}decoder.up.{{i}}.upsample.conv", "codec.decoder.up.{i}.scale"),
+        ]
+    ),
     # text tower
-    (f"{_TEXT}token_embedding.weight", "text.tokens.weight"), (f"{_TEXT}positional_embedding", "text.places"),
+    (f"{_TEXT}token_embedding.weight", "text.tokens.weight"),
+    (f"{_TEXT}positional_embedding", "text.places"),
     *_at(f"{_TEXT}transformer.resblocks.{{i}}.", "text.blocks.{i}.", _TOWER_BLOCK),
     *_parameters([(f"{_TEXT}ln_final", "text.norm")]),
     # image tower
-    (f"{_IMAGE}visual.class_embedding", "image.whole"), (f"{_IMAGE}visual.positional_embedding", "image.places"),
+    (f"{_IMAGE}visual.class_embedding", "image.whole"),
+    (f"{_IMAGE}visual.positional_embedding", "image.places"),
     (f"{_IMAGE}visual.conv1.weight", "image.patches.weight"),
     *_parameters([(f"{_IMAGE}visual.ln_pre", "image.norm")]),
     *_at(f"{_IMAGE}visual.transformer.resblocks.{{i}}.", "image.blocks.{i}.", _TOWER_BLOCK),
     # image tokens
     (f"{_IMAGE_TOKENS}latents", "image_tokens.queries"),
-    *_parameters([
-        (f"{_IMAGE_TOKENS}proj_in", "image_tokens.enter"), (f"{_IMAGE_TOKENS}proj_out", "image_tokens.leave"),
-        (f"{_IMAGE_TOKENS}norm_out", "image_tokens.norm"),
-        (f"{_IMAGE_TOKENS}layers.{{i}}.0.norm1", "image_tokens.layers.{i}.attention.norm_image"),
-        (f"{_IMAGE_TOKENS}layers.{{i}}.0.norm2", "image_tokens.layers.{i}.attention.norm_queries"),
-        (f"{_IMAGE_TOKENS}layers.{{i}}.0.to_q", "image_tokens.layers.{i}.attention.query"),
-        (f"{_IMAGE_TOKENS}layers.{{i}}.0.to_kv", "image_tokens.layers.{i}.attention.key_value"),
-        (f"{_IMAGE_TOKENS}layers.{{i}}.0.to_out", "image_tokens.layers.{i}.attention.out"),
-        (f"{_IMAGE_TOKENS}layers.{{i}}.1.0", "image_tokens.layers.{i}.feed.0"),
-        (f"{_IMAGE_TOKENS}layers.{{i}}.1.1", "image_tokens.layers.{i}.feed.1"),
-        (f"{_IMAGE_TOKENS}layers.{{i}}.1.3", "image_tokens.layers.{i}.feed.3"),
-    ]),
+    *_parameters(
+        [
+            (f"{_IMAGE_TOKENS}proj_in", "image_tokens.enter"),
+            (f"{_IMAGE_TOKENS}proj_out", "image_tokens.leave"),
+            (f"{_IMAGE_TOKENS}norm_out", "image_tokens.norm"),
+            (f"{_IMAGE_TOKENS}layers.{{i}}.0.norm1", "image_tokens.layers.{i}.attention.norm_image"),
+            (f"{_IMAGE_TOKENS}layers.{{i}}.0.norm2", "image_tokens.layers.{i}.attention.norm_queries"),
+            (f"{_IMAGE_TOKENS}layers.{{i}}.0.to_q", "image_tokens.layers.{i}.attention.query"),
+            (f"{_IMAGE_TOKENS}layers.{{i}}.0.to_kv", "image_tokens.layers.{i}.attention.key_value"),
+            (f"{_IMAGE_TOKENS}layers.{{i}}.0.to_out", "image_tokens.layers.{i}.attention.out"),
+            (f"{_IMAGE_TOKENS}layers.{{i}}.1.0", "image_tokens.layers.{i}.feed.0"),
+            (f"{_IMAGE_TOKENS}layers.{{i}}.1.1", "image_tokens.layers.{i}.feed.1"),
+            (f"{_IMAGE_TOKENS}layers.{{i}}.1.3", "image_tokens.layers.{i}.feed.3"),
+        ]
+    ),
     # the dynamic rescale table: the one buffer whose values decide
     ("scale_arr", "scale"),
-)  # fmt: skip
+)
 """(published name, our name). Read from the top; the first row that fits holds."""
 
 UNUSED: frozenset[str] = frozenset(
     (
-        "betas", "alphas_cumprod", "alphas_cumprod_prev", "sqrt_alphas_cumprod", "sqrt_one_minus_alphas_cumprod",
-        "log_one_minus_alphas_cumprod", "sqrt_recip_alphas_cumprod", "sqrt_recipm1_alphas_cumprod", "posterior_variance",
-        "posterior_log_variance_clipped", "posterior_mean_coef1", "posterior_mean_coef2",
+        "betas",
+        "alphas_cumprod",
+        "alphas_cumprod_prev",
+        "sqrt_alphas_cumprod",
+        "sqrt_one_minus_alphas_cumprod",
+        "log_one_minus_alphas_cumprod",
+        "sqrt_recip_alphas_cumprod",
+        "sqrt_recipm1_alphas_cumprod",
+        "posterior_variance",
+        "posterior_log_variance_clipped",
+        "posterior_mean_coef1",
+        "posterior_mean_coef2",
         *(f"{tower}{name}" for tower in (_TEXT, _IMAGE) for name in ("text_projection", "logit_scale", "attn_mask")),
-        *(f"{_IMAGE}{name}" for name in (
-            "positional_embedding", "token_embedding.weight", "ln_final.weight", "ln_final.bias", "visual.proj",
-            "visual.ln_post.weight", "visual.ln_post.bias",
-        )),
+        *(
+            f"{_IMAGE}{name}"
+            for name in (
+                "positional_embedding",
+                "token_embedding.weight",
+                "ln_final.weight",
+                "ln_final.bias",
+                "visual.proj",
+                "visual.ln_post.weight",
+                "visual.ln_post.bias",
+            )
+        ),
     )
-)  # fmt: skip
-"""Published names that may be there and are not read: tables that follow from the schedule, parts of the towers past the layers in use."""
+)
+"""Published names that may be there and are not read: tables that follow from the schedule, parts of the towers past
+the layers in use."""
 
 _NUMBER = {"{i}": r"(?P<i>\d+)", "{j}": r"(?P<j>\d+)"}
 _Index = dict[tuple[str, int, str], list[tuple[re.Pattern[str], str]]]
@@ -312,7 +395,7 @@ def published_names(clean: Iterable[str]) -> dict[str, str]:
     return result
 
 
-# containers -----------------------------------------------------------------------------------------------------------
+# containers ---------------------------------------------------------------------------------------
 
 
 class _Ignored:
@@ -332,16 +415,34 @@ def _mapping(*_: object) -> OrderedDict[str, Any]:
 
 
 INERT = (
-    "omegaconf.dictconfig.DictConfig", "omegaconf.listconfig.ListConfig", "omegaconf.base.ContainerMetadata",
-    "omegaconf.base.Metadata", "omegaconf.nodes.AnyNode", "omegaconf.nodes.IntegerNode", "omegaconf.nodes.FloatNode",
-    "omegaconf.nodes.StringNode", "omegaconf.nodes.BooleanNode", "typing.Any", "builtins.dict", "builtins.list",
-    "builtins.tuple", "builtins.int", "builtins.float", "builtins.str", "builtins.bool", "argparse.Namespace",
-    "numpy.dtype", "numpy.core.multiarray.scalar", "numpy._core.multiarray.scalar",
+    "omegaconf.dictconfig.DictConfig",
+    "omegaconf.listconfig.ListConfig",
+    "omegaconf.base.ContainerMetadata",
+    "omegaconf.base.Metadata",
+    "omegaconf.nodes.AnyNode",
+    "omegaconf.nodes.IntegerNode",
+    "omegaconf.nodes.FloatNode",
+    "omegaconf.nodes.StringNode",
+    "omegaconf.nodes.BooleanNode",
+    "typing.Any",
+    "builtins.dict",
+    "builtins.list",
+    "builtins.tuple",
+    "builtins.int",
+    "builtins.float",
+    "builtins.str",
+    "builtins.bool",
+    "argparse.Namespace",
+    "numpy.dtype",
+    "numpy.core.multiarray.scalar",
+    "numpy._core.multiarray.scalar",
     "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint",
-    "lightning.pytorch.callbacks.model_checkpoint.ModelCheckpoint", "torch.optim.lr_scheduler.LambdaLR",
-    "deepspeed.runtime.fp16.loss_scaler.LossScaler", "deepspeed.runtime.fp16.loss_scaler.DynamicLossScaler",
+    "lightning.pytorch.callbacks.model_checkpoint.ModelCheckpoint",
+    "torch.optim.lr_scheduler.LambdaLR",
+    "deepspeed.runtime.fp16.loss_scaler.LossScaler",
+    "deepspeed.runtime.fp16.loss_scaler.DynamicLossScaler",
     "deepspeed.runtime.zero.config.ZeroStageEnum",
-)  # fmt: skip
+)
 """Names in pickles that are replaced by `_Ignored`. Not one of them is imported or called."""
 
 INERT_MAPPINGS: dict[str, Any] = {
@@ -357,9 +458,10 @@ _PREFIXES = ("_forward_module.", "module.", "_orig_mod.")
 def read_checkpoint(path: Path) -> dict[str, Tensor]:
     """All named tensors of a published checkpoint, under the names in the file, without wrapper prefixes.
 
-    Understood: a training-framework file (`state_dict` inside), a DeepSpeed file (`module` inside, names that start with
-    `_forward_module.`), a plain mapping of names to tensors, safetensors, and a TorchScript archive, of which only the tensors are read.
-    Tensors are mapped from the file where its format allows, so that memory is taken as they are used.
+    Understood: a training-framework file (`state_dict` inside), a DeepSpeed file (`module` inside, names that start
+    with `_forward_module.`), a plain mapping of names to tensors, safetensors, and a TorchScript archive, of which only
+    the tensors are read. Tensors are mapped from the file where its format allows, so that memory is taken as they are
+    used.
 
     Raises:
         InputError: missing, truncated, or holds objects that are not on the list of harmless ones, or no tensors.
@@ -374,9 +476,12 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
     content = _unpickle(path)
     found = _named_tensors(content)
     if not found:
-        raise InputError("the file holds no named tensors", where=str(path),
+        raise InputError(
+            "the file holds no named tensors",
+            where=str(path),
             expected="state_dict, module, or names with tensors",
-            got=", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else type(content).__name__)  # fmt: skip
+            got=", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else type(content).__name__,
+        )
     return _without_prefix(found)
 
 
@@ -394,14 +499,20 @@ def _unpickle(path: Path) -> Any:
         if refused is not None:
             raise InputError(
                 "the checkpoint holds an object that is neither a tensor nor known to be harmless; it was not loaded",
-                where=str(path), expected="tensors, numbers, text and plain containers", got=refused.group(1),
-                remedy="do not load it elsewhere either, unless you trust its maker; ask for safetensors") from error  # fmt: skip
+                where=str(path),
+                expected="tensors, numbers, text and plain containers",
+                got=refused.group(1),
+                remedy="do not load it elsewhere either, unless you trust its maker; ask for safetensors",
+            ) from error
         if out_of_memory(error):
             raise MemoryError(text) from error
-        raise InputError("not a readable checkpoint", where=str(path),
+        raise InputError(
+            "not a readable checkpoint",
+            where=str(path),
             expected="a complete file written by torch.save, or safetensors",
             got=text.splitlines()[0][:200] if text else type(error).__name__,
-            remedy="fetch the file again and compare its size") from error  # fmt: skip
+            remedy="fetch the file again and compare its size",
+        ) from error
 
 
 def out_of_memory(error: Exception) -> bool:
@@ -410,9 +521,17 @@ def out_of_memory(error: Exception) -> bool:
 
 
 _UNREADABLE: tuple[type[Exception], ...] = (
-    EOFError, RuntimeError, ValueError, KeyError, IndexError, TypeError, AttributeError, OSError,
-    torch.serialization.pickle.UnpicklingError,  # type: ignore[attr-defined]  # through torch: this package imports no pickle
-)  # fmt: skip
+    EOFError,
+    RuntimeError,
+    ValueError,
+    KeyError,
+    IndexError,
+    TypeError,
+    AttributeError,
+    OSError,
+    # through torch: this package imports no pickle
+    torch.serialization.pickle.UnpicklingError,  # type: ignore[attr-defined]
+)
 
 
 def _named_tensors(content: Any) -> dict[str, Tensor]:
@@ -433,7 +552,8 @@ def _without_prefix(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def with_towers(found: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A checkpoint completed by an OpenCLIP file (names without prefix) where it has no text or no image tower of its own."""
+    """A checkpoint completed by an OpenCLIP file (names without prefix) where it has no text or no image tower of its
+    own."""
     result = dict(found)
     for prefix in (_TEXT, _IMAGE):
         if not any(name.startswith(prefix) for name in found):
@@ -442,7 +562,7 @@ def with_towers(found: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> di
     return result
 
 
-# matching -------------------------------------------------------------------------------------------------------------
+# matching -----------------------------------------------------------------------------------------
 
 
 def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str) -> dict[str, Tensor]:
@@ -453,7 +573,8 @@ def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], wher
         wanted: our name -> shape, all that the model needs and nothing else.
 
     Raises:
-        InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the counts.
+        InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the
+            counts.
     """
     published = published_names(wanted)
     known = set(published.values())
@@ -466,7 +587,9 @@ def refuse_bad_values(tensors: Mapping[str, Tensor], where: str) -> None:
     """InputError for the first tensor that does not hold finite floating-point numbers; ``where``: its file."""
     for name, value in tensors.items():
         if not value.is_floating_point():
-            raise InputError("a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=str(value.dtype))
+            raise InputError(
+                "a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=str(value.dtype)
+            )
         if not bool(torch.isfinite(value).all()):
             raise InputError("a tensor holds values that are not finite", where=f"{where}: {name}")
 
@@ -475,7 +598,8 @@ def match_exactly(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int
     """Names and shapes of a checkpoint against what its network needs, strictly; ``network``: what to call it.
 
     Raises:
-        InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the counts.
+        InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the
+            counts.
     """
     missing = [name for name in wanted if name not in found]
     unexpected = [name for name in found if name not in wanted]
@@ -490,6 +614,10 @@ def match_exactly(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int
             for kind, names in (("missing", missing), ("unexpected", unexpected), ("of another shape", misshaped))
             if names
         ]
-        raise InputError("the checkpoint is not the network it should be", where=where,
-            expected=f"{len(wanted)} tensors of {network}", got="; ".join(lines),
-            remedy="check that the file is complete and of the right kind")  # fmt: skip
+        raise InputError(
+            "the checkpoint is not the network it should be",
+            where=where,
+            expected=f"{len(wanted)} tensors of {network}",
+            got="; ".join(lines),
+            remedy="check that the file is complete and of the right kind",
+        )

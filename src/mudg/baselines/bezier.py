@@ -1,8 +1,8 @@
 """The fit of ``bezier``: BezierGS (Ma et al. 2025), tracked objects on learnt Bezier curves.
 
-Published, and here: the curves of ``baselines/bezier.py`` with their learning rates, and the losses and weights below. The loss of
-curves that agree is our reading of it: a Gaussian keeps its distance from the centre of its object. Left out: the velocity of
-the background, which here has no curves. Everything else is ``street_gaussians``.
+Published, and here: the curves of ``baselines/bezier.py`` with their learning rates, and the losses and weights below.
+The loss of curves that agree is our reading of it: a Gaussian keeps its distance from the centre of its object. Left
+out: the velocity of the background, which here has no curves. Everything else is ``street_gaussians``.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import start_model
 from mudg.gaussians.views import StoredView
 
-# bezier ---------------------------------------------------------------------------------------------------------------
+# bezier -------------------------------------------------------------------------------------------
 #
 # Tracked objects whose Gaussians follow Bezier curves (BezierGS, Ma et al. 2025).
 #
-# The box track of an object becomes a cubic curve of its centre, whose four control points are learnt on; every Gaussian has a curve of
-# its own about it, given by four offsets. At a time, ``tau`` the parameter that belongs to it,
+# The box track of an object becomes a cubic curve of its centre, whose four control points are learnt on; every
+# Gaussian has a curve of its own about it, given by four offsets. At a time, ``tau`` the parameter that belongs to it,
 #
 #     mean(t) = B(tau) (trajectory) + B(tau) (offsets),    offsets = turned place in the box + learnt deviation
 #
-# ``B`` are the four Bernstein polynomials. The turned place is a curve too: the one closest to what the rotations of the boxes
-# make of the place. Gaussians themselves turn with the boxes.
+# ``B`` are the four Bernstein polynomials. The turned place is a curve too: the one closest to what the rotations of
+# the boxes make of the place. Gaussians themselves turn with the boxes.
 #
 # Column: ``curve`` [N, 4, 3] metres in the world, the deviations; 0 and unused for the background.
 
@@ -65,9 +65,10 @@ class BezierPath:
     """A cubic curve and the parameter that belongs to a time.
 
     Args:
-        control: f64[4, 3] metres. clock: coefficients of the cubic in time, highest power first. middle_s, span_s: time that it is a
-            polynomial in, ``(t - middle) / span``.
-        tau: parameters of the keys, f64[K]. error_m: root mean square distance of the curve from the keys at their times.
+        control: f64[4, 3] metres. clock: coefficients of the cubic in time, highest power first. middle_s, span_s: time
+            that it is a polynomial in, ``(t - middle) / span``.
+        tau: parameters of the keys, f64[K]. error_m: root mean square distance of the curve from the keys at their
+            times.
     """
 
     control: Array
@@ -118,8 +119,8 @@ def _refined(times: Array, positions: Array, tau: Array, middle: float, span: fl
 
 
 def control_points(tau: Array, values: Array) -> Array:
-    """The four control points [4, c] whose curve comes closest to values [K, c] at parameters [K]; with fewer than four keys, those
-    nearest to a straight line."""
+    """The four control points [4, c] whose curve comes closest to values [K, c] at parameters [K]; with fewer than four
+    keys, those nearest to a straight line."""
     line = values[0] + np.linspace(0, 1, 4)[:, None] * (values[-1] - values[0])
     basis = bernstein(tau)
     return line + np.linalg.lstsq(basis, values - basis @ line, rcond=1e-9)[0]
@@ -139,7 +140,8 @@ def _nearest(control: Array, positions: Array, tau: Array) -> Array:
 
 
 class BezierNode(RigidNode):
-    """A tracked object on curves. Its own table: ``trajectory`` [1, 4, 3] metres, what the centre's control points differ by."""
+    """A tracked object on curves. Its own table: ``trajectory`` [1, 4, 3] metres, what the centre's control points
+    differ by."""
 
     kind = "bezier"
     learnt: Table
@@ -163,10 +165,13 @@ class BezierNode(RigidNode):
         if placement is None:
             return None
         means = self._center(time_s) + self.offsets_at(rows, float(self.path.tau_at(time_s)))
-        return replace(rows, means=means, quats=rows.quats @ placement[2], sh_rest=self._colors_turned(rows.sh_rest, time_s))
+        return replace(
+            rows, means=means, quats=rows.quats @ placement[2], sh_rest=self._colors_turned(rows.sh_rest, time_s)
+        )
 
     def offsets_at(self, rows: NodeRows, tau: float) -> Tensor:
-        """Where Gaussians are beside the centre of the object at a parameter of the curve, ``[n, 3]`` metres in the world."""
+        """Where Gaussians are beside the centre of the object at a parameter of the curve, ``[n, 3]`` metres in the
+        world."""
         weights, turned, _ = self._at(tau)
         return rows.means.detach() @ turned + torch.einsum("j,njc->nc", weights, rows.own["curve"])
 
@@ -175,14 +180,14 @@ class BezierNode(RigidNode):
         return center + (weights[:, None] * self.learnt["trajectory"][0]).sum(0)
 
     def _at(self, tau: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Weights of the control points [4], what turns places (transposed, [3, 3]) and the track's own centre [3], where the rows
-        are; the last few are remembered."""
+        """Weights of the control points [4], what turns places (transposed, [3, 3]) and the track's own centre [3],
+        where the rows are; the last few are remembered."""
         if tau not in self._curves:
             if len(self._curves) > 256:
                 self._curves.clear()
             weights, device = bernstein(np.array(tau)), self.learnt.device
             parts = (weights, np.einsum("j,jab->ba", weights, self.turns), weights @ self.path.control)
-            self._curves[tau] = tuple(torch.from_numpy(np.array(p)).float().to(device) for p in parts)  # type: ignore[assignment]
+            self._curves[tau] = tuple(torch.from_numpy(np.array(p)).float().to(device) for p in parts)
         return self._curves[tau]
 
     def parameters(self) -> Table:
@@ -222,7 +227,7 @@ def distance_change(node: BezierNode, rows: NodeRows, taus: Sequence[float]) -> 
     return (first - second).abs().sum()
 
 
-# bezier ---------------------------------------------------------------------------------------------------------------
+# bezier -------------------------------------------------------------------------------------------
 
 
 LIDAR_WEIGHT, LIDAR_DECAY_STEPS = 1.0, 8000.0
@@ -265,7 +270,8 @@ class BezierRecipe(OwnRecipe):
 
 
 def objects_alone(drawn: DrawnView, channels: Tensor) -> Tensor:
-    """Colour of the objects by themselves and the difference of their opacity from the mask: pixels of a dynamic class in a box."""
+    """Colour of the objects by themselves and the difference of their opacity from the mask: pixels of a dynamic class
+    in a box."""
     model, view = drawn.model, drawn.view
     number_of = [channel for channel, train_id in enumerate(model.classes) if train_id in DYNAMIC_IDS]
     mask = boxes_in_view(model, view.view).to(channels.device, non_blocking=True)
@@ -275,8 +281,8 @@ def objects_alone(drawn: DrawnView, channels: Tensor) -> Tensor:
 
 
 def consistency(drawn: DrawnView) -> Tensor:
-    """Mean over the Gaussians of objects of how much their distance from the centre, at the time of the view, differs from that at
-    another time (drawn from seed and step)."""
+    """Mean over the Gaussians of objects of how much their distance from the centre, at the time of the view, differs
+    from that at another time (drawn from seed and step)."""
     model, time_s = drawn.model, drawn.view.view.time_s
     table, counts = model.table, model.counts()
     other = float(seeds.numpy_rng(drawn.config.seed, drawn.step, "other time").random())
@@ -285,7 +291,12 @@ def consistency(drawn: DrawnView) -> Tensor:
     for node, start, count in zip(model.nodes, starts, counts):
         if isinstance(node, BezierNode) and count and node.keys_around(time_s) is not None:
             part = slice(int(start), int(start) + count)
-            given = NodeRows(table["means"][part], table["quats"][part], table["logits"][part], table["sh_dc"][part],
-                             {"curve": table["curve"][part]})  # fmt: skip
+            given = NodeRows(
+                table["means"][part],
+                table["quats"][part],
+                table["logits"][part],
+                table["sh_dc"][part],
+                {"curve": table["curve"][part]},
+            )
             total, rows = total + distance_change(node, given, (float(node.path.tau_at(time_s)), other)), rows + count
     return total / max(1, rows)

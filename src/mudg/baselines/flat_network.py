@@ -27,7 +27,8 @@ class FlatNetwork:
         return sum((before + 1) * after for before, after in zip(self.widths, self.widths[1:]))
 
     def start(self, generator: torch.Generator, silent: bool = True) -> Tensor:
-        """Starting values ``[1, P]``: uniform for ReLU (He et al. 2015), biases 0; ``silent``: the last layer 0, so that the output is."""
+        """Starting values ``[1, P]``: uniform for ReLU (He et al. 2015), biases 0; ``silent``: the last layer 0, so
+        that the output is."""
         parts = []
         for place, (before, after) in enumerate(zip(self.widths, self.widths[1:])):
             last = silent and place == len(self.widths) - 2

@@ -1,8 +1,9 @@
 """The fit of ``omnire``: OmniRe (Chen et al. 2024) without body models.
 
-Published, and here: rigid nodes for vehicles, nodes deformed by one network with an embedding per object for people and cyclists,
-which begins after a tenth of the run; the weight of LiDAR depth. Left out: SMPL bodies. Different (``docs/baselines.md``): everything
-else is ``street_gaussians``, with its sky, start and densification; the network is small unless asked for.
+Published, and here: rigid nodes for vehicles, nodes deformed by one network with an embedding per object for people and
+cyclists, which begins after a tenth of the run; the weight of LiDAR depth. Left out: SMPL bodies. Different
+(``docs/baselines.md``): everything else is ``street_gaussians``, with its sky, start and densification; the network is
+small unless asked for.
 """
 
 from __future__ import annotations
@@ -27,12 +28,13 @@ from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import start_model
 from mudg.gaussians.views import StoredView, TrainView
 
-# deformed -------------------------------------------------------------------------------------------------------------
+# deformed -----------------------------------------------------------------------------------------
 #
 # People and cyclists that one network deforms (the deformable nodes of OmniRe, Chen et al. 2024).
 #
-# Within its box every Gaussian of such an object moves by ``network(x, t, z)``: its place in the box, the time, and what tells the
-# object from others, an embedding that is learnt. One network serves all objects of a scene; it is a node without Gaussians.
+# Within its box every Gaussian of such an object moves by ``network(x, t, z)``: its place in the box, the time, and
+# what tells the object from others, an embedding that is learnt. One network serves all objects of a scene; it is a
+# node without Gaussians.
 
 
 EMBEDDING: Final = 16
@@ -115,7 +117,8 @@ def network_of(layers: int, width: int) -> FlatNetwork:
 class DeformedNode(RigidNode):
     """A tracked object whose Gaussians also move within its box as a ``DeformationField`` of the same scene says.
 
-    ``instance``: number of its embedding. Without a field (before the scene is put together, or ``resting``) it is rigid.
+    ``instance``: number of its embedding. Without a field (before the scene is put together, or ``resting``) it is
+    rigid.
     """
 
     kind = "deformed"
@@ -175,7 +178,7 @@ class DeformedNode(RigidNode):
         return made
 
 
-# omnire ---------------------------------------------------------------------------------------------------------------
+# omnire -------------------------------------------------------------------------------------------
 
 
 RIGID_SHARE: Final = 0.1

@@ -1,9 +1,10 @@
 """The fit of ``pvg``: Periodic Vibration Gaussians (Chen et al. 2023), a dynamic street without boxes.
 
-Published, and here: the two equations of ``baselines/pvg.py``; temporal smoothing; the losses and weights below; children of
-split Gaussians at other times of their parent's life. Different here (``docs/baselines.md``): a panorama for the sky's cube map,
-starting points with the colours of the photographs, our filling of what LiDAR does not reach, no limits on size that grow with the
-distance, no growing image sizes. Published lengths are those of scenes of `SCENE_UNIT_M`.
+Published, and here: the two equations of ``baselines/pvg.py``; temporal smoothing; the losses and weights below;
+children of split Gaussians at other times of their parent's life. Different here (``docs/baselines.md``): a panorama
+for the sky's cube map, starting points with the colours of the photographs, our filling of what LiDAR does not reach,
+no limits on size that grow with the distance, no growing image sizes. Published lengths are those of scenes of
+`SCENE_UNIT_M`.
 """
 
 from __future__ import annotations
@@ -30,17 +31,19 @@ from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import painted_sky
 from mudg.gaussians.views import StoredView, TrainView
 
-# vibration ------------------------------------------------------------------------------------------------------------
+# vibration ----------------------------------------------------------------------------------------
 #
-# A world without boxes whose Gaussians swing about a point and show for a while (Periodic Vibration Gaussians, Chen et al. 2023).
+# A world without boxes whose Gaussians swing about a point and show for a while (Periodic Vibration Gaussians, Chen et
+# al. 2023).
 #
 # Every Gaussian has a peak time ``tau``, a life span ``beta`` and a velocity ``v``. At the time t, with the cycle l,
 #
 #     mean(t)    = mean + v sin(2 pi (t - tau) / l) l / (2 pi)
 #     opacity(t) = opacity exp(-(t - tau)^2 / (2 beta^2)),   nothing where the factor is at most 0.05
 #
-# What stands still has a long life span and no velocity; what moves is either carried by its velocity or drawn by Gaussians that show
-# one after the other. Times are counted in units of 50 frames (a frame is 0.02), 0 in the middle of the log, as published.
+# What stands still has a long life span and no velocity; what moves is either carried by its velocity or drawn by
+# Gaussians that show one after the other. Times are counted in units of 50 frames (a frame is 0.02), 0 in the middle of
+# the log, as published.
 #
 # Columns: ``tau`` [N], ``log_beta`` [N] (natural logarithm), ``velocity`` [N, 3] metres per unit of time.
 
@@ -59,8 +62,8 @@ class VibrationNode(StaticNode):
     Args:
         name: of the node.
         middle_s: seconds; time 0. frame_s: seconds between frames.
-        early: difference D between the time that is drawn and the time whose state is drawn, in units of time; the state at t - D is
-            carried by D times the average velocity (temporal smoothing, while fitting).
+        early: difference D between the time that is drawn and the time whose state is drawn, in units of time; the
+            state at t - D is carried by D times the average velocity (temporal smoothing, while fitting).
     """
 
     kind = "vibration"
@@ -133,11 +136,12 @@ def starting_columns(count: int, tau: Tensor, duration: float) -> dict[str, Tens
 
 
 def moving_rows(columns: Mapping[str, Tensor], least_beta: float = 0.2) -> Tensor:
-    """Bool[N]: Gaussians that show for a short while only, which draw what moves (published: all with beta at most 0.2)."""
+    """Bool[N]: Gaussians that show for a short while only, which draw what moves (published: all with beta at most
+    0.2)."""
     return columns["log_beta"].detach().exp() <= least_beta
 
 
-# pvg ------------------------------------------------------------------------------------------------------------------
+# pvg ----------------------------------------------------------------------------------------------
 
 
 SMOOTHING_PROBABILITY: Final = 0.5
@@ -186,7 +190,8 @@ class VibrationRecipe(OwnRecipe):
         )
 
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
-        """See ``Recipe``. The velocity is averaged over Gaussians by what they show of themselves at the time (published: over pixels)."""
+        """See ``Recipe``. The velocity is averaged over Gaussians by what they show of themselves at the time
+        (published: over pixels)."""
         render, view = drawn.render, drawn.view
         inverse = losses.inverse_depth(render.depth, render.alpha, SKY_M) * SCENE_UNIT_M
         terms = {
@@ -205,7 +210,8 @@ class VibrationRecipe(OwnRecipe):
 
 
 def mean_velocity(drawn: DrawnView) -> Tensor:
-    """Mean absolute component of the average velocities, in scene units per unit of time, weighted by the opacity of the moment."""
+    """Mean absolute component of the average velocities, in scene units per unit of time, weighted by the opacity of
+    the moment."""
     table, weight = drawn.model.table, drawn.gaussians.opacity.detach()
     speed = average_velocity(table["velocity"], table["log_beta"].exp()).abs().mean(1)
     return (speed * weight).sum() / weight.sum().clamp_min(1e-9) / SCENE_UNIT_M

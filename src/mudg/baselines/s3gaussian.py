@@ -1,9 +1,10 @@
-"""The fit of ``s3gaussian``: S3Gaussian (Huang et al. 2024), a dynamic street without boxes, moved by a field of place and time.
+"""The fit of ``s3gaussian``: S3Gaussian (Huang et al. 2024), a dynamic street without boxes, moved by a field of place
+and time.
 
-Published, and here: the field of ``baselines/s3gaussian.py``, a static first stage, losses and weights below, no sky. Left out: the
-head that imitates features of a vision network. Different (``docs/baselines.md``): changes of colour of the constant band only; planes
-are small unless asked for; the field is asked only for Gaussians near the frustum. Terms are divided by 1.2, since the common
-colour term has weights of sum 1 and the published one L1 + 0.2 (1 - SSIM).
+Published, and here: the field of ``baselines/s3gaussian.py``, a static first stage, losses and weights below, no sky.
+Left out: the head that imitates features of a vision network. Different (``docs/baselines.md``): changes of colour of
+the constant band only; planes are small unless asked for; the field is asked only for Gaussians near the frustum. Terms
+are divided by 1.2, since the common colour term has weights of sum 1 and the published one L1 + 0.2 (1 - SSIM).
 """
 
 from __future__ import annotations
@@ -31,13 +32,14 @@ from mudg.gaussians.schedule import FIELD_STEPS
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.views import StoredView, TrainView
 
-# hexplane -------------------------------------------------------------------------------------------------------------
+# hexplane -----------------------------------------------------------------------------------------
 #
-# A world without boxes whose Gaussians are moved and recoloured by a field of place and time (S3Gaussian, Huang et al. 2024).
+# A world without boxes whose Gaussians are moved and recoloured by a field of place and time (S3Gaussian, Huang et al.
+# 2024).
 #
-# The field lies in six planes (xy, xz, yz and xt, yt, zt) of several sizes. A Gaussian at x, y, z and the time t takes from each the
-# bilinear value at its place; the six values are multiplied, those of the sizes joined. A linear layer and two small networks turn them
-# into a displacement and a change of colour:
+# The field lies in six planes (xy, xz, yz and xt, yt, zt) of several sizes. A Gaussian at x, y, z and the time t takes
+# from each the bilinear value at its place; the six values are multiplied, those of the sizes joined. A linear layer
+# and two small networks turn them into a displacement and a change of colour:
 #
 #     mean(t) = mean + dx(x, y, z, t)        colour(t) = colour + dc(x, y, z, t)
 #
@@ -45,7 +47,8 @@ from mudg.gaussians.views import StoredView, TrainView
 
 
 FRUSTUM_MARGIN: Final = 1.3
-"""A Gaussian may be moved this much further than the edge of the image, as a share of half the image, plus `NEAR_MARGIN_M`."""
+"""A Gaussian may be moved this much further than the edge of the image, as a share of half the image, plus
+`NEAR_MARGIN_M`."""
 NEAR_MARGIN_M: Final = 5.0
 SPACE_START: Final = (0.1, 0.5)
 """Planes of space start between these."""
@@ -66,7 +69,13 @@ class HexPlaneNode(StaticNode):
     kind = "hexplane"
 
     def __init__(
-        self, name: str, low: Sequence[float], high: Sequence[float], sizes: PlaneSizes, learnt: Table, gain: float = 1.0
+        self,
+        name: str,
+        low: Sequence[float],
+        high: Sequence[float],
+        sizes: PlaneSizes,
+        learnt: Table,
+        gain: float = 1.0,
     ) -> None:
         super().__init__(name)
         self.low, self.high = tuple(map(float, low)), tuple(map(float, high))
@@ -87,9 +96,11 @@ class HexPlaneNode(StaticNode):
         least, most = SPACE_START
         generator = seeds.torch_generator(run_seed, 0, "hexplane")
         planes = [
-            torch.ones(shape).flatten()
-            if TIME in axes
-            else torch.rand(shape, generator=generator).flatten() * (most - least) + least
+            (
+                torch.ones(shape).flatten()
+                if TIME in axes
+                else torch.rand(shape, generator=generator).flatten() * (most - least) + least
+            )
             for axes, shape in sizes.shapes
         ]
         node = cls("background", low, high, sizes, Table({"planes": torch.zeros(1, 1)}), gain)
@@ -115,7 +126,8 @@ class HexPlaneNode(StaticNode):
         return self.sizes.planes(self.learnt["planes"][0])
 
     def features(self, places: Tensor) -> Tensor:
-        """What the planes say at places ``[n, 4]``, -1 to 1 along x, y, z, t, times the gain: ``[n, features * levels]``."""
+        """What the planes say at places ``[n, 4]``, -1 to 1 along x, y, z, t, times the gain: ``[n, features *
+        levels]``."""
         return self.gain * look_up(places, self.learnt["planes"][0], self.sizes)
 
     def changes(self, means: Tensor, time_s: float) -> tuple[Tensor, Tensor]:
@@ -173,7 +185,9 @@ class HexPlaneNode(StaticNode):
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> HexPlaneNode:
         """Inverse of ``state``."""
         sizes = PlaneSizes(**{name: int(facts[name]) for name in PlaneSizes.__dataclass_fields__})
-        return cls(str(facts["name"]), facts["low"], facts["high"], sizes, Table.from_state(tensors), float(facts["gain"]))
+        return cls(
+            str(facts["name"]), facts["low"], facts["high"], sizes, Table.from_state(tensors), float(facts["gain"])
+        )
 
 
 def _near_frustum(view: View, means: Tensor) -> Tensor:
@@ -188,14 +202,15 @@ def _near_frustum(view: View, means: Tensor) -> Tensor:
 
 
 def moving_rows(displacement_m: Tensor) -> Tensor:
-    """Bool[N]: Gaussians whose largest displacement component ``[N, 3]`` is above the mean of all (published rule for display)."""
+    """Bool[N]: Gaussians whose largest displacement component ``[N, 3]`` is above the mean of all (published rule for
+    display)."""
     largest = displacement_m.detach().abs().amax(1)
     return largest > largest.mean()
 
 
 def plane_smoothness(node: HexPlaneNode) -> tuple[Tensor, Tensor, Tensor]:
-    """Three scalars, sums over planes: mean squared second differences of the planes of space (both axes) and of time (along the time),
-    and the mean |1 - value| of the planes of time."""
+    """Three scalars, sums over planes: mean squared second differences of the planes of space (both axes) and of time
+    (along the time), and the mean |1 - value| of the planes of time."""
     space = time = flat = node.learnt["planes"].new_zeros(())
     for axes, plane in node.planes():
         if TIME in axes:
@@ -211,7 +226,7 @@ def _bending(plane: Tensor, dim: int) -> Tensor:
     return bent.square().mean() if bent.numel() else bent.sum()
 
 
-# s3gaussian -----------------------------------------------------------------------------------------------------------
+# s3gaussian ---------------------------------------------------------------------------------------
 
 
 STATIC_SHARE: Final = 5 / 55
@@ -223,7 +238,8 @@ SPACE_WEIGHT, TIME_WEIGHT, FLAT_WEIGHT = 1e-4, 0.01, 1e-4
 SIZES: Final = PlaneSizes(features=8, levels=2, space=64, time=25, width=64)
 """Of the planes and networks (published: 32 features, 4 levels)."""
 FRAMES_PER_CELL: Final = 2
-"""Frames of a cell of time (published: 25 cells for 50 frames): what lies between two shown frames must not have one of its own."""
+"""Frames of a cell of time (published: 25 cells for 50 frames): what lies between two shown frames must not have one of
+its own."""
 BOX_MARGIN: Final = 0.02
 """The box of the field is that of the LiDAR points, grown by this share."""
 
@@ -254,7 +270,8 @@ class FieldRecipe(OwnRecipe):
         node = HexPlaneNode.fresh([*(low - margin), first], [*(high + margin), last], sizes, config.seed, gain)
         columns = found.points.columns(classes, config.sh_degree)
         log.info(
-            f"start: {len(found.time_s)} Gaussians, {node.learnt['planes'].numel()} numbers in {sizes.levels} x 6 planes"
+            f"start: {len(found.time_s)} Gaussians, {node.learnt['planes'].numel()} numbers in {sizes.levels} x 6"
+            " planes"
         )
         owner = torch.zeros(len(found.time_s), dtype=torch.int32)
         return SceneModel(

@@ -1,8 +1,9 @@
-"""Starting points of methods without boxes: LiDAR points where and when they were measured, coloured by the photographs of that time.
+"""Starting points of methods without boxes: LiDAR points where and when they were measured, coloured by the photographs
+of that time.
 
-Nothing here knows tracked boxes or the fused cloud (whose dynamic points lie in boxes): a point of a moving car stays where its sweep
-met it. Colours come from training photographs at most half a frame from the sweep, so that a moving point has the colour of its
-own moment; points that none of these shows are left out.
+Nothing here knows tracked boxes or the fused cloud (whose dynamic points lie in boxes): a point of a moving car stays
+where its sweep met it. Colours come from training photographs at most half a frame from the sweep, so that a moving
+point has the colour of its own moment; points that none of these shows are left out.
 """
 
 from __future__ import annotations
@@ -35,30 +36,32 @@ LARGEST_M = 150.0
 
 @dataclass(frozen=True, eq=False)
 class TimedPoints:
-    """Points and when they were measured, f64[N] seconds; NaN: no time belongs to the point (what LiDAR did not reach)."""
+    """Points and when they were measured, f64[N] seconds; NaN: no time belongs to the point (what LiDAR did not
+    reach)."""
 
     points: StartPoints
     time_s: NDArray[np.float64]
 
 
 def timed_points(
-    scene: Scene,
-    views: Sequence[StoredView],
-    classes: tuple[int, ...],
-    config: FitConfig,
-    colors: CameraColors,
+    scene: Scene, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig, colors: CameraColors
 ) -> TimedPoints:
-    """Starting points of a log, thinned to ``config.start.gaussians``, and what LiDAR did not reach (as in ``gaussians/start.py``).
+    """Starting points of a log, thinned to ``config.start.gaussians``, and what LiDAR did not reach (as in
+    ``gaussians/start.py``).
 
-    Half of them are one per cube of space, half one per cube and every few frames, so that what moves has points all along its way.
+    Half of them are one per cube of space, half one per cube and every few frames, so that what moves has points all
+    along its way.
 
     Raises:
         InputError: no photograph shows any LiDAR point.
     """
     xyz, rgb, semantics, time_s = _measured(scene, views, classes, colors)
     if len(xyz) == 0:
-        raise InputError("no LiDAR point is seen by a training photograph of its time", where=scene.root,
-                         remedy="check the LiDAR of the scene and --cameras")  # fmt: skip
+        raise InputError(
+            "no LiDAR point is seen by a training photograph of its time",
+            where=scene.root,
+            remedy="check the LiDAR of the scene and --cameras",
+        )
     centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
     half = replace(config, start=replace(config.start, gaussians=max(50, config.start.gaussians // 2)))
     parts = [thinned(xyz, centers, half), *_by_moment(xyz, time_s, scene, half)]

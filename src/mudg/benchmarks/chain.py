@@ -1,9 +1,12 @@
-"""The steps of a scene that benchmarks of complete methods share, each in a folder that is verified and reused: what ``mudg run`` does, a
-folder per method.
+"""The steps of a scene that benchmarks of complete methods share, each in a folder that is verified and reused: what
+``mudg run`` does, a folder per method.
 
-OUT/fuse  OUT/fit/<row>   every fit       OUT/start/<row>   what a variant with other settings of the first fit goes on with
-OUT/render/<row>  OUT/nearest_fill  OUT/exact   views to score; those of the diffusion model lie where the benchmark puts them
-OUT/repair/<step>  repaired renders on the way to the places of generated views (difix); OUT/start/difix-<step>   the fit that has seen them
+OUT/fuse  OUT/fit/<row>   every fit       OUT/start/<row>   what a variant with other settings of the first fit goes on
+          with
+OUT/render/<row>  OUT/nearest_fill  OUT/exact
+views to score; those of the diffusion model lie where the benchmark puts them
+OUT/repair/<step>  repaired renders on the way to the places of generated views (difix); OUT/start/difix-<step>
+the fit that has seen them
 """
 
 from __future__ import annotations
@@ -43,8 +46,8 @@ class Chain:
     """The steps of one scene.
 
     Args:
-        out: folder of all. scene: what methods see. config: its settings of steps, as ``mudg run`` takes them. overwrite: replace what
-            other settings left there.
+        out: folder of all. scene: what methods see. config: its settings of steps, as ``mudg run`` takes them.
+            overwrite: replace what other settings left there.
         generator: settings of generated views that fits learn from, whose places are those of repaired ones.
     """
 
@@ -80,7 +83,8 @@ class Chain:
         """Views of a row's fit.
 
         Args:
-            virtual: views that it learns from, if its method learns from such. drawn: which views. scene: with their places, if other.
+            virtual: views that it learns from, if its method learns from such. drawn: which views. scene: with their
+                places, if other.
         """
         model, out = self.fitted(row, virtual), self.out / "render" / row.name
         return self.run(RenderViews(scene=scene or self.scene, model=model, out=out, settings=drawn))
@@ -92,8 +96,8 @@ class Chain:
         return self._fit(fits_of(usual_fit(self.config))[0], self.out / "fit" / WITHOUT_DIFFUSION)
 
     def fitted(self, row: Row, virtual: Sequence[Path] = ()) -> Path:
-        """The fit of a row. Where its method learns from ``virtual`` views, it goes on with a fit on recorded views of the same settings:
-        the first one, if these are the usual ones but for virtual views."""
+        """The fit of a row. Where its method learns from ``virtual`` views, it goes on with a fit on recorded views of
+        the same settings: the first one, if these are the usual ones but for virtual views."""
         out, settings, usual = self.out / "fit" / row.name, row.fit or usual_fit(self.config), usual_fit(self.config)
         if row.name == LONGER:
             plain, guided = fits_of(usual)
@@ -110,9 +114,9 @@ class Chain:
         return self._fit(guided, out, virtual, begun)
 
     def _repaired(self, name: str, settings: FitConfig) -> Path:
-        """Step by step towards the places of generated views: render there, repair, and fit under all that was repaired so far. Every
-        fit goes on with the first one. Where steps pass the same place (2 m is the end of the way to 2 m, and two thirds of that to
-        3 m), the newest views count."""
+        """Step by step towards the places of generated views: render there, repair, and fit under all that was repaired
+        so far. Every fit goes on with the first one. Where steps pass the same place (2 m is the end of the way to 2 m,
+        and two thirds of that to 3 m), the newest views count."""
         model, seen = self.first(), {}
         settings = replace(fits_of(settings)[1], method=settings.method)
         for number in range(1, REPAIR_STEPS + 1):
@@ -125,18 +129,29 @@ class Chain:
         return model
 
     def _fit(self, settings: FitConfig, out: Path, virtual: Sequence[Path] = (), begun: Path | None = None) -> Path:
-        return self.run(Fit(
-            scene=self.scene, fused=self.fused, observations=tuple(virtual), start_from=begun, out=out, settings=settings
-        ))  # fmt: skip
+        return self.run(
+            Fit(
+                scene=self.scene,
+                fused=self.fused,
+                observations=tuple(virtual),
+                start_from=begun,
+                out=out,
+                settings=settings,
+            )
+        )
 
 
 def repair_settings(generator: SynthesizeConfig, share: float) -> SynthesizeConfig:
-    """How renders are repaired, in one pass from nothing that was measured, after a share of the way to the places of generated views.
-    Paths with a name begin at the end of the way."""
+    """How renders are repaired, in one pass from nothing that was measured, after a share of the way to the places of
+    generated views. Paths with a name begin at the end of the way."""
     shifts = tuple(round(share * shift, 4) for shift in generator.shifts_m if shift)
     return replace(
-        generator, condition="repair", steps=1, shifts_m=shifts, paths=generator.paths if share == 1 or not shifts else (),
-    )  # fmt: skip
+        generator,
+        condition="repair",
+        steps=1,
+        shifts_m=shifts,
+        paths=generator.paths if share == 1 or not shifts else (),
+    )
 
 
 class FillViews(Output):
@@ -179,5 +194,9 @@ class ExactViews(Output):
             with ObservationWriter(work.path / name, name, EXACT) as writer:
                 for index in range(len(views)):
                     seen = views[index]
-                    writer.skip(seen.view) if index < writer.done else writer.add(replace(seen, kind="virtual", source=EXACT))
+                    (
+                        writer.skip(seen.view)
+                        if index < writer.done
+                        else writer.add(replace(seen, kind="virtual", source=EXACT))
+                    )
         return self.key_settings()

@@ -1,7 +1,8 @@
 """The columns of ``mudg bench real``, and a method's values under a protocol.
 
-A column adds up arrays of numbers over the views of a place (a camera, or a distance beside the path); its value is read from the sum.
-A method's value on a log is the mean over its places; or, under a protocol that pools, the value of the sum over all places.
+A column adds up arrays of numbers over the views of a place (a camera, or a distance beside the path); its value is
+read from the sum. A method's value on a log is the mean over its places; or, under a protocol that pools, the value of
+the sum over all places.
 """
 
 from __future__ import annotations
@@ -49,9 +50,9 @@ Sums = Mapping[str, Sum]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sight:
-    """A method's view beside its truth: colour f32[3, H, W] as the target's camera would record it, depth f32[1, H, W] metres (80 m
-    where there is none), classes i64[H, W] or None; the photograph f32[3, H, W] or None; ``distance``: perceptual, or None at a view
-    where it is not computed."""
+    """A method's view beside its truth: colour f32[3, H, W] as the target's camera would record it, depth f32[1, H, W]
+    metres (80 m where there is none), classes i64[H, W] or None; the photograph f32[3, H, W] or None; ``distance``:
+    perceptual, or None at a view where it is not computed."""
 
     target: Target
     rgb: Tensor
@@ -61,7 +62,8 @@ class Sight:
     distance: Callable[[metrics.Pair], float | None] | None
 
     def mask(self, name: str) -> Tensor | None:
-        """A mask bool[1, H, W] by the name of its map; ``upper``: the upper third of the image. None where the truth has no such map."""
+        """A mask bool[1, H, W] by the name of its map; ``upper``: the upper third of the image. None where the truth
+        has no such map."""
         if name == "upper":
             height, width = self.rgb.shape[-2:]
             return (torch.arange(height) < height // 3)[None, :, None].expand(1, height, width)
@@ -133,7 +135,8 @@ def _accuracy(total: Sum) -> float | None:
 
 
 def _photo(compare: Callable[[Tensor, Tensor, Tensor | None], float], name: str = "") -> Measure:
-    """A number per view from colours, on all pixels or those of a mask that covers at least a thousandth of the image."""
+    """A number per view from colours, on all pixels or those of a mask that covers at least a thousandth of the
+    image."""
 
     def of(sight: Sight) -> Sum | None:
         mask = sight.mask(name) if name else None
@@ -226,7 +229,9 @@ def _depth_columns(part: str) -> dict[str, Column]:
 def _point_columns(part: str) -> dict[str, Column]:
     return {
         f"point_psnr_{part}": Column(f"PSNR at points, {part}", 2, _point_color(torch.square, part), _decibels),
-        f"point_abs_{part}": Column(f"colour error at points, {part}", 4, _point_color(torch.abs, part), _mean, ratio=True),
+        f"point_abs_{part}": Column(
+            f"colour error at points, {part}", 4, _point_color(torch.abs, part), _mean, ratio=True
+        ),
     }
 
 
@@ -269,11 +274,22 @@ class ScoreTargets(Output):
     """Of the network behind the perceptual distance."""
 
     def key_settings(self) -> dict[str, Any]:
-        return {"protocol": self.protocol.name, "columns": list(self.protocol.columns), "perceptual_views": PERCEPTUAL_VIEWS}
+        return {
+            "protocol": self.protocol.name,
+            "columns": list(self.protocol.columns),
+            "perceptual_views": PERCEPTUAL_VIEWS,
+        }
 
     def make(self, work: RunDir) -> dict[str, Any]:
-        scene, targets, finder, protocol = read_scene(self.log), read_targets(self.truth), ViewFinder(self.views), self.protocol
-        sampled = _perceptual_views(targets) if any(name.startswith("perceptual") for name in protocol.columns) else set()
+        scene, targets, finder, protocol = (
+            read_scene(self.log),
+            read_targets(self.truth),
+            ViewFinder(self.views),
+            self.protocol,
+        )
+        sampled = (
+            _perceptual_views(targets) if any(name.startswith("perceptual") for name in protocol.columns) else set()
+        )
         features = None
         if sampled:
             network = choose_device(self.device, "networks of the scores")
@@ -282,7 +298,9 @@ class ScoreTargets(Output):
         with log.task(f"score {protocol.name}", len(targets)) as bar:
             for number in range(len(targets)):
                 target = targets.load(number, scene)
-                sight = sight_of(target, finder.at(target.view), scene, protocol, features if number in sampled else None)
+                sight = sight_of(
+                    target, finder.at(target.view), scene, protocol, features if number in sampled else None
+                )
                 _add(sums.setdefault(target.place, {}), {name: COLUMNS[name].of(sight) for name in protocol.columns})
                 if number in targets.pictures:
                     picture = jpeg_bytes(_picture_of(sight, protocol), quality=80)
@@ -329,13 +347,19 @@ def mean_values(rows: list[dict[str, float | str]], columns: tuple[str, ...]) ->
 
 
 def sight_of(
-    target: Target, seen: Observation, scene: Scene, protocol: Protocol, distance: Callable[[metrics.Pair], float | None] | None
+    target: Target,
+    seen: Observation,
+    scene: Scene,
+    protocol: Protocol,
+    distance: Callable[[metrics.Pair], float | None] | None,
 ) -> Sight:
     """A method's view brought to the size and the colours of its target."""
     height, width = target.view.camera.height, target.view.camera.width
     rgb = resize_rgb(seen.rgb, height, width)
     if target.color_map.pairs:
-        gain, offset = (torch.tensor(values).view(3, 1, 1) for values in (target.color_map.gain, target.color_map.offset))
+        gain, offset = (
+            torch.tensor(values).view(3, 1, 1) for values in (target.color_map.gain, target.color_map.offset)
+        )
         rgb = (rgb * gain + offset).clamp(0, 1)
     depth = None
     if seen.depth is not None:
@@ -360,8 +384,11 @@ class ViewFinder:
                 same = own.camera.name == view.camera.name and abs(own.time_s - view.time_s) <= SAME_TIME_S
                 if same and apart_m(own, view) <= SAME_PLACE_M:
                     return views[index]
-        raise InputError("a method lacks a view that is scored", where=str(self._folder),
-                         expected=f"camera {view.camera.name} at {view.time_s:.3f} s")  # fmt: skip
+        raise InputError(
+            "a method lacks a view that is scored",
+            where=str(self._folder),
+            expected=f"camera {view.camera.name} at {view.time_s:.3f} s",
+        )
 
 
 def _picture_of(sight: Sight, protocol: Protocol) -> NDArray[np.uint8]:

@@ -1,26 +1,29 @@
-"""``mudg bench edit``: edits of fitted scenes against exact truth, the generated city drawn again with the object elsewhere or gone.
+"""``mudg bench edit``: edits of fitted scenes against exact truth, the generated city drawn again with the object
+elsewhere or gone.
 
-Of every city the vehicle that shows the most pixels is edited in a scene that was fitted to the city as it was. Truth is the same city
-with that vehicle on the edited path (``CityWorld.rearranged``), shadows included. Over frames of the recorded path:
+Of every city the vehicle that shows the most pixels is edited in a scene that was fitted to the city as it was. Truth
+is the same city with that vehicle on the edited path (``CityWorld.rearranged``), shadows included. Over frames of the
+recorded path:
 
-    inside     PSNR in the pixels that the edit changes in the truth (by more than 4/255), against the edited truth; and of the unedited
-               render in the same pixels, against the unedited truth: what the fit can do there at all
+    inside     PSNR in the pixels that the edit changes in the truth (by more than 4/255), against the edited truth; and
+               of the unedited render in the same pixels, against the unedited truth: what the fit can do there at all
     vehicle    PSNR in all pixels of the vehicle, with the edit and without
     uncovered  PSNR in those of the changed pixels that show no vehicle any more: what stood behind it, and its shadow
     outside    share of the other pixels that the edit changes in the render by more than 1/255
-    overlap    intersection over union of the vehicle's pixels in the truth and in the render, where its Gaussians make more than half;
-               and the same without the edit
+    overlap    intersection over union of the vehicle's pixels in the truth and in the render, where its Gaussians make
+               more than half; and the same without the edit
     perceptual  perceptual distance in the changed pixels (features of the shipped codec)
 
-With several cities the vehicle of each is also replaced by that of the next one, which knows nothing of this city but what
-`matched_light` tells. Truth is the city with a vehicle of that shape, size and paint on the path of its own, in its own light
-(``CityWorld.recast``). Beside it stands what the fit makes of its own vehicle, which was recorded there. light: true mean light of the
-vehicle over that of the render, in linear light: 1 = as bright as it should be.
+With several cities the vehicle of each is also replaced by that of the next one, which knows nothing of this city but
+what `matched_light` tells. Truth is the city with a vehicle of that shape, size and paint on the path of its own, in
+its own light (``CityWorld.recast``). Beside it stands what the fit makes of its own vehicle, which was recorded there.
+light: true mean light of the vehicle over that of the render, in linear light: 1 = as bright as it should be.
 
-With a diffusion model (``--harmonize``) three edits are made in three ways: the fitted scene with the edits; its frames with the touched
-pixels repaired by the model (``editing/harmonised.py``); renders of a fit that goes on for as many steps again on an edited drive
-whose images are such frames. Besides a fit of the same city in which the object was never there: what a scene of this size can show at
-all. `insert` takes the object away and puts its own asset in 3 m ahead, so that the truth is that of the move.
+With a diffusion model (``--harmonize``) three edits are made in three ways: the fitted scene with the edits; its frames
+with the touched pixels repaired by the model (``editing/harmonised.py``); renders of a fit that goes on for as many
+steps again on an edited drive whose images are such frames. Besides a fit of the same city in which the object was
+never there: what a scene of this size can show at all. `insert` takes the object away and puts its own asset in 3 m
+ahead, so that the truth is that of the move.
 """
 
 from __future__ import annotations
@@ -115,8 +118,8 @@ class EditCase:
 
 
 def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-    """The edits of fitted scenes, vehicles of other cities, and, if asked for, what a diffusion model adds; numbers and tables. Cities that
-    an interrupted run finished are kept."""
+    """The edits of fitted scenes, vehicles of other cities, and, if asked for, what a diffusion model adds; numbers and
+    tables. Cities that an interrupted run finished are kept."""
     names, cases = bench_poses.LISTS[config.cities][: config.count], {}
 
     def case(city: int) -> EditCase:
@@ -133,7 +136,9 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
                 bar.advance()
         return found
 
-    edited = rows("editing", {"edits": lambda city: [_edited_row(case(city), name, text) for name, text in EDITS.items()]})
+    edited = rows(
+        "editing", {"edits": lambda city: [_edited_row(case(city), name, text) for name, text in EDITS.items()]}
+    )
     first = dict.fromkeys(("edit", "cities", "outside"))  # the order of these in bench.json
     means = [{**first, **row} for row in EDITED.summary(edited)]
     result = {"cities": list(names), "iterations": config.pose_iterations, "rows": edited, "summary": means}
@@ -141,14 +146,21 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     text = replace(EDITED, title=title).table(means)
     if len(names) > 1:
         giver = dict(zip(names, [*names[1:], *names[:1]], strict=True))
-        replaced = rows("inserting vehicles of other cities", {"insert": lambda city: _replaced_rows(case(city), case(giver[city]), out)})
+        replaced = rows(
+            "inserting vehicles of other cities",
+            {"insert": lambda city: _replaced_rows(case(city), case(giver[city]), out)},
+        )
         result["insert"] = {"rows": replaced, "summary": REPLACED.summary(replaced)}
         text += REPLACED.table(result["insert"]["summary"])
     if config.harmonize:
         parts = {f"{edit.replace(' ', '_')}_diffusion": edit for edit in REPAIRED_EDITS}
-        repaired = rows("editing with diffusion", {
-            name: lambda city, edit=edit: _repaired_rows(config, case(city), edit, out) for name, edit in parts.items()
-        })  # fmt: skip
+        repaired = rows(
+            "editing with diffusion",
+            {
+                name: lambda city, edit=edit: _repaired_rows(config, case(city), edit, out)
+                for name, edit in parts.items()
+            },
+        )
         result["diffusion"] = {"rows": repaired, "summary": REPAIRED.summary(repaired)}
         text += REPAIRED.table(result["diffusion"]["summary"])
     return result, text
@@ -169,7 +181,9 @@ def most_visible(scene: Scene, model: SceneModel) -> str:
     Raises:
         InputError: the city has none.
     """
-    pixels = np.sum([np.bincount(read_label(scene, frame, "instance").ravel(), minlength=4096) for frame in scene.frames], 0)
+    pixels = np.sum(
+        [np.bincount(read_label(scene, frame, "instance").ravel(), minlength=4096) for frame in scene.frames], 0
+    )
     names = [name for name in model.node_names() if name.startswith(("car", "truck", "bus"))]
     if not names:
         raise InputError("no vehicle moves in this city", where=scene.id)
@@ -204,17 +218,23 @@ def city_keys(motion: Motion, height_m: float) -> NDArray[np.float64]:
 def _compared(
     case: EditCase, truth: CityWorld, edited: Draw, unedited: Draw, models: tuple[SceneModel, SceneModel] | None = None
 ) -> dict[str, Any]:
-    """Scores of one way to make the edited frames, beside the fit without the edit; with both ``models`` also the overlap of the vehicle,
-    without them the perceptual distance."""
+    """Scores of one way to make the edited frames, beside the fit without the edit; with both ``models`` also the
+    overlap of the vehicle, without them the perceptual distance."""
     errors: dict[str, list[NDArray[np.float32]]] = {}
-    outside, distances, counts = [], [], np.zeros((2, 2), np.int64)  # with and without the edit: pixels in both, pixels in either
+    # with and without the edit: pixels in both, pixels in either
+    outside, distances, counts = [], [], np.zeros((2, 2), np.int64)
     for frame in case.scene.frames[::EVERY_FRAMES]:
         now, then = truth.render(frame.view), case.world.render(frame.view)
         made, usual = (draw(frame.view).permute(1, 2, 0).numpy() for draw in (edited, unedited))
         mask = np.abs(now.rgb - then.rgb).max(-1) > CHANGED
         new, old, mine = made - now.rgb, usual - then.rgb, now.instance == case.instance
-        parts = {"inside": new[mask], "inside_before": old[mask], "vehicle": new[mine],
-                 "vehicle_before": old[then.instance == case.instance], "uncovered": new[mask & ~mine]}  # fmt: skip
+        parts = {
+            "inside": new[mask],
+            "inside_before": old[mask],
+            "vehicle": new[mine],
+            "vehicle_before": old[then.instance == case.instance],
+            "uncovered": new[mask & ~mine],
+        }
         for place, part in parts.items():
             errors.setdefault(place, []).append(part)
         far = np.logical_not(ndimage.binary_dilation(mask, iterations=NEARBY_PX))
@@ -227,7 +247,11 @@ def _compared(
     psnr = {place: psnr_in(found) for place, found in errors.items()}
     away = float(np.concatenate(outside).mean())
     if models is None:
-        return {**{place: psnr[place] for place in ("inside", "vehicle", "uncovered")}, "outside": away, "perceptual": _mean(distances)}
+        return {
+            **{place: psnr[place] for place in ("inside", "vehicle", "uncovered")},
+            "outside": away,
+            "perceptual": _mean(distances),
+        }
     overlaps = [float(a / b) if b else None for a, b in counts]
     pixels = int(sum(map(len, errors["inside"])))
     return {"pixels": pixels, **psnr, "outside": away, "overlap": overlaps[0], "overlap_before": overlaps[1]}
@@ -275,8 +299,8 @@ def _mean(values: Iterable[float | None]) -> float | None:
 
 @dataclass(frozen=True)
 class Part:
-    """A part of the benchmark: what its rows are grouped by, with values in order, the title and headings of its table, and
-    its numbers as text. A city counts where the first of ``numbers`` exists."""
+    """A part of the benchmark: what its rows are grouped by, with values in order, the title and headings of its table,
+    and its numbers as text. A city counts where the first of ``numbers`` exists."""
 
     title: str
     heads: tuple[str, ...]
@@ -309,7 +333,17 @@ class Part:
 _PIXELS: Final = ("inside", "inside_before", "vehicle", "vehicle_before", "uncovered")
 EDITED: Final = Part(
     "# Edits of {cities} fitted cities ({iterations} steps) against the cities drawn again",
-    ("edit", "changed pixels [dB]", "unedited", "vehicle [dB]", "unedited", "uncovered [dB]", "outside changed", "overlap", "unedited"),
+    (
+        "edit",
+        "changed pixels [dB]",
+        "unedited",
+        "vehicle [dB]",
+        "unedited",
+        "uncovered [dB]",
+        "outside changed",
+        "overlap",
+        "unedited",
+    ),
     {"edit": tuple(EDITS)},
     {**dict.fromkeys(_PIXELS, "{:.2f}"), "outside": "{:.2%}", "overlap": "{:.2f}", "overlap_before": "{:.2f}"},
 )
@@ -317,9 +351,15 @@ REPLACED: Final = Part(
     "\n## Vehicles of other cities",
     ("inserted", "vehicle [dB]", "recorded there", "perceptual", "recorded there", "ratio", "light off by"),
     {"way": tuple(LIGHTS)},
-    {"psnr": "{:.2f}", "psnr_recorded": "{:.2f}", "perceptual": "{:.4f}", "perceptual_recorded": "{:.4f}", "ratio": "{:.1f}x",
-     "light": "{:.2f}x"},
-)  # fmt: skip
+    {
+        "psnr": "{:.2f}",
+        "psnr_recorded": "{:.2f}",
+        "perceptual": "{:.4f}",
+        "perceptual_recorded": "{:.4f}",
+        "ratio": "{:.1f}x",
+        "light": "{:.2f}x",
+    },
+)
 REPAIRED: Final = Part(
     "\n## With a diffusion model",
     ("edit", "frames", "changed pixels [dB]", "vehicle [dB]", "uncovered [dB]", "perceptual", "outside changed"),
@@ -363,7 +403,9 @@ def vehicle_scores(made: Sequence[Seen], recorded: Sequence[Seen]) -> dict[str, 
     for end, seen in (("", made), ("_recorded", recorded)):
         found["psnr" + end] = psnr_in([(image - true)[mask] for image, true, mask in seen])
         found["perceptual" + end] = _mean(distance_in(image, true, mask) for image, true, mask in seen)
-    light = [np.concatenate([linear_of(one[which][one[2]]) for one in made]).mean() for which in (0, 1)] if made else None
+    light = (
+        [np.concatenate([linear_of(one[which][one[2]]) for one in made]).mean() for which in (0, 1)] if made else None
+    )
     return {**found, "light": None if light is None else float(light[1] / light[0])}
 
 
@@ -375,7 +417,9 @@ def _repaired_rows(config: BenchConfig, case: EditCase, name: str, out: Path) ->
     script = parse_edits(_script(case, REPAIRED_EDITS[name], out), "bench")
     drive = carry_out(script, case.model, case.scene, bench_poses.cloud_of(case.scene))
     edited, truth = drive.model(case.model), _true_city(case, drive, "new" if name == "insert" else case.name)
-    settings = EditConfig(harmonize=HarmonizeConfig(on=True, model=config.model, seed=config.seed), device=config.device)
+    settings = EditConfig(
+        harmonize=HarmonizeConfig(on=True, model=config.model, seed=config.seed), device=config.device
+    )
     images = repairing(EditedImages(case.model, edited, settings, drive.plan.moves_ego), drive, case.scene)
     frames: dict[float, Observation] = {}
     for frame in case.scene.frames:
@@ -397,17 +441,25 @@ def _script(case: EditCase, text: str, out: Path) -> str:
         moved = carry_out(parse_edits(MOVE.replace("ID", case.name), "move"), case.model, case.scene)
         motion = moved.plan.after.actors[case.name].motion
         yaws = np.degrees(np.unwrap(np.arctan2(motion.poses[:, 1, 0], motion.poses[:, 0, 0])))
-        path = [[round(float(x), 4) for x in row] for row in np.column_stack([motion.times_s, motion.poses[:, :2, 3], yaws])]
+        path = [
+            [round(float(x), 4) for x in row] for row in np.column_stack([motion.times_s, motion.poses[:, :2, 3], yaws])
+        ]
         text = text.replace("PATH", str(path)).replace("ASSET", str(asset))
     return text.replace("[ID]", f"[{case.name}]").replace("id: ID", f"id: {case.name}")
 
 
 def _refitted(config: BenchConfig, case: EditCase, drive: EditedDrive, images: EditedImages, out: Path) -> SceneModel:
-    """The edited fit after as many steps again on the repaired images; as `mudg fit --start-from` on an edited run does it."""
-    if not (out / "scene" / "scene.json").is_file() and drive.scene is not None and drive.cloud is not None:  # both were given
+    """The edited fit after as many steps again on the repaired images; as `mudg fit --start-from` on an edited run does
+    it."""
+    # both were given
+    if not (out / "scene" / "scene.json").is_file() and drive.scene is not None and drive.cloud is not None:
         write_edited_scene(case.scene, DriveChange(drive.plan, drive.scene, drive.cloud), images, out / "scene")
     save_model(images.after, out / "start")
-    scene, start, settings = read_scene(out / "scene"), StartFit(out / "start", ""), bench_poses.fit_settings(config, "fixed")
+    scene, start, settings = (
+        read_scene(out / "scene"),
+        StartFit(out / "start", ""),
+        bench_poses.fit_settings(config, "fixed"),
+    )
     views, classes = fit.recorded_views(settings, scene, None, start)
     state = fit.continued_state(whole_run(settings), start, views, classes)
     return bench_poses.optimised(state, whole_run(settings), out / "fit").model

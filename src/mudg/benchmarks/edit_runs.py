@@ -1,17 +1,23 @@
 """``mudg bench edit RUN ...``: edits of recorded drives, of which no truth exists, by measures that need none.
 
-On every finished ``mudg run``, seen by its front camera on the recorded path, the moving vehicle ahead that shows the most pixels is taken
-away and moved, a vehicle of the next run is put in, and fog and dusk come. Every render is compared with that of the unedited fit:
+On every finished ``mudg run``, seen by its front camera on the recorded path, the moving vehicle ahead that shows the
+most pixels is taken away and moved, a vehicle of the next run is put in, and fog and dusk come. Every render is
+compared with that of the unedited fit:
 
-    warp       mean absolute colour difference, [0, 1], of a surface between neighbouring frames, carried by the depth and the poses of
-               the rendered scene (the edited vehicle by its path); lower is steadier. Beside it that of the unedited video
-    outside    share of the pixels away from the edit that change by more than 1/255, [0, 1]; lower is better (not for weather and light)
-    structure  correlation of luminance gradients with the unedited render, [-1, 1]; higher is better (weather and light alone)
-    lidar      AbsRel, 0 and up, of rendered depth at the LiDAR points of the moment away from the edit, with the edit and without
-    uncovered  AbsRel in the pixels that showed the vehicle and do not any more, at static points of the sweeps around; lower is better.
-               PSNR, dB, of the render's colours there against those that recorded frames show at these points when neither the vehicle
-               nor its shadow is there; higher is better
-    overlap    intersection over union of the vehicle's pixels with the outline of its box, [0, 1], at the new place and at the old one
+    warp       mean absolute colour difference, [0, 1], of a surface between neighbouring frames, carried by the depth
+               and the poses of the rendered scene (the edited vehicle by its path); lower is steadier. Beside it that
+               of the unedited video
+    outside    share of the pixels away from the edit that change by more than 1/255, [0, 1]; lower is better (not for
+               weather and light)
+    structure  correlation of luminance gradients with the unedited render, [-1, 1]; higher is better (weather and light
+               alone)
+    lidar      AbsRel, 0 and up, of rendered depth at the LiDAR points of the moment away from the edit, with the edit
+               and without
+    uncovered  AbsRel in the pixels that showed the vehicle and do not any more, at static points of the sweeps around;
+               lower is better. PSNR, dB, of the render's colours there against those that recorded frames show at these
+               points when neither the vehicle nor its shadow is there; higher is better
+    overlap    intersection over union of the vehicle's pixels with the outline of its box, [0, 1], at the new place and
+               at the old one
     collisions, warnings   numbers of what ``mudg edit`` reports
 
 OUT/bench.json  OUT/bench.md  OUT/page.html  OUT/rows/  OUT/pictures/  OUT/assets/ the vehicles that were put in
@@ -62,9 +68,10 @@ from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_image, read_scene
 from mudg.scoring.truth import LogPoints
 
-# edit runs measure ----------------------------------------------------------------------------------------------------
+# edit runs measure --------------------------------------------------------------------------------
 #
-# One edit of a recorded drive, measured against the unedited fit (see ``benchmarks/edit_runs.py`` for what the numbers are).
+# One edit of a recorded drive, measured against the unedited fit (see ``benchmarks/edit_runs.py`` for what the numbers
+# are).
 
 
 AROUND_SWEEPS: Final = 12
@@ -156,8 +163,8 @@ def _carrier(seen: Observation) -> flicker.TrueFrame:
 
 @dataclass(slots=True)
 class Sums:
-    """What is pooled over frames: pixels away from the edit and those of them that changed; correlations; errors of colours of uncovered
-    points; depth errors by name."""
+    """What is pooled over frames: pixels away from the edit and those of them that changed; correlations; errors of
+    colours of uncovered points; depth errors by name."""
 
     away: int = 0
     changed: int = 0
@@ -166,7 +173,8 @@ class Sums:
     depth: dict[str, metrics.DepthError] = field(default_factory=dict)
 
     def add_depth(self, name: str, seen: Observation, truth: NDArray[np.float32], where: NDArray[np.bool_]) -> None:
-        """Relative error of rendered depth at LiDAR points; where there is no depth, it counts as the farthest that is compared."""
+        """Relative error of rendered depth at LiDAR points; where there is no depth, it counts as the farthest that is
+        compared."""
         if seen.depth is None:
             return
         made = torch.nan_to_num(seen.depth, DEPTH_LIMIT_M, DEPTH_LIMIT_M, DEPTH_LIMIT_M)
@@ -200,7 +208,9 @@ def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> d
         (old, stood), (new, stands) = usual.add(frame.view), edited.add(frame.view)
         touched, freed = _regions(drive.plan, frame.view, stood, stands)
         if weather:
-            sums.structure += [value for value in [view_metrics.gradient_correlation(new.rgb, old.rgb)] if value is not None]
+            sums.structure += [
+                value for value in [view_metrics.gradient_correlation(new.rgb, old.rgb)] if value is not None
+            ]
         else:
             sums.away += int((~touched).sum())
             sums.changed += int((view_metrics.changed_pixels(new.rgb, old.rgb) & ~touched).sum())
@@ -209,13 +219,20 @@ def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> d
             shown(number, old, new)
     kinds = [note["kind"] for note in drive.notes]
     return {
-        "warp": edited.warp, "warp_before": usual.warp, "outside": sums.changed / sums.away if sums.away else None,
+        "warp": edited.warp,
+        "warp_before": usual.warp,
+        "outside": sums.changed / sums.away if sums.away else None,
         "structure": float(np.mean(sums.structure)) if sums.structure else None,
-        "lidar": sums.depth_of("after"), "lidar_before": sums.depth_of("before"), "uncovered": sums.depth_of("uncovered"),
+        "lidar": sums.depth_of("after"),
+        "lidar_before": sums.depth_of("before"),
+        "uncovered": sums.depth_of("uncovered"),
         "uncovered_psnr": sums.uncovered_psnr,
-        "overlap": edited.overlap, "overlap_before": usual.overlap,
-        "collisions": kinds.count("collision"), "warnings": len(kinds), "notes": [note["text"] for note in drive.notes],
-    }  # fmt: skip
+        "overlap": edited.overlap,
+        "overlap_before": usual.overlap,
+        "collisions": kinds.count("collision"),
+        "warnings": len(kinds),
+        "notes": [note["text"] for note in drive.notes],
+    }
 
 
 def _videos(case: RunCase, drive: EditedDrive) -> tuple[Video, Video, bool]:
@@ -247,17 +264,21 @@ def drawer(model: SceneModel) -> Drawer:
 def _regions(
     plan: EditPlan, view: View, stood: NDArray[np.bool_], stands: NDArray[np.bool_]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Bool[H, W] each: pixels near the edit (the boxes' old and new places and the ground about them, where shadows lie), and those that
-    showed the vehicle and do not any more."""
+    """Bool[H, W] each: pixels near the edit (the boxes' old and new places and the ground about them, where shadows
+    lie), and those that showed the vehicle and do not any more."""
     before, after = (touched_boxes(plan, view.time_s, when) for when in ("before", "after"))
     touched = boxes_mask(view, before) | boxes_mask(view, after) | ground_mask(view, [*before, *after])
     return touched, stood & ~stands & ~boxes_mask(view, after) if before else np.zeros_like(stood)
 
 
 def _add_points(
-    case: RunCase, plan: EditPlan, frame: Frame, pair: tuple[Observation, Observation],
-    regions: tuple[NDArray[np.bool_], NDArray[np.bool_]], sums: Sums,
-) -> None:  # fmt: skip
+    case: RunCase,
+    plan: EditPlan,
+    frame: Frame,
+    pair: tuple[Observation, Observation],
+    regions: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+    sums: Sums,
+) -> None:
     """Add the errors of depth and of uncovered colours at LiDAR points."""
     (old, new), (touched, freed) = pair, regions
     truth = case.points.truth_at(frame.view, None)
@@ -279,8 +300,9 @@ def _add_points(
 
 
 def _recorded_colors(case: RunCase, plan: EditPlan, points: OwnedPoints) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """Colours u8[N, 3] that recorded frames show at points, and which of them some frame shows, bool[N]: of ``COLOR_FRAMES`` frames, the
-    middle one first. What lies in the boxes of the edit's objects or on the ground about them, where their shadow lies, is not known."""
+    """Colours u8[N, 3] that recorded frames show at points, and which of them some frame shows, bool[N]: of
+    ``COLOR_FRAMES`` frames, the middle one first. What lies in the boxes of the edit's objects or on the ground about
+    them, where their shadow lies, is not known."""
     middle = (len(case.frames) - 1) / 2
     spread = np.unique(np.linspace(0, len(case.frames) - 1, COLOR_FRAMES).round().astype(int))
     color, known = np.zeros((len(points.xyz), 3), np.uint8), np.zeros(len(points.xyz), bool)
@@ -296,7 +318,7 @@ def _recorded_colors(case: RunCase, plan: EditPlan, points: OwnedPoints) -> tupl
     return color, known
 
 
-# edit runs ------------------------------------------------------------------------------------------------------------
+# edit runs ----------------------------------------------------------------------------------------
 
 
 EDITS: Final = {
@@ -312,7 +334,8 @@ EDITS: Final = {
 }
 """Name of a row -> script."""
 INSERT_AT_M: Final = tuple((ahead, left) for left in (0.0, 3.5, -3.5) for ahead in (12.0, 9.0, 16.0, 20.0))
-"""Places, metres ahead of and to the left of the vehicle, that are tried for an inserted one: the first without a collision is taken."""
+"""Places, metres ahead of and to the left of the vehicle, that are tried for an inserted one: the first without a
+collision is taken."""
 AHEAD_M: Final = 2.0
 CANDIDATES: Final = 6
 LOOKS: Final = 6
@@ -320,36 +343,65 @@ LOOKS: Final = 6
 PICTURES: Final = (1 / 3, 2 / 3)
 """Where in the video the frames of the page lie."""
 HEADS: Final = (
-    "run", "edit", "warp error (lower)", "unedited", "outside changed (lower)", "structure (higher)", "LiDAR AbsRel (lower)", "unedited",
-    "uncovered AbsRel (lower)", "uncovered PSNR dB (higher)", "overlap (higher)", "unedited", "collisions", "warnings",
-)  # fmt: skip
+    "run",
+    "edit",
+    "warp error (lower)",
+    "unedited",
+    "outside changed (lower)",
+    "structure (higher)",
+    "LiDAR AbsRel (lower)",
+    "unedited",
+    "uncovered AbsRel (lower)",
+    "uncovered PSNR dB (higher)",
+    "overlap (higher)",
+    "unedited",
+    "collisions",
+    "warnings",
+)
 FORMS: Final = {
-    "warp": "{:.4f}", "warp_before": "{:.4f}", "outside": "{:.2%}", "structure": "{:.3f}", "lidar": "{:.4f}", "lidar_before": "{:.4f}",
-    "uncovered": "{:.3f}", "uncovered_psnr": "{:.2f}",
-    "overlap": "{:.2f}", "overlap_before": "{:.2f}", "collisions": "{}", "warnings": "{}",
-}  # fmt: skip
+    "warp": "{:.4f}",
+    "warp_before": "{:.4f}",
+    "outside": "{:.2%}",
+    "structure": "{:.3f}",
+    "lidar": "{:.4f}",
+    "lidar_before": "{:.4f}",
+    "uncovered": "{:.3f}",
+    "uncovered_psnr": "{:.2f}",
+    "overlap": "{:.2f}",
+    "overlap_before": "{:.2f}",
+    "collisions": "{}",
+    "warnings": "{}",
+}
 KINDS: Final = ("unedited", "edited", "difference")
 """Pictures of a frame."""
-OUTPUT: Final = VerbOutput("bench edit of runs", 1, ("bench.json", "bench.md", "page.html", "rows/*.json", "pictures/*.jpg", "assets/*"))
+OUTPUT: Final = VerbOutput(
+    "bench edit of runs", 1, ("bench.json", "bench.md", "page.html", "rows/*.json", "pictures/*.jpg", "assets/*")
+)
 
 
 def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
-    """Edit recorded drives; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``. What an interrupted one finished is kept.
+    """Edit recorded drives; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``. What an interrupted
+    one finished is kept.
 
     Args:
         sources: folders of finished ``mudg run``.
 
     Raises:
-        UsageError: ``--harmonize``, which compares with a truth. InputError: a folder is no finished run, its scene has no labels, no
-            LiDAR or no moving vehicle.
+        UsageError: ``--harmonize``, which compares with a truth. InputError: a folder is no finished run, its scene has
+            no labels, no LiDAR or no moving vehicle.
     """
     if config.harmonize:
-        raise UsageError("what a diffusion model adds is compared with generated cities alone", where="--harmonize",
-            remedy="leave it out, or name no runs")  # fmt: skip
+        raise UsageError(
+            "what a diffusion model adds is compared with generated cities alone",
+            where="--harmonize",
+            remedy="leave it out, or name no runs",
+        )
     runs = {name: _whole(path) for name, path in names_of(sources).items()}
     refuse_overlap(out, {f"run {name}": path for name, path in names_of(sources).items()})
     device = drawing_device(config.device, "benchmark")
-    inputs = {f"{name} {part}": store.digest(path) for name, parts in runs.items() for part, path in _inputs(parts).items()}
+    inputs = {
+        f"{name} {part}": store.digest(path) for name, parts in runs.items() for part, path in _inputs(parts).items()
+    }
     folder = RunDir.open(out, OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
@@ -371,19 +423,27 @@ def names_of(sources: Sequence[Path]) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in map(Path, sources):
         plain = re.sub(r"[^A-Za-z0-9_.+-]+", "_", path.name or path.resolve().name) or "run"
-        found[next(name for n in range(1, len(found) + 2) if (name := plain if n == 1 else f"{plain}-{n}") not in found)] = path
+        found[
+            next(name for n in range(1, len(found) + 2) if (name := plain if n == 1 else f"{plain}-{n}") not in found)
+        ] = path
     return found
 
 
 def _whole(path: Path) -> RunParts:
     parts = find_run(path)
     if not parts.whole:
-        raise InputError("of a fit alone the recorded drive is not known", where=str(path), expected="a folder made by `mudg run`")
+        raise InputError(
+            "of a fit alone the recorded drive is not known", where=str(path), expected="a folder made by `mudg run`"
+        )
     return parts
 
 
 def _inputs(parts: RunParts) -> dict[str, Path]:
-    return {key: path for key, path in (("fit", parts.model), ("scene", parts.scene), ("fused", parts.fused)) if path is not None}
+    return {
+        key: path
+        for key, path in (("fit", parts.model), ("scene", parts.scene), ("fused", parts.fused))
+        if path is not None
+    }
 
 
 def _document(runs: Mapping[str, RunParts], device: torch.device, out: Path) -> dict[str, Any]:
@@ -401,7 +461,9 @@ def _document(runs: Mapping[str, RunParts], device: torch.device, out: Path) -> 
         write_asset(out / "assets" / f"{name}.safetensors", asset_from(runs[name], lead))
         return {"lead": lead}
 
-    leads = {name: str(finished(out / "rows" / f"{name}_lead.json", partial(lead_found, name))["lead"]) for name in names}
+    leads = {
+        name: str(finished(out / "rows" / f"{name}_lead.json", partial(lead_found, name))["lead"]) for name in names
+    }
     with log.task("editing runs", len(names) * len(EDITS)) as bar:
         for number, name in enumerate(names):
             giver = names[(number + 1) % len(names)]
@@ -413,7 +475,14 @@ def _document(runs: Mapping[str, RunParts], device: torch.device, out: Path) -> 
                     script = script_of(drive, edit, out / "assets" / f"{giver}.safetensors")
                     values = measured(drive, script, _pictures(len(drive.frames), out, _stem(name, edit)))
                     given_by = giver if edit == "insert" else None
-                    return {"run": name, "edit": edit, "object": drive.lead, "given_by": given_by, **values, "script": script.text()}
+                    return {
+                        "run": name,
+                        "edit": edit,
+                        "object": drive.lead,
+                        "given_by": given_by,
+                        **values,
+                        "script": script.text(),
+                    }
 
                 rows.append(finished(out / "rows" / f"{_stem(name, edit)}.json", row))
                 bar.advance()
@@ -434,11 +503,16 @@ def case_of(name: str, parts: RunParts, device: torch.device, lead: str = "") ->
         raise InputError("a run without its scene", where=name)
     scene, fused = read_scene(parts.scene), read_fused(parts.fused)
     if not scene.sweeps:
-        raise InputError("this scene has no LiDAR, which tells the depth that edits are held against", where=str(parts.scene))
+        raise InputError(
+            "this scene has no LiDAR, which tells the depth that edits are held against", where=str(parts.scene)
+        )
     model = model_of_scene(parts.model, scene).to(device)
     if not model.classes:
-        raise InputError("this scene was fitted without labels, which edits of weather and the warp error need", where=str(parts.model),
-            remedy="label the scene with `mudg annotate` and fit it again")  # fmt: skip
+        raise InputError(
+            "this scene was fitted without labels, which edits of weather and the warp error need",
+            where=str(parts.model),
+            remedy="label the scene with `mudg annotate` and fit it again",
+        )
     camera = "front" if "front" in scene.cameras else next(iter(scene.cameras))
     frames = tuple(sorted((f for f in scene.frames if f.view.camera.name == camera), key=lambda f: f.view.time_s))
     points = LogPoints(scene)
@@ -446,7 +520,8 @@ def case_of(name: str, parts: RunParts, device: torch.device, lead: str = "") ->
 
 
 def lead_of(scene: Scene, model: SceneModel, frames: Sequence[Frame], points: LogPoints) -> str:
-    """The moving vehicle with Gaussians of its own that shows the most pixels, of those that are ahead where there are any.
+    """The moving vehicle with Gaussians of its own that shows the most pixels, of those that are ahead where there are
+    any.
 
     Raises:
         InputError: there is none.
@@ -463,13 +538,19 @@ def lead_of(scene: Scene, model: SceneModel, frames: Sequence[Frame], points: Lo
                 edge = np.array([view.camera.width, view.camera.height], np.float64)
                 areas[track.id] += float((np.clip(box[2:], 0, edge) - np.clip(box[:2], 0, edge)).prod())
     ahead = {track.id for track in tracks if any(_is_ahead(track, view) for view in chosen)}
-    seen = sorted((name for name, area in areas.items() if area > 0), key=lambda name: (name not in ahead, -areas[name]))
+    seen = sorted(
+        (name for name, area in areas.items() if area > 0), key=lambda name: (name not in ahead, -areas[name])
+    )
     nearest = [name for name in seen if name in ahead or not ahead & {*seen}][:CANDIDATES]
     shown = {name: sum(int(drawn_pixels(model, name, view).sum()) for view in chosen) for name in nearest}
     if not any(shown.values()):
-        raise InputError("no vehicle moves in the view of this drive's front camera", where=scene.id,
+        raise InputError(
+            "no vehicle moves in the view of this drive's front camera",
+            where=scene.id,
             expected="a moving track of a vehicle with Gaussians of its own",
-            got=f"{len(points.dynamic)} moving tracks of {len(scene.tracks)}", remedy="edit another drive")  # fmt: skip
+            got=f"{len(points.dynamic)} moving tracks of {len(scene.tracks)}",
+            remedy="edit another drive",
+        )
     return max(shown, key=lambda name: shown[name])
 
 
@@ -481,7 +562,8 @@ def _is_ahead(track: Track, view: View) -> bool:
 
 
 def script_of(case: RunCase, edit: str, asset: Path) -> EditScript:
-    """The script of one edit; an inserted vehicle stands at the first free place of ``INSERT_AT_M``, or at the first of all."""
+    """The script of one edit; an inserted vehicle stands at the first free place of ``INSERT_AT_M``, or at the first of
+    all."""
     text = EDITS[edit].replace("ID", case.lead).replace("ASSET", store.json_text(str(asset.resolve()), indent=None))
     made = [parse_edits(text.replace("AHEAD", str(a)).replace("LEFT", str(b)), edit, Path()) for a, b in INSERT_AT_M]
     if edit != "insert":
@@ -499,7 +581,9 @@ def _pictures(frames: int, out: Path, name: str) -> Shown:
         if number in chosen:
             images = (pictures.to_bytes(old.rgb), pictures.to_bytes(new.rgb), pictures.error_image(new.rgb, old.rgb))
             for kind, image in zip(KINDS, images, strict=True):
-                store.atomic_write(out / "pictures" / f"{name}_{chosen[number]}_{kind}.jpg", jpeg_bytes(image, quality=85))
+                store.atomic_write(
+                    out / "pictures" / f"{name}_{chosen[number]}_{kind}.jpg", jpeg_bytes(image, quality=85)
+                )
 
     return shown
 
@@ -519,7 +603,8 @@ def markdown(doc: Mapping[str, Any]) -> str:
 
 
 def page(doc: Mapping[str, Any], out: Path) -> str:
-    """The whole page, from what ``bench.json`` holds and the pictures in ``out``, which it holds: it is for their owner."""
+    """The whole page, from what ``bench.json`` holds and the pictures in ``out``, which it holds: it is for their
+    owner."""
     walls = []
     for row in doc["rows"]:
         stem = out / "pictures" / _stem(row["run"], row["edit"])
@@ -527,11 +612,16 @@ def page(doc: Mapping[str, Any], out: Path) -> str:
             images = {kind: stem.with_name(f"{stem.name}_{number}_{kind}.jpg") for kind in KINDS}
             walls.append(pages.wall(f"{row['run']}: {row['edit']}", images, row["notes"] if number == 0 else ()))
     return pages.render(
-        "Edited drives", "mudg bench edit",
-        "Recorded drives, edited, against their unedited fits. The pictures show your recordings: share this page with care.",
+        "Edited drives",
+        "mudg bench edit",
+        "Recorded drives, edited, against their unedited fits. The pictures show your recordings: share this page with"
+        " care.",
         [
             {"title": "Numbers", "tables": [TextTable.of_texts(HEADS, map(_cells, doc["rows"]))]},
-            {"title": "Pictures", "walls": walls,
-             "notes": ["Difference: mean of the channels, black = equal, through red to white = 0.35 or more."]},
+            {
+                "title": "Pictures",
+                "walls": walls,
+                "notes": ["Difference: mean of the channels, black = equal, through red to white = 0.35 or more."],
+            },
         ],
-    )  # fmt: skip
+    )

@@ -1,4 +1,5 @@
-"""The one loop of benchmarks: logs that are worked on side by side, parts that are reused, and folders that hold nothing foreign."""
+"""The one loop of benchmarks: logs that are worked on side by side, parts that are reused, and folders that hold
+nothing foreign."""
 
 from __future__ import annotations
 
@@ -31,14 +32,18 @@ class BenchJob(Protocol):
 
 
 def compare(
-    out: Path, jobs: Sequence[BenchJob], config: BenchConfig, document: Callable[[list[dict[str, Any]]], dict[str, Any]],
+    out: Path,
+    jobs: Sequence[BenchJob],
+    config: BenchConfig,
+    document: Callable[[list[dict[str, Any]]], dict[str, Any]],
     texts: Mapping[str, Callable[[Mapping[str, Any]], str]],
-) -> Path:  # fmt: skip
-    """Do all jobs, several at a time with one thread each; write ``bench.json`` and its texts. Results do not depend on how many run at
-    a time; finished steps of an interrupted benchmark are reused.
+) -> Path:
+    """Do all jobs, several at a time with one thread each; write ``bench.json`` and its texts. Results do not depend on
+    how many run at a time; finished steps of an interrupted benchmark are reused.
 
     Args:
-        document: what ``bench.json`` holds, from what the jobs measured, in their order. texts: file -> its text, from the document.
+        document: what ``bench.json`` holds, from what the jobs measured, in their order. texts: file -> its text, from
+            the document.
     """
     measured: dict[int, dict[str, Any]] = {}
     with log.task("logs", len(jobs)) as bar, native.one_thread():
@@ -58,7 +63,8 @@ def _measure(job: BenchJob) -> dict[str, Any]:
 
 
 def at_once(config: BenchConfig) -> int:
-    """Logs that are processed at the same time: as many as asked for, else one per core, or one where they would share a GPU."""
+    """Logs that are processed at the same time: as many as asked for, else one per core, or one where they would share
+    a GPU."""
     if config.processes:
         return config.processes
     return os.cpu_count() or 1 if drawing_device(config.device, "benchmark").type == "cpu" else 1
@@ -75,7 +81,8 @@ def run_step(step: Result) -> Path:
 
 
 def finished(path: Path, measure: Callable[[], Any]) -> Any:
-    """What a part of a benchmark wrote; it is measured if there is no such file yet, so an interrupted benchmark goes on."""
+    """What a part of a benchmark wrote; it is measured if there is no such file yet, so an interrupted benchmark goes
+    on."""
     if not path.is_file():
         store.write_json(path, measure())
     return store.read_json(path)
@@ -101,8 +108,12 @@ def refuse_foreign(
         except (InputError, KeyError, TypeError):
             foreign = [name for name in names if name in pages]
     if foreign:
-        raise UsageError("the output folder holds files that do not belong to this run", where=str(out), got=", ".join(sorted(foreign)[:8]),
-                         remedy="choose an empty --out")  # fmt: skip
+        raise UsageError(
+            "the output folder holds files that do not belong to this run",
+            where=str(out),
+            got=", ".join(sorted(foreign)[:8]),
+            remedy="choose an empty --out",
+        )
 
 
 def seconds_of(out: Path) -> dict[str, float]:
@@ -110,5 +121,6 @@ def seconds_of(out: Path) -> dict[str, float]:
     steps = sorted(path.relative_to(out) for path in out.glob("**/run.json"))
     return {
         path.parent.as_posix(): float(store.read_json(out / path).get("seconds", math.nan))
-        for path in steps if len(path.parts) <= 3 and ".part" not in str(path)
-    }  # fmt: skip
+        for path in steps
+        if len(path.parts) <= 3 and ".part" not in str(path)
+    }

@@ -1,5 +1,5 @@
-"""``mudg bench mdm``: the diffusion model on held-out cities, 2, 3 and 4 m beside the recorded path, against exact truth: with and without
-given classes, at several numbers of steps; and the seam between windows of a longer video."""
+"""``mudg bench mdm``: the diffusion model on held-out cities, 2, 3 and 4 m beside the recorded path, against exact
+truth: with and without given classes, at several numbers of steps; and the seam between windows of a longer video."""
 
 from __future__ import annotations
 
@@ -48,30 +48,45 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
                 picture = out / f"steps_{steps}_{'classes' if given else 'plain'}.png"
                 started = time.perf_counter()
                 scores = learn_score.score(
-                    model, cities, out / "clips", replace(request, steps=steps),
-                    prepare=None if given else learn_score.without_classes, picture=picture,
-                )  # fmt: skip
+                    model,
+                    cities,
+                    out / "clips",
+                    replace(request, steps=steps),
+                    prepare=None if given else learn_score.without_classes,
+                    picture=picture,
+                )
                 seconds = (time.perf_counter() - started) / scores["clips"]
                 row = {"steps": steps, "given_classes": given, "seconds_per_clip": round(seconds, 2), "scores": scores}
                 result["rows"].append(row)
                 title = f"{steps} step{'s' if steps > 1 else ''}, classes {'given' if given else 'withheld'}"
-                lines += [f"## {title}, {seconds:.1f} s per clip with its scoring", "", "```", learn_score.table(scores), "```", ""]
+                lines += [
+                    f"## {title}, {seconds:.1f} s per clip with its scoring",
+                    "",
+                    "```",
+                    learn_score.table(scores),
+                    "```",
+                    "",
+                ]
                 bar.update(title)
                 bar.advance()
     found = result["seam"] = seam(model, config, request)
     lines += [
-        f"Seam: static surfaces change {found['across']:.3f} times as much as in the truth across the seams of windows, "
-        f"{found['inside']:.3f} times inside them (city {found['city']}, {SEAM_FRAMES} frames, 3 m, {found['steps']} steps).", "",
-    ]  # fmt: skip
+        (
+            f"Seam: static surfaces change {found['across']:.3f} times as much as in the truth across the seams of"
+            f" windows, {found['inside']:.3f} times inside them (city {found['city']}, {SEAM_FRAMES} frames, 3 m,"
+            f" {found['steps']} steps)."
+        ),
+        "",
+    ]
     return result, "\n".join(lines)
 
 
 def seam(model: MDM, config: BenchConfig, request: SampleRequest) -> dict[str, Any]:
     """Change of static surfaces across the seams of overlapping windows, against that inside windows.
 
-    A video of `SEAM_FRAMES` frames 3 m beside the path of one city is made in windows and steps as synthesize takes them by default,
-    with the sampler of the request. Returned per place: the mean of (change made / change of the truth) over pairs of frames; and the
-    pairs themselves.
+    A video of `SEAM_FRAMES` frames 3 m beside the path of one city is made in windows and steps as synthesize takes
+    them by default, with the sampler of the request. Returned per place: the mean of (change made / change of the
+    truth) over pairs of frames; and the pairs themselves.
     """
     city, usual = from_city.LISTS[config.cities][0], SynthesizeConfig()
     rules = CityClipRules(window=model.config.window)
@@ -86,7 +101,12 @@ def seam(model: MDM, config: BenchConfig, request: SampleRequest) -> dict[str, A
     spans = windows(len(views), model.config.window, usual.overlap)
     for number, span in enumerate(spans):
         condition = build_conditions(
-            record.cloud, record.world.tracks(), [views[i] for i in span], record.recorded, ConditionRules(*sizes), sources
+            record.cloud,
+            record.world.tracks(),
+            [views[i] for i in span],
+            record.recorded,
+            ConditionRules(*sizes),
+            sources,
         )[0]
         shared = len(frames) - span.start
         known = {m: z[-shared:] for m, z in tail.items()} if tail else None
@@ -103,5 +123,11 @@ def seam(model: MDM, config: BenchConfig, request: SampleRequest) -> dict[str, A
     mean = lambda kept: sum(kept) / len(kept) if kept else math.nan  # noqa: E731
     across = mean([r for i, r in enumerate(ratios) if i in seams])
     within = mean([r for i, r in enumerate(ratios) if i not in seams])
-    return {"city": city, "across": round(across, 4), "inside": round(within, 4), "steps": usual.steps, "seams": sorted(seams),
-            "pairs": [round(r, 4) for r in ratios]}  # fmt: skip
+    return {
+        "city": city,
+        "across": round(across, 4),
+        "inside": round(within, 4),
+        "steps": usual.steps,
+        "seams": sorted(seams),
+        "pairs": [round(r, 4) for r in ratios],
+    }

@@ -1,12 +1,13 @@
 """``mudg bench paper``: a table of a paper, filled with our numbers, on generated cities or recorded logs.
 
-A table (``papers.yaml``) says which frames, places and columns. Every log is prepared once; every method is fitted, rendered and scored on
-its own, by the ordinary verbs, so that whatever is finished is reused and an interrupted table goes on. In every table stand the truth
-(what it scores itself) and the fused points with holes filled.
+A table (``papers.yaml``) says which frames, places and columns. Every log is prepared once; every method is fitted,
+rendered and scored on its own, by the ordinary verbs, so that whatever is finished is reused and an interrupted table
+goes on. In every table stand the truth (what it scores itself) and the fused points with holes filled.
 
-A cell is a number or the reason why there is none. A mean over logs is one over all of them: a method that lacks a number on one log has
-none in that cell, for means over other logs could not be compared. FID, KID and FVD compare the views of all logs at a place, as one set
-as in papers, with all recorded frames of their cameras; a mean of the distances of small sets is mostly bias.
+A cell is a number or the reason why there is none. A mean over logs is one over all of them: a method that lacks a
+number on one log has none in that cell, for means over other logs could not be compared. FID, KID and FVD compare the
+views of all logs at a place, as one set as in papers, with all recorded frames of their cameras; a mean of the
+distances of small sets is mostly bias.
 
     OUT/<log>/...   see ``benchmarks/views.py``; views that fits learn from lie in OUT/<log>/virtual
     OUT/bench.json   every number   OUT/bench.md bench.csv bench.tex   the table   OUT/page.html   table and pictures
@@ -59,7 +60,8 @@ POOLED: Final = ("distributions", "videos")
 NONE: Final = "-"
 """What stands in a column without any number; a note gives the reason once."""
 Files = dict[str, dict[str, list[str]]]
-"""Entry of ``POOLED`` -> files of the features "made" and of their "reference", relative to the folder of the benchmark."""
+"""Entry of ``POOLED`` -> files of the features "made" and of their "reference", relative to the folder of the
+benchmark."""
 Values = dict[str, dict[str, Any]]
 """Column -> ``{"value": number or reason, "n", "n_reference"}``."""
 
@@ -83,27 +85,41 @@ class PaperLog(Views):
         names = {place.name: self.trajectories(place.endings(self.log.side)) for place in self.table.places}
         keys = {column.key: column for column in (*self.table.columns, *further_columns(truth is not None))}
         columns = tuple(keys.values())
-        values = {row: {p: at_place(tuple(of.values()), at, columns) for p, at in names.items()} for row, of in scored.items()}
+        values = {
+            row: {p: at_place(tuple(of.values()), at, columns) for p, at in names.items()} for row, of in scored.items()
+        }
         features = {row: {p: files_at(of, at, out) for p, at in names.items()} for row, of in scored.items()}
         fill = tuple(scored[FILL].values())
         for row in self.rows:
             if row.left_out:
                 why = "the model uses no renders" if row.name == REPAIRED else "no model: --freevs-model"
                 values[row.name] = dict.fromkeys(names, {key: {"value": why} for key in keys})
-        if truth is None:  # it is not known off the path: the scorer's floors, and frames of the reference against others of it
+        # it is not known off the path: the scorer's floors, and frames of the reference against others of it
+        if truth is None:
             values[TRUTH] = {p: floors_at(fill, at, columns) for p, at in names.items()}
             features[TRUTH] = {
-                p: {entry: {"made": [], "reference": of["reference"]} for entry, of in files.items()} for p, files in features[FILL].items()
+                p: {entry: {"made": [], "reference": of["reference"]} for entry, of in files.items()}
+                for p, files in features[FILL].items()
             }
         films, scene = self.film(shown), self.loaded
         sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in scene.cameras.values())
         return {
-            "log": self.log.name, "dataset": scene.source.dataset, "cameras": list(scene.cameras),
-            "frames": len(scene.frames_of(first_camera(scene, ()))), "size": ", ".join(sizes),
-            "held_out": len(scene.frames_in("test")), "tracks": len(scene.tracks), "note": self.log.note, "exact": truth is not None,
-            "values": values, "features": features, "made": _made_of(fill), "films": films, "columns": list(shown),
+            "log": self.log.name,
+            "dataset": scene.source.dataset,
+            "cameras": list(scene.cameras),
+            "frames": len(scene.frames_of(first_camera(scene, ()))),
+            "size": ", ".join(sizes),
+            "held_out": len(scene.frames_in("test")),
+            "tracks": len(scene.tracks),
+            "note": self.log.note,
+            "exact": truth is not None,
+            "values": values,
+            "features": features,
+            "made": _made_of(fill),
+            "films": films,
+            "columns": list(shown),
             "seconds": seconds_of(self.out),
-        }  # fmt: skip
+        }
 
 
 def run(
@@ -112,21 +128,24 @@ def run(
     """Fill a table; returns ``out`` with ``bench.json``, the table as Markdown, CSV and LaTeX, and ``page.html``.
 
     Args:
-        config: see ``BenchConfig``; fields marked paper, and model, precision, iterations and seed. preset: what it started from.
+        config: see ``BenchConfig``; fields marked paper, and model, precision, iterations and seed. preset: what it
+            started from.
         sources: ``city:reported`` (or another list of cities), or folders of recorded logs.
         out: what lies there of the same settings is reused; logs and methods may be added later.
         overwrite: replace what other settings left there.
 
     Raises:
-        UsageError: an unknown method or list, a setting that no row of the table uses, or ``out`` holds something else. InputError:
-            methods have different numbers of views. Whatever a verb raises.
+        UsageError: an unknown method or list, a setting that no row of the table uses, or ``out`` holds something else.
+            InputError: methods have different numbers of views. Whatever a verb raises.
     """
     table, out = TABLES[config.table], Path(out)
     rows = paper_rows(config, table, preset)
     logs = logs_of(config, sources, table)
     read = {f"log {log.name}": log.source for log in logs if not isinstance(log, ListedCity)}
     weights = _weights_of(config.score)
-    refuse_overlap(out, {"model": mdm_files.folder_of(config.model), "freevs-model": config.freevs_model, **read, **weights})
+    refuse_overlap(
+        out, {"model": mdm_files.folder_of(config.model), "freevs-model": config.freevs_model, **read, **weights}
+    )
     digests = {name: store.digest(Path(path)) for name, path in weights.items()}  # before any work: one may be missing
     digests |= {"freevs_model": mdm_files.digest(config.freevs_model)} if config.freevs_model else {}
     refuse_foreign(out, PAGES, lambda doc: doc["bench"] == "paper" and doc["table"]["name"] == table.name)
@@ -135,14 +154,24 @@ def run(
     measured, renders = score_settings(config, table), mdm_files.uses_renders(config.model)
     fill = Row(FILL, ANCHORS[FILL])
     jobs = [
-        PaperLog(log, out / log.name, table, (fill, *rows), config, of_log(measured, log.name), renders, overwrite) for log in logs
-    ]  # fmt: skip
+        PaperLog(log, out / log.name, table, (fill, *rows), config, of_log(measured, log.name), renders, overwrite)
+        for log in logs
+    ]
     settings = {
-        "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "", "missing_scenes": missing_scenes(table, logs),
-        "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model), "renders": renders,
-        "videos": config.videos, "score": configuration.result_settings(measured), "digests": digests, **chain_settings(config, preset),
-    }  # fmt: skip
-    values = [{"name": row.name, "title": row.title, "method": row.method, "changes": dict(row.changes)} for row in rows]
+        "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "",
+        "missing_scenes": missing_scenes(table, logs),
+        "iterations": config.iterations,
+        "seed": config.seed,
+        "model": mdm_files.digest(config.model),
+        "renders": renders,
+        "videos": config.videos,
+        "score": configuration.result_settings(measured),
+        "digests": digests,
+        **chain_settings(config, preset),
+    }
+    values = [
+        {"name": row.name, "title": row.title, "method": row.method, "changes": dict(row.changes)} for row in rows
+    ]
     texts = {"bench.md": markdown, "bench.csv": as_csv, "bench.tex": as_latex, "page.html": page}
     return compare(out, jobs, config, lambda logs: document(table, logs, values, settings, pooled(logs, out)), texts)
 
@@ -192,7 +221,8 @@ def _reason(column: PaperColumn, reason: str) -> str:
 
 
 def floors_at(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
-    """What the truth itself scores on a recorded log at a place: the scorer's floors, for measures of sets of views alone."""
+    """What the truth itself scores on a recorded log at a place: the scorer's floors, for measures of sets of views
+    alone."""
     result: Values = {}
     for column in columns:
         entry = SET_METRICS.get(column.key, "")
@@ -213,7 +243,9 @@ def _made_of(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     for document in documents:
         for entry in dict.fromkeys(SET_METRICS.values()):
             if document.get(entry):
-                result[entry] = {name: value for name, value in document[entry].items() if name not in ("floors", "sets")}
+                result[entry] = {
+                    name: value for name, value in document[entry].items() if name not in ("floors", "sets")
+                }
     return result
 
 
@@ -224,14 +256,18 @@ def files_at(documents: Mapping[Path, Mapping[str, Any]], names: Sequence[str], 
     """Files of features of one method on one log at a place; an entry that lacks a trajectory is left out.
 
     Args:
-        documents: folder of scores -> its metrics.json, one method each. names: trajectories of the place. out: of the benchmark.
+        documents: folder of scores -> its metrics.json, one method each. names: trajectories of the place. out: of the
+            benchmark.
     """
     result: Files = {}
     for entry in POOLED:
         sets = {
-            record["trajectory"]: [(folder / FEATURES_FOLDER / record[part]).relative_to(out).as_posix() for part in ("made", "reference")]
-            for folder, document in documents.items() for record in document.get(entry, {}).get("sets", [])
-        }  # fmt: skip
+            record["trajectory"]: [
+                (folder / FEATURES_FOLDER / record[part]).relative_to(out).as_posix() for part in ("made", "reference")
+            ]
+            for folder, document in documents.items()
+            for record in document.get(entry, {}).get("sets", [])
+        }
         known = [sets[name] for name in names if name in sets]
         if known and len(known) == len(names):
             made, reference = zip(*known, strict=True)
@@ -268,9 +304,12 @@ def pooled(logs: Sequence[Mapping[str, Any]], out: Path) -> dict[str, dict[str, 
 def _sets(
     files: Sequence[Mapping[str, Sequence[str]]], out: Path, is_truth: bool
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Features f32[n, d] of all views, and of all recorded frames. Truth that was not made compares every second recorded frame with the
-    others."""
-    read = lambda part: [store.read_safetensors(out / name)["features"] for of in files for name in of[part]]  # noqa: E731
+    """Features f32[n, d] of all views, and of all recorded frames. Truth that was not made compares every second
+    recorded frame with the others."""
+
+    def read(part: str) -> list[Any]:
+        return [store.read_safetensors(out / name)["features"] for of in files for name in of[part]]
+
     made, reference = read("made"), read("reference")
     if is_truth and not made:
         made, reference = [rows[::2] for rows in reference], [rows[1::2] for rows in reference]
@@ -281,15 +320,20 @@ def _sets(
 
 
 def document(
-    table: PaperTable, logs: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], settings: Mapping[str, Any],
+    table: PaperTable,
+    logs: Sequence[Mapping[str, Any]],
+    rows: Sequence[Mapping[str, Any]],
+    settings: Mapping[str, Any],
     pooled: Mapping[str, Mapping[str, Values]] = MappingProxyType({}),
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Everything ``bench.json`` holds.
 
     Args:
-        logs: per log its facts, ``exact``, ``values[row][place][key]`` as from `at_place`, ``made``, ``films``, ``columns``, seconds.
+        logs: per log its facts, ``exact``, ``values[row][place][key]`` as from `at_place`, ``made``, ``films``,
+            ``columns``, seconds.
         rows: name, title, method and changes of what was computed. settings: of the benchmark.
-        pooled: row -> place -> metric -> mean and standard error of the sets of all logs together, where there are such.
+        pooled: row -> place -> metric -> mean and standard error of the sets of all logs together, where there are
+            such.
 
     Raises:
         InputError: methods have different numbers of views.
@@ -297,7 +341,10 @@ def document(
     exact = all(entry["exact"] for entry in logs)
     every = [*({"name": name, "title": title, "method": "", "changes": {}} for name, title in ANCHORS.items()), *rows]
     columns = further_columns(exact)
-    wanted = [*((p.name, c) for p, c in table.cells()), *((place.name, column) for place in table.places for column in columns)]
+    wanted = [
+        *((p.name, c) for p, c in table.cells()),
+        *((place.name, column) for place in table.places for column in columns),
+    ]
     cells: dict[str, dict[str, Values]] = {row["name"]: {} for row in every}
     for row, of in cells.items():
         for place, column in wanted:
@@ -306,16 +353,30 @@ def document(
     best: dict[str, dict[str, list[str]]] = {}
     for place, column in wanted:
         _refuse_other_counts(cells, place, column)
-        numbers = {row: round(of[place][column.key]["mean"], column.digits) for row, of in cells.items()
-                   if row != TRUTH and "mean" in of[place][column.key]}  # fmt: skip
+        numbers = {
+            row: round(of[place][column.key]["mean"], column.digits)
+            for row, of in cells.items()
+            if row != TRUTH and "mean" in of[place][column.key]
+        }
         best.setdefault(place, {})[column.key] = best_of(column.better, numbers)
-    published = [{"title": row.title, "source": row.source, "values": list(map(list, row.values))} for row in table.published]
+    published = [
+        {"title": row.title, "source": row.source, "values": list(map(list, row.values))} for row in table.published
+    ]
     return {
-        "schema": 1, "bench": "paper", "table": table.values(), "exact": exact, "settings": dict(settings), "rows": every,
-        "cells": cells, "best": best, "further": [column.values() for column in columns],
+        "schema": 1,
+        "bench": "paper",
+        "table": table.values(),
+        "exact": exact,
+        "settings": dict(settings),
+        "rows": every,
+        "cells": cells,
+        "best": best,
+        "further": [column.values() for column in columns],
         "further_title": "Exact truth" if exact else "Measured at LiDAR points and in recorded frames",
-        "published": published, "made": logs[0]["made"], "logs": [dict(entry) for entry in logs],
-    }  # fmt: skip
+        "published": published,
+        "made": logs[0]["made"],
+        "logs": [dict(entry) for entry in logs],
+    }
 
 
 def _cell(
@@ -336,7 +397,8 @@ def _cell(
 
 
 def _refuse_other_counts(cells: dict[str, dict[str, Values]], place: str, column: PaperColumn) -> None:
-    """Refuse methods with different numbers of views in a column; a floor with another number is left out of the table, with the reason.
+    """Refuse methods with different numbers of views in a column; a floor with another number is left out of the table,
+    with the reason.
 
     Raises:
         InputError: they differ.
@@ -346,10 +408,12 @@ def _refuse_other_counts(cells: dict[str, dict[str, Values]], place: str, column
     wanted = {tuple(n) for n in counts.values() if n is not None}
     if len(wanted) > 1:
         raise InputError(
-            "methods with different numbers of views cannot stand in one table", where=f"{column.title} at {place}",
-            expected="the same n on every log", got=", ".join(f"{name}: {sum(n)}" for name, n in counts.items() if n is not None),
+            "methods with different numbers of views cannot stand in one table",
+            where=f"{column.title} at {place}",
+            expected="the same n on every log",
+            got=", ".join(f"{name}: {sum(n)}" for name, n in counts.items() if n is not None),
             remedy="make the table anew with --overwrite",
-        )  # fmt: skip
+        )
     if floor is not None and wanted and tuple(floor) not in wanted:
         cells[TRUTH][place][column.key] = {"reason": OTHER_N, "floor": cells[TRUTH][place][column.key]}
 
@@ -361,7 +425,11 @@ def heading(doc: Mapping[str, Any]) -> str:
     """What the table is, and what it is filled with."""
     count, name = len(doc["logs"]), doc["settings"]["list"]
     logs = f"{count} log{'s' if count != 1 else ''}"
-    return f"{doc['table']['title']}, on {logs} of generated cities ({name})" if name else f"{doc['table']['title']}, on {logs} recorded"
+    return (
+        f"{doc['table']['title']}, on {logs} of generated cities ({name})"
+        if name
+        else f"{doc['table']['title']}, on {logs} recorded"
+    )
 
 
 def notes_of(doc: Mapping[str, Any]) -> list[str]:
@@ -371,9 +439,15 @@ def notes_of(doc: Mapping[str, Any]) -> list[str]:
     ours = "generated cities, not the paper's data" if settings["list"] else "the logs below"
     missing = ", ".join(settings["missing_scenes"])
     return [
-        f"Published rows: {table['data']}. Ours: {ours} ({'; '.join(sizes)}). The two cannot be compared number by number.",
+        (
+            f"Published rows: {table['data']}. Ours: {ours} ({'; '.join(sizes)}). The two cannot be compared number by"
+            " number."
+        ),
         f"Every fit has {settings['iterations']} iterations, {virtual_fits_of(settings)}; seed {settings['seed']}.",
-        "Means over logs; in brackets the standard error over logs. Bold: best of ours; truth and published rows are not ranked.",
+        (
+            "Means over logs; in brackets the standard error over logs. Bold: best of ours; truth and published rows"
+            " are not ranked."
+        ),
         *table["notes"],
         *(f"{', '.join(titles)} ({NONE}): {reason}." for reason, titles in _empty_columns(doc).items()),
         *_notes_of_sets(doc["made"]),
@@ -387,14 +461,14 @@ def _notes_of_sets(made: Mapping[str, Any]) -> list[str]:
     if sets:
         whose = "published weights" if sets["published_weights"] else "weights that are not the published file"
         notes.append(
-            f"FID, KID and FVD: all logs' views of a place are one set, against all recorded frames of their cameras; "
+            "FID, KID and FVD: all logs' views of a place are one set, against all recorded frames of their cameras; "
             f"{whose} ({sets['weights_sha256'][:12]}), resize rule {sets['resize']}, "
             f"covariance with {sets['covariance']}. FID of few frames is mostly bias: read it beside the truth itself."
-        )  # fmt: skip
+        )
     if videos:
         notes.append(
-            f"FVD: clips of {videos['clip_frames']} views, one at every {videos['hop_frames']}th; weights {videos['weights_sha256'][:12]}, "
-            f"resize rule {videos['resize']}, epsilon {videos['norm_epsilon']:g}."
+            f"FVD: clips of {videos['clip_frames']} views, one at every {videos['hop_frames']}th; weights"
+            f" {videos['weights_sha256'][:12]}, resize rule {videos['resize']}, epsilon {videos['norm_epsilon']:g}."
         )
     return notes
 
@@ -428,7 +502,9 @@ def main_table(doc: Mapping[str, Any]) -> TextTable:
     for row in doc["published"]:
         values = {(place, key): value for place, key, value in row["values"]}
         if values.keys() & set(wanted):
-            cells = tuple(TextCell(_digits(values[cell], columns[cell[1]]) if cell in values else "") for cell in wanted)
+            cells = tuple(
+                TextCell(_digits(values[cell], columns[cell[1]]) if cell in values else "") for cell in wanted
+            )
             lines.append(TextLine(f"{row['title']} ({PUBLISHED}: {row['source']})", cells, PUBLISHED))
     return TextTable(tuple(heads), (*lines, *_ours(doc, wanted)))
 
@@ -437,9 +513,14 @@ def further_tables(doc: Mapping[str, Any]) -> list[TextTable]:
     """The further columns, one table per place."""
     columns = doc["further"]
     return [
-        TextTable(("", *map(_headed, columns)), tuple(_ours(doc, [(place["name"], column["key"]) for column in columns])), place["title"])
-        for place in doc["table"]["places"] if columns
-    ]  # fmt: skip
+        TextTable(
+            ("", *map(_headed, columns)),
+            tuple(_ours(doc, [(place["name"], column["key"]) for column in columns])),
+            place["title"],
+        )
+        for place in doc["table"]["places"]
+        if columns
+    ]
 
 
 def _headed(column: Mapping[str, Any]) -> str:
@@ -449,7 +530,10 @@ def _headed(column: Mapping[str, Any]) -> str:
 def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> Iterator[TextLine]:
     shared = {cell: _shared_reason(doc, *cell) for cell in wanted}
     for row in doc["rows"]:
-        cells = (TextCell(NONE, reason=shared[cell]) if shared[cell] else _printed(doc, row["name"], *cell) for cell in wanted)
+        cells = (
+            TextCell(NONE, reason=shared[cell]) if shared[cell] else _printed(doc, row["name"], *cell)
+            for cell in wanted
+        )
         yield TextLine(row["title"], tuple(cells), "ours" if row["method"] else "anchor")
     yield TextLine("n", tuple(TextCell(_count(doc, *cell)) for cell in wanted), "n")
 
@@ -482,7 +566,13 @@ LOG_HEADS: Final = ("log", "dataset", "cameras", "frames", "size", "images held 
 def _log_cells(entry: Mapping[str, Any]) -> list[str]:
     """A log's row under ``LOG_HEADS``."""
     facts = [str(entry[key]) for key in ("frames", "size", "held_out", "tracks")]
-    return [entry["log"], entry["dataset"], ", ".join(entry["cameras"]), *facts, f"{sum(entry['seconds'].values()):.0f}"]
+    return [
+        entry["log"],
+        entry["dataset"],
+        ", ".join(entry["cameras"]),
+        *facts,
+        f"{sum(entry['seconds'].values()):.0f}",
+    ]
 
 
 def markdown(doc: Mapping[str, Any]) -> str:
@@ -506,13 +596,23 @@ def as_csv(doc: Mapping[str, Any]) -> str:
     """One line per number: ``kind,row,source,place,metric,value,standard_error,logs,n,n_reference,reason,best``."""
     rows: list[list[Any]] = []
     for row in doc["published"]:
-        rows += [[PUBLISHED, row["title"], row["source"], place, key, value, *[""] * 6] for place, key, value in row["values"]]
+        rows += [
+            [PUBLISHED, row["title"], row["source"], place, key, value, *[""] * 6]
+            for place, key, value in row["values"]
+        ]
     for row in doc["rows"]:
         for place, of in doc["cells"][row["name"]].items():
             for key, result in of.items():
-                numbers = ["" if (value := result.get(name)) is None else f"{value:.6g}" for name in ("mean", "standard_error")]
+                numbers = [
+                    "" if (value := result.get(name)) is None else f"{value:.6g}" for name in ("mean", "standard_error")
+                ]
                 counts = [sum(result[name]) if name in result else "" for name in ("n", "n_reference")]
-                last = [result.get("logs", ""), *counts, result.get("reason", ""), int(row["name"] in doc["best"][place][key])]
+                last = [
+                    result.get("logs", ""),
+                    *counts,
+                    result.get("reason", ""),
+                    int(row["name"] in doc["best"][place][key]),
+                ]
                 rows.append(["ours" if row["method"] else "anchor", row["name"], "", place, key, *numbers, *last])
     return csv_text("kind row source place metric value standard_error logs n n_reference reason best".split(), rows)
 
@@ -522,11 +622,14 @@ def page(doc: Mapping[str, Any]) -> str:
     lead, *notes = notes_of(doc)
     further = [{"title": doc["further_title"], "tables": further_tables(doc)}] if doc["further"] else []
     return pages.render(
-        heading(doc), f"mudg bench paper --table {doc['table']['name']}", lead,
+        heading(doc),
+        f"mudg bench paper --table {doc['table']['name']}",
+        lead,
         [
-            {"title": "Table", "tables": [main_table(doc)], "below": notes}, *further,
+            {"title": "Table", "tables": [main_table(doc)], "below": notes},
+            *further,
             pages.films(doc, doc["logs"][0]["columns"], videos=doc["settings"]["videos"], exact=doc["exact"]),
             {"title": "Logs", "tables": [TextTable.of_texts(LOG_HEADS, map(_log_cells, doc["logs"]))]},
         ],
         "The pictures lie beside this page.",
-    )  # fmt: skip
+    )

@@ -21,8 +21,8 @@ RECORDED: Final = "0"
 
 
 class SceneRange(StrictRecord):
-    """A segment of a dataset, by a part of its name, with its first and last frame (from 0, both included); ``side``: to which side
-    one-sided shifts go (1 left, -1 right)."""
+    """A segment of a dataset, by a part of its name, with its first and last frame (from 0, both included); ``side``:
+    to which side one-sided shifts go (1 left, -1 right)."""
 
     segment: str
     first: int
@@ -34,7 +34,8 @@ class PaperPlace(StrictRecord):
     """Where views are scored.
 
     Args:
-        name: in result files. title: in headings. shifts_m: lateral shifts, metres, positive to the left (0 = the recorded path), and
+        name: in result files. title: in headings. shifts_m: lateral shifts, metres, positive to the left (0 = the
+            recorded path), and
         paths: further paths by name (``core.trajectory.named``); their scores are averaged.
     """
 
@@ -50,8 +51,8 @@ class PaperPlace(StrictRecord):
 
 
 class PaperColumn(StrictRecord):
-    """A number of ``metrics.json``: its name there, heading, better side, digits, the setting of ``mudg score`` that it needs, and the
-    entry of a result that holds its ``n`` (empty: the views that count)."""
+    """A number of ``metrics.json``: its name there, heading, better side, digits, the setting of ``mudg score`` that it
+    needs, and the entry of a result that holds its ``n`` (empty: the views that count)."""
 
     key: str
     title: str
@@ -66,7 +67,8 @@ class PaperColumn(StrictRecord):
 
 
 class PaperRow(StrictRecord):
-    """A row that is computed: a method of `METHODS`, with other settings of its fit (or of synthesize) where it is an ablation's."""
+    """A row that is computed: a method of `METHODS`, with other settings of its fit (or of synthesize) where it is an
+    ablation's."""
 
     name: str
     title: str
@@ -83,7 +85,8 @@ class PublishedRow(StrictRecord):
 
 
 class PaperTable(StrictRecord):
-    """A table of a paper; the fields are explained in ``papers.yaml``. Without ``only`` every column stands at every place."""
+    """A table of a paper; the fields are explained in ``papers.yaml``. Without ``only`` every column stands at every
+    place."""
 
     name: str
     title: str = ""
@@ -113,20 +116,34 @@ class PaperTable(StrictRecord):
         _refuse(set(self.only) - {place.name for place in self.places}, "only: no such place")
         _refuse({cell for cell in cells if cells.count(cell) > 1}, "a place has a column twice")
         for row in self.published:
-            _refuse({(place, key) for place, key, _ in row.values} - set(cells), f"published {row.title!r}: not in the table")
+            _refuse(
+                {(place, key) for place, key, _ in row.values} - set(cells),
+                f"published {row.title!r}: not in the table",
+            )
         _refuse({row.method for row in self.rows} - set(METHODS), "rows: no such method")
         if self.virtual_shifts_m and any(any(place.shifts_m) or place.paths for place in self.places):
-            raise InputError("generated views lie at the places off the path", where="virtual_shifts_m", remedy="leave it out")
+            raise InputError(
+                "generated views lie at the places off the path", where="virtual_shifts_m", remedy="leave it out"
+            )
         return self
 
     def values(self) -> dict[str, Any]:
         """For JSON, without published rows."""
         return {
-            "name": self.name, "title": self.title, "data": self.data, "scenes": self.scenes, "notes": self.notes,
-            "places": [{"name": p.name, "title": p.title, "shifts_m": p.shifts_m, "paths": p.paths} for p in self.places],
-            "cells": [[place.name, column.key] for place, column in self.cells()], "columns": [c.values() for c in self.columns],
-            "held_out_every": self.held_out_every, "front_only": self.front_only, "all_cameras": self.all_cameras,
-        }  # fmt: skip
+            "name": self.name,
+            "title": self.title,
+            "data": self.data,
+            "scenes": self.scenes,
+            "notes": self.notes,
+            "places": [
+                {"name": p.name, "title": p.title, "shifts_m": p.shifts_m, "paths": p.paths} for p in self.places
+            ],
+            "cells": [[place.name, column.key] for place, column in self.cells()],
+            "columns": [c.values() for c in self.columns],
+            "held_out_every": self.held_out_every,
+            "front_only": self.front_only,
+            "all_cameras": self.all_cameras,
+        }
 
 
 class Papers(StrictRecord):
@@ -144,8 +161,8 @@ def _refuse(unknown: set[Any], what: str) -> None:
 
 
 def read_papers(text: str, where: str) -> Papers:
-    """The tables of a text in the form of ``papers.yaml``; names of columns and places stand for their records, and lines of text for
-    published rows.
+    """The tables of a text in the form of ``papers.yaml``; names of columns and places stand for their records, and
+    lines of text for published rows.
 
     Raises:
         InputError: it is not YAML, or not such tables.
@@ -155,15 +172,21 @@ def read_papers(text: str, where: str) -> Papers:
         columns = {key: {"key": key, **column} for key, column in raw["columns"].items()}
         tables = {
             name: {
-                **table, "name": name, "columns": [columns[key] for key in table["columns"]],
+                **table,
+                "name": name,
+                "columns": [columns[key] for key in table["columns"]],
                 "places": [raw["places"][place] for place in table["places"]],
                 "published": [row for group in table.get("published", ()) for row in _printed(**group)],
             }
             for name, table in raw["tables"].items()
-        }  # fmt: skip
+        }
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise InputError("these are no tables of papers", where=where, got=f"{type(error).__name__}: {error}") from error
-    papers = parse_record(Papers, {**{k: v for k, v in raw.items() if k != "places"}, "columns": columns, "tables": tables}, f"{where}: ")
+        raise InputError(
+            "these are no tables of papers", where=where, got=f"{type(error).__name__}: {error}"
+        ) from error
+    papers = parse_record(
+        Papers, {**{k: v for k, v in raw.items() if k != "places"}, "columns": columns, "tables": tables}, f"{where}: "
+    )
     _refuse({table.scenes for table in papers.tables.values()} - {"", *papers.scene_lists}, "scenes: no such list")
     _refuse({key for keys in papers.further.values() for key in keys} - set(columns), "further: no such column")
     return papers

@@ -1,4 +1,5 @@
-"""The logs of benchmarks: lists of generated cities and recorded logs, their scenes, and what of a log the methods do not see.
+"""The logs of benchmarks: lists of generated cities and recorded logs, their scenes, and what of a log the methods do
+not see.
 
 OUT/<log>/imported   a dataset's log as a scene      OUT/<log>/shown   a table's frames, cameras and held-out rule
 OUT/<log>/scene      the same with the labels that it lacks; of a city, the generated log itself
@@ -62,8 +63,9 @@ class RecordedLog:
     """A recorded log.
 
     Args:
-        name: of its folder. source: a dataset's log or a scene. frames: first and last frame (both included), or None for all. size: of
-            imported images (empty = as recorded). side: of one-sided shifts. note: what is to be said of it.
+        name: of its folder. source: a dataset's log or a scene. frames: first and last frame (both included), or None
+            for all. size: of imported images (empty = as recorded). side: of one-sided shifts. note: what is to be said
+            of it.
     """
 
     name: str
@@ -90,23 +92,32 @@ def logs_of(config: BenchConfig, sources: Sequence[Path], table: PaperTable) -> 
     lists = [name.removeprefix(CITY) for name in names if name.startswith(CITY)]
     if not names or (lists and len(names) > 1):
         raise UsageError(
-            "a list of cities stands alone" if names else "no logs to fill the table with", where=f"mudg bench paper --table {table.name}",
-            expected=f"{CITY}reported, {CITY}development, or folders of logs", got=" ".join(names),
-        )  # fmt: skip
+            "a list of cities stands alone" if names else "no logs to fill the table with",
+            where=f"mudg bench paper --table {table.name}",
+            expected=f"{CITY}reported, {CITY}development, or folders of logs",
+            got=" ".join(names),
+        )
     if lists:
         return _cities(config, lists[0], table)
     if config.logs != BenchConfig().logs:
-        raise UsageError("recorded logs are counted by naming them", where="--logs", got=str(config.logs), remedy="leave it out")
+        raise UsageError(
+            "recorded logs are counted by naming them", where="--logs", got=str(config.logs), remedy="leave it out"
+        )
     return tuple(_recorded(config, name, source, table) for name, source in names_of(sources).items())
 
 
 def _cities(config: BenchConfig, name: str, table: PaperTable) -> tuple[Log, ...]:
     if name not in city_logs.LISTS:
-        raise UsageError("no such list of cities", expected=", ".join(CITY + known for known in city_logs.LISTS), got=CITY + name)
+        raise UsageError(
+            "no such list of cities", expected=", ".join(CITY + known for known in city_logs.LISTS), got=CITY + name
+        )
     size, frames = parse_resolution(config.resolution), parse_frame_range(config.frames)
     if isinstance(size, int) or (frames is not None and frames[0] != 0):
-        raise UsageError("a generated city takes a whole size and frames from 0 on", expected="--resolution WIDTHxHEIGHT, --frames 0:END",
-                         got=f"{config.resolution} {config.frames}".strip())  # fmt: skip
+        raise UsageError(
+            "a generated city takes a whole size and frames from 0 on",
+            expected="--resolution WIDTHxHEIGHT, --frames 0:END",
+            got=f"{config.resolution} {config.frames}".strip(),
+        )
     width, height = size or (STANDARD.width, STANDARD.height)
     cameras = ("front",) if table.front_only else STANDARD.cameras
     return listed_cities(name, config.logs, LogRules(frames[1] if frames else STANDARD.frames, width, height, cameras))
@@ -129,8 +140,12 @@ def _recorded(config: BenchConfig, name: str, source: Path, table: PaperTable) -
     elif segment is not None and frames != (segment.first, segment.last):
         note = f"the table's frames are {segment.first} to {segment.last}"
     if config.resolution and ingest.is_scene(source):
-        raise UsageError("a scene's images keep their size", where=str(source), got="--resolution",
-                         remedy="leave it out, or give the dataset's own folder")  # fmt: skip
+        raise UsageError(
+            "a scene's images keep their size",
+            where=str(source),
+            got="--resolution",
+            remedy="leave it out, or give the dataset's own folder",
+        )
     size = "" if ingest.is_scene(source) else config.resolution or table.size
     return RecordedLog(name, source, frames, size, 1 if segment is None else segment.side, note)
 
@@ -146,7 +161,9 @@ def missing_scenes(table: PaperTable, logs: Sequence[Log]) -> list[str]:
     return [one.segment for one in SCENE_LISTS.get(table.scenes, ()) if identities and one.segment not in identities]
 
 
-def names_of(sources: Sequence[Path], pages: Sequence[str] = ("bench.json", "bench.md", "page.html")) -> dict[str, Path]:
+def names_of(
+    sources: Sequence[Path], pages: Sequence[str] = ("bench.json", "bench.md", "page.html")
+) -> dict[str, Path]:
     """Name -> log: the last part of its path, in characters that every file system takes.
 
     Raises:
@@ -159,8 +176,12 @@ def names_of(sources: Sequence[Path], pages: Sequence[str] = ("bench.json", "ben
         last = source.resolve().stem if source.suffix == ".zip" else source.resolve().name
         name = _NAME.sub("_", last).strip("._-") or "log"
         if name in named or name in pages:
-            raise UsageError("two logs have the same name", where=str(source), got=name,
-                             remedy="rename one, or prepare it with mudg ingest in a folder of another name")  # fmt: skip
+            raise UsageError(
+                "two logs have the same name",
+                where=str(source),
+                got=name,
+                remedy="rename one, or prepare it with mudg ingest in a folder of another name",
+            )
         named[name] = source
     return named
 
@@ -185,7 +206,10 @@ def make_scene(log: Log, table: PaperTable, out: Path, device: DeviceName, overw
     if not ingest.is_scene(whole):
         text = "" if frames is None else f"{frames[0]}:{frames[1] + 1}"
         settings = IngestConfig(test_every=0, resolution=log.size, frames=text)
-        whole, frames = run_step(Ingest(log=str(log.source), out=out / "imported", overwrite=overwrite, settings=settings)), None
+        whole, frames = (
+            run_step(Ingest(log=str(log.source), out=out / "imported", overwrite=overwrite, settings=settings)),
+            None,
+        )
     shown = run_step(ShownFrames(scene=whole, frames=frames, table=table, out=out / "shown", overwrite=overwrite))
     return labelled(shown, out / "scene", device, overwrite)
 
@@ -204,8 +228,12 @@ def imported(config: BenchConfig, source: Path, out: Path, overwrite: bool) -> P
         settings = IngestConfig(resolution=config.resolution, frames=config.frames, test_every=0)
         return run_step(Ingest(log=str(source), out=out, overwrite=overwrite, settings=settings))
     if config.resolution or config.frames:
-        raise UsageError("a scene is taken as it is", where=str(source), got="--resolution or --frames",
-                         remedy="leave them out, or give the dataset's own folder")  # fmt: skip
+        raise UsageError(
+            "a scene is taken as it is",
+            where=str(source),
+            got="--resolution or --frames",
+            remedy="leave them out, or give the dataset's own folder",
+        )
     return source
 
 
@@ -229,14 +257,20 @@ class ShownFrames(Output):
         if self.frames is not None and len(times) == last - first + 1:
             first, last = 0, len(times) - 1  # imported with these very frames
         if last >= len(times):
-            raise InputError("the log has fewer frames than the table asks for", where=str(self.scene),
-                             expected=f"frames {first} to {last}",
-                             got=f"{len(times)} frames of camera {camera}", remedy="give the whole log, or choose --frames")  # fmt: skip
+            raise InputError(
+                "the log has fewer frames than the table asks for",
+                where=str(self.scene),
+                expected=f"frames {first} to {last}",
+                got=f"{len(times)} frames of camera {camera}",
+                remedy="give the whole log, or choose --frames",
+            )
         moment = lambda time_s: int(np.argmin(np.abs(times - time_s)))  # noqa: E731
         chosen = [
-            frame for frame in scene.frames
-            if first <= moment(frame.view.time_s) <= last and (not self.table.front_only or frame.view.camera.name == camera)
-        ]  # fmt: skip
+            frame
+            for frame in scene.frames
+            if first <= moment(frame.view.time_s) <= last
+            and (not self.table.front_only or frame.view.camera.name == camera)
+        ]
         sweeps = [sweep.id for sweep in scene.sweeps if first <= moment(sweep.time_s) <= last]
         groups = [[f.id for f in chosen if moment(f.view.time_s) == number] for number in range(first, last + 1)]
         held = [name for name, part in holdout_split(groups, self.table.held_out_every).items() if part == "test"]
@@ -254,8 +288,9 @@ class Split:
     """What of a log the methods see.
 
     Args:
-        name: also of its folder. block: length of the blocks of held-out moments (0 = none). by_camera: only the chosen cameras are
-            shown. all_cameras: views of all cameras are asked for that have held-out frames; else of the first camera.
+        name: also of its folder. block: length of the blocks of held-out moments (0 = none). by_camera: only the chosen
+            cameras are shown. all_cameras: views of all cameras are asked for that have held-out frames; else of the
+            first camera.
         shifts_m: lateral shifts of the views that are asked for, metres, positive to the left.
     """
 
@@ -272,9 +307,11 @@ class Protocol:
 
     Args:
         name: in tables. family: as asked for with ``--protocols``. title: heading. split: name of a ``Split``.
-        shifts_m: lateral shifts of the scored views. every: every n-th view of a camera counts, beginning with the second where n > 1.
+        shifts_m: lateral shifts of the scored views. every: every n-th view of a camera counts, beginning with the
+            second where n > 1.
         maps: what the truth of a view holds. columns: names in ``columns.COLUMNS``, in the order of the table.
-        pooled: a log's value is that of all its places together, so that a place weighs what it adds to the sums; else their mean.
+        pooled: a log's value is that of all its places together, so that a place weighs what it adds to the sums; else
+            their mean.
     """
 
     name: str
@@ -298,17 +335,42 @@ SPLITS: Final[dict[str, Split]] = {
 _GAP: Final = ("psnr", "ssim", "perceptual", "psnr_dynamic", "psnr_upper", "abs_rel")
 _CAMERA: Final = ("psnr_seen", "perceptual_seen", "abs_rel_seen", "rmse_seen", "delta1_seen")
 _LIDAR: Final = (
-    "abs_rel_static", "rmse_static", "delta1_static", "abs_rel_dynamic", "rmse_dynamic", "delta1_dynamic", "point_psnr_static",
-    "point_abs_static", "point_psnr_dynamic", "point_abs_dynamic",
-)  # fmt: skip
+    "abs_rel_static",
+    "rmse_static",
+    "delta1_static",
+    "abs_rel_dynamic",
+    "rmse_dynamic",
+    "delta1_dynamic",
+    "point_psnr_static",
+    "point_abs_static",
+    "point_psnr_dynamic",
+    "point_abs_dynamic",
+)
 PROTOCOLS: Final[tuple[Protocol, ...]] = (
     Protocol("gap-1", "gap", "Single held-out frames", "gap-1", ("photo", "depth", "dynamic"), _GAP),
     Protocol("gap-3", "gap", "Blocks of 3 held-out frames", "gap-3", ("photo", "depth", "dynamic"), _GAP),
     Protocol("gap-5", "gap", "Blocks of 5 held-out frames", "gap-5", ("photo", "depth", "dynamic"), _GAP),
-    Protocol("camera", "camera", "Cameras that the methods never saw", "camera", ("photo", "depth", "seen"), _CAMERA, every=2, pooled=True),
-    Protocol("lidar", "lidar", "LiDAR beside the recorded path", "all", ("depth", "dynamic", "color"), _LIDAR, (2.0, -2.0, 3.0, -3.0)),
+    Protocol(
+        "camera",
+        "camera",
+        "Cameras that the methods never saw",
+        "camera",
+        ("photo", "depth", "seen"),
+        _CAMERA,
+        every=2,
+        pooled=True,
+    ),
+    Protocol(
+        "lidar",
+        "lidar",
+        "LiDAR beside the recorded path",
+        "all",
+        ("depth", "dynamic", "color"),
+        _LIDAR,
+        (2.0, -2.0, 3.0, -3.0),
+    ),
     Protocol("classes", "classes", "Classes of LiDAR points", "all", ("classes",), ("miou", "accuracy")),
-)  # fmt: skip
+)
 
 
 def protocols_of(names: Sequence[str]) -> tuple[Protocol, ...]:
@@ -322,7 +384,8 @@ def protocols_of(names: Sequence[str]) -> tuple[Protocol, ...]:
 
 @dataclass(frozen=True)
 class HeldOut:
-    """What a split hides of a log: ids of frames and sweeps, and facts for people. ``reason``: why the log cannot be split so."""
+    """What a split hides of a log: ids of frames and sweeps, and facts for people. ``reason``: why the log cannot be
+    split so."""
 
     frames: tuple[str, ...] = ()
     sweeps: tuple[str, ...] = ()
@@ -338,7 +401,8 @@ class HeldOut:
 def blocks_of(moments: int, length: int) -> tuple[range, ...]:
     """Blocks of ``length`` held-out moments, spread evenly among ``moments``; the first and the last one are shown.
 
-    As many as leave ``SHOWN_BETWEEN`` shown moments before, between and after them, but at least one; none where it does not fit.
+    As many as leave ``SHOWN_BETWEEN`` shown moments before, between and after them, but at least one; none where it
+    does not fit.
     """
     if moments < length + 2:
         return ()
@@ -359,7 +423,8 @@ def first_camera(scene: Scene, wanted: Sequence[str]) -> str:
 
 
 def held_out(scene: Scene, split: Split, wanted: Sequence[str]) -> HeldOut:
-    """What a split hides of a scene; ``wanted`` are the cameras to show by the split by cameras (empty = the default)."""
+    """What a split hides of a scene; ``wanted`` are the cameras to show by the split by cameras (empty = the
+    default)."""
     if split.by_camera:
         shown = shown_cameras(scene, wanted)
         hidden = [name for name in scene.cameras if name not in shown]
@@ -381,7 +446,9 @@ def _hidden_blocks(scene: Scene, length: int) -> HeldOut:
     frames = tuple(frame.id for frame in scene.frames if is_hidden(frame.view.time_s))
     sweeps = tuple(sweep.id for sweep in scene.sweeps if is_hidden(sweep.time_s))
     facts = (
-        ("moments", len(times)), ("blocks", [[block.start, block.stop - 1] for block in blocks]),
-        ("held_out_frames", len(frames)), ("held_out_sweeps", len(sweeps)),
-    )  # fmt: skip
+        ("moments", len(times)),
+        ("blocks", [[block.start, block.stop - 1] for block in blocks]),
+        ("held_out_frames", len(frames)),
+        ("held_out_sweeps", len(sweeps)),
+    )
     return HeldOut(frames, sweeps, facts)

@@ -1,20 +1,22 @@
 """How much of the error of tracked boxes a fit takes out: generated logs whose boxes were disturbed by known amounts.
 
-Three kinds of disturbance, in the frame of the box, all `NOISE_M` along each axis and `NOISE_RAD` of yaw: *noise*, drawn anew at every
-key, as a detector makes it; *drift*, the same noise passed through a Gaussian of `DRIFT_S`, as a tracking filter leaves it; an
-*offset*, drawn once per object, as a labeller makes it. Boxes stay disturbed for fusing too.
+Three kinds of disturbance, in the frame of the box, all `NOISE_M` along each axis and `NOISE_RAD` of yaw: *noise*,
+drawn anew at every key, as a detector makes it; *drift*, the same noise passed through a Gaussian of `DRIFT_S`, as a
+tracking filter leaves it; an *offset*, drawn once per object, as a labeller makes it. Boxes stay disturbed for fusing
+too.
 
-What can be recovered. An object is its Gaussians in the box frame and the poses of that frame. Any one rigid motion may be
-taken from the poses and given to the Gaussians without changing a single picture, at any time. So poses are compared after
-the best such motion (shift and yaw, one per object) is taken out, before and after fitting alike:
+What can be recovered. An object is its Gaussians in the box frame and the poses of that frame. Any one rigid motion may
+be taken from the poses and given to the Gaussians without changing a single picture, at any time. So poses are compared
+after the best such motion (shift and yaw, one per object) is taken out, before and after fitting alike:
 
     recovered = 1 - rms(after) / rms(before)
 
-over the keys of frames in which the object shows at least `SEEN_PX` pixels, held-out frames included. Of an offset, which is such a
-motion, nothing can be recovered from pictures; there, the test is that pictures do not suffer and boxes do not drift.
+over the keys of frames in which the object shows at least `SEEN_PX` pixels, held-out frames included. Of an offset,
+which is such a motion, nothing can be recovered from pictures; there, the test is that pictures do not suffer and boxes
+do not drift.
 
-Objects in generated cities move evenly, which flatters smoothing: of independent noise, the smooth path alone (poses "smoothed": no
-picture consulted) takes out most. Drift is the case in which only the pictures can help.
+Objects in generated cities move evenly, which flatters smoothing: of independent noise, the smooth path alone (poses
+"smoothed": no picture consulted) takes out most. Drift is the case in which only the pictures can help.
 """
 
 from __future__ import annotations
@@ -74,8 +76,8 @@ class Errors:
 
 
 def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
-    """Fit every city with boxes as they are, with noise and with offsets, poses fixed and learnt; numbers and a table. Rows that an
-    interrupted run wrote are taken as they are."""
+    """Fit every city with boxes as they are, with noise and with offsets, poses fixed and learnt; numbers and a table.
+    Rows that an interrupted run wrote are taken as they are."""
     cities, rows = LISTS[config.cities][: config.count], []
     with log.task("fitting", len(cities) * len(CASES)) as bar:
         for city in cities:
@@ -113,11 +115,17 @@ def cloud_of(scene: Scene) -> FusedCloud:
 def fit_settings(config: BenchConfig, poses: str) -> FitConfig:
     """A small, quick fit with poses "fixed", "learnt", or only "smoothed"."""
     return FitConfig(
-        method="street_gaussians", iterations=config.pose_iterations, seed=config.seed, device=config.device,
-        preview_every=10**6, checkpoint_every=10**6, start=StartConfig(gaussians=8000),
-        densify=DensifyConfig(kind="none"), loss=RecordedLossConfig(semantic_every=1000),
+        method="street_gaussians",
+        iterations=config.pose_iterations,
+        seed=config.seed,
+        device=config.device,
+        preview_every=10**6,
+        checkpoint_every=10**6,
+        start=StartConfig(gaussians=8000),
+        densify=DensifyConfig(kind="none"),
+        loss=RecordedLossConfig(semantic_every=1000),
         poses=PoseConfig(learn=poses != "fixed", rounds=0 if poses == "smoothed" else PoseConfig().rounds),
-    )  # fmt: skip
+    )
 
 
 def city_scene(seed: int, folder: Path, **changes: Any) -> Scene:
@@ -148,7 +156,9 @@ def disturbed(tracks: tuple[Track, ...], kind: str, seed: int) -> tuple[Track, .
 def fitted(scene: Scene, cloud: FusedCloud, config: FitConfig, folder: Path) -> fit.FitState:
     """Fit in memory; ``folder`` takes the log and the pictures."""
     device = drawing_device(config.device, "fit", config.raster)
-    return optimised(fit.start_state(config, scene, cloud, *fit.recorded_views(config, scene)).to(device), config, folder)
+    return optimised(
+        fit.start_state(config, scene, cloud, *fit.recorded_views(config, scene)).to(device), config, folder
+    )
 
 
 def optimised(state: fit.FitState, config: FitConfig, folder: Path) -> fit.FitState:
@@ -176,7 +186,8 @@ def seen_keys(scene: Scene) -> dict[str, NDArray[np.intp]]:
 
 
 def pose_errors(truth: NDArray[np.float64], keys: NDArray[np.float64], free: bool = True) -> Errors:
-    """Errors of poses f64[K, 4, 4] against the truth; ``free``: after the best constant motion in the box frame is taken out."""
+    """Errors of poses f64[K, 4, 4] against the truth; ``free``: after the best constant motion in the box frame is
+    taken out."""
     local = np.einsum("kji,kj->ki", keys[:, :3, :3], truth[:, :3, 3] - keys[:, :3, 3])
     turn = np.array([geometry.yaw_of(geometry.invert(b) @ a) for a, b in zip(truth, keys)])
     if free:
@@ -191,8 +202,14 @@ def row_of(truth: Scene, given: Scene, model: SceneModel) -> dict[str, Any]:
         if not isinstance(node, RigidNode) or len(keys_seen[node.name]) < FEWEST_KEYS:
             continue
         seen = keys_seen[node.name]
-        exact, before, after = (t[seen] for t in (truth.track(node.name).world_from_object, given.track(node.name).world_from_object,
-                                                  node.corrected_keys()))  # fmt: skip
+        exact, before, after = (
+            t[seen]
+            for t in (
+                truth.track(node.name).world_from_object,
+                given.track(node.name).world_from_object,
+                node.corrected_keys(),
+            )
+        )
         found = {"object": node.name, "keys": len(seen)}
         for name, keys in (("before", before), ("after", after)):
             for free in (True, False):
@@ -221,31 +238,79 @@ def summary(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
         objects = [found for row in mine for found in row["objects"]]
         keys = np.array([found["keys"] for found in objects], float)
         pooled = {}
-        for name in (f"{when}{how}_{unit}" for when in ("before", "after") for how in ("", "_absolute") for unit in ("m", "rad")):
+        for name in (
+            f"{when}{how}_{unit}" for when in ("before", "after") for how in ("", "_absolute") for unit in ("m", "rad")
+        ):
             pooled[name] = float(np.sqrt((np.array([found[name] for found in objects]) ** 2 * keys).sum() / keys.sum()))
-        shares = {f"recovered_{unit}": 1 - pooled[f"after_{unit}"] / max(pooled[f"before_{unit}"], 1e-9) for unit in ("m", "rad")}
+        shares = {
+            f"recovered_{unit}": 1 - pooled[f"after_{unit}"] / max(pooled[f"before_{unit}"], 1e-9)
+            for unit in ("m", "rad")
+        }
         psnr = float(np.nanmean([row["psnr_moving"] for row in mine]))
-        made.append({"boxes": kind, "poses": poses, "objects": len(objects), "keys": int(keys.sum()), **pooled, **shares,
-                     "psnr_moving": psnr})  # fmt: skip
+        made.append(
+            {
+                "boxes": kind,
+                "poses": poses,
+                "objects": len(objects),
+                "keys": int(keys.sum()),
+                **pooled,
+                **shares,
+                "psnr_moving": psnr,
+            }
+        )
     return made
 
 
 def table(result: dict[str, Any]) -> str:
     """The summary as text."""
-    heads = ["boxes", "poses", "objects", "position [m]", "after", "recovered", "yaw [deg]", "after", "recovered", "absolute [m]",
-             "PSNR moving [dB]"]  # fmt: skip
+    heads = [
+        "boxes",
+        "poses",
+        "objects",
+        "position [m]",
+        "after",
+        "recovered",
+        "yaw [deg]",
+        "after",
+        "recovered",
+        "absolute [m]",
+        "PSNR moving [dB]",
+    ]
     cells = []
     for row in result["summary"]:
         recoverable = row["boxes"] in ("noise", "drift") and row["poses"] != "fixed"
         shares = [f"{row[f'recovered_{unit}']:.0%}" if recoverable else "-" for unit in ("m", "rad")]
         degrees = [f"{np.degrees(row[f'{when}_rad']):.2f}" for when in ("before", "after")]
-        cells.append([
-            row["boxes"], row["poses"], str(row["objects"]), f"{row['before_m']:.3f}", f"{row['after_m']:.3f}", shares[0], *degrees,
-            shares[1], f"{row['after_absolute_m']:.3f}", f"{row['psnr_moving']:.2f}",
-        ])  # fmt: skip
-    return "\n".join([
-        f"# Boxes of {len(result['cities'])} generated logs ({FRAMES} frames, {WIDTH}x{HEIGHT}, {result['iterations']} steps)", "",
-        f"noise: {NOISE_M} m along each axis and 1 degree, anew per key; drift: the same, correlated over {DRIFT_S} s; offset: once per",
-        "object. A constant motion per object is taken out of all errors but the absolute one.", "",
-        *markdown_table(heads, cells),
-    ]) + "\n"  # fmt: skip
+        cells.append(
+            [
+                row["boxes"],
+                row["poses"],
+                str(row["objects"]),
+                f"{row['before_m']:.3f}",
+                f"{row['after_m']:.3f}",
+                shares[0],
+                *degrees,
+                shares[1],
+                f"{row['after_absolute_m']:.3f}",
+                f"{row['psnr_moving']:.2f}",
+            ]
+        )
+    return (
+        "\n".join(
+            [
+                (
+                    f"# Boxes of {len(result['cities'])} generated logs ({FRAMES} frames, {WIDTH}x{HEIGHT},"
+                    f" {result['iterations']} steps)"
+                ),
+                "",
+                (
+                    f"noise: {NOISE_M} m along each axis and 1 degree, anew per key; drift: the same, correlated over"
+                    f" {DRIFT_S} s; offset: once per"
+                ),
+                "object. A constant motion per object is taken out of all errors but the absolute one.",
+                "",
+                *markdown_table(heads, cells),
+            ]
+        )
+        + "\n"
+    )

@@ -1,11 +1,12 @@
 """``mudg bench real``: complete methods on real logs, against what the log recorded and the methods did not see.
 
-A protocol (a row of ``places.PROTOCOLS``) says which frames, sweeps or cameras are hidden and what is scored. Per log and way of
-hiding, the verbs of the chain are run with folders of their own. They are given scenes from which what is hidden was removed
-(``scene/part.py``), so they cannot use it. Whatever is finished is verified and reused.
+A protocol (a row of ``places.PROTOCOLS``) says which frames, sweeps or cameras are hidden and what is scored. Per log
+and way of hiding, the verbs of the chain are run with folders of their own. They are given scenes from which what is
+hidden was removed (``scene/part.py``), so they cannot use it. Whatever is finished is verified and reused.
 
     OUT/<log>/scene                                         the whole log; read by truth and scores alone
-    OUT/<log>/<split>/shown annotate scene asked            what the methods see; with labels; and places of held-out frames
+    OUT/<log>/<split>/shown annotate scene asked            what the methods see; with labels; and places of held-out
+                                                            frames
     OUT/<log>/<split>/fuse adapt fit/<method> virtual/<sees>   what methods make of it; what the diffusion model sees
     OUT/<log>/<split>/nearest_fill generated/<sees> render/<method>   the views to score
     OUT/<log>/truth/<protocol>  OUT/<log>/score/<protocol>/<method>
@@ -84,9 +85,14 @@ class PartOfScene(Output):
 
 
 def run(
-    config: BenchConfig, sources: Sequence[Path], out: Path, *, preset: PresetName = "default", overwrite: bool = False,
+    config: BenchConfig,
+    sources: Sequence[Path],
+    out: Path,
+    *,
+    preset: PresetName = "default",
+    overwrite: bool = False,
     adaptation: AdaptConfig | None = None,
-) -> Path:  # fmt: skip
+) -> Path:
     """Compare methods on real logs; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``.
 
     Args:
@@ -94,14 +100,17 @@ def run(
         sources: folders of dataset logs, or scenes made by ``mudg ingest``.
         out: what lies there of the same settings is reused; logs, protocols and methods may be added later.
         overwrite: replace what other settings left there.
-        adaptation: how the diffusion model is adapted to a log; its model, cameras, precision and seed are those of ``config``.
+        adaptation: how the diffusion model is adapted to a log; its model, cameras, precision and seed are those of
+            ``config``.
 
     Raises:
-        UsageError: no log, an unknown method or protocol, a setting that no row uses, two logs of one name, or ``out`` holds something
-            else. Whatever a verb raises.
+        UsageError: no log, an unknown method or protocol, a setting that no row uses, two logs of one name, or ``out``
+            holds something else. Whatever a verb raises.
     """
     rows, protocols, logs, out = real_rows(config, preset), protocols_of(config.protocols), names_of(sources), Path(out)
-    refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **{f"log {name}": path for name, path in logs.items()}})
+    refuse_overlap(
+        out, {"model": mdm_files.folder_of(config.model), **{f"log {name}": path for name, path in logs.items()}}
+    )
     refuse_foreign(out, PAGES, lambda document: document["bench"] == "real")
     generates = any(row.sees and row.fit is None for row in rows)
     refuse_unfit(config, preset, rows, [generator_of(config)] * generates)
@@ -111,20 +120,38 @@ def run(
     scenes = {name: imported(config, path, out / name / "scene", overwrite) for name, path in logs.items()}
     jobs = [
         SplitJob(
-            out / name, scene, SPLITS[split], tuple(p for p in protocols if p.split == split), rows, config,
-            on_device(training, config.device), overwrite,
+            out / name,
+            scene,
+            SPLITS[split],
+            tuple(p for p in protocols if p.split == split),
+            rows,
+            config,
+            on_device(training, config.device),
+            overwrite,
         )
-        for name, scene in scenes.items() for split in dict.fromkeys(protocol.split for protocol in protocols)
-    ]  # fmt: skip
+        for name, scene in scenes.items()
+        for split in dict.fromkeys(protocol.split for protocol in protocols)
+    ]
     settings = {
-        "protocols": list(config.protocols), "iterations": config.iterations, "seed": config.seed,
-        "model": mdm_files.digest(config.model), "shown_cameras": list(config.shown), "resolution": config.resolution,
-        "frames": config.frames, "virtual_shifts_m": list(config.synthesize.shifts_m), **chain_settings(config, preset),
-    }  # fmt: skip
+        "protocols": list(config.protocols),
+        "iterations": config.iterations,
+        "seed": config.seed,
+        "model": mdm_files.digest(config.model),
+        "shown_cameras": list(config.shown),
+        "resolution": config.resolution,
+        "frames": config.frames,
+        "virtual_shifts_m": list(config.synthesize.shifts_m),
+        **chain_settings(config, preset),
+    }
 
     def filled(measured: list[dict[str, Any]]) -> dict[str, Any]:
         of_log = {name: [result for job, result in zip(jobs, measured) if job.out.name == name] for name in scenes}
-        return document([_entry(name, scenes[name], of_log[name]) for name in scenes], list(map(_row_values, rows)), protocols, settings)
+        return document(
+            [_entry(name, scenes[name], of_log[name]) for name in scenes],
+            list(map(_row_values, rows)),
+            protocols,
+            settings,
+        )
 
     return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": lambda doc: page_of(doc, out)})
 
@@ -134,7 +161,8 @@ def run(
 
 @dataclass(frozen=True)
 class DiffusionUse:
-    """How a method uses the diffusion model on a log: what is left of what it asks for, the model, and a sentence about it."""
+    """How a method uses the diffusion model on a log: what is left of what it asks for, the model, and a sentence about
+    it."""
 
     sees: Sees
     model: str
@@ -181,10 +209,16 @@ class SplitJob:
         chain, cameras = self.chain(), self.cameras(whole, held)
         truths, result = {}, {}
         for protocol in self.protocols:
-            truth = chain.run(MakeTargets(
-                log=self.source, shown=chain.scene, protocol=protocol, held=tuple(held.frames), cameras=cameras,
-                out=self.out / "truth" / protocol.name,
-            ))  # fmt: skip
+            truth = chain.run(
+                MakeTargets(
+                    log=self.source,
+                    shown=chain.scene,
+                    protocol=protocol,
+                    held=tuple(held.frames),
+                    cameras=cameras,
+                    out=self.out / "truth" / protocol.name,
+                )
+            )
             targets = read_targets(truth)
             result[protocol.name] = {"facts": targets.facts, "pictures": list(targets.pictures), "values": {}}
             if len(targets):
@@ -199,16 +233,22 @@ class SplitJob:
             if use is not None:
                 used[row.name] = {"sees": use.sees, "note": use.note}
             for protocol in (p for p in self.protocols if p.name in truths):
-                scored = chain.run(ScoreTargets(
-                    log=self.source, truth=truths[protocol.name], views=views, protocol=protocol, device=self.config.device,
-                    out=self.out / "score" / protocol.name / row.name,
-                ))  # fmt: skip
+                scored = chain.run(
+                    ScoreTargets(
+                        log=self.source,
+                        truth=truths[protocol.name],
+                        views=views,
+                        protocol=protocol,
+                        device=self.config.device,
+                        out=self.out / "score" / protocol.name / row.name,
+                    )
+                )
                 result[protocol.name]["values"][row.name] = store.read_json(scored / "metrics.json")
         return {"split": self.split.name, "held_out": dict(held.facts), "diffusion": used, "protocols": result}
 
     def write_seen(self, whole: Scene, held: HeldOut) -> None:
-        """Write what the methods see: the shown frames and sweeps; these with the labels that they lack; the same with the places of
-        held-out frames; and these places alone (``asked``), for rendering."""
+        """Write what the methods see: the shown frames and sweeps; these with the labels that they lack; the same with
+        the places of held-out frames; and these places alone (``asked``), for rendering."""
         frames = {f.id for f in whole.frames} - set(held.frames)
         sweeps = {s.id for s in whole.sweeps} - set(held.sweeps)
         places, inputs = held.places(whole), {"log": store.digest(self.source)}
@@ -223,7 +263,9 @@ class SplitJob:
         """Write a part of a scene as a folder that is verified and reused."""
         shown = tuple(self.config.shown)
         return run_step(
-            PartOfScene(split=self.split.name, shown=shown, digests_read=inputs, write=write, out=out, overwrite=self.overwrite)
+            PartOfScene(
+                split=self.split.name, shown=shown, digests_read=inputs, write=write, out=out, overwrite=self.overwrite
+            )
         )
 
     def cameras(self, whole: Scene, held: HeldOut) -> tuple[str, ...]:
@@ -234,7 +276,8 @@ class SplitJob:
         return tuple(name for name in whole.cameras if name in hidden)
 
     def views(self, row: Row, chain: Chain, cameras: tuple[str, ...]) -> tuple[Path, DiffusionUse | None]:
-        """The folder with a method's views at all places that are asked for, made if need be; and how it used the diffusion model.
+        """The folder with a method's views at all places that are asked for, made if need be; and how it used the
+        diffusion model.
 
         Fits learn from generated views beside the recorded path, and where views of hidden frames are asked for.
         """
@@ -257,7 +300,8 @@ class SplitJob:
         return chain.rendered(row, virtual, drawn, places), use
 
     def use(self, sees: Sees, chain: Chain) -> DiffusionUse:
-        """How the diffusion model is used where a method asks for ``sees``; adapted to what the method sees of the log if need be.
+        """How the diffusion model is used where a method asks for ``sees``; adapted to what the method sees of the log
+        if need be.
 
         What the model or the log does not allow is left out, and the note says so.
         """
@@ -291,41 +335,68 @@ class SplitJob:
 
 def _row_values(row: Row) -> dict[str, Any]:
     changes = configuration.result_settings(row.fit) if row.varied else None
-    return {"name": row.name, "title": row.title, "fit": "" if row.fit is None else row.method, "sees": row.sees, "changes": changes}
+    return {
+        "name": row.name,
+        "title": row.title,
+        "fit": "" if row.fit is None else row.method,
+        "sees": row.sees,
+        "changes": changes,
+    }
 
 
 def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """A log with its facts and all its values."""
     loaded = read_scene(scene)
-    cameras = {n: {"size_px": [c.width, c.height], "frames": len(loaded.frames_of(n))} for n, c in loaded.cameras.items()}
+    cameras = {
+        n: {"size_px": [c.width, c.height], "frames": len(loaded.frames_of(n))} for n, c in loaded.cameras.items()
+    }
     return {
-        "log": name, "id": loaded.id, "dataset": loaded.source.dataset, "digest": store.digest(scene), "cameras": cameras,
-        "sweeps": len(loaded.sweeps), "tracks": len(loaded.tracks), "held_out": {s["split"]: s["held_out"] for s in splits},
+        "log": name,
+        "id": loaded.id,
+        "dataset": loaded.source.dataset,
+        "digest": store.digest(scene),
+        "cameras": cameras,
+        "sweeps": len(loaded.sweeps),
+        "tracks": len(loaded.tracks),
+        "held_out": {s["split"]: s["held_out"] for s in splits},
         "diffusion": {s["split"]: s["diffusion"] for s in splits},
         "protocols": {protocol: result for s in splits for protocol, result in s["protocols"].items()},
-    }  # fmt: skip
+    }
 
 
 def document(
-    logs: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], protocols: Sequence[Protocol], settings: Mapping[str, Any]
+    logs: Sequence[Mapping[str, Any]],
+    rows: Sequence[Mapping[str, Any]],
+    protocols: Sequence[Protocol],
+    settings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Everything ``bench.json`` holds: per protocol, log and method the values by place and their mean; the means over the logs that have
-    a number; and differences (or ratios) to the fit without diffusion."""
+    """Everything ``bench.json`` holds: per protocol, log and method the values by place and their mean; the means over
+    the logs that have a number; and differences (or ratios) to the fit without diffusion."""
     names, result = [row["name"] for row in rows], {}
     for protocol in protocols:
         entries = {entry["log"]: entry["protocols"][protocol.name] for entry in logs}
         counted = [entry["values"] for entry in entries.values() if "left_out" not in entry]
         pooled = {name: mean_values([values[name]["mean"] for values in counted], protocol.columns) for name in names}
         result[protocol.name] = {
-            "row": asdict(protocol), "logs": entries, "pooled": pooled,
+            "row": asdict(protocol),
+            "logs": entries,
+            "pooled": pooled,
             "left_out": {log: entry["left_out"] for log, entry in entries.items() if "left_out" in entry},
             "against": {
                 name: {c: COLUMNS[c].compared(pooled[name][c], pooled[BASE][c]) for c in protocol.columns}
-                for name in names if BASE in names and name != BASE
+                for name in names
+                if BASE in names and name != BASE
             },
-        }  # fmt: skip
+        }
     facts = [{key: value for key, value in entry.items() if key != "protocols"} for entry in logs]
-    return {"schema": 1, "bench": "real", "settings": dict(settings), "methods": list(rows), "logs": facts, "protocols": result}
+    return {
+        "schema": 1,
+        "bench": "real",
+        "settings": dict(settings),
+        "methods": list(rows),
+        "logs": facts,
+        "protocols": result,
+    }
 
 
 # ---- text ----
@@ -338,7 +409,11 @@ def table_of(doc: Mapping[str, Any], protocol: str, values: Mapping[str, Mapping
     for method, of in values.items():
         cells = [method]
         for name in columns:
-            more = "" if method == BASE or BASE not in values else COLUMNS[name].compared_text(of[name], values[BASE][name])
+            more = (
+                ""
+                if method == BASE or BASE not in values
+                else COLUMNS[name].compared_text(of[name], values[BASE][name])
+            )
             cells.append(COLUMNS[name].text(of[name]) + (f" ({more})" if more else ""))
         rows.append(cells)
     return TextTable.of_texts(["method", *(COLUMNS[name].title for name in columns)], rows)
@@ -364,7 +439,8 @@ def notes_of(doc: Mapping[str, Any], protocol: str) -> list[str]:
             for place, share in facts["seen_share"].items()
         ]
         words += [
-            f"colour map of {place}: gain {' '.join(f'{g:.2f}' for g in of['gain'])}, offset {' '.join(f'{o:+.3f}' for o in of['offset'])}"
+            f"colour map of {place}: gain {' '.join(f'{g:.2f}' for g in of['gain'])}, offset"
+            f" {' '.join(f'{o:+.3f}' for o in of['offset'])}"
             for place, of in facts["color_maps"].items()
         ]
         words += [f"{place} is left out ({reason})" for place, reason in facts["left_out"].items()]
@@ -385,19 +461,24 @@ def summary_of(doc: Mapping[str, Any]) -> str:
     """One line about the whole."""
     settings, count = doc["settings"], len(doc["logs"])
     return (
-        f"{count} log{'s' if count != 1 else ''}, {settings['iterations']} iterations per fit, {virtual_fits_of(settings)}; "
-        f"seed {settings['seed']}."
+        f"{count} log{'s' if count != 1 else ''}, {settings['iterations']} iterations per fit,"
+        f" {virtual_fits_of(settings)}; seed {settings['seed']}."
     )
 
 
 def markdown(doc: Mapping[str, Any]) -> str:
     """The tables for people; those of single places stand only where a log has several."""
     lines = [
-        "# Real logs", "",
-        f"{summary_of(doc)} In brackets: difference to {BASE}, or the ratio (x) where lower is better. Perceptual: features of the "
-        "shipped codec, not LPIPS.", "",
-        *markdown_table(LOG_HEADS, map(log_cells, doc["logs"])), "",
-    ]  # fmt: skip
+        "# Real logs",
+        "",
+        (
+            f"{summary_of(doc)} In brackets: difference to {BASE}, or the ratio (x) where lower is better. Perceptual:"
+            " features of the shipped codec, not LPIPS."
+        ),
+        "",
+        *markdown_table(LOG_HEADS, map(log_cells, doc["logs"])),
+        "",
+    ]
     for name, result in doc["protocols"].items():
         counted = {log: entry["values"] for log, entry in result["logs"].items() if "left_out" not in entry}
         lines += [f"## {heading_of(doc, name)}", "", *(f"* {note}" for note in notes_of(doc, name)), ""]
@@ -448,15 +529,21 @@ def _section(doc: Mapping[str, Any], name: str, out: Path) -> dict[str, Any]:
     below = next((text for key, text in BELOW.items() if key in result["row"]["maps"]), BELOW[""])
     brackets = f"In brackets: difference to {BASE}, or the ratio (x) where lower is better."
     return {
-        "title": heading_of(doc, name), "notes": notes_of(doc, name), "walls": walls,
-        "tables": [table_of(doc, name, result["pooled"])] if counted else [], "below": [brackets] * bool(counted) + [below] * bool(walls),
-    }  # fmt: skip
+        "title": heading_of(doc, name),
+        "notes": notes_of(doc, name),
+        "walls": walls,
+        "tables": [table_of(doc, name, result["pooled"])] if counted else [],
+        "below": [brackets] * bool(counted) + [below] * bool(walls),
+    }
 
 
 BELOW: Final = {
     "seen": "Below: of the truth the part that the shown cameras saw; of the methods the colour error.",
     "photo": "Below: of the truth the depth of LiDAR points; of the methods the colour error.",
     "classes": "Truth: the classes of LiDAR points.",
-    "": "Truth: LiDAR points in their recorded colours, below in the colours of their depth; of the methods colour and depth.",
+    "": (
+        "Truth: LiDAR points in their recorded colours, below in the colours of their depth; of the methods colour and"
+        " depth."
+    ),
 }
 """Map of a protocol -> what the lower pictures show."""

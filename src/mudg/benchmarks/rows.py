@@ -38,20 +38,32 @@ ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
     "only_I_S": ("virtual colour and classes", _NO_DEPTH),
     EXACT: ("the truth in place of generated views", {}),
 }
-"""Rows beside the fit without virtual views and that with all terms, as in table 3 of the paper, and the most that virtual views can bring
-at this number of steps: row -> (what is learned from, settings ``virtual`` of the fit)."""
+"""Rows beside the fit without virtual views and that with all terms, as in table 3 of the paper, and the most that
+virtual views can bring at this number of steps: row -> (what is learned from, settings ``virtual`` of the fit)."""
 Sees = Literal["", "adapted", "renders", "points"]
-"""How a method uses its diffusion model: adapted to the log, with renders of the first fit, or with points and photographs alone."""
+"""How a method uses its diffusion model: adapted to the log, with renders of the first fit, or with points and
+photographs alone."""
 LESS: Final[dict[Sees, tuple[str, str]]] = {
-    "adapted": ("", ""), "renders": ("-no-adapt", ", model not adapted"), "points": ("-no-renders", ", points alone"),
-}  # fmt: skip
+    "adapted": ("", ""),
+    "renders": ("-no-adapt", ", model not adapted"),
+    "points": ("-no-renders", ", points alone"),
+}
 """What a method sees -> the endings of its name and title."""
 PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
 """Settings of generated views that are the benchmark's matter, not the user's."""
 SAMPLING: Final = (
-    "steps", "sampler", "eta", "overlap", "align_depth", "full_size", "guidance", "guidance_rescale", "memory_budget_gb", "offload",
+    "steps",
+    "sampler",
+    "eta",
+    "overlap",
+    "align_depth",
+    "full_size",
+    "guidance",
+    "guidance_rescale",
+    "memory_budget_gb",
+    "offload",
     "compiled",
-)  # fmt: skip
+)
 """Settings of generated views that published-type and small models do not share."""
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 
@@ -63,7 +75,8 @@ class Row:
     Args:
         name: in tables and folders. title: for people. method: of `METHODS`; empty = fused points, holes filled.
         fit: settings of its fit (those of the first fit where it is ``LONGER``); None = no fit.
-        changes: other settings of its fit or of synthesize; ``model: ""`` = there is no model, so the row has no numbers.
+        changes: other settings of its fit or of synthesize; ``model: ""`` = there is no model, so the row has no
+            numbers.
         sees: how it uses the diffusion model, where benchmarks let it choose. varied: its settings stand in the table.
     """
 
@@ -92,7 +105,12 @@ class Row:
 def generator_of(config: BenchConfig) -> SynthesizeConfig:
     """How views are generated, by the benchmark's model, number format, seed and device; one trajectory at a time."""
     return replace(
-        config.synthesize, model=config.model, precision=config.precision, seed=config.seed, device=config.device, processes=1
+        config.synthesize,
+        model=config.model,
+        precision=config.precision,
+        seed=config.seed,
+        device=config.device,
+        processes=1,
     )
 
 
@@ -102,7 +120,8 @@ def usual_fit(config: BenchConfig) -> FitConfig:
 
 
 def method_fit(usual: FitConfig, method: str, preset: PresetName) -> FitConfig:
-    """The usual settings with a method. What a preset sets and a method for comparison does not know has its default there.
+    """The usual settings with a method. What a preset sets and a method for comparison does not know has its default
+    there.
 
     Raises:
         UsageError: a setting beyond the preset that the method does not know.
@@ -119,14 +138,16 @@ def method_fit(usual: FitConfig, method: str, preset: PresetName) -> FitConfig:
 
 
 def chain_settings(config: BenchConfig, preset: PresetName) -> dict[str, Any]:
-    """What the chain of a benchmark runs with, for ``bench.json``; ``continued_share`` is None where fits under virtual views begin from
-    nothing."""
+    """What the chain of a benchmark runs with, for ``bench.json``; ``continued_share`` is None where fits under virtual
+    views begin from nothing."""
     generator = configuration.result_settings(generator_of(config))
     return {
-        "preset": preset, "continued_share": CONTINUED_SHARE if config.continue_fit else None,
-        "fuse": configuration.result_settings(config.fuse), "fit": configuration.result_settings(usual_fit(config)),
+        "preset": preset,
+        "continued_share": CONTINUED_SHARE if config.continue_fit else None,
+        "fuse": configuration.result_settings(config.fuse),
+        "fit": configuration.result_settings(usual_fit(config)),
         "synthesize": {name: value for name, value in generator.items() if name not in PLACES},
-    }  # fmt: skip
+    }
 
 
 def changed_settings(config: BenchConfig, usual: BenchConfig) -> list[str]:
@@ -140,34 +161,50 @@ def flag_of(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def refuse_unfit(config: BenchConfig, preset: PresetName, rows: Sequence[Row], generators: Sequence[SynthesizeConfig]) -> None:
+def refuse_unfit(
+    config: BenchConfig, preset: PresetName, rows: Sequence[Row], generators: Sequence[SynthesizeConfig]
+) -> None:
     """Refuse, before anything is written, what the rows of a benchmark cannot follow or do not use.
 
     Args:
-        preset: what the configuration started from. generators: settings behind all views that are generated for a row itself.
+        preset: what the configuration started from. generators: settings behind all views that are generated for a row
+            itself.
 
     Raises:
-        UsageError: a setting that no row uses, weights that are asked for and not given, or a method that the model cannot serve.
+        UsageError: a setting that no row uses, weights that are asked for and not given, or a method that the model
+            cannot serve.
         InputError: there is no such model.
     """
     fits = [row.fit for row in rows if row.fit is not None]
     virtual = [fit for fit in fits if {"virtual", "repaired"} & set(METHODS[fit.method].supervision)]
     renders = mdm_files.uses_renders(config.model)
     if any(fit.method == REPAIRED for fit in fits) and not renders:
-        raise UsageError(f"{REPAIRED} repairs renders, and this diffusion model uses none", where="--methods", got=config.model,
-                         remedy=f"leave {REPAIRED} out, or choose another --model")  # fmt: skip
+        raise UsageError(
+            f"{REPAIRED} repairs renders, and this diffusion model uses none",
+            where="--methods",
+            got=config.model,
+            remedy=f"leave {REPAIRED} out, or choose another --model",
+        )
     if fits and not config.continue_fit and LONGER in config.methods:
-        raise UsageError(f"with --no-continue-fit every fit has the same iterations, so this row is that of {BASE}", where="--methods",
-                         got=LONGER, remedy="leave it out")  # fmt: skip
+        raise UsageError(
+            f"with --no-continue-fit every fit has the same iterations, so this row is that of {BASE}",
+            where="--methods",
+            got=LONGER,
+            remedy="leave it out",
+        )
     idle = {
         "no row of this table generates views": () if generators or virtual else ("synthesize",),
-        "no row of this table fits a scene": () if fits or (renders and generators) else ("fit", "iterations", "continue_fit"),
+        "no row of this table fits a scene": (
+            () if fits or (renders and generators) else ("fit", "iterations", "continue_fit")
+        ),
         "no row of this table learns from virtual views": () if virtual else ("fit.virtual", "continue_fit"),
     }
     for name in changed_settings(config, bench_preset(preset)):
         for reason, unused in idle.items():
             if any(name == one or name.startswith(f"{one}.") for one in unused):
-                raise UsageError("this setting would change nothing", where=flag_of(name), got=reason, remedy="leave it out")
+                raise UsageError(
+                    "this setting would change nothing", where=flag_of(name), got=reason, remedy="leave it out"
+                )
     if generators or virtual:
         refuse_missing(generator_of(config), virtual[0] if virtual else FitConfig(), "--model")
     for generator in dict.fromkeys((*generators, *((generator_of(config),) if virtual else ()))):
@@ -181,20 +218,23 @@ def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row
     """The methods, ablation rows and variants of ``mudg bench shift``, in the order of the tables.
 
     Raises:
-        UsageError: an unknown method, one that does not know a setting beyond the preset, or a malformed or repeated variant.
+        UsageError: an unknown method, one that does not know a setting beyond the preset, or a malformed or repeated
+            variant.
     """
     known = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
     wanted, usual = {*config.methods, *((BASE, FULL) if config.ablation else ())}, usual_fit(config)
     _refuse_unknown(wanted, known)
     rows = [_method_row(name, usual, preset) for name in known if name in wanted]
     for name, (description, weights) in ABLATION.items() if config.ablation else ():
-        rows.append(Row(name, f"with {description}", FULL, configuration.load(FitConfig, usual, overrides={"virtual": weights})))
+        rows.append(
+            Row(name, f"with {description}", FULL, configuration.load(FitConfig, usual, overrides={"virtual": weights}))
+        )
     return _without_twins([*rows, *(variant_of(text, usual) for text in config.variant)])
 
 
 def real_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The methods and variants of ``mudg bench real``; ``mudg_r`` and ``mudg_s`` are the chain of ``mudg run`` for recorded logs, the rows
-    after each leave out parts of it. Raises as `shift_rows`."""
+    """The methods and variants of ``mudg bench real``; ``mudg_r`` and ``mudg_s`` are the chain of ``mudg run`` for
+    recorded logs, the rows after each leave out parts of it. Raises as `shift_rows`."""
     usual = usual_fit(config)
     less = {name + ending: (name, sees, words) for name in (DIFFUSION, FULL) for sees, (ending, words) in LESS.items()}
     known = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, *less)
@@ -215,17 +255,26 @@ def real_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row,
 
 
 def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The rows of a paper's table: its own where it has such, else the methods asked for (all of them, where none is named).
+    """The rows of a paper's table: its own where it has such, else the methods asked for (all of them, where none is
+    named).
 
     Raises:
-        UsageError: an unknown method, one that does not know a setting beyond the preset, or methods for a table that has rows of its own.
+        UsageError: an unknown method, one that does not know a setting beyond the preset, or methods for a table that
+            has rows of its own.
     """
     usual_methods, freevs = BenchConfig().methods, config.freevs_model
     if table.rows:
         if config.methods != usual_methods:
-            raise UsageError("this table has rows of its own", where="--methods", expected="not given", got=", ".join(config.methods))
+            raise UsageError(
+                "this table has rows of its own", where="--methods", expected="not given", got=", ".join(config.methods)
+            )
         if freevs:
-            raise UsageError("this table has no row freevs", where="--freevs-model", got=f"--table {table.name}", remedy="leave it out")
+            raise UsageError(
+                "this table has no row freevs",
+                where="--freevs-model",
+                got=f"--table {table.name}",
+                remedy="leave it out",
+            )
         rows = [Row(row.name, row.title, row.method, changes=row.changes) for row in table.rows]
     else:
         known = [name for method in METHODS for name in ((method, LONGER) if method == BASE else (method,))]
@@ -234,8 +283,12 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
             methods = [name for name in known if config.continue_fit or name != LONGER]
         _refuse_unknown(methods, known, some=False)
         if freevs and "freevs" not in methods:
-            raise UsageError("no row freevs was asked for", where="--freevs-model", got=f"--methods {' '.join(config.methods)}",
-                             remedy="leave it out, or add freevs to --methods")  # fmt: skip
+            raise UsageError(
+                "no row freevs was asked for",
+                where="--freevs-model",
+                got=f"--methods {' '.join(config.methods)}",
+                remedy="leave it out, or add freevs to --methods",
+            )
         changes: dict[str, dict[str, Any]] = {"freevs": {"condition": "freevs", "model": freevs}}
         if freevs and is_published(config.model):  # the row's own model is a small one, which samples in its own way
             changes["freevs"] |= {name: getattr(SynthesizeConfig(), name) for name in SAMPLING}
@@ -243,7 +296,11 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
             changes[REPAIRED] = {"model": ""}
         control = Row(LONGER, f"{LONGER_TITLE} ({LONGER})", BASE)
         rows = [
-            control if name == LONGER else Row(name, f"{METHODS[name].title} ({name})", name, changes=changes.get(name, {}))
+            (
+                control
+                if name == LONGER
+                else Row(name, f"{METHODS[name].title} ({name})", name, changes=changes.get(name, {}))
+            )
             for name in methods
         ]
     complete = []
@@ -263,8 +320,8 @@ def _method_row(name: str, usual: FitConfig, preset: PresetName) -> Row:
 
 
 def variant_of(text: str, usual: FitConfig) -> Row:
-    """A row of ``mudg_s`` from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its field. UsageError if
-    malformed or no field of ``FitConfig``."""
+    """A row of ``mudg_s`` from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its
+    field. UsageError if malformed or no field of ``FitConfig``."""
     name, separator, rest = text.partition("=")
     fields: dict[str, Any] = {}
     for part in rest.split(","):

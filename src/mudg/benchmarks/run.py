@@ -1,15 +1,18 @@
 """``mudg bench``: measurements that print a table, each from one command.
 
 mdm            the diffusion model on held-out cities, against exact truth (``benchmarks/mdm.py``)
-poses          how much of the error of tracked boxes a fit takes out (``benchmarks/poses.py``); needs no diffusion model
-edit           edits of a fitted scene against the city regenerated with them (``benchmarks/edit.py``); needs no diffusion model. Of
-               finished runs that are given: edits of recorded drives by measures that need no truth (``benchmarks/edit_runs.py``)
+poses          how much of the error of tracked boxes a fit takes out (``benchmarks/poses.py``); needs no diffusion
+               model
+edit           edits of a fitted scene against the city regenerated with them (``benchmarks/edit.py``); needs no
+               diffusion model. Of finished runs that are given: edits of recorded drives by measures that need no truth
+               (``benchmarks/edit_runs.py``)
 shift          whole methods beside the recorded path, on lists of generated logs (``benchmarks/shift.py``)
 real           whole methods on real logs, against what the methods did not see of them (``benchmarks/real.py``)
 paper          a table of a paper, on generated cities or real logs (``benchmarks/paper.py``)
 
-The first three are one folder, with OUT/clips/ (or cities, fits, ...), OUT/bench.json, OUT/bench.md and pictures; the others compare rows
-(``benchmarks/rows.py``) on logs (``benchmarks/places.py``), worked on in one loop (``benchmarks/loop.py``), in folders of their steps.
+The first three are one folder, with OUT/clips/ (or cities, fits, ...), OUT/bench.json, OUT/bench.md and pictures; the
+others compare rows (``benchmarks/rows.py``) on logs (``benchmarks/places.py``), worked on in one loop
+(``benchmarks/loop.py``), in folders of their steps.
 """
 
 from __future__ import annotations
@@ -41,37 +44,77 @@ CHAINS = (SHIFT, REAL, PAPER)
 RUNS = "edit RUN"
 """The benchmark edit of finished runs."""
 USED: Final[Mapping[str, tuple[str, ...]]] = {
-    "model": ("mdm", EDIT, *CHAINS), "cities": ("mdm", "poses", EDIT), "count": ("mdm", "poses", EDIT), "steps": ("mdm",),
-    "sampler": ("mdm",), "eta": ("mdm",), "precision": ("mdm", *CHAINS), "harmonize": (EDIT, RUNS),
-    "threads": ("mdm", "poses", EDIT, RUNS), "seed": ("mdm", "poses", EDIT, *CHAINS), "list": (SHIFT,), "logs": (SHIFT, PAPER),
-    "methods": CHAINS, "iterations": CHAINS, "continue_fit": CHAINS, "ablation": (SHIFT, REAL), "variant": (SHIFT, REAL),
-    "processes": CHAINS, "videos": (SHIFT, PAPER), "table": (PAPER,), "freevs_model": (PAPER,), "protocols": (REAL,), "shown": (REAL,),
-    "resolution": (REAL, PAPER), "frames": (REAL, PAPER), "pose_iterations": ("poses", EDIT),
-    "device": ("mdm", "poses", EDIT, RUNS, *CHAINS), "fuse": CHAINS, "synthesize": CHAINS, "fit": CHAINS, "score": (PAPER,),
-}  # fmt: skip
+    "model": ("mdm", EDIT, *CHAINS),
+    "cities": ("mdm", "poses", EDIT),
+    "count": ("mdm", "poses", EDIT),
+    "steps": ("mdm",),
+    "sampler": ("mdm",),
+    "eta": ("mdm",),
+    "precision": ("mdm", *CHAINS),
+    "harmonize": (EDIT, RUNS),
+    "threads": ("mdm", "poses", EDIT, RUNS),
+    "seed": ("mdm", "poses", EDIT, *CHAINS),
+    "list": (SHIFT,),
+    "logs": (SHIFT, PAPER),
+    "methods": CHAINS,
+    "iterations": CHAINS,
+    "continue_fit": CHAINS,
+    "ablation": (SHIFT, REAL),
+    "variant": (SHIFT, REAL),
+    "processes": CHAINS,
+    "videos": (SHIFT, PAPER),
+    "table": (PAPER,),
+    "freevs_model": (PAPER,),
+    "protocols": (REAL,),
+    "shown": (REAL,),
+    "resolution": (REAL, PAPER),
+    "frames": (REAL, PAPER),
+    "pose_iterations": ("poses", EDIT),
+    "device": ("mdm", "poses", EDIT, RUNS, *CHAINS),
+    "fuse": CHAINS,
+    "synthesize": CHAINS,
+    "fit": CHAINS,
+    "score": (PAPER,),
+}
 """Setting or group of settings -> the benchmarks that use it; the others refuse it."""
 OWN: Final[Mapping[str, str]] = {
     **{f"synthesize.{name}": f"give --{name}" for name in ("model", "precision", "seed", "device", "processes")},
-    **{f"fit.{name}": f"give --{name}" for name in ("iterations", "seed", "device")}, "fit.method": "give --methods",
-    **dict.fromkeys((
-        "synthesize.cameras", "synthesize.shifts_m", "synthesize.paths", "synthesize.condition",
-        "score.baseline", "score.error_pictures", "score.perceptual_views",
-    ), "leave it out"),
-}  # fmt: skip
+    **{f"fit.{name}": f"give --{name}" for name in ("iterations", "seed", "device")},
+    "fit.method": "give --methods",
+    **dict.fromkeys(
+        (
+            "synthesize.cameras",
+            "synthesize.shifts_m",
+            "synthesize.paths",
+            "synthesize.condition",
+            "score.baseline",
+            "score.error_pictures",
+            "score.perceptual_views",
+        ),
+        "leave it out",
+    ),
+}
 """Settings of steps that a benchmark of complete methods chooses itself, and what to do instead."""
 
 
 def run(
-    name: str, config: BenchConfig, out: Path, *, sources: Sequence[Path] = (), preset: PresetName = "default", overwrite: bool = False
+    name: str,
+    config: BenchConfig,
+    out: Path,
+    *,
+    sources: Sequence[Path] = (),
+    preset: PresetName = "default",
+    overwrite: bool = False,
 ) -> Path:
     """Run one of `BENCHES`, shift, real or paper; returns the folder with `bench.json` and `bench.md`.
 
     Args:
-        sources: logs, for real; logs or a list of cities, for paper; finished runs, for edit. preset: what the configuration started
-            from, for shift, real and paper.
+        sources: logs, for real; logs or a list of cities, for paper; finished runs, for edit. preset: what the
+            configuration started from, for shift, real and paper.
 
     Raises:
-        UsageError: there is no such benchmark, a setting that it does not use, or logs were given to one that makes its own.
+        UsageError: there is no such benchmark, a setting that it does not use, or logs were given to one that makes its
+            own.
     """
     if name not in (*BENCHES, *CHAINS):
         raise UsageError("no such benchmark", expected=", ".join((*BENCHES, *CHAINS)), got=name)
@@ -83,7 +126,9 @@ def run(
     if name == EDIT and sources:
         return edit_runs.run(config, sources, out, overwrite=overwrite)
     if sources:
-        raise UsageError("this benchmark makes its own logs", where=f"mudg bench {name}", got=", ".join(map(str, sources)))
+        raise UsageError(
+            "this benchmark makes its own logs", where=f"mudg bench {name}", got=", ".join(map(str, sources))
+        )
     if name == SHIFT:
         return shift.run(config, out, preset=preset, overwrite=overwrite)
     inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
@@ -101,30 +146,45 @@ def run(
 
 
 def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
-    """UsageError for a preset, or a setting that differs from it, of which a benchmark makes no use, and where weights are missing.
+    """UsageError for a preset, or a setting that differs from it, of which a benchmark makes no use, and where weights
+    are missing.
 
     Args:
         name: of the benchmark; `RUNS` for edits of finished runs.
     """
     if name not in CHAINS and preset != "default":
-        raise UsageError("only benchmarks of complete methods have presets", where="--preset", expected=", ".join(CHAINS), got=name,
-                         remedy="leave it out")  # fmt: skip
+        raise UsageError(
+            "only benchmarks of complete methods have presets",
+            where="--preset",
+            expected=", ".join(CHAINS),
+            got=name,
+            remedy="leave it out",
+        )
     for setting in changed_settings(config, bench_preset(preset)):
         users, group = USED[setting.split(".")[0]], f"synthesize.{setting}"
         if name not in users:
             elsewhere = name in CHAINS and setting in ("steps", "sampler", "eta")
-            raise UsageError(f"mudg bench {name} does not use this setting", where=flag_of(setting),
-                             expected=" or ".join(f"mudg bench {one}" for one in users),
-                             remedy=f"give {flag_of(group)}" if elsewhere else "leave it out")  # fmt: skip
+            raise UsageError(
+                f"mudg bench {name} does not use this setting",
+                where=flag_of(setting),
+                expected=" or ".join(f"mudg bench {one}" for one in users),
+                remedy=f"give {flag_of(group)}" if elsewhere else "leave it out",
+            )
         if setting in OWN and (setting, name) != ("synthesize.shifts_m", REAL):
             raise UsageError("the benchmark chooses this itself", where=flag_of(setting), remedy=OWN[setting])
     if name == EDIT and config.model != BenchConfig().model and not config.harmonize:
-        raise UsageError("without --harmonize no diffusion model is used", where="--model", got=config.model, remedy="leave it out")
+        raise UsageError(
+            "without --harmonize no diffusion model is used", where="--model", got=config.model, remedy="leave it out"
+        )
     if name in CHAINS:
         refuse_missing(generator_of(config), FitConfig(), "--model")
     if name == "mdm" and is_published(config.model):
-        raise UsageError("mudg bench mdm measures small models", where="--model", got=config.model,
-                         remedy="mudg bench paper --table mudg2 measures published-type ones")  # fmt: skip
+        raise UsageError(
+            "mudg bench mdm measures small models",
+            where="--model",
+            got=config.model,
+            remedy="mudg bench paper --table mudg2 measures published-type ones",
+        )
 
 
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {

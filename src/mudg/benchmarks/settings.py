@@ -18,25 +18,26 @@ class BenchOwn:
     """The settings of ``mudg bench`` without those of the steps that it takes."""
 
     model: str = "embedded"
-    """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or
-    convert."""
+    """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn
+    or convert."""
     cities: Literal["reported", "development"] = "reported"
-    """mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen."""
+    """mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing
+    was chosen."""
     count: int = setting(default=6, ge=1, le=6)
-    """mdm, poses, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4 m, and on the
-    recorded path."""
+    """mdm, poses, edit: number of cities taken from the list, 1 to 6. mdm: each gives four clips: shifted by 2, 3 and 4
+    m, and on the recorded path."""
     steps: tuple[int, ...] = (1, 2, 8)
     """mdm: numbers of denoising steps to compare; each is measured on its own."""
     sampler: Literal["ddim", "dpm_solver"] = "ddim"
-    """mdm: sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and
-    deterministic, for many steps. Both cost one network pass per step. shift, real and paper have `--synthesize.sampler`, and
-    likewise steps and eta."""
+    """mdm: sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order
+    and deterministic, for many steps. Both cost one network pass per step. shift, real and paper have
+    `--synthesize.sampler`, and likewise steps and eta."""
     eta: float | None = setting(default=None, ge=0, le=1)
-    """mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not given:
-    1)."""
+    """mdm: sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has)
+    (not given: 1)."""
     precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
-    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere. float16:
-    published-type models on CUDA devices (shift, real, paper)."""
+    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
+    elsewhere. float16: published-type models on CUDA devices (shift, real, paper)."""
     harmonize: bool = False
     """edit: add rows with the diffusion model: edited frames that it repaired, and fits that go on with them."""
     threads: int = setting(default=1, ge=1)
@@ -49,42 +50,55 @@ class BenchOwn:
     """shift; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4)."""
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
     """shift, real: methods to compare: those of the default; pvg, s3gaussian, bezier, omnire, emernerf and difix; and
-    street_gaussians-longer, which goes on for as many steps as mudg_s, without generated views. real also has mudg_r-no-adapt,
-    mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and with points alone
-    in its input. paper: any of these of shift, and freevs; with the default, all of them."""
+    street_gaussians-longer, which goes on for as many steps as mudg_s, without generated views. real also has
+    mudg_r-no-adapt, mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to
+    the log, and with points alone in its input. paper: any of these of shift, and freevs; with the default, all of
+    them."""
     iterations: int = setting(default=1000, ge=1)
-    """shift, real, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more."""
+    """shift, real, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as
+    many more."""
     continue_fit: bool = True
-    """shift, real, paper: make fits under virtual views from the one without, with half as many steps. Off: from nothing with all steps, as
-    published."""
+    """shift, real, paper: make fits under virtual views from the one without, with half as many steps. Off: from
+    nothing with all steps, as published."""
     ablation: bool = False
-    """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact
-    views instead of generated ones. real: add the rows without adaptation and without renders."""
+    """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and
+    with exact views instead of generated ones. real: add the rows without adaptation and without renders."""
     variant: tuple[str, ...] = ()
-    """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such
-    as virtual.color_weight. Both of its fits have them."""
+    """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is
+    a setting such as virtual.color_weight. Both of its fits have them."""
     processes: int = setting(default=0, ge=0)
-    """shift, real, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per
-    core). Results do not depend on it."""
+    """shift, real, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread
+    each (0 = one per core). Results do not depend on it."""
     videos: bool = True
     """shift, paper: also write videos of all methods side by side."""
     table: Literal[
-        "mudg1", "mudg2", "mudg3", "recondreamer", "drivedreamer4d", "streetcrafter", "freesim", "recam", "spvc", "panda", "dist"
+        "mudg1",
+        "mudg2",
+        "mudg3",
+        "recondreamer",
+        "drivedreamer4d",
+        "streetcrafter",
+        "freesim",
+        "recam",
+        "spvc",
+        "panda",
+        "dist",
     ] = "mudg1"
     """paper: the table to fill (docs/paper_tables.md)."""
     freevs_model: str = ""
-    """paper: diffusion model for the row freevs, learned with `--data.condition freevs` (empty = the row has no numbers)."""
+    """paper: diffusion model for the row freevs, learned with `--data.condition freevs` (empty = the row has no
+    numbers)."""
     protocols: tuple[str, ...] = ("gap", "camera", "lidar", "classes")
     """real: protocols, out of the four of the default. Instead of gap also gap-1, gap-3 and gap-5 alone."""
     shown: tuple[str, ...] = ()
-    """real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path (empty = front,
-    or the first camera)."""
+    """real: cameras that the methods see in protocol camera; the first one gives the views beside the recorded path
+    (empty = front, or the first camera)."""
     resolution: str = ""
-    """real, paper: image size of logs that are imported, as for ingest (empty = as recorded; paper: as the table says). paper with a list
-    of cities: WIDTHxHEIGHT (empty = 384x256)."""
+    """real, paper: image size of logs that are imported, as for ingest (empty = as recorded; paper: as the table says).
+    paper with a list of cities: WIDTHxHEIGHT (empty = 384x256)."""
     frames: str = ""
-    """real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper: as the table says).
-    paper with a list of cities: 0:END (empty = 0:24)."""
+    """real, paper: frames of logs that are imported, FIRST:END without END itself, as for ingest (empty = all; paper:
+    as the table says). paper with a list of cities: 0:END (empty = 0:24)."""
     pose_iterations: int = setting(default=300, ge=1)
     """poses, edit: optimisation steps of every fit."""
     device: DeviceName = "auto"
@@ -93,14 +107,15 @@ class BenchOwn:
 
 @settings
 class BenchConfig(BenchOwn):
-    """Measure the diffusion model, the correction of box tracks, or complete methods off the recorded path, all on generated cities
-    against exact ground truth; complete methods on real logs; or fill a table of a paper."""
+    """Measure the diffusion model, the correction of box tracks, or complete methods off the recorded path, all on
+    generated cities against exact ground truth; complete methods on real logs; or fill a table of a paper."""
 
     fuse: FuseConfig = setting(default_factory=FuseConfig)
     """shift, real, paper: how the clouds of every log are made."""
     synthesize: SynthesizeConfig = setting(default_factory=SynthesizeConfig)
-    """shift, real, paper: how views are generated. Model, number format, seed and device are the benchmark's own flags; where views are
-    generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn from)."""
+    """shift, real, paper: how views are generated. Model, number format, seed and device are the benchmark's own flags;
+    where views are generated is the benchmark's matter (real: `--synthesize.shifts-m` for the views that fits learn
+    from)."""
     fit: FitConfig = setting(default_factory=FitConfig)
     """shift, real, paper: how scenes are fitted. Method, steps, seed and device are the benchmark's own flags."""
     score: ScoreConfig = setting(default_factory=ScoreConfig)
@@ -108,16 +123,22 @@ class BenchConfig(BenchOwn):
 
 
 def bench_preset(name: PresetName = "default") -> BenchConfig:
-    """The settings of ``mudg bench shift``, ``real`` and ``paper`` before any file or flag: those of a preset that say how clouds, views
-    and fits are made. Which logs, and their size, is the benchmark's matter.
+    """The settings of ``mudg bench shift``, ``real`` and ``paper`` before any file or flag: those of a preset that say
+    how clouds, views and fits are made. Which logs, and their size, is the benchmark's matter.
 
     Raises:
         UsageError: no such preset.
     """
     run = run_preset(name)
     usual = SynthesizeConfig()
-    return changed(BenchConfig(), {
-        "model": run.synthesize.model, "iterations": run.fit.iterations, "continue_fit": run.continue_fit, "fuse": run.fuse,
-        "synthesize": changed(run.synthesize, {"model": usual.model, "cameras": usual.cameras}),
-        "fit": changed(run.fit, {"iterations": FitConfig().iterations}),
-    })  # fmt: skip
+    return changed(
+        BenchConfig(),
+        {
+            "model": run.synthesize.model,
+            "iterations": run.fit.iterations,
+            "continue_fit": run.continue_fit,
+            "fuse": run.fuse,
+            "synthesize": changed(run.synthesize, {"model": usual.model, "cameras": usual.cameras}),
+            "fit": changed(run.fit, {"iterations": FitConfig().iterations}),
+        },
+    )

@@ -1,8 +1,8 @@
 """``mudg bench shift``: whole methods beside the recorded path, on lists of generated logs, against exact truth.
 
-Every log is ingested, fused and synthesized once; every method is fitted, rendered and scored on its own, by the ordinary verbs, so that
-whatever is finished is reused and another variant costs only itself. Fits under virtual views go on with the one on recorded views, as in
-``mudg run``.
+Every log is ingested, fused and synthesized once; every method is fitted, rendered and scored on its own, by the
+ordinary verbs, so that whatever is finished is reused and another variant costs only itself. Fits under virtual views
+go on with the one on recorded views, as in ``mudg run``.
 
     OUT/<log>/...   see ``benchmarks/views.py``; generated views lie in OUT/<log>/synthesize
     OUT/bench.json   every number        OUT/bench.md   the tables        OUT/page.html   tables and videos
@@ -44,9 +44,16 @@ from mudg.steps.settings.presets import PresetName
 SHIFTED: Final = "shifted"
 """The mean over the lateral distances."""
 COLUMNS: Final[dict[str, tuple[str, int]]] = {
-    "psnr": ("PSNR dB", 2), "ssim": ("SSIM", 3), "perceptual": ("perceptual", 4), "abs_rel": ("AbsRel", 4), "rmse_m": ("RMSE m", 2),
-    "delta1": ("delta1", 4), "miou": ("mIoU", 3), "flicker": ("flicker", 3), "psnr_movers": ("PSNR of dynamic objects", 2),
-}  # fmt: skip
+    "psnr": ("PSNR dB", 2),
+    "ssim": ("SSIM", 3),
+    "perceptual": ("perceptual", 4),
+    "abs_rel": ("AbsRel", 4),
+    "rmse_m": ("RMSE m", 2),
+    "delta1": ("delta1", 4),
+    "miou": ("mIoU", 3),
+    "flicker": ("flicker", 3),
+    "psnr_movers": ("PSNR of dynamic objects", 2),
+}
 """Metric -> heading, digits."""
 RATIOS: Final = ("perceptual", "abs_rel", "rmse_m", "flicker")
 """Metrics whose comparison is a ratio (a / b); of the others it is a difference (a - b)."""
@@ -61,8 +68,13 @@ COMPARISONS: Final = (
 )
 """A method, that against which it is held, a place, and metrics."""
 ABLATION_ROWS: Final = {
-    BASE: "none", "only_I": "+ I", "only_I_D": "+ I + D", "only_I_S": "+ I + S", FULL: "+ I + D + S", EXACT: "exact views",
-}  # fmt: skip
+    BASE: "none",
+    "only_I": "+ I",
+    "only_I_D": "+ I + D",
+    "only_I_S": "+ I + S",
+    FULL: "+ I + D + S",
+    EXACT: "exact views",
+}
 SHOWN: Final = (FILL, "gs3d", BASE, DIFFUSION, FULL)
 """Methods in the videos."""
 _PAGES: Final = ("bench.json", "bench.md", "page.html")
@@ -88,16 +100,27 @@ class ShiftLog(Views):
             films = self.film({"truth": self.truth, **{name: of[0] for name, of in views.items() if name in SHOWN}})
         facts = city_logs.facts(self.log.seed, self.log.rules)
         return {
-            "log": self.log.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1), "movers": facts.moving,
-            "mover_share": round(facts.moving_share, 4), "words": facts.description, "films": films, "values": values,
+            "log": self.log.seed,
+            "turn_deg": round(facts.turn_deg, 2),
+            "length_m": round(facts.length_m, 1),
+            "movers": facts.moving,
+            "mover_share": round(facts.moving_share, 4),
+            "words": facts.description,
+            "films": films,
+            "values": values,
             "seconds": seconds_of(self.out),
-        }  # fmt: skip
+        }
 
 
 def run(
-    config: BenchConfig, out: Path, *, preset: PresetName = "default", overwrite: bool = False, rules: LogRules = STANDARD,
+    config: BenchConfig,
+    out: Path,
+    *,
+    preset: PresetName = "default",
+    overwrite: bool = False,
+    rules: LogRules = STANDARD,
     distances_m: Sequence[float] = (2.0, 3.0, 4.0),
-) -> Path:  # fmt: skip
+) -> Path:
     """Compare methods on the logs of a list; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``.
 
     Args:
@@ -107,29 +130,52 @@ def run(
         rules: frames, size and cameras of the logs. distances_m: lateral distances, each to both sides.
 
     Raises:
-        UsageError: an unknown method, a malformed variant, a setting that no row uses, or ``out`` holds logs of other settings. Whatever
-            a verb raises.
+        UsageError: an unknown method, a malformed variant, a setting that no row uses, or ``out`` holds logs of other
+            settings. Whatever a verb raises.
     """
     rows, out = shift_rows(config, preset), Path(out)
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
     refuse_foreign(
-        out, _PAGES, lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc, lambda entry: entry.name.isdigit()
+        out,
+        _PAGES,
+        lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc,
+        lambda entry: entry.name.isdigit(),
     )
     shifts = {RECORDED: [0.0], **{f"{d:g}": [d, -d] for d in distances_m}}
     places = [PaperPlace(name=name, title="", shifts_m=shifts_m) for name, shifts_m in shifts.items()]
     table, renders = PaperTable(name="shift", places=places, columns=[]), mdm_files.uses_renders(config.model)
     jobs = [
-        ShiftLog(log, out / log.name, table, rows, config, score_settings(config, table), renders, overwrite, "synthesize", on_path=False)
+        ShiftLog(
+            log,
+            out / log.name,
+            table,
+            rows,
+            config,
+            score_settings(config, table),
+            renders,
+            overwrite,
+            "synthesize",
+            on_path=False,
+        )
         for log in listed_cities(config.list, config.logs, rules)
     ]
     refuse_unfit(config, preset, rows, [generator_of(config)] * any(row.method == DIFFUSION for row in rows))
     settings = {
-        "list": config.list, "iterations": config.iterations, "seed": config.seed, "model": mdm_files.digest(config.model),
-        "renders": renders, "frames": rules.frames, "size_px": [rules.width, rules.height], "cameras": list(rules.cameras),
-        "held_out_every": table.held_out_every, "ablation": config.ablation, **chain_settings(config, preset),
-    }  # fmt: skip
+        "list": config.list,
+        "iterations": config.iterations,
+        "seed": config.seed,
+        "model": mdm_files.digest(config.model),
+        "renders": renders,
+        "frames": rules.frames,
+        "size_px": [rules.width, rules.height],
+        "cameras": list(rules.cameras),
+        "held_out_every": table.held_out_every,
+        "ablation": config.ablation,
+        **chain_settings(config, preset),
+    }
     values = [
-        {"name": r.name, "title": r.title, "fit": None if r.fit is None else configuration.result_settings(r.fit)} for r in rows
+        {"name": r.name, "title": r.title, "fit": None if r.fit is None else configuration.result_settings(r.fit)}
+        for r in rows
     ]
     filled = lambda logs: document(logs, values, list(distances_m), settings)  # noqa: E731
     return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": page})
@@ -139,34 +185,56 @@ def run(
 
 
 def document(
-    logs: Sequence[Mapping[str, Any]], rows: Sequence[Mapping[str, Any]], distances_m: Sequence[float], settings: Mapping[str, Any]
+    logs: Sequence[Mapping[str, Any]],
+    rows: Sequence[Mapping[str, Any]],
+    distances_m: Sequence[float],
+    settings: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Everything ``bench.json`` holds.
 
     Args:
         logs: per log its facts, ``values[method][distance][metric]`` (a number, or why there is none) and seconds.
-        rows: name, title and fit of each method. distances_m: lateral shifts off the recorded path. settings: of the bench.
+        rows: name, title and fit of each method. distances_m: lateral shifts off the recorded path. settings: of the
+            bench.
     """
     shifted = [f"{d:g}" for d in sorted(distances_m)]
     full = [{**entry, "values": {m: with_mean(of, shifted) for m, of in entry["values"].items()}} for entry in logs]
     names = [row["name"] for row in rows]
     pooled = {
-        name: {p: {m: _pooled([entry["values"][name].get(p, {}).get(m, "not produced") for entry in full]) for m in COLUMNS}
-               for p in (RECORDED, *shifted, SHIFTED)}
+        name: {
+            p: {
+                m: _pooled([entry["values"][name].get(p, {}).get(m, "not produced") for entry in full]) for m in COLUMNS
+            }
+            for p in (RECORDED, *shifted, SHIFTED)
+        }
         for name in names
-    }  # fmt: skip
-    against_full = [r["name"] for r in rows if FULL in names and r["fit"] is not None and r["name"] not in ("gs3d", BASE, FULL)]
+    }
+    against_full = [
+        r["name"] for r in rows if FULL in names and r["fit"] is not None and r["name"] not in ("gs3d", BASE, FULL)
+    ]
     return {
-        "schema": 1, "settings": dict(settings), "distances_m": list(distances_m), "methods": [dict(r) for r in rows],
-        "metrics": list(COLUMNS), "logs": full, "pooled": pooled,
-        "comparisons": [c for a, b, place, metrics in COMPARISONS if {a, b} <= {*names} for c in against(full, a, b, place, metrics)],
+        "schema": 1,
+        "settings": dict(settings),
+        "distances_m": list(distances_m),
+        "methods": [dict(r) for r in rows],
+        "metrics": list(COLUMNS),
+        "logs": full,
+        "pooled": pooled,
+        "comparisons": [
+            c for a, b, place, metrics in COMPARISONS if {a, b} <= {*names} for c in against(full, a, b, place, metrics)
+        ],
         "variants": [
-            {"name": name, "against_mudg_s": [
-                c for place in (SHIFTED, RECORDED) for c in against(full, name, FULL, place, "psnr perceptual abs_rel miou")
-            ]}
+            {
+                "name": name,
+                "against_mudg_s": [
+                    c
+                    for place in (SHIFTED, RECORDED)
+                    for c in against(full, name, FULL, place, "psnr perceptual abs_rel miou")
+                ],
+            }
             for name in against_full
         ],
-    }  # fmt: skip
+    }
 
 
 def with_mean(of: Mapping[str, Mapping[str, Any]], shifted: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -190,8 +258,9 @@ def _pooled(values: Sequence[Any]) -> Any:
 def against(logs: Sequence[Mapping[str, Any]], a: str, b: str, place: str, metrics: str) -> list[dict[str, Any]]:
     """Comparisons of two methods over the logs that have both numbers, one per metric.
 
-    The difference of the means over logs, or their ratio; the standard error is the jackknife's over logs (for a difference:
-    the spread of the differences of single logs over the root of their number). None with fewer than two logs.
+    The difference of the means over logs, or their ratio; the standard error is the jackknife's over logs (for a
+    difference: the spread of the differences of single logs over the root of their number). None with fewer than two
+    logs.
     """
     comparisons = []
     for metric in metrics.split():
@@ -200,12 +269,20 @@ def against(logs: Sequence[Mapping[str, Any]], a: str, b: str, place: str, metri
         both, of = [pair for pair in known if pair is not None], _ratio if metric in RATIOS else _difference
         per_log = [None if pair is None else of([pair]) for pair in known]
         where = "recorded path" if place == RECORDED else "off the recorded path"
-        comparisons.append({
-            "title": f"{a} against {b}, {where}: {COLUMNS[metric][0]}", "a": a, "b": b, "place": place, "metric": metric,
-            "kind": "ratio" if metric in RATIOS else "difference", "value": of(both) if both else None,
-            "standard_error": standard_error(of, both), "logs": len(both),
-            "per_log": [None if value is None else round(value, 5) for value in per_log],
-        })  # fmt: skip
+        comparisons.append(
+            {
+                "title": f"{a} against {b}, {where}: {COLUMNS[metric][0]}",
+                "a": a,
+                "b": b,
+                "place": place,
+                "metric": metric,
+                "kind": "ratio" if metric in RATIOS else "difference",
+                "value": of(both) if both else None,
+                "standard_error": standard_error(of, both),
+                "logs": len(both),
+                "per_log": [None if value is None else round(value, 5) for value in per_log],
+            }
+        )
     return comparisons
 
 
@@ -253,13 +330,18 @@ def markdown(doc: Mapping[str, Any]) -> str:
     settings = doc["settings"]
     width, height = settings["size_px"]
     lines = [
-        f"# Off the recorded path: {_logs_text(doc)} of the {settings['list']} list", "",
-        f"{settings['frames']} frames at 10 Hz, {width}x{height}, {len(settings['cameras'])} cameras, every {settings['held_out_every']}th "
-        f"frame held out; {_summary(settings)}; seed {settings['seed']}. Means over both "
-        "sides and all logs, +- the standard error over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped "
-        "codec, not LPIPS.", "",
-        *markdown_table(FACTS, map(_facts, doc["logs"])), "",
-    ]  # fmt: skip
+        f"# Off the recorded path: {_logs_text(doc)} of the {settings['list']} list",
+        "",
+        (
+            f"{settings['frames']} frames at 10 Hz, {width}x{height}, {len(settings['cameras'])} cameras, every"
+            f" {settings['held_out_every']}th frame held out; {_summary(settings)}; seed {settings['seed']}. Means over"
+            " both sides and all logs, +- the standard error over logs. Flicker: 1 = as steady as the truth."
+            " Perceptual: features of the shipped codec, not LPIPS."
+        ),
+        "",
+        *markdown_table(FACTS, map(_facts, doc["logs"])),
+        "",
+    ]
     headings = [heading for heading, _ in COLUMNS.values()]
     names = [row["name"] for row in doc["methods"]]
     for place in _places(doc):
@@ -269,15 +351,25 @@ def markdown(doc: Mapping[str, Any]) -> str:
     if "only_I" in names:
         metrics = ("psnr", "ssim", "perceptual", "abs_rel", "delta1", "miou")
         heads = ["virtual terms", *(COLUMNS[metric][0] for metric in metrics)]
-        rows = [[title, *_cells(doc["pooled"][name][SHIFTED], metrics, with_error=True)] for name, title in ABLATION_ROWS.items()]
+        rows = [
+            [title, *_cells(doc["pooled"][name][SHIFTED], metrics, with_error=True)]
+            for name, title in ABLATION_ROWS.items()
+        ]
         lines += ["## Which virtual term does what", "", *markdown_table(heads, rows), ""]
     for variant in doc["variants"]:
         lines += [f"## {variant['name']} against mudg_s", "", *_comparison_table(variant["against_mudg_s"]), ""]
-    rows = [[str(entry["log"]), name, *_cells(entry["values"][name][SHIFTED])] for entry in doc["logs"] for name in names]
+    rows = [
+        [str(entry["log"]), name, *_cells(entry["values"][name][SHIFTED])] for entry in doc["logs"] for name in names
+    ]
     steps = dict.fromkeys(step for entry in doc["logs"] for step in entry["seconds"])
     seconds = [[step, *(f"{entry['seconds'].get(step, math.nan):.0f}" for entry in doc["logs"])] for step in steps]
     lines += ["## Each log, mean off the recorded path", "", *markdown_table(["log", "method", *headings], rows), ""]
-    lines += ["## Seconds per log", "", *markdown_table(["step", *(str(entry["log"]) for entry in doc["logs"])], seconds), ""]
+    lines += [
+        "## Seconds per log",
+        "",
+        *markdown_table(["step", *(str(entry["log"]) for entry in doc["logs"])], seconds),
+        "",
+    ]
     return "\n".join(lines)
 
 
@@ -289,23 +381,29 @@ def page(doc: Mapping[str, Any]) -> str:
     compared = [[c["title"], *_compared(c), c["kind"], str(c["logs"])] for c in doc["comparisons"]]
     scores = [
         TextTable.of_texts(
-            heads, [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names], _place_title(doc, place)
+            heads,
+            [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names],
+            _place_title(doc, place),
         )
         for place in (mean, *places)
     ]
     videos = pages.films(doc, ["truth", *(name for name in names if name in SHOWN)], videos=True, choice=True)
     return pages.render(
-        f"Off the recorded path: {_logs_text(doc)}, {settings['list']} list", "mudg bench shift",
-        f"Generated logs of {settings['frames']} frames with exact ground truth at every view; {_summary(settings)}. Means over logs and "
-        "both sides of the path.",
+        f"Off the recorded path: {_logs_text(doc)}, {settings['list']} list",
+        "mudg bench shift",
+        f"Generated logs of {settings['frames']} frames with exact ground truth at every view; {_summary(settings)}."
+        " Means over logs and both sides of the path.",
         [
             *([videos] if videos["films"] else []),
-            {"title": "Comparisons", "tables": [TextTable.of_texts(["", "value", "standard error", "as", "logs"], compared)]},
+            {
+                "title": "Comparisons",
+                "tables": [TextTable.of_texts(["", "value", "standard error", "as", "logs"], compared)],
+            },
             {"title": "Scores", "tables": scores},
             {"title": "Logs", "tables": [TextTable.of_texts(FACTS, map(_facts, doc["logs"]))]},
         ],
         "The videos lie beside this page.",
-    )  # fmt: skip
+    )
 
 
 def _places(doc: Mapping[str, Any]) -> list[str]:
@@ -327,7 +425,8 @@ def _place_title(doc: Mapping[str, Any], place: str) -> str:
 
 
 def _cells(values: Mapping[str, Any], metrics: Sequence[str] = tuple(COLUMNS), with_error: bool = False) -> list[str]:
-    """Values by metric as text, pooled (with the standard error where that is wanted and known) or of one log; or the reason for none."""
+    """Values by metric as text, pooled (with the standard error where that is wanted and known) or of one log; or the
+    reason for none."""
     cells = []
     for metric in metrics:
         value, digits = values[metric], COLUMNS[metric][1]
@@ -346,9 +445,13 @@ FACTS: Final = ("log", "turn, degrees", "length, m", "dynamic vehicles in view",
 def _facts(entry: Mapping[str, Any]) -> list[str]:
     """Cells of a log's row under ``FACTS``."""
     return [
-        str(entry["log"]), f"{entry['turn_deg']:.1f}", f"{entry['length_m']:.0f}", str(entry["movers"]),
-        f"{entry['mover_share']:.1%}", entry["words"],
-    ]  # fmt: skip
+        str(entry["log"]),
+        f"{entry['turn_deg']:.1f}",
+        f"{entry['length_m']:.0f}",
+        str(entry["movers"]),
+        f"{entry['mover_share']:.1%}",
+        entry["words"],
+    ]
 
 
 def _compared(comparison: Mapping[str, Any]) -> tuple[str, str]:

@@ -16,32 +16,39 @@ if TYPE_CHECKING:
 
 
 class Bench(Output):
-    """Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of papers."""
+    """Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of
+    papers."""
 
     section = "benchmarks"
     examples = (
-        "mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses", "mudg bench edit --out runs/edits",
+        "mudg bench mdm --out runs/bench",
+        "mudg bench poses --out runs/poses",
+        "mudg bench edit --out runs/edits",
         "mudg bench edit runs/a runs/b --out runs/edited",
         "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
         "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",
         "mudg bench paper city:reported --table mudg1 --out runs/mudg1",
         "mudg bench paper logs/* --table mudg2 --preset paper --model models/mudg_1024 --out runs/mudg2",
-    )  # fmt: skip
+    )
     short = ("model", "seed", "device")
     parts = {
-        "mdm": "Measure the diffusion model against exact truth.", "poses": "Measure the correction of box tracks.",
-        "edit": "Measure edits of fitted scenes.", "shift": "Measure complete methods off the recorded path, against exact truth.",
-        "real": "Measure complete methods on real logs.", "paper": "Fill a table of a paper.",
-    }  # fmt: skip
+        "mdm": "Measure the diffusion model against exact truth.",
+        "poses": "Measure the correction of box tracks.",
+        "edit": "Measure edits of fitted scenes.",
+        "shift": "Measure complete methods off the recorded path, against exact truth.",
+        "real": "Measure complete methods on real logs.",
+        "paper": "Fill a table of a paper.",
+    }
     name: Annotated[str, Flag("BENCHMARK", "first")]
-    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off
-    the recorded path), real (complete methods on real logs) or paper (a table of a paper)."""
+    """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift
+    (complete methods off the recorded path), real (complete methods on real logs) or paper (a table of a paper)."""
     sources: Annotated[tuple[Path, ...], Flag("[LOG ...]", "rest")] = ()
-    """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of
-    generated cities. edit: folders of finished runs, whose drives are edited in place of generated cities."""
+    """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or
+    city:development, a list of generated cities. edit: folders of finished runs, whose drives are edited in place of
+    generated cities."""
     preset: PresetName = "default"
-    """shift, real, paper: settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the
-    published set-up, with a published-type model."""
+    """shift, real, paper: settings of clouds, generated views and fits to start from, as for mudg run
+    (docs/presets.md). paper: the published set-up, with a published-type model."""
     settings: BenchConfig
 
     @classmethod
@@ -66,7 +73,9 @@ class Bench(Output):
     def act(self) -> Path:
         from mudg.benchmarks import run as bench
 
-        return bench.run(self.name, self.settings, self.out, sources=self.sources, preset=self.preset, overwrite=self.overwrite)
+        return bench.run(
+            self.name, self.settings, self.out, sources=self.sources, preset=self.preset, overwrite=self.overwrite
+        )
 
     def answer(self, outcome: Any) -> dict[str, Any]:
         from mudg.base import store

@@ -46,7 +46,8 @@ SPLAT_SHARE: Final = 0.006
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Target:
-    """A view to score: where its values are pooled (``place``), the recorded frame (of its moment), and its maps by name."""
+    """A view to score: where its values are pooled (``place``), the recorded frame (of its moment), and its maps by
+    name."""
 
     place: str
     frame: Frame
@@ -107,9 +108,12 @@ class MakeTargets(Output):
         records, left_out, color_maps = _written(maker, by_camera, work.path)
         pictures = _write_pictures(maker, records, work.path)
         document = {
-            "views": records, "color_maps": {name: asdict(found) for name, found in color_maps.items()}, "pictures": pictures,
-            "left_out": left_out, "reason": "" if records else (next(iter(left_out.values()), "no frame to score")),
-        }  # fmt: skip
+            "views": records,
+            "color_maps": {name: asdict(found) for name, found in color_maps.items()},
+            "pictures": pictures,
+            "left_out": left_out,
+            "reason": "" if records else (next(iter(left_out.values()), "no frame to score")),
+        }
         store.write_json(work.path / "targets.json", document)
         return {"views": len(records)}
 
@@ -124,12 +128,15 @@ def read_targets(folder: Path) -> Targets:
     all_seen = sum(map(sum, seen.values()))
     facts = {
         "views": {place: len(own) for place, own in by_place.items()},
-        "left_out": found["left_out"], "color_maps": found["color_maps"],
+        "left_out": found["left_out"],
+        "color_maps": found["color_maps"],
         "seen_share": {
-            place: round(float(np.mean([r["seen_share"] for r in own])), 4) for place, own in by_place.items() if seen[place]
+            place: round(float(np.mean([r["seen_share"] for r in own])), 4)
+            for place, own in by_place.items()
+            if seen[place]
         },
         "weight": {place: round(sum(counts) / all_seen, 4) for place, counts in seen.items() if counts and all_seen},
-    }  # fmt: skip
+    }
     return Targets(folder, tuple(found["views"]), maps, tuple(found["pictures"]), facts, found["reason"])
 
 
@@ -144,7 +151,8 @@ def _view_of(scene: Scene, frame: Frame, shift_m: float) -> View:
 def _written(
     maker: _Maker, by_camera: Mapping[str, Sequence[Frame]], out: Path
 ) -> tuple[list[dict[str, Any]], dict[str, str], dict[str, ColorMap]]:
-    """Write the maps of all views; returns their records, the cameras left out with the reason, and the colour maps of cameras."""
+    """Write the maps of all views; returns their records, the cameras left out with the reason, and the colour maps of
+    cameras."""
     protocol, records, left_out, color_maps = maker.protocol, [], {}, {}
     with log.task(f"truth of {protocol.name}", sum(map(len, by_camera.values()))) as bar:
         for name, frames in by_camera.items():
@@ -161,9 +169,16 @@ def _written(
                     maps = maker.maps(frame, shift_m)
                     if maps is None:
                         continue
-                    record = {"place": f"{abs(shift_m):g} m" if shift_m else name, "frame": frame.id, "shift_m": shift_m}
+                    record = {
+                        "place": f"{abs(shift_m):g} m" if shift_m else name,
+                        "frame": frame.id,
+                        "shift_m": shift_m,
+                    }
                     if "seen" in maps:
-                        record |= {"seen_px": int(maps["seen"].sum()), "seen_share": round(float(maps["seen"].mean()), 4)}
+                        record |= {
+                            "seen_px": int(maps["seen"].sum()),
+                            "seen_share": round(float(maps["seen"].mean()), 4),
+                        }
                     store.write_safetensors(out / "maps" / f"{len(records):06d}.safetensors", maps)
                     records.append(record)
     return records, left_out, color_maps
@@ -232,7 +247,8 @@ class _Maker:
         return mask
 
     def _seen(self, frame: Frame) -> tuple[NDArray[np.bool_], NDArray[np.uint8], NDArray[np.uint8]]:
-        """Pixels bool[H, W] that the shown cameras saw, and the colours u8[N, 3] of the same points there and in this image."""
+        """Pixels bool[H, W] that the shown cameras saw, and the colours u8[N, 3] of the same points there and in this
+        image."""
         view = frame.view
         shape, nothing = (view.camera.height, view.camera.width), np.zeros((0, 3), np.uint8)
         points = self.points.around(view.time_s)
@@ -250,7 +266,7 @@ class _Maker:
         return calibration.color_map(*(np.concatenate([pair[side] for pair in pairs]) for side in (0, 1)))
 
 
-# ---- pictures ----------------------------------------------------------------------------------------------------------
+# ---- pictures ------------------------------------------------------------------------------------
 
 
 def _write_pictures(maker: _Maker, records: Sequence[Mapping[str, Any]], out: Path) -> list[int]:
@@ -271,8 +287,8 @@ def _write_pictures(maker: _Maker, records: Sequence[Mapping[str, Any]], out: Pa
 def truth_picture(
     scene: Scene, frame: Frame, maps: Mapping[str, NDArray[Any]], protocol: Protocol
 ) -> NDArray[np.uint8]:
-    """What the page shows as truth, two pictures above each other: the photograph, and its part that counts or the LiDAR depth;
-    without a photograph the points, in the colours or classes that they have."""
+    """What the page shows as truth, two pictures above each other: the photograph, and its part that counts or the
+    LiDAR depth; without a photograph the points, in the colours or classes that they have."""
     camera = frame.view.camera
     width = max(1, round(SPLAT_SHARE * camera.width))
     depth = np.where(maps["depth"] > 0, maps["depth"], np.float32(np.nan))

@@ -1,4 +1,5 @@
-"""One log of ``mudg bench shift`` or ``paper``: the views of every row at the places of a table, their scores, and pictures of them.
+"""One log of ``mudg bench shift`` or ``paper``: the views of every row at the places of a table, their scores, and
+pictures of them.
 
 OUT/<log>/scene fuse truth nearest_fill generated/<row> fit/<row> start/<row> render/<row> score/<row> film
 """
@@ -40,9 +41,11 @@ class Views:
     """The views of one log at the places of a table.
 
     Args:
-        out: folder of the log. rows: those that are scored, in order. renders: whether the diffusion model uses those of a fit.
+        out: folder of the log. rows: those that are scored, in order. renders: whether the diffusion model uses those
+            of a fit.
         score: how every row is scored. overwrite: replace what other settings left there.
-        virtual: folder of the views that fits learn from. on_path: the diffusion model's own rows have views of the recorded path, too.
+        virtual: folder of the views that fits learn from. on_path: the diffusion model's own rows have views of the
+            recorded path, too.
     """
 
     log: Log
@@ -72,7 +75,9 @@ class Views:
         cameras = tuple(self.loaded.cameras) if self.table.all_cameras else (first_camera(self.loaded, ()),)
         sides = [s if len(p.shifts_m) > 1 else self.log.side * s for p in self.table.places for s in p.shifts_m]
         paths = tuple(dict.fromkeys(name for place in self.table.places for name in place.paths))
-        return RenderConfig(cameras=cameras, shifts_m=tuple(dict.fromkeys(sides)), paths=paths, video=False, device=self.config.device)
+        return RenderConfig(
+            cameras=cameras, shifts_m=tuple(dict.fromkeys(sides)), paths=paths, video=False, device=self.config.device
+        )
 
     @cached_property
     def paths(self) -> tuple[Trajectory, ...]:
@@ -117,7 +122,9 @@ class Views:
                 folders.append(self.chain.generated(replace(self.off_path, **row.changes), folder, renders=renders))
             if self.on_path and any(path.origin == "recorded" for path in self.paths):
                 on_path = replace(self.off_path, shifts_m=(0.0,), paths=(), **row.changes)
-                folders.append(self.chain.generated(on_path, self.out / "generated" / f"{row.name}-{RECORDED}", renders=renders))
+                folders.append(
+                    self.chain.generated(on_path, self.out / "generated" / f"{row.name}-{RECORDED}", renders=renders)
+                )
             return tuple(folders)
         virtual: tuple[Path, ...] = ()
         if row.name == EXACT:
@@ -127,34 +134,49 @@ class Views:
         return (self.chain.rendered(row, virtual, self.drawn),)
 
     def scores(self, name: str, folders: Sequence[Path]) -> dict[Path, Mapping[str, Any]]:
-        """What the scorer says of every folder of a row's views, by its own folder; the truth needs no networks that compare view with
-        view."""
-        settings, documents = replace(self.score, perceptual_views=0, lpips_weights="") if name == TRUTH else self.score, {}
+        """What the scorer says of every folder of a row's views, by its own folder; the truth needs no networks that
+        compare view with view."""
+        settings, documents = (
+            (replace(self.score, perceptual_views=0, lpips_weights="") if name == TRUTH else self.score),
+            {},
+        )
         for number, folder in enumerate(folders):
             scored = self.out / "score" / (f"{name}-{number}" if number else name)
-            self.chain.run(Score(scene=self.scene, views={name: folder}, truth=self.truth, out=scored, settings=settings))
+            self.chain.run(
+                Score(scene=self.scene, views={name: folder}, truth=self.truth, out=scored, settings=settings)
+            )
             documents[scored] = store.read_json(scored / "metrics.json")
         return documents
 
     def film(self, shown: Mapping[str, Path | Sequence[Path]]) -> list[str]:
-        """Make a picture (or video) of every trajectory; returns their names. With another method the old ones are out of date, whatever
-        was asked."""
-        views = {name: (folder,) if isinstance(folder, Path) else tuple(folder) for name, folder in shown.items() if folder is not None}
-        run_step(page.Film(views=views, paths=self.paths, videos=self.config.videos, out=self.out / "film", overwrite=True))
+        """Make a picture (or video) of every trajectory; returns their names. With another method the old ones are out
+        of date, whatever was asked."""
+        views = {
+            name: (folder,) if isinstance(folder, Path) else tuple(folder)
+            for name, folder in shown.items()
+            if folder is not None
+        }
+        run_step(
+            page.Film(views=views, paths=self.paths, videos=self.config.videos, out=self.out / "film", overwrite=True)
+        )
         return [path.name for path in self.paths]
 
 
 def score_settings(config: BenchConfig, table: PaperTable) -> ScoreConfig:
-    """How every row of a table is scored: the table's resize rule unless another was asked for; LPIPS, if computed, at all views."""
+    """How every row of a table is scored: the table's resize rule unless another was asked for; LPIPS, if computed, at
+    all views."""
     settings = config.score
     resize = table.resize if settings.fid_resize == ScoreConfig().fid_resize else settings.fid_resize
     views = ALL_VIEWS if settings.lpips_weights else PERCEPTUAL_VIEWS
-    return on_device(replace(settings, baseline=False, error_pictures=False, fid_resize=resize, perceptual_views=views), config.device)
+    return on_device(
+        replace(settings, baseline=False, error_pictures=False, fid_resize=resize, perceptual_views=views),
+        config.device,
+    )
 
 
 def of_log(config: ScoreConfig, log: str) -> ScoreConfig:
-    """How the rows of one log are scored: where a folder of detections, lanes or features has an entry of the log's name (or such a
-    ``.json``), that one is taken."""
+    """How the rows of one log are scored: where a folder of detections, lanes or features has an entry of the log's
+    name (or such a ``.json``), that one is taken."""
     own: dict[str, Any] = {}
     for name in PER_LOG:
         folder = getattr(config, name, "")

@@ -61,15 +61,17 @@ class CityConfig:
     traffic: Annotated[float, Limits(ge=0, le=2)] = 1.0
     """Density of moving and parked vehicles and of people, 0 = none, 1 = standard, 2 = busy."""
     overhead: Annotated[float, Limits(ge=0, le=1)] = 0.0
-    """Amount of what stands above the LiDAR, 0 = as little as ever, 1 = much: wide tree crowns, bare trees, bridges, gantries, wires,
-    arms with lamps and signals, tall vehicles, taller buildings."""
+    """Amount of what stands above the LiDAR, 0 = as little as ever, 1 = much: wide tree crowns, bare trees, bridges,
+    gantries, wires, arms with lamps and signals, tall vehicles, taller buildings."""
     skies: Literal["plain", "varied"] = "plain"
-    """varied = more kinds of sky: white and near saturation, hazy, deep blue, scattered clouds, sunset, before a storm."""
+    """varied = more kinds of sky: white and near saturation, hazy, deep blue, scattered clouds, sunset, before a
+    storm."""
     textures: str = ""
-    """Folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to use; empty = none. A scene
-    made with it can only be rebuilt while the folder is there."""
+    """Folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to use; empty =
+    none. A scene made with it can only be rebuilt while the folder is there."""
     shift_margin_m: Annotated[float, Limits(ge=0, le=5)] = 4.0
-    """Free space beside the recorded path, metres: a camera shifted laterally by up to this distance never enters an object."""
+    """Free space beside the recorded path, metres: a camera shifted laterally by up to this distance never enters an
+    object."""
     supersample: Annotated[int, Limits(ge=1, le=4)] = 2
     """Rays per pixel along each axis of the recorded images; more gives smoother edges and takes longer."""
     sensor_noise: bool = True

@@ -12,7 +12,7 @@ from mudg.city.layout import AHEAD_M, StreetPlan
 from mudg.city.objects import BRICK_COLORS, KERB_M, LEAF_COLORS, RENDER_COLORS, Color, Furnisher, plant_tree, record
 from mudg.city.overhead import add_overhead
 
-# objects on the sidewalks: trees, lamps, poles, signs, bins, benches, bollards ----------------------------------------
+# objects on the sidewalks: trees, lamps, poles, signs, bins, benches, bollards --------------------
 
 
 Size = tuple[float, float, float]
@@ -32,10 +32,18 @@ class Sidewalk:
         self.facing_back = 0.0 if side < 0 else math.pi
 
     def put(
-        self, kind: int, place: tuple[float, float], across: float, turn: float, size: Size, rgb: Color,
-        rgb2: Color = (0.5, 0.5, 0.5), parameters: tuple[float, ...] = (),
-    ) -> None:  # fmt: skip
-        """Place an object of half width ``across`` unless it stands in a crossing or there is no room beside the corridor.
+        self,
+        kind: int,
+        place: tuple[float, float],
+        across: float,
+        turn: float,
+        size: Size,
+        rgb: Color,
+        rgb2: Color = (0.5, 0.5, 0.5),
+        parameters: tuple[float, ...] = (),
+    ) -> None:
+        """Place an object of half width ``across`` unless it stands in a crossing or there is no room beside the
+        corridor.
 
         ``place``: metres along the street and from the kerb.
         """
@@ -143,11 +151,19 @@ def _sign(walk: Sidewalk, s: float) -> None:
         rgb = ((0.02, 0.08, 0.35), (0.03, 0.22, 0.10), (0.72, 0.72, 0.7))[int(f.rng.integers(3))]
     width = size * f.uniform(1.6, 2.6) if mask == 0 else 0.0
     ink = (0.75, 0.75, 0.74) if rgb[0] < 0.5 else (0.03, 0.03, 0.03)
-    walk.put(rec.SIGN, (s, f.uniform(0.35, 0.7)), 0.3, towards, (0.1, width, f.uniform(2.1, 2.7)), rgb, ink,
-             (float(mask), size, float(f.chance(0.25)), motif))  # fmt: skip
+    walk.put(
+        rec.SIGN,
+        (s, f.uniform(0.35, 0.7)),
+        0.3,
+        towards,
+        (0.1, width, f.uniform(2.1, 2.7)),
+        rgb,
+        ink,
+        (float(mask), size, float(f.chance(0.25)), motif),
+    )
 
 
-# furnish --------------------------------------------------------------------------------------------------------------
+# furnish ------------------------------------------------------------------------------------------
 
 
 def furnish(config: CityConfig, plan: StreetPlan) -> list[list[float]]:
@@ -172,9 +188,15 @@ def _facade(f: Furnisher, shop: bool) -> tuple[float, ...]:
     window = f.uniform(1.6, 2.1) if modern else f.uniform(1.3, 1.8)
     sill = f.uniform(0.45, 0.8) if modern else f.uniform(0.75, 1.0)
     return (
-        bay, f.uniform(2.9, 3.5), f.uniform(3.6, 4.6) if shop else f.uniform(2.9, 3.4), width, sill, window,
-        f.uniform(0.12, 0.28), float(shop),
-    )  # fmt: skip
+        bay,
+        f.uniform(2.9, 3.5),
+        f.uniform(3.6, 4.6) if shop else f.uniform(2.9, 3.4),
+        width,
+        sill,
+        window,
+        f.uniform(0.12, 0.28),
+        float(shop),
+    )
 
 
 def _building(f: Furnisher, x0: float, y0: float, x1: float, y1: float, side: int, depth: float, urban: bool) -> None:
@@ -201,9 +223,17 @@ def _building(f: Furnisher, x0: float, y0: float, x1: float, y1: float, side: in
     balconies = float(urban and f.chance(0.35))
     yaw_out = yaw if side > 0 else yaw + math.pi  # local -y faces the street
     f.rows.append(
-        record(rec.BUILDING, (cx, cy, 0.0), yaw_out, (length, depth, height), f.seed(), wall, trim,
-               (*facade, float(gable), balconies, float(brick)))
-    )  # fmt: skip
+        record(
+            rec.BUILDING,
+            (cx, cy, 0.0),
+            yaw_out,
+            (length, depth, height),
+            f.seed(),
+            wall,
+            trim,
+            (*facade, float(gable), balconies, float(brick)),
+        )
+    )
 
 
 def _building_row(f: Furnisher, side: int, front: float) -> None:
@@ -242,8 +272,14 @@ def _front_garden(f: Furnisher, side: int, front: float, s: float, length: float
     extent = length + (0 if plan.urban else 2.0)
     if draw < 0.3:
         height = f.uniform(0.8, 1.6)
-        f.place(rec.HEDGE, (middle, u + side * 0.2), 0, (extent, f.uniform(0.6, 0.9), height), f.pick(LEAF_COLORS[:3]),
-                parameters=(0, 0, 0, 0.17))  # fmt: skip
+        f.place(
+            rec.HEDGE,
+            (middle, u + side * 0.2),
+            0,
+            (extent, f.uniform(0.6, 0.9), height),
+            f.pick(LEAF_COLORS[:3]),
+            parameters=(0, 0, 0, 0.17),
+        )
     elif draw < 0.55:
         brick = f.chance(0.5)
         color = f.pick(BRICK_COLORS if brick else RENDER_COLORS)
@@ -256,9 +292,15 @@ def _front_garden(f: Furnisher, side: int, front: float, s: float, length: float
         for _ in range(int(f.rng.integers(0, 3))):
             bush = side * (front + f.uniform(1.2, setback - 0.8))
             size = f.uniform(0.9, 1.7)
-            f.place(rec.BUSH, (s + f.uniform(0.5, length - 0.5), bush), f.uniform(0, 3),
-                    (size, size, size * f.uniform(0.7, 1.1)), f.pick(LEAF_COLORS), parameters=(0, 0, 0, 0.15),
-                    z=0.08)  # fmt: skip
+            f.place(
+                rec.BUSH,
+                (s + f.uniform(0.5, length - 0.5), bush),
+                f.uniform(0, 3),
+                (size, size, size * f.uniform(0.7, 1.1)),
+                f.pick(LEAF_COLORS),
+                parameters=(0, 0, 0, 0.15),
+                z=0.08,
+            )
         if f.chance(0.5) and setback > 4:
             plant_tree(f, s + f.uniform(1, length - 1), side * (front + setback * 0.5), garden=True)
 
@@ -269,8 +311,14 @@ def _fence(f: Furnisher, s: float, u: float, turn: float, length: float) -> None
     if style == 0 and f.chance(0.4):
         color = (0.6, 0.6, 0.58)
     wide = f.chance(0.35)
-    f.place(rec.FENCE, (s, u), turn, (length, 0.05, f.uniform(0.9, 1.8)), color,
-            parameters=(float(style), 0.16 if wide else 0.13, 0.09 if wide else 0.025))  # fmt: skip
+    f.place(
+        rec.FENCE,
+        (s, u),
+        turn,
+        (length, 0.05, f.uniform(0.9, 1.8)),
+        color,
+        parameters=(float(style), 0.16 if wide else 0.13, 0.09 if wide else 0.025),
+    )
 
 
 def _green_lot(f: Furnisher, side: int, front: float, s: float, length: float) -> None:
@@ -281,8 +329,15 @@ def _green_lot(f: Furnisher, side: int, front: float, s: float, length: float) -
             _fence(f, middle, u, 0, length)
         else:
             brick = f.chance(0.5)
-            f.place(rec.WALL, (middle, u), 0, (length, 0.26, f.uniform(1.0, 2.3)), f.pick(BRICK_COLORS if brick else RENDER_COLORS),
-                    (0.5, 0.49, 0.46), (float(brick),))  # fmt: skip
+            f.place(
+                rec.WALL,
+                (middle, u),
+                0,
+                (length, 0.26, f.uniform(1.0, 2.3)),
+                f.pick(BRICK_COLORS if brick else RENDER_COLORS),
+                (0.5, 0.49, 0.46),
+                (float(brick),),
+            )
     for _ in range(int(length / 5)):
         plant_tree(f, s + f.uniform(0, length), side * (front + f.uniform(2.5, 12)), garden=True)
 
@@ -307,8 +362,18 @@ def _crossing_surroundings(f: Furnisher) -> None:
                 _building(f, x0, y0, x1, y1, side * arm, f.uniform(9, 12), plan.urban)
                 if f.chance(0.5):
                     x, y = crossing.to_world(arm * (a + 2), side * (crossing.half_width + 0.9))
-                    f.rows.append(record(rec.TREE, (x, y, KERB_M), 0.0, (1, 1, f.uniform(6, 9)), f.seed(), f.pick(LEAF_COLORS),
-                                         (0.13, 0.10, 0.075), (f.uniform(1.8, 2.5), 0.6, 0.0, 0.27, 0.15)))  # fmt: skip
+                    f.rows.append(
+                        record(
+                            rec.TREE,
+                            (x, y, KERB_M),
+                            0.0,
+                            (1, 1, f.uniform(6, 9)),
+                            f.seed(),
+                            f.pick(LEAF_COLORS),
+                            (0.13, 0.10, 0.075),
+                            (f.uniform(1.8, 2.5), 0.6, 0.0, 0.27, 0.15),
+                        )
+                    )
                 a += length + (0.05 if plan.urban else f.uniform(3, 8))
         x, y = crossing.to_world(arm * 125.0, 0.0)  # something closes the view
         _block(f, (x, y), crossing.yaw + arm * -math.pi / 2, (40, 12, f.uniform(9, 16)))
@@ -319,9 +384,17 @@ def _crossing_surroundings(f: Furnisher) -> None:
 def _block(f: Furnisher, xy: tuple[float, float], yaw: float, size: tuple[float, float, float]) -> None:
     """A plain building at a place in the world."""
     f.rows.append(
-        record(rec.BUILDING, (*xy, 0), yaw, size, f.seed(), f.pick(RENDER_COLORS), (0.6, 0.58, 0.55),
-               (*_facade(f, False), 0.0, 0.0, 0.0))
-    )  # fmt: skip
+        record(
+            rec.BUILDING,
+            (*xy, 0),
+            yaw,
+            size,
+            f.seed(),
+            f.pick(RENDER_COLORS),
+            (0.6, 0.58, 0.55),
+            (*_facade(f, False), 0.0, 0.0, 0.0),
+        )
+    )
 
 
 def _close_arm(f: Furnisher, arm: int) -> None:
@@ -362,8 +435,15 @@ def _signals(f: Furnisher) -> None:
         if f.blocked(crossing.s, a, 1.0, crossing.half_width + 1.5):
             continue
         facing = crossing.yaw + (0.0 if arm_side > 0 else math.pi)
-        row = record(rec.SIGNAL, (x, y, KERB_M), facing, (0.3, 0.3, 3.5), f.seed(), (tone, tone, tone),
-                     parameters=(0.0, 2.0 - lit))  # fmt: skip
+        row = record(
+            rec.SIGNAL,
+            (x, y, KERB_M),
+            facing,
+            (0.3, 0.3, 3.5),
+            f.seed(),
+            (tone, tone, tone),
+            parameters=(0.0, 2.0 - lit),
+        )
         f.rows.append(row)
 
 
@@ -378,8 +458,16 @@ def _background(f: Furnisher) -> None:
     for i in range(14):
         u = (i - 6.5) * 7.0 + f.uniform(-2, 2)
         size = f.uniform(9, 16)
-        f.place(rec.TREE, (end + f.uniform(16, 30), u), 0, (1, 1, size), f.pick(LEAF_COLORS[:4]), (0.13, 0.10, 0.075),
-                (size * 0.34, 0.8, 0.0, 0.6, 0.25), z=0.0)  # fmt: skip
+        f.place(
+            rec.TREE,
+            (end + f.uniform(16, 30), u),
+            0,
+            (1, 1, size),
+            f.pick(LEAF_COLORS[:4]),
+            (0.13, 0.10, 0.075),
+            (size * 0.34, 0.8, 0.0, 0.6, 0.25),
+            z=0.0,
+        )
     if plan.urban or f.chance(0.4):
         for side in (-1, 1):
             for _ in range(int(f.rng.integers(2, 7))):
@@ -387,12 +475,26 @@ def _background(f: Furnisher) -> None:
                 if f.near_crossing(s, 16):
                     continue
                 size = (f.uniform(12, 24), f.uniform(12, 20), f.uniform(20, 48))
-                f.place(rec.BUILDING, (s, u), 0 if side > 0 else math.pi, size, f.pick(RENDER_COLORS),
-                        parameters=(*_facade(f, False), 0.0, 0.0, 0.0), z=0.0)  # fmt: skip
+                f.place(
+                    rec.BUILDING,
+                    (s, u),
+                    0 if side > 0 else math.pi,
+                    size,
+                    f.pick(RENDER_COLORS),
+                    parameters=(*_facade(f, False), 0.0, 0.0, 0.0),
+                    z=0.0,
+                )
     for i in range(8):
         angle, distance = heading + (i - 3.5) * 0.42, f.uniform(260, 480)
         height = f.uniform(10, 42)
         place = (x + distance * math.cos(angle), y + distance * math.sin(angle), -2.0)
-        row = record(rec.HILL, place, f.uniform(0, 3), (f.uniform(160, 320), f.uniform(120, 220), height), f.seed(),
-                     f.pick(LEAF_COLORS[:3]), parameters=(float(np.sign(height - 14) > 0),))  # fmt: skip
+        row = record(
+            rec.HILL,
+            place,
+            f.uniform(0, 3),
+            (f.uniform(160, 320), f.uniform(120, 220), height),
+            f.seed(),
+            f.pick(LEAF_COLORS[:3]),
+            parameters=(float(np.sign(height - 14) > 0),),
+        )
         f.rows.append(row)

@@ -126,10 +126,27 @@ def plan_streets(config: CityConfig) -> StreetPlan:
     marks = _paint(rng, lanes, lane, (left, right))
     crosswalks = _crosswalks(rng, (left, right), crossing)
     return StreetPlan(
-        line, urban, lane, forward_u, backward_u, ego_u, float(left), float(right), park_left, park_right,
-        walks[0], walks[1], urban or rng.random() < 0.1, urban or rng.random() < 0.1, crossing, marks, crosswalks,
-        drive_s, times, drive_length,
-    )  # fmt: skip
+        line,
+        urban,
+        lane,
+        forward_u,
+        backward_u,
+        ego_u,
+        float(left),
+        float(right),
+        park_left,
+        park_right,
+        walks[0],
+        walks[1],
+        urban or rng.random() < 0.1,
+        urban or rng.random() < 0.1,
+        crossing,
+        marks,
+        crosswalks,
+        drive_s,
+        times,
+        drive_length,
+    )
 
 
 def _drive(rng: np.random.Generator, config: CityConfig) -> tuple[Array, Array]:

@@ -22,7 +22,8 @@ Numbers = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sky:
-    """Radiances f64[3] of sun, zenith, horizon, ambient light and clouds; share of clouds; elevation of the sun in radians."""
+    """Radiances f64[3] of sun, zenith, horizon, ambient light and clouds; share of clouds; elevation of the sun in
+    radians."""
 
     sun: Numbers
     zenith: Numbers
@@ -43,29 +44,57 @@ def _other_sky(rng: np.random.Generator, plain: Sky) -> Sky:
         return replace(plain, zenith=plain.zenith * k, horizon=plain.horizon * k, cloud=plain.cloud * k)
     if kind == 1:  # white all over, near saturation
         white = np.array([0.97, 1.0, 1.03]) * warm * bright * rng.uniform(1.0, 1.8)
-        return replace(plain, sun=plain.sun * rng.uniform(0, 0.15), zenith=white * rng.uniform(0.75, 1.05),
-                       horizon=white, cloud=white * 0.95,
-                       ambient=np.array([0.95, 1.0, 1.06]) * rng.uniform(0.7, 1.3), cloudiness=rng.uniform(0.0, 1.0))  # fmt: skip
+        return replace(
+            plain,
+            sun=plain.sun * rng.uniform(0, 0.15),
+            zenith=white * rng.uniform(0.75, 1.05),
+            horizon=white,
+            cloud=white * 0.95,
+            ambient=np.array([0.95, 1.0, 1.06]) * rng.uniform(0.7, 1.3),
+            cloudiness=rng.uniform(0.0, 1.0),
+        )
     if kind == 2:  # graded blue, pale at the horizon
         deep = np.array([rng.uniform(0.08, 0.4), rng.uniform(0.3, 0.62), rng.uniform(0.75, 1.2)])
-        return replace(plain, zenith=deep * rng.uniform(0.6, 1.3), horizon=np.array([0.85, 0.95, 1.05]) * warm * rng.uniform(0.8, 1.8),
-                       cloudiness=rng.uniform(0, 0.25))  # fmt: skip
+        return replace(
+            plain,
+            zenith=deep * rng.uniform(0.6, 1.3),
+            horizon=np.array([0.85, 0.95, 1.05]) * warm * rng.uniform(0.8, 1.8),
+            cloudiness=rng.uniform(0, 0.25),
+        )
     if kind == 3:  # scattered bright clouds
         deep = np.array([rng.uniform(0.15, 0.35), rng.uniform(0.4, 0.55), rng.uniform(0.8, 1.1)])
-        return replace(plain, zenith=deep, horizon=np.array([0.8, 0.9, 1.0]) * rng.uniform(0.8, 1.5), cloudiness=rng.uniform(0.35, 1.1),
-                       cloud=np.array([1.0, 1.0, 1.02]) * warm * bright)  # fmt: skip
+        return replace(
+            plain,
+            zenith=deep,
+            horizon=np.array([0.8, 0.9, 1.0]) * rng.uniform(0.8, 1.5),
+            cloudiness=rng.uniform(0.35, 1.1),
+            cloud=np.array([1.0, 1.0, 1.02]) * warm * bright,
+        )
     if kind == 4:  # haze: white below, bluish above
         white = np.array([1.0, 1.0, 1.0]) * warm * bright
         blue = np.array([0.55, 0.72, 0.95]) * bright
         return replace(plain, horizon=white * 1.2, zenith=blue, cloud=white, cloudiness=rng.uniform(0.1, 0.6))
     if kind == 5:  # low sun
         glow = np.array([1.5, rng.uniform(0.7, 1.1), rng.uniform(0.35, 0.8)]) * rng.uniform(0.8, 1.6)
-        return Sky(np.array([2.8, 1.7, 0.9]) * rng.uniform(0.4, 1.0), np.array([0.25, 0.35, 0.6]) * rng.uniform(0.8, 1.5), glow,
-                   np.array([0.55, 0.52, 0.6]) * rng.uniform(0.9, 1.4), glow * rng.uniform(0.5, 0.9), rng.uniform(0.2, 0.9),
-                   float(np.deg2rad(rng.uniform(3, 12))))  # fmt: skip
+        return Sky(
+            np.array([2.8, 1.7, 0.9]) * rng.uniform(0.4, 1.0),
+            np.array([0.25, 0.35, 0.6]) * rng.uniform(0.8, 1.5),
+            glow,
+            np.array([0.55, 0.52, 0.6]) * rng.uniform(0.9, 1.4),
+            glow * rng.uniform(0.5, 0.9),
+            rng.uniform(0.2, 0.9),
+            float(np.deg2rad(rng.uniform(3, 12))),
+        )
     dark = np.array([0.42, 0.46, 0.52]) * rng.uniform(0.6, 1.2)  # before a storm
-    return replace(plain, sun=plain.sun * 0.05, zenith=dark * 0.8, horizon=dark * rng.uniform(1.0, 1.8), cloud=dark * 0.7,
-                   ambient=np.array([0.75, 0.8, 0.9]) * rng.uniform(0.6, 1.0), cloudiness=rng.uniform(0.6, 1.1))  # fmt: skip
+    return replace(
+        plain,
+        sun=plain.sun * 0.05,
+        zenith=dark * 0.8,
+        horizon=dark * rng.uniform(1.0, 1.8),
+        cloud=dark * 0.7,
+        ambient=np.array([0.75, 0.8, 0.9]) * rng.uniform(0.6, 1.0),
+        cloudiness=rng.uniform(0.6, 1.1),
+    )
 
 
 def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
@@ -110,15 +139,30 @@ def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
         haze = config.fog_visibility_m / 3.0
     direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
     numbers = [
-        *direction, *sun, *zenith, *horizon, *ambient, *cloud, *tint, cloudiness, haze, night, exposure,
-        rng.uniform(0.95, 1.08), rng.uniform(0.85, 1.08), rng.uniform(0.003, 0.009), rng.uniform(0.05, 0.3), 0.0035,
-    ]  # fmt: skip
+        *direction,
+        *sun,
+        *zenith,
+        *horizon,
+        *ambient,
+        *cloud,
+        *tint,
+        cloudiness,
+        haze,
+        night,
+        exposure,
+        rng.uniform(0.95, 1.08),
+        rng.uniform(0.85, 1.08),
+        rng.uniform(0.003, 0.009),
+        rng.uniform(0.05, 0.3),
+        0.0035,
+    ]
     return name, np.array(numbers, np.float64)
 
 
-# weather --------------------------------------------------------------------------------------------------------------
+# weather ------------------------------------------------------------------------------------------
 #
-# Wet ground, snow and street lamps of a generated city: the numbers its ray caster needs, by the same rules as ``mudg.core.weather``.
+# Wet ground, snow and street lamps of a generated city: the numbers its ray caster needs, by the same rules as
+# ``mudg.core.weather``.
 
 
 def weather_numbers(config: CityConfig) -> NDArray[np.float64] | None:

@@ -1,8 +1,8 @@
 """Whole generated logs for scoring scenes off the recorded path, in two lists; no model was ever trained on them.
 
-A list is not picked by eye: `choose` walks the seeds upwards and keeps what satisfies `LogChoice`. In 2.3 s the generator's
-streets turn little (half of 220 cities by less than 1.1 degrees, one in twenty by 4.7, the most by 9.6), so that "curved" means 5 degrees
-here, and half of each list is curved.
+A list is not picked by eye: `choose` walks the seeds upwards and keeps what satisfies `LogChoice`. In 2.3 s the
+generator's streets turn little (half of 220 cities by less than 1.1 degrees, one in twenty by 4.7, the most by 9.6), so
+that "curved" means 5 degrees here, and half of each list is curved.
 """
 
 from __future__ import annotations
@@ -26,14 +26,15 @@ from mudg.city.world import CityWorld
 from mudg.core.fusion import FusionRules, judge_track
 from mudg.scene.write import SceneWriter
 
-# records a generated city as a scene directory ------------------------------------------------------------------------
+# records a generated city as a scene directory ----------------------------------------------------
 
 
 SENSOR = "lidar"
 
 
 def write_city(config: CityConfig, out_dir: Path | str, *, test_every: int = 4) -> Scene:
-    """Generate the log of ``config`` and write it, as lossless PNG, with its exact labels (depth, semantics, sky, dynamic, instance).
+    """Generate the log of ``config`` and write it, as lossless PNG, with its exact labels (depth, semantics, sky,
+    dynamic, instance).
 
     All cores work: the rays of a frame on the native threads, encoding and writing on the writer's. The scene is moved
     into place when it is complete; an interrupted call leaves nothing, and the same call makes the same bytes again.
@@ -87,18 +88,22 @@ def write_world(world: CityWorld, out_dir: Path | str, test_every: int = 4) -> S
 def _write_frame(writer: SceneWriter, world: CityWorld, frame_id: str, view: View, moving: NDArray[np.bool_]) -> None:
     truth = world.render(view, sensor_noise=world.config.sensor_noise)
     labels = {
-        "depth": truth.depth, "semantics": truth.semantics, "sky": truth.sky, "dynamic": moving[truth.instance],
+        "depth": truth.depth,
+        "semantics": truth.semantics,
+        "sky": truth.sky,
+        "dynamic": moving[truth.instance],
         "instance": truth.instance,
-    }  # fmt: skip
+    }
     writer.add_frame(frame_id, view, truth.rgb_u8, labels)
 
 
-# logs -----------------------------------------------------------------------------------------------------------------
+# logs ---------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class LogRules:
-    """What a log is recorded with: frames at 10 Hz, image size in pixels, and the cameras; the LiDAR is the standard one."""
+    """What a log is recorded with: frames at 10 Hz, image size in pixels, and the cameras; the LiDAR is the standard
+    one."""
 
     frames: int = 24
     width: int = 384
@@ -125,8 +130,8 @@ class LogChoice:
 
 @dataclass(frozen=True)
 class LogFacts:
-    """What a log holds: turn in degrees (range of headings), length in metres, moving vehicles in view of the front camera, the
-    share of the image they cover together on average, and the generator's line about the city."""
+    """What a log holds: turn in degrees (range of headings), length in metres, moving vehicles in view of the front
+    camera, the share of the image they cover together on average, and the generator's line about the city."""
 
     seed: int
     turn_deg: float
@@ -154,7 +159,8 @@ def log_config(seed: int, rules: LogRules = STANDARD) -> CityConfig:
 
 
 def moving_instances(world: CityWorld, labels: Container[str] | None = None) -> tuple[int, ...]:
-    """Instance ids of the objects that move during the log, by the test that also separates their clouds; `labels`: which count."""
+    """Instance ids of the objects that move during the log, by the test that also separates their clouds; `labels`:
+    which count."""
     rules = FusionRules()
     moving = (t for t in world.tracks() if (labels is None or t.label in labels) and judge_track(t, rules).moving)
     return tuple(world.instance_of(track.id) for track in moving)
@@ -181,7 +187,8 @@ def turn_deg(config: CityConfig) -> float:
 
 
 def choose(first_seed: int, count: int, rules: LogRules = STANDARD, choice: LogChoice = CHOICE) -> tuple[int, ...]:
-    """The first seeds from `first_seed` on that satisfy the choice: half of `count` curved, the others not, in ascending order.
+    """The first seeds from `first_seed` on that satisfy the choice: half of `count` curved, the others not, in
+    ascending order.
 
     Raises:
         UsageError: `count` is odd or not positive.

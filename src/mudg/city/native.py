@@ -52,8 +52,13 @@ class CityHandle:
     """Owns one native world."""
 
     def __init__(
-        self, records: NDArray[np.float64], plan: StreetPlan, road: NDArray[np.float64], light: NDArray[np.float64], seed: int
-    ) -> None:  # fmt: skip
+        self,
+        records: NDArray[np.float64],
+        plan: StreetPlan,
+        road: NDArray[np.float64],
+        light: NDArray[np.float64],
+        seed: int,
+    ) -> None:
         self._lib = library()
         line = _f64(np.stack([plan.line.s, plan.line.x, plan.line.y, plan.line.heading], 1))
         records, marks, walks = _f64(records), _f64(plan.marks), _f64(plan.crosswalks)
@@ -61,12 +66,25 @@ class CityHandle:
         got = (len(road), len(light), records.shape[1])
         expected = tuple(self._lib.mudg_city_number_counts(which) for which in range(3))
         if got != expected:
-            raise ResourceError("the native library belongs to another version of the city", expected=str(got),
-                got=str(expected), remedy="build it again")  # fmt: skip
+            raise ResourceError(
+                "the native library belongs to another version of the city",
+                expected=str(got),
+                got=str(expected),
+                remedy="build it again",
+            )
         self._handle = self._lib.mudg_city_create(
-            records.ctypes.data, len(records), line.ctypes.data, len(line), marks.ctypes.data, len(marks), walks.ctypes.data,
-            len(walks), road.ctypes.data, light.ctypes.data, seed & 0x7FFFFFFF,
-        )  # fmt: skip
+            records.ctypes.data,
+            len(records),
+            line.ctypes.data,
+            len(line),
+            marks.ctypes.data,
+            len(marks),
+            walks.ctypes.data,
+            len(walks),
+            road.ctypes.data,
+            light.ctypes.data,
+            seed & 0x7FFFFFFF,
+        )
         if not self._handle:
             raise ResourceError("not enough memory to build the city")
         self.shape_count = int(self._lib.mudg_city_shape_count(self._handle))
@@ -74,7 +92,9 @@ class CityHandle:
     def set_texture(self, slot: int, rgb: NDArray[np.float32], metres: float) -> None:
         """Give a surface or the sky a photograph f32[H, W, 3]; before anything is rendered."""
         pixels = np.ascontiguousarray(rgb, np.float32)
-        if self._lib.mudg_city_set_texture(self._handle, slot, pixels.ctypes.data, pixels.shape[1], pixels.shape[0], metres):
+        if self._lib.mudg_city_set_texture(
+            self._handle, slot, pixels.ctypes.data, pixels.shape[1], pixels.shape[0], metres
+        ):
             raise ResourceError("not enough memory for a texture of the city")
 
     def set_weather(self, numbers: NDArray[np.float64], lamps: NDArray[np.float64]) -> None:
@@ -84,15 +104,25 @@ class CityHandle:
             raise ResourceError("not enough memory for the lamps of the city")
 
     def planes(
-        self, poses: NDArray[np.float64], phases: NDArray[np.float64], camera: Camera, world_from_cam: NDArray[np.float64]
+        self,
+        poses: NDArray[np.float64],
+        phases: NDArray[np.float64],
+        camera: Camera,
+        world_from_cam: NDArray[np.float64],
     ) -> NDArray[np.float32]:
         """Normal, albedo, open sky, sun, snow and water f32[H, W, 10] of what the rays through pixel centres meet."""
         out = np.empty((camera.height, camera.width, 10), np.float32)
         poses, phases, numbers, pose = _f64(poses), _f64(phases), _f64(camera.intrinsics), _f64(world_from_cam)
         if self._lib.mudg_city_planes(
-            self._handle, poses.ctypes.data, phases.ctypes.data, numbers.ctypes.data, camera.width, camera.height, pose.ctypes.data,
+            self._handle,
+            poses.ctypes.data,
+            phases.ctypes.data,
+            numbers.ctypes.data,
+            camera.width,
+            camera.height,
+            pose.ctypes.data,
             out.ctypes.data,
-        ):  # fmt: skip
+        ):
             raise ResourceError("not enough memory to render the city")
         return out
 
@@ -102,26 +132,50 @@ class CityHandle:
             self._handle = None
 
     def render(
-        self, poses: NDArray[np.float64], phases: NDArray[np.float64], intrinsics: tuple[float, float, float, float],
-        width: int, height: int, world_from_cam: NDArray[np.float64], supersample: int, noise_key: int,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:  # fmt: skip
+        self,
+        poses: NDArray[np.float64],
+        phases: NDArray[np.float64],
+        intrinsics: tuple[float, float, float, float],
+        width: int,
+        height: int,
+        world_from_cam: NDArray[np.float64],
+        supersample: int,
+        noise_key: int,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
         """rgb f32[H, W, 3] in [0, 1], depth f32[H, W] (+inf in the sky), semantics u8[H, W], instance i32[H, W]."""
         rgb, depth = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
         semantics, instance = np.empty((height, width), np.uint8), np.empty((height, width), np.int32)
         poses, phases, camera, pose = _f64(poses), _f64(phases), _f64(intrinsics), _f64(world_from_cam)
         code = self._lib.mudg_city_render(
-            self._handle, poses.ctypes.data, phases.ctypes.data, camera.ctypes.data, width, height, pose.ctypes.data,
-            supersample, noise_key & 0xFFFFFFFF, rgb.ctypes.data, depth.ctypes.data, semantics.ctypes.data, instance.ctypes.data,
-        )  # fmt: skip
+            self._handle,
+            poses.ctypes.data,
+            phases.ctypes.data,
+            camera.ctypes.data,
+            width,
+            height,
+            pose.ctypes.data,
+            supersample,
+            noise_key & 0xFFFFFFFF,
+            rgb.ctypes.data,
+            depth.ctypes.data,
+            semantics.ctypes.data,
+            instance.ctypes.data,
+        )
         if code:
             raise ResourceError("not enough memory to render the city")
         return rgb, depth, semantics, instance
 
     def sweep(
-        self, poses: NDArray[np.float64], phases: NDArray[np.float64], elevations: NDArray[np.float64],
-        azimuths: NDArray[np.float64], world_from_lidar: NDArray[np.float64], fractions: NDArray[np.float64],
-        settings: tuple[float, float, float, float], key: int,
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:  # fmt: skip
+        self,
+        poses: NDArray[np.float64],
+        phases: NDArray[np.float64],
+        elevations: NDArray[np.float64],
+        azimuths: NDArray[np.float64],
+        world_from_lidar: NDArray[np.float64],
+        fractions: NDArray[np.float64],
+        settings: tuple[float, float, float, float],
+        key: int,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
         """World points f32[C, B, 3], intensity f32[C, B] (negative: no return), semantics u8[C, B], instance i32[C, B]
         for C columns and B beams; ``poses`` f64[knots, objects, 4], ``world_from_lidar`` f64[C, 3, 4]."""
         columns, beams = len(azimuths), len(elevations)
@@ -130,10 +184,23 @@ class CityHandle:
         poses, phases, elevations, azimuths = _f64(poses), _f64(phases), _f64(elevations), _f64(azimuths)
         rows, fractions, numbers = _f64(world_from_lidar), _f64(fractions), _f64(settings)
         code = self._lib.mudg_city_sweep(
-            self._handle, poses.ctypes.data, len(poses), phases.ctypes.data, elevations.ctypes.data, beams, azimuths.ctypes.data,
-            columns, rows.ctypes.data, fractions.ctypes.data, numbers.ctypes.data, key & 0xFFFFFFFF, xyz.ctypes.data,
-            intensity.ctypes.data, semantics.ctypes.data, instance.ctypes.data,
-        )  # fmt: skip
+            self._handle,
+            poses.ctypes.data,
+            len(poses),
+            phases.ctypes.data,
+            elevations.ctypes.data,
+            beams,
+            azimuths.ctypes.data,
+            columns,
+            rows.ctypes.data,
+            fractions.ctypes.data,
+            numbers.ctypes.data,
+            key & 0xFFFFFFFF,
+            xyz.ctypes.data,
+            intensity.ctypes.data,
+            semantics.ctypes.data,
+            instance.ctypes.data,
+        )
         if code:
             raise ResourceError("not enough memory to scan the city")
         return xyz, intensity, semantics, instance

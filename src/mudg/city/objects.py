@@ -8,7 +8,7 @@ from mudg.base import seeds
 from mudg.city.config import CityConfig
 from mudg.city.layout import StreetPlan
 
-# records --------------------------------------------------------------------------------------------------------------
+# records ------------------------------------------------------------------------------------------
 #
 # Records: one row of numbers per object of the city. The native library makes shapes and materials from them.
 
@@ -21,7 +21,15 @@ SHELTER, HILL, BUSH = range(12, 15)
 BOLLARD, MOTORBIKE, PLANTER, PART = range(16, 20)
 CAR, VAN, TRUCK, BUS, PEDESTRIAN, CYCLIST, TANKER = range(50, 57)
 
-LABELS: Final = {CAR: "car", VAN: "car", TRUCK: "truck", BUS: "bus", PEDESTRIAN: "pedestrian", CYCLIST: "cyclist", TANKER: "truck"}
+LABELS: Final = {
+    CAR: "car",
+    VAN: "car",
+    TRUCK: "truck",
+    BUS: "bus",
+    PEDESTRIAN: "pedestrian",
+    CYCLIST: "cyclist",
+    TANKER: "truck",
+}
 
 Color = tuple[float, float, float]
 
@@ -61,18 +69,31 @@ class Draws:
         return float(self.rng.random()) < probability
 
 
-# furnisher ------------------------------------------------------------------------------------------------------------
+# furnisher ----------------------------------------------------------------------------------------
 
 
 KERB_M = 0.13
 RENDER_COLORS: tuple[Color, ...] = (
-    (0.52, 0.46, 0.36), (0.60, 0.56, 0.48), (0.42, 0.42, 0.41), (0.62, 0.52, 0.36), (0.36, 0.30, 0.25),
-    (0.55, 0.38, 0.28), (0.34, 0.38, 0.42), (0.66, 0.62, 0.57), (0.48, 0.30, 0.22), (0.55, 0.50, 0.30), (0.30, 0.36, 0.30),
-)  # fmt: skip
+    (0.52, 0.46, 0.36),
+    (0.60, 0.56, 0.48),
+    (0.42, 0.42, 0.41),
+    (0.62, 0.52, 0.36),
+    (0.36, 0.30, 0.25),
+    (0.55, 0.38, 0.28),
+    (0.34, 0.38, 0.42),
+    (0.66, 0.62, 0.57),
+    (0.48, 0.30, 0.22),
+    (0.55, 0.50, 0.30),
+    (0.30, 0.36, 0.30),
+)
 BRICK_COLORS: tuple[Color, ...] = ((0.30, 0.13, 0.085), (0.36, 0.19, 0.12), (0.24, 0.12, 0.09), (0.42, 0.30, 0.20))
 LEAF_COLORS: tuple[Color, ...] = (
-    (0.085, 0.15, 0.035), (0.11, 0.17, 0.04), (0.06, 0.115, 0.03), (0.15, 0.17, 0.045), (0.20, 0.13, 0.03),
-)  # fmt: skip
+    (0.085, 0.15, 0.035),
+    (0.11, 0.17, 0.04),
+    (0.06, 0.115, 0.03),
+    (0.15, 0.17, 0.045),
+    (0.20, 0.13, 0.03),
+)
 CLEARANCE_M = 1.0
 
 
@@ -98,7 +119,8 @@ class Furnisher(Draws):
         return inside and abs(u - self.plan.ego_u) < self.reach + across
 
     def free_u(self, s: float, u: float, along: float, across: float, side: int, limit: float) -> float | None:
-        """``u``, moved outwards if the corridor needs it; None when there is no room before ``limit`` (|u| of a wall)."""
+        """``u``, moved outwards if the corridor needs it; None when there is no room before ``limit`` (|u| of a
+        wall)."""
         if self.blocked(s, u, along, across):
             u = self.plan.ego_u + side * (self.reach + across + 0.05)
         return u if abs(u) + across < abs(limit) else None
@@ -109,9 +131,16 @@ class Furnisher(Draws):
         return crossing is not None and abs(s - crossing.s) < crossing.half_width + margin
 
     def place(
-        self, kind: int, place: tuple[float, float], turn: float, size: tuple[float, float, float], rgb: Color,
-        rgb2: Color = (0.5, 0.5, 0.5), parameters: tuple[float, ...] = (), z: float = KERB_M,
-    ) -> None:  # fmt: skip
+        self,
+        kind: int,
+        place: tuple[float, float],
+        turn: float,
+        size: tuple[float, float, float],
+        rgb: Color,
+        rgb2: Color = (0.5, 0.5, 0.5),
+        parameters: tuple[float, ...] = (),
+        z: float = KERB_M,
+    ) -> None:
         """Add an object at street coordinates (s, u); ``turn`` is its heading relative to the street."""
         x, y, heading = self.plan.line.point(*place)
         self.rows.append(record(kind, (x, y, z), heading + turn, size, self.seed(), rgb, rgb2, parameters))
@@ -124,5 +153,12 @@ def plant_tree(f: Furnisher, s: float, u: float, garden: bool = False) -> None:
     height = f.uniform(6.0, 11.0) if habit == 0 else f.uniform(7, 12)
     radius = height * f.uniform(0.24, 0.32) if habit == 0 else f.uniform(1.0, 1.7)
     cell = f.uniform(0.20, 0.27) * (1 + 0.05 * max(0.0, height - 7))
-    f.place(TREE, (s, u), f.uniform(0, 6.28), (1.0, 1.0, height), f.pick(LEAF_COLORS), (0.13, 0.10, 0.075),
-            (radius, f.uniform(0.45, 0.72), habit, cell, f.uniform(0.11, 0.2)))  # fmt: skip
+    f.place(
+        TREE,
+        (s, u),
+        f.uniform(0, 6.28),
+        (1.0, 1.0, height),
+        f.pick(LEAF_COLORS),
+        (0.13, 0.10, 0.075),
+        (radius, f.uniform(0.45, 0.72), habit, cell, f.uniform(0.11, 0.2)),
+    )

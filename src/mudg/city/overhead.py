@@ -1,4 +1,5 @@
-"""What stands above a LiDAR's field of view: crowns over the road, bare trees, bridges, gantries, wires, arms, taller buildings.
+"""What stands above a LiDAR's field of view: crowns over the road, bare trees, bridges, gantries, wires, arms, taller
+buildings.
 
 Only in cities with ``overhead`` > 0. Nothing comes lower than `CLEARANCE_M` above the corridor of the shifted cameras.
 """
@@ -13,9 +14,16 @@ from mudg.city.objects import KERB_M, LEAF_COLORS, RENDER_COLORS, Color, Furnish
 
 CLEARANCE_M = 4.0
 BUILDING, WALL, FENCE, POLE, SIGN_CLASS, VEGETATION = 2, 3, 4, 5, 7, 8  # Cityscapes train ids
-PLAIN, BARK, METAL, BRICK, SIGN, CONCRETE = 0, 3, 4, 10, 12, 19  # materials; the same numbers stand in native/city_world.h
+# materials; the same numbers stand in native/city_world.h
+PLAIN, BARK, METAL, BRICK, SIGN, CONCRETE = 0, 3, 4, 10, 12, 19
 GREYS: tuple[Color, ...] = ((0.36, 0.35, 0.33), (0.24, 0.24, 0.24), (0.45, 0.43, 0.39), (0.30, 0.27, 0.23))
-METALS: tuple[Color, ...] = ((0.35, 0.36, 0.37), (0.05, 0.06, 0.06), (0.04, 0.10, 0.07), (0.16, 0.17, 0.2), (0.20, 0.10, 0.06))
+METALS: tuple[Color, ...] = (
+    (0.35, 0.36, 0.37),
+    (0.05, 0.06, 0.06),
+    (0.04, 0.10, 0.07),
+    (0.16, 0.17, 0.2),
+    (0.20, 0.10, 0.06),
+)
 Point = tuple[float, float, float]
 
 
@@ -31,7 +39,8 @@ class Overhead:
         return abs(self.f.plan.kerb(side))
 
     def foot(self, s: float, side: int, beyond_m: float, half: float) -> float | None:
-        """u of something that stands on the sidewalk, out of the corridor; None where it would stand on the crossing street."""
+        """u of something that stands on the sidewalk, out of the corridor; None where it would stand on the crossing
+        street."""
         f, crossing = self.f, self.f.plan.crossing
         if crossing is not None and f.near_crossing(s, crossing.corner + half + 1.0):
             return None
@@ -40,17 +49,36 @@ class Overhead:
     def cylinder(self, start: Point, end: Point, width_m: float, rgb: Color, looks: tuple[int, int]) -> None:
         """A round bar between two places (s, u, z); ``looks`` = class and material."""
         (x0, y0, _), (x1, y1, _) = self.f.plan.line.point(*start[:2]), self.f.plan.line.point(*end[:2])
-        row = record(rec.PART, (x0, y0, start[2]), 0.0, (1.0, width_m, 1.0), self.f.seed(), rgb, rgb,
-                     (1.0, float(looks[0]), float(looks[1]), x1 - x0, y1 - y0, end[2] - start[2]))  # fmt: skip
+        row = record(
+            rec.PART,
+            (x0, y0, start[2]),
+            0.0,
+            (1.0, width_m, 1.0),
+            self.f.seed(),
+            rgb,
+            rgb,
+            (1.0, float(looks[0]), float(looks[1]), x1 - x0, y1 - y0, end[2] - start[2]),
+        )
         self.f.rows.append(row)
 
     def box(self, place: Point, size: Point, rgb: Color, looks: tuple[int, int], turn: float = 0.0) -> None:
         """A box with its centre at (s, u, z); ``size`` along the street, across it and upwards."""
-        self.f.place(rec.PART, place[:2], turn, size, rgb, parameters=(0.0, float(looks[0]), float(looks[1])), z=place[2])
+        self.f.place(
+            rec.PART, place[:2], turn, size, rgb, parameters=(0.0, float(looks[0]), float(looks[1])), z=place[2]
+        )
 
     def board(self, place: Point, width_m: float, height_m: float, rgb: Color, ink: Color, turn: float) -> None:
         """A sign with letters that faces ``turn`` relative to the street."""
-        self.f.place(rec.PART, place[:2], turn, (0.1, width_m, height_m), rgb, ink, (0.0, float(SIGN_CLASS), float(SIGN)), z=place[2])
+        self.f.place(
+            rec.PART,
+            place[:2],
+            turn,
+            (0.1, width_m, height_m),
+            rgb,
+            ink,
+            (0.0, float(SIGN_CLASS), float(SIGN)),
+            z=place[2],
+        )
 
     def wire(self, start: Point, end: Point, sag_m: float, width_m: float) -> None:
         """A hanging wire in six straight pieces."""
@@ -112,8 +140,15 @@ def _avenue(o: Overhead, side: int) -> None:
             height, radius = size * f.uniform(11, 16), size * f.uniform(4.2, 7.0)
             k = f.uniform(0.8, 1.2)
             rgb = (leaves[0] * k, leaves[1] * k, leaves[2] * k)
-            f.place(rec.TREE, (s, u), f.uniform(0, 6.28), (1.0, 1.0, height), rgb, (0.10, 0.08, 0.06),
-                    (radius, density * f.uniform(0.8, 1.2), 0.0, f.uniform(0.3, 0.42), f.uniform(0.18, 0.34)))  # fmt: skip
+            f.place(
+                rec.TREE,
+                (s, u),
+                f.uniform(0, 6.28),
+                (1.0, 1.0, height),
+                rgb,
+                (0.10, 0.08, 0.06),
+                (radius, density * f.uniform(0.8, 1.2), 0.0, f.uniform(0.3, 0.42), f.uniform(0.18, 0.34)),
+            )
         s += spacing * f.uniform(0.85, 1.2)
 
 
@@ -137,7 +172,11 @@ def _bare_trees(o: Overhead, side: int) -> None:
             o.cylinder(fork, bough, f.uniform(0.09, 0.16), bark, (VEGETATION, BARK))
             for _ in range(4):
                 turn, reach = angle + f.uniform(-1.2, 1.2), f.uniform(0.1, 0.2) * height
-                twig = (bough[0] + reach * math.cos(turn), bough[1] + reach * math.sin(turn), bough[2] + f.uniform(0.0, 0.2) * height)
+                twig = (
+                    bough[0] + reach * math.cos(turn),
+                    bough[1] + reach * math.sin(turn),
+                    bough[2] + f.uniform(0.0, 0.2) * height,
+                )
                 o.cylinder(bough, twig, f.uniform(0.03, 0.06), bark, (VEGETATION, BARK))
 
 
@@ -148,7 +187,9 @@ def _tall_lamps(o: Overhead, side: int) -> None:
     while s < o.end:
         u = o.foot(s, side, 0.5, 0.3)
         if u is not None:
-            f.place(rec.LAMP, (s, u), -side * math.pi / 2, (0.2, 0.2, height), (tone, tone, tone), parameters=(reach, 0.0))
+            f.place(
+                rec.LAMP, (s, u), -side * math.pi / 2, (0.2, 0.2, height), (tone, tone, tone), parameters=(reach, 0.0)
+            )
         s += step
 
 
@@ -163,10 +204,30 @@ def _bridge(o: Overhead, s: float) -> None:
     looks = (BUILDING, BRICK if stone else (METAL if f.chance(0.2) else CONCRETE))
     x, y, heading = f.plan.line.point(s, 0.0)
     turn = f.uniform(-0.25, 0.25)
-    f.rows.append(record(rec.PART, (x, y, low + deck / 2), heading + turn, (along, 90.0, deck), f.seed(), rgb, rgb,
-                         (0.0, float(looks[0]), float(looks[1]))))  # fmt: skip
-    f.rows.append(record(rec.PART, (x, y, 0.0), heading + turn, (0.02, 0.02, 0.02), f.seed(), rgb, rgb,
-                         (0.0, float(looks[0]), float(looks[1]), 0, 0, 0, along / 2, 40.0, f.uniform(0.35, 0.7))))  # fmt: skip
+    f.rows.append(
+        record(
+            rec.PART,
+            (x, y, low + deck / 2),
+            heading + turn,
+            (along, 90.0, deck),
+            f.seed(),
+            rgb,
+            rgb,
+            (0.0, float(looks[0]), float(looks[1])),
+        )
+    )
+    f.rows.append(
+        record(
+            rec.PART,
+            (x, y, 0.0),
+            heading + turn,
+            (0.02, 0.02, 0.02),
+            f.seed(),
+            rgb,
+            rgb,
+            (0.0, float(looks[0]), float(looks[1]), 0, 0, 0, along / 2, 40.0, f.uniform(0.35, 0.7)),
+        )
+    )
     c, n = math.cos(heading + turn), math.sin(heading + turn)
     solid, girders = f.chance(0.5), int(f.rng.integers(0, 4))
     edge = f.pick(METALS)
@@ -174,15 +235,44 @@ def _bridge(o: Overhead, s: float) -> None:
         at = (x + end * c * along / 2, y + end * n * along / 2)
         high = f.uniform(0.9, 1.4)
         if solid:
-            f.rows.append(record(rec.PART, (*at, low + deck + high / 2), heading + turn, (0.25, 90.0, high), f.seed(), rgb, rgb,
-                                 (0.0, float(WALL), float(looks[1]))))  # fmt: skip
+            f.rows.append(
+                record(
+                    rec.PART,
+                    (*at, low + deck + high / 2),
+                    heading + turn,
+                    (0.25, 90.0, high),
+                    f.seed(),
+                    rgb,
+                    rgb,
+                    (0.0, float(WALL), float(looks[1])),
+                )
+            )
         else:
-            f.rows.append(record(rec.FENCE, (*at, low + deck), heading + turn + math.pi / 2, (70.0, 0.05, high), f.seed(), edge,
-                                 parameters=(float(f.chance(0.4)), 0.14, 0.04)))  # fmt: skip
+            f.rows.append(
+                record(
+                    rec.FENCE,
+                    (*at, low + deck),
+                    heading + turn + math.pi / 2,
+                    (70.0, 0.05, high),
+                    f.seed(),
+                    edge,
+                    parameters=(float(f.chance(0.4)), 0.14, 0.04),
+                )
+            )
     for i in range(girders):
         at = ((i + 0.5) / girders - 0.5) * along
-        f.rows.append(record(rec.PART, (x + c * at, y + n * at, low - 0.25), heading + turn, (0.4, 90.0, 0.5), f.seed(), edge, edge,
-                             (0.0, float(looks[0]), float(PLAIN))))  # fmt: skip
+        f.rows.append(
+            record(
+                rec.PART,
+                (x + c * at, y + n * at, low - 0.25),
+                heading + turn,
+                (0.4, 90.0, 0.5),
+                f.seed(),
+                edge,
+                edge,
+                (0.0, float(looks[0]), float(PLAIN)),
+            )
+        )
     walls = f.chance(0.5)
     for side in (-1, 1):
         u = max(o.kerb(side) + f.plan.sidewalk(side), f.reach + abs(f.plan.ego_u) + 0.6) + 0.4
@@ -192,7 +282,14 @@ def _bridge(o: Overhead, s: float) -> None:
             for k in (-0.35, 0.35):
                 o.box((s + k * along, side * (u + 0.5), low / 2), (1.0, 1.0, low), rgb, (BUILDING, looks[1]))
     if f.chance(0.4):
-        o.board((s - along / 2 - 0.2, f.plan.ego_u, low + 0.5 * deck), 3.0, min(0.9, deck), (0.72, 0.6, 0.05), (0.03, 0.03, 0.03), math.pi)
+        o.board(
+            (s - along / 2 - 0.2, f.plan.ego_u, low + 0.5 * deck),
+            3.0,
+            min(0.9, deck),
+            (0.72, 0.6, 0.05),
+            (0.03, 0.03, 0.03),
+            math.pi,
+        )
 
 
 def _gantry(o: Overhead, s: float) -> None:
@@ -213,7 +310,14 @@ def _gantry(o: Overhead, s: float) -> None:
     for u in lanes:
         if f.chance(0.75):
             turn = math.pi if u in f.plan.forward_lanes else 0.0
-            o.board((s - 0.3 if turn else s + 0.3, u, height + 0.4), f.uniform(2.0, 3.0), f.uniform(1.2, 2.2), rgb, ink, turn)
+            o.board(
+                (s - 0.3 if turn else s + 0.3, u, height + 0.4),
+                f.uniform(2.0, 3.0),
+                f.uniform(1.2, 2.2),
+                rgb,
+                ink,
+                turn,
+            )
 
 
 def _cross_wires(o: Overhead) -> None:
@@ -225,7 +329,12 @@ def _cross_wires(o: Overhead) -> None:
     s = f.uniform(3, 15)
     while s < min(o.end, f.plan.drive_length + 80):
         ends = [side * (o.kerb(side) + f.plan.sidewalk(side) + 0.3) for side in (-1, 1)]
-        o.wire((s, ends[0], height + 0.6), (s + f.uniform(-1, 1), ends[1], height + 0.6), f.uniform(0.3, 0.9), f.uniform(0.02, 0.05))
+        o.wire(
+            (s, ends[0], height + 0.6),
+            (s + f.uniform(-1, 1), ends[1], height + 0.6),
+            f.uniform(0.3, 0.9),
+            f.uniform(0.02, 0.05),
+        )
         if hung == 1:
             middle = 0.5 * (ends[0] + ends[1])
             o.box((s, middle, height - 0.5), (0.7, 0.35, 0.2), (0.4, 0.4, 0.39), (POLE, METAL))
@@ -253,7 +362,12 @@ def _pole_line(o: Overhead, side: int) -> None:
     for a, b in zip(tops[:-1], tops[1:], strict=True):
         if b[0] - a[0] < 1.6 * step:
             for across, below in wires:
-                o.wire((a[0], a[1] + across, height - below), (b[0], b[1] + across, height - below), f.uniform(0.3, 0.9), 0.03)
+                o.wire(
+                    (a[0], a[1] + across, height - below),
+                    (b[0], b[1] + across, height - below),
+                    f.uniform(0.3, 0.9),
+                    0.03,
+                )
     for s, u in tops:
         if f.chance(0.35):
             far = -side * (o.kerb(-side) + f.plan.sidewalk(-side) + 2.0)
@@ -268,8 +382,15 @@ def _signal_arm(o: Overhead, s: float) -> None:
     if u is None:
         return
     tone = f.uniform(0.03, 0.4)
-    f.place(rec.SIGNAL, (s, u), math.pi if side < 0 else 0.0, (0.3, 0.3, f.uniform(5.6, 6.6)), (tone, tone, tone),
-            parameters=(f.uniform(4.5, 8.5), float(f.rng.integers(0, 3))), z=KERB_M)  # fmt: skip
+    f.place(
+        rec.SIGNAL,
+        (s, u),
+        math.pi if side < 0 else 0.0,
+        (0.3, 0.3, f.uniform(5.6, 6.6)),
+        (tone, tone, tone),
+        parameters=(f.uniform(4.5, 8.5), float(f.rng.integers(0, 3))),
+        z=KERB_M,
+    )
 
 
 def _banner(o: Overhead, s: float) -> None:

@@ -1,4 +1,5 @@
-"""Where paint lies on the streets of the generated city, exactly: at any point of the ground, and as lines for scores that want a map.
+"""Where paint lies on the streets of the generated city, exactly: at any point of the ground, and as lines for scores
+that want a map.
 
 The rules are those of ``native/city_ground.cpp``, without its blur over the footprint of a pixel and without wear.
 """
@@ -27,7 +28,8 @@ def painted(plan: StreetPlan, street: Array, xy: Array) -> NDArray[np.bool_]:
     """Whether points of the road carry paint, bool[N].
 
     Args:
-        street: s, u and distance to the kerb f64[N, 3] of the points (``CityHandle.street``). xy: the points f64[N, 2] in the world.
+        street: s, u and distance to the kerb f64[N, 3] of the points (``CityHandle.street``). xy: the points f64[N, 2]
+            in the world.
     """
     s, u = street[:, 0], street[:, 1]
     crossing = plan.crossing
@@ -91,7 +93,7 @@ def _cross_coordinates(crossing: Crossing, xy: Array) -> tuple[Array, Array]:
     return c * dx + n * dy, -n * dx + c * dy
 
 
-# ---- as a map has it ----------------------------------------------------------------------------------------------------
+# ---- as a map has it -----------------------------------------------------------------------------
 
 
 def lane_lines(plan: StreetPlan) -> list[Array]:

@@ -1,8 +1,9 @@
 """Photographic surfaces and skies for a city, from a folder of the user's: `textures/*.jpg` or `.png` and `sky/*.hdr`.
 
-A surface's photograph multiplies its drawn colour, so only its variation around its own mean is used. Which surface a file is for
-follows from words in its name (`SURFACES`); files that fit none are not used. Panoramas are Radiance HDR; what lies below `HORIZON_DEG` in
-them (trees, houses) is left out and the rest is stretched down to the horizon. The same folder and seed give the same city.
+A surface's photograph multiplies its drawn colour, so only its variation around its own mean is used. Which surface a
+file is for follows from words in its name (`SURFACES`); files that fit none are not used. Panoramas are Radiance HDR;
+what lies below `HORIZON_DEG` in them (trees, houses) is left out and the rest is stretched down to the horizon. The
+same folder and seed give the same city.
 """
 
 from __future__ import annotations
@@ -32,7 +33,8 @@ SURFACES: Final[tuple[tuple[str, ...], ...]] = (
     ("roofing",),
     ("corrugated", "metal0", "fabric"),
 )
-"""Words in the names of files, per texture slot of the native library: road, sidewalk, grass, walls, brick, concrete, bark, roof, cargo."""
+"""Words in the names of files, per texture slot of the native library: road, sidewalk, grass, walls, brick, concrete,
+bark, roof, cargo."""
 METRES: Final = (2.5, 1.6, 2.0, 2.4, 1.2, 2.5, 0.8, 1.6, 2.0)
 """Side of the place that a photograph covers, per slot."""
 SKY_SLOT: Final = 9
@@ -42,13 +44,16 @@ SKY_PX: Final = (512, 96)
 
 
 def draw_photos(folder: Path, seed: int) -> list[tuple[int, Pixels, float]]:
-    """Slot, pixels f32[H, W, 3] and size in metres of the photographs that a city uses; half of the cities also get a panorama.
+    """Slot, pixels f32[H, W, 3] and size in metres of the photographs that a city uses; half of the cities also get a
+    panorama.
 
     Raises:
         InputError: no such folder, or a file in it cannot be read.
     """
     if not folder.is_dir():
-        raise InputError("there is no such folder of textures", where=str(folder), expected="textures/*.jpg and sky/*.hdr")
+        raise InputError(
+            "there is no such folder of textures", where=str(folder), expected="textures/*.jpg and sky/*.hdr"
+        )
     rng = seeds.numpy_rng(seed, 0, "city photographs")
     files = sorted(p for p in folder.glob("textures/*") if p.suffix.lower() in (".jpg", ".png"))
     found: list[tuple[int, Pixels, float]] = []
@@ -70,7 +75,8 @@ def draw_photos(folder: Path, seed: int) -> list[tuple[int, Pixels, float]]:
 
 @functools.lru_cache(maxsize=64)
 def surface(path: Path) -> Pixels:
-    """A photograph as albedo relative to its mean, f32[256, 256, 3]: linear light, three quarters of its tint taken out."""
+    """A photograph as albedo relative to its mean, f32[256, 256, 3]: linear light, three quarters of its tint taken
+    out."""
     try:
         with Image.open(io.BytesIO(store.read_bytes(path))) as image:
             small = image.convert("RGB").resize((SIDE_PX, SIDE_PX), Image.Resampling.BOX)

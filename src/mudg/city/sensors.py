@@ -1,12 +1,13 @@
 """What real cameras, LiDARs and calibrations add to a recorded log: applied on top of the generator's exact truth.
 
-Everything is a pure function of its arguments; random parts take a key from `base.seeds`. Two kinds of effects are kept apart:
+Everything is a pure function of its arguments; random parts take a key from `base.seeds`. Two kinds of effects are kept
+apart:
 
-* The **look** of a camera: exposure, white balance, vignetting and contrast, which differ from camera to camera and partly drift over
-  time. Recorded images have it, and so has the truth that goes with them (`with_look`): a view beside the recorded path is to look as
-  that camera would show it.
-* **Faults** of a recording: noise, blur, bloom, compression, rolling shutter, errors of poses, calibration, clocks and boxes. Only what is
-  recorded has them (`recorded`, `thinned`, `pose_errors`, `noisy_tracks`); the truth does not.
+* The **look** of a camera: exposure, white balance, vignetting and contrast, which differ from camera to camera and
+  partly drift over time. Recorded images have it, and so has the truth that goes with them (`with_look`): a view beside
+  the recorded path is to look as that camera would show it.
+* **Faults** of a recording: noise, blur, bloom, compression, rolling shutter, errors of poses, calibration, clocks and
+  boxes. Only what is recorded has them (`recorded`, `thinned`, `pose_errors`, `noisy_tracks`); the truth does not.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from mudg.base import geometry, seeds
 from mudg.base.types import Camera, SweepPoints, Track
 from mudg.city.config import CityConfig
 
-# sensors of the recording vehicle: three cameras and a spinning LiDAR on the roof -------------------------------------
+# sensors of the recording vehicle: three cameras and a spinning LiDAR on the roof -----------------
 
 
 SIDE_YAW_DEG = 50.0
@@ -107,7 +108,7 @@ def lidar_azimuths(config: CityConfig) -> NDArray[np.float64]:
     return np.pi - (np.arange(columns) + 0.5) * (2 * np.pi / columns)
 
 
-# sensors --------------------------------------------------------------------------------------------------------------
+# sensors ------------------------------------------------------------------------------------------
 
 
 Array = NDArray[np.float64]
@@ -176,7 +177,8 @@ class CameraFaults:
 
 @dataclass(frozen=True)
 class LidarMount:
-    """A LiDAR: place on the vehicle in metres (x forward, y left, z up from the ground), beams and their elevation range in degrees."""
+    """A LiDAR: place on the vehicle in metres (x forward, y left, z up from the ground), beams and their elevation
+    range in degrees."""
 
     place: Triple
     beams: int
@@ -211,8 +213,8 @@ class LidarFaults:
 
 @dataclass(frozen=True)
 class PoseFaults:
-    """Errors of the recorded poses of the vehicle: independent from frame to frame (jitter) and growing to the stated amount over a log
-    (drift). Standard deviations per axis, metres and degrees."""
+    """Errors of the recorded poses of the vehicle: independent from frame to frame (jitter) and growing to the stated
+    amount over a log (drift). Standard deviations per axis, metres and degrees."""
 
     jitter_m: float = 0.0
     jitter_deg: float = 0.0
@@ -255,7 +257,7 @@ class SensorFaults:
         return self.cameras.get(camera, CameraFaults())
 
 
-# --- images -----------------------------------------------------------------------------------------------------------
+# --- images ---------------------------------------------------------------------------------------
 
 
 def with_look(rgb: Rgb, look: CameraLook, time_s: float) -> Rgb:
@@ -311,7 +313,7 @@ def recorded(rgb: Rgb, faults: CameraFaults, key: int) -> NDArray[np.uint8]:
     return image
 
 
-# --- LiDAR, poses, boxes ----------------------------------------------------------------------------------------------
+# --- LiDAR, poses, boxes --------------------------------------------------------------------------
 
 
 def kept_points(points: SweepPoints, faults: LidarFaults, key: int) -> NDArray[np.bool_]:

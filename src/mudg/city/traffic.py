@@ -18,13 +18,27 @@ from mudg.city.sensors import pitch_rotation
 Array = NDArray[np.float64]
 
 PAINTS: tuple[Color, ...] = (
-    (0.62, 0.62, 0.62), (0.70, 0.70, 0.69), (0.018, 0.018, 0.02), (0.05, 0.052, 0.056), (0.16, 0.165, 0.17),
-    (0.32, 0.33, 0.34), (0.30, 0.018, 0.018), (0.02, 0.05, 0.20), (0.05, 0.10, 0.24), (0.16, 0.12, 0.08),
-    (0.03, 0.09, 0.06), (0.42, 0.18, 0.03), (0.50, 0.42, 0.05),
-)  # fmt: skip
+    (0.62, 0.62, 0.62),
+    (0.70, 0.70, 0.69),
+    (0.018, 0.018, 0.02),
+    (0.05, 0.052, 0.056),
+    (0.16, 0.165, 0.17),
+    (0.32, 0.33, 0.34),
+    (0.30, 0.018, 0.018),
+    (0.02, 0.05, 0.20),
+    (0.05, 0.10, 0.24),
+    (0.16, 0.12, 0.08),
+    (0.03, 0.09, 0.06),
+    (0.42, 0.18, 0.03),
+    (0.50, 0.42, 0.05),
+)
 BUS_COLORS: tuple[Color, ...] = (
-    (0.45, 0.03, 0.03), (0.55, 0.42, 0.03), (0.6, 0.6, 0.58), (0.03, 0.16, 0.30), (0.05, 0.25, 0.12),
-)  # fmt: skip
+    (0.45, 0.03, 0.03),
+    (0.55, 0.42, 0.03),
+    (0.6, 0.6, 0.58),
+    (0.03, 0.16, 0.30),
+    (0.05, 0.25, 0.12),
+)
 PAINT_WEIGHTS = np.array([4, 4, 3, 3, 3, 3, 2, 1.5, 1.5, 1, 0.7, 0.5, 0.3])
 KEY_MARGIN_S = 0.5
 RIG_BOX = (-1.2, 3.2)  # where cameras may sit along the vehicle, with clearance, metres
@@ -174,13 +188,26 @@ class TrafficPlanner(Draws):
     def tall_vehicle(self, seed: int, paint: Color) -> list[float]:
         """Record of a lorry, tanker or bus of full height."""
         kind, origin = float(self.rng.random()), (0.0, 0.0, 0.0)
-        box = PAINTS[1] if self.chance(0.5) else (self.uniform(0.05, 0.5), self.uniform(0.05, 0.4), self.uniform(0.05, 0.5))
+        box = (
+            PAINTS[1]
+            if self.chance(0.5)
+            else (self.uniform(0.05, 0.5), self.uniform(0.05, 0.4), self.uniform(0.05, 0.5))
+        )
         if kind < 0.5:
-            return record(rec.TRUCK, origin, 0, (self.uniform(7.0, 15.0), 2.5, self.uniform(3.6, 4.0)), seed, paint, box)
+            return record(
+                rec.TRUCK, origin, 0, (self.uniform(7.0, 15.0), 2.5, self.uniform(3.6, 4.0)), seed, paint, box
+            )
         if kind < 0.65:
             steel = self.uniform(0.3, 0.6)
-            return record(rec.TANKER, origin, 0, (self.uniform(8.0, 13.0), 2.5, self.uniform(3.3, 3.7)), seed, paint,
-                          (steel, steel, steel) if self.chance(0.6) else box)  # fmt: skip
+            return record(
+                rec.TANKER,
+                origin,
+                0,
+                (self.uniform(8.0, 13.0), 2.5, self.uniform(3.3, 3.7)),
+                seed,
+                paint,
+                (steel, steel, steel) if self.chance(0.6) else box,
+            )
         body = BUS_COLORS[int(self.rng.integers(5))]
         height = self.uniform(4.1, 4.4) if self.chance(0.35) else self.uniform(3.1, 3.5)
         return record(rec.BUS, origin, 0, (self.uniform(10.5, 12), 2.5, height), seed, body, (0.6, 0.6, 0.58))
@@ -196,8 +223,16 @@ class TrafficPlanner(Draws):
         clothes = [self.cloth(), self.cloth()]
         height = self.uniform(1.55, 1.9)
         swing = min(0.5, 0.33 * speed)
-        return record(rec.PEDESTRIAN, (0, 0, 0), 0, (0.85, 0.65, height), self.seed(), clothes[0],
-                      tuple(0.4 * c for c in clothes[1]), (swing, float(self.chance(0.3))))  # type: ignore[arg-type]  # fmt: skip
+        return record(
+            rec.PEDESTRIAN,
+            (0, 0, 0),
+            0,
+            (0.85, 0.65, height),
+            self.seed(),
+            clothes[0],
+            tuple(0.4 * c for c in clothes[1]),
+            (swing, float(self.chance(0.3))),
+        )
 
     def along_street(self, s: Array, u: Array | float, direction: int, z: float = 0.0) -> Array:
         """Keys of an object that follows the main street; direction -1 = against it."""

@@ -38,8 +38,8 @@ FAR_BELOW_M = 1000.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CityTruth:
-    """Exact truth at a view. Depth, semantics and instance belong to the ray through the pixel's centre; rgb is averaged
-    over the pixel.
+    """Exact truth at a view. Depth, semantics and instance belong to the ray through the pixel's centre; rgb is
+    averaged over the pixel.
 
     Args:
         rgb: f32[H, W, 3], display values in [0, 1].
@@ -66,8 +66,9 @@ class CityTruth:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CitySurfaces:
-    """Exact surfaces behind pixel centres, 0 in the sky: unit normals f32[H, W, 3] in the world and albedo f32[H, W, 3]; and f32[H, W]
-    in [0, 1]: share of the sky that is seen, whether the sun shines on it, snow cover, standing water."""
+    """Exact surfaces behind pixel centres, 0 in the sky: unit normals f32[H, W, 3] in the world and albedo f32[H, W,
+    3]; and f32[H, W] in [0, 1]: share of the sky that is seen, whether the sun shines on it, snow cover, standing
+    water."""
 
     normal: NDArray[np.float32]
     albedo: NDArray[np.float32]
@@ -79,8 +80,8 @@ class CitySurfaces:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CitySweep:
-    """One turn of the LiDAR with its truth. ``points`` are in the LiDAR frame at ``time_s``, compensated for the motion of
-    the recording vehicle (each point was measured at ``time_s + dt_s``; moving objects are where they were then).
+    """One turn of the LiDAR with its truth. ``points`` are in the LiDAR frame at ``time_s``, compensated for the motion
+    of the recording vehicle (each point was measured at ``time_s + dt_s``; moving objects are where they were then).
     ``semantics`` u8[N] and ``instance`` i32[N] belong to the points."""
 
     time_s: float
@@ -119,7 +120,9 @@ class CityWorld:
         """The native world of all shapes, in its light and weather."""
         config = self.config
         records = np.array(self._furniture + [m.row for m in self.objects], np.float64).reshape(-1, rec.COLUMNS)
-        handle = CityHandle(records, self.plan, _road_numbers(config, self.plan), self._light, _seed31(config, "city surfaces"))
+        handle = CityHandle(
+            records, self.plan, _road_numbers(config, self.plan), self._light, _seed31(config, "city surfaces")
+        )
         for slot, rgb, metres in draw_photos(Path(config.textures), config.seed) if config.textures else ():
             handle.set_texture(slot, rgb, metres)
         numbers = weather_numbers(config)
@@ -136,24 +139,34 @@ class CityWorld:
         """
         recipe = source.recipe
         if recipe is None or "city" not in recipe:
-            raise InputError("the scene was not generated, so there is no exact truth", where="source.recipe",
-                got=source.dataset)  # fmt: skip
+            raise InputError(
+                "the scene was not generated, so there is no exact truth", where="source.recipe", got=source.dataset
+            )
         if recipe.get("generator_version") != GENERATOR_VERSION:
-            raise InputError("the scene was made by another version of the generator",
-                where="source.recipe.generator_version", expected=str(GENERATOR_VERSION),
-                got=str(recipe.get("generator_version")), remedy="generate it again")  # fmt: skip
+            raise InputError(
+                "the scene was made by another version of the generator",
+                where="source.recipe.generator_version",
+                expected=str(GENERATOR_VERSION),
+                got=str(recipe.get("generator_version")),
+                remedy="generate it again",
+            )
         if not isinstance(recipe["city"], Mapping):
-            raise InputError("the recipe of a generated city is no object", where="source.recipe.city", got=str(recipe["city"]))
+            raise InputError(
+                "the recipe of a generated city is no object", where="source.recipe.city", got=str(recipe["city"])
+            )
         try:
             return cls(build(CityConfig, recipe["city"], "source.recipe.city"))
         except UsageError as error:  # nobody asked for these settings: a file states them
-            raise InputError(error.what, where=error.where, expected=error.expected, got=error.got, remedy="generate it again") from error
+            raise InputError(
+                error.what, where=error.where, expected=error.expected, got=error.got, remedy="generate it again"
+            ) from error
 
     def rearranged(self, keys: Mapping[str, NDArray[np.float64] | None]) -> CityWorld:
         """The same world, light and shadows included, with some vehicles or people elsewhere or gone.
 
         Args:
-            keys: track id -> x, y, z of the point on the ground below the box's centre, yaw f64[K, 4] at ``key_times_s``; None: not there.
+            keys: track id -> x, y, z of the point on the ground below the box's centre, yaw f64[K, 4] at
+                ``key_times_s``; None: not there.
         """
         moved = self._keys.copy()
         for track_id, values in keys.items():
@@ -201,7 +214,7 @@ class CityWorld:
         recipe: Mapping[str, Any] = {"city": to_dict(self.config), "generator_version": GENERATOR_VERSION}
         return Source(DATASET, "CC0-1.0", recipe, (f"generated city, light: {self.light_name}",))
 
-    # --- facts ------------------------------------------------------------------------------------------------------
+    # --- facts ------------------------------------------------------------------------------------
 
     def describe(self) -> str:
         """One line about what was drawn."""
@@ -211,8 +224,8 @@ class CityWorld:
         crossing = "a crossing" if plan.crossing is not None else "no crossing"
         moving = sum(m.moving for m in self.objects)
         return (
-            f"{quarter}, {self.light_name}, {lanes}, {crossing}, {plan.drive_length:.0f} m of drive, {moving} moving and "
-            f"{len(self.objects) - moving} standing objects, {self.shape_count} shapes"
+            f"{quarter}, {self.light_name}, {lanes}, {crossing}, {plan.drive_length:.0f} m of drive, {moving} moving"
+            f" and {len(self.objects) - moving} standing objects, {self.shape_count} shapes"
         )
 
     @property
@@ -270,8 +283,11 @@ class CityWorld:
     def _world_from_ego(self, time_s: float) -> NDArray[np.float64]:
         pose = self._ego_path.pose_at(time_s)
         if pose is None:
-            raise UsageError("time lies outside the log",
-                expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s", got=f"{time_s} s")  # fmt: skip
+            raise UsageError(
+                "time lies outside the log",
+                expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s",
+                got=f"{time_s} s",
+            )
         return pose
 
     def _object_keys_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -279,8 +295,11 @@ class CityWorld:
         times, keys = self._key_times, self._keys
         first, last = self.span_s
         if times_s.min() < first - 1e-6 or times_s.max() > last + 1e-6:
-            raise UsageError("time lies outside the log", expected=f"{first:.3f}..{last:.3f} s",
-                got=f"{times_s.min()}..{times_s.max()} s")  # fmt: skip
+            raise UsageError(
+                "time lies outside the log",
+                expected=f"{first:.3f}..{last:.3f} s",
+                got=f"{times_s.min()}..{times_s.max()} s",
+            )
         at = np.clip((times_s - first) * self.config.rate_hz, 0, len(times) - 1)
         nearest = np.rint(at)
         at = np.where(np.abs(at - nearest) < 1e-6 * self.config.rate_hz, nearest, at)
@@ -292,7 +311,8 @@ class CityWorld:
         return self._gait_starts + self._gaits * time_s
 
     def markings(self, view: View, truth: CityTruth) -> NDArray[np.bool_]:
-        """Pixels bool[H, W] whose centre shows paint on the road, exactly: without the blur of a pixel and without wear.
+        """Pixels bool[H, W] whose centre shows paint on the road, exactly: without the blur of a pixel and without
+        wear.
 
         Args:
             truth: what ``render`` gave for this view.
@@ -308,7 +328,7 @@ class CityWorld:
         """Road lines, road edges and crosswalks as a map has them: lines f64[N, 3] in the world, metres."""
         return paint.lane_lines(self.plan)
 
-    # --- truth ------------------------------------------------------------------------------------------------------
+    # --- truth ------------------------------------------------------------------------------------
 
     def render(self, view: View, *, supersample: int | None = None, sensor_noise: bool = False) -> CityTruth:
         """Truth at any view whose time lies in ``span_s``.
@@ -332,8 +352,18 @@ class CityWorld:
         if not 1 <= per_axis <= 8:
             raise UsageError("supersample must lie in 1..8", got=str(per_axis))
         poses = self._object_keys_at(np.array([view.time_s]))[0]
-        return CityTruth(*self._handle.render(poses, self._phases(view.time_s), intrinsics, camera.width, camera.height,
-                                              view.world_from_cam, per_axis, noise_key))  # fmt: skip
+        return CityTruth(
+            *self._handle.render(
+                poses,
+                self._phases(view.time_s),
+                intrinsics,
+                camera.width,
+                camera.height,
+                view.world_from_cam,
+                per_axis,
+                noise_key,
+            )
+        )
 
     def surfaces(self, view: View) -> CitySurfaces:
         """Exact surfaces behind the pixel centres of a view, as ``render`` sees them."""
@@ -342,8 +372,8 @@ class CityWorld:
         return CitySurfaces(planes[..., :3], planes[..., 3:6], *(planes[..., i] for i in range(6, 10)))
 
     def observation(self, view: View, truth: CityTruth | None = None) -> Observation:
-        """Noise-free truth as torch tensors; depth is 0 (= none) in the sky, everything may be used. ``truth``: what ``render``
-        gave for this view already."""
+        """Noise-free truth as torch tensors; depth is 0 (= none) in the sky, everything may be used. ``truth``: what
+        ``render`` gave for this view already."""
         import torch
 
         truth = truth or self.render(view)
@@ -354,7 +384,8 @@ class CityWorld:
         return Observation(view, rgb, depth, semantics, ones, ones.bool(), "recorded", "city truth")
 
     def render_rolling(self, view: View, readout_s: float, strips: int = 8) -> CityTruth:
-        """The image of a rolling shutter: vehicle and objects move while the rows are read, the middle row at the view's time.
+        """The image of a rolling shutter: vehicle and objects move while the rows are read, the middle row at the
+        view's time.
 
         Rows are taken in strips of one time each. Times beyond the log's span keep the pose of its end.
         """
@@ -366,17 +397,25 @@ class CityWorld:
             at = view.time_s + readout_s * ((top + bottom) / 2 / camera.height - 0.5)
             at = min(max(at, first), last)
             intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy - top)
-            parts.append(self._handle.render(
-                self._object_keys_at(np.array([at]))[0], self._phases(at), intrinsics, camera.width, bottom - top,
-                self._world_from_ego(at) @ mount, self.config.supersample, 0,
-            ))  # fmt: skip
+            parts.append(
+                self._handle.render(
+                    self._object_keys_at(np.array([at]))[0],
+                    self._phases(at),
+                    intrinsics,
+                    camera.width,
+                    bottom - top,
+                    self._world_from_ego(at) @ mount,
+                    self.config.supersample,
+                    0,
+                )
+            )
         rgb, depth, semantics, instance = zip(*parts, strict=True)
         return CityTruth(*(np.concatenate(column) for column in (rgb, depth, semantics, instance)))
 
     def lidar_sweep(self, index: int, scan: sensors.LidarScan | None = None) -> CitySweep:
         """The sweep around the time of frame ``index``: it starts and ends half a turn away from it, looking backwards.
-        Vehicle and objects move during the turn; the limbs of people keep their pose of the middle. ``scan``: another LiDAR than the
-        configuration's; with a delay, points and pose are what a log has whose clock is wrong by it."""
+        Vehicle and objects move during the turn; the limbs of people keep their pose of the middle. ``scan``: another
+        LiDAR than the configuration's; with a delay, points and pose are what a log has whose clock is wrong by it."""
         config = self.config
         if not 0 <= index < config.n_frames:
             raise UsageError("there is no such sweep", expected=f"0..{config.n_frames - 1}", got=str(index))
@@ -393,9 +432,15 @@ class CityWorld:
         columns = _interpolated_poses(self._ego_times, self._ego_poses, time_s + offsets) @ mount
         settings = (config.lidar_range_m, config.lidar_noise_m, config.lidar_dropout, 0.55)
         xyz, intensity, semantics, instance = self._handle.sweep(
-            self._object_keys_at(knots), self._phases(time_s), scan.elevations_rad, azimuths, columns[:, :3],
-            (offsets + period / 2) / period, settings, seeds.key(config.seed, index, f"city lidar{scan.name}"),
-        )  # fmt: skip
+            self._object_keys_at(knots),
+            self._phases(time_s),
+            scan.elevations_rad,
+            azimuths,
+            columns[:, :3],
+            (offsets + period / 2) / period,
+            settings,
+            seeds.key(config.seed, index, f"city lidar{scan.name}"),
+        )
         hit = intensity >= 0
         lidar_from_world = geometry.invert(world_from_lidar)
         world = xyz[hit].astype(np.float64)
@@ -431,8 +476,19 @@ def _interpolated_poses(
         q /= np.linalg.norm(q, axis=1, keepdims=True)
         w, x, y, z = q.T
         out[rows, :3, :3] = np.stack(
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y), 2 * (x * y + w * z), 1 - 2 * (x * x + z * z),
-             2 * (y * z - w * x), 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)], 1).reshape(-1, 3, 3)  # fmt: skip
+            [
+                1 - 2 * (y * y + z * z),
+                2 * (x * y - w * z),
+                2 * (x * z + w * y),
+                2 * (x * y + w * z),
+                1 - 2 * (x * x + z * z),
+                2 * (y * z - w * x),
+                2 * (x * z - w * y),
+                2 * (y * z + w * x),
+                1 - 2 * (x * x + y * y),
+            ],
+            1,
+        ).reshape(-1, 3, 3)
         out[rows, :3, 3] = (1 - u)[:, None] * poses[i][:3, 3] + u[:, None] * poses[i + 1][:3, 3]
         out[rows, 3] = (0, 0, 0, 1)
     return out
@@ -449,9 +505,17 @@ def _road_numbers(config: CityConfig, plan: StreetPlan) -> NDArray[np.float64]:
     cross = [0.0] * 10
     if crossing is not None:
         cross = [
-            1.0, crossing.s, crossing.x, crossing.y, crossing.yaw, crossing.half_width, crossing.corner, crossing.start,
-            crossing.end, crossing.sidewalk,
-        ]  # fmt: skip
+            1.0,
+            crossing.s,
+            crossing.x,
+            crossing.y,
+            crossing.yaw,
+            crossing.half_width,
+            crossing.corner,
+            crossing.start,
+            crossing.end,
+            crossing.sidewalk,
+        ]
     grey = rng.uniform(0.045, 0.11)
     warm = rng.uniform(-0.06, 0.06)
     asphalt = grey * np.array([1 + warm, 1.0, 1 - warm])
@@ -465,8 +529,27 @@ def _road_numbers(config: CityConfig, plan: StreetPlan) -> NDArray[np.float64]:
     pad = 75.0
     bounds = [line.x.min() - pad, line.y.min() - pad, line.x.max() + pad, line.y.max() + pad]
     return np.array(
-        [plan.left, plan.right, plan.sidewalk_left, plan.sidewalk_right, plan.paved_left, plan.paved_right, plan.park_left,
-         plan.park_right, *cross, plan.lane_width, float(_seed31(config, "city ground texture") % 1_000_000), *asphalt, *sidewalk,
-         *(sidewalk * rng.uniform(0.9, 1.2)), *terrain, rng.uniform(0.5, 1.6), rng.uniform(0.0, 1.0), rng.uniform(0.0, 1.0),
-         float(rng.random() < 0.3), *np.floor(bounds)], np.float64,
-    )  # fmt: skip
+        [
+            plan.left,
+            plan.right,
+            plan.sidewalk_left,
+            plan.sidewalk_right,
+            plan.paved_left,
+            plan.paved_right,
+            plan.park_left,
+            plan.park_right,
+            *cross,
+            plan.lane_width,
+            float(_seed31(config, "city ground texture") % 1_000_000),
+            *asphalt,
+            *sidewalk,
+            *(sidewalk * rng.uniform(0.9, 1.2)),
+            *terrain,
+            rng.uniform(0.5, 1.6),
+            rng.uniform(0.0, 1.0),
+            rng.uniform(0.0, 1.0),
+            float(rng.random() < 0.3),
+            *np.floor(bounds),
+        ],
+        np.float64,
+    )

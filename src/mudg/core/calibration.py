@@ -1,11 +1,12 @@
-"""Does the LiDAR fit the camera? Depth edges of sweeps against brightness edges of images, at the given and at turned poses.
+"""Does the LiDAR fit the camera? Depth edges of sweeps against brightness edges of images, at the given and at turned
+poses.
 
-Where a near surface ends before a far one, the image nearly always has an edge too. With the right calibration the near side
-of such jumps falls on image edges more often than with the camera turned by a degree; so the mean edge strength under the
-jumps, as a function of a small extra turn, has its peak at no turn. Nothing is fitted and no truth is needed.
+Where a near surface ends before a far one, the image nearly always has an edge too. With the right calibration the near
+side of such jumps falls on image edges more often than with the camera turned by a degree; so the mean edge strength
+under the jumps, as a function of a small extra turn, has its peak at no turn. Nothing is fitted and no truth is needed.
 
-Source of the idea: J. Levinson and S. Thrun, Automatic online calibration of cameras and lasers, RSS 2013. Their scan-line
-neighbours are replaced by the nearest directions in a row, so that clouds need no ring numbers.
+Source of the idea: J. Levinson and S. Thrun, Automatic online calibration of cameras and lasers, RSS 2013. Their
+scan-line neighbours are replaced by the nearest directions in a row, so that clouds need no ring numbers.
 """
 
 from __future__ import annotations
@@ -24,13 +25,13 @@ from mudg.base.camera_colors import SAME_COLORS, CameraColors, ColorMap
 from mudg.base.geometry import transform_points
 from mudg.base.types import View
 
-# color match ----------------------------------------------------------------------------------------------------------
+# color match --------------------------------------------------------------------------------------
 #
 # Finding the maps between the colours of a log's cameras, from points that two of them saw.
 #
-# Cameras of a rig overlap little at one moment, but the front camera sees what the side cameras pass a little later. So every point
-# is looked up in images of several moments. Photographs differ for other reasons too (reflections, shadows of the vehicle, poses), so
-# a map is used only where it explains a good part of the difference.
+# Cameras of a rig overlap little at one moment, but the front camera sees what the side cameras pass a little later. So
+# every point is looked up in images of several moments. Photographs differ for other reasons too (reflections, shadows
+# of the vehicle, poses), so a map is used only where it explains a good part of the difference.
 
 
 TRIM_DEVIATIONS: Final = 2.5
@@ -46,11 +47,11 @@ Seen = Mapping[str, tuple[NDArray[np.integer], NDArray[np.uint8]]]
 
 
 def color_map(given: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> ColorMap:
-    """The affine map per channel from colours u8[N, 3] to those of another camera, by trimmed orthogonal least squares: both sides are
-    photographs, as noisy as each other, and plain least squares would find too little contrast.
+    """The affine map per channel from colours u8[N, 3] to those of another camera, by trimmed orthogonal least squares:
+    both sides are photographs, as noisy as each other, and plain least squares would find too little contrast.
 
-    Six rounds, the first a guess from medians; each leaves out pairs that are farther than ``TRIM_DEVIATIONS`` robust standard
-    deviations from the last line. The identity where there are fewer than ``FEWEST_PAIRS`` pairs.
+    Six rounds, the first a guess from medians; each leaves out pairs that are farther than ``TRIM_DEVIATIONS`` robust
+    standard deviations from the last line. The identity where there are fewer than ``FEWEST_PAIRS`` pairs.
     """
     usable = ((given > 4) & (given < 251) & (wanted > 4) & (wanted < 251)).all(1)
     x, y = given[usable] / 255.0, wanted[usable] / 255.0
@@ -70,8 +71,8 @@ def color_map(given: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> ColorMap:
 
 
 def _line(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Gain and offset of the line y = gain x + offset from which points are least far. Where the two are loosely correlated, so that no
-    line stands out, the gain alone: the ratio of the means."""
+    """Gain and offset of the line y = gain x + offset from which points are least far. Where the two are loosely
+    correlated, so that no line stands out, the gain alone: the ratio of the means."""
     (xx, xy), (_, yy) = np.cov(x, y)
     if xy < LEAST_CORRELATION * math.sqrt(xx * yy) or xy <= 0:
         return float(y.mean() / x.mean()), 0.0
@@ -87,8 +88,8 @@ def match_cameras(cameras: Iterable[str], seen: Iterable[Seen]) -> CameraColors:
         seen: sets of points, each with what the cameras saw of it.
 
     Returns:
-        Maps of the cameras whose colours differ. A camera that shares too few points with the others keeps its colours, as if they
-        were common ones.
+        Maps of the cameras whose colours differ. A camera that shares too few points with the others keeps its colours,
+        as if they were common ones.
     """
     names = tuple(cameras)
     given: dict[tuple[str, str], list[tuple[NDArray[np.uint8], NDArray[np.uint8]]]] = {}
@@ -100,8 +101,11 @@ def match_cameras(cameras: Iterable[str], seen: Iterable[Seen]) -> CameraColors:
     pairs = {edge: tuple(np.concatenate(column) for column in zip(*parts)) for edge, parts in given.items()}
     reached: dict[str, ColorMap] = {names[0]: ColorMap()} if names else {}
     while True:
-        edges = [(len(colors[0]), edge) for edge, colors in pairs.items()
-                 if (edge[0] in reached) != (edge[1] in reached) and len(colors[0]) >= FEWEST_PAIRS]  # fmt: skip
+        edges = [
+            (len(colors[0]), edge)
+            for edge, colors in pairs.items()
+            if (edge[0] in reached) != (edge[1] in reached) and len(colors[0]) >= FEWEST_PAIRS
+        ]
         if not edges:
             break
         a, b = max(edges)[1]
@@ -117,7 +121,8 @@ def match_cameras(cameras: Iterable[str], seen: Iterable[Seen]) -> CameraColors:
 
 
 def _useful(found: ColorMap, given: NDArray[np.uint8], wanted: NDArray[np.uint8]) -> ColorMap:
-    """The map, or the identity where it does not explain enough of the difference (see ``LEAST_GAIN`` and ``LEAST_CHANGE``)."""
+    """The map, or the identity where it does not explain enough of the difference (see ``LEAST_GAIN`` and
+    ``LEAST_CHANGE``)."""
     same = ColorMap(pairs=found.pairs)
     if min(found.gain) <= 0.2 or max(found.gain) >= 5:
         return same
@@ -127,7 +132,7 @@ def _useful(found: ColorMap, given: NDArray[np.uint8], wanted: NDArray[np.uint8]
     return found if after <= (1 - LEAST_GAIN) * before and change >= LEAST_CHANGE else same
 
 
-# edge alignment -------------------------------------------------------------------------------------------------------
+# edge alignment -----------------------------------------------------------------------------------
 
 
 Floats = NDArray[np.float64]
@@ -141,7 +146,8 @@ MIN_CONTRAST: Final = 0.06
 RIGHT_FROM: Final = 0.7
 LARGEST_RIGHT_TURN_DEG: Final = 0.75
 MIN_SIGMAS: Final = 1.5
-"""A turn fits better than the given pose if the gain is this many of its standard errors: with few edges some turn always leads."""
+"""A turn fits better than the given pose if the gain is this many of its standard errors: with few edges some turn
+always leads."""
 _CLUSTER_DEG: Final = 2.0
 """Jumps of one image within this much of azimuth are of one contour, mostly; they count as one observation."""
 _JUMP_RATIO: Final = 0.12
@@ -162,7 +168,8 @@ class EdgeAlignment:
         best_turn_deg: the turn that fits best, about the camera's y axis (right +) and its x axis (up +), degrees.
         contrast: how far the peak stands out, as a share of the median.
         jumps: depth jumps seen.
-        verdict: ``right``; ``doubtful`` if a turn inside the range tried fits clearly better; ``unknown`` if edges do not tell.
+        verdict: ``right``; ``doubtful`` if a turn inside the range tried fits clearly better; ``unknown`` if edges do
+            not tell.
         sigmas: by how many of its standard errors ``best_turn_deg`` fits better than the given pose.
     """
 
@@ -175,7 +182,8 @@ class EdgeAlignment:
 
 
 def depth_jumps(xyz_lidar: NDArray[np.floating]) -> NDArray[np.intp]:
-    """Indices of points [N, 3] (LiDAR frame, metres) beside which, in their row of the scan, the range jumps away from the sensor."""
+    """Indices of points [N, 3] (LiDAR frame, metres) beside which, in their row of the scan, the range jumps away from
+    the sensor."""
     from scipy.spatial import KDTree
 
     xyz = np.asarray(xyz_lidar, np.float64)
@@ -196,8 +204,8 @@ def depth_jumps(xyz_lidar: NDArray[np.floating]) -> NDArray[np.intp]:
 
 
 def edge_map(rgb: NDArray[np.uint8], blur_px: float) -> Floats:
-    """Edge strength f64[H, W] of u8[H, W, 3]: gradient length, compressed so that one bright border does not outweigh all others,
-    and spread by ``blur_px``."""
+    """Edge strength f64[H, W] of u8[H, W, 3]: gradient length, compressed so that one bright border does not outweigh
+    all others, and spread by ``blur_px``."""
     from scipy.ndimage import gaussian_filter, sobel
 
     grey = gaussian_filter(rgb.astype(np.float64).mean(2), 1.0)
@@ -210,8 +218,8 @@ def edge_alignment(shots: Iterable[tuple[View, NDArray[np.uint8], Floats, NDArra
     """Compare the given pose of a camera with slightly turned ones.
 
     Args:
-        shots: for some images of one camera: view, image u8[H, W, 3], world_from_lidar f64[4, 4] of the sweep of that moment, and
-            its points [N, 3] in the LiDAR frame.
+        shots: for some images of one camera: view, image u8[H, W, 3], world_from_lidar f64[4, 4] of the sweep of that
+            moment, and its points [N, 3] in the LiDAR frame.
     """
     parts: list[Floats] = []
     jumps = 0
@@ -238,8 +246,8 @@ def _in_sight(xyz_cam: NDArray[np.floating], view: View) -> NDArray[np.bool_]:
 
 
 def _turned_sums(edges: Floats, xyz_cam: Floats, view: View) -> tuple[Floats, int]:
-    """Sums of edge strength under the points f64[turns, clusters] and the number of points; only those that stay in the image
-    at all turns count."""
+    """Sums of edge strength under the points f64[turns, clusters] and the number of points; only those that stay in the
+    image at all turns count."""
     camera = view.camera
     places = []
     for about_y in TURNS_DEG:

@@ -1,17 +1,19 @@
 """Dense depth from sparse measurements and one image, without learned weights.
 
-The unknown is the logarithm of depth at every pixel, so that all errors count relative to the distance. A sparse linear system
-pulls it to the measurements and asks neighbouring pixels to differ as a plane would:
+The unknown is the logarithm of depth at every pixel, so that all errors count relative to the distance. A sparse linear
+system pulls it to the measurements and asks neighbouring pixels to differ as a plane would:
 
 1. ``core.visible`` projects points into the view and drops those that a nearer surface hides.
-2. Every measurement gets a plane in inverse depth (planes of the world are planes there) from its neighbours of like depth.
-3. Every pixel takes over the plane of its nearest measurement. It gives the start, and the difference to expect between two pixels.
-4. Differences across image edges count little. After a first solve, differences that are far off what was expected count less still
-   (iteratively reweighted least squares), so that steps in depth settle on edges of the image.
+2. Every measurement gets a plane in inverse depth (planes of the world are planes there) from its neighbours of like
+  depth.
+3. Every pixel takes over the plane of its nearest measurement. It gives the start, and the difference to expect between
+  two pixels.
+4. Differences across image edges count little. After a first solve, differences that are far off what was expected
+   count less still (iteratively reweighted least squares), so that steps in depth settle on edges of the image.
 5. Sky lies at a fixed distance and takes no part.
 
-Far from measurements, above the highest beam for example, planes fade to constant depth: facades and trunks stand upright, and an
-upright surface has one depth along an image column.
+Far from measurements, above the highest beam for example, planes fade to constant depth: facades and trunks stand
+upright, and an upright surface has one depth along an image column.
 """
 
 from __future__ import annotations
@@ -30,11 +32,12 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import pixel_rays
 from mudg.base.types import View
 
-# align ----------------------------------------------------------------------------------------------------------------
+# align --------------------------------------------------------------------------------------------
 #
 # Bringing generated depth to the scale of what was measured: one scale and one shift per frame, robustly.
 #
-# ``fit_depth`` starts from metres that are nearly right; ``fit_affine`` from any numbers that grow with depth, or with its inverse.
+# ``fit_depth`` starts from metres that are nearly right; ``fit_affine`` from any numbers that grow with depth, or with
+# its inverse.
 
 
 MIN_POINTS = 50
@@ -52,8 +55,9 @@ _SEARCH_POINTS, _SEARCH_PAIRS = 4096, 256
 
 @dataclass(frozen=True, slots=True)
 class DepthFit:
-    """measured = scale * generated + shift_m in one frame, f64 numbers; `residual`: median of |aligned / measured - 1| after it
-    and `residual_before`: before it (both over the measured pixels; NaN without any); `used`: whether it was applied."""
+    """measured = scale * generated + shift_m in one frame, f64 numbers; `residual`: median of |aligned / measured - 1|
+    after it and `residual_before`: before it (both over the measured pixels; NaN without any); `used`: whether it was
+    applied."""
 
     scale: float
     shift_m: float
@@ -65,7 +69,8 @@ class DepthFit:
 def fit_depth(depth: Tensor, measured: Tensor, valid: Tensor, rounds: int = 12) -> DepthFit:
     """Scale and shift of one frame by iteratively reweighted least squares.
 
-    depth, measured  [1,H,W] metres; valid bool[1,H,W]: where `measured` holds. Residuals are relative to the measured depth
+    depth, measured  [1,H,W] metres; valid bool[1,H,W]: where `measured` holds. Residuals are relative to the measured
+                     depth
     and weighted with Tukey's function at 4.7 times their robust spread, starting from the median ratio, so that wrongly
     painted surfaces do not pull.
 
@@ -73,8 +78,10 @@ def fit_depth(depth: Tensor, measured: Tensor, valid: Tensor, rounds: int = 12) 
         InputError: shapes differ.
     """
     if depth.shape != measured.shape or depth.shape != valid.shape:
-        raise InputError("depth, measured depth and its mask differ in shape",
-            got=f"{tuple(depth.shape)}, {tuple(measured.shape)}, {tuple(valid.shape)}")  # fmt: skip
+        raise InputError(
+            "depth, measured depth and its mask differ in shape",
+            got=f"{tuple(depth.shape)}, {tuple(measured.shape)}, {tuple(valid.shape)}",
+        )
     known = valid & torch.isfinite(depth) & torch.isfinite(measured) & (measured > 0)
     x, y = _exactly(depth[known]), _exactly(measured[known])
     if len(x) == 0:
@@ -87,7 +94,8 @@ def fit_depth(depth: Tensor, measured: Tensor, valid: Tensor, rounds: int = 12) 
     found = torch.stack([(y / x.clamp(min=0.1)).median(), x.new_zeros(())])  # a start that outliers do not move
     found = _reweighted(rows, found, rounds)
     still = (((found[0] * x + found[1]) / y) - 1).abs().median()
-    scale, shift, before, after = torch.stack([*found, off, still]).cpu().tolist()  # all four numbers leave the device at once
+    # all four numbers leave the device at once
+    scale, shift, before, after = torch.stack([*found, off, still]).cpu().tolist()
     used = MIN_SCALE <= scale <= MAX_SCALE and after < before
     return DepthFit(scale, shift, after if used else before, before, used)
 
@@ -98,7 +106,8 @@ def _exactly(x: Tensor) -> Tensor:
 
 
 def _reweighted(rows: Tensor, found: Tensor, rounds: int) -> Tensor:
-    """`rows` f64[N,2] @ result f64[2] near 1, by least squares reweighted with Tukey's function, from a start `found`."""
+    """`rows` f64[N,2] @ result f64[2] near 1, by least squares reweighted with Tukey's function, from a start
+    `found`."""
     for _ in range(rounds):
         error = (rows @ found - 1).abs()
         reach = 4.685 * (1.4826 * error.median()).clamp(min=1e-6)
@@ -111,8 +120,8 @@ def _reweighted(rows: Tensor, found: Tensor, rounds: int) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class AffineFit:
-    """scale * value + shift is depth in metres, or its inverse (`space`); `residual`: median of |fitted / measured depth - 1|
-    over `points` points (NaN without a fit); `used`: whether the fit is to be believed."""
+    """scale * value + shift is depth in metres, or its inverse (`space`); `residual`: median of |fitted / measured
+    depth - 1| over `points` points (NaN without a fit); `used`: whether the fit is to be believed."""
 
     space: Space
     scale: float
@@ -134,16 +143,21 @@ def fit_affine(values: Tensor, measured: Tensor, space: Space, rounds: int = 12)
 
     values, measured  [N] numbers of the network, and metres, at the same pixels.
 
-    Errors count relative to the measured depth. The start is the line through two of the points that has the least median error
-    (Rousseeuw, "Least median of squares regression", 1984; pairs half the range of values apart, chosen without chance), so up to
-    nearly half of the points may be wrong; then least squares reweighted with Tukey's function, as in `fit_depth`.
+    Errors count relative to the measured depth. The start is the line through two of the points that has the least
+    median error (Rousseeuw, "Least median of squares regression", 1984; pairs half the range of values apart, chosen
+    without chance), so up to nearly half of the points may be wrong; then least squares reweighted with Tukey's
+    function, as in `fit_depth`.
 
     Raises:
         InputError: shapes differ, or there is no such space.
     """
     if values.shape != measured.shape or values.ndim != 1:
-        raise InputError("values and measured depth differ in shape", where="fit_affine", expected="[N] and [N]",
-            got=f"{tuple(values.shape)}, {tuple(measured.shape)}")  # fmt: skip
+        raise InputError(
+            "values and measured depth differ in shape",
+            where="fit_affine",
+            expected="[N] and [N]",
+            got=f"{tuple(values.shape)}, {tuple(measured.shape)}",
+        )
     if space not in ("depth", "disparity"):
         raise InputError("there is no such space", where="fit_affine", expected="depth or disparity", got=str(space))
     known = torch.isfinite(values) & torch.isfinite(measured) & (measured > 0)
@@ -165,7 +179,8 @@ def fit_affine(values: Tensor, measured: Tensor, space: Space, rounds: int = 12)
 
 
 def _least_median(rows: Tensor) -> Tensor | None:
-    """Of lines through two rows [x / goal, 1 / goal], rising ones, the one of least median error f64[2]; None: none rises."""
+    """Of lines through two rows [x / goal, 1 / goal], rising ones, the one of least median error f64[2]; None: none
+    rises."""
     order = (rows[:, 0] / rows[:, 1]).argsort(stable=True)
     rows = rows[order[torch.linspace(0, len(rows) - 1, min(len(rows), _SEARCH_POINTS)).long()]]
     half = len(rows) // 2
@@ -189,7 +204,7 @@ def align_depth(depth: Tensor, measured: Tensor, valid: Tensor) -> tuple[Tensor,
     return torch.stack(frames), fits
 
 
-# complete -------------------------------------------------------------------------------------------------------------
+# complete -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,7 +220,8 @@ class CompletionRules:
         iterations: conjugate-gradient steps per solve.
         neighbours: measurements that a plane is fitted to.
         plane_fade_px: distance from its measurement over which a plane fades to constant depth.
-        outlier_scale: distance of the solution from a measurement, in the logarithm, from which the measurement counts half.
+        outlier_scale: distance of the solution from a measurement, in the logarithm, from which the measurement counts
+            half.
         sky_m: depth given to the sky, and aimed at beyond the scanner's reach, metres.
         beyond_weight: pull towards ``sky_m`` beyond the scanner's reach.
         near_m, far_m: limits of the result, metres.
@@ -231,8 +247,10 @@ class CompletionRules:
                 "depth limits are out of order", expected="0 < near_m < far_m", got=f"{self.near_m}, {self.far_m}"
             )
         if self.rounds < 1 or self.iterations < 1 or self.neighbours < 3:
-            raise UsageError("completion needs at least 1 round, 1 iteration and 3 neighbours",
-                             got=f"{self.rounds}, {self.iterations}, {self.neighbours}")  # fmt: skip
+            raise UsageError(
+                "completion needs at least 1 round, 1 iteration and 3 neighbours",
+                got=f"{self.rounds}, {self.iterations}, {self.neighbours}",
+            )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -254,7 +272,8 @@ def beyond_reach(
 ) -> NDArray[np.bool_]:
     """Where the scanner looked and nothing came back: what is there is far, if it is not glass; bool[H, W].
 
-    Only near the horizon and up to the highest beam: below, the road would answer, and windows of cars are what is silent.
+    Only near the horizon and up to the highest beam: below, the road would answer, and windows of cars are what is
+    silent.
 
     Args:
         view: camera and pose.
@@ -278,7 +297,7 @@ def ray_elevation(view: View) -> NDArray[np.float32]:
     return np.arcsin(rise / np.sqrt(1 + x[None] ** 2 + y[:, None] ** 2)).astype(np.float32)
 
 
-# --- completion -------------------------------------------------------------------------------------------------------
+# --- completion -----------------------------------------------------------------------------------
 
 
 def complete_depth(
@@ -303,8 +322,12 @@ def complete_depth(
     sky = np.zeros(shape, bool) if sky is None else sky
     beyond = np.zeros(shape, bool) if beyond is None else beyond & ~sky
     if rgb.shape != (*shape, 3) or sky.shape != shape or beyond.shape != shape:
-        raise InputError("image, depth and sky differ in size", where="complete_depth",
-                         expected=f"{shape} and 3 channels", got=f"{rgb.shape}, {sky.shape}")  # fmt: skip
+        raise InputError(
+            "image, depth and sky differ in size",
+            where="complete_depth",
+            expected=f"{shape} and 3 channels",
+            got=f"{rgb.shape}, {sky.shape}",
+        )
     known = np.isfinite(measured) & ~sky
     if (measured[known] <= 0).any():
         raise InputError(
@@ -334,8 +357,8 @@ def complete_depth(
 
 
 def _fit_planes(known: NDArray[np.bool_], measured: NDArray[np.float32], rules: CompletionRules) -> NDArray[np.float32]:
-    """Plane of each measurement in inverse depth: f32[3, H, W] with inverse depth, and its change per pixel to the right and
-    downwards relative to it; zero outside ``known``."""
+    """Plane of each measurement in inverse depth: f32[3, H, W] with inverse depth, and its change per pixel to the
+    right and downwards relative to it; zero outside ``known``."""
     row, column = np.nonzero(known)
     planes = np.zeros((3, *known.shape), np.float32)
     inverse = 1 / measured[known].astype(np.float64)
@@ -365,7 +388,8 @@ def _fit_planes(known: NDArray[np.bool_], measured: NDArray[np.float32], rules: 
 def _expected(
     planes: NDArray[np.float32], owner: NDArray[np.intp], away_px: NDArray[np.float64], rules: CompletionRules
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float32]]:
-    """Start of the solve and the differences to expect to the right [H, W-1] and below [H-1, W], in the logarithm of depth."""
+    """Start of the solve and the differences to expect to the right [H, W-1] and below [H-1, W], in the logarithm of
+    depth."""
     inverse, slope_u, slope_v = (plane[owner[0], owner[1]] for plane in planes)
     rows, columns = np.indices(away_px.shape)
     du, dv = (columns - owner[1]).astype(np.float32), (rows - owner[0]).astype(np.float32)
@@ -392,10 +416,14 @@ def _color_weights(rgb: NDArray[np.uint8], rules: CompletionRules) -> tuple[NDAr
 
 
 def _solve(
-    start: NDArray[np.float32], expected: tuple[NDArray[np.float32], NDArray[np.float32]],
-    weights: tuple[NDArray[np.float32], NDArray[np.float32]], pull: NDArray[np.float32], goal: NDArray[np.float32],
-    sky: NDArray[np.bool_], rules: CompletionRules,
-) -> NDArray[np.float32]:  # fmt: skip
+    start: NDArray[np.float32],
+    expected: tuple[NDArray[np.float32], NDArray[np.float32]],
+    weights: tuple[NDArray[np.float32], NDArray[np.float32]],
+    pull: NDArray[np.float32],
+    goal: NDArray[np.float32],
+    sky: NDArray[np.bool_],
+    rules: CompletionRules,
+) -> NDArray[np.float32]:
     """Logarithm of depth f32[H, W]: reweighted least squares over all pixels but the sky."""
     number = np.cumsum(~sky.ravel()).reshape(sky.shape) - 1
     pairs = []
@@ -433,13 +461,17 @@ def _solve(
 
 
 def conjugate_gradients(
-    matrix: sparse.csr_matrix, right_side: NDArray[np.float32], start: NDArray[np.float32], inverse_diagonal: NDArray[np.float32],
-    iterations: int, tolerance: float = 1e-4,
-) -> NDArray[np.float32]:  # fmt: skip
+    matrix: sparse.csr_matrix,
+    right_side: NDArray[np.float32],
+    start: NDArray[np.float32],
+    inverse_diagonal: NDArray[np.float32],
+    iterations: int,
+    tolerance: float = 1e-4,
+) -> NDArray[np.float32]:
     """Solve a symmetric positive definite system by conjugate gradients with Jacobi's preconditioner, from a start.
 
-    Stops after ``iterations``, or when the preconditioned residual has fallen to ``tolerance`` of its start; what is then missing is
-    small beside what the start already knew.
+    Stops after ``iterations``, or when the preconditioned residual has fallen to ``tolerance`` of its start; what is
+    then missing is small beside what the start already knew.
     """
     x = start.copy()
     residual = right_side - matrix @ x
@@ -463,12 +495,17 @@ def conjugate_gradients(
 
 
 def _confidence(
-    solved: NDArray[np.float32], nearest: NDArray[np.float32], away_px: NDArray[np.float64], sky: NDArray[np.bool_], sky_m: float
-) -> NDArray[np.float32]:  # fmt: skip
+    solved: NDArray[np.float32],
+    nearest: NDArray[np.float32],
+    away_px: NDArray[np.float64],
+    sky: NDArray[np.bool_],
+    sky_m: float,
+) -> NDArray[np.float32]:
     """exp(-e / 0.05) of the expected relative error e.
 
-    e grows with the distance to the nearest measurement, with the difference to it, and with the steps of the solution around the
-    pixel (where depth is steep, half a pixel is much). Its four numbers are a least-squares fit on generated cities.
+    e grows with the distance to the nearest measurement, with the difference to it, and with the steps of the solution
+    around the pixel (where depth is steep, half a pixel is much). Its four numbers are a least-squares fit on generated
+    cities.
     """
     around = np.where(sky, np.float32(np.log(sky_m)), solved)
     steps = ndimage.maximum_filter(around, 5) - ndimage.minimum_filter(around, 5)

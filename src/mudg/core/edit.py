@@ -1,10 +1,12 @@
-"""Changes of how road users move: pure functions on the keys of a path, for tracks, the vehicle and nodes of a fitted scene alike.
+"""Changes of how road users move: pure functions on the keys of a path, for tracks, the vehicle and nodes of a fitted
+scene alike.
 
-A ``Motion`` is the path of one of them: poses at key times, straight lines and slerp between them. Each key also says which moment of
-the recording it shows (``source_s``), so that what moves within a box (a walking person) can follow when a path is retimed.
+A ``Motion`` is the path of one of them: poses at key times, straight lines and slerp between them. Each key also says
+which moment of the recording it shows (``source_s``), so that what moves within a box (a walking person) can follow
+when a path is retimed.
 
-Lane change: ``y(s) = d (10 s^3 - 15 s^4 + 6 s^5)``, ``s = (t - t0) / T``: no lateral speed and acceleration at its ends. Its largest
-lateral acceleration, at ``s = 1/2 +- sqrt(3)/6``, is ``10 / sqrt(3) d / T^2``.
+Lane change: ``y(s) = d (10 s^3 - 15 s^4 + 6 s^5)``, ``s = (t - t0) / T``: no lateral speed and acceleration at its
+ends. Its largest lateral acceleration, at ``s = 1/2 +- sqrt(3)/6``, is ``10 / sqrt(3) d / T^2``.
 """
 
 from __future__ import annotations
@@ -20,18 +22,21 @@ from scipy.interpolate import PchipInterpolator
 from mudg.base import geometry
 from mudg.base.errors import InputError
 
-# boxes ----------------------------------------------------------------------------------------------------------------
+# boxes --------------------------------------------------------------------------------------------
 #
 # Boxes of road users against each other and against cameras: do they collide, and which sides were ever seen?
 
 
 def overlap_m(poses_a: Array, size_a: ArrayLike, poses_b: Array, size_b: ArrayLike) -> Array:
-    """How deep pairs of boxes overlap, f64[T] metres: the shortest way that parts them; negative: the gap along the best axis.
+    """How deep pairs of boxes overlap, f64[T] metres: the shortest way that parts them; negative: the gap along the
+    best axis.
 
-    Separating axes of two boxes: three faces of each and the nine cross products of their edges (Gottschalk et al., 1996).
+    Separating axes of two boxes: three faces of each and the nine cross products of their edges (Gottschalk et al.,
+    1996).
 
     Args:
-        poses_a, poses_b: world_from_box f64[T, 4, 4], origin in the centre of the box. size_a, size_b: length, width, height.
+        poses_a, poses_b: world_from_box f64[T, 4, 4], origin in the centre of the box. size_a, size_b: length, width,
+            height.
     """
     half_a, half_b = np.asarray(size_a, np.float64) / 2, np.asarray(size_b, np.float64) / 2
     edges_a, edges_b = np.swapaxes(poses_a[:, :3, :3], 1, 2), np.swapaxes(poses_b[:, :3, :3], 1, 2)
@@ -50,21 +55,23 @@ def overlap_m(poses_a: Array, size_a: ArrayLike, poses_b: Array, size_b: ArrayLi
 
 
 def azimuths(world_from_box: Array, places: Array) -> Array:
-    """From which side places f64[N, 3] look at boxes f64[N, 4, 4]: angle from the box's front, counter-clockwise, radians."""
+    """From which side places f64[N, 3] look at boxes f64[N, 4, 4]: angle from the box's front, counter-clockwise,
+    radians."""
     toward = places - world_from_box[:, :3, 3]
     local = np.einsum("nji,nj->ni", world_from_box[:, :3, :3], toward)
     return np.arctan2(local[:, 1], local[:, 0])
 
 
 def angle_to_nearest(asked: Array, seen: Array) -> Array:
-    """Angle f64[N] radians from each asked direction f64[N] to the nearest seen one f64[M]; pi where nothing was seen."""
+    """Angle f64[N] radians from each asked direction f64[N] to the nearest seen one f64[M]; pi where nothing was
+    seen."""
     if not len(seen):
         return np.full(len(asked), np.pi)
     apart = np.abs(asked[:, None] - seen[None])
     return np.minimum(apart % (2 * np.pi), 2 * np.pi - apart % (2 * np.pi)).min(1)
 
 
-# ground ---------------------------------------------------------------------------------------------------------------
+# ground -------------------------------------------------------------------------------------------
 #
 # A height map of the ground, from points that lie on it: what a vehicle stands on that is put somewhere else.
 
@@ -104,13 +111,17 @@ class HeightMap:
         points = np.asarray(xyz, np.float64)
         points = points[np.isfinite(points).all(1)]
         if not len(points):
-            raise InputError("there is no ground: no point is of class road, sidewalk or terrain",
-                remedy="fuse a scene with labels, or leave ground out (ground: false)")  # fmt: skip
+            raise InputError(
+                "there is no ground: no point is of class road, sidewalk or terrain",
+                remedy="fuse a scene with labels, or leave ground out (ground: false)",
+            )
         cells = np.floor(points[:, :2] / cell_m).astype(np.int64)
         first = cells.min(0) - int(np.ceil(REACH_M / cell_m))
         shape = cells.max(0) - first + 1 + int(np.ceil(REACH_M / cell_m))
         if shape.prod() > MOST_CELLS:
-            raise InputError("the ground spans too large an area", got=f"{shape[0] * cell_m:.0f} x {shape[1] * cell_m:.0f} m")
+            raise InputError(
+                "the ground spans too large an area", got=f"{shape[0] * cell_m:.0f} x {shape[1] * cell_m:.0f} m"
+            )
         flat = (cells[:, 0] - first[0]) * shape[1] + cells[:, 1] - first[1]
         order = np.lexsort((points[:, 2], flat))
         ids, begins, counts = np.unique(flat[order], return_index=True, return_counts=True)
@@ -151,7 +162,7 @@ def _smoothed(heights: Array, cell_m: float) -> Array:
     return np.where(far, np.nan, blurred)
 
 
-# edit -----------------------------------------------------------------------------------------------------------------
+# edit ---------------------------------------------------------------------------------------------
 
 
 Array = NDArray[np.float64]
@@ -191,7 +202,8 @@ class Motion:
         """The same path with keys at these times, which lie within its span."""
         inside = np.clip(times_s, self.times_s[0], self.times_s[-1])
         poses = [geometry.pose_at(self.times_s, self.poses, float(t)) for t in inside]
-        return Motion(times_s, np.stack(poses), np.interp(inside, self.times_s, self.source_s))  # type: ignore[arg-type]
+        source_s = np.interp(inside, self.times_s, self.source_s)
+        return Motion(times_s, np.stack(poses), source_s)  # type: ignore[arg-type]
 
     def with_keys_between(self, begin_s: float, end_s: float) -> Motion:
         """The same path with further keys, every `STEP_S` within a stretch."""
@@ -219,7 +231,7 @@ def quintic(s: Array) -> Array:
     return u**3 * (10 - 15 * u + 6 * u**2)
 
 
-# -- where ---------------------------------------------------------------------------------------------------------------
+# -- where -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -256,7 +268,9 @@ def moved(motion: Motion, by: Displacement, ground: HeightMap | None = None) -> 
     return changed if ground is None else grounded(changed, keyed, ground)
 
 
-def lane_changed(motion: Motion, left_m: float, start_s: float, duration_s: float, ground: HeightMap | None = None) -> Motion:
+def lane_changed(
+    motion: Motion, left_m: float, start_s: float, duration_s: float, ground: HeightMap | None = None
+) -> Motion:
     """A path that changes lanes: quintic offset to the left of the recorded path, heading along the new one.
 
     Raises:
@@ -264,12 +278,21 @@ def lane_changed(motion: Motion, left_m: float, start_s: float, duration_s: floa
     """
     first, last = float(motion.times_s[0]), float(motion.times_s[-1])
     if not first <= start_s < last:
-        raise InputError("the lane change begins outside the path", where="start_s", expected=f"{first:.2f}..{last:.2f} s",
-            got=f"{start_s} s")  # fmt: skip
+        raise InputError(
+            "the lane change begins outside the path",
+            where="start_s",
+            expected=f"{first:.2f}..{last:.2f} s",
+            got=f"{start_s} s",
+        )
     speed = motion.speed_at(start_s)
     if speed < STANDING_M_S:
-        raise InputError("only what drives can change lanes", where="start_s", expected=f"at least {STANDING_M_S} m/s",
-            got=f"{speed:.2f} m/s at {start_s} s", remedy="use move to displace what stands")  # fmt: skip
+        raise InputError(
+            "only what drives can change lanes",
+            where="start_s",
+            expected=f"at least {STANDING_M_S} m/s",
+            got=f"{speed:.2f} m/s at {start_s} s",
+            remedy="use move to displace what stands",
+        )
     keyed = motion.with_keys_between(start_s, start_s + duration_s)
     s = (keyed.times_s - start_s) / duration_s
     u = np.clip(s, 0, 1)
@@ -285,7 +308,8 @@ def lane_changed(motion: Motion, left_m: float, start_s: float, duration_s: floa
 
 
 def grounded(motion: Motion, before: Motion, ground: HeightMap) -> Motion:
-    """Set a changed path on the ground: the height above it, and the tilt against it, are those that the path had before.
+    """Set a changed path on the ground: the height above it, and the tilt against it, are those that the path had
+    before.
 
     Keys of both belong together. Where the ground is unknown at either place, a key stays as it is.
     """
@@ -300,7 +324,8 @@ def grounded(motion: Motion, before: Motion, ground: HeightMap) -> Motion:
 
 
 def regrounded(motion: Motion, old: HeightMap, new: HeightMap) -> Motion:
-    """A path on other ground below the same places: the height above it and the tilt against it stay. Unknown ground changes nothing."""
+    """A path on other ground below the same places: the height above it and the tilt against it stay. Unknown ground
+    changes nothing."""
     xy = motion.poses[:, :2, 3]
     poses = motion.poses.copy()
     rise = new.height(xy) - old.height(xy)
@@ -315,13 +340,17 @@ def along_points(points: Array, height_m: float, ground: HeightMap | None, floor
     """A path through given places.
 
     Args:
-        points: f64[P, 4]: time in seconds, x, y in metres, heading in radians (NaN: along the path); times increase. One point stands.
-        height_m: of the object's origin above the ground. floor_m: height of the ground where ``ground`` does not know it.
+        points: f64[P, 4]: time in seconds, x, y in metres, heading in radians (NaN: along the path); times increase.
+            One point stands.
+        height_m: of the object's origin above the ground. floor_m: height of the ground where ``ground`` does not know
+            it.
     """
     times = points[:, 0] if len(points) > 1 else points[[0, 0], 0] + [0.0, 1e-3]
     xy, yaw = points[:, 1:3], points[:, 3]
     if len(points) > 1:
-        keys = _merged(times, np.linspace(times[0], times[-1], max(2, int(np.ceil((times[-1] - times[0]) / (2 * STEP_S))) + 1)))
+        keys = _merged(
+            times, np.linspace(times[0], times[-1], max(2, int(np.ceil((times[-1] - times[0]) / (2 * STEP_S))) + 1))
+        )
         path = PchipInterpolator(times, xy)
         velocity = path.derivative()(keys)
         along = np.unwrap(np.arctan2(velocity[:, 1], velocity[:, 0]))
@@ -331,25 +360,30 @@ def along_points(points: Array, height_m: float, ground: HeightMap | None, floor
     else:
         keys, xy, yaw = times, xy[[0, 0]], np.nan_to_num(yaw)[[0, 0]]
     floor = np.full(len(keys), floor_m) if ground is None else np.nan_to_num(ground.height(xy), nan=floor_m)
-    poses = np.stack([geometry.yaw_matrix(float(a), (x, y, z + height_m)) for a, (x, y), z in zip(yaw, xy, floor, strict=True)])
+    poses = np.stack(
+        [geometry.yaw_matrix(float(a), (x, y, z + height_m)) for a, (x, y), z in zip(yaw, xy, floor, strict=True)]
+    )
     if ground is not None:
         for pose, normal in zip(poses, ground.normal(xy), strict=True):
             pose[:3, :3] = _turn_between(np.array([0.0, 0, 1]), normal) @ pose[:3, :3]
     return Motion.recorded(keys, poses)
 
 
-# -- when ----------------------------------------------------------------------------------------------------------------
+# -- when ------------------------------------------------------------------------------------------
 
 
 def stopped(motion: Motion, at_s: float, brake_m_s2: float) -> Motion:
-    """A path that brakes evenly from ``at_s`` on until it stands; it never goes farther than the recorded one has by then.
+    """A path that brakes evenly from ``at_s`` on until it stands; it never goes farther than the recorded one has by
+    then.
 
     Raises:
         InputError: ``at_s`` lies outside the path.
     """
     first, last = float(motion.times_s[0]), float(motion.times_s[-1])
     if not first <= at_s <= last:
-        raise InputError("it stops outside its path", where="at_s", expected=f"{first:.2f}..{last:.2f} s", got=f"{at_s} s")
+        raise InputError(
+            "it stops outside its path", where="at_s", expected=f"{first:.2f}..{last:.2f} s", got=f"{at_s} s"
+        )
     keyed = motion.with_keys_between(at_s, last)
     after = keyed.times_s >= at_s
     way = keyed.travelled_m()
@@ -366,19 +400,23 @@ def stopped(motion: Motion, at_s: float, brake_m_s2: float) -> Motion:
 
 
 def sped(motion: Motion, factor: float, from_s: float | None = None) -> Motion:
-    """A path driven at another speed from a moment on. Where it gets ahead of the recording, it goes on straight as at its end.
+    """A path driven at another speed from a moment on. Where it gets ahead of the recording, it goes on straight as at
+    its end.
 
     Args:
         factor: > 0; 0.5 is half as fast.
     """
-    begin = float(motion.times_s[0]) if from_s is None else float(np.clip(from_s, motion.times_s[0], motion.times_s[-1]))
+    begin = (
+        float(motion.times_s[0]) if from_s is None else float(np.clip(from_s, motion.times_s[0], motion.times_s[-1]))
+    )
     keyed = motion.with_keys_between(begin, float(motion.times_s[-1]))
     recording = np.where(keyed.times_s < begin, keyed.times_s, begin + factor * (keyed.times_s - begin))
     return _retimed(motion, keyed.times_s, recording)
 
 
 def _retimed(motion: Motion, times_s: Array, recording_s: Array) -> Motion:
-    """The path that is at ``times_s`` where the given one was at ``recording_s``; beyond its end, straight on at its last speed."""
+    """The path that is at ``times_s`` where the given one was at ``recording_s``; beyond its end, straight on at its
+    last speed."""
     found, last = motion.at(recording_s), float(motion.times_s[-1])
     beyond = np.maximum(recording_s - last, 0)
     if beyond.any() and len(motion.times_s) > 1:
@@ -388,7 +426,7 @@ def _retimed(motion: Motion, times_s: Array, recording_s: Array) -> Motion:
     return Motion(times_s, found.poses, found.source_s)
 
 
-# -- helpers -------------------------------------------------------------------------------------------------------------
+# -- helpers ---------------------------------------------------------------------------------------
 
 
 def _merged(a: Array, b: Array) -> Array:

@@ -1,12 +1,13 @@
-"""Distances between two sets of feature vectors: how far the distribution of generated images is from that of real ones.
+"""Distances between two sets of feature vectors: how far the distribution of generated images is from that of real
+ones.
 
-All take two arrays ``[n, d]`` and ``[m, d]`` (rows are images, any real dtype), compute in float64 on the CPU and return a plain
-number. Smaller is better everywhere. What the features are decides the name of the number: with those of ``networks/inception.py``
-``frechet_distance`` is FID and ``kernel_distance`` is KID.
+All take two arrays ``[n, d]`` and ``[m, d]`` (rows are images, any real dtype), compute in float64 on the CPU and
+return a plain number. Smaller is better everywhere. What the features are decides the name of the number: with those of
+``networks/inception.py`` ``frechet_distance`` is FID and ``kernel_distance`` is KID.
 
-All of them depend on the number of rows. The Frechet distance of two small samples of the *same* law is far from 0: with FID's
-features and 96 rows about nine tenths of the total variance. Compare only numbers of equal n, and show what two samples of the truth
-give beside them. ``kernel_distance`` alone is unbiased.
+All of them depend on the number of rows. The Frechet distance of two small samples of the *same* law is far from 0:
+with FID's features and 96 rows about nine tenths of the total variance. Compare only numbers of equal n, and show what
+two samples of the truth give beside them. ``kernel_distance`` alone is unbiased.
 """
 
 from __future__ import annotations
@@ -35,15 +36,16 @@ JEDI_FACTOR: Final = 100.0
 def frechet_distance(made: ArrayLike, real: ArrayLike) -> float:
     """Squared Frechet distance of the Gaussians with the sets' means and covariances (divisor n - 1).
 
-    ``|m1 - m2|^2 + tr S1 + tr S2 - 2 tr (S1 S2)^(1/2)``. The last trace is the nuclear norm of ``A B^T``, where A and B are the centred
-    sets over the root of n - 1: exact also for singular covariances (n <= d), with no small number added to any diagonal.
+    ``|m1 - m2|^2 + tr S1 + tr S2 - 2 tr (S1 S2)^(1/2)``. The last trace is the nuclear norm of ``A B^T``, where A and B
+    are the centred sets over the root of n - 1: exact also for singular covariances (n <= d), with no small number
+    added to any diagonal.
 
     Args:
         made, real: ``[n, d]`` and ``[m, d]``, n, m >= 2.
 
     Returns:
-        In squared units of the features, [0, inf). 0 for equal means and covariances, up to rounding. Symmetric; unchanged by common
-        rotations and translations of all features; multiplied by c^2 when all are multiplied by c.
+        In squared units of the features, [0, inf). 0 for equal means and covariances, up to rounding. Symmetric;
+        unchanged by common rotations and translations of all features; multiplied by c^2 when all are multiplied by c.
 
     Raises:
         InputError: sets of other widths, too few rows, or values that are not finite.
@@ -66,8 +68,9 @@ def frechet_at_infinity(
 ) -> float:
     """The Frechet distance extrapolated to endless sets: its bias is nearly linear in 1/N.
 
-    Both sets are reduced to N random rows (without replacement), for ``sizes`` values of N at even distances from half of the smaller
-    set to all of it; the distances are regressed on 1/N, and the intercept is returned. Useful from about 1000 rows on.
+    Both sets are reduced to N random rows (without replacement), for ``sizes`` values of N at even distances from half
+    of the smaller set to all of it; the distances are regressed on 1/N, and the intercept is returned. Useful from
+    about 1000 rows on.
 
     Args:
         made, real: ``[n, d]`` and ``[m, d]``, at least twice ``sizes`` rows each.
@@ -91,14 +94,15 @@ def frechet_at_infinity(
 
 
 def kernel_distance(made: ArrayLike, real: ArrayLike) -> float:
-    """Unbiased squared maximum mean discrepancy with the kernel ``(x.y / d + 1)^3`` over all rows; KID on FID's features.
+    """Unbiased squared maximum mean discrepancy with the kernel ``(x.y / d + 1)^3`` over all rows; KID on FID's
+    features.
 
     Args:
         made, real: ``[n, d]`` and ``[m, d]``, n, m >= 2; n and m may differ.
 
     Returns:
-        (-inf, inf), raw (not times 100 or 1000). Its mean over samples of one law is 0, so a single value may be negative. Symmetric;
-        unchanged by common rotations of all features.
+        (-inf, inf), raw (not times 100 or 1000). Its mean over samples of one law is 0, so a single value may be
+        negative. Symmetric; unchanged by common rotations of all features.
 
     Raises:
         InputError: as ``frechet_distance``.
@@ -108,14 +112,10 @@ def kernel_distance(made: ArrayLike, real: ArrayLike) -> float:
 
 
 def kernel_distance_error(
-    made: ArrayLike,
-    real: ArrayLike,
-    blocks: Sequence[ArrayLike],
-    rng: np.random.Generator,
-    draws: int = 200,
+    made: ArrayLike, real: ArrayLike, blocks: Sequence[ArrayLike], rng: np.random.Generator, draws: int = 200
 ) -> float:
-    """Standard error of ``kernel_distance`` by a block bootstrap: rows of a block, such as frames of one log, depend on each other and
-    are drawn together.
+    """Standard error of ``kernel_distance`` by a block bootstrap: rows of a block, such as frames of one log, depend on
+    each other and are drawn together.
 
     A row that is drawn twice is never compared with itself: pairs of one row are left out, as in the distance itself.
 
@@ -136,8 +136,11 @@ def kernel_distance_error(
         given = np.asarray(numbers, np.int64)
         names, where = np.unique(given, return_inverse=True)
         if given.shape != (len(rows),) or len(names) < 2:
-            raise InputError("blocks do not fit the features", expected=f"a number for each of {len(rows)} rows, two blocks or more",
-                got=f"{given.size} numbers, {len(names)} blocks")  # fmt: skip
+            raise InputError(
+                "blocks do not fit the features",
+                expected=f"a number for each of {len(rows)} rows, two blocks or more",
+                got=f"{given.size} numbers, {len(names)} blocks",
+            )
         groups.append((where, len(names)))
     own_a, own_b, across = _cubic(a, a), _cubic(b, b), _cubic(a, b)
     found = []
@@ -170,16 +173,16 @@ def mind_distance(
 ) -> float:
     """MIND: squared 2-Wasserstein distance along random directions, times 3 d (sliced Wasserstein distance).
 
-    Both sets are projected on unit vectors and sorted; the mean over directions and ranks of the squared difference is multiplied by
-    3 d. A larger set is first reduced to the size of the smaller one, to random rows.
+    Both sets are projected on unit vectors and sorted; the mean over directions and ranks of the squared difference is
+    multiplied by 3 d. A larger set is first reduced to the size of the smaller one, to random rows.
 
     Args:
         made, real: ``[n, d]`` and ``[m, d]``, n, m >= 1.
         rng: draws rows and directions: the same state and sizes give the same directions. directions: how many.
 
     Returns:
-        In squared units of the features, [0, inf); 0 for equal sets in any order. Symmetric for sets of equal size; 3 |t|^2 on average
-        over directions when one set is the other moved by t.
+        In squared units of the features, [0, inf); 0 for equal sets in any order. Symmetric for sets of equal size; 3
+        |t|^2 on average over directions when one set is the other moved by t.
 
     Raises:
         InputError: as ``frechet_distance``.
@@ -196,15 +199,15 @@ def mind_distance(
 def cmmd_distance(made: ArrayLike, real: ArrayLike) -> float:
     """CMMD: squared maximum mean discrepancy of directions under a Gaussian kernel of sigma 10, times 1000.
 
-    Rows are brought to length 1 first. Biased: means over full kernel matrices, with their diagonals. Published values are of image
-    embeddings of CLIP ViT-L/14 at 336 pixels.
+    Rows are brought to length 1 first. Biased: means over full kernel matrices, with their diagonals. Published values
+    are of image embeddings of CLIP ViT-L/14 at 336 pixels.
 
     Args:
         made, real: ``[n, d]`` and ``[m, d]``, n, m >= 1, no row of length 0.
 
     Returns:
-        [0, 1000 * 2 * (1 - exp(-4 / 200))], that is at most 39.6; 0 for equal sets. Symmetric; unchanged by common rotations and by the
-        length of rows.
+        [0, 1000 * 2 * (1 - exp(-4 / 200))], that is at most 39.6; 0 for equal sets. Symmetric; unchanged by common
+        rotations and by the length of rows.
 
     Raises:
         InputError: as ``frechet_distance``, or a row of length 0.
@@ -227,7 +230,8 @@ def cmmd_distance(made: ArrayLike, real: ArrayLike) -> float:
 
 
 def polynomial_distance(made: ArrayLike, real: ArrayLike) -> float:
-    """Squared maximum mean discrepancy with the kernel ``(x.y / d)^2``, times 100, as JEDi has it on features of videos.
+    """Squared maximum mean discrepancy with the kernel ``(x.y / d)^2``, times 100, as JEDi has it on features of
+    videos.
 
     Biased: means over full kernel matrices, with their diagonals.
 
@@ -235,8 +239,8 @@ def polynomial_distance(made: ArrayLike, real: ArrayLike) -> float:
         made, real: ``[n, d]`` and ``[m, d]``, n, m >= 1.
 
     Returns:
-        [0, inf); 0 for equal sets, and for sets with equal second moments. Symmetric; multiplied by c^4 when all features are multiplied by
-        c.
+        [0, inf); 0 for equal sets, and for sets with equal second moments. Symmetric; multiplied by c^4 when all
+        features are multiplied by c.
 
     Raises:
         InputError: as ``frechet_distance``.
@@ -263,8 +267,12 @@ def _pair(made: ArrayLike, real: ArrayLike, fewest: int) -> tuple[Features, Feat
 def _checked(features: Any, name: str, fewest: int) -> Features:
     found = np.asarray(features, np.float64)
     if found.ndim != 2 or not found.shape[-1] or len(found) < fewest:
-        raise InputError("a set of features has the wrong shape", where=f"{name} images", expected=f"[n >= {fewest}, d >= 1]",
-            got=str(list(found.shape)))  # fmt: skip
+        raise InputError(
+            "a set of features has the wrong shape",
+            where=f"{name} images",
+            expected=f"[n >= {fewest}, d >= 1]",
+            got=str(list(found.shape)),
+        )
     if not np.isfinite(found).all():
         bad = int(np.flatnonzero(~np.isfinite(found).all(1))[0])
         raise InputError("a set of features holds values that are not finite", where=f"{name} images, row {bad}")

@@ -5,21 +5,22 @@ beside them, one sweep in memory at a time, and is what both the ``fuse`` stage 
 
 The rules, stated once:
 
-* **Dynamic objects.** A tracked box moves if its centre gets far from where it started, or travels a path (both measured with a
-  dead band, so that annotation jitter does not count; going out and coming back does), or if a long box turns.
-  Everything else, parked cars included, belongs to the static world.
+* **Dynamic objects.** A tracked box moves if its centre gets far from where it started, or travels a path (both
+  measured with a dead band, so that annotation jitter does not count; going out and coming back does), or if a long box
+  turns. Everything else, parked cars included, belongs to the static world.
 * **Separation.** At a sweep's time the points inside a moving box (slightly grown, and only above a margin over its
-  floor, so that the road stays road) belong to the object and are kept in its frame. In overlapping boxes the smaller wins.
-* **Colour.** A point takes the pixel (nearest, no interpolation) of an image taken at about the sweep's time, the object's
-  motion between sweep and image taken into account. If several cameras see it, the one whose optical axis points
-  closest to it wins. Points that no camera sees have no colour and are left out. Cameras whose exposure or white balance differs are
-  brought to the colours of one of them first (``core/calibration.py``).
-* **Occlusion.** A point does not see a camera if, at its pixel, something of the same sweep that stands (objects included,
-  the ground not) is clearly nearer to that camera. Each point covers half the gap to the next beam.
-* **Semantics.** A point keeps the class that people gave it. For others the cameras that see a point vote, weighted by the cosine to their
-  axes. In a voxel the samples vote.
-* **Small objects.** A dynamic object with too few coloured points over the whole log is left out, and so are its points: they would
-  smear the static world.
+  floor, so that the road stays road) belong to the object and are kept in its frame. In overlapping boxes the smaller
+  wins.
+* **Colour.** A point takes the pixel (nearest, no interpolation) of an image taken at about the sweep's time, the
+  object's motion between sweep and image taken into account. If several cameras see it, the one whose optical axis
+  points closest to it wins. Points that no camera sees have no colour and are left out. Cameras whose exposure or white
+  balance differs are brought to the colours of one of them first (``core/calibration.py``).
+* **Occlusion.** A point does not see a camera if, at its pixel, something of the same sweep that stands (objects
+  included, the ground not) is clearly nearer to that camera. Each point covers half the gap to the next beam.
+* **Semantics.** A point keeps the class that people gave it. For others the cameras that see a point vote, weighted by
+  the cosine to their axes. In a voxel the samples vote.
+* **Small objects.** A dynamic object with too few coloured points over the whole log is left out, and so are its
+  points: they would smear the static world.
 """
 
 from __future__ import annotations
@@ -112,7 +113,7 @@ class FusionReport:
     left_out: dict[str, str] = field(default_factory=dict)
 
 
-# --- dynamic objects ------------------------------------------------------------------------------------------------
+# --- dynamic objects ------------------------------------------------------------------------------
 
 
 def judge_track(track: Track, rules: FusionRules) -> TrackVerdict:
@@ -137,7 +138,8 @@ def judge_track(track: Track, rules: FusionRules) -> TrackVerdict:
 
 
 def _dead_banded_path(centers: Matrix, band_m: float) -> float:
-    """Length of the path through the centres, counting only steps that leave a ball of ``band_m`` around the last anchor."""
+    """Length of the path through the centres, counting only steps that leave a ball of ``band_m`` around the last
+    anchor."""
     anchor, length = centers[0], 0.0
     for center in centers[1:]:
         step = float(np.linalg.norm(center - anchor))
@@ -157,7 +159,8 @@ def _largest_turn(yaws_rad: Matrix) -> float:
 def points_in_box(
     xyz_object: NDArray[np.floating], size_m: Matrix, growth_m: float, floor_margin_m: float
 ) -> NDArray[np.bool_]:
-    """Which points ``[N, 3]`` (object frame, origin in the box centre) lie in the grown box above its floor margin; bool[N]."""
+    """Which points ``[N, 3]`` (object frame, origin in the box centre) lie in the grown box above its floor margin;
+    bool[N]."""
     half = np.asarray(size_m) / 2
     return (
         (np.abs(xyz_object[:, 0]) <= half[0] + growth_m)
@@ -220,13 +223,14 @@ def _velocity_in_lidar(track: Track, sweep: SweepShots, step_s: float = 0.05) ->
     return sweep.world_from_lidar[:3, :3].T @ (last[:3, 3] - first[:3, 3]) / span
 
 
-# --- colours --------------------------------------------------------------------------------------------------------
+# --- colours --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Colors:
-    """Colours of a sweep's points: ``seen`` bool[N]; ``rgb`` u8[N, 3], ``semantics`` u8[N] and ``depth_m`` f32[N] (to the
-    camera that gave the colour) where seen; ``hidden`` bool[N]: in an image, but behind a nearer surface in all of them."""
+    """Colours of a sweep's points: ``seen`` bool[N]; ``rgb`` u8[N, 3], ``semantics`` u8[N] and ``depth_m`` f32[N] (to
+    the camera that gave the colour) where seen; ``hidden`` bool[N]: in an image, but behind a nearer surface in all of
+    them."""
 
     seen: NDArray[np.bool_]
     hidden: NDArray[np.bool_]
@@ -243,7 +247,8 @@ def color_points(
     rules: FusionRules,
     cameras: CameraColors = SAME_COLORS,
 ) -> Colors:
-    """Common colours (and semantics) of a sweep's points from the images beside it; see the module text for the rules."""
+    """Common colours (and semantics) of a sweep's points from the images beside it; see the module text for the
+    rules."""
     count = len(owner)
     best = np.full(count, -1.0, np.float32)
     rgb = np.zeros((count, 3), np.uint8)
@@ -275,7 +280,8 @@ def color_points(
 def points_in_image(
     sweep: SweepShots, view: View, dynamic: Sequence[Track], rules: FusionRules
 ) -> tuple[NDArray[np.intp], NDArray[np.intp], NDArray[np.intp], NDArray[np.float32]]:
-    """Points of a sweep that an image shows: indices, column, row and depth f32[n]. Objects stand where they are at its time."""
+    """Points of a sweep that an image shows: indices, column, row and depth f32[n]. Objects stand where they are at its
+    time."""
     owner, owned = separate(sweep, dynamic, rules)
     members = {index: np.flatnonzero(owner == index) for index in owned}
     xyz_cam, known = _points_in_camera(sweep, view, members, owned, dynamic)
@@ -294,7 +300,8 @@ def _points_in_camera(
     owned: dict[int, NDArray[np.float32]],
     dynamic: Sequence[Track],
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """All points in camera coordinates at the image's time f32[N, 3]; dynamic objects whose pose then is not known are flagged."""
+    """All points in camera coordinates at the image's time f32[N, 3]; dynamic objects whose pose then is not known are
+    flagged."""
     xyz_cam = _apply(view.cam_from_world @ sweep.world_from_lidar, sweep.points.xyz)
     known = np.ones(len(xyz_cam), bool)
     for index, ids in members.items():
@@ -339,10 +346,13 @@ def hidden_points(
 ) -> NDArray[np.bool_]:
     """Which points ``[N, 3]`` (camera frame, inside the image) lie behind a clearly nearer standing point; bool[N].
 
-    What hides is what stands (``standing_points``). The ground hides nothing: seen at a grazing angle its rings overlap each other.
+    What hides is what stands (``standing_points``). The ground hides nothing: seen at a grazing angle its rings overlap
+    each other.
     """
     camera, rule = view.camera, RULES["colour"]
-    nearest, index = draw_points([PointLayer(np.ascontiguousarray(xyz_cam[stands]), np.eye(4))], View(camera, np.eye(4), 0.0), DrawLimits())
+    nearest, index = draw_points(
+        [PointLayer(np.ascontiguousarray(xyz_cam[stands]), np.eye(4))], View(camera, np.eye(4), 0.0), DrawLimits()
+    )
     nearest[index < 0] = np.inf
     nearer = nearer_depth(nearest, rule, rule.reach(camera, gap_deg))
     column, row = (np.floor(place).astype(np.intp) for place in pinhole(camera.intrinsics, *xyz_cam.T))
@@ -350,7 +360,8 @@ def hidden_points(
 
 
 def measure_beam_gap(xyz_lidar: NDArray[np.floating], default_deg: float = 0.4) -> float:
-    """Vertical angle between neighbouring beams of a turning LiDAR, degrees: the median step of elevation in thin wedges.
+    """Vertical angle between neighbouring beams of a turning LiDAR, degrees: the median step of elevation in thin
+    wedges.
 
     Steps below 0.08 degrees lie within a beam. Too few points to tell give ``default_deg``; the result is in 0.1..2.5.
     """
@@ -408,14 +419,14 @@ def _apply(a_from_b: Matrix, xyz_b: NDArray[np.floating]) -> NDArray[np.float32]
     )
 
 
-# --- accumulation ---------------------------------------------------------------------------------------------------
+# --- accumulation ---------------------------------------------------------------------------------
 
 
 class CloudAccumulator:
     """Collects coloured points sweep by sweep.
 
-    With ``voxel_m`` > 0 one point per voxel is kept: the one seen from the smallest depth, with the class that the voxel's
-    samples agree on (pairwise cancellation vote). Memory then follows the number of voxels, not of points.
+    With ``voxel_m`` > 0 one point per voxel is kept: the one seen from the smallest depth, with the class that the
+    voxel's samples agree on (pairwise cancellation vote). Memory then follows the number of voxels, not of points.
     """
 
     def __init__(self, voxel_m: float) -> None:
@@ -510,14 +521,17 @@ def _majority(
     return winner, np.where(winner == palette.UNLABELLED, 0, margin).astype(np.int32)
 
 
-# --- the whole ------------------------------------------------------------------------------------------------------
+# --- the whole ------------------------------------------------------------------------------------
 
 
 DEFAULT_RULES: Final = FusionRules()
 
 
 def fuse_sweeps(
-    sweeps: Iterable[SweepShots], tracks: Sequence[Track], rules: FusionRules = DEFAULT_RULES, cameras: CameraColors = SAME_COLORS
+    sweeps: Iterable[SweepShots],
+    tracks: Sequence[Track],
+    rules: FusionRules = DEFAULT_RULES,
+    cameras: CameraColors = SAME_COLORS,
 ) -> tuple[FusedCloud, FusionReport]:
     """Fuse sweeps and images; one sweep is held in memory at a time.
 

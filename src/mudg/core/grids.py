@@ -1,11 +1,12 @@
-"""Multi-resolution hash grids (Müller et al. 2022, "Instant neural graphics primitives"): learnt features of places in 3 or 4 dimensions.
+"""Multi-resolution hash grids (Müller et al. 2022, "Instant neural graphics primitives"): learnt features of places in
+3 or 4 dimensions.
 
-A grid has levels of growing resolution. The features of a point are, level by level, those of the corners of its cell, blended
-linearly along every axis. A level that has room for all its corners stores them in order; a finer one shares its entries by a hash of the
-corner's integer coordinates.
+A grid has levels of growing resolution. The features of a point are, level by level, those of the corners of its cell,
+blended linearly along every axis. A level that has room for all its corners stores them in order; a finer one shares
+its entries by a hash of the corner's integer coordinates.
 
-The native op runs on float32 tensors on the CPU; ``torch_encode`` is the specification and runs everywhere. Gradients reach the
-table and, where they are asked for, the points. They do not depend on the number of threads.
+The native op runs on float32 tensors on the CPU; ``torch_encode`` is the specification and runs everywhere. Gradients
+reach the table and, where they are asked for, the points. They do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -25,15 +26,17 @@ from mudg import native
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 
-# hex planes -----------------------------------------------------------------------------------------------------------
+# hex planes ---------------------------------------------------------------------------------------
 #
-# Six planes of several sizes (HexPlane, Cao and Johnson 2023; K-Planes, Fridovich-Keil et al. 2023): learnt features of places and times.
+# Six planes of several sizes (HexPlane, Cao and Johnson 2023; K-Planes, Fridovich-Keil et al. 2023): learnt features of
+# places and times.
 #
-# The planes lie along xy, xz, yz and xt, yt, zt. The features of a place and time at one size are the product of the six bilinear values
-# there; those of the sizes are joined. All numbers are one tensor: size by size, plane by plane, ``[second axis, first axis, features]``.
+# The planes lie along xy, xz, yz and xt, yt, zt. The features of a place and time at one size are the product of the
+# six bilinear values there; those of the sizes are joined. All numbers are one tensor: size by size, plane by plane,
+# ``[second axis, first axis, features]``.
 #
-# The native op runs on float32 tensors on the CPU; ``torch_look_up`` is the specification and runs everywhere. Gradients reach the planes
-# and, where they are asked for, the places. They do not depend on the number of threads.
+# The native op runs on float32 tensors on the CPU; ``torch_look_up`` is the specification and runs everywhere.
+# Gradients reach the planes and, where they are asked for, the places. They do not depend on the number of threads.
 
 
 PLANES: Final = ((0, 1), (0, 2), (1, 2), (0, 3), (1, 3), (2, 3))
@@ -45,8 +48,8 @@ NATIVE_LEVELS: Final = 16
 
 @dataclass(frozen=True)
 class PlaneSizes:
-    """Sizes of the planes: ``features`` numbers per place, ``levels`` of 1, 2, 4, ... times ``space`` cells along x, y and z, ``time``
-    cells along t at every level; ``width`` of the networks."""
+    """Sizes of the planes: ``features`` numbers per place, ``levels`` of 1, 2, 4, ... times ``space`` cells along x, y
+    and z, ``time`` cells along t at every level; ``width`` of the networks."""
 
     features: int
     levels: int
@@ -61,10 +64,9 @@ class PlaneSizes:
 
     @cached_property
     def shapes(self) -> tuple[tuple[tuple[int, int], tuple[int, int, int]], ...]:
-        """Axes and shape (second axis, first axis, features) of every plane, in the order in which their numbers lie."""
-        return tuple(
-            (axes, (cells[axes[1]], cells[axes[0]], self.features)) for cells in self.cells for axes in PLANES
-        )
+        """Axes and shape (second axis, first axis, features) of every plane, in the order in which their numbers
+        lie."""
+        return tuple((axes, (cells[axes[1]], cells[axes[0]], self.features)) for cells in self.cells for axes in PLANES)
 
     @cached_property
     def numbers(self) -> int:
@@ -72,7 +74,8 @@ class PlaneSizes:
         return sum(rows * columns * features for _, (rows, columns, features) in self.shapes)
 
     def planes(self, numbers: Tensor) -> Iterator[tuple[tuple[int, int], Tensor]]:
-        """Axes and view ``[second axis, first axis, features]`` of every plane of a tensor ``[numbers]``; one gradient for all."""
+        """Axes and view ``[second axis, first axis, features]`` of every plane of a tensor ``[numbers]``; one gradient
+        for all."""
         parts = numbers.split([rows * columns * features for _, (rows, columns, features) in self.shapes])
         for (axes, shape), part in zip(self.shapes, parts):
             yield axes, part.view(shape)
@@ -91,8 +94,11 @@ def look_up(places: Tensor, numbers: Tensor, sizes: PlaneSizes) -> Tensor:
         InputError: shapes do not fit.
     """
     if places.ndim != 2 or places.shape[1] != 4 or tuple(numbers.shape) != (sizes.numbers,):
-        raise InputError("planes of place and time: shapes do not fit", expected=f"places [N, 4], planes ({sizes.numbers},)",
-                         got=f"{tuple(places.shape)}, {tuple(numbers.shape)}")  # fmt: skip
+        raise InputError(
+            "planes of place and time: shapes do not fit",
+            expected=f"places [N, 4], planes ({sizes.numbers},)",
+            got=f"{tuple(places.shape)}, {tuple(numbers.shape)}",
+        )
     library = native.library()
     known = sizes.features in NATIVE_FEATURES and sizes.levels <= NATIVE_LEVELS and sizes.space > 1 and sizes.time > 1
     fits = known and all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (places, numbers))
@@ -133,7 +139,9 @@ class _LookUp(torch.autograd.Function):
         places, numbers = ctx.saved_tensors
         of_places = torch.zeros_like(places) if ctx.needs_input_grad[0] else None
         of_numbers = torch.zeros_like(numbers) if ctx.needs_input_grad[1] else None
-        _call_hex_planes(ctx.library, ctx.sizes, (places, numbers), (None, upstream.contiguous(), of_numbers, of_places))
+        _call_hex_planes(
+            ctx.library, ctx.sizes, (places, numbers), (None, upstream.contiguous(), of_numbers, of_places)
+        )
         return of_places, of_numbers, None, None
 
 
@@ -144,9 +152,14 @@ def _call_hex_planes(
     flat = [count for cells in sizes.cells for count in cells]
     library.mudg_hex_planes.restype = ctypes.c_int
     status = library.mudg_hex_planes(
-        _address_hex_planes(places), ctypes.c_int64(len(places)), _address_hex_planes(numbers), sizes.features, sizes.levels,
-        (ctypes.c_int32 * len(flat))(*flat), *map(_address_hex_planes, rest),
-    )  # fmt: skip
+        _address_hex_planes(places),
+        ctypes.c_int64(len(places)),
+        _address_hex_planes(numbers),
+        sizes.features,
+        sizes.levels,
+        (ctypes.c_int32 * len(flat))(*flat),
+        *map(_address_hex_planes, rest),
+    )
     if status == 2:
         raise MemoryError("the look-up in planes of place and time needs more memory than there is")
     if status != 0:
@@ -157,7 +170,7 @@ def _address_hex_planes(tensor: Tensor | None) -> ctypes.c_void_p:
     return ctypes.c_void_p(None if tensor is None else tensor.data_ptr())
 
 
-# hash grid ------------------------------------------------------------------------------------------------------------
+# hash grid ----------------------------------------------------------------------------------------
 
 
 _PRIMES = (1, 2654435761, 805459861, 3674653429)
@@ -196,9 +209,13 @@ class HashGrid:
         )
         if not fits:
             raise UsageError(
-                "hash grid: sizes out of range", got=str(self),
-                expected="3 or 4 dimensions, 1..32 levels, 1, 2, 4 or 8 features, coarsest <= finest <= 65536, 2^4..2^30 entries",
-            )  # fmt: skip
+                "hash grid: sizes out of range",
+                got=str(self),
+                expected=(
+                    "3 or 4 dimensions, 1..32 levels, 1, 2, 4 or 8 features, coarsest <= finest <= 65536, 2^4..2^30"
+                    " entries"
+                ),
+            )
 
     @cached_property
     def resolutions(self) -> tuple[int, ...]:
@@ -244,8 +261,11 @@ def encode(points: Tensor, table: Tensor, grid: HashGrid) -> Tensor:
         InputError: shapes do not fit the grid.
     """
     if points.ndim != 2 or points.shape[1] != grid.dimensions or tuple(table.shape) != grid.table_shape:
-        raise InputError("hash grid: shapes do not fit", expected=f"points [N, {grid.dimensions}], table {grid.table_shape}",
-                         got=f"{tuple(points.shape)}, {tuple(table.shape)}")  # fmt: skip
+        raise InputError(
+            "hash grid: shapes do not fit",
+            expected=f"points [N, {grid.dimensions}], table {grid.table_shape}",
+            got=f"{tuple(points.shape)}, {tuple(table.shape)}",
+        )
     library = native.library()
     fits = all(t.dtype == torch.float32 and t.device.type == "cpu" for t in (points, table))
     if library is None or not fits or not len(points):
@@ -304,9 +324,15 @@ def _call(library: ctypes.CDLL, grid: HashGrid, given: tuple[Tensor, Tensor], re
     sizes = (ctypes.c_int * 3)(grid.dimensions, levels, grid.features)
     library.mudg_hash_grid.restype = ctypes.c_int
     status = library.mudg_hash_grid(
-        _address(places), ctypes.c_int64(len(places)), _address(values), sizes, (ctypes.c_int32 * levels)(*grid.resolutions),
-        (ctypes.c_int64 * levels)(*grid.entries), (ctypes.c_uint8 * levels)(*grid.hashed), *map(_address, rest),
-    )  # fmt: skip
+        _address(places),
+        ctypes.c_int64(len(places)),
+        _address(values),
+        sizes,
+        (ctypes.c_int32 * levels)(*grid.resolutions),
+        (ctypes.c_int64 * levels)(*grid.entries),
+        (ctypes.c_uint8 * levels)(*grid.hashed),
+        *map(_address, rest),
+    )
     if status != 0:
         raise InputError("the native library does not know such a hash grid", got=str(grid))
 

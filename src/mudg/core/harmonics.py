@@ -1,7 +1,8 @@
 """Real spherical harmonics of colours, in numpy: values at directions, and their exact rotation.
 
-The basis is that of Gaussian splatting (Kerbl et al. 2023): bands 0 to 3, in each band m = -l .. l, with the factor (-1)^m
-(Condon-Shortley). A colour is ``0.5 + basis @ coefficients``. ``core/raster/torch_twin.py`` has the same basis in torch.
+The basis is that of Gaussian splatting (Kerbl et al. 2023): bands 0 to 3, in each band m = -l .. l, with the factor
+(-1)^m (Condon-Shortley). A colour is ``0.5 + basis @ coefficients``. ``core/raster/torch_twin.py`` has the same basis
+in torch.
 """
 
 from __future__ import annotations
@@ -27,10 +28,18 @@ def rotation_matrix(quat: Tensor) -> Tensor:
     """Rotation ``[3, 3]`` of a quaternion ``[4]``, normalised here."""
     w, x, y, z = (quat / quat.norm()).unbind()
     return torch.stack(
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-         2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    ).view(3, 3)  # fmt: skip
+        [
+            1 - 2 * (y * y + z * z),
+            2 * (x * y - w * z),
+            2 * (x * z + w * y),
+            2 * (x * y + w * z),
+            1 - 2 * (x * x + z * z),
+            2 * (y * z - w * x),
+            2 * (x * z - w * y),
+            2 * (y * z + w * x),
+            1 - 2 * (x * x + y * y),
+        ]
+    ).view(3, 3)
 
 
 def slerp(quat0: Tensor, quat1: Tensor, u: float) -> Tensor:
@@ -53,7 +62,7 @@ def rotate(quats: Tensor, vectors: Tensor) -> Tensor:
     return vectors + 2 * (w * cross + torch.linalg.cross(axis, cross))
 
 
-# sh -------------------------------------------------------------------------------------------------------------------
+# sh -----------------------------------------------------------------------------------------------
 
 
 C0: Final = 0.28209479177387814
@@ -75,13 +84,25 @@ def basis(directions: Array, degree: int) -> Array:
     if degree >= 1:
         rows += [-0.4886025119029199 * y, 0.4886025119029199 * z, -0.4886025119029199 * x]
     if degree >= 2:
-        rows += [0.5462742152960396 * sin2, -1.0925484305920792 * y * z, 0.31539156525252005 * (3 * z * z - 1),
-                 -1.0925484305920792 * x * z, 0.5462742152960396 * cos2]  # fmt: skip
+        rows += [
+            0.5462742152960396 * sin2,
+            -1.0925484305920792 * y * z,
+            0.31539156525252005 * (3 * z * z - 1),
+            -1.0925484305920792 * x * z,
+            0.5462742152960396 * cos2,
+        ]
     if degree >= 3:
         cos3, sin3 = x * cos2 - y * sin2, x * sin2 + y * cos2
         c = 0.4570457994644658 * (1 - 5 * z * z)
-        rows += [-0.5900435899266435 * sin3, 1.445305721320277 * z * sin2, c * y, 0.3731763325901154 * z * (5 * z * z - 3),
-                 c * x, 1.445305721320277 * z * cos2, -0.5900435899266435 * cos3]  # fmt: skip
+        rows += [
+            -0.5900435899266435 * sin3,
+            1.445305721320277 * z * sin2,
+            c * y,
+            0.3731763325901154 * z * (5 * z * z - 3),
+            c * x,
+            1.445305721320277 * z * cos2,
+            -0.5900435899266435 * cos3,
+        ]
     return np.stack(rows, 1)
 
 
@@ -102,9 +123,11 @@ def rotated(coefficients: NDArray[np.float32], rotation: Array) -> NDArray[np.fl
 
 
 def band_rotation(rotation: Array, band: int) -> Array:
-    """The orthogonal matrix f64[2 band + 1, 2 band + 1] by which a rotation f64[3, 3] mixes the coefficients of one band.
+    """The orthogonal matrix f64[2 band + 1, 2 band + 1] by which a rotation f64[3, 3] mixes the coefficients of one
+    band.
 
-    A rotated harmonic is a sum of harmonics of its band, so its values at a few directions determine the sum: exact but for rounding.
+    A rotated harmonic is a sum of harmonics of its band, so its values at a few directions determine the sum: exact but
+    for rounding.
     """
     directions, inverse = _probes(band)
     rows = slice(band**2, (band + 1) ** 2)
@@ -113,7 +136,8 @@ def band_rotation(rotation: Array, band: int) -> Array:
 
 @functools.cache
 def _probes(band: int) -> tuple[Array, Array]:
-    """Well-spread directions [M, 3] (a spiral from pole to pole) and the inverse of a band's values there, [2 band + 1, M]."""
+    """Well-spread directions [M, 3] (a spiral from pole to pole) and the inverse of a band's values there, [2 band + 1,
+    M]."""
     directions = spiral(24)
     return directions, np.asarray(np.linalg.pinv(basis(directions, band)[:, band**2 : (band + 1) ** 2]), np.float64)
 
@@ -126,15 +150,14 @@ def spiral(count: int) -> Array:
     return np.stack([radius * np.cos(longitude), radius * np.sin(longitude), z], 1)
 
 
-# harmonics ------------------------------------------------------------------------------------------------------------
+# harmonics ----------------------------------------------------------------------------------------
 #
 # Spherical harmonics of colours in a turned frame.
 #
-# A colour is the sum of harmonics of the direction from the camera to a Gaussian. Where the harmonics belong to a frame that is turned
-# against the world, evaluating them with the direction turned into that frame is the same as evaluating turned coefficients with the
-# direction in the world: functions of one degree mix among themselves, by an orthogonal matrix (``core/harmonics.py``). So every renderer
-# draws
-# them without knowing of frames.
+# A colour is the sum of harmonics of the direction from the camera to a Gaussian. Where the harmonics belong to a frame
+# that is turned against the world, evaluating them with the direction turned into that frame is the same as evaluating
+# turned coefficients with the direction in the world: functions of one degree mix among themselves, by an orthogonal
+# matrix (``core/harmonics.py``). So every renderer draws them without knowing of frames.
 
 
 def mixing(rotation: Tensor, degree: int) -> Tensor:
@@ -145,7 +168,8 @@ def mixing(rotation: Tensor, degree: int) -> Tensor:
         degree: 1 to 3.
 
     Returns:
-        f32[K - 1, K - 1], K = (degree + 1)^2, orthogonal: coefficients of the world = matrix @ coefficients of the frame.
+        f32[K - 1, K - 1], K = (degree + 1)^2, orthogonal: coefficients of the world = matrix @ coefficients of the
+        frame.
     """
     turn = rotation.detach().double().numpy()
     return torch.block_diag(*(torch.from_numpy(band_rotation(turn, band)) for band in range(1, degree + 1))).float()

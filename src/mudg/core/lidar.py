@@ -1,6 +1,8 @@
-"""LiDAR points as sparse truth at any view: where they are at a moment, which a view shows, and which other images saw them.
+"""LiDAR points as sparse truth at any view: where they are at a moment, which a view shows, and which other images saw
+them.
 
-Points in the boxes of dynamic objects travel with their box; all others stand still. What hides a point is decided by ``core/project.py``.
+Points in the boxes of dynamic objects travel with their box; all others stand still. What hides a point is decided by
+``core/project.py``.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ from mudg.core.edit import HeightMap
 from mudg.core.fusion import STATIC
 from mudg.core.project import RULES, DrawLimits, PointLayer, draw_points, hidden_pixels
 
-# beams ----------------------------------------------------------------------------------------------------------------
+# beams --------------------------------------------------------------------------------------------
 #
 # What laser beams meet: surfaces of points, boxes, the ground. All in the frame of the sensor, beams from its origin.
 
@@ -70,7 +72,8 @@ def met_points(beams: Array, xyz: Array, sizes: Array) -> tuple[Array, NDArray[n
 
 
 def met_box(beams: Array, sensor_from_box: Array, size_m: ArrayLike) -> Array:
-    """Range f64[B] at which beams enter a box, metres; infinite where they miss it. A sensor within the box enters at 0."""
+    """Range f64[B] at which beams enter a box, metres; infinite where they miss it. A sensor within the box enters at
+    0."""
     half = np.asarray(size_m, np.float64) / 2
     origin = geometry.invert(sensor_from_box)[:3, 3]
     directions = beams @ sensor_from_box[:3, :3]
@@ -102,7 +105,7 @@ def met_ground(beams: Array, world_from_sensor: Array, ground: HeightMap, from_m
     return np.where(passes.any(1), ranges[rows, at] + share[rows, at] * GROUND_STEP_M, np.inf)
 
 
-# points seen ----------------------------------------------------------------------------------------------------------
+# points seen --------------------------------------------------------------------------------------
 
 
 NEAR_M: Final = 0.5
@@ -139,7 +142,8 @@ class PointTruth:
     Args:
         depth: f32[H, W] metres of the point that a pixel shows, 0 = none.
         dynamic: bool[H, W]: it belongs to a dynamic object.
-        color: u8[H, W, 3], its colour in the recorded image of that time, where ``colored`` bool[H, W]: that image shows it, too.
+        color: u8[H, W, 3], its colour in the recorded image of that time, where ``colored`` bool[H, W]: that image
+            shows it, too.
         classes: u8[H, W], its class in the recorded image's labels, 255 = none or not shown there.
     """
 
@@ -161,8 +165,8 @@ def placed(points: OwnedPoints, dynamic: Sequence[Track], time_s: float) -> NDAr
 
 
 def visible(view: View, world: NDArray[np.float32], gap_deg: float) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Depth f32[H, W] (0 = none) and number i32[H, W] (-1 = none) of the point that each pixel shows, hidden ones left out (the rule
-    ``sweep`` of ``core/project.py``)."""
+    """Depth f32[H, W] (0 = none) and number i32[H, W] (-1 = none) of the point that each pixel shows, hidden ones left
+    out (the rule ``sweep`` of ``core/project.py``)."""
     depth, index = draw_points([PointLayer(world, np.eye(4))], view, DrawLimits(NEAR_M, DEPTH_LIMIT_M))
     rule = RULES["sweep"]
     found = np.where(index >= 0, depth, np.float32(np.inf))
@@ -184,7 +188,8 @@ def pixels_of(
 def carried(
     recorded: View, image: NDArray[np.uint8], world: NDArray[np.float32], gap_deg: float
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-    """What an image shows at points: its pixels' values u8[N + 1, ...] for N points, and which of them it shows, bool[N + 1].
+    """What an image shows at points: its pixels' values u8[N + 1, ...] for N points, and which of them it shows, bool[N
+    + 1].
 
     The last entry is that of no point, as the index -1 of ``visible`` asks for it.
 
@@ -200,12 +205,13 @@ def carried(
     return values, known
 
 
-# ---- what other cameras saw --------------------------------------------------------------------------------------------
+# ---- what other cameras saw ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownFrame:
-    """A shown frame: dense depth f32[H, W] metres (infinite where unknown), and its photograph u8[H, W, 3], a little blurred."""
+    """A shown frame: dense depth f32[H, W] metres (infinite where unknown), and its photograph u8[H, W, 3], a little
+    blurred."""
 
     view: View
     depth: NDArray[np.float32]
@@ -227,9 +233,9 @@ def seen_by(
 ) -> tuple[NDArray[np.bool_], NDArray[np.uint8]]:
     """Which points bool[N] some shown frame of any time saw, and the colour u8[N, 3] that they had there.
 
-    A point is seen if it falls into the image and its depth there is not behind the frame's dense depth (rule ``drawn`` of
-    ``core/project.py``). Frames near ``time_s`` are asked first; the first that saw a point gives its colour. ``place(points, time)`` says
-    where points are.
+    A point is seen if it falls into the image and its depth there is not behind the frame's dense depth (rule ``drawn``
+    of ``core/project.py``). Frames near ``time_s`` are asked first; the first that saw a point gives its colour.
+    ``place(points, time)`` says where points are.
     """
     seen, colors = np.zeros(len(points.xyz), bool), np.zeros((len(points.xyz), 3), np.uint8)
     for frame in sorted(shown, key=lambda frame: abs(frame.view.time_s - time_s)):

@@ -1,8 +1,9 @@
-"""Every loss, as pure functions: of the scene fit (maps where they are maps, scalars where a sum is part of the idea) and of the
-diffusion model (scalars, below).
+"""Every loss, as pure functions: of the scene fit (maps where they are maps, scalars where a sum is part of the idea)
+and of the diffusion model (scalars, below).
 
-All work in float32 and float64 and are differentiable in the prediction. Masks are boolean and never change the shape of
-the work. Published form: Street Gaussians (recorded views) and the supervision of MuDG's scene stage (virtual views).
+All work in float32 and float64 and are differentiable in the prediction. Masks are boolean and never change the shape
+of the work. Published form: Street Gaussians (recorded views) and the supervision of MuDG's scene stage (virtual
+views).
 
     recorded:  (1 - w) L1 + w (1 - SSIM)  +  trimmed LiDAR depth  +  sky  +  semantics
     virtual:   perceptual + robust dense depth + semantics, every pixel weighted by the observation's confidence
@@ -25,7 +26,7 @@ from torch.autograd.function import once_differentiable
 from mudg.base.errors import InputError
 from mudg.base.palette import UNLABELLED
 
-# perceptual -----------------------------------------------------------------------------------------------------------
+# perceptual ---------------------------------------------------------------------------------------
 #
 # Distances of two images in the features of a network or a filter bank: losses of a fit, and rows of the scores.
 
@@ -34,7 +35,8 @@ LPIPS_EPSILON: Final = 1e-10
 
 
 def unit_features(stages: Sequence[Tensor]) -> list[Tensor]:
-    """Feature vectors of every place brought to length 1 as LPIPS does it: ``x / (|x| + 1e-10)``; per stage ``[C_l, h_l, w_l]``.
+    """Feature vectors of every place brought to length 1 as LPIPS does it: ``x / (|x| + 1e-10)``; per stage ``[C_l,
+    h_l, w_l]``.
 
     A place without any feature has no direction: it stays 0 and passes no gradient, where the root would pass NaN.
     """
@@ -49,7 +51,8 @@ def _unit(features: Tensor) -> Tensor:
 
 
 def distance_places(features: Tensor, target: Tensor, channel_weights: Tensor | None = None) -> Tensor:
-    """Squared difference at every place of one stage ``[h, w]``: of features ``[C, h, w]``, brought to length 1, and unit features."""
+    """Squared difference at every place of one stage ``[h, w]``: of features ``[C, h, w]``, brought to length 1, and
+    unit features."""
     squared = (_unit(features) - target) ** 2
     if channel_weights is not None:
         squared = squared * channel_weights.view(-1, 1, 1)
@@ -66,16 +69,16 @@ def lpips_distance(
 ) -> Tensor:
     """LPIPS (Zhang et al. 2018, eq. 1) in the features of any network; differentiable in the prediction.
 
-    Per stage: every place's feature vector is brought to length 1, the squared difference is summed over channels and averaged
-    over places; the stages are averaged (without ``channel_weights``) or summed (with them, as LPIPS does).
+    Per stage: every place's feature vector is brought to length 1, the squared difference is summed over channels and
+    averaged over places; the stages are averaged (without ``channel_weights``) or summed (with them, as LPIPS does).
 
     Args:
         prediction: features of one image, per stage ``[C_l, h_l, w_l]``.
         target_units: ``unit_features`` of the other image, same shapes.
         weight: ``[1, H, W]`` in [0, 1] at full size, averaged down to each stage (default 1).
         channel_weights: per stage ``[C_l]`` for the squared differences (default 1).
-        over_weight: what a weighted sum is divided by. False: the number of places, so that an image of which little is certain also
-            weighs little (loss). True: the sum of the weights, so that only chosen pixels count (score).
+        over_weight: what a weighted sum is divided by. False: the number of places, so that an image of which little is
+            certain also weighs little (loss). True: the sum of the weights, so that only chosen pixels count (score).
 
     Returns:
         Scalar: 0 for equal images, NaN when nothing counts.
@@ -86,8 +89,12 @@ def lpips_distance(
     total = prediction[0].new_zeros(())
     for stage, (features, target) in enumerate(zip(prediction, target_units, strict=True)):
         if features.shape != target.shape:
-            raise InputError("features of two images differ in shape", where=f"stage {stage}",
-                expected=str(tuple(target.shape)), got=str(tuple(features.shape)))  # fmt: skip
+            raise InputError(
+                "features of two images differ in shape",
+                where=f"stage {stage}",
+                expected=str(tuple(target.shape)),
+                got=str(tuple(features.shape)),
+            )
         places = distance_places(features, target, None if channel_weights is None else channel_weights[stage])
         if weight is None:
             total = total + places.mean()
@@ -98,7 +105,7 @@ def lpips_distance(
     return total if channel_weights is not None else total / len(prediction)
 
 
-# losses ---------------------------------------------------------------------------------------------------------------
+# losses -------------------------------------------------------------------------------------------
 
 
 SSIM_WINDOW: Final = 11
@@ -110,20 +117,22 @@ MAX_LOG_RATIO: Final = 2.0
 
 
 def weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Sum of ``values * weight`` over sum of ``weight`` (broadcast); zero, still differentiable, where nothing weighs."""
+    """Sum of ``values * weight`` over sum of ``weight`` (broadcast); zero, still differentiable, where nothing
+    weighs."""
     weight = weight.to(values.dtype).expand_as(values)
     return (values * weight).sum() / weight.sum().clamp_min(1e-12)
 
 
 def confident_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Mean over **all** pixels of ``values * weight`` (broadcast): an observation that is sure of little also weighs little.
+    """Mean over **all** pixels of ``values * weight`` (broadcast): an observation that is sure of little also weighs
+    little.
 
     ``weighted_mean`` would blow the few sure pixels up to the weight of a whole image.
     """
     return (values * weight.to(values.dtype)).mean()
 
 
-# ---- colour ------------------------------------------------------------------------------------------------------
+# ---- colour --------------------------------------------------------------------------------------
 
 
 def l1_map(prediction: Tensor, target: Tensor) -> Tensor:
@@ -153,7 +162,9 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
     row, column = _window(5 * channels, prediction.dtype, prediction.device)
     stack = torch.cat([prediction, target, prediction**2, target**2, prediction * target])[None]
     half = SSIM_WINDOW // 2
-    blurred = F.conv2d(F.conv2d(stack, row, padding=(0, half), groups=5 * channels), column, padding=(half, 0), groups=5 * channels)
+    blurred = F.conv2d(
+        F.conv2d(stack, row, padding=(0, half), groups=5 * channels), column, padding=(half, 0), groups=5 * channels
+    )
     mean_p, mean_t, square_p, square_t, product = blurred[0].split(channels)
     variance_p, variance_t = square_p - mean_p**2, square_t - mean_t**2
     covariance = product - mean_p * mean_t
@@ -164,13 +175,15 @@ def ssim_map(prediction: Tensor, target: Tensor) -> Tensor:
 def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
     """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[3, H, W]`` in [0, 1]: the plain-torch form.
 
-    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.native_ops.photometric`` computes the same value and
-    gradient in one native pass.
+    With a weight ``[H, W]`` per pixel: the ``confident_mean`` of both maps. ``core.native_ops.photometric`` computes
+    the same value and gradient in one native pass.
     """
     if weight is not None:
         both = (1 - ssim_weight) * l1_map(prediction, target) + ssim_weight * (1 - ssim_map(prediction, target))
         return confident_mean(both, weight)
-    return (1 - ssim_weight) * l1_map(prediction, target).mean() + ssim_weight * (1 - ssim_map(prediction, target).mean())
+    return (1 - ssim_weight) * l1_map(prediction, target).mean() + ssim_weight * (
+        1 - ssim_map(prediction, target).mean()
+    )
 
 
 def outside_mask_copied(prediction: Tensor, target: Tensor, mask: Tensor | None) -> Tensor:
@@ -181,13 +194,14 @@ def outside_mask_copied(prediction: Tensor, target: Tensor, mask: Tensor | None)
     return prediction if mask is None else torch.where(mask, prediction, target)
 
 
-# ---- depth -------------------------------------------------------------------------------------------------------
+# ---- depth ---------------------------------------------------------------------------------------
 
 
 def trimmed_mean(values: Tensor, keep: float) -> Tensor:
     """Mean of the smallest ``keep`` share of a flat tensor; zero for an empty one.
 
-    Outliers are the point of trimming: a LiDAR return seen through a window, or past an edge, must not pull the surface.
+    Outliers are the point of trimming: a LiDAR return seen through a window, or past an edge, must not pull the
+    surface.
     """
     if values.numel() == 0:
         return values.sum()
@@ -222,13 +236,15 @@ def dense_depth_map(depth_m: Tensor, target_m: Tensor, delta: float = 0.1) -> Te
 
 
 def sparse_squared_depth(depth_m: Tensor, pixel: Tensor, target_m: Tensor, span_m: float) -> Tensor:
-    """Mean squared difference of depths over ``span_m``, over sparse LiDAR pixels that are at most that far (S3Gaussian)."""
+    """Mean squared difference of depths over ``span_m``, over sparse LiDAR pixels that are at most that far
+    (S3Gaussian)."""
     near = (target_m > 0.01) & (target_m < span_m)
     return weighted_mean(((depth_m.reshape(-1)[pixel] - target_m) / span_m).square(), near)
 
 
 def inverse_depth(depth_m: Tensor, alpha: Tensor, sky_m: float) -> Tensor:
-    """Inverse depth of a pixel that is partly sky, in 1/m: ``alpha / depth + (1 - alpha) / sky_m`` (Periodic Vibration Gaussians).
+    """Inverse depth of a pixel that is partly sky, in 1/m: ``alpha / depth + (1 - alpha) / sky_m`` (Periodic Vibration
+    Gaussians).
 
     Args:
         depth_m: expected depth of what covers the pixel, any shape. alpha: the same shape, in [0, 1].
@@ -237,12 +253,14 @@ def inverse_depth(depth_m: Tensor, alpha: Tensor, sky_m: float) -> Tensor:
 
 
 def sparse_inverse_depth(inverse: Tensor, pixel: Tensor, target_m: Tensor) -> Tensor:
-    """Mean of |1 / target - inverse| over sparse LiDAR pixels, 1/m; ``pixel`` and ``target_m`` as in ``sparse_depth``."""
+    """Mean of |1 / target - inverse| over sparse LiDAR pixels, 1/m; ``pixel`` and ``target_m`` as in
+    ``sparse_depth``."""
     return (1 / target_m - inverse.reshape(-1)[pixel]).abs().mean()
 
 
 def edge_aware(values: Tensor, rgb: Tensor) -> Tensor:
-    """Mean absolute difference of neighbouring ``values`` ``[1, H, W]``, less where the image ``[3, H, W]`` has an edge."""
+    """Mean absolute difference of neighbouring ``values`` ``[1, H, W]``, less where the image ``[3, H, W]`` has an
+    edge."""
     total = values.new_zeros(())
     for dim in (1, 2):
         edge = torch.diff(rgb, dim=dim).abs().mean(0, keepdim=True)
@@ -250,7 +268,7 @@ def edge_aware(values: Tensor, rgb: Tensor) -> Tensor:
     return total
 
 
-# ---- sky, semantics, objects -------------------------------------------------------------------------------------
+# ---- sky, semantics, objects ---------------------------------------------------------------------
 
 
 def sky_map(alpha: Tensor, sky: Tensor, floor: float = 1e-3) -> Tensor:
@@ -286,7 +304,9 @@ def semantic_map(logits: Tensor, target: Tensor) -> Tensor:
         ``[H, W]``.
     """
     if logits.shape[1:] != target.shape:
-        raise InputError("semantic loss: sizes differ", expected=str(tuple(logits.shape[1:])), got=str(tuple(target.shape)))
+        raise InputError(
+            "semantic loss: sizes differ", expected=str(tuple(logits.shape[1:])), got=str(tuple(target.shape))
+        )
     return F.cross_entropy(logits[None], target[None], ignore_index=UNLABELLED, reduction="none")[0]
 
 
@@ -298,17 +318,20 @@ def class_loss(
     ``core.native_ops.class_loss`` computes the same value and gradient in one native pass, and names the arguments.
     """
     if lift is not None:
-        channel = torch.full((1,), lift[0], device=logits.device)  # filled there: a list would be copied, and waited for
+        # filled there: a list would be copied, and waited for
+        channel = torch.full((1,), lift[0], device=logits.device)
         logits = logits.index_add(0, channel, lift[1].detach()[None].to(logits.dtype))
     labelled = torch.where((target >= 0) & (target < len(logits)), target, UNLABELLED)
-    return (semantic_map(logits, labelled) * weight).sum() / (total.to(weight.dtype) if isinstance(total, Tensor) else total)
+    return (semantic_map(logits, labelled) * weight).sum() / (
+        total.to(weight.dtype) if isinstance(total, Tensor) else total
+    )
 
 
 def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) -> Tensor:
     """Regulariser of an objects-only render (Street Gaussians, lambda 0.1, after densification).
 
-    Entropy of the opacity inside the projected boxes (be there or not, but decide), ``-log(1 - alpha)`` outside (objects
-    leave no haze outside their boxes). ``[1, H, W]`` each; ``inside_boxes`` bool.
+    Entropy of the opacity inside the projected boxes (be there or not, but decide), ``-log(1 - alpha)`` outside
+    (objects leave no haze outside their boxes). ``[1, H, W]`` each; ``inside_boxes`` bool.
     """
     _same_shape(object_alpha, inside_boxes, "object_map")
     alpha = object_alpha.clamp(floor, 1 - floor)
@@ -316,11 +339,14 @@ def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) 
     return torch.where(inside_boxes, entropy, -torch.log(1 - alpha))
 
 
-# ---- regularisers ------------------------------------------------------------------------------------------------
+# ---- regularisers --------------------------------------------------------------------------------
 
 
-def opacity_and_scale(opacity: Tensor, scales_m: Tensor, opacity_weight: float, scale_weight: float) -> dict[str, Tensor]:
-    """Weighted mean opacity and mean scale of all Gaussians (Kheradmand et al. 2024), scalars by name; a weight of 0 leaves a term out.
+def opacity_and_scale(
+    opacity: Tensor, scales_m: Tensor, opacity_weight: float, scale_weight: float
+) -> dict[str, Tensor]:
+    """Weighted mean opacity and mean scale of all Gaussians (Kheradmand et al. 2024), scalars by name; a weight of 0
+    leaves a term out.
 
     Args:
         opacity: ``[N]`` in [0, 1]. scales_m: ``[N, 3]`` metres.
@@ -338,12 +364,12 @@ def identity_distance(difference: Tensor) -> Tensor:
     return difference.abs().mean()
 
 
-# ---- features ----------------------------------------------------------------------------------------------------
+# ---- features ------------------------------------------------------------------------------------
 
 
 def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Tensor) -> Tensor:
-    """Mean absolute difference of feature maps, every place weighted by its confidence, averaged over the scales. Differentiable (once)
-    in the prediction; everything else is data.
+    """Mean absolute difference of feature maps, every place weighted by its confidence, averaged over the scales.
+    Differentiable (once) in the prediction; everything else is data.
 
     Args:
         prediction, target: per scale ``[C_s, H_s, W_s]``.
@@ -358,7 +384,8 @@ def feature_distance(prediction: list[Tensor], target: list[Tensor], weight: Ten
 
 
 class _ConfidentDifference(torch.autograd.Function):
-    """``confident_mean((mine - theirs).abs(), weight)``, its gradient worked out along with it: half of the passes over large maps."""
+    """``confident_mean((mine - theirs).abs(), weight)``, its gradient worked out along with it: half of the passes over
+    large maps."""
 
     @staticmethod
     def forward(ctx: Any, mine: Tensor, theirs: Tensor, weight: Tensor) -> Tensor:
@@ -374,7 +401,7 @@ class _ConfidentDifference(torch.autograd.Function):
         return gradient * upstream, None, None
 
 
-# ---- diffusion model ---------------------------------------------------------------------------------------------
+# ---- diffusion model -----------------------------------------------------------------------------
 # Every term is a plain mean over clips, so that the loss of a batch is the mean over its parts however it is divided.
 
 
@@ -384,18 +411,21 @@ def latent_error(stated: Tensor, truth: Tensor, weight: Tensor) -> Tensor:
 
 
 def latent_depth_error(stated: Tensor, truth: Tensor, weight: Tensor, known: Tensor) -> Tensor:
-    """As ``latent_error`` with 5 x Huber (delta 0.2), where depth is ``known``: share of the cell f32[B, T, 1, h, w]."""
+    """As ``latent_error`` with 5 x Huber (delta 0.2), where depth is ``known``: share of the cell f32[B, T, 1, h,
+    w]."""
     return (weight * (F.huber_loss(stated, truth, reduction="none", delta=0.2) * 5.0) * known).mean()
 
 
 def share_cross_entropy(log_shares: Tensor, shares: Tensor, class_weights: Tensor | None) -> Tensor:
-    """Mean cross-entropy of class shares ``[B, T, C, h, w]`` under stated logarithms; weights of the classes ``[C]`` or None."""
+    """Mean cross-entropy of class shares ``[B, T, C, h, w]`` under stated logarithms; weights of the classes ``[C]`` or
+    None."""
     weighted = shares if class_weights is None else shares * class_weights.view(-1, 1, 1)
     return -(weighted * log_shares).sum(2).mean()
 
 
 def image_error(error: Tensor, square: float, gradient: float) -> Tensor:
-    """L1 of an error image ``[N, 3, H, W]`` + ``square`` x its mean square + ``gradient`` x the L1 of its differences."""
+    """L1 of an error image ``[N, 3, H, W]`` + ``square`` x its mean square + ``gradient`` x the L1 of its
+    differences."""
     across, down = error[..., 1:] - error[..., :-1], error[..., 1:, :] - error[..., :-1, :]
     return error.abs().mean() + square * error.square().mean() + gradient * (across.abs().mean() + down.abs().mean())
 
@@ -415,13 +445,15 @@ def depth_code_error(made: Tensor, truth: Tensor, weight: Tensor, log_per_code: 
 
 
 def class_error(scores: Tensor, ids: Tensor, class_weights: Tensor | None) -> Tensor:
-    """Cross-entropy of scores ``[N, C, H, W]`` summed over labelled pixels of i64[N, H, W], divided by the number of all."""
+    """Cross-entropy of scores ``[N, C, H, W]`` summed over labelled pixels of i64[N, H, W], divided by the number of
+    all."""
     weight = None if class_weights is None else class_weights.to(scores.dtype)
     return F.cross_entropy(scores, ids, weight, ignore_index=UNLABELLED, reduction="none").mean()
 
 
 def stated_error(log_error: Tensor, error: Tensor) -> Tensor:
-    """Negative log-likelihood (Laplace) of the absolute error of colour ``[N, 3, H, W]`` under the scale ``exp(log_error)``.
+    """Negative log-likelihood (Laplace) of the absolute error of colour ``[N, 3, H, W]`` under the scale
+    ``exp(log_error)``.
 
     Moves the statement ``[N, 1, H, W]`` only, not the colour.
     """

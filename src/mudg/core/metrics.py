@@ -1,9 +1,9 @@
 """Image, depth and semantic metrics, each as a small accumulator over a whole trajectory.
 
-A metric says what it measures of one view (``source``, a pure function that threads may call), adds that to its sums, and its
-``value()`` is read once at the end. Metrics with the same source share one measurement.
-What a method did not produce stays None ("not produced"); what needs weights that are not there is listed in ``METRICS``
-with ``build=None`` ("not computed"). Nothing is ever reported as zero for want of data.
+A metric says what it measures of one view (``source``, a pure function that threads may call), adds that to its sums,
+and its ``value()`` is read once at the end. Metrics with the same source share one measurement. What a method did not
+produce stays None ("not produced"); what needs weights that are not there is listed in ``METRICS`` with ``build=None``
+("not computed"). Nothing is ever reported as zero for want of data.
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ class LaneFacts:
     """Road markings of a view.
 
     Args:
-        road: bool[H, W], where they are looked for. marking, band: bool[H, W], where they are, and the band around them.
+        road: bool[H, W], where they are looked for. marking, band: bool[H, W], where they are, and the band around
+            them.
         reference: colours f32[3, H, W] in [0, 1]: the true image, or the recorded one carried over by the ground plane.
         exact: ``marking`` is the truth, not what a rule found in the reference.
     """
@@ -62,7 +63,7 @@ class ViewFacts:
     instance: NDArray[np.int32] | None = None
 
 
-# flicker --------------------------------------------------------------------------------------------------------------
+# flicker ------------------------------------------------------------------------------------------
 #
 # How restless a video is: what static surfaces change from frame to frame, against what they change in the truth.
 
@@ -74,7 +75,8 @@ MOVABLE = tuple(palette.ID[n] for n in ("person", "rider", "car", "truck", "bus"
 
 
 def flicker(made: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> float:
-    """Change of static surfaces from one frame to the next in `made`, over that in `truth` (1 = as steady as the truth).
+    """Change of static surfaces from one frame to the next in `made`, over that in `truth` (1 = as steady as the
+    truth).
 
     Arguments as for `changes`. NaN for one frame or without such pixels.
     """
@@ -84,7 +86,8 @@ def flicker(made: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> float:
 
 
 def changes(made: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> list[tuple[float, float]]:
-    """Summed absolute change of static surfaces between each frame and the next, in `made` and in `truth`, f32[T,3,H,W] each.
+    """Summed absolute change of static surfaces between each frame and the next, in `made` and in `truth`, f32[T,3,H,W]
+    each.
 
     Every pixel of a class that cannot move is carried by its true depth into the next frame and compared with what is
     there (bilinear), if the same surface is seen there (depths within 3 %).
@@ -98,7 +101,8 @@ def changes(made: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> list[tu
 
 @dataclass(frozen=True)
 class TrueFrame:
-    """Truth of one frame: depth f32[1,H,W] metres, ids i64[H,W], world_from_cam f64[4,4], intrinsics f64[4]: fx, fy, cx, cy."""
+    """Truth of one frame: depth f32[1,H,W] metres, ids i64[H,W], world_from_cam f64[4,4], intrinsics f64[4]: fx, fy,
+    cx, cy."""
 
     depth: Tensor
     ids: Tensor
@@ -115,8 +119,8 @@ class TrueFrame:
 
 @dataclass(frozen=True)
 class PixelMotion:
-    """Where each pixel of a frame lies in the next one: ``there`` f32[1,H,W,2] in [-1, 1] as `grid_sample` takes it; ``same``
-    bool[H,W]: static, and the same surface is seen there."""
+    """Where each pixel of a frame lies in the next one: ``there`` f32[1,H,W,2] in [-1, 1] as `grid_sample` takes it;
+    ``same`` bool[H,W]: static, and the same surface is seen there."""
 
     there: Tensor
     same: Tensor
@@ -128,8 +132,8 @@ def pixel_motion(
     """Carry every pixel of a frame by its depth into the following one.
 
     Args:
-        moved: how rigid objects move in the world between the two, f64[4, 4] by their number in ``instance`` i64[H, W] of the first
-            frame; their pixels are carried with them and count as static ones do.
+        moved: how rigid objects move in the world between the two, f64[4, 4] by their number in ``instance`` i64[H, W]
+            of the first frame; their pixels are carried with them and count as static ones do.
     """
     height, width = frame.ids.shape
     found = [_motion_of_rows(frame, following, moved, instance, rows) for rows in _bands(height, width)]
@@ -151,7 +155,9 @@ def _motion_of_rows(
     (height, width), rows_of = whole.ids.shape, slice(chosen.start, chosen.stop)
     frame = replace(whole, depth=whole.depth[:, rows_of], ids=whole.ids[rows_of])
     instance = None if instance is None else instance[rows_of]
-    rows, columns = torch.meshgrid(torch.arange(chosen.start, chosen.stop) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    rows, columns = torch.meshgrid(
+        torch.arange(chosen.start, chosen.stop) + 0.5, torch.arange(width) + 0.5, indexing="ij"
+    )
     static = ~torch.isin(frame.ids, torch.tensor(MOVABLE)) & (frame.depth[0] < 90.0)
     z = frame.depth[0]
     ray_x, ray_y = geometry.pinhole_ray(frame.intrinsics.float(), columns, rows)
@@ -174,7 +180,8 @@ def _motion_of_rows(
 
 
 def change(frame: Tensor, following: Tensor, where: PixelMotion) -> float:
-    """Summed absolute change of colours f32[3,H,W] from a frame to the following one, over the pixels in ``where.same``."""
+    """Summed absolute change of colours f32[3,H,W] from a frame to the following one, over the pixels in
+    ``where.same``."""
     total = 0.0
     for band in _bands(*where.same.shape):
         rows = slice(band.start, band.stop)
@@ -187,18 +194,19 @@ def _sample_at(image: Tensor, there: Tensor, mode: str) -> Tensor:
     return torch.nn.functional.grid_sample(image[None], there, mode=mode, align_corners=False)[0]
 
 
-# metrics --------------------------------------------------------------------------------------------------------------
+# metrics ------------------------------------------------------------------------------------------
 
 
 CLASS_COUNT: Final = len(CLASSES)
 PIECE_VALUES: Final = 2_500_000
 SMALLEST_SHARE: Final = 1e-3
-"""Masks of dynamic objects that cover less of an image than this do not count: a handful of pixels has no PSNR to speak of."""
+"""Masks of dynamic objects that cover less of an image than this do not count: a handful of pixels has no PSNR to speak
+of."""
 
 
 def pieces_of(values: Tensor, channels: int = 1) -> Iterator[Tensor]:
-    """All values of a tensor, flat: whole for images of up to 2.5 million pixels, else in pieces. What is worked out in double precision
-    would fill the memory at large sizes.
+    """All values of a tensor, flat: whole for images of up to 2.5 million pixels, else in pieces. What is worked out in
+    double precision would fill the memory at large sizes.
 
     Args:
         channels: values per pixel.
@@ -232,7 +240,8 @@ def psnr(prediction: Tensor, truth: Tensor, mask: Tensor | None = None) -> float
 
 
 def psnr_of_errors(errors: Tensor) -> float:
-    """Peak signal-to-noise ratio in dB from differences, of any sign, of values in [0, 1]; infinity without any, NaN of nothing."""
+    """Peak signal-to-noise ratio in dB from differences, of any sign, of values in [0, 1]; infinity without any, NaN of
+    nothing."""
     if errors.numel() == 0:
         return math.nan
     error = sum(float(piece.double().square().sum()) for piece in pieces_of(errors)) / errors.numel()
@@ -319,7 +328,7 @@ def iou_of(counts: Tensor) -> dict[str, float]:
     return {CLASSES[i]: float(hit[i] / union[i]) for i in range(CLASS_COUNT) if true[i] > 0}
 
 
-# ---- accumulators over a trajectory ------------------------------------------------------------------------------
+# ---- accumulators over a trajectory --------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -327,8 +336,8 @@ class Pair:
     """One predicted view with its truth. Absent modalities are None.
 
     rgb ``[3, H, W]`` in [0, 1]; depth ``[1, H, W]`` m; semantics i64 ``[H, W]``; truth_depth_valid bool ``[1, H, W]``;
-    mask bool ``[1, H, W]``: pixels that count at all (outside the ego vehicle); moving bool ``[1, H, W]``: true pixels of
-    dynamic objects, where they are known; view: camera and pose of both; facts: what is known beside the true image.
+    mask bool ``[1, H, W]``: pixels that count at all (outside the ego vehicle); moving bool ``[1, H, W]``: true pixels
+    of dynamic objects, where they are known; view: camera and pose of both; facts: what is known beside the true image.
     """
 
     rgb: Tensor | None
@@ -361,8 +370,11 @@ class Metric(Protocol):
         ...
 
 
-def measure(pair: Pair, metrics: Mapping[str, Metric], known: Mapping[Callable[[Pair], Any], Any] | None = None) -> dict[str, Any]:
-    """What the named metrics measure of one view, ready for ``Metric.add``; each source is asked once, those in ``known`` not at all."""
+def measure(
+    pair: Pair, metrics: Mapping[str, Metric], known: Mapping[Callable[[Pair], Any], Any] | None = None
+) -> dict[str, Any]:
+    """What the named metrics measure of one view, ready for ``Metric.add``; each source is asked once, those in
+    ``known`` not at all."""
     found: dict[Callable[[Pair], Any], Any] = dict(known or {})
     for metric in metrics.values():
         if metric.source not in found:
@@ -496,8 +508,8 @@ class Flicker:
 
 
 def neighbour_of(pair: Pair) -> Pair:
-    """What is kept of a view until the next one comes, to follow surfaces from one to the other: made and true colours, true depth and
-    classes, and the instances. The rest would fill the memory at large sizes."""
+    """What is kept of a view until the next one comes, to follow surfaces from one to the other: made and true colours,
+    true depth and classes, and the instances. The rest would fill the memory at large sizes."""
     facts = None if pair.facts is None else ViewFacts(instance=pair.facts.instance)
     return replace(pair, depth=None, semantics=None, truth_depth_valid=None, mask=None, moving=None, facts=facts)
 
@@ -537,7 +549,8 @@ def _psnr_of_dynamic(pair: Pair) -> float | None:
 
 @dataclass(frozen=True)
 class MetricRow:
-    """One row of the table: what it needs, which way is better (one: nearest to 1), how to build it (None: its weights are not shipped)."""
+    """One row of the table: what it needs, which way is better (one: nearest to 1), how to build it (None: its weights
+    are not shipped)."""
 
     title: str
     unit: str
@@ -589,9 +602,10 @@ METRICS: Final[dict[str, MetricRow]] = {
 
 
 def build_all(
-    distances: Mapping[str, Callable[[Pair], float | None]] | None = None, motion: StaticMotion | None = None,
+    distances: Mapping[str, Callable[[Pair], float | None]] | None = None,
+    motion: StaticMotion | None = None,
     more: Mapping[str, Metric] | None = None,
-) -> dict[str, Metric]:  # fmt: skip
+) -> dict[str, Metric]:
     """A fresh accumulator for every metric that can be computed.
 
     Args:

@@ -1,9 +1,9 @@
-"""Training steps that touch much memory, done in one native pass: losses with their gradients, pictures over the sky, means over boxes
-of pixels, and Adam.
+"""Training steps that touch much memory, done in one native pass: losses with their gradients, pictures over the sky,
+means over boxes of pixels, and Adam.
 
-Each has a plain-torch twin (``core.losses.photometric``, ``core.losses.class_loss``, ``torch_over``, ``torch_box_mean``,
-``core.table.torch_adam_columns``), which is used, and named once, where the native library is missing or the tensors are not float32
-on the CPU.
+Each has a plain-torch twin (``core.losses.photometric``, ``core.losses.class_loss``, ``torch_over``,
+``torch_box_mean``, ``core.table.torch_adam_columns``), which is used, and named once, where the native library is
+missing or the tensors are not float32 on the CPU.
 """
 
 from __future__ import annotations
@@ -25,23 +25,30 @@ from mudg.core.table import BETA1, BETA2, EPSILON, AdamColumn, torch_adam_column
 
 
 def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, weight: Tensor | None = None) -> Tensor:
-    """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[C, H, W]`` in [0, 1]; with a weight ``[H, W]`` for every pixel the
-    mean over all of them of weight times ``(1 - w) |p - t| + w (1 - SSIM)``.
+    """Scalar ``(1 - w) mean|p - t| + w (1 - mean SSIM)`` of images ``[C, H, W]`` in [0, 1]; with a weight ``[H, W]``
+    for every pixel the mean over all of them of weight times ``(1 - w) |p - t| + w (1 - SSIM)``.
 
-    Differentiable in the prediction (once); target and weight are data. The value does not depend on the number of threads.
-    SSIM: 11x11 Gaussian window, sigma 1.5 px, zero padding.
+    Differentiable in the prediction (once); target and weight are data. The value does not depend on the number of
+    threads. SSIM: 11x11 Gaussian window, sigma 1.5 px, zero padding.
 
     Raises:
         InputError: shapes differ or are not [C, H, W].
         UsageError: the weight is outside [0, 1].
     """
     if prediction.shape != target.shape or prediction.ndim != 3:
-        raise InputError("photometric: images must be [C, H, W] of one shape", expected=str(tuple(prediction.shape)),
-            got=str(tuple(target.shape)))  # fmt: skip
+        raise InputError(
+            "photometric: images must be [C, H, W] of one shape",
+            expected=str(tuple(prediction.shape)),
+            got=str(tuple(target.shape)),
+        )
     if not 0 <= ssim_weight <= 1:
         raise UsageError("the weight of SSIM must lie in [0, 1]", got=str(ssim_weight))
     if weight is not None and weight.shape != prediction.shape[1:]:
-        raise InputError("photometric: one weight for every pixel", expected=str(tuple(prediction.shape[1:])), got=str(tuple(weight.shape)))
+        raise InputError(
+            "photometric: one weight for every pixel",
+            expected=str(tuple(prediction.shape[1:])),
+            got=str(tuple(weight.shape)),
+        )
     weight = None if weight is None else weight.detach().to(prediction.dtype).contiguous()
     library = _library_for((prediction, target))
     if library is None or prediction.numel() == 0:
@@ -50,9 +57,12 @@ def photometric(prediction: Tensor, target: Tensor, ssim_weight: float = 0.2, we
     gradient, status = torch.empty_like(image), ctypes.c_int(0)
     library.mudg_photometric.restype = ctypes.c_double
     value = library.mudg_photometric(
-        *map(_address, (image, wanted, weight)), *map(ctypes.c_int, image.shape), ctypes.c_float(ssim_weight), _address(gradient),
+        *map(_address, (image, wanted, weight)),
+        *map(ctypes.c_int, image.shape),
+        ctypes.c_float(ssim_weight),
+        _address(gradient),
         ctypes.byref(status),
-    )  # fmt: skip
+    )
     if status.value != 0:
         raise ResourceError("not enough memory for the photometric loss", where=f"image {tuple(image.shape)}")
     return _WithGradient.apply(prediction, value, gradient)
@@ -77,11 +87,17 @@ def class_loss(
     """
     size = logits.shape[1:]
     if logits.ndim != 3 or not len(logits) or target.shape != size or weight.shape != size:
-        raise InputError("class loss: logits must be [C, H, W], target and weight [H, W]", expected=str(tuple(size)),
-            got=str([tuple(t.shape) for t in (logits, target, weight)]))  # fmt: skip
+        raise InputError(
+            "class loss: logits must be [C, H, W], target and weight [H, W]",
+            expected=str(tuple(size)),
+            got=str([tuple(t.shape) for t in (logits, target, weight)]),
+        )
     if lift is not None and (lift[1].shape != size or not 0 <= lift[0] < len(logits)):
-        raise InputError("class loss: the lift must be of one channel and [H, W]",
-            expected=f"0..{len(logits) - 1}, {tuple(size)}", got=f"{lift[0]}, {tuple(lift[1].shape)}")  # fmt: skip
+        raise InputError(
+            "class loss: the lift must be of one channel and [H, W]",
+            expected=f"0..{len(logits) - 1}, {tuple(size)}",
+            got=f"{lift[0]}, {tuple(lift[1].shape)}",
+        )
     library = _library_for((logits, weight))
     if library is None or logits.numel() == 0 or target.dtype != torch.int64:
         return losses.class_loss(logits, target, weight, total, lift)
@@ -90,16 +106,22 @@ def class_loss(
     gradient, status = torch.empty_like(values), ctypes.c_int(0)
     library.mudg_class_loss.restype = ctypes.c_double
     value = library.mudg_class_loss(
-        *map(_address, (values, ids, weight, added)), ctypes.c_int(channel), ctypes.c_int(len(values)),
-        ctypes.c_int64(ids.numel()), ctypes.c_float(1.0 / float(total)), _address(gradient), ctypes.byref(status),
-    )  # fmt: skip
+        *map(_address, (values, ids, weight, added)),
+        ctypes.c_int(channel),
+        ctypes.c_int(len(values)),
+        ctypes.c_int64(ids.numel()),
+        ctypes.c_float(1.0 / float(total)),
+        _address(gradient),
+        ctypes.byref(status),
+    )
     if status.value != 0:
         raise ResourceError("not enough memory for the class loss", where=f"logits {tuple(values.shape)}")
     return _WithGradient.apply(logits, value, gradient)
 
 
 def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
-    """``rgb + (1 - alpha) * coarse``, with the coarse picture enlarged to the size of the other (bilinear between pixel centres).
+    """``rgb + (1 - alpha) * coarse``, with the coarse picture enlarged to the size of the other (bilinear between pixel
+    centres).
 
     Differentiable (once) in all three.
 
@@ -110,8 +132,10 @@ def over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
         InputError: shapes do not fit.
     """
     if rgb.ndim != 3 or coarse.ndim != 3 or len(rgb) != len(coarse) or alpha.shape != (1, *rgb.shape[1:]):
-        raise InputError("over: pictures must be [C, H, W] and [C, h, w], alpha [1, H, W]",
-            got=str([tuple(t.shape) for t in (rgb, coarse, alpha)]))  # fmt: skip
+        raise InputError(
+            "over: pictures must be [C, H, W] and [C, h, w], alpha [1, H, W]",
+            got=str([tuple(t.shape) for t in (rgb, coarse, alpha)]),
+        )
     library = _library_for((rgb, alpha, coarse))
     if library is None or rgb.numel() == 0 or coarse.numel() == 0:
         return torch_over(rgb, alpha, coarse)
@@ -125,7 +149,8 @@ def torch_over(rgb: Tensor, alpha: Tensor, coarse: Tensor) -> Tensor:
 
 
 def box_mean(values: Tensor, size: int) -> Tensor:
-    """Means over ``size`` x ``size`` pixels (odd), of the same shape ``[..., H, W]``; at the borders, over what is there.
+    """Means over ``size`` x ``size`` pixels (odd), of the same shape ``[..., H, W]``; at the borders, over what is
+    there.
 
     Differentiable (once).
 
@@ -143,7 +168,9 @@ def box_mean(values: Tensor, size: int) -> Tensor:
 def torch_box_mean(values: Tensor, size: int) -> Tensor:
     """The plain-torch twin of ``box_mean``."""
     planes = values.reshape(1, -1, *values.shape[-2:])
-    return functional.avg_pool2d(planes, size, stride=1, padding=size // 2, count_include_pad=False).reshape(values.shape)
+    return functional.avg_pool2d(planes, size, stride=1, padding=size // 2, count_include_pad=False).reshape(
+        values.shape
+    )
 
 
 def adam_columns(columns: Sequence[AdamColumn], step: int, chosen: Tensor | None = None) -> None:
@@ -174,17 +201,31 @@ def adam_columns(columns: Sequence[AdamColumn], step: int, chosen: Tensor | None
         return
     rows = columns[0].parameter.shape[0]
     gradients = [one.gradient.detach().contiguous() for one in columns]
-    table = (_Column * len(columns))(*(
-        _Column(one.parameter.data_ptr(), gradient.data_ptr(), one.moment1.data_ptr(), one.moment2.data_ptr(),
-                one.parameter.numel() // rows if rows else 0, one.rate)
-        for one, gradient in zip(columns, gradients, strict=True)
-    ))  # fmt: skip
+    table = (_Column * len(columns))(
+        *(
+            _Column(
+                one.parameter.data_ptr(),
+                gradient.data_ptr(),
+                one.moment1.data_ptr(),
+                one.moment2.data_ptr(),
+                one.parameter.numel() // rows if rows else 0,
+                one.rate,
+            )
+            for one, gradient in zip(columns, gradients, strict=True)
+        )
+    )
     mask = None if chosen is None else chosen.contiguous()
     real, integer = ctypes.c_double, ctypes.c_int64
     library.mudg_adam(
-        table, ctypes.c_int(len(columns)), integer(rows), ctypes.c_void_p(None if mask is None else mask.data_ptr()),
-        real(BETA1), real(BETA2), real(EPSILON), integer(step),
-    )  # fmt: skip
+        table,
+        ctypes.c_int(len(columns)),
+        integer(rows),
+        ctypes.c_void_p(None if mask is None else mask.data_ptr()),
+        real(BETA1),
+        real(BETA2),
+        real(EPSILON),
+        integer(step),
+    )
     # The library wrote behind autograd's back: tell it, so that a graph that still needs the old values is refused.
     torch.autograd.graph.increment_version(in_place)
 
@@ -194,19 +235,26 @@ class _Column(ctypes.Structure):
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("parameter", "gradient", "moment1", "moment2")),
-        ("width", ctypes.c_int64), ("rate", ctypes.c_double), ("step_size", ctypes.c_float),
-    ]  # fmt: skip
+        ("width", ctypes.c_int64),
+        ("rate", ctypes.c_double),
+        ("step_size", ctypes.c_float),
+    ]
 
 
 def _check_column(column: AdamColumn, first: Tensor, chosen: Tensor | None) -> None:
     parameter = column.parameter
     tensors = (parameter, column.gradient, column.moment1, column.moment2)
     if any(t.shape != parameter.shape for t in tensors) or parameter.ndim == 0 or parameter.shape[0] != first.shape[0]:
-        raise InputError("adam: parameter, gradient and moments must share one shape [N, ...], all columns one N",
-            got=str([tuple(t.shape) for t in (*tensors, first)]))  # fmt: skip
+        raise InputError(
+            "adam: parameter, gradient and moments must share one shape [N, ...], all columns one N",
+            got=str([tuple(t.shape) for t in (*tensors, first)]),
+        )
     if chosen is not None and (chosen.shape != parameter.shape[:1] or chosen.dtype != torch.bool):
-        raise InputError("adam: the chosen rows must be bool, one per row", expected=f"bool[{parameter.shape[0]}]",
-            got=f"{chosen.dtype}{list(chosen.shape)}")  # fmt: skip
+        raise InputError(
+            "adam: the chosen rows must be bool, one per row",
+            expected=f"bool[{parameter.shape[0]}]",
+            got=f"{chosen.dtype}{list(chosen.shape)}",
+        )
 
 
 class _WithGradient(torch.autograd.Function):
@@ -231,7 +279,11 @@ class _Over(torch.autograd.Function):
         picture, cover, small = (t.detach().contiguous() for t in (rgb, alpha, coarse))
         out = torch.empty_like(picture)
         ctx.library, ctx.sizes = library, (ctypes.c_int * 5)(*picture.shape, *small.shape[1:])
-        _done(library.mudg_over(*map(_address, (picture, cover, small)), ctx.sizes, *map(_address, (out, None, None, None))))
+        _done(
+            library.mudg_over(
+                *map(_address, (picture, cover, small)), ctx.sizes, *map(_address, (out, None, None, None))
+            )
+        )
         ctx.save_for_backward(cover, small)
         return out
 
@@ -240,9 +292,11 @@ class _Over(torch.autograd.Function):
     def backward(ctx: Any, upstream: Tensor) -> tuple[Tensor | None, ...]:
         cover, small = ctx.saved_tensors
         of_alpha, of_coarse, gradient = torch.empty_like(cover), torch.empty_like(small), upstream.contiguous()
-        _done(ctx.library.mudg_over(
-            *map(_address, (None, cover, small)), ctx.sizes, *map(_address, (None, gradient, of_alpha, of_coarse))
-        ))  # fmt: skip
+        _done(
+            ctx.library.mudg_over(
+                *map(_address, (None, cover, small)), ctx.sizes, *map(_address, (None, gradient, of_alpha, of_coarse))
+            )
+        )
         return upstream, of_alpha, of_coarse, None
 
 

@@ -8,9 +8,9 @@ Symbols, as in the diffusion literature:
     SNR_t         alpha_t^2 / sigma_t^2
 
 The schedule is the one of the published street-view model: betas linear in their square roots (0.00085 to 0.012, 1000
-steps), rescaled so that the last step carries no signal at all (Lin et al., "Common diffusion noise schedules and sample
-steps are flawed", algorithm 1), and an optional *dynamic rescale* that multiplies x_0 by a factor falling from 1 to
-`base_scale` over the first 400 steps.
+steps), rescaled so that the last step carries no signal at all (Lin et al., "Common diffusion noise schedules and
+sample steps are flawed", algorithm 1), and an optional *dynamic rescale* that multiplies x_0 by a factor falling from 1
+to `base_scale` over the first 400 steps.
 
 A step index `t` runs from 0 (nearly clean) to `steps - 1` (pure noise).
 """
@@ -57,8 +57,11 @@ class Schedule:
         if config.steps < 2:
             raise UsageError("a noise schedule needs at least two steps", expected=">= 2", got=str(config.steps))
         if not 0 < config.beta_start <= config.beta_end < 1:
-            raise UsageError("betas of the noise schedule are out of order", expected="0 < beta_start <= beta_end < 1",
-                got=f"{config.beta_start}, {config.beta_end}")  # fmt: skip
+            raise UsageError(
+                "betas of the noise schedule are out of order",
+                expected="0 < beta_start <= beta_end < 1",
+                got=f"{config.beta_start}, {config.beta_end}",
+            )
         self.config = config
         betas = np.linspace(math.sqrt(config.beta_start), math.sqrt(config.beta_end), config.steps) ** 2
         root = np.sqrt(np.cumprod(1.0 - betas))
@@ -101,11 +104,13 @@ class Schedule:
         return alpha * noise - sigma * scale * x0
 
 
-def x0_and_eps(x: Tensor, output: Tensor, alpha: Tensor, sigma: Tensor, prediction: Prediction) -> tuple[Tensor, Tensor]:
+def x0_and_eps(
+    x: Tensor, output: Tensor, alpha: Tensor, sigma: Tensor, prediction: Prediction
+) -> tuple[Tensor, Tensor]:
     """Clean data and noise implied by a network output at one noise level.
 
-    `x`, `output` [B,...]; `alpha`, `sigma` broadcastable. With `prediction="x0"` the noise is (x - alpha x0) / sigma, with
-    sigma floored at 1e-4.
+    `x`, `output` [B,...]; `alpha`, `sigma` broadcastable. With `prediction="x0"` the noise is (x - alpha x0) / sigma,
+    with sigma floored at 1e-4.
     """
     if prediction == "v":
         return alpha * x - sigma * output, alpha * output + sigma * x
@@ -117,8 +122,8 @@ def x0_and_eps(x: Tensor, output: Tensor, alpha: Tensor, sigma: Tensor, predicti
 def loss_weight(schedule: Schedule, t: Tensor, clip: float = 5.0, floor: float = 1.0) -> Tensor:
     """Weight f32[B] on the squared error of x0: the v-loss weight 1 + SNR, clipped to [floor, clip].
 
-    The squared error of v equals (1 + SNR) times that of x0. Without the clip the nearly clean steps rule the loss; without
-    a floor (as in min-SNR weighting) a zero-terminal-SNR model is never trained at its first sampling step.
+    The squared error of v equals (1 + SNR) times that of x0. Without the clip the nearly clean steps rule the loss;
+    without a floor (as in min-SNR weighting) a zero-terminal-SNR model is never trained at its first sampling step.
     """
     return (1.0 + schedule.snr(t)).clamp(min=floor, max=clip)
 
@@ -155,8 +160,8 @@ def video_noise(shape: Sequence[int], generator: torch.Generator, shared: float 
 def guide(conditional: Tensor, unconditional: Tensor, scale: float, rescale: float = 0.0) -> Tensor:
     """Classifier-free guidance u + scale (c - u), with the standard deviation pulled back to that of `c`.
 
-    `rescale` r mixes r (guided * std(c) / std(guided)) with (1 - r) guided; standard deviations are per sample over all other
-    axes, unbiased (Lin et al., equations 15 and 16).
+    `rescale` r mixes r (guided * std(c) / std(guided)) with (1 - r) guided; standard deviations are per sample over all
+    other axes, unbiased (Lin et al., equations 15 and 16).
     """
     guided = unconditional + scale * (conditional - unconditional)
     if rescale <= 0:
@@ -185,8 +190,8 @@ def ddim(
 
     start        x at noise level step_indices[0], [B,...]
     eta          0 deterministic, 1 ancestral; needs `draw`, a function giving fresh noise of start's shape
-    last         what the final step returns: "x0" the clean estimate itself; "first_alpha" one more step to alpha_bar[0],
-                 which the published sampler does
+    last         what the final step returns: "x0" the clean estimate itself; "first_alpha" one more step to
+                 alpha_bar[0], which the published sampler does
 
     With a dynamic rescale the estimate of x0 is multiplied by scale_previous / scale_t at each step, and the final
     result keeps the factor of the last step visited, as the published sampler does.
@@ -218,11 +223,11 @@ def dpm_solver(
 ) -> Tensor:
     """DPM-Solver++(2M) (Lu et al. 2022, algorithm 2): second order from two consecutive estimates of x0, deterministic.
 
-    With lambda = log(alpha / sigma) and h its step, x_next = sigma_next / sigma x - alpha_next (exp(-h) - 1) D, where D is
-    extrapolated from the last two estimates. A first step at zero SNR (lambda = -infinity) is taken at first order, and so
-    is the one after it, whose extrapolation weight is then 0; the last step returns the estimate itself. With a dynamic
-    rescale, x_t is alpha_t scale_t x_0 + sigma_t eps: alpha times scale takes the place of alpha, and the result is x_0 itself,
-    without the factor that `ddim` leaves. Arguments and result as for `ddim`.
+    With lambda = log(alpha / sigma) and h its step, x_next = sigma_next / sigma x - alpha_next (exp(-h) - 1) D, where D
+    is extrapolated from the last two estimates. A first step at zero SNR (lambda = -infinity) is taken at first order,
+    and so is the one after it, whose extrapolation weight is then 0; the last step returns the estimate itself. With a
+    dynamic rescale, x_t is alpha_t scale_t x_0 + sigma_t eps: alpha times scale takes the place of alpha, and the
+    result is x_0 itself, without the factor that `ddim` leaves. Arguments and result as for `ddim`.
     """
     alpha = schedule.alpha_bar.sqrt() * schedule.scale.double()
     sigma = (1 - schedule.alpha_bar).clamp(min=0).sqrt()
@@ -246,8 +251,8 @@ def dpm_solver(
 
 
 SAMPLERS: dict[str, Callable[..., Tensor]] = {"ddim": ddim, "dpm_solver": dpm_solver}
-"""Every sampler by name. Each costs one denoiser pass per step (two with classifier-free guidance). A new one is a function
-that takes the positional arguments and `prediction` of `ddim`, and one row here and in `SAMPLER_SETTINGS`."""
+"""Every sampler by name. Each costs one denoiser pass per step (two with classifier-free guidance). A new one is a
+function that takes the positional arguments and `prediction` of `ddim`, and one row here and in `SAMPLER_SETTINGS`."""
 
 SAMPLER_SETTINGS: dict[str, tuple[str, ...]] = {"ddim": ("eta", "draw", "last"), "dpm_solver": ()}
 """Sampler -> its further settings. Any other is refused by `check_sampler`, never ignored."""
@@ -260,6 +265,10 @@ def check_sampler(sampler: str, settings: Iterable[str] = ()) -> None:
     for name in settings:
         if name not in SAMPLER_SETTINGS[sampler]:
             takers = ", ".join(other for other, taken in SAMPLER_SETTINGS.items() if name in taken)
-            raise UsageError(f"the sampler {sampler} does not take the setting {name}", where=f"sampler {sampler}",
+            raise UsageError(
+                f"the sampler {sampler} does not take the setting {name}",
+                where=f"sampler {sampler}",
                 expected=f"{name} with {takers}" if takers else ", ".join(SAMPLER_SETTINGS[sampler]) or "no settings",
-                got=name, remedy=f"leave {name} out, or choose a sampler that takes it")  # fmt: skip
+                got=name,
+                remedy=f"leave {name} out, or choose a sampler that takes it",
+            )

@@ -27,19 +27,20 @@ from mudg.base.types import Observation
 
 Map = TypeVar("Map", Tensor, NDArray[Any])
 
-# Near = warm, far = cold. Saturated all the way, so that points stand out from the image under them and far is not taken for missing.
+# Near = warm, far = cold. Saturated all the way, so that points stand out from the image under them and far is not
+# taken for missing.
 _DEPTH_STOPS: Final = np.array(
     [[220, 30, 30], [250, 120, 30], [230, 210, 50], [90, 220, 90], [40, 190, 200], [50, 110, 230], [70, 40, 160]],
     np.float64,
 )
 
 
-# ---- sizes -----------------------------------------------------------------------------------------------------------
+# ---- sizes ---------------------------------------------------------------------------------------
 
 
 def resize_area(rgb: NDArray[np.uint8], width: int, height: int) -> NDArray[np.uint8]:
-    """Image u8[H, W, 3] or plane u8[H, W] to another size by averaging areas (Pillow's box filter); the same array if the size is right
-    already."""
+    """Image u8[H, W, 3] or plane u8[H, W] to another size by averaging areas (Pillow's box filter); the same array if
+    the size is right already."""
     if rgb.shape[:2] == (height, width):
         return rgb
     return np.array(Image.fromarray(rgb).resize((width, height), Image.Resampling.BOX))
@@ -58,8 +59,8 @@ def resize_rgb(rgb: Tensor, height: int, width: int) -> Tensor:
 
 
 def bilinear_from_corner(images: Tensor, side: int) -> Tensor:
-    """Images f32[n, C, H, W] squashed to ``side`` x ``side``, bilinear as TensorFlow 1 did it: pixel k of the result lies at k * in /
-    out, with no half-pixel offset and no antialiasing."""
+    """Images f32[n, C, H, W] squashed to ``side`` x ``side``, bilinear as TensorFlow 1 did it: pixel k of the result
+    lies at k * in / out, with no half-pixel offset and no antialiasing."""
     for axis in (-2, -1):
         count = images.shape[axis]
         place = torch.arange(side, dtype=torch.float32) * (count / side)
@@ -106,7 +107,7 @@ def _area_weights(old: int, new: int) -> Any:
     return csr_matrix(((share * new / old).astype(np.float32), (rows, columns)), (new, old))
 
 
-# ---- colours ---------------------------------------------------------------------------------------------------------
+# ---- colours -------------------------------------------------------------------------------------
 
 
 def to_bytes(rgb: Tensor) -> NDArray[np.uint8]:
@@ -120,7 +121,8 @@ def to_bytes(rgb: Tensor) -> NDArray[np.uint8]:
 def depth_colors(depth_m: NDArray[np.floating], near_m: float = 2.0, far_m: float = 100.0) -> NDArray[np.uint8]:
     """Depth f[...] in metres to colours u8[..., 3], logarithmic from near (warm) to far (cold); no depth is black.
 
-    The one colour map of depth: videos, pages, previews and contact sheets use it. Pictures are for people; nothing reads them back.
+    The one colour map of depth: videos, pages, previews and contact sheets use it. Pictures are for people; nothing
+    reads them back.
     """
     known = np.isfinite(depth_m) & (depth_m > 0)
     safe = np.where(known, depth_m, far_m).clip(near_m, far_m)
@@ -149,7 +151,7 @@ def error_image(rgb: Tensor, truth: Tensor) -> NDArray[np.uint8]:
     return (np.stack(channels, -1) * 255).round().astype(np.uint8)
 
 
-# ---- panels ----------------------------------------------------------------------------------------------------------
+# ---- panels --------------------------------------------------------------------------------------
 
 
 def panels_of(observation: Observation) -> list[NDArray[np.uint8]]:

@@ -27,7 +27,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
 
-# zbuffer --------------------------------------------------------------------------------------------------------------
+# zbuffer ------------------------------------------------------------------------------------------
 #
 # The z-buffer of points: the nearest point of every pixel, native or, operation for operation the same, in numpy.
 
@@ -51,7 +51,8 @@ class PointLayer:
 
 @dataclass(frozen=True, slots=True)
 class DrawLimits:
-    """Depth range in metres, and squares that grow with nearness: side ``splat_m`` metres (0 = do not grow), at most ``most_px``."""
+    """Depth range in metres, and squares that grow with nearness: side ``splat_m`` metres (0 = do not grow), at most
+    ``most_px``."""
 
     near_m: float = 0.1
     far_m: float = 200.0
@@ -62,7 +63,8 @@ class DrawLimits:
 def draw_points(
     layers: Sequence[PointLayer], view: View, limits: DrawLimits
 ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-    """Depth f32[H, W] in metres (0 = none) and index i32[H, W] of the nearest point of every pixel, over all layers (-1 = none).
+    """Depth f32[H, W] in metres (0 = none) and index i32[H, W] of the nearest point of every pixel, over all layers (-1
+    = none).
 
     Equal depths go to the lower index.
     """
@@ -75,8 +77,15 @@ def draw_points(
         if len(layer.xyz):
             cam_from_points = (view.cam_from_world @ layer.world_from_points)[:3].astype(np.float32)
             limit = max(limits.most_px, layer.splat_px)
-            arguments = (np.ascontiguousarray(layer.xyz, np.float32), first, cam_from_points, view.camera,
-                         (layer.splat_px, limits.splat_m, limit), (limits.near_m, limits.far_m), keys)  # fmt: skip
+            arguments = (
+                np.ascontiguousarray(layer.xyz, np.float32),
+                first,
+                cam_from_points,
+                view.camera,
+                (layer.splat_px, limits.splat_m, limit),
+                (limits.near_m, limits.far_m),
+                keys,
+            )
             if library is None:
                 _draw_numpy(*arguments)
             else:
@@ -97,23 +106,44 @@ def pointer(array: NDArray[np.generic]) -> ctypes.c_void_p:
 
 
 def _draw_native(
-    library: ctypes.CDLL, xyz: NDArray[np.float32], first: int, cam_from_points: NDArray[np.float32], camera: Camera,
-    splat: tuple[float, float, float], limits_m: tuple[float, float], keys: NDArray[np.uint64],
-) -> None:  # fmt: skip
+    library: ctypes.CDLL,
+    xyz: NDArray[np.float32],
+    first: int,
+    cam_from_points: NDArray[np.float32],
+    camera: Camera,
+    splat: tuple[float, float, float],
+    limits_m: tuple[float, float],
+    keys: NDArray[np.uint64],
+) -> None:
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float32)
     matrix = np.ascontiguousarray(cam_from_points)
     real = ctypes.c_float
     library.mudg_zbuffer_draw(
-        pointer(xyz), ctypes.c_int64(len(xyz)), ctypes.c_uint32(first), pointer(matrix), pointer(intrinsics),
-        ctypes.c_int(camera.width), ctypes.c_int(camera.height), real(splat[0]), real(splat[1]), real(splat[2]),
-        real(limits_m[0]), real(limits_m[1]), pointer(keys),
-    )  # fmt: skip
+        pointer(xyz),
+        ctypes.c_int64(len(xyz)),
+        ctypes.c_uint32(first),
+        pointer(matrix),
+        pointer(intrinsics),
+        ctypes.c_int(camera.width),
+        ctypes.c_int(camera.height),
+        real(splat[0]),
+        real(splat[1]),
+        real(splat[2]),
+        real(limits_m[0]),
+        real(limits_m[1]),
+        pointer(keys),
+    )
 
 
 def _draw_numpy(
-    xyz: NDArray[np.float32], first: int, cam_from_points: NDArray[np.float32], camera: Camera,
-    splat: tuple[float, float, float], limits_m: tuple[float, float], keys: NDArray[np.uint64],
-) -> None:  # fmt: skip
+    xyz: NDArray[np.float32],
+    first: int,
+    cam_from_points: NDArray[np.float32],
+    camera: Camera,
+    splat: tuple[float, float, float],
+    limits_m: tuple[float, float],
+    keys: NDArray[np.uint64],
+) -> None:
     """The native loop in numpy, operation for operation in float32, so that both give the same bits."""
     f = np.float32
     x, y, z = xyz.T
@@ -147,20 +177,21 @@ def _draw_numpy(
             np.minimum.at(flat, (top[inside] + dy) * camera.width + left[inside] + dx, key[inside])
 
 
-# visible --------------------------------------------------------------------------------------------------------------
+# visible ------------------------------------------------------------------------------------------
 #
 # Which LiDAR points a camera sees: one z-buffer, one rule, and its settings for each use by name.
 #
-# A scanner stands elsewhere than the camera and sees past things that hide what lies behind them. A point is hidden if something clearly
-# nearer lies around it in the image:
+# A scanner stands elsewhere than the camera and sees past things that hide what lies behind them. A point is hidden if
+# something clearly nearer lies around it in the image:
 #
 #     depth > nearer * (1 + ratio) + slack_m
 #
-# ``nearer`` is the depth of what may hide it. Points are sparse, so it is looked for around the point as well, within ``reach``:
+# ``nearer`` is the depth of what may hide it. Points are sparse, so it is looked for around the point as well, within
+# ``reach``:
 #
 # * ``sides="any"``: the nearest depth within reach. For surfaces that fill the space between their points.
-# * ``sides="opposite"``: nearer depths on two opposite sides, above and below or left and right; of the two the farther. A surface seen
-#   through a gap is hidden, what lies beside an edge is not.
+# * ``sides="opposite"``: nearer depths on two opposite sides, above and below or left and right; of the two the
+#   farther. A surface seen through a gap is hidden, what lies beside an edge is not.
 #
 # ``RULES`` holds the settings; the sizes are in pixels, or follow from the angle between the scanner's beams.
 
@@ -172,12 +203,13 @@ class HidingRule:
     Args:
         ratio, slack_m: a point is hidden if farther than ``nearer * (1 + ratio) + slack_m``.
         sides: "any" or "opposite"; see the module text.
-        reach_px: (horizontal, vertical) distance within which nearer points are looked for; those of an image when the angle between
-            beams is not given, and at least this far when it is.
-        reach_beams: (horizontal degrees, vertical share of the angle between beams): reach that follows from the scanner; 0 = none.
+        reach_px: (horizontal, vertical) distance within which nearer points are looked for; those of an image when the
+            angle between beams is not given, and at least this far when it is.
+        reach_beams: (horizontal degrees, vertical share of the angle between beams): reach that follows from the
+            scanner; 0 = none.
         inside: the reach that follows from the scanner ends a pixel short of the next beam.
-        widen: "opposite": how far across its direction a side is looked at, as a share of the other direction's reach, at least a
-            pixel; 0 = not at all.
+        widen: "opposite": how far across its direction a side is looked at, as a share of the other direction's reach,
+            at least a pixel; 0 = not at all.
     """
 
     ratio: float
@@ -213,15 +245,20 @@ RULES: Final[Mapping[str, HidingRule]] = {
     "colour": HidingRule(ratio=0.053, slack_m=0.21, reach_beams=(0.1, 0.6)),
     "drawn": HidingRule(ratio=0.1, slack_m=0.3),
 }
-"""sweep: returns beside an image: for labels, dense depth, the depth a fit learns from, and that renders are scored against. condition:
-fused clouds drawn for the diffusion model. colour: standing things that keep an image from colouring a point.
-drawn: points drawn as squares of a size in metres, which then need no reach (``core.project``)."""
+"""sweep: returns beside an image: for labels, dense depth, the depth a fit learns from, and that renders are scored
+against. condition: fused clouds drawn for the diffusion model. colour: standing things that keep an image from
+colouring a point. drawn: points drawn as squares of a size in metres, which then need no reach (``core.project``)."""
 
 
 def visible_depth(
-    view: View, xyz_world: NDArray[np.floating], rule: HidingRule, *,
-    gap_deg: float = 0.0, near_m: float = 0.5, far_m: float = 200.0,
-) -> NDArray[np.float32]:  # fmt: skip
+    view: View,
+    xyz_world: NDArray[np.floating],
+    rule: HidingRule,
+    *,
+    gap_deg: float = 0.0,
+    near_m: float = 0.5,
+    far_m: float = 200.0,
+) -> NDArray[np.float32]:
     """The nearest point of every pixel, without the hidden ones; f32[H, W] metres, NaN = none.
 
     Args:
@@ -243,7 +280,8 @@ def visible_depth(
 
 
 def hidden_pixels(depth: NDArray[np.float32], rule: HidingRule, reach: tuple[int, int]) -> NDArray[np.bool_]:
-    """Which measured pixels of a depth map f32[H, W] (infinite = none) others of it hide, bool[H, W]; ``reach`` in pixels."""
+    """Which measured pixels of a depth map f32[H, W] (infinite = none) others of it hide, bool[H, W]; ``reach`` in
+    pixels."""
     known = np.isfinite(depth)
     nearer = nearer_depth(depth, rule, reach)
     hidden = np.zeros(depth.shape, bool)
@@ -252,7 +290,8 @@ def hidden_pixels(depth: NDArray[np.float32], rule: HidingRule, reach: tuple[int
 
 
 def seen_pixels(depth: NDArray[np.float32], valid: NDArray[np.bool_], rule: HidingRule) -> NDArray[np.bool_]:
-    """Valid pixels of a depth map f32[H, W] that others of it do not hide by a rule whose reach is in pixels, bool[H, W]."""
+    """Valid pixels of a depth map f32[H, W] that others of it do not hide by a rule whose reach is in pixels, bool[H,
+    W]."""
     return valid & ~hidden_pixels(np.where(valid, depth, np.float32(np.inf)), rule, rule.reach_px)
 
 
@@ -276,12 +315,13 @@ def nearer_depth(nearest: NDArray[np.float32], rule: HidingRule, reach: tuple[in
 
 
 def _minimum(values: NDArray[np.float32], size: int, axis: int, shift: int) -> NDArray[np.float32]:
-    """Running minimum over ``size`` cells along an axis, the window moved by ``shift``; nothing lies beyond the edge."""
+    """Running minimum over ``size`` cells along an axis, the window moved by ``shift``; nothing lies beyond the
+    edge."""
     found = ndimage.minimum_filter1d(values, size, axis=axis, origin=shift, mode="constant", cval=np.inf)
     return np.asarray(found, np.float32)
 
 
-# project --------------------------------------------------------------------------------------------------------------
+# project ------------------------------------------------------------------------------------------
 
 
 _MAX_POINTS: Final = 2**31 - 1
@@ -359,7 +399,8 @@ def project_cloud(
     view: View,
     config: ProjectConfig | None = None,
 ) -> SparseView:
-    """Draw a fused cloud, its objects placed at the given poses, composed by depth, in the colours of the view's camera.
+    """Draw a fused cloud, its objects placed at the given poses, composed by depth, in the colours of the view's
+    camera.
 
     Args:
         cloud: the static world and one cloud per object in its box frame.
@@ -392,7 +433,9 @@ def _draw(
         raise InputError("too many points for one view", expected=f"<= {_MAX_POINTS}", got=str(total))
     depth, index = draw_points(layers, view, DrawLimits(config.near_m, config.far_m))
     if config.occluder_m > 0:
-        nearest, _ = draw_points(layers, view, DrawLimits(config.near_m, config.far_m, config.occluder_m, config.occluder_max_px))
+        nearest, _ = draw_points(
+            layers, view, DrawLimits(config.near_m, config.far_m, config.occluder_m, config.occluder_max_px)
+        )
         hidden = RULES["drawn"].hides(nearest, depth)
         depth[hidden], index[hidden] = 0.0, -1
     color = np.zeros((3, camera.height, camera.width), np.float32)
@@ -428,8 +471,8 @@ def _paint(index: NDArray[np.int32], rgb: NDArray[np.uint8], first: int, color: 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ProjectedPoints:
-    """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of objects),
-    semantics u8[H,W] (255 = unknown)."""
+    """A projected cloud: rgb f32[3,H,W] in [0,1], depth f32[H,W] m, valid bool[H,W], moving bool[H,W] (points of
+    objects), semantics u8[H,W] (255 = unknown)."""
 
     rgb: Tensor
     depth: Tensor
@@ -438,7 +481,9 @@ class ProjectedPoints:
     semantics: Tensor
 
 
-def project_sparse(cloud: FusedCloud, tracks: Sequence[Track], view: View, config: ProjectConfig, *, hide: bool) -> ProjectedPoints:
+def project_sparse(
+    cloud: FusedCloud, tracks: Sequence[Track], view: View, config: ProjectConfig, *, hide: bool
+) -> ProjectedPoints:
     """Project a fused cloud into a view, its objects where they are at that time.
 
     Args:

@@ -1,8 +1,9 @@
-"""How well vehicles are where they should be: NTA-IoU from a detector's boxes, and agent IoU from class maps and exact truth.
+"""How well vehicles are where they should be: NTA-IoU from a detector's boxes, and agent IoU from class maps and exact
+truth.
 
-``NTA-IoU`` (DriveDreamer4D) asks a detector for boxes in the generated image and compares each with the nearest projected 3-D box, which
-ignores what hides it. ``agent IoU`` is this package's own measure: the class map of an image against what is really visible.
-A box in an image is f64[4]: left, top, right, bottom in pixels.
+``NTA-IoU`` (DriveDreamer4D) asks a detector for boxes in the generated image and compares each with the nearest
+projected 3-D box, which ignores what hides it. ``agent IoU`` is this package's own measure: the class map of an image
+against what is really visible. A box in an image is f64[4]: left, top, right, bottom in pixels.
 """
 
 from __future__ import annotations
@@ -19,13 +20,14 @@ from scipy import ndimage
 from mudg.base import geometry, palette
 from mudg.base.types import Track, View
 
-# lane scores ----------------------------------------------------------------------------------------------------------
+# lane scores --------------------------------------------------------------------------------------
 #
-# How well road markings are where they should be: NTL-IoU from a detector's masks, and lane IoU and lane gradients from the images.
+# How well road markings are where they should be: NTL-IoU from a detector's masks, and lane IoU and lane gradients from
+# the images.
 #
-# ``NTL-IoU`` (DriveDreamer4D) compares the mask of a lane detector with lane lines of a map drawn into the view; nothing hides them.
-# ``lane IoU`` is this package's own measure: a fixed rule finds bright stripes on the road, and they are compared with the exact
-# markings.
+# ``NTL-IoU`` (DriveDreamer4D) compares the mask of a lane detector with lane lines of a map drawn into the view;
+# nothing hides them. ``lane IoU`` is this package's own measure: a fixed rule finds bright stripes on the road, and
+# they are compared with the exact markings.
 
 
 NTL_WIDTH_PX: Final = 640
@@ -57,8 +59,8 @@ Mask = NDArray[np.bool_]
 def lane_truth(view: View, lines: Sequence[NDArray[np.float64]]) -> Mask:
     """Lane lines of a map as the published score draws them, bool[360, 640].
 
-    Points of a line within 75 m and at most 10 m beside the camera are kept, lines are cut where points are not; what is left is
-    drawn 20 pixels thick at 1920 x 1280 and reduced bilinearly; every touched pixel counts.
+    Points of a line within 75 m and at most 10 m beside the camera are kept, lines are cut where points are not; what
+    is left is drawn 20 pixels thick at 1920 x 1280 and reduced bilinearly; every touched pixel counts.
 
     Args:
         lines: places f64[N, 3] in the world, metres, of each line.
@@ -134,7 +136,8 @@ def at_lane_size(mask: NDArray[np.generic]) -> Mask:
 def ntl_iou(found: Mask, true: Mask) -> float:
     """(IoU of the background + IoU of lanes) / 2 of one frame, times 100; a class that neither has counts as 0.
 
-    An image without any lane found scores 47 to 50, because nearly everything is background: read differences of single points.
+    An image without any lane found scores 47 to 50, because nearly everything is background: read differences of single
+    points.
     """
     return 50.0 * (_iou(~found, ~true) + _iou(found, true))
 
@@ -144,7 +147,7 @@ def _iou(a: Mask, b: Mask) -> float:
     return float((a & b).sum() / union) if union else 0.0
 
 
-# ---- markings of the image itself -----------------------------------------------------------------------------------------
+# ---- markings of the image itself ----------------------------------------------------------------
 
 
 def gray_of(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
@@ -156,9 +159,9 @@ def gray_of(rgb: NDArray[np.floating]) -> NDArray[np.float64]:
 def bright_stripes(rgb: NDArray[np.floating], road: Mask) -> Mask:
     """Road markings of an image by a fixed rule, bool[H, W].
 
-    The image is blurred a little; a pixel of the road is a marking if it is brighter by ``CONTRAST`` than what an opening along its
-    row, an eighth of the image wide, leaves of it; specks are left out. Only pixels of the road are looked at: beside a dark car it is no
-    marking.
+    The image is blurred a little; a pixel of the road is a marking if it is brighter by ``CONTRAST`` than what an
+    opening along its row, an eighth of the image wide, leaves of it; specks are left out. Only pixels of the road are
+    looked at: beside a dark car it is no marking.
 
     Args:
         rgb: colours ``[3, H, W]`` in [0, 1]. road: pixels where markings are looked for.
@@ -180,7 +183,8 @@ def bright_stripes(rgb: NDArray[np.floating], road: Mask) -> Mask:
 
 
 def tolerant_iou(found: Mask, true: Mask, tolerance_px: int = TOLERANCE_PX) -> tuple[float, float]:
-    """(Hits, hits + misses + false alarms) of thin structures: pixels count as hit if the other mask has one within ``tolerance_px``.
+    """(Hits, hits + misses + false alarms) of thin structures: pixels count as hit if the other mask has one within
+    ``tolerance_px``.
 
     Hits are the mean of those of either mask. Both numbers add up over frames; their ratio is the IoU.
     """
@@ -191,9 +195,12 @@ def tolerant_iou(found: Mask, true: Mask, tolerance_px: int = TOLERANCE_PX) -> t
 
 
 def rows_of(mask: Mask, margin: int) -> slice:
-    """Rows in which a mask has pixels, and ``margin`` more on both sides where the image has them; none for an empty mask."""
+    """Rows in which a mask has pixels, and ``margin`` more on both sides where the image has them; none for an empty
+    mask."""
     rows = np.flatnonzero(mask.any(1))
-    return slice(max(0, int(rows[0]) - margin), min(len(mask), int(rows[-1]) + 1 + margin)) if len(rows) else slice(0, 0)
+    return (
+        slice(max(0, int(rows[0]) - margin), min(len(mask), int(rows[-1]) + 1 + margin)) if len(rows) else slice(0, 0)
+    )
 
 
 def _grown(mask: Mask, pixels: int) -> Mask:
@@ -205,7 +212,8 @@ def _grown(mask: Mask, pixels: int) -> Mask:
 
 
 def lane_band(marking: Mask) -> Mask:
-    """The band around markings in which gradients are compared: 8 pixels to each side in an image 1920 pixels wide, at least 2."""
+    """The band around markings in which gradients are compared: 8 pixels to each side in an image 1920 pixels wide, at
+    least 2."""
     return _grown(marking, max(2, round(BAND_PX * marking.shape[1] / NTL_DRAWN[0])))
 
 
@@ -221,11 +229,12 @@ def edge_correlation(a: NDArray[np.float64], b: NDArray[np.float64], band: Mask)
     return float(x @ y) / scale if scale > 0 else float("nan")
 
 
-# ---- the recorded image on the road, seen from beside ---------------------------------------------------------------------
+# ---- the recorded image on the road, seen from beside --------------------------------------------
 
 
 def plane_points(view: View, plane: NDArray[np.float64], far_m: float = LANE_FAR_M) -> NDArray[np.float64]:
-    """Where pixels' rays meet the ground plane z = a x + b y + c, f64[H, W, 3] in the world; NaN above it and beyond ``far_m``."""
+    """Where pixels' rays meet the ground plane z = a x + b y + c, f64[H, W, 3] in the world; NaN above it and beyond
+    ``far_m``."""
     camera = view.camera
     x, y = geometry.pixel_rays(camera)
     rays = np.stack(np.broadcast_arrays(x[None], y[:, None], np.ones((camera.height, camera.width))), -1)
@@ -242,7 +251,8 @@ def plane_points(view: View, plane: NDArray[np.float64], far_m: float = LANE_FAR
 def seen_from(
     view: View, rgb: NDArray[np.floating], xyz_world: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], Mask]:
-    """Values f64[C, h, w] that an image ``[C, H, W]`` has where it shows places f64[h, w, 3] (bilinear), and where it shows them."""
+    """Values f64[C, h, w] that an image ``[C, H, W]`` has where it shows places f64[h, w, 3] (bilinear), and where it
+    shows them."""
     shape = xyz_world.shape[:2]
     uv, z = geometry.project(view, xyz_world.reshape(-1, 3))
     width, height = view.camera.width, view.camera.height
@@ -253,7 +263,7 @@ def seen_from(
     return np.stack(colors).reshape(len(rgb), *shape), inside.reshape(shape)
 
 
-# box scores -----------------------------------------------------------------------------------------------------------
+# box scores ---------------------------------------------------------------------------------------
 
 
 ImageBox = NDArray[np.float64]
@@ -279,7 +289,8 @@ def iou(a: ImageBox, b: ImageBox) -> float:
 
 
 def clipped_box(view: View, world_from_box: NDArray[np.float64], size_m: NDArray[np.float64]) -> ImageBox | None:
-    """Outline of what lies ahead of a view's near plane (0.3 m) of a 3-D box, not cut at the image's edges; None outside the image."""
+    """Outline of what lies ahead of a view's near plane (0.3 m) of a 3-D box, not cut at the image's edges; None
+    outside the image."""
     hull = geometry.box_hull(view, world_from_box, size_m)
     if hull is None:
         return None
@@ -287,8 +298,8 @@ def clipped_box(view: View, world_from_box: NDArray[np.float64], size_m: NDArray
 
 
 def published_box(view: View, world_from_box: NDArray[np.float64], size_m: NDArray[np.float64]) -> ImageBox | None:
-    """The same as published scores compute it: all eight corners are divided by their depth, also those behind the camera, so that a
-    box beside the camera becomes one that means nothing. None if no corner lies ahead."""
+    """The same as published scores compute it: all eight corners are divided by their depth, also those behind the
+    camera, so that a box beside the camera becomes one that means nothing. None if no corner lies ahead."""
     corners = geometry.transform_points(view.cam_from_world @ world_from_box, geometry.box_corners(size_m))
     if not (corners[:, 2] > 0).any():
         return None
@@ -298,11 +309,12 @@ def published_box(view: View, world_from_box: NDArray[np.float64], size_m: NDArr
 
 
 def nta_truths(view: View, tracks: Sequence[Track], as_published: bool = False) -> list[tuple[Track, ImageBox]]:
-    """Boxes of the vehicles that a view shows, in whole pixels of an image of 480 x 320; only those that lie inside it whole.
+    """Boxes of the vehicles that a view shows, in whole pixels of an image of 480 x 320; only those that lie inside it
+    whole.
 
     Args:
-        tracks: candidates; those without a pose at the view's time or that are no vehicles are left out. Nothing is asked about what
-            hides them.
+        tracks: candidates; those without a pose at the view's time or that are no vehicles are left out. Nothing is
+            asked about what hides them.
         as_published: boxes of corners behind the camera, too (``published_box``).
     """
     box_of = published_box if as_published else clipped_box
@@ -321,7 +333,8 @@ def nta_truths(view: View, tracks: Sequence[Track], as_published: bool = False) 
 
 
 def nta_iou(truths: Sequence[ImageBox], detections: Sequence[ImageBox]) -> list[float]:
-    """For each true box the IoU with the detection whose centre is nearest, or 0 if that is more than 10 pixels away or there is none.
+    """For each true box the IoU with the detection whose centre is nearest, or 0 if that is more than 10 pixels away or
+    there is none.
 
     One detection may serve several true boxes. All in pixels of 480 x 320.
     """
@@ -337,13 +350,13 @@ def _matched(true: ImageBox, found: Sequence[ImageBox], reach_px: float) -> floa
     return iou(true, found[nearest]) if away[nearest] <= reach_px else 0.0
 
 
-# ---- what is really visible ----------------------------------------------------------------------------------------------
+# ---- what is really visible ----------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class VisibleAgent:
-    """A vehicle that a view shows: ``outline``, the box of its whole 3-D box cut at the image's edges, and ``visible``, that of its
-    visible pixels."""
+    """A vehicle that a view shows: ``outline``, the box of its whole 3-D box cut at the image's edges, and ``visible``,
+    that of its visible pixels."""
 
     outline: ImageBox
     visible: ImageBox
@@ -381,8 +394,8 @@ def visible_agents(
 
 
 def agent_ious(agents: Sequence[VisibleAgent], classes: NDArray[np.integer]) -> list[float]:
-    """For each vehicle the IoU of its visible box with that of the largest connected region of vehicle pixels near it; 0 if there is
-    none or its centre is off by more than 10 pixels in an image 480 pixels wide.
+    """For each vehicle the IoU of its visible box with that of the largest connected region of vehicle pixels near it;
+    0 if there is none or its centre is off by more than 10 pixels in an image 480 pixels wide.
 
     Near means: inside the outline of the true 3-D box, made 1.2 times as large.
 

@@ -1,7 +1,8 @@
 """A row-aligned table of parameters: every column, its two Adam moments and every counter share one row order.
 
-Row operations (``take``, ``append``, ``permute`` as a take) move all of them together, so a moment can never belong to another
-row's parameter. Columns are *raw* (unactivated) leaf tensors; what they mean is the business of ``gaussians/model.py``.
+Row operations (``take``, ``append``, ``permute`` as a take) move all of them together, so a moment can never belong to
+another row's parameter. Columns are *raw* (unactivated) leaf tensors; what they mean is the business of
+``gaussians/model.py``.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ from mudg.base.errors import InputError
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdamColumn:
-    """One column of a step of Adam: four tensors of one shape [N, ...] (all but ``gradient`` are updated) and the learning rate."""
+    """One column of a step of Adam: four tensors of one shape [N, ...] (all but ``gradient`` are updated) and the
+    learning rate."""
 
     parameter: Tensor
     gradient: Tensor
@@ -59,9 +61,14 @@ class Table:
         rows = len(self)
         for name, value in {**self.columns, **self.labels}.items():
             if value.shape[:1] != (rows,):
-                raise InputError("columns of a table differ in length", where=name, expected=f"{rows} rows", got=str(tuple(value.shape)))
+                raise InputError(
+                    "columns of a table differ in length",
+                    where=name,
+                    expected=f"{rows} rows",
+                    got=str(tuple(value.shape)),
+                )
 
-    # -- device -----------------------------------------------------------------------------------------------------
+    # -- device ------------------------------------------------------------------------------------
 
     @property
     def device(self) -> torch.device:
@@ -80,7 +87,7 @@ class Table:
         there.moment2 = {name: value.to(device) for name, value in self.moment2.items()}
         return there
 
-    # -- row operations ---------------------------------------------------------------------------------------------
+    # -- row operations ----------------------------------------------------------------------------
 
     def take(self, rows: Tensor) -> None:
         """Keep ``rows`` (i64 indices in the wanted order, or a bool mask [N]); everything moves together."""
@@ -94,8 +101,11 @@ class Table:
     def append(self, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor]) -> None:
         """Add rows with zero moments. Every column and label of the table must be given."""
         if set(columns) != set(self.columns) or set(labels) != set(self.labels):
-            raise InputError("appended rows must fill every column",
-                expected=str(sorted(set(self.columns) | set(self.labels))), got=str(sorted(set(columns) | set(labels))))  # fmt: skip
+            raise InputError(
+                "appended rows must fill every column",
+                expected=str(sorted(set(self.columns) | set(self.labels))),
+                got=str(sorted(set(columns) | set(labels))),
+            )
         fresh = {name: value.detach() for name, value in columns.items()}
         self.columns = {name: _leaf(torch.cat([value.detach(), fresh[name]])) for name, value in self.columns.items()}
         for moments in (self.moment1, self.moment2):
@@ -112,7 +122,7 @@ class Table:
             else:
                 moments[name][rows] = 0.0
 
-    # -- optimisation -----------------------------------------------------------------------------------------------
+    # -- optimisation ------------------------------------------------------------------------------
 
     def gradients(self) -> dict[str, Tensor]:
         """Gradients of the last backward, by column; columns without one are left out."""
@@ -133,12 +143,16 @@ class Table:
             rows: bool[N]: update these rows only, parameters and moments (the others wait); None = all.
         """
         kernel(
-            [AdamColumn(value.detach(), value.grad, self.moment1[name], self.moment2[name], rates[name])
-             for name, value in self.columns.items() if value.grad is not None and rates.get(name, 0.0) > 0],
-            step, rows,
-        )  # fmt: skip
+            [
+                AdamColumn(value.detach(), value.grad, self.moment1[name], self.moment2[name], rates[name])
+                for name, value in self.columns.items()
+                if value.grad is not None and rates.get(name, 0.0) > 0
+            ],
+            step,
+            rows,
+        )
 
-    # -- state ------------------------------------------------------------------------------------------------------
+    # -- state -------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Tensor]:
         """All tensors under flat names, ready for a checkpoint."""
@@ -154,8 +168,11 @@ class Table:
         for key, value in flat.items():
             group, _, name = key.partition(".")
             if group == "partial":
-                raise InputError("this scene's objects change colour over time, which is not supported any more",
-                    where=key, remedy="fit it again, or render it with the version that fitted it")  # fmt: skip
+                raise InputError(
+                    "this scene's objects change colour over time, which is not supported any more",
+                    where=key,
+                    remedy="fit it again, or render it with the version that fitted it",
+                )
             if group not in groups or not name:
                 raise InputError("not a tensor of a parameter table", where=key)
             groups[group][name] = value
@@ -169,7 +186,8 @@ class Table:
 
 
 def torch_adam_columns(columns: Sequence[AdamColumn], step: int, rows: Tensor | None = None) -> None:
-    """Adam (Kingma & Ba 2015), betas 0.9 and 0.999, epsilon 1e-15, in place: the plain-torch kernel of ``Table.adam_step``."""
+    """Adam (Kingma & Ba 2015), betas 0.9 and 0.999, epsilon 1e-15, in place: the plain-torch kernel of
+    ``Table.adam_step``."""
     for one in columns:
         whole = (one.parameter, one.moment1, one.moment2)
         parameter, moment1, moment2 = whole if rows is None else (values.clone() for values in whole)
@@ -179,7 +197,8 @@ def torch_adam_columns(columns: Sequence[AdamColumn], step: int, rows: Tensor | 
         denominator = (moment2 / (1 - BETA2**step)).sqrt_().add_(EPSILON)
         parameter.addcdiv_(moment1, denominator, value=-one.rate / (1 - BETA1**step))
         if rows is not None:
-            chosen = rows.view(-1, *[1] * (gradient.ndim - 1))  # chosen by a mask: counting rows would wait for the device
+            # chosen by a mask: counting rows would wait for the device
+            chosen = rows.view(-1, *[1] * (gradient.ndim - 1))
             for values, updated in zip(whole, (parameter, moment1, moment2)):
                 values.copy_(torch.where(chosen, updated, values))
 

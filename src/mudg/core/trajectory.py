@@ -2,12 +2,12 @@
 
 Which left is used
 ------------------
-``shifted`` moves the whole vehicle sideways along **the ego's own left axis at that moment, made horizontal**: the y axis
-of ``world_from_ego(time)`` with its vertical part removed, normalised. That is the direction left of travel for a car
-driving forwards. It is not the x axis of the camera (a side camera's x axis points along the road) and not a finite
+``shifted`` moves the whole vehicle sideways along **the ego's own left axis at that moment, made horizontal**: the y
+axis of ``world_from_ego(time)`` with its vertical part removed, normalised. That is the direction left of travel for a
+car driving forwards. It is not the x axis of the camera (a side camera's x axis points along the road) and not a finite
 difference of positions (which has no direction while the car stands, and turns round when it reverses: here, left stays
-the vehicle's left). Where the vehicle's heading and the tangent of its path differ (sideslip, a pose origin far from the
-rear axle in a tight turn), the heading wins.
+the vehicle's left). Where the vehicle's heading and the tangent of its path differ (sideslip, a pose origin far from
+the rear axle in a tight turn), the heading wins.
 """
 
 from __future__ import annotations
@@ -41,8 +41,11 @@ def ego_left_world(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
     left[2] = 0.0
     length = float(np.linalg.norm(left))
     if length < 1e-3:
-        raise InputError("the vehicle's left axis is vertical, so there is no lateral direction",
-            expected="ego poses with x forward, y left, z up", got=f"left axis {world_from_ego[:3, 1].tolist()}")  # fmt: skip
+        raise InputError(
+            "the vehicle's left axis is vertical, so there is no lateral direction",
+            expected="ego poses with x forward, y left, z up",
+            got=f"left axis {world_from_ego[:3, 1].tolist()}",
+        )
     return left / length
 
 
@@ -90,9 +93,9 @@ def at_shift(scene: Scene, camera: str, shift_m: float) -> Trajectory:
 def named(scene: Scene, camera: str, name: str) -> Trajectory:
     """A path by its name; tables of papers use them.
 
-    ``up+1``: the drive raised by 1 m. ``lane+0.1``: a lane change, with every frame 0.1 m further to the left of where the recorded
-    vehicle is, along the left axis of the first frame. ``speed+0.1``: a faster drive, with every frame 0.1 m further ahead, along the
-    forward axis of the first frame. A minus means down, right, slower.
+    ``up+1``: the drive raised by 1 m. ``lane+0.1``: a lane change, with every frame 0.1 m further to the left of where
+    the recorded vehicle is, along the left axis of the first frame. ``speed+0.1``: a faster drive, with every frame 0.1
+    m further ahead, along the forward axis of the first frame. A minus means down, right, slower.
 
     Args:
         scene: the log. camera: camera name. name: kind, sign and metres.
@@ -105,7 +108,9 @@ def named(scene: Scene, camera: str, name: str) -> Trajectory:
     """
     found = _NAMED.fullmatch(name)
     if found is None:
-        raise UsageError("malformed name of a path", expected="up+1, lane+0.1 or speed-0.1 (kind, sign, metres)", got=name)
+        raise UsageError(
+            "malformed name of a path", expected="up+1, lane+0.1 or speed-0.1 (kind, sign, metres)", got=name
+        )
     views = recorded(scene, camera).views
     left = ego_left_world(_ego_pose(scene.ego, views[0]))
     direction = {"up": WORLD_UP, "lane": left, "speed": np.cross(left, WORLD_UP)}[found["kind"]]
@@ -118,8 +123,8 @@ def named(scene: Scene, camera: str, name: str) -> Trajectory:
 
 
 def velocity(path: EgoPath, time_s: float) -> tuple[float, float, float]:
-    """Velocity of the vehicle between the recorded poses around a time, metres per second along the world's axes; outside the
-    recording that of its first or last two poses, 0 with a single one."""
+    """Velocity of the vehicle between the recorded poses around a time, metres per second along the world's axes;
+    outside the recording that of its first or last two poses, 0 with a single one."""
     if len(path.times_s) < 2:
         return 0.0, 0.0, 0.0
     after = int(np.clip(np.searchsorted(path.times_s, time_s), 1, len(path.times_s) - 1))
@@ -154,8 +159,11 @@ def readout_poses(path: EgoPath, view: View) -> NDArray[np.float64]:
 
 def _frames(scene: Scene, camera: str) -> tuple:
     if camera not in scene.cameras:
-        raise UsageError(f"the scene has no camera named {camera!r}", where=f"scene {scene.id}",
-            expected=f"one of {', '.join(scene.cameras)}")  # fmt: skip
+        raise UsageError(
+            f"the scene has no camera named {camera!r}",
+            where=f"scene {scene.id}",
+            expected=f"one of {', '.join(scene.cameras)}",
+        )
     frames = tuple(scene.frames_of(camera))
     if not frames:
         raise UsageError(f"camera {camera!r} has no frames", where=f"scene {scene.id}")
@@ -170,6 +178,9 @@ def _ego_pose(path: EgoPath, view: View) -> NDArray[np.float64]:
     nearest = 0 if view.time_s < path.times_s[0] else -1
     if abs(path.times_s[nearest] - view.time_s) <= 0.2:
         return path.world_from_ego[nearest]
-    raise InputError("no ego pose at the time of a camera frame, so there is no left direction",
-        where=f"camera {view.camera.name}", expected=f"a time within [{path.times_s[0]}, {path.times_s[-1]}] s",
-        got=f"{view.time_s} s")  # fmt: skip
+    raise InputError(
+        "no ego pose at the time of a camera frame, so there is no left direction",
+        where=f"camera {view.camera.name}",
+        expected=f"a time within [{path.times_s[0]}, {path.times_s[-1]}] s",
+        got=f"{view.time_s} s",
+    )

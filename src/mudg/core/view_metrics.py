@@ -1,4 +1,5 @@
-"""Metrics of one view, or of neighbouring views, that need more than a true image: LiDAR points, exact boxes, markings and motion.
+"""Metrics of one view, or of neighbouring views, that need more than a true image: LiDAR points, exact boxes, markings
+and motion.
 
 ``view_facts.ViewFacts`` is what is known of a view beside its true image. The metrics are accumulators as in
 ``core/metrics.py``.
@@ -27,9 +28,10 @@ from mudg.core.metrics import CLASS_COUNT, FrameMean, Metric, Pair, confusion, d
 from mudg.core.street_scores import agent_ious
 from mudg.core.weather.light import LUMA
 
-# edit scores ----------------------------------------------------------------------------------------------------------
+# edit scores --------------------------------------------------------------------------------------
 #
-# What an edit did to renders, where no truth of the edited drive exists: the edited render against the unedited one of the same view.
+# What an edit did to renders, where no truth of the edited drive exists: the edited render against the unedited one of
+# the same view.
 
 
 SAME: Final = 1.5 / 255
@@ -42,8 +44,9 @@ def changed_pixels(edited: Tensor, unedited: Tensor) -> NDArray[np.bool_]:
 
 
 def gradient_correlation(edited: Tensor, unedited: Tensor) -> float | None:
-    """Correlation of luminance gradients of two images f32[3, H, W]: [-1, 1], higher is better, 1 = every edge in its place with the same
-    relative strength; a change of brightness or contrast of the whole image leaves it at 1. None where an image has no gradients.
+    """Correlation of luminance gradients of two images f32[3, H, W]: [-1, 1], higher is better, 1 = every edge in its
+    place with the same relative strength; a change of brightness or contrast of the whole image leaves it at 1. None
+    where an image has no gradients.
     """
     pair = [_gradients(image.numpy()) for image in (edited, unedited)]
     scale = math.sqrt(float((pair[0] ** 2).sum()) * float((pair[1] ** 2).sum()))
@@ -61,14 +64,14 @@ def mask_counts(a: NDArray[np.bool_], b: NDArray[np.bool_]) -> tuple[int, int]:
     return int((a & b).sum()), int((a | b).sum())
 
 
-# view metrics ---------------------------------------------------------------------------------------------------------
+# view metrics -------------------------------------------------------------------------------------
 
 
 POINT_PARTS: Final = ("", "static", "dynamic")
 PointField = Literal["abs_rel", "rmse_m", "delta1"]
 
 
-# ---- LiDAR points ---------------------------------------------------------------------------------------------------------
+# ---- LiDAR points --------------------------------------------------------------------------------
 
 
 def _chosen(points: PointTruth, part: str) -> NDArray[np.bool_]:
@@ -179,7 +182,7 @@ def _carried_classes(pair: Pair) -> Tensor | None:
     return confusion(pair.semantics, true, pair.mask)
 
 
-# ---- vehicles and markings -----------------------------------------------------------------------------------------------
+# ---- vehicles and markings -----------------------------------------------------------------------
 
 
 class AgentIou:
@@ -214,7 +217,8 @@ class LaneCounts:
 
 
 class LaneIou:
-    """IoU of the markings that a fixed rule finds with the exact ones, both on the true road within 40 m, 2 pixels of tolerance, pooled."""
+    """IoU of the markings that a fixed rule finds with the exact ones, both on the true road within 40 m, 2 pixels of
+    tolerance, pooled."""
 
     def __init__(self) -> None:
         self.source = _lanes_of
@@ -251,7 +255,9 @@ def _lane_edges(pair: Pair) -> float | None:
     if lanes is None or pair.rgb is None or not lanes.band.any():
         return None
     rows = street_scores.rows_of(lanes.band, 1)
-    made, true = (street_scores.edges_of(street_scores.gray_of(rgb[:, rows])) for rgb in (pair.rgb.numpy(), lanes.reference))
+    made, true = (
+        street_scores.edges_of(street_scores.gray_of(rgb[:, rows])) for rgb in (pair.rgb.numpy(), lanes.reference)
+    )
     return street_scores.edge_correlation(made, true, lanes.band[rows])
 
 
@@ -263,12 +269,12 @@ def _lane_colors(pair: Pair) -> tuple[float, int] | None:
     return float((apart.astype(np.float64) ** 2).sum()), apart.size
 
 
-# ---- neighbouring views --------------------------------------------------------------------------------------------------
+# ---- neighbouring views --------------------------------------------------------------------------
 
 
 class TemporalFlickering:
-    """(255 - mean |frame - next frame|) / 255 on 8 bits, mean over neighbouring frames: VBench's measure, meant for videos that stand
-    still. A moving camera lowers it, also that of the truth; a blurred video has a high one."""
+    """(255 - mean |frame - next frame|) / 255 on 8 bits, mean over neighbouring frames: VBench's measure, meant for
+    videos that stand still. A moving camera lowers it, also that of the truth; a blurred video has a high one."""
 
     def __init__(self) -> None:
         self.source = _bytes_of
@@ -293,7 +299,8 @@ def _bytes_of(pair: Pair) -> Tensor | None:
 
 
 class ExactMotion:
-    """Where surfaces of one view are in the next: by true depth and poses, vehicles by their boxes. The last answer is kept.
+    """Where surfaces of one view are in the next: by true depth and poses, vehicles by their boxes. The last answer is
+    kept.
 
     Args:
         tracks: number in the instance map and track of every vehicle.
@@ -334,8 +341,8 @@ def _true_frame(pair: Pair) -> flicker.TrueFrame:
 
 
 class WarpError:
-    """Mean absolute difference of colour, of 1, between a surface in one frame and the same surface in the next, pooled. Surfaces are
-    followed by exact motion; those that are hidden in either frame do not count.
+    """Mean absolute difference of colour, of 1, between a surface in one frame and the same surface in the next,
+    pooled. Surfaces are followed by exact motion; those that are hidden in either frame do not count.
 
     Args:
         motion: shared by the methods on a trajectory.
@@ -362,7 +369,7 @@ class WarpError:
         return self._sum / self._pixels if self._pixels else None
 
 
-# ---- the table -----------------------------------------------------------------------------------------------------------
+# ---- the table -----------------------------------------------------------------------------------
 
 EVERY_VIEW: Final = ("temporal_flickering", "warp_error")
 """Metrics that want all views of a trajectory, in order."""
@@ -378,7 +385,8 @@ FACTS: Final[Mapping[str, Callable[[], Metric]]] = {
     "lane_psnr": lambda: Decibels(_lane_colors),
     "temporal_flickering": TemporalFlickering,
 }
-"""Rows of ``metrics.METRICS`` that are computed from ``ViewFacts`` or from neighbouring views; the warp error needs a motion besides."""
+"""Rows of ``metrics.METRICS`` that are computed from ``ViewFacts`` or from neighbouring views; the warp error needs a
+motion besides."""
 PARTS: Final[Mapping[str, Callable[[], Metric]]] = {
     f"{name}_{part}": build
     for part in ("static", "dynamic")

@@ -1,10 +1,11 @@
 """adapt: the diffusion model, trained for a few steps on the log that it is going to work on.
 
 Read from `PlannedAdaptation`: short fits to what the lessons of the log show (`diffusion/adapt.py`), clips of them
-(`diffusion/adapt.py`), some steps of the `learn` verb, and the comparison on blocks of frames that were kept for it. Frames that the scene
-holds out are never read.
+(`diffusion/adapt.py`), some steps of the `learn` verb, and the comparison on blocks of frames that were kept for it.
+Frames that the scene holds out are never read.
 
-    OUT/model/            the model to use: adapted, or the one started from if that is as good (same layout as `learn`'s)
+    OUT/model/            the model to use: adapted, or the one started from if that is as good (same layout as
+                          `learn`'s)
     OUT/adapt.json        scores of both on the clips kept for scoring, and which was taken
     OUT/before.png, after.png   those clips: condition, generated and true colour, depth and classes, confidence
     OUT/work              fits, clips and training while it runs; removed at the end
@@ -50,20 +51,19 @@ from mudg.scene.labels import photographs, read_trusted_classes
 from mudg.scene.part import write_photos
 from mudg.scene.read import read_image, read_points, read_scene
 
-# lessons --------------------------------------------------------------------------------------------------------------
+# lessons ------------------------------------------------------------------------------------------
 #
 # What a log can teach about views that were not driven: its photographs as truth, seen without them.
 #
 # A lesson is a drive that shows some photographs and not others:
 #
-# * **gap**: blocks of consecutive frames are left out, every other block in the first lesson, the rest in the second. The truth are the
-#   photographs left out.
-# * **shifted**: every photograph is carried to a pose some metres to the side, with the depth of the scene fitted to the log; what it
-# does
-#   not show there is rendered. These pictures are taken for a recorded drive, and the real photographs, now beside its path, are the
-#   truth. The way there goes by the depth of the first fit, the way back by that of another, which is fitted to the carried pictures
-#   alone,
-#   so holes, splinters and wrong parallax are those of a lateral shift.
+# * **gap**: blocks of consecutive frames are left out, every other block in the first lesson, the rest in the second.
+#   The truth are the photographs left out.
+# * **shifted**: every photograph is carried to a pose some metres to the side, with the depth of the scene fitted to
+# the log; what it does
+#   not show there is rendered. These pictures are taken for a recorded drive, and the real photographs, now beside its
+#   path, are the truth. The way there goes by the depth of the first fit, the way back by that of another, which is
+#   fitted to the carried pictures alone, so holes, splinters and wrong parallax are those of a lateral shift.
 #
 # A short fit to what a lesson shows gives the renders of its conditions, as `synthesize` would have them.
 
@@ -75,8 +75,8 @@ class Lesson:
     Args:
         name: of its folder.
         shift_m: how far the shown pictures were carried to the left; 0 = they are photographs.
-        shown: ids of the frames that are shown. truth: blocks of ids of the frames to be generated, one camera and at most
-            `AdaptConfig.block` frames each, with the number of the block along the log.
+        shown: ids of the frames that are shown. truth: blocks of ids of the frames to be generated, one camera and at
+            most `AdaptConfig.block` frames each, with the number of the block along the log.
     """
 
     name: str
@@ -87,8 +87,8 @@ class Lesson:
 
 @dataclass(frozen=True)
 class LearntLog:
-    """The log that is learned: folders of its scene, its fused cloud and the fit to it; width and height of the clips, and how many times
-    finer their patches are."""
+    """The log that is learned: folders of its scene, its fused cloud and the fit to it; width and height of the clips,
+    and how many times finer their patches are."""
 
     scene: Path
     fused: Path
@@ -104,7 +104,8 @@ def cameras_of(scene: Scene, config: AdaptConfig) -> tuple[str, ...]:
 
 
 def blocks_of(scene: Scene, config: AdaptConfig) -> list[list[Frame]]:
-    """The photographs that may be used, in blocks of `config.block` consecutive moments; all cameras of a moment lie in one block."""
+    """The photographs that may be used, in blocks of `config.block` consecutive moments; all cameras of a moment lie in
+    one block."""
     names = set(cameras_of(scene, config))
     frames = sorted((f for f in photographs(scene) if f.view.camera.name in names), key=lambda f: f.view.time_s)
     moment, last_s, blocks = -1, -np.inf, []
@@ -135,11 +136,12 @@ def _by_camera(block: Sequence[Frame]) -> list[tuple[str, ...]]:
     return [tuple(f.id for f in block if f.view.camera.name == name) for name in names]
 
 
-# what a lesson shows --------------------------------------------------------------------------------------------------
+# what a lesson shows ------------------------------------------------------------------------------
 
 
 def shown_photos(scene: Scene, lesson: Lesson, config: AdaptConfig, model: SceneModel, width_px: int) -> list[Photo]:
-    """The pictures of a lesson: photographs, or photographs carried to the side by a fitted scene (at most `width_px` wide)."""
+    """The pictures of a lesson: photographs, or photographs carried to the side by a fitted scene (at most `width_px`
+    wide)."""
     photos = []
     for frame in (f for f in scene.frames if f.id in set(lesson.shown)):
         photo = Photo(frame.view, read_image(scene, frame), read_trusted_classes(scene, frame))
@@ -156,8 +158,8 @@ def moved_view(scene: Scene, view: View, shift_m: float) -> View:
 
 
 def carried(photo: Photo, target: View, model: SceneModel, width_px: int) -> Photo:
-    """A photograph as it would look from another pose: carried by the depth of a fitted scene, which is rendered where the photograph
-    shows nothing."""
+    """A photograph as it would look from another pose: carried by the depth of a fitted scene, which is rendered where
+    the photograph shows nothing."""
     camera = photo.view.camera
     width = min(width_px, camera.width)
     size = width, max(8, round(camera.height * width / camera.width))
@@ -174,16 +176,17 @@ def carried(photo: Photo, target: View, model: SceneModel, width_px: int) -> Pho
     return Photo(view, pixels, None if photo.semantics is None else classes.numpy())
 
 
-# the fit of a lesson --------------------------------------------------------------------------------------------------
+# the fit of a lesson ------------------------------------------------------------------------------
 
 
 FitScene = Callable[[FitConfig, Path, Path | None, Path], None]
-"""Fits a scene with these settings and fused clouds into a folder (`folder`/fit); without clouds it makes its own (`folder`/fuse)."""
+"""Fits a scene with these settings and fused clouds into a folder (`folder`/fit); without clouds it makes its own
+(`folder`/fuse)."""
 
 
 def fit_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, folder: Path, fit_scene: FitScene) -> Path:
-    """Write what a lesson shows as a scene (`folder`/scene), fuse it where photographs are missing (`folder`/fuse), and fit it
-    (`folder`/fit); returns `folder`. What is there already is used again."""
+    """Write what a lesson shows as a scene (`folder`/scene), fuse it where photographs are missing (`folder`/fuse), and
+    fit it (`folder`/fit); returns `folder`. What is there already is used again."""
     scene = read_scene(log.scene)
     if not (folder / "scene" / "scene.json").is_file():
         photos = shown_photos(scene, lesson, config, load_model(log.fitted), log.width_px * log.scale)
@@ -196,13 +199,13 @@ def fit_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, folder: Path
     return folder
 
 
-# clips ----------------------------------------------------------------------------------------------------------------
+# clips --------------------------------------------------------------------------------------------
 #
 # Training clips of a log's lessons (see `adapt.py`).
 #
-# The truth of a clip are photographs, and depth where a sweep measured it. Elsewhere depth and all classes are what the model that is
-# adapted makes itself of the same condition: the log shows colours, but nobody knows what stands above its LiDAR, and guessed labels
-# must not be learned as truth.
+# The truth of a clip are photographs, and depth where a sweep measured it. Elsewhere depth and all classes are what the
+# model that is adapted makes itself of the same condition: the log shows colours, but nobody knows what stands above
+# its LiDAR, and guessed labels must not be learned as truth.
 
 
 CLIPS = "clips"
@@ -211,7 +214,8 @@ Plan = list[tuple[int, Lesson, tuple[str, ...]]]
 
 
 def plan_clips(lessons: list[Lesson], config: AdaptConfig) -> Plan:
-    """All clips: those to learn from have numbers from 0, those for scoring from `HELD_OUT`; a block serves for one only."""
+    """All clips: those to learn from have numbers from 0, those for scoring from `HELD_OUT`; a block serves for one
+    only."""
     plan: Plan = []
     counts = {False: 0, True: 0}
     for lesson in lessons:
@@ -237,9 +241,11 @@ def why_too_short(plan: Plan, config: AdaptConfig) -> str:
     return f"it is too short: {len(plan)} clips of {config.block} frames, {scored} of them to score"
 
 
-def make_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, rows: Plan, work: Path, fit_scene: FitScene) -> int:
-    """Fit a lesson and write its shards of a plan into `work`/clips, those that are not there yet; returns how many were made. One
-    lesson needs nothing of another, so this may run in a process of its own."""
+def make_lesson(
+    config: AdaptConfig, log: LearntLog, lesson: Lesson, rows: Plan, work: Path, fit_scene: FitScene
+) -> int:
+    """Fit a lesson and write its shards of a plan into `work`/clips, those that are not there yet; returns how many
+    were made. One lesson needs nothing of another, so this may run in a process of its own."""
     missing = [row for row in rows if not shard_path(work / CLIPS, row[0]).is_file()]
     if not missing:
         return 0
@@ -260,9 +266,7 @@ class ClipMaker:
         self._config, self._log, self._lesson, self._model = config, log, lesson, model
         self._scene, shown = read_scene(log.scene), read_scene(folder / "scene")
         self._cloud = read_fused(log.fused if lesson.shift_m else folder / "fuse")
-        self._photos = [
-            Photo(f.view, read_image(shown, f), read_trusted_classes(shown, f)) for f in shown.frames
-        ]
+        self._photos = [Photo(f.view, read_image(shown, f), read_trusted_classes(shown, f)) for f in shown.frames]
         self._fitted = load_model(folder / "fit")
         self._sources: dict[int, WarpSource] = {}
         size = (log.width_px, log.height_px)
@@ -273,9 +277,14 @@ class ClipMaker:
         chosen = [next(f for f in self._scene.frames if f.id == name) for name in frames]
         views = [f.view for f in chosen]
         condition, fine = build_conditions(
-            self._cloud, self._scene.tracks, views, self._photos, self._rules, self._sources,
+            self._cloud,
+            self._scene.tracks,
+            views,
+            self._photos,
+            self._rules,
+            self._sources,
             lambda view: render_planes(self._fitted, view),
-        )  # fmt: skip
+        )
         images = [read_image(self._scene, f) for f in chosen]
         request, finished = SampleRequest(1, self._config.seed, number), None
         if self._model.finisher is None:
@@ -289,7 +298,9 @@ class ClipMaker:
         return replace(clip, shift_m=self._lesson.shift_m)
 
     def _clip(self, condition: Condition, images: list, made: GeneratedClip) -> Clip:
-        rgb = torch.stack([image_tensor(resize_area(i, v.camera.width, v.camera.height)) for i, v in zip(images, condition.views)])
+        rgb = torch.stack(
+            [image_tensor(resize_area(i, v.camera.width, v.camera.height)) for i, v in zip(images, condition.views)]
+        )
         depth, known = (torch.stack(parts) for parts in zip(*(self._measured(view) for view in condition.views)))
         return Clip(condition, rgb, torch.where(known, depth, made.depth), torch.ones_like(known), made.semantics)
 
@@ -298,7 +309,7 @@ class ClipMaker:
         return torch.from_numpy(depth)[None], torch.from_numpy(known)[None]
 
 
-# adapt ----------------------------------------------------------------------------------------------------------------
+# adapt --------------------------------------------------------------------------------------------
 
 
 MOST_SCALE = 4
@@ -306,7 +317,8 @@ MOST_SCALE = 4
 SCORED_STEPS = 2
 """Denoising steps of the samples that are compared."""
 SHARING = 4
-"""Most lessons made at the same time where they share a device: each process holds a context and a small model there."""
+"""Most lessons made at the same time where they share a device: each process holds a context and a small model
+there."""
 LEAST_GAIN_DB = 0.05
 """An adapted model that gains less than this on the clips kept for scoring is not taken."""
 
@@ -334,20 +346,36 @@ class PlannedAdaptation:
         """
         model = mdm_files.load(config.model)
         if not mdm_files.uses_renders(config.model):
-            raise UsageError("this model was not trained with renders of a fitted scene", where="--model", got=config.model,
-                             remedy="choose another model; `embedded` is one that was")  # fmt: skip
+            raise UsageError(
+                "this model was not trained with renders of a fitted scene",
+                where="--model",
+                got=config.model,
+                remedy="choose another model; `embedded` is one that was",
+            )
         learnt, lessons = _open_log(config, model, scene, fused, fitted)
         clips = plan_clips(lessons, config)
         reason = why_too_short(clips, config)
         if reason:
-            raise InputError("the model cannot be adapted to this log", where=str(scene), got=reason,
-                             remedy="smaller --block, or use the model as it is")  # fmt: skip
+            raise InputError(
+                "the model cannot be adapted to this log",
+                where=str(scene),
+                got=reason,
+                remedy="smaller --block, or use the model as it is",
+            )
         return cls(config, model, learnt, lessons, clips)
 
     def make_clips(self, fit_scene: FitScene, work: Path) -> None:
-        """Fits and clips of all lessons, several made at a time. fit_scene: fuses and fits one, also in another process."""
+        """Fits and clips of all lessons, several made at a time. fit_scene: fuses and fits one, also in another
+        process."""
         jobs = [
-            (self.config, self.learnt, lesson, [row for row in self.clips if row[1].name == lesson.name], work, fit_scene)
+            (
+                self.config,
+                self.learnt,
+                lesson,
+                [row for row in self.clips if row[1].name == lesson.name],
+                work,
+                fit_scene,
+            )
             for lesson in self.lessons
         ]
         made, cores = 0, native.default_threads()
@@ -367,19 +395,27 @@ class PlannedAdaptation:
         record = _choose(self.config, model_of_window(self.model, self.config.block), self.clips, work, out)
         chosen = mdm_files.load(adapted) if record["adapted"] else self.model
         facts = {**mdm_files.facts(self.config.model), "adapted": record}
-        mdm_files.save(model_of_window(chosen, self.model.config.window), out / "model", _card(self.config, record), facts)
+        mdm_files.save(
+            model_of_window(chosen, self.model.config.window), out / "model", _card(self.config, record), facts
+        )
         store.write_json(out / "adapt.json", record)
         return {"adapted": record["adapted"], "psnr": [record["before"]["psnr"], record["after"]["psnr"]]}
 
 
-def _open_log(config: AdaptConfig, model: MDM, scene: Path, fused: Path, fitted: Path) -> tuple[LearntLog, list[Lesson]]:
+def _open_log(
+    config: AdaptConfig, model: MDM, scene: Path, fused: Path, fitted: Path
+) -> tuple[LearntLog, list[Lesson]]:
     loaded = read_scene(scene)
     model_of_scene(fitted, loaded)  # refuses the fit of another scene
     names = cameras_of(loaded, config)
     unknown = [name for name in names if name not in loaded.cameras]
     if unknown or not names:
-        raise InputError("the scene has no such camera", where=f"--cameras, {loaded.root}", expected=", ".join(loaded.cameras),
-                         got=", ".join(unknown))  # fmt: skip
+        raise InputError(
+            "the scene has no such camera",
+            where=f"--cameras, {loaded.root}",
+            expected=", ".join(loaded.cameras),
+            got=", ".join(unknown),
+        )
     camera = loaded.cameras[names[0]]
     width, height = model.image_size(camera.width, camera.height)
     scale = max(1, min(MOST_SCALE, camera.width // width))
@@ -390,24 +426,39 @@ def _training(config: AdaptConfig, learnt: LearntLog, plan: Plan, clips: Path) -
     """The settings of the training, in terms of `learn`."""
     train = sum(number < HELD_OUT for number, _, _ in plan)
     return LearnConfig(
-        seed=config.seed, start=config.model, steps=config.steps, precision=config.precision,
+        seed=config.seed,
+        start=config.model,
+        steps=config.steps,
+        precision=config.precision,
         threads=config.threads or native.default_threads(),
         frozen="denoiser" if config.trained == "refiner" else "nothing",
         data=LearnData(
-            width=learnt.width_px, height=learnt.height_px, window=config.block, clips=str(clips), cities=train,
-            first_cities=train, clips_per_city=1, held_out=len(plan) - train, renders=False,  # the network is taken as it is
+            width=learnt.width_px,
+            height=learnt.height_px,
+            window=config.block,
+            clips=str(clips),
+            cities=train,
+            # the network is taken as it is
+            first_cities=train,
+            clips_per_city=1,
+            held_out=len(plan) - train,
+            renders=False,
         ),
         optimizer=LearnOptimizer(
-            batch_frames=config.batch_frames, lr=config.lr, full_window_share=1.0, warmup_steps=min(10, config.steps // 4),
+            batch_frames=config.batch_frames,
+            lr=config.lr,
+            full_window_share=1.0,
+            warmup_steps=min(10, config.steps // 4),
             average_decay=0.95,
         ),
         score=LearnScore(every=1_000_000, watched=len(plan) - train, steps=SCORED_STEPS),
         compute=LearnCompute(device=config.device, workers=0, checkpoint_every=20, log_every=10),
-    )  # fmt: skip
+    )
 
 
 def _choose(config: AdaptConfig, base: MDM, plan: Plan, work: Path, out: Path) -> dict[str, Any]:
-    """Compare the model started from with the one that `learn` left, on the clips kept for it; the record of the comparison."""
+    """Compare the model started from with the one that `learn` left, on the clips kept for it; the record of the
+    comparison."""
     kept = [number for number, _, _ in plan if number >= HELD_OUT]
     device = torch.device(config.device)
     request = SampleRequest(SCORED_STEPS, config.seed, bf16=choose_bf16(config.precision, device))
@@ -417,11 +468,18 @@ def _choose(config: AdaptConfig, base: MDM, plan: Plan, work: Path, out: Path) -
     }
     picture = work / "learn" / "samples" / f"{config.steps:07d}.png"
     store.atomic_write(out / "after.png", store.read_bytes(picture))
-    scores = {name: {"psnr": _mean_psnr(row), **{k: v for k, v in row.items() if k != "clips"}} for name, row in found.items()}
+    scores = {
+        name: {"psnr": _mean_psnr(row), **{k: v for k, v in row.items() if k != "clips"}} for name, row in found.items()
+    }
     gain = scores["after"]["psnr"] - scores["before"]["psnr"]
     verdict = "" if gain >= LEAST_GAIN_DB else "; the model is kept as it was"
     log.info(f"adapt: {_in_db(scores)}, on {len(kept)} clips not learned from{verdict}")
-    return {"schema": 1, "adapted": gain >= LEAST_GAIN_DB, "clips": {"learned": len(plan) - len(kept), "scored": len(kept)}, **scores}
+    return {
+        "schema": 1,
+        "adapted": gain >= LEAST_GAIN_DB,
+        "clips": {"learned": len(plan) - len(kept), "scored": len(kept)},
+        **scores,
+    }
 
 
 def _mean_psnr(found: Mapping[str, Any]) -> float:
@@ -433,9 +491,9 @@ def _card(config: AdaptConfig, record: Mapping[str, Any]) -> str:
     """Text that lies with the model."""
     what = "adapted to one recorded log" if record["adapted"] else "as it was: adapting it to the log did not help"
     return (
-        f"# Small multi-modal diffusion model, {what}\n\nStarted from `{config.model}`. PSNR on {record['clips']['scored']} clips of "
-        f"the log that were not learned from: {_in_db(record)}. For this log only.\n"
-        "Whoever passes it on passes on what the log's photographs taught it: mind their licence.\n"
+        f"# Small multi-modal diffusion model, {what}\n\nStarted from `{config.model}`. PSNR on"
+        f" {record['clips']['scored']} clips of the log that were not learned from: {_in_db(record)}. For this log"
+        " only.\nWhoever passes it on passes on what the log's photographs taught it: mind their licence.\n"
     )
 
 

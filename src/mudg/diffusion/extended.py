@@ -13,7 +13,8 @@ from mudg.diffusion.network import MDMConfig
 
 
 def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
-    """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the size trained at."""
+    """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the size trained
+    at."""
     plain = {
         "refine_widths": (),
         "refine_blocks": (),
@@ -27,17 +28,20 @@ def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
 
 
 def extended(before: MDM, config: MDMConfig) -> MDM:
-    """A model of `config` with the weights of `before`; a refiner is taken over if `before` has one of the same shape. For
-    continuing the training of an earlier, plainer model. What new inputs weigh is 0, so they change nothing at first.
+    """A model of `config` with the weights of `before`; a refiner is taken over if `before` has one of the same shape.
+    For continuing the training of an earlier, plainer model. What new inputs weigh is 0, so they change nothing at
+    first.
 
     Raises:
         UsageError: the two differ in more than the refiner, the use of renders and the size trained at.
     """
     if not same_denoiser(before.config, config) or (before.config.renders and not config.renders):
         raise UsageError(
-            "the model to continue from is of another kind", expected=str(config), got=str(before.config),
+            "the model to continue from is of another kind",
+            expected=str(config),
+            got=str(before.config),
             remedy="give its widths, blocks, attention, patch, window and renders",
-        )  # fmt: skip
+        )
     model = MDM(config)
     state = model.state_dict()
     for name, old in before.state_dict().items():

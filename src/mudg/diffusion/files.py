@@ -1,6 +1,7 @@
 """Folders that hold a small diffusion model, and what every diffusion model's folder has in common.
 
-model.json                configuration, sha256 of the weight files, facts (recipe, scores); of published-type models also their kind
+model.json                configuration, sha256 of the weight files, facts (recipe, scores); of published-type models
+                          also their kind
 weights_NN.safetensors    weights in fp16
 MODEL_CARD.md             for people
 """
@@ -26,12 +27,19 @@ SHARD_BYTES = 15 * 1024 * 1024
 
 FORMER_FIELDS: dict[str, dict[str, Any]] = {
     "top": {
-        "joint": True, "head": "x0", "copy_condition": True, "backdrop": True, "mask_planes": "valid_image", "reference": "warped",
-        "given_classes": True, "effects": 0,
+        "joint": True,
+        "head": "x0",
+        "copy_condition": True,
+        "backdrop": True,
+        "mask_planes": "valid_image",
+        "reference": "warped",
+        "given_classes": True,
+        "effects": 0,
     },
     "codec": {"kind": "patch", "depth_code": "log", "semantics_code": "shares"},
-}  # fmt: skip
-"""Fields of earlier model files whose variants were taken out (`docs/diffusion.md`), each with the one value that is still built."""
+}
+"""Fields of earlier model files whose variants were taken out (`docs/diffusion.md`), each with the one value that is
+still built."""
 
 LATER_FIELDS: dict[str, Any] = {"renders": False, "finish_widths": [], "finish_blocks": []}
 """Fields that earlier model files lack, with what their models are."""
@@ -51,8 +59,12 @@ def read_description(path: Path | str) -> dict[str, Any]:
     where = folder_of(path) / MODEL_FILE
     if not where.is_file():
         inside = (where.parent / "model" / MODEL_FILE).is_file()
-        raise InputError("no diffusion model here", where=str(where.parent), expected=f"a file {MODEL_FILE}",
-                         remedy=f"give {where.parent / 'model'}" if inside else "")  # fmt: skip
+        raise InputError(
+            "no diffusion model here",
+            where=str(where.parent),
+            expected=f"a file {MODEL_FILE}",
+            remedy=f"give {where.parent / 'model'}" if inside else "",
+        )
     content = store.read_json(where)
     known = isinstance(content, dict) and content.get("schema") == 1
     if not known or not isinstance(content.get("files"), dict) or not isinstance(content.get("facts", {}), dict):
@@ -95,13 +107,19 @@ def _without_former(values: Any, group: str, where: str) -> Any:
         return values
     for name, value in FORMER_FIELDS[group].items():
         if values.get(name, value) != value:
-            raise InputError("the model is of a variant that this version no longer has", where=f"{where}.{name}", expected=repr(value),
-                             got=repr(values[name]), remedy="train it anew with mudg learn")  # fmt: skip
+            raise InputError(
+                "the model is of a variant that this version no longer has",
+                where=f"{where}.{name}",
+                expected=repr(value),
+                got=repr(values[name]),
+                remedy="train it anew with mudg learn",
+            )
     return {name: value for name, value in values.items() if name not in FORMER_FIELDS[group]}
 
 
 def save(model: MDM, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
-    """Write a model as fp16 safetensors in parts, `model.json` (configuration, sha256 of the parts, facts) and MODEL_CARD.md."""
+    """Write a model as fp16 safetensors in parts, `model.json` (configuration, sha256 of the parts, facts) and
+    MODEL_CARD.md."""
     with store.atomic_directory(folder) as partial:
         files = checkpoint.write_shards(partial, model.state_dict(), SHARD_BYTES, torch.float16)
         store.write_text(partial / "MODEL_CARD.md", card)
@@ -119,7 +137,10 @@ def load(path: Path | str = "embedded") -> MDM:
     """
     folder = folder_of(path)
     content = read_description(folder)
-    config, state = config_from_dict(content.get("config"), str(folder / MODEL_FILE)), checkpoint.read_shards(folder, content["files"])
+    config, state = (
+        config_from_dict(content.get("config"), str(folder / MODEL_FILE)),
+        checkpoint.read_shards(folder, content["files"]),
+    )
     with records.understood("a diffusion model", str(folder / MODEL_FILE)):
         with torch.device("meta"):  # takes no memory: its size may be anything
             checkpoint.check_fit(state, MDM(config).state_dict(), folder)

@@ -1,12 +1,13 @@
 """The last stage of the small models: from what was generated to the camera's resolution.
 
-The denoiser and the refiner work on some 25,000 pixels per frame; a camera has up to a hundred times as many. The `Finisher` reads the
-enlarged clip and the condition at the new size: images warped in, measured depth, renders of a fitted scene. For every pixel it
-states how much to take of each (colour, depth and class in the same way), what colour to add, and how wrong the colour will
-probably be. It is small, so that a full-size image costs about as much as the clip it comes from.
+The denoiser and the refiner work on some 25,000 pixels per frame; a camera has up to a hundred times as many. The
+`Finisher` reads the enlarged clip and the condition at the new size: images warped in, measured depth, renders of a
+fitted scene. For every pixel it states how much to take of each (colour, depth and class in the same way), what colour
+to add, and how wrong the colour will probably be. It is small, so that a full-size image costs about as much as the
+clip it comes from.
 
-`finish_in_tiles` bounds the memory: every tile is computed with a margin that is wider than the receptive field, and only its core is
-kept, so the result equals that of one pass over the whole image.
+`finish_in_tiles` bounds the memory: every tile is computed with a margin that is wider than the receptive field, and
+only its core is kept, so the result equals that of one pass over the whole image.
 """
 
 from __future__ import annotations
@@ -32,8 +33,8 @@ LEAST_SHARE = 1e-3
 
 @dataclass(frozen=True)
 class Made:
-    """A generated clip, or a finished one: rgb f32[N,3,H,W] in [-1,1], depth_code f32[N,1,H,W], ids u8[N,1,H,W], log_error f32[N,1,H,W]:
-    logarithm of the expected absolute error of rgb."""
+    """A generated clip, or a finished one: rgb f32[N,3,H,W] in [-1,1], depth_code f32[N,1,H,W], ids u8[N,1,H,W],
+    log_error f32[N,1,H,W]: logarithm of the expected absolute error of rgb."""
 
     rgb: Tensor
     depth_code: Tensor
@@ -45,8 +46,8 @@ class Made:
         return Made(*(getattr(self, f.name)[..., rows, columns] for f in fields(self)))
 
     def enlarged(self, size: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> Made:
-        """The clip enlarged to `size` (height, width), of that only the rectangle rows x columns, which may reach beyond its borders:
-        colour and error bilinearly, depth and class from the nearest pixel."""
+        """The clip enlarged to `size` (height, width), of that only the rectangle rows x columns, which may reach
+        beyond its borders: colour and error bilinearly, depth and class from the nearest pixel."""
         grid = sampling_grid(size, rows, columns, self.rgb)
         smooth = _sampled(torch.cat([self.rgb.float(), self.log_error.float()], 1), grid, "bilinear")
         sharp = _sampled(torch.cat([self.depth_code.float(), self.ids.float()], 1), grid, "nearest")
@@ -55,7 +56,8 @@ class Made:
 
 @dataclass(frozen=True)
 class Finished:
-    """As `Made`, with classes as sources u8[N,S,1,H,W] and how much each of them counts, weights f32[N,S,H,W], which sum to 1."""
+    """As `Made`, with classes as sources u8[N,S,1,H,W] and how much each of them counts, weights f32[N,S,H,W], which
+    sum to 1."""
 
     rgb: Tensor
     depth_code: Tensor
@@ -73,7 +75,10 @@ class Finished:
 
         (``max`` finds the first of several equal ones, as ``argmax`` does, in half of the time.)
         """
-        most = (_shares(w[None], s[None]).max(1, keepdim=True).indices for w, s in zip(self.weights, self.sources, strict=True))
+        most = (
+            _shares(w[None], s[None]).max(1, keepdim=True).indices
+            for w, s in zip(self.weights, self.sources, strict=True)
+        )
         return torch.cat([one.to(torch.uint8) for one in most])
 
 
@@ -85,7 +90,8 @@ def _shares(weights: Tensor, sources: Tensor) -> Tensor:
 
 
 def sampling_grid(size: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int], like: Tensor) -> Tensor:
-    """Where the pixels of a rectangle of an image of `size` lie in another image of the same view, for `grid_sample`: f32[N,h,w,2]."""
+    """Where the pixels of a rectangle of an image of `size` lie in another image of the same view, for `grid_sample`:
+    f32[N,h,w,2]."""
     y = (torch.arange(*rows, device=like.device) + 0.5) * (2.0 / size[0]) - 1.0
     x = (torch.arange(*columns, device=like.device) + 0.5) * (2.0 / size[1]) - 1.0
     return torch.stack(torch.meshgrid(x, y, indexing="xy"), -1).expand(len(like), -1, -1, -1)
@@ -96,18 +102,20 @@ def _sampled(image: Tensor, grid: Tensor, mode: str) -> Tensor:
 
 
 class Finisher(CellNet):
-    """See the module text. `widths`: channels at half and at a quarter of the resolution; `blocks`: residual blocks there (`CellNet`)."""
+    """See the module text. `widths`: channels at half and at a quarter of the resolution; `blocks`: residual blocks
+    there (`CellNet`)."""
 
     SOURCES = 4
-    """Of colour: the enlarged clip, images warped in, the backdrop, the render. Of depth and class: the clip, the measured or
-    warped, the backdrop's class (no depth), the render's."""
+    """Of colour: the enlarged clip, images warped in, the backdrop, the render. Of depth and class: the clip, the
+    measured or warped, the backdrop's class (no depth), the render's."""
     SIZES = (4 * SOURCES, 4 * (SOURCES - 1), 4 * SOURCES, 12, 4)
-    """Outputs: shares of the sources of colour, depth and class; colour to add; change of the logarithm of the error."""
+    """Outputs: shares of the sources of colour, depth and class; colour to add; change of the logarithm of the
+    error."""
     STARTS = (2.0, 0.0, -2.0, 0.0), (2.0, 0.0, -2.0), (2.0, 0.0, -2.0, 0.0)
     """Logits of the shares before training."""
     PLANES = 4 * (4 * 3 + 3 + 4 + 1) + 3 + 1
-    """Inputs: four colours, three depths, four masks and the error, each as the four pixels of a cell; whether the other classes
-    are that of the clip; the scale."""
+    """Inputs: four colours, three depths, four masks and the error, each as the four pixels of a cell; whether the
+    other classes are that of the clip; the scale."""
 
     def __init__(self, widths: tuple[int, int], blocks: tuple[int, int]) -> None:
         super().__init__(self.PLANES, sum(self.SIZES), widths, blocks, reach=1)
@@ -123,7 +131,7 @@ class Finisher(CellNet):
         starts = [torch.tensor(part).repeat_interleave(4) for part in self.STARTS]
         with torch.no_grad():
             self.leave.weight.zero_()
-            self.leave.bias.copy_(torch.cat([*starts, torch.zeros(16)]))  # type: ignore[union-attr]
+            self.leave.bias.copy_(torch.cat([*starts, torch.zeros(16)]))
 
     def forward(self, made: Made, given: ConditionPixels, frames: int, scale: Tensor) -> Finished:
         """Finish clips (N = clips times frames, frames innermost).
@@ -132,13 +140,18 @@ class Finisher(CellNet):
             made: the generated clip, enlarged to the size of `given`; sides are multiples of `STRIDE_PX`.
             scale: f32[N], how many times smaller the clip was.
         """
-        colors = torch.stack([made.rgb, given.color, given.backdrop, given.render], 1)  # type: ignore[list-item]
-        depths = torch.stack([made.depth_code, given.depth_code, given.render_code], 1)  # type: ignore[list-item]
-        ids = torch.stack([made.ids, given.ids, given.backdrop_ids, given.render_ids], 1)  # type: ignore[list-item]
+        colors = torch.stack([made.rgb, given.color, given.backdrop, given.render], 1)
+        depths = torch.stack([made.depth_code, given.depth_code, given.render_code], 1)
+        ids = torch.stack([made.ids, given.ids, given.backdrop_ids, given.render_ids], 1)
         masks = [given.valid, given.warped, given.alpha, given.certainty]
         fold = lambda x: functional.pixel_unshuffle(x, 2)  # noqa: E731
         agree = (ids[:, 1:] == ids[:, :1]).float().flatten(1, 2)
-        planes = [fold(colors.flatten(1, 2)), fold(depths.flatten(1, 2)), *(fold(m) for m in masks), fold(made.log_error)]  # type: ignore[arg-type]
+        planes = [
+            fold(colors.flatten(1, 2)),
+            fold(depths.flatten(1, 2)),
+            *(fold(m) for m in masks),
+            fold(made.log_error),
+        ]
         planes.append(functional.avg_pool2d(agree, 2))
         planes.append(scale.log2().view(-1, 1, 1, 1).expand(-1, 1, *planes[0].shape[-2:]))
         out = self.pixels(joined(planes, colors.dtype), frames)
@@ -154,9 +167,9 @@ def class_scores(finished: Finished) -> Tensor:
 
 
 def with_detail(rgb: Tensor, given: ConditionPixels) -> Tensor:
-    """Finished colours f32[N,3,H,W] in [-1,1] with the finest structure of the images warped in (the difference from the mean of 3x3
-    pixels) in place of their own, where the two agree but for that: the more, the better they agree. What is learned by squared error
-    is blurred where it is unsure; a warped photograph is not."""
+    """Finished colours f32[N,3,H,W] in [-1,1] with the finest structure of the images warped in (the difference from
+    the mean of 3x3 pixels) in place of their own, where the two agree but for that: the more, the better they agree.
+    What is learned by squared error is blurred where it is unsure; a warped photograph is not."""
     coarse = lambda x: functional.avg_pool2d(functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, 1)  # noqa: E731
     mine, theirs = coarse(rgb), coarse(given.color)
     apart = (mine - theirs).abs().amax(1, keepdim=True)
@@ -164,12 +177,12 @@ def with_detail(rgb: Tensor, given: ConditionPixels) -> Tensor:
     return rgb + weight * ((given.color - theirs) - (rgb - mine))
 
 
-# tiles ----------------------------------------------------------------------------------------------------------------
+# tiles --------------------------------------------------------------------------------------------
 
 
 def spans(length: int, longest: int = TILE_PX) -> list[tuple[int, int]]:
-    """Cut 0..length into pieces of about equal size, none longer than `longest` (up to `STRIDE_PX`), with borders at multiples of
-    `STRIDE_PX`."""
+    """Cut 0..length into pieces of about equal size, none longer than `longest` (up to `STRIDE_PX`), with borders at
+    multiples of `STRIDE_PX`."""
     count = -(-length // max(longest, STRIDE_PX))
     borders = [round(number * length / count / STRIDE_PX) * STRIDE_PX for number in range(count)] + [length]
     return [(first, last) for first, last in zip(borders, borders[1:], strict=False) if first < last]
@@ -202,8 +215,12 @@ def finish_in_tiles(
     small, device = made.rgb.shape[-2:], made.rgb.device
     scale = torch.full((frames,), (size[0] * size[1] / (small[0] * small[1])) ** 0.5, device=device)
     margin = finisher.margin_px
-    whole = Made(*(torch.empty(frames, c, *size, dtype=t, device=device) for c, t in (
-        (3, torch.float32), (1, torch.float32), (1, torch.uint8), (1, torch.float32))))  # fmt: skip
+    whole = Made(
+        *(
+            torch.empty(frames, c, *size, dtype=t, device=device)
+            for c, t in ((3, torch.float32), (1, torch.float32), (1, torch.uint8), (1, torch.float32))
+        )
+    )
     for top, bottom in spans(size[0], tile_px):
         for left, right in spans(size[1], tile_px):
             rows, columns = (

@@ -1,13 +1,15 @@
 """learn: train a multi-modal diffusion model on generated cities or recorded logs, on one process or many.
 
-Read from `run`: make the clips, train the latent codec (`diffusion/training/models.py`), train the denoising network, score, export. The
-training loop is in full view in `_train_network`; from the disk to the loss it goes through `diffusion/clips/shards.py` (`read_clip`),
-`diffusion/training/clips.py` (`draw_clips`) and `diffusion/model.py` (`MDM.loss`). Every draw is a function of (seed, step) and of a
-clip's place in the step's batch, so a run that was interrupted and continued equals one that was not: bit for bit at a fixed
-number of threads and processes, up to rounding if the number of processes or the layout changed meanwhile.
+Read from `run`: make the clips, train the latent codec (`diffusion/training/models.py`), train the denoising network,
+score, export. The training loop is in full view in `_train_network`; from the disk to the loss it goes through
+`diffusion/clips/shards.py` (`read_clip`), `diffusion/training/clips.py` (`draw_clips`) and `diffusion/model.py`
+(`MDM.loss`). Every draw is a function of (seed, step) and of a clip's place in the step's batch, so a run that was
+interrupted and continued equals one that was not: bit for bit at a fixed number of threads and processes, up to
+rounding if the number of processes or the layout changed meanwhile.
 
 OUT/clips/    one shard per city or clip of a log (or the folder `data.clips` of the configuration)
-OUT/codec/    checkpoints of the codec         OUT/steps/   checkpoints of the network, its moving average, the optimiser
+OUT/codec/    checkpoints of the codec         OUT/steps/   checkpoints of the network, its moving average, the
+              optimiser
 OUT/samples/  picture grids during training    OUT/loss.png, OUT/log.jsonl, OUT/metrics.json
 OUT/model/    the exported model: fp16 weights, model.json, MODEL_CARD.md
 OUT/cache/    clips that were fetched or made when they were drawn; removed at the end
@@ -47,14 +49,7 @@ from mudg.diffusion.training import parallel
 from mudg.diffusion.training import score as learn_score
 from mudg.diffusion.training.clips import class_weights, draw_clips
 from mudg.diffusion.training.memory_plan import choose_bf16
-from mudg.diffusion.training.models import (  # fmt: skip
-    Model,
-    draw_weights,
-    freeze,
-    hold_finisher,
-    kind_of,
-    starting_model,
-)
+from mudg.diffusion.training.models import Model, draw_weights, freeze, hold_finisher, kind_of, starting_model
 from mudg.diffusion.training.parallel import SAME_SIGNAL_S, Ranks, Spread, agreed_terms
 from mudg.diffusion.training.scene_list import ListedShards, is_list, read_list
 from mudg.diffusion.training.state import TrainingState, mean_of
@@ -64,18 +59,27 @@ def check(config: LearnConfig) -> LearnConfig:
     """The configuration; without renders where the condition has none.
 
     Raises:
-        UsageError: settings that do not go together, or a condition that cannot be made. ResourceError: a package is missing.
+        UsageError: settings that do not go together, or a condition that cannot be made. ResourceError: a package is
+            missing.
     """
     if config.compute.tensorboard and importlib.util.find_spec("tensorboard") is None:
-        raise ResourceError("TensorBoard is not installed", where="--compute.tensorboard",
-            remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same")  # fmt: skip
+        raise ResourceError(
+            "TensorBoard is not installed",
+            where="--compute.tensorboard",
+            remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same",
+        )
     if config.data.condition != "full":
         if config.data.scenes:
-            raise UsageError("this condition is made of generated cities only", where="--data.condition", got="--data.scenes",
-                             remedy="leave one of them out")  # fmt: skip
+            raise UsageError(
+                "this condition is made of generated cities only",
+                where="--data.condition",
+                got="--data.scenes",
+                remedy="leave one of them out",
+            )
         config = learn_clips.without_renders(config)
     learn_clips.is_streamed(config)  # refuses what does not go together
     return config
+
 
 WEIGHT_DECAY = 0.01
 """Of AdamW, as published."""
@@ -90,7 +94,8 @@ def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callabl
         open_work: opens the folder, in the leader alone; a finished result is verified and used again.
 
     Raises:
-        NumericsError: a loss or gradient is not finite (names the term, the step and the process; parameters are untouched).
+        NumericsError: a loss or gradient is not finite (names the term, the step and the process; parameters are
+            untouched).
         InputError: logs or clips that cannot be used. ResourceError, UsageError: see `RunDir.open`.
     """
     torch.set_num_threads(config.threads)
@@ -129,7 +134,8 @@ def _sources(config: LearnConfig) -> list[from_log.LogSource]:
 
 
 def files_read(config: LearnConfig, out: Path, overwrite: bool) -> dict[str, Path | str | None]:
-    """What is read, by names for messages. Clips may lie in `out` where they do by default, unless a result there is to be replaced."""
+    """What is read, by names for messages. Clips may lie in `out` where they do by default, unless a result there is to
+    be replaced."""
     read: dict[str, Path | str | None] = {"start": mdm_files.folder_of(config.start) if config.start else ""}
     for number, source in enumerate(_sources(config)):
         read |= {f"scene {number}": source.scene, f"fused {number}": source.fused}
@@ -143,7 +149,8 @@ def files_read(config: LearnConfig, out: Path, overwrite: bool) -> dict[str, Pat
 
 
 def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
-    """Clips, codec, network, scores. From logs, `config` is rewritten in terms of shards: `given` is what the user said."""
+    """Clips, codec, network, scores. From logs, `config` is rewritten in terms of shards: `given` is what the user
+    said."""
     out, given, kind = directory.path, config, kind_of(model)
     bf16 = choose_bf16(config.precision, ranks.device)
     folder: Path | ShardSource = Path(config.data.clips) if config.data.clips else out / "clips"
@@ -203,7 +210,7 @@ def _class_weights(config: LearnConfig, folder: Path | ShardSource) -> Tensor:
     return class_weights(folder, learn_clips.weighed_shards(config, folder), config.loss.class_balance)
 
 
-# network --------------------------------------------------------------------------------------------------------------
+# network ------------------------------------------------------------------------------------------
 
 
 def learning_rate(config: LearnConfig, step: int) -> float:
@@ -232,9 +239,12 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
     spread = Spread(model, trained, ranks, config.compute.parallel, config.compute.processes_per_replica)
     rules = config.optimizer
     optimizer = torch.optim.AdamW(
-        [p for p in trained.parameters() if p.requires_grad], lr=rules.lr, betas=rules.betas, weight_decay=WEIGHT_DECAY,
+        [p for p in trained.parameters() if p.requires_grad],
+        lr=rules.lr,
+        betas=rules.betas,
+        weight_decay=WEIGHT_DECAY,
         fused=True,
-    )  # fmt: skip
+    )
     average = None
     if rules.average_decay:
         average = {name: value.detach().clone() for name, value in trained.state_dict().items()}
@@ -275,9 +285,10 @@ def _train_network(
     watch = partial(_score_watched, model, config, run_dir, folder, bf16)
     _watch_missed(state, config, run_dir, ranks, watch)
     with (
-        log.task("network", config.steps, begun) as bar, Interruption(SAME_SIGNAL_S) as interruption,
+        log.task("network", config.steps, begun) as bar,
+        Interruption(SAME_SIGNAL_S) as interruption,
         _reading_ahead(config, folder, ranks) as ahead,
-    ):  # fmt: skip
+    ):
         for step in range(begun, config.steps):
             ahead.beyond(step)
             for group in state.optimizer.param_groups:
@@ -326,8 +337,12 @@ def _train_network(
 
 def _loss_settings(config: LearnConfig, class_weights: Tensor) -> LossSettings:
     data = config.data
-    return LossSettings(class_weights, config.loss.refined_share, data.reference_dropout,
-                        frame_dropout=data.reference_dropout_scope == "tokens_and_frame")  # fmt: skip
+    return LossSettings(
+        class_weights,
+        config.loss.refined_share,
+        data.reference_dropout,
+        frame_dropout=data.reference_dropout_scope == "tokens_and_frame",
+    )
 
 
 def _watch_missed(

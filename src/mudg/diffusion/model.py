@@ -1,11 +1,12 @@
 """The multi-modal diffusion model: from a sparse, projected point cloud to dense colour, depth and semantic video.
 
-Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to do,
-`encode_condition`, `loss` and `sample`. The network and the step from latents to pixels are in
+Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to
+do, `encode_condition`, `loss` and `sample`. The network and the step from latents to pixels are in
 `models.mdm.network`, reading and writing in `models.mdm.files`.
 
-The network's input is, per latent cell, [noisy latents of all modalities | colour condition | depth condition | backdrop | masks of
-what was seen | classes of the condition]. It states the clean latents of all modalities at once, and may copy the condition's own.
+The network's input is, per latent cell, [noisy latents of all modalities | colour condition | depth condition |
+backdrop | masks of what was seen | classes of the condition]. It states the clean latents of all modalities at once,
+and may copy the condition's own.
 
 Layouts: conditions and samples [T,C,H,W] of one clip; inside the model [B,T,C,h,w], with (h, w) the latent size; inside
 the UNet [B*T,C,h,w] stored channels-last.
@@ -30,16 +31,8 @@ from mudg.core import losses, noise
 from mudg.core.depth import align_depth
 from mudg.core.noise import Schedule
 from mudg.diffusion.finisher import Finisher, Made, class_scores, finish_in_tiles
-from mudg.diffusion.network import (  # fmt: skip
-    ConditionPixels,
-    MDMConfig,
-    PixelTruth,
-    Refined,
-    Refiner,
-    TemporalAttention,
-    UNet,
-)
-from mudg.diffusion.requests import (  # fmt: skip
+from mudg.diffusion.network import ConditionPixels, MDMConfig, PixelTruth, Refined, Refiner, TemporalAttention, UNet
+from mudg.diffusion.requests import (
     GeneratedClip,
     SampleRequest,
     StartClip,
@@ -53,20 +46,12 @@ from mudg.diffusion.requests import (  # fmt: skip
     sized_to_width,
 )
 from mudg.diffusion.stacked import Stacked, cell_means, cell_shares
-from mudg.networks.codec import (  # fmt: skip
-    CLASSES,
-    MODALITIES,
-    Decoded,
-    Modality,
-    PatchCodec,
-    code_to_depth,
-    semantic_shares,
-)
+from mudg.networks.codec import CLASSES, MODALITIES, Decoded, Modality, PatchCodec, code_to_depth, semantic_shares
 
 SKY = palette.ID["sky"]
 
 
-# model ----------------------------------------------------------------------------------------------------------------
+# model --------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -75,8 +60,8 @@ class ConditionLatents:
 
     planes f32[B,T,CONDITION_PLANES,h,w]; copy: latents of the condition [B,T,4,h,w] for colour and depth, class shares
     [B,T,19,h,w] for semantics; backdrop: as copy, of the backdrop's colour; seen: share of the cell that is
-    trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..]. render: of models that use
-    renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w].
+    trustworthy, [B,T,1,h,w] in [0,1], per modality; pixels: the condition at pixel resolution, [B*T,..]. render: of
+    models that use renders, latents of their colour and depth [B,T,4,h,w], and certainty: [B,T,1,h,w].
     """
 
     planes: Tensor
@@ -90,8 +75,8 @@ class ConditionLatents:
 
 @dataclass(frozen=True)
 class BatchPart:
-    """Clips number `first` and following of the `count` clips of a training step. Whatever training draws for a clip depends on
-    (seed, step, its number), and not on how the step's batch is divided."""
+    """Clips number `first` and following of the `count` clips of a training step. Whatever training draws for a clip
+    depends on (seed, step, its number), and not on how the step's batch is divided."""
 
     seed: int
     step: int
@@ -106,7 +91,8 @@ class LossSettings:
     class_weights      f32[19], weights of the classes in the cross-entropy; None = all 1
     refined_share      share of each side of the image on which the refiner is trained at a step
     reference_dropout  share of the clips that go without their reference image; the published kind
-    frame_dropout      where the reference is left out, frame 0 of the colour condition goes without it too; the published kind
+    frame_dropout      where the reference is left out, frame 0 of the colour condition goes without it too; the
+                       published kind
     """
 
     class_weights: Tensor | None
@@ -117,8 +103,8 @@ class LossSettings:
 
 @dataclass(frozen=True)
 class EncodedTruth:
-    """Encoded truth of a batch: latents [B,T,C,h,w]; class shares [B,T,19,h,w]; depth_known f32[B,T,1,h,w], share of the cell with
-    valid depth; and all of it at pixel resolution."""
+    """Encoded truth of a batch: latents [B,T,C,h,w]; class shares [B,T,19,h,w]; depth_known f32[B,T,1,h,w], share of
+    the cell with valid depth; and all of it at pixel resolution."""
 
     latents: dict[Modality, Tensor]
     shares: Tensor
@@ -141,27 +127,30 @@ COPY_BIAS = 4.0
 """Start value of the copy gates' logits where the cell is seen (minus this for the backdrop); 0 where it is not."""
 
 CONDITION_PLANES = 3 * 4 + 2 * PatchCodec.factor**2 + CLASSES + 1
-"""Planes of a condition: latents of colour, depth and backdrop, two masks at pixel resolution, class shares and their sum."""
+"""Planes of a condition: latents of colour, depth and backdrop, two masks at pixel resolution, class shares and their
+sum."""
 
 GATES = 4
 """Outputs that say how much of the condition is copied: its colour, its depth, the backdrop's colour, its classes."""
 
 RENDER_PLANES = 2 * 4 + 2 + CLASSES + 1
-"""Further planes of models that use renders: latents of their colour and depth, coverage and certainty, class shares and their
-sum."""
+"""Further planes of models that use renders: latents of their colour and depth, coverage and certainty, class shares
+and their sum."""
 
 RENDER_GATES = 2
 """Their further outputs: how much of the render's colour and of its depth is copied."""
 
 SURROUNDINGS = 8
-"""Latent cells beside a patch that are refined with it in training. What lies farther away changes the losses by 1e-4 of their value."""
+"""Latent cells beside a patch that are refined with it in training. What lies farther away changes the losses by 1e-4
+of their value."""
 
 LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3}
 """Weights of the modalities in the joint loss."""
 
 
 class MDM(nn.Module):
-    """The multi-modal diffusion model (see the module text). Weights are random until `files.load` or `learn` sets them."""
+    """The multi-modal diffusion model (see the module text). Weights are random until `files.load` or `learn` sets
+    them."""
 
     points_alone = False
     """The condition is filled, and recorded images are warped into it."""
@@ -178,7 +167,9 @@ class MDM(nn.Module):
         self.refiner: Refiner | None = None
         if config.refine_widths:
             (fine, coarse), (outer, inner) = config.refine_widths, config.refine_blocks
-            self.refiner = Refiner(noisy, (fine, coarse), (outer, inner), config.renders).to(memory_format=torch.channels_last)
+            self.refiner = Refiner(noisy, (fine, coarse), (outer, inner), config.renders).to(
+                memory_format=torch.channels_last
+            )
         self.finisher: Finisher | None = None
         if config.finish_widths:
             (fine, coarse), (outer, inner) = config.finish_widths, config.finish_blocks
@@ -189,7 +180,7 @@ class MDM(nn.Module):
         """Where the weights lie."""
         return self.codec.rgb_mean.device
 
-    # inputs -----------------------------------------------------------------------------------------------------------
+    # inputs ---------------------------------------------------------------------------------------
 
     def check_size(self, height: int, width: int) -> None:
         """UsageError unless an image of this size fits the network's strides."""
@@ -203,20 +194,23 @@ class MDM(nn.Module):
     def encode_condition(self, condition: Condition | Sequence[Condition]) -> ConditionLatents:
         """Latents and mask planes of one clip's condition, or of several of the same shape (see `ConditionLatents`).
 
-        A condition without warped images, backdrop or classes counts as one with none warped, its own colour as backdrop, and
-        unknown classes.
+        A condition without warped images, backdrop or classes counts as one with none warped, its own colour as
+        backdrop, and unknown classes.
         """
         given = Stacked.of([condition] if isinstance(condition, Condition) else list(condition))
         color, depth, valid, warped, ids = given.color, given.depth, given.valid, given.warped, given.ids
         self.check_size(*color.shape[-2:])
         factor = self.codec.factor
         copy: dict[Modality, Tensor] = {
-            "rgb": self.codec.encode_rgb(color), "depth": self.codec.encode_depth(depth), "semantics": cell_shares(ids),
-        }  # fmt: skip
+            "rgb": self.codec.encode_rgb(color),
+            "depth": self.codec.encode_depth(depth),
+            "semantics": cell_shares(ids),
+        }
         seen: dict[Modality, Tensor] = {
-            "rgb": cell_means(torch.maximum(valid, warped), factor), "depth": cell_means(valid, factor),
+            "rgb": cell_means(torch.maximum(valid, warped), factor),
+            "depth": cell_means(valid, factor),
             "semantics": copy["semantics"].sum(2, keepdim=True),
-        }  # fmt: skip
+        }
         far = self.codec.encode_rgb(given.backdrop)
         masks = (functional.pixel_unshuffle(m, factor) for m in (valid, warped))
         planes = [copy["rgb"], copy["depth"], far, *masks, copy["semantics"], seen["semantics"]]
@@ -224,7 +218,10 @@ class MDM(nn.Module):
         if not self.config.renders:
             return ConditionLatents(torch.cat(planes, 2), copy, far, seen, pixels)
         shown = given.renders
-        render: dict[Modality, Tensor] = {"rgb": self.codec.encode_rgb(shown.color), "depth": self.codec.encode_depth(shown.depth)}
+        render: dict[Modality, Tensor] = {
+            "rgb": self.codec.encode_rgb(shown.color),
+            "depth": self.codec.encode_depth(shown.depth),
+        }
         classes, certainty = cell_shares(shown.semantics), cell_means(shown.certainty, factor)
         alpha = cell_means(shown.alpha, factor)
         planes += [render["rgb"], render["depth"], alpha, certainty, classes, classes.sum(2, keepdim=True)]
@@ -234,14 +231,20 @@ class MDM(nn.Module):
         """What the refiner sees of a batch of conditions, [B*T,..]."""
         code = self.codec.linear_depth_code
         pixels = [
-            given.color * 2 - 1, given.backdrop * 2 - 1, code(given.depth), given.valid, given.warped, given.ids, given.backdrop_ids
-        ]  # fmt: skip
+            given.color * 2 - 1,
+            given.backdrop * 2 - 1,
+            code(given.depth),
+            given.valid,
+            given.warped,
+            given.ids,
+            given.backdrop_ids,
+        ]
         if self.config.renders:
             shown = given.renders
             pixels += [shown.color * 2 - 1, code(shown.depth), shown.alpha, shown.certainty, shown.semantics]
         return ConditionPixels(*(x.flatten(0, 1) for x in pixels))
 
-    # network ----------------------------------------------------------------------------------------------------------
+    # network --------------------------------------------------------------------------------------
 
     def predict(
         self, x: dict[Modality, Tensor], encoded: ConditionLatents, t: Tensor
@@ -265,13 +268,13 @@ class MDM(nn.Module):
         log_shares = (classes + 4.0 * copy_classes.sigmoid() * encoded.copy["semantics"]).log_softmax(2)
         return {"rgb": rgb, "depth": depth, "semantics": self.codec.shares_to_latent(log_shares.exp())}, log_shares
 
-    # training ---------------------------------------------------------------------------------------------------------
+    # training -------------------------------------------------------------------------------------
 
     def loss(self, clips: Sequence[Clip], part: BatchPart, settings: LossSettings) -> Losses:
         """Denoising loss of clips of one size; all that is drawn comes from `part`.
 
-        Squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a clip; cross-entropy for class
-        shares. Steps are stratified over the batch. Where depth is not valid it has no part.
+        Squared error of x0 (depth: Huber) times 1 + SNR clipped to [1, 5], which is the v-loss with a clip;
+        cross-entropy for class shares. Steps are stratified over the batch. Where depth is not valid it has no part.
         With a refiner its terms are added, and their gradient reaches the denoiser.
         """
         with torch.no_grad():
@@ -296,7 +299,7 @@ class MDM(nn.Module):
             errors |= self._finisher_terms(stated, encoded, clips, settings)
             terms |= {name: float(error.detach()) for name, error in errors.items()}
             total = total + sum(errors.values())
-        return Losses(total, terms)  # type: ignore[arg-type]
+        return Losses(total, terms)
 
     forward = loss
     """What `DistributedDataParallel` calls, to exchange gradients behind it."""
@@ -304,13 +307,15 @@ class MDM(nn.Module):
     def encode_truth(self, clips: Sequence[Clip]) -> EncodedTruth:
         """What `loss` compares with."""
         rgb, depth, valid, ids = (
-            torch.stack([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_valid", "semantics")
+            torch.stack([getattr(clip, name) for clip in clips])
+            for name in ("rgb", "depth", "depth_valid", "semantics")
         )
         pixels = self.pixel_truth(clips)
         latents: dict[Modality, Tensor] = {
-            "rgb": self.codec.encode_rgb(rgb), "depth": self.codec.encode_depth(depth),
+            "rgb": self.codec.encode_rgb(rgb),
+            "depth": self.codec.encode_depth(depth),
             "semantics": self.codec.encode_semantics(ids),
-        }  # fmt: skip
+        }
         cells = functional.avg_pool2d(pixels.depth_known, self.codec.factor).unflatten(0, valid.shape[:2])
         return EncodedTruth(latents, semantic_shares(ids), cells, pixels)
 
@@ -322,7 +327,8 @@ class MDM(nn.Module):
         return PixelTruth(rgb * 2 - 1, self.codec.linear_depth_code(depth), ids, weight)
 
     def _clip_noise(self, like: Tensor, seed: int, first: int, name: str) -> Tensor:
-        """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on nothing else."""
+        """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on
+        nothing else."""
         shape = (1, *like.shape[1:])
         draws = [
             noise.video_noise(shape, seeds.torch_generator(seed, first + i, name), self.config.shared_noise)
@@ -331,7 +337,12 @@ class MDM(nn.Module):
         return torch.cat(draws).to(like.device)
 
     def _refiner_terms(
-        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, truth: PixelTruth, part: BatchPart, settings: LossSettings
+        self,
+        stated: dict[Modality, Tensor],
+        encoded: ConditionLatents,
+        truth: PixelTruth,
+        part: BatchPart,
+        settings: LossSettings,
     ) -> dict[str, Tensor]:
         """Weighted terms of the refiner in a rectangle of the image, at the denoiser's resolution."""
         frames, (h, w) = encoded.planes.shape[1], encoded.planes.shape[-2:]
@@ -345,7 +356,8 @@ class MDM(nn.Module):
     def _finisher_terms(
         self, stated: dict[Modality, Tensor], encoded: ConditionLatents, clips: Sequence[Clip], settings: LossSettings
     ) -> dict[str, Tensor]:
-        """Weighted terms of the finisher on the patches that the clips have; denoiser and refiner learn nothing from them."""
+        """Weighted terms of the finisher on the patches that the clips have; denoiser and refiner learn nothing from
+        them."""
         patches = [(number, clip.fine) for number, clip in enumerate(clips) if clip.fine is not None]
         if self.finisher is None or not patches:
             return {}
@@ -355,19 +367,26 @@ class MDM(nn.Module):
             made = Made(*(torch.cat([getattr(m, f.name) for m in enlarged]) for f in fields(Made)))
             given = self._pixels_of(Stacked.of([patch.clip.condition for _, patch in patches]))
             truth = self.pixel_truth([patch.clip for _, patch in patches])
-            scale = torch.tensor([float(patch.scale) for _, patch in patches], device=made.rgb.device).repeat_interleave(frames)
+            scale = torch.tensor(
+                [float(patch.scale) for _, patch in patches], device=made.rgb.device
+            ).repeat_interleave(frames)
         done = self.finisher(made, given, frames, scale)
         found = Refined(done.rgb, done.depth_code, class_scores(done), done.log_error)
         return self._pixel_terms(found, truth, settings, "fine")
 
-    def _enlarged(self, stated: dict[Modality, Tensor], encoded: ConditionLatents, number: int, patch: FinePatch) -> Made:
-        """What denoiser and refiner make of the patch of clip `number`, at the patch's size. Only its surroundings are refined."""
+    def _enlarged(
+        self, stated: dict[Modality, Tensor], encoded: ConditionLatents, number: int, patch: FinePatch
+    ) -> Made:
+        """What denoiser and refiner make of the patch of clip `number`, at the patch's size. Only its surroundings are
+        refined."""
         frames, *cells = stated["rgb"].shape[1], *stated["rgb"].shape[-2:]
         factor, own = self.codec.factor, slice(number, number + 1)
         starts, sides = (patch.row, patch.column), (side // patch.scale for side in patch.clip.rgb.shape[-2:])
         around = [_around(start, side, factor, count) for start, side, count in zip(starts, sides, cells, strict=True)]
         tall, wide = (slice(cut.start * factor, cut.stop * factor) for cut in around)
-        latents: dict[Modality, Tensor] = {m: z[own, ..., around[0], around[1]].flatten(0, 1) for m, z in stated.items()}
+        latents: dict[Modality, Tensor] = {
+            m: z[own, ..., around[0], around[1]].flatten(0, 1) for m, z in stated.items()
+        }
         pixels = encoded.pixels.map(lambda x: x[number * frames : (number + 1) * frames]).crop(tall, wide)
         small = self._made(self.refine(latents, pixels, frames))
         size = (tall.stop - tall.start) * patch.scale, (wide.stop - wide.start) * patch.scale
@@ -394,7 +413,8 @@ class MDM(nn.Module):
 
     @staticmethod
     def _refined_window(part: BatchPart, share: float, height: int, width: int) -> tuple[slice, slice]:
-        """Rows and columns of latent cells on which the refiner is trained at a step: a share of each side, anywhere."""
+        """Rows and columns of latent cells on which the refiner is trained at a step: a share of each side,
+        anywhere."""
         rng = seeds.numpy_rng(part.seed, part.step, "refined window")
         spans = []
         for cells in (height, width):
@@ -410,32 +430,42 @@ class MDM(nn.Module):
         return self.refiner(self.codec, latents, given, frames)
 
     def trained_part(self) -> nn.ModuleDict:
-        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner and finisher."""
+        """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner
+        and finisher."""
         parts = {"net": self.net, "refiner": self.refiner, "finisher": self.finisher}
         return nn.ModuleDict({name: part for name, part in parts.items() if part is not None})
 
     def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
-        """Names in `trained_part` of the parameters that mix frames: of the temporal attentions, or of `all` temporal layers.
+        """Names in `trained_part` of the parameters that mix frames: of the temporal attentions, or of `all` temporal
+        layers.
 
         This network has no temporal layers with parameters besides its attentions.
         """
         del which
         kinds = {name for name, module in self.trained_part().named_modules() if isinstance(module, TemporalAttention)}
-        return {f"{owner}.{name}" for owner in kinds for name, _ in self.trained_part().get_submodule(owner).named_parameters()}
+        return {
+            f"{owner}.{name}"
+            for owner in kinds
+            for name, _ in self.trained_part().get_submodule(owner).named_parameters()
+        }
 
-    # sampling ---------------------------------------------------------------------------------------------------------
+    # sampling -------------------------------------------------------------------------------------
 
     @staticmethod
     def check_request(request: SampleRequest) -> None:
         """UsageError for a setting that does not apply to this kind of model, or to the sampler."""
         request.sampler_settings()
         if request.guidance is not None or request.guidance_rescale is not None:
-            raise UsageError("only published-type models have guidance", where="guidance, guidance_rescale",
-                             got=f"{request.guidance}, {request.guidance_rescale}", remedy="leave them out")  # fmt: skip
+            raise UsageError(
+                "only published-type models have guidance",
+                where="guidance, guidance_rescale",
+                got=f"{request.guidance}, {request.guidance_rescale}",
+                remedy="leave them out",
+            )
 
     def image_size(self, width: int, height: int, width_px: int = 0) -> tuple[int, int]:
-        """Width and height the model works at for a camera of width x height: about the area it was trained at, or about
-        `width_px` wide, in the camera's aspect."""
+        """Width and height the model works at for a camera of width x height: about the area it was trained at, or
+        about `width_px` wide, in the camera's aspect."""
         aspect, multiple = width / height, self.config.pixel_multiple
         if width_px:
             return sized_to_width(width_px, aspect, multiple)
@@ -445,8 +475,9 @@ class MDM(nn.Module):
     def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
         """Generate one clip (see `SampleRequest`).
 
-        Condition and clip are on the model's device. The condition has T views; H and W are multiples of `config.pixel_multiple`.
-        Frames of which `request.known` has latents keep them. Measured depth (`condition.valid`) replaces generated depth.
+        Condition and clip are on the model's device. The condition has T views; H and W are multiples of
+        `config.pixel_multiple`. Frames of which `request.known` has latents keep them. Measured depth
+        (`condition.valid`) replaces generated depth.
         """
         self.check_request(request)
         encoded = self.encode_condition(condition)
@@ -488,12 +519,22 @@ class MDM(nn.Module):
         confidence = torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR) * depth_agreement(decoded.depth, fine)
         depth = settle_depth(decoded.depth, fine, self.config.codec.far_m)
         return replace(
-            clip, rgb=decoded.rgb, depth=depth, semantics=decoded.semantics, confidence=confidence, log_error=made.log_error
-        )  # fmt: skip
+            clip,
+            rgb=decoded.rgb,
+            depth=depth,
+            semantics=decoded.semantics,
+            confidence=confidence,
+            log_error=made.log_error,
+        )
 
     def _decoded(self, made: Made) -> Decoded:
-        """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made; takes its colour over."""
-        return Decoded(made.rgb.add_(1).div_(2).clamp_(0, 1), code_to_depth(made.depth_code, self.config.codec), made.ids[:, 0].long())
+        """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made; takes its
+        colour over."""
+        return Decoded(
+            made.rgb.add_(1).div_(2).clamp_(0, 1),
+            code_to_depth(made.depth_code, self.config.codec),
+            made.ids[:, 0].long(),
+        )
 
     def _denoise(self, encoded: ConditionLatents, request: SampleRequest) -> tuple[dict[Modality, Tensor], Tensor]:
         """Draw a clip; returns latents [1,T,C,h,w] and how much the colour's still changed, [1,T,1,h,w]."""
@@ -513,7 +554,8 @@ class MDM(nn.Module):
                 out = torch.where(begun[1] * len(self.schedule) >= t + 1, out, begun[0])
             return out if known is None else torch.cat([known, out[:, known.shape[1] :]], 1)
 
-        with torch.autocast(device.type, torch.bfloat16, enabled=request.bf16):  # around all steps: the weights are converted once
+        # around all steps: the weights are converted once
+        with torch.autocast(device.type, torch.bfloat16, enabled=request.bf16):
             x, estimates = denoised(denoise, draw, self.schedule, request, "x0")
         color = lambda z: z[:, :, : sizes[0]]  # noqa: E731
         return dict(zip(MODALITIES, x.split(sizes, 2))), mean_change([color(e) for e in estimates], color(x))
@@ -529,7 +571,8 @@ class MDM(nn.Module):
 
 @dataclass(frozen=True)
 class _FinePixels:
-    """A condition at the camera's resolution; what the finisher reads of it is made tile by tile, for all of it is large."""
+    """A condition at the camera's resolution; what the finisher reads of it is made tile by tile, for all of it is
+    large."""
 
     model: MDM
     fine: Condition
@@ -547,7 +590,8 @@ class _FinePixels:
 
 
 def _around(start_px: int, side_px: int, factor: int, count: int) -> slice:
-    """The latent cells, of `count`, of a span of pixels with `SURROUNDINGS`; whole pairs, as the refiner's inner blocks take them."""
+    """The latent cells, of `count`, of a span of pixels with `SURROUNDINGS`; whole pairs, as the refiner's inner blocks
+    take them."""
     first = max(0, start_px // factor - SURROUNDINGS)
     last = min(count, -(-(start_px + side_px) // factor) + SURROUNDINGS)
     return slice(first - first % 2, last + last % 2)

@@ -1,14 +1,14 @@
 """The networks of the small models: the denoiser, and the refiner that goes from latents to pixels.
 
-`UNet` is a U of residual blocks with attention over the cells of a patched latent video; `UNetStage` is one block with the
-attentions of its level. Frames of a clip are told apart by a free temporal shift of channels in every block, keys and values from
-frame 0, and temporal attention at the lowest level.
+`UNet` is a U of residual blocks with attention over the cells of a patched latent video; `UNetStage` is one block with
+the attentions of its level. Frames of a clip are told apart by a free temporal shift of channels in every block, keys
+and values from frame 0, and temporal attention at the lowest level.
 
-The latent code has a quarter of the image's places and loses texture, one axis of hue and whatever is one pixel wide; the
-condition has all of it wherever something was seen. The `Refiner` reads both and states, for every pixel, how much of the
-condition's colour, depth and class to take over, what to add, and how wrong the colour will probably be. It runs once per
-clip, after the last denoising step, and is trained together with the denoiser, on what the denoiser makes. All its maps are held at
-the latent resolution, the 2x2 pixels of a cell as channels (`functional.pixel_unshuffle`).
+The latent code has a quarter of the image's places and loses texture, one axis of hue and whatever is one pixel wide;
+the condition has all of it wherever something was seen. The `Refiner` reads both and states, for every pixel, how much
+of the condition's colour, depth and class to take over, what to add, and how wrong the colour will probably be. It runs
+once per clip, after the last denoising step, and is trained together with the denoiser, on what the denoiser makes. All
+its maps are held at the latent resolution, the 2x2 pixels of a cell as channels (`functional.pixel_unshuffle`).
 
 `MDMConfig` is all that distinguishes one model from another.
 """
@@ -25,7 +25,7 @@ from torch.nn import functional
 
 from mudg.base.errors import UsageError
 from mudg.core.noise import ScheduleConfig
-from mudg.networks.codec import (  # fmt: skip
+from mudg.networks.codec import (
     CLASSES,
     MODALITIES,
     ChannelNorm,
@@ -42,7 +42,8 @@ COPY_SCORE = 6.0
 
 @dataclass(frozen=True, kw_only=True)
 class MDMConfig:
-    """Everything that fixes a model's function except its weights. What `LearnConfig` states has its default there alone."""
+    """Everything that fixes a model's function except its weights. What `LearnConfig` states has its default there
+    alone."""
 
     codec: CodecConfig = CodecConfig()
     schedule: ScheduleConfig = ScheduleConfig()
@@ -66,7 +67,8 @@ class MDMConfig:
     renders: bool = False
     """Whether the condition may hold renders of a fitted scene."""
     finish_widths: tuple[int, ...] = ()
-    """Channels of the finisher (`models.mdm.finisher`) at half and at a quarter of the camera's resolution; empty = no finisher."""
+    """Channels of the finisher (`models.mdm.finisher`) at half and at a quarter of the camera's resolution; empty = no
+    finisher."""
     finish_blocks: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
@@ -83,9 +85,13 @@ class MDMConfig:
                 "refine_widths and refine_blocks have two entries each, or none", got=str(self.refine_widths)
             )
         if (len(self.finish_widths), len(self.finish_blocks)) not in ((0, 0), (2, 2)):
-            raise UsageError("finish_widths and finish_blocks have two entries each, or none", got=str(self.finish_widths))
+            raise UsageError(
+                "finish_widths and finish_blocks have two entries each, or none", got=str(self.finish_widths)
+            )
         if self.finish_widths and not (self.refine_widths and self.renders):
-            raise UsageError("a finisher needs a refiner before it, and renders", got=f"renders {self.renders}, {self.refine_widths}")
+            raise UsageError(
+                "a finisher needs a refiner before it, and renders", got=f"renders {self.renders}, {self.refine_widths}"
+            )
 
     @property
     def pixel_multiple(self) -> int:
@@ -93,7 +99,7 @@ class MDMConfig:
         return 2 * self.patch * 2 ** (len(self.widths) - 1)
 
 
-# denoiser -------------------------------------------------------------------------------------------------------------
+# denoiser -----------------------------------------------------------------------------------------
 
 
 def sinusoid(t: Tensor, width: int) -> Tensor:
@@ -128,7 +134,7 @@ class UNetBlock(nn.Module):
         self.conv2 = nn.Conv2d(outside, outside, 3, padding=1)
         self.skip = nn.Conv2d(inside, outside, 1) if inside != outside else nn.Identity()
         nn.init.zeros_(self.conv2.weight)
-        nn.init.zeros_(self.conv2.bias)  # type: ignore[arg-type]
+        nn.init.zeros_(self.conv2.bias)
 
     def forward(self, x: Tensor, embedding: Tensor, frames: int) -> Tensor:
         """`x` [B*T,inside,h,w], `embedding` [B*T,embed] -> [B*T,outside,h,w]."""
@@ -220,7 +226,8 @@ class UNet(nn.Module):
         widths, embed, area = config.widths, config.embed_width, config.patch**2
         self.patch = config.patch
         self.time = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))
-        self.label = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))  # of label 0: all modalities at once
+        # of label 0: all modalities at once
+        self.label = nn.Sequential(nn.Linear(64, embed), nn.SiLU(), nn.Linear(embed, embed))
         self.enter = nn.Conv2d(planes_in * area, widths[0], 1)
         width, skips = widths[0], [widths[0]]
         self.down, self.shrink = nn.ModuleList(), nn.ModuleList()
@@ -249,7 +256,7 @@ class UNet(nn.Module):
         self.norm = ChannelNorm(width)
         self.leave = nn.Conv2d(width, planes_out * area, 1)
         nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
+        nn.init.zeros_(self.leave.bias)
 
     def forward(self, x: Tensor, t: Tensor) -> Tensor:
         """`x` [B,T,planes_in,h,w], `t` i64[B] -> f32 [B,T,planes_out,h,w]."""
@@ -276,7 +283,7 @@ class UNet(nn.Module):
         return functional.pixel_shuffle(h.float(), self.patch).unflatten(0, (batch, frames))
 
 
-# refiner --------------------------------------------------------------------------------------------------------------
+# refiner ------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -311,13 +318,13 @@ class ConditionPixels:
     def map(self, change: Callable[[Tensor], Tensor]) -> ConditionPixels:
         """The same with ``change`` applied to every tensor."""
         parts = (getattr(self, f.name) for f in fields(self))
-        return ConditionPixels(*(None if x is None else change(x) for x in parts))  # type: ignore[arg-type]
+        return ConditionPixels(*(None if x is None else change(x) for x in parts))
 
 
 @dataclass(frozen=True)
 class Refined:
-    """Pixels: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], class scores f32[N,19,H,W] (none of them clamped), and the
-    expected absolute error of rgb as its logarithm f32[N,1,H,W]."""
+    """Pixels: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], class scores f32[N,19,H,W] (none of them clamped),
+    and the expected absolute error of rgb as its logarithm f32[N,1,H,W]."""
 
     rgb: Tensor
     depth_code: Tensor
@@ -332,7 +339,8 @@ def one_hot(ids: Tensor) -> Tensor:
 
 
 def shares(ids: Tensor) -> Tensor:
-    """Share of each class among all 2x2 pixels of a cell, u8[N,1,H,W] -> f32[N,19,H/2,W/2]; unknown pixels count for none."""
+    """Share of each class among all 2x2 pixels of a cell, u8[N,1,H,W] -> f32[N,19,H/2,W/2]; unknown pixels count for
+    none."""
     return functional.avg_pool2d(one_hot(ids), 2)
 
 
@@ -352,9 +360,7 @@ class CellNet(nn.Module):
         reach: side of the first convolution, cells.
     """
 
-    def __init__(
-        self, inside: int, outside: int, widths: tuple[int, int], blocks: tuple[int, int], reach: int
-    ) -> None:
+    def __init__(self, inside: int, outside: int, widths: tuple[int, int], blocks: tuple[int, int], reach: int) -> None:
         super().__init__()
         fine, coarse = widths
         self.enter = nn.Conv2d(inside, fine, reach, padding=reach // 2)
@@ -385,7 +391,8 @@ class CellNet(nn.Module):
 
 
 class Refiner(CellNet):
-    """See the module text. `widths`: channels at the latent resolution and at half of it; `blocks`: residual blocks there.
+    """See the module text. `widths`: channels at the latent resolution and at half of it; `blocks`: residual blocks
+    there.
 
     With `renders` it also reads what a fitted scene shows.
     """
@@ -407,10 +414,11 @@ class Refiner(CellNet):
         self.reset()
 
     def take_back(self, class_weights: Tensor) -> None:
-        """Undo what class weights f32[19] in the loss did to the scores: each class loses the logarithm of its weight."""
+        """Undo what class weights f32[19] in the loss did to the scores: each class loses the logarithm of its
+        weight."""
         first = sum(self.SIZES[:5])
         with torch.no_grad():
-            bias = self.leave.bias[first : first + 4 * CLASSES]  # type: ignore[index]
+            bias = self.leave.bias[first : first + 4 * CLASSES]
             bias -= class_weights.log().repeat_interleave(4).to(bias.device)
 
     def reset(self) -> None:
@@ -419,20 +427,33 @@ class Refiner(CellNet):
             self.leave.weight.zero_()
             starts = self.STARTS + (self.RENDER_STARTS if self.renders else ())
             parts = [torch.full((size,), start) for size, start in zip(self.sizes, starts)]
-            self.leave.bias.copy_(torch.cat(parts))  # type: ignore[union-attr]
+            self.leave.bias.copy_(torch.cat(parts))
 
-    def forward(self, codec: PatchCodec, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
+    def forward(
+        self, codec: PatchCodec, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int
+    ) -> Refined:
         """`latents` [N,C,h,w] of all modalities (N = clips times frames, frames innermost) -> pixels."""
         rgb, depth, scores = codec.decode_raw(latents)
         fold = lambda x: functional.pixel_unshuffle(x, 2)  # noqa: E731
         seen = [given.color, given.backdrop, given.depth_code, given.valid, given.warped]
-        planes = [*(latents[m] for m in MODALITIES), fold(rgb), fold(depth), *(fold(x) for x in seen), shares(given.ids),
-                  shares(given.backdrop_ids)]  # fmt: skip
+        planes = [
+            *(latents[m] for m in MODALITIES),
+            fold(rgb),
+            fold(depth),
+            *(fold(x) for x in seen),
+            shares(given.ids),
+            shares(given.backdrop_ids),
+        ]
         if self.renders:
-            planes += [*(fold(x) for x in (given.render, given.render_code, given.alpha, given.certainty)), shares(given.render_ids)]
+            planes += [
+                *(fold(x) for x in (given.render, given.render_code, given.alpha, given.certainty)),
+                shares(given.render_ids),
+            ]
         out = self.pixels(joined(planes, rgb.dtype), frames)
         parts = out.split([size // 4 for size in self.sizes], 1)
-        more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error = parts[: len(self.SIZES)]
+        more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error = parts[
+            : len(self.SIZES)
+        ]
         if self.renders:
             take_render, take_code, take_render_ids = (gate.sigmoid() for gate in parts[len(self.SIZES) :])
             rgb = rgb + take_render * (given.render - rgb)
@@ -441,16 +462,19 @@ class Refiner(CellNet):
         rgb = rgb + take.sigmoid() * (given.color - rgb)
         rgb = rgb + take_far.sigmoid() * (given.backdrop - rgb) + 0.2 * more
         depth = depth + take_depth.sigmoid() * (given.depth_code - depth) + 0.05 * deeper
-        scores = scores + more_scores + COPY_SCORE * (
-            take_ids.sigmoid() * one_hot(given.ids) + take_far_ids.sigmoid() * one_hot(given.backdrop_ids)
-        )  # fmt: skip
+        scores = (
+            scores
+            + more_scores
+            + COPY_SCORE
+            * (take_ids.sigmoid() * one_hot(given.ids) + take_far_ids.sigmoid() * one_hot(given.backdrop_ids))
+        )
         return Refined(rgb, depth, scores, log_error)
 
 
 @dataclass(frozen=True)
 class PixelTruth:
-    """What the refiner should give: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], ids i64[N,H,W] (255 = unlabelled);
-    depth_known f32[N,1,H,W]: 1 where the depth is true, 0 where it only fills a gap."""
+    """What the refiner should give: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], ids i64[N,H,W] (255 =
+    unlabelled); depth_known f32[N,1,H,W]: 1 where the depth is true, 0 where it only fills a gap."""
 
     rgb: Tensor
     depth_code: Tensor

@@ -1,11 +1,12 @@
 """The interface that the two diffusion models share: requests, generated clips, and their confidence.
 
-`MDM` (`diffusion/model.py`) and `PublishedMDM` (`diffusion/published/model.py`) have the same methods: `check_request`, `check_clip`,
-`image_size`, and `sample`, which makes a `GeneratedClip` from a condition and a `SampleRequest`, both on the model's device.
+`MDM` (`diffusion/model.py`) and `PublishedMDM` (`diffusion/published/model.py`) have the same methods: `check_request`,
+`check_clip`, `image_size`, and `sample`, which makes a `GeneratedClip` from a condition and a `SampleRequest`, both on
+the model's device.
 
-Conditions are made on the CPU, and clips are used there: `generated` is the border to the model's device. It takes a clip's condition
-over once and brings back the finished clip; in between only noise, drawn on the CPU so that it is the same for every device, and
-latents of the window before go over.
+Conditions are made on the CPU, and clips are used there: `generated` is the border to the model's device. It takes a
+clip's condition over once and brings back the finished clip; in between only noise, drawn on the CPU so that it is the
+same for every device, and latents of the window before go over.
 """
 
 from __future__ import annotations
@@ -29,8 +30,9 @@ from mudg.networks.codec import Modality
 
 @dataclass(frozen=True, eq=False)
 class StartClip:
-    """What a clip is to stay like: rgb f32[T,3,H,W] in [0,1], depth f32[T,1,H,W] metres, semantics u8[T,1,H,W] (255 = unknown), and
-    freedom f32[T,1,H,W]: the share of the noise schedule, from 0 (stays) to 1 (made from noise), that each pixel goes through."""
+    """What a clip is to stay like: rgb f32[T,3,H,W] in [0,1], depth f32[T,1,H,W] metres, semantics u8[T,1,H,W] (255 =
+    unknown), and freedom f32[T,1,H,W]: the share of the noise schedule, from 0 (stays) to 1 (made from noise), that
+    each pixel goes through."""
 
     rgb: Tensor
     depth: Tensor
@@ -43,15 +45,17 @@ class SampleRequest:
     """How one clip is to be generated.
 
     Args:
-        steps: denoiser passes; 1 is the regression of the clip on its condition. The published kind needs one pass for each
-            modality, and twice as many with guidance.
+        steps: denoiser passes; 1 is the regression of the clip on its condition. The published kind needs one pass for
+            each modality, and twice as many with guidance.
         seed, index: all noise is drawn from (seed, index): same in, same out.
         sampler: a row of `noise.SAMPLERS`.
         eta: ddim: noise added between steps, 0 to 1 (None = the sampler's default).
         guidance: published kind: weight of the guided over the unguided prediction; 1 = none (None = the model's own).
-        guidance_rescale: published kind: share of the guided prediction whose spread is pulled back (None = the model's own).
+        guidance_rescale: published kind: share of the guided prediction whose spread is pulled back (None = the model's
+            own).
         known: modality -> latents [k,C,h,w] of the clip's first k frames, from the previous window.
-        start: a clip at the size of the condition that the sample begins from, each pixel as far as its freedom says; small kind.
+        start: a clip at the size of the condition that the sample begins from, each pixel as far as its freedom says;
+            small kind.
         align: bring each frame's depth to the measured scale (`core.align`).
         bf16: run the networks in bfloat16.
     """
@@ -69,7 +73,8 @@ class SampleRequest:
     bf16: bool = False
 
     def sampler_settings(self) -> dict[str, Any]:
-        """Settings of the sampler that were given; UsageError where there is no such sampler or it does not take them."""
+        """Settings of the sampler that were given; UsageError where there is no such sampler or it does not take
+        them."""
         settings = {} if self.eta is None else {"eta": self.eta}
         noise.check_sampler(self.sampler, settings)
         return settings
@@ -79,10 +84,10 @@ class SampleRequest:
 class GeneratedClip:
     """A generated clip.
 
-    rgb f32[T,3,H,W] in [0,1]; depth f32[T,1,H,W] metres; semantics i64[T,H,W]; confidence f32[T,1,H,W] in [0,1]. `latents`:
-    modality -> [T,C,h,w], to be handed to the next window as `known`. `depth_fits`: one per frame, how depth was brought to
-    the measured scale; empty without `SampleRequest.align`. `log_error`: of small models with a refiner, logarithm of the expected
-    absolute error of colour codes (-1 to 1) f32[T,1,H,W], for `MDM.finish`.
+    rgb f32[T,3,H,W] in [0,1]; depth f32[T,1,H,W] metres; semantics i64[T,H,W]; confidence f32[T,1,H,W] in [0,1].
+    `latents`: modality -> [T,C,h,w], to be handed to the next window as `known`. `depth_fits`: one per frame, how depth
+    was brought to the measured scale; empty without `SampleRequest.align`. `log_error`: of small models with a refiner,
+    logarithm of the expected absolute error of colour codes (-1 to 1) f32[T,1,H,W], for `MDM.finish`.
     """
 
     rgb: Tensor
@@ -99,7 +104,7 @@ class GeneratedClip:
         return replace(self, **own, latents={m: z.to(device) for m, z in self.latents.items()})
 
 
-# the border to the device ---------------------------------------------------------------------------------------------
+# the border to the device -------------------------------------------------------------------------
 
 
 class Sampling(Protocol):
@@ -144,8 +149,11 @@ def generated_and_finished(
 def check_image_size(height: int, width: int, multiple: int) -> None:
     """UsageError unless both sides are positive multiples of `multiple` pixels, as the network's strides need."""
     if height % multiple or width % multiple or min(height, width) < multiple:
-        raise UsageError("image size does not fit the diffusion model", expected=f"multiples of {multiple} pixels",
-            got=f"{width}x{height}")  # fmt: skip
+        raise UsageError(
+            "image size does not fit the diffusion model",
+            expected=f"multiples of {multiple} pixels",
+            got=f"{width}x{height}",
+        )
 
 
 def sized_to_width(width_px: int, aspect: float, multiple: int) -> tuple[int, int]:
@@ -157,7 +165,8 @@ def sized_to_width(width_px: int, aspect: float, multiple: int) -> tuple[int, in
 def sized_to_area(area_px: int, aspect: float, multiple: int) -> tuple[int, int]:
     """Width and height in multiples of `multiple`, of about this area and this aspect (width / height).
 
-    Of the candidates the one with the least distortion of aspect plus half the deviation of area, both as logarithms, wins.
+    Of the candidates the one with the least distortion of aspect plus half the deviation of area, both as logarithms,
+    wins.
     """
     best, chosen = math.inf, (multiple, multiple)
     for rows in range(1, 64):
@@ -170,9 +179,13 @@ def sized_to_area(area_px: int, aspect: float, multiple: int) -> tuple[int, int]
 
 
 def denoised(
-    denoise: Denoise, draw: Callable[[], Tensor], schedule: Schedule, request: SampleRequest, prediction: Prediction,
+    denoise: Denoise,
+    draw: Callable[[], Tensor],
+    schedule: Schedule,
+    request: SampleRequest,
+    prediction: Prediction,
     **settings: Any,
-) -> tuple[Tensor, list[Tensor]]:  # fmt: skip
+) -> tuple[Tensor, list[Tensor]]:
     """Run the request's sampler from fresh noise.
 
     Args:
@@ -198,7 +211,7 @@ def denoised(
     return sampler(watched, draw(), schedule, indices, prediction=prediction, **settings), estimates
 
 
-# confidence -----------------------------------------------------------------------------------------------------------
+# confidence ---------------------------------------------------------------------------------------
 
 
 def mean_change(estimates: list[Tensor], last: Tensor) -> Tensor:
@@ -211,10 +224,12 @@ def confidence_of(seen: Tensor, change: Tensor, factor: int) -> Tensor:
 
     Args:
         seen: [T,1,h,w] share of the latent cell that was measured or warped from a recorded image.
-        change: [T,1,h,w] how much the colour latent still changed in the later half of sampling (or its spread over samples).
+        change: [T,1,h,w] how much the colour latent still changed in the later half of sampling (or its spread over
+            samples).
         factor: pixels per cell.
 
-    The product of a coverage term (1 where seen, 0.35 far from anything seen, smoothed over 5 cells) and exp(-2 change).
+    The product of a coverage term (1 where seen, 0.35 far from anything seen, smoothed over 5 cells) and exp(-2
+    change).
     """
     near = functional.avg_pool2d(seen, 5, stride=1, padding=2, count_include_pad=False)
     coverage = 0.35 + 0.65 * torch.maximum(seen, near)
@@ -226,12 +241,13 @@ def depth_agreement(depth: Tensor, condition: Condition, slack_px: int = 0) -> T
     """How far generated depth f32[T,1,H,W] agrees with what was measured nearby, f32[T,1,H,W] in [0.2, 1].
 
     exp(-5 |log(generated / measured)|) at measured pixels, carried over to the pixels within 2 pixels as the mean of
-    those there; 1 where nothing was measured nearby. Where a surface was painted at a wrong distance, its colour is not to
-    be trusted either.
+    those there; 1 where nothing was measured nearby. Where a surface was painted at a wrong distance, its colour is not
+    to be trusted either.
 
     Args:
-        slack_px: a measurement agrees with every depth between the least and the greatest of the pixels so near. For measurements of
-            a finer grid than the image's, which lie anywhere in a pixel: near the horizon, and at edges, depth changes within one.
+        slack_px: a measurement agrees with every depth between the least and the greatest of the pixels so near. For
+            measurements of a finer grid than the image's, which lie anywhere in a pixel: near the horizon, and at
+            edges, depth changes within one.
     """
     pool = lambda x: functional.avg_pool2d(x, 5, stride=1, padding=2, count_include_pad=True)  # noqa: E731
     top = lambda x: functional.max_pool2d(x, 2 * slack_px + 1, stride=1, padding=slack_px)  # noqa: E731

@@ -19,8 +19,8 @@ NO_RENDER = -1.0
 
 @dataclass(frozen=True)
 class Stacked:
-    """The tensors of conditions of one shape [B,T,..]; what a condition lacks is filled in: none warped, its own colour as backdrop,
-    unknown classes, no render. Masks are f32."""
+    """The tensors of conditions of one shape [B,T,..]; what a condition lacks is filled in: none warped, its own colour
+    as backdrop, unknown classes, no render. Masks are f32."""
 
     color: Tensor
     depth: Tensor

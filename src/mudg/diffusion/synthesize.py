@@ -1,8 +1,9 @@
 """synthesize: dense colour, depth and semantics on trajectories that were never driven.
 
 For every trajectory: build the condition view by view from the fused cloud and the recorded images, run the diffusion
-model over windows of frames, write one folder of observations. Windows overlap; the shared frames are fixed in the later
-window, so that the video continues. The last window ends at the last frame: every frame of the trajectory is produced.
+model over windows of frames, write one folder of observations. Windows overlap; the shared frames are fixed in the
+later window, so that the video continues. The last window ends at the last frame: every frame of the trajectory is
+produced.
 
 OUT/<trajectory>/        observations (see `scene/observations.py`) and overview.png
 OUT/<trajectory>/state/  what an interrupted run needs to continue after the last finished window; removed at the end
@@ -62,14 +63,16 @@ FITS = "depth_fits.json"
 """Frame -> [scale, shift in metres, median relative residual before, after] of the alignment of its depth."""
 PROCESS_BYTES = int(1.2 * memory.GIB)
 PIXEL_BYTES, FRAME_PIXEL_BYTES = 240, 80
-"""What a process takes: with the small models; for each pixel of the written size; and for each pixel of a window's frames. Measured:
-2.0 GiB at 1242x375 with windows of eight frames, 3.85 GiB at 3840x2160 with three, where conditions lie in files (4.5 GiB before)."""
+"""What a process takes: with the small models; for each pixel of the written size; and for each pixel of a window's
+frames. Measured: 2.0 GiB at 1242x375 with windows of eight frames, 3.85 GiB at 3840x2160 with three, where conditions
+lie in files (4.5 GiB before)."""
 WINDOW_FRAMES = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """What all trajectories are made from, read; ``images``: the recorded ones, as they have been prepared for views of a size."""
+    """What all trajectories are made from, read; ``images``: the recorded ones, as they have been prepared for views of
+    a size."""
 
     scene: Scene
     cloud: FusedCloud
@@ -131,8 +134,8 @@ def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, work:
 
 
 def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> int:
-    """Trajectories made at the same time where the configuration names no number: as many as there are cores and as memory lasts for;
-    one where they would share a GPU. Says so where memory decides."""
+    """Trajectories made at the same time where the configuration names no number: as many as there are cores and as
+    memory lasts for; one where they would share a GPU. Says so where memory decides."""
     cores = native.default_threads() if config.device == "cpu" else 1
     wanted, free = min(cores, len(paths)), memory.free_bytes()
     if wanted == 1 or not free:
@@ -143,8 +146,10 @@ def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> in
     need = PROCESS_BYTES + pixels * (PIXEL_BYTES + frames * FRAME_PIXEL_BYTES)
     possible = max(1, min(wanted, free // need))
     if possible < wanted:
-        log.info(f"synthesize: {possible} of {wanted} processes: at {camera.width}x{camera.height} each takes about "
-                 f"{memory.in_words(need)}, and {memory.in_words(free)} are free")  # fmt: skip
+        log.info(
+            f"synthesize: {possible} of {wanted} processes: at {camera.width}x{camera.height} each takes about "
+            f"{memory.in_words(need)}, and {memory.in_words(free)} are free"
+        )
     return possible
 
 
@@ -163,7 +168,7 @@ def _run_jobs(jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: 
     return made
 
 
-# one trajectory -------------------------------------------------------------------------------------------------------
+# one trajectory -----------------------------------------------------------------------------------
 
 
 def near_sweeps(scene: Scene, cloud: FusedCloud, path: Trajectory) -> NearSweeps:
@@ -186,8 +191,8 @@ def without_classes(cloud: FusedCloud) -> FusedCloud:
 def make_trajectory(
     config: SynthesizeConfig, given: JobInputs, out: Path, path: Trajectory, model: loading.DiffusionModel | None = None
 ) -> int:
-    """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one. `model`: that of the
-    configuration, if it is in memory already."""
+    """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one. `model`:
+    that of the configuration, if it is in memory already."""
     folder = out / path.name
     if (folder / "observations.json").is_file():
         return len(path)
@@ -262,13 +267,16 @@ def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
     files = sorted(state.glob("[0-9]*.safetensors"))
     if not files:
         return 0, {}
-    return int(files[-1].stem), store.read_tensors(files[-1])  # type: ignore[return-value]
+    return int(files[-1].stem), store.read_tensors(files[-1])
 
 
 def _sheet_row(condition: Condition, sample: GeneratedClip, i: int) -> np.ndarray:
     """Condition, colour, depth, classes and confidence of one frame side by side, u8[H,5W,3]."""
     cells = [
-        to_bytes(condition.color[i]), to_bytes(sample.rgb[i]), depth_colors(sample.depth[i, 0].numpy()),
-        class_colors(sample.semantics[i].numpy()), gray(sample.confidence[i, 0].numpy()),
-    ]  # fmt: skip
+        to_bytes(condition.color[i]),
+        to_bytes(sample.rgb[i]),
+        depth_colors(sample.depth[i, 0].numpy()),
+        class_colors(sample.semantics[i].numpy()),
+        gray(sample.confidence[i, 0].numpy()),
+    ]
     return np.concatenate(cells, 1)

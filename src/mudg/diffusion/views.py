@@ -1,6 +1,7 @@
 """Windows of generated views: the condition of each, its sample, and the observations made of it.
 
-Whoever generates along a path (``synthesize``, repairs of edited views) goes through `windows` and asks a `ViewMaker` for each.
+Whoever generates along a path (``synthesize``, repairs of edited views) goes through `windows` and asks a `ViewMaker`
+for each.
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ from mudg.networks.codec import Modality
 from mudg.scene.labels import read_label, read_trusted_classes
 from mudg.scene.read import read_image
 
-# the diffusion model that a synthesize configuration names, of whichever kind, ready to sample ------------------------
+# the diffusion model that a synthesize configuration names, of whichever kind, ready to sample ----
 
 
 FEW_STEPS = 20
@@ -43,11 +44,12 @@ DiffusionModel = MDM | PublishedMDM
 
 
 def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = False) -> SynthesizeConfig:
-    """The configuration with its device chosen, and the number of processes that its model wants; without reading weights of a
-    published-type model.
+    """The configuration with its device chosen, and the number of processes that its model wants; without reading
+    weights of a published-type model.
 
     Args:
-        fitted: whether a fitted scene is given too. weather: and tells the distances by which views are brought into other weather.
+        fitted: whether a fitted scene is given too. weather: and tells the distances by which views are brought into
+            other weather.
 
     Raises:
         UsageError: a setting that does not apply to this kind of model, or to the device. InputError: no such model.
@@ -55,53 +57,94 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
     """
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
     if device.type != "cpu" and config.processes > 1:
-        raise UsageError(f"on {device} one process makes all trajectories", where="--processes", expected="0 or 1",
-                         got=str(config.processes), remedy="leave it out, or give --device cpu")  # fmt: skip
+        raise UsageError(
+            f"on {device} one process makes all trajectories",
+            where="--processes",
+            expected="0 or 1",
+            got=str(config.processes),
+            remedy="leave it out, or give --device cpu",
+        )
     config = replace(config, device=str(device))
     half_of(config)
     published = published_files.is_published(config.model)
     (PublishedMDM if published else MDM).check_request(request_of(config))
     if published and fitted and not weather:
-        raise UsageError("a published-type model uses a fitted scene for weather and light of --edits only", where="--fitted",
-                         remedy="leave it out")  # fmt: skip
+        raise UsageError(
+            "a published-type model uses a fitted scene for weather and light of --edits only",
+            where="--fitted",
+            remedy="leave it out",
+        )
     repairs = config.condition == "repair"
     if repairs and not (fitted or published):
-        raise UsageError("this condition is made of renders of a fitted scene", where="--condition", got="repair",
-                         remedy="give the folder of a finished fit as --fitted")  # fmt: skip
+        raise UsageError(
+            "this condition is made of renders of a fitted scene",
+            where="--condition",
+            got="repair",
+            remedy="give the folder of a finished fit as --fitted",
+        )
     if published and config.condition in ("freevs", "repair"):
         raise UsageError(
-            "a published-type model does not know this condition", where="--condition", expected="full, reference, points, concat",
-            got=config.condition, remedy="leave it out, or choose another --model",
-        )  # fmt: skip
+            "a published-type model does not know this condition",
+            where="--condition",
+            expected="full, reference, points, concat",
+            got=config.condition,
+            remedy="leave it out, or choose another --model",
+        )
     if config.condition != "full" and fitted and not repairs:
-        raise UsageError("parts of the condition cannot be switched off here", where="--condition", expected="full",
-                         got="--fitted: renders are left out of such a condition", remedy="leave out --condition or --fitted")  # fmt: skip
+        raise UsageError(
+            "parts of the condition cannot be switched off here",
+            where="--condition",
+            expected="full",
+            got="--fitted: renders are left out of such a condition",
+            remedy="leave out --condition or --fitted",
+        )
     if published and config.offload and device.type == "cpu":
-        raise UsageError("the image tower is on the CPU already", where="--offload", got="--device cpu", remedy="leave one of them out")
+        raise UsageError(
+            "the image tower is on the CPU already",
+            where="--offload",
+            got="--device cpu",
+            remedy="leave one of them out",
+        )
     if published:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
-    for flag, given in (("memory-budget-gb", config.memory_budget_gb), ("offload", config.offload), ("compiled", config.compiled)):
+    for flag, given in (
+        ("memory-budget-gb", config.memory_budget_gb),
+        ("offload", config.offload),
+        ("compiled", config.compiled),
+    ):
         if given:
             raise UsageError(
                 "this setting applies to published-type models only", where=f"--{flag}", remedy="leave it out"
             )
     model = mdm_files.load(config.model)  # fails now rather than in every process
     if fitted and not model.config.renders:
-        raise UsageError("this model was not trained with renders of a fitted scene", where="--fitted", got=config.model,
-                         remedy="leave it out, or choose another --model")  # fmt: skip
+        raise UsageError(
+            "this model was not trained with renders of a fitted scene",
+            where="--fitted",
+            got=config.model,
+            remedy="leave it out, or choose another --model",
+        )
     return config
 
 
 def request_of(config: SynthesizeConfig, bf16: bool = False) -> SampleRequest:
-    """What a configuration asks of the model for every window; the window's own number and known frames are to be put in."""
+    """What a configuration asks of the model for every window; the window's own number and known frames are to be put
+    in."""
     return SampleRequest(
-        config.steps, config.seed, sampler=config.sampler, eta=config.eta, guidance=config.guidance,
-        guidance_rescale=config.guidance_rescale, align=config.align_depth, bf16=bf16,
-    )  # fmt: skip
+        config.steps,
+        config.seed,
+        sampler=config.sampler,
+        eta=config.eta,
+        guidance=config.guidance,
+        guidance_rescale=config.guidance_rescale,
+        align=config.align_depth,
+        bf16=bf16,
+    )
 
 
 def half_of(config: SynthesizeConfig) -> torch.dtype | None:
-    """The half precision that a configuration's model computes in, None for float32. Published-type models bear float16."""
+    """The half precision that a configuration's model computes in, None for float32. Published-type models bear
+    float16."""
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
     return half_format(config.precision, device, float16=published_files.is_published(config.model))
 
@@ -109,8 +152,8 @@ def half_of(config: SynthesizeConfig) -> torch.dtype | None:
 def load_any(config: SynthesizeConfig) -> DiffusionModel:
     """The model of a configuration.
 
-    On another device than the CPU a published-type model has its weights in the number format that `precision` says. Its work is cut to
-    fit `memory_budget_gb`, or, without one, what is free on a CUDA device.
+    On another device than the CPU a published-type model has its weights in the number format that `precision` says.
+    Its work is cut to fit `memory_budget_gb`, or, without one, what is free on a CUDA device.
 
     Raises:
         ResourceError: it does not fit however it is cut, or no such device.
@@ -120,7 +163,8 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
         return mdm_files.load(config.model).to(device)
     if config.steps < FEW_STEPS:
         log.warn(
-            f"synthesize: the published model was trained for 50 denoising steps, but --steps is {config.steps} (recommended: --steps 50)"
+            f"synthesize: the published model was trained for 50 denoising steps, but --steps is {config.steps}"
+            " (recommended: --steps 50)"
         )
     half = half_of(config)
     dtype = None if device.type == "cpu" else half or torch.float32
@@ -131,7 +175,7 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
         model.split = _choose_split(model, config, budget_gb, 4 if half is None else 2)
     tower = model.image
     if model.split.offload:
-        model.image = torch.nn.Identity()  # type: ignore[assignment]
+        model.image = torch.nn.Identity()
     model.to(device).image = tower
     if config.compiled:
         model.net.compile()
@@ -146,15 +190,19 @@ def _free_gb(device: torch.device) -> float:
 def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: float, bytes_per_value: int) -> WorkSplit:
     """How the model's work is cut to fit a memory budget in GB."""
     split, peak_bytes = memory_plan.choose(
-        memory_plan.needs_of(model.config, bytes_per_value), int(budget_gb * 1e9), guidance=config.guidance != 1,
+        memory_plan.needs_of(model.config, bytes_per_value),
+        int(budget_gb * 1e9),
+        guidance=config.guidance != 1,
         offload=(False,) if config.device == "cpu" else (True,) if config.offload else (False, True),
-    )  # fmt: skip
+    )
     if peak_bytes > budget_gb * 1e9:
         raise ResourceError(
             "the model does not fit into the memory budget, however its work is split",
             where="--memory-budget-gb" if config.memory_budget_gb else f"free memory of --device {config.device}",
-            expected=f">= {peak_bytes / 1e9:.1f} GB", got=f"{budget_gb:.4g} GB", remedy="use the 320x512 model, or bfloat16",
-        )  # fmt: skip
+            expected=f">= {peak_bytes / 1e9:.1f} GB",
+            got=f"{budget_gb:.4g} GB",
+            remedy="use the 320x512 model, or bfloat16",
+        )
     log.info(
         f"synthesize: modalities {'together' if split.modalities_together else 'one by one'}, guidance "
         f"{'together' if split.guidance_together else 'in two passes'}, {split.frames_at_once} frames per decoding, "
@@ -164,7 +212,7 @@ def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: floa
     return split
 
 
-# views ----------------------------------------------------------------------------------------------------------------
+# views --------------------------------------------------------------------------------------------
 
 
 SOURCE, FREEVS = "mudg_r", "freevs"
@@ -194,20 +242,26 @@ def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
     """Recorded images that may be warped in, of all cameras, with the classes that may be given."""
     frames = scene.frames_in("train")
     classes = lambda frame: read_trusted_classes(scene, frame) if config.given_classes else None  # noqa: E731
-    return [Photo(frame.view, read_image(scene, frame), classes(frame), recorded_pixels(scene, frame)) for frame in frames]
+    return [
+        Photo(frame.view, read_image(scene, frame), classes(frame), recorded_pixels(scene, frame)) for frame in frames
+    ]
 
 
 def recorded_pixels(scene: Scene, frame: Frame) -> NDArray[np.bool_] | None:
-    """Which pixels bool[H, W] of a frame a camera recorded; None = all. Frames of an edited drive say which are rendered."""
+    """Which pixels bool[H, W] of a frame a camera recorded; None = all. Frames of an edited drive say which are
+    rendered."""
     return ~read_label(scene, frame, "rendered") if "rendered" in frame.labels else None
 
 
 class PreparedImages(KeptImages):
-    """Images made ready for warping, for all windows and trajectories that a process makes; colours as bytes where that is exact."""
+    """Images made ready for warping, for all windows and trajectories that a process makes; colours as bytes where that
+    is exact."""
 
     def __setitem__(self, number: int, image: WarpSource) -> None:
         coarse = (image.rgb * 255).round().clamp(0, 255).to(torch.uint8)
-        super().__setitem__(number, replace(image, rgb=coarse) if torch.equal(coarse.float() / 255, image.rgb) else image)
+        super().__setitem__(
+            number, replace(image, rgb=coarse) if torch.equal(coarse.float() / 255, image.rgb) else image
+        )
 
     def __getitem__(self, number: int) -> WarpSource:
         image = super().__getitem__(number)
@@ -227,9 +281,13 @@ class ViewMaker:
     """
 
     def __init__(
-        self, model: DiffusionModel, given: ConditionSources, config: SynthesizeConfig, start_at: StartAt | None = None,
+        self,
+        model: DiffusionModel,
+        given: ConditionSources,
+        config: SynthesizeConfig,
+        start_at: StartAt | None = None,
         images: PreparedImages | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         if not given.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
         self._model, self._given, self._full_size = model, given, config.full_size
@@ -258,17 +316,24 @@ class ViewMaker:
         source, color_alone = COLOR_ALONE.get(self._parts, SOURCE), self._parts in COLOR_ALONE
         observations = [
             Observation(
-                view, made.rgb[i], None if color_alone else made.depth[i], None if color_alone else made.semantics[i], trust[i],
-                usable[i], "virtual", source,
+                view,
+                made.rgb[i],
+                None if color_alone else made.depth[i],
+                None if color_alone else made.semantics[i],
+                trust[i],
+                usable[i],
+                "virtual",
+                source,
             )
             for i, view in enumerate(made_views)
-        ]  # fmt: skip
+        ]
         return sample, condition, observations
 
     def _generated(
         self, condition: Condition, fine: Condition, views: Sequence[View], request: SampleRequest
     ) -> tuple[GeneratedClip, GeneratedClip, tuple[View, ...]]:
-        """The clip at the size the model works at; it and its views at the size that is written, without depth in the sky."""
+        """The clip at the size the model works at; it and its views at the size that is written, without depth in the
+        sky."""
         model = self._model
         if self._full_size and isinstance(model, MDM) and model.finisher is not None and self._parts != FREEVS:
             sample, finished = generated_and_finished(model, condition, fine, request)
@@ -291,8 +356,8 @@ def without_sky_depth(clip: GeneratedClip, condition: Condition) -> GeneratedCli
 def recorded_at_pose(view: View, recorded: Sequence[Photo]) -> bool:
     """Whether a recorded image was taken where `view` is (to 5 cm and 10 mrad).
 
-    The published model puts the reference, as it was recorded, into frame 0 of a window. On a shifted trajectory that frame is a
-    picture from another place, and must not be used as if it were one from there.
+    The published model puts the reference, as it was recorded, into frame 0 of a window. On a shifted trajectory that
+    frame is a picture from another place, and must not be used as if it were one from there.
     """
     for image in recorded:
         moved = image.view.cam_from_world @ view.world_from_cam
@@ -304,10 +369,12 @@ def recorded_at_pose(view: View, recorded: Sequence[Photo]) -> bool:
 def enlarge(
     clip: GeneratedClip, size: tuple[int, int], conditions: tuple[Condition, Condition] | None
 ) -> GeneratedClip:
-    """A clip at the size (height, width): colour bicubic, depth f32[T,1,h,w] (NaN = none) and classes nearest, confidence bilinear.
+    """A clip at the size (height, width): colour bicubic, depth f32[T,1,h,w] (NaN = none) and classes nearest,
+    confidence bilinear.
 
-    With the clip's condition and the same at the new size, detail is put back: in colour by `add_detail`; the fine measured depth
-    where it is within a tenth of the generated one; and the fine class where the clip has it in that pixel or beside it.
+    With the clip's condition and the same at the new size, detail is put back: in colour by `add_detail`; the fine
+    measured depth where it is within a tenth of the generated one; and the fine class where the clip has it in that
+    pixel or beside it.
     """
     nearest = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")  # noqa: E731
     depth, ids = nearest(clip.depth), nearest(clip.semantics.unsqueeze(1).float())[:, 0].long()
@@ -325,8 +392,8 @@ def enlarge(
 
 
 def finer_classes(enlarged: Tensor, made: Tensor, given: Tensor) -> Tensor:
-    """Classes i64[T,H,W]: those of `given` u8[T,1,H,W] where `made` i64[T,h,w] has that class in the pixel or one beside it,
-    else `enlarged` i64[T,H,W]. The outline is the given one; what is there, the model has decided."""
+    """Classes i64[T,H,W]: those of `given` u8[T,1,H,W] where `made` i64[T,h,w] has that class in the pixel or one
+    beside it, else `enlarged` i64[T,H,W]. The outline is the given one; what is there, the model has decided."""
     size = enlarged.shape[-2:]
     around = functional.pad(made.unsqueeze(1).float(), (1, 1, 1, 1), mode="replicate")
     height, width = made.shape[-2:]
@@ -341,8 +408,9 @@ def finer_classes(enlarged: Tensor, made: Tensor, given: Tensor) -> Tensor:
 def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:
     """Enlarge generated colour f32[T,3,h,w] to the size of `full`, with the detail that the warped images have there.
 
-    Where the generated colour agrees with the small condition, the finer structure of the full condition (its difference
-    from its own reduced copy) is added; the weight falls with the disagreement, to nothing at a difference of 0.12.
+    Where the generated colour agrees with the small condition, the finer structure of the full condition (its
+    difference from its own reduced copy) is added; the weight falls with the disagreement, to nothing at a difference
+    of 0.12.
     """
     size = full.color.shape[-2:]
     larger = lambda x: functional.interpolate(x, size=size, mode="bicubic", align_corners=False)  # noqa: E731

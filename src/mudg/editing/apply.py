@@ -42,9 +42,9 @@ StreetOf = Callable[[SceneModel, EditPlan], SceneModel]
 
 
 def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> SceneModel:
-    """A fitted scene without the objects that a plan removes, with objects of their own for standing ones that it moves, and, unless told
-    not to `close` anything, without the traces of those behind which the street is closed and with all sides of those that are moved.
-    Depends on `left_behind` alone."""
+    """A fitted scene without the objects that a plan removes, with objects of their own for standing ones that it
+    moves, and, unless told not to `close` anything, without the traces of those behind which the street is closed and
+    with all sides of those that are moved. Depends on `left_behind` alone."""
     without_nodes, removed, closed, sides = left_behind(model, plan)
     model = _cut_out(model, without_nodes, plan)
     removed = tuple(name for name in removed if name in model.node_names())
@@ -56,13 +56,15 @@ def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> Sce
         model = without_traces(model, hidden, views, raster_of(model))
     sides = tuple(name for name in sides if close and name in model.node_names())
     if sides:
-        model = with_closed_sides(model, sides, views_of([plan.before.actors[name] for name in sides], plan.views), raster_of(model))
+        model = with_closed_sides(
+            model, sides, views_of([plan.before.actors[name] for name in sides], plan.views), raster_of(model)
+        )
     return model
 
 
 def left_behind(model: SceneModel, plan: EditPlan) -> tuple[tuple[str, ...], ...]:
-    """Ids of what a plan cuts out of the background, of what it removes, of those behind which the street is closed, and of those whose
-    sides are closed."""
+    """Ids of what a plan cuts out of the background, of what it removes, of those behind which the street is closed,
+    and of those whose sides are closed."""
     without_nodes = sorted({*plan.changes, *plan.removed} - set(model.node_names()))
     sides = sorted(plan.sides & set(plan.before.actors)) if plan.views else []
     closed = sorted(plan.closed & set(plan.before.actors)) if plan.views else []
@@ -75,7 +77,9 @@ def _some(names: Sequence[str]) -> str:
     return ", ".join(names) if len(names) <= MOST_NAMED else f"{len(names)} objects"
 
 
-def edited_model(model: SceneModel, plan: EditPlan, sky: Path | None = None, street_of: StreetOf = street_left) -> SceneModel:
+def edited_model(
+    model: SceneModel, plan: EditPlan, sky: Path | None = None, street_of: StreetOf = street_left
+) -> SceneModel:
     """A fitted scene with a plan carried out.
 
     Args:
@@ -121,12 +125,15 @@ def views_of(actors: Sequence[Actor], views: Sequence[View]) -> list[View]:
 
 def hidden_by(actor: Actor, views: Sequence[View]) -> Hidden:
     """An object and the views at whose times it is there, at most `MOST_VIEWS`."""
-    there = sorted((view for view in views if actor.motion.pose_at(view.time_s) is not None), key=lambda view: view.time_s)
+    there = sorted(
+        (view for view in views if actor.motion.pose_at(view.time_s) is not None), key=lambda view: view.time_s
+    )
     return Hidden(actor.size_m, actor.motion, actor.moves, tuple(spread(there)))
 
 
 def _cut_out(model: SceneModel, names: Sequence[str], plan: EditPlan) -> SceneModel:
-    """A copy with objects of their own for what stands in boxes. What the fit does not show is named, if it is only to be removed.
+    """A copy with objects of their own for what stands in boxes. What the fit does not show is named, if it is only to
+    be removed.
 
     Raises:
         UsageError: an object that is to be moved does not show in the fit.
@@ -136,8 +143,11 @@ def _cut_out(model: SceneModel, names: Sequence[str], plan: EditPlan) -> SceneMo
         actor = plan.before.actors[name]
         try:
             if actor.moves:
-                raise UsageError("this object has no Gaussians of its own in the fit: the recording hardly saw it", where=f"track {name!r}",
-                    remedy="leave it out of the script")  # fmt: skip
+                raise UsageError(
+                    "this object has no Gaussians of its own in the fit: the recording hardly saw it",
+                    where=f"track {name!r}",
+                    remedy="leave it out of the script",
+                )
             cut = edited.cut_out(model, _track(name, actor))
         except UsageError as problem:
             if name not in plan.removed:
@@ -146,18 +156,25 @@ def _cut_out(model: SceneModel, names: Sequence[str], plan: EditPlan) -> SceneMo
             continue
         model = cut if name in plan.removed else edited.with_shadow(cut, name, CUT_SHADOW)
     if missing:
-        why = next(iter(missing.values())) if len(missing) == 1 else "they have no Gaussians of their own, and none are in their boxes"
+        why = (
+            next(iter(missing.values()))
+            if len(missing) == 1
+            else "they have no Gaussians of their own, and none are in their boxes"
+        )
         log.info(f"edit: {_some(list(missing))}: not in the fit: {why}")
     return model
 
 
 def panorama(path: Path, yaw_deg: float, model: SceneModel) -> SkyNode:
-    """A sky from an image of all directions: longitude across, growing to the right as one looks at it; zenith in the top row."""
+    """A sky from an image of all directions: longitude across, growing to the right as one looks at it; zenith in the
+    top row."""
     rows = 256 if model.sky is None else model.sky.rows
     rgb = decode_image(store.read_bytes(path), str(path))
     height, width = rgb.shape[:2]
     if width != 2 * height:
-        raise InputError("a panorama of the sky is twice as wide as it is high", where=str(path), got=f"{width}x{height}")
+        raise InputError(
+            "a panorama of the sky is twice as wide as it is high", where=str(path), got=f"{width}x{height}"
+        )
     small = np.asarray(Image.fromarray(rgb).resize((2 * rows, rows), Image.Resampling.BOX), np.float32) / 255
     turned = np.roll(small[:, ::-1], round(yaw_deg / 360 * 2 * rows), axis=1)  # columns of ``SkyNode`` grow to the left
     sky = SkyNode.uniform(rows)
@@ -165,11 +182,12 @@ def panorama(path: Path, yaw_deg: float, model: SceneModel) -> SkyNode:
     return sky.to(model.device)
 
 
-# -- clouds --------------------------------------------------------------------------------------------------------------
+# -- clouds ----------------------------------------------------------------------------------------
 
 
 def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
-    """Fused clouds with a plan carried out; moved objects need no other points, for these lie in the frame of their box."""
+    """Fused clouds with a plan carried out; moved objects need no other points, for these lie in the frame of their
+    box."""
     static, objects = cloud.static, dict(cloud.objects)
     standing = {name for name in (*plan.changes, *plan.removed) if not plan.before.actors[name].moves}
     for name in sorted(standing - set(objects)):
@@ -177,7 +195,9 @@ def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
     objects = {name: points for name, points in objects.items() if name not in plan.removed}
     if plan.background is not None:
         static = _other_street(*plan.background)
-        objects = {name: _relit_points(points, plan.objects_gain) for name, points in objects.items() if name not in standing}
+        objects = {
+            name: _relit_points(points, plan.objects_gain) for name, points in objects.items() if name not in standing
+        }
     objects |= {name: asset_points(insertion.asset) for name, insertion in plan.inserted.items()}
     return FusedCloud(static, objects, cloud.colors)
 
@@ -212,7 +232,9 @@ def _cut_points(static: PointCloud, track: Track) -> tuple[PointCloud, PointClou
     inside &= ~ground
 
     def part(rows: NDArray[np.bool_], xyz: NDArray[np.float32], frame: Any) -> PointCloud:
-        return PointCloud(xyz[rows], static.rgb[rows], frame, None if static.semantics is None else static.semantics[rows])
+        return PointCloud(
+            xyz[rows], static.rgb[rows], frame, None if static.semantics is None else static.semantics[rows]
+        )
 
     return part(~inside, static.xyz, "world"), part(inside, local.astype(np.float32), "object")
 
@@ -222,11 +244,14 @@ def asset_points(asset: Asset) -> PointCloud:
     solid = torch.sigmoid(asset.columns["logits"]).numpy() > edited.SOLID_OPACITY
     rgb = (0.5 + SH_C0 * asset.columns["sh_dc"].numpy()[:, 0]).clip(0, 1)
     ids = np.where(asset.class_ids < 0, 255, asset.class_ids).astype(np.uint8)
-    return PointCloud(asset.columns["means"].numpy()[solid], (rgb[solid] * 255 + 0.5).astype(np.uint8), "object", ids[solid])
+    return PointCloud(
+        asset.columns["means"].numpy()[solid], (rgb[solid] * 255 + 0.5).astype(np.uint8), "object", ids[solid]
+    )
 
 
 def ground_of(cloud: FusedCloud | None, model: SceneModel) -> HeightMap | None:
-    """Height map of the ground: of the fused points of ground classes, else of the fitted Gaussians; None where there are neither."""
+    """Height map of the ground: of the fused points of ground classes, else of the fitted Gaussians; None where there
+    are neither."""
     xyz = np.zeros((0, 3), np.float32)
     if cloud is not None and cloud.static.semantics is not None:
         xyz = cloud.static.xyz[np.isin(cloud.static.semantics, edited.GROUND_CLASSES)]
@@ -234,11 +259,12 @@ def ground_of(cloud: FusedCloud | None, model: SceneModel) -> HeightMap | None:
     return HeightMap.from_points(xyz) if len(xyz) else None
 
 
-# -- what a scene says ---------------------------------------------------------------------------------------------------
+# -- what a scene says -----------------------------------------------------------------------------
 
 
 def edited_scene(scene: Scene, plan: EditPlan) -> Scene:
-    """A scene with other boxes, another path of the vehicle and other poses of its frames; its files stay what they are."""
+    """A scene with other boxes, another path of the vehicle and other poses of its frames; its files stay what they
+    are."""
     tracks = tuple(_track(name, actor) for name, actor in plan.after.actors.items())
     given = {track.id: track for track in scene.tracks}
     tracks = tuple(given[t.id] if t.id in given and t.id not in {*plan.changes, *plan.inserted} else t for t in tracks)
@@ -255,11 +281,14 @@ def with_ego(scene: Scene, ego: Motion) -> Scene:
 
 
 def _carried(view: View, before: EgoPath, after: Motion) -> View:
-    """A view from the same place of the vehicle, on its new path; before its first and after its last key the vehicle stands there."""
+    """A view from the same place of the vehicle, on its new path; before its first and after its last key the vehicle
+    stands there."""
     time_s = float(np.clip(view.time_s, before.times_s[0], before.times_s[-1]))
     old, new = before.pose_at(time_s), after.pose_at(float(np.clip(time_s, after.times_s[0], after.times_s[-1])))
     if old is None or new is None:
-        raise InputError("the vehicle has no pose at the time of a frame", where=f"camera {view.camera.name}", got=f"{view.time_s} s")
+        raise InputError(
+            "the vehicle has no pose at the time of a frame", where=f"camera {view.camera.name}", got=f"{view.time_s} s"
+        )
     return View(view.camera, new @ geometry.invert(old) @ view.world_from_cam, view.time_s)
 
 

@@ -1,8 +1,8 @@
 """Objects of fitted scenes as files: one safetensors file each, with the description as JSON in its header.
 
-    means f32[n, 3]  quats f32[n, 4]  log_scales f32[n, 3]  logits f32[n]  sh_dc f32[n, 1, 3]   raw, in the frame of the box
-    class_ids u8[n] (255 = unknown)   certainty f16[n], if it is known
-    header "mudg_asset": {schema, label, size_m, light_rgb, seen_deg, origin}
+means f32[n, 3]  quats f32[n, 4]  log_scales f32[n, 3]  logits f32[n]  sh_dc f32[n, 1, 3]   raw, in the frame of the box
+class_ids u8[n] (255 = unknown)   certainty f16[n], if it is known
+header "mudg_asset": {schema, label, size_m, light_rgb, seen_deg, origin}
 """
 
 from __future__ import annotations
@@ -50,7 +50,8 @@ class AssetHeader(StrictRecord):
 
 
 def write_asset_from(parts: RunParts, name: str, file: ResultFile) -> dict[str, Any]:
-    """Write one object of a fit, or of a run, to a file; returns what it is. UsageError where there is no such object."""
+    """Write one object of a fit, or of a run, to a file; returns what it is. UsageError where there is no such
+    object."""
     asset = asset_from(parts, name)
     write_asset(file.path, asset)
     log.info(f"asset: {name} ({asset.label}, {len(asset)} Gaussians, seen from {len(asset.seen_rad)} directions)")
@@ -68,7 +69,8 @@ def asset_from(parts: RunParts, name: str) -> Asset:
 
 @one_torch_thread()
 def complete_asset(model: SceneModel, name: str, views: Sequence[View]) -> Asset:
-    """An object of a fitted scene, with the sides from which views show it; the others are closed (``editing/street.py``)."""
+    """An object of a fitted scene, with the sides from which views show it; the others are closed
+    (``editing/street.py``)."""
     node = model.dynamic_object(name)
     actor = Actor(node.label, (node.size_m[0], node.size_m[1], node.size_m[2]), motion_of(node))
     closed = with_closed_sides(model, [name], views_of([actor], views), raster_of(model))
@@ -82,10 +84,13 @@ def write_asset(path: Path, asset: Asset) -> None:
     if asset.certainty is not None:
         arrays["certainty"] = asset.certainty.astype(np.float16)
     header = {
-        "schema": 2, "label": asset.label, "size_m": list(asset.size_m), "origin": asset.origin,
+        "schema": 2,
+        "label": asset.label,
+        "size_m": list(asset.size_m),
+        "origin": asset.origin,
         "light_rgb": None if asset.light_rgb is None else list(asset.light_rgb),
         "seen_deg": [round(float(np.degrees(a)), 2) for a in asset.seen_rad],
-    }  # fmt: skip
+    }
     store.write_safetensors(path, arrays, {HEADER: store.json_text(header, indent=None)})
 
 
@@ -96,7 +101,10 @@ def read_asset(path: Path) -> Asset:
         InputError: it is missing, damaged, or no asset.
     """
     content = store.read_bytes(path)
-    arrays, text = store.parse_safetensors(content, str(path)), store.safetensors_metadata(content, str(path)).get(HEADER)
+    arrays, text = (
+        store.parse_safetensors(content, str(path)),
+        store.safetensors_metadata(content, str(path)).get(HEADER),
+    )
     if text is None:
         raise InputError("this file is no asset", where=str(path), expected="a file written by `mudg asset export`")
     facts = store.parse_json(text, f"{path}: header")
@@ -108,15 +116,21 @@ def read_asset(path: Path) -> Asset:
         if name not in arrays or arrays[name].shape != shape or arrays[name].dtype != kind or not count:
             got = f"{arrays[name].dtype} {arrays[name].shape}" if name in arrays else "nothing"
             expected = f"{kind.__name__} {shape}"
-            raise InputError(f"tensor {name!r} of an asset has the wrong form", where=str(path), expected=expected, got=got)
+            raise InputError(
+                f"tensor {name!r} of an asset has the wrong form", where=str(path), expected=expected, got=got
+            )
         if not np.isfinite(arrays[name]).all():
             raise InputError(f"tensor {name!r} of an asset holds values that are not finite", where=str(path))
     ids = arrays["class_ids"].astype(np.int64)
     known = arrays.get("certainty")
     length, width, height = header.size_m
     return Asset(
-        {key: torch.from_numpy(arrays[key].copy()) for key in _SHAPES}, np.where(ids < len(CLASSES), ids, -1),
-        None if known is None or known.shape != (count,) else known.astype(np.float32), header.label, (length, width, height),
+        {key: torch.from_numpy(arrays[key].copy()) for key in _SHAPES},
+        np.where(ids < len(CLASSES), ids, -1),
+        None if known is None or known.shape != (count,) else known.astype(np.float32),
+        header.label,
+        (length, width, height),
         None if header.light_rgb is None else (header.light_rgb[0], header.light_rgb[1], header.light_rgb[2]),
-        tuple(float(a) for a in np.radians(header.seen_deg)), header.origin,
-    )  # fmt: skip
+        tuple(float(a) for a in np.radians(header.seen_deg)),
+        header.origin,
+    )

@@ -70,19 +70,24 @@ class EditedDrive:
         return replace(made, facts=facts)
 
 
-def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None, cloud: FusedCloud | None = None) -> EditedDrive:
+def carry_out(
+    script: EditScript, model: SceneModel, scene: Scene | None = None, cloud: FusedCloud | None = None
+) -> EditedDrive:
     """Carry out a script on a drive, but for its fitted scenes (``EditedDrive.model``).
 
     Args:
-        model: a fit of the drive: its objects are those that a script can name where there is no scene; its ground where there is no cloud.
+        model: a fit of the drive: its objects are those that a script can name where there is no scene; its ground
+            where there is no cloud.
 
     Raises:
         InputError: something in the script that cannot be done here.
     """
     if conditions_of(script.canonical()) is not None and not model.classes:
-        raise InputError("weather, light and season need the classes of surfaces, and this scene was fitted without",
+        raise InputError(
+            "weather, light and season need the classes of surfaces, and this scene was fitted without",
             where="weather, light, season",
-            remedy="fit a scene with labels (`mudg annotate` makes them), or take them out of the script")  # fmt: skip
+            remedy="fit a scene with labels (`mudg annotate` makes them), or take them out of the script",
+        )
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
     background = lambda name: background_of(find_run(script.path_of(name)), name)  # noqa: E731
@@ -91,11 +96,20 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
     plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
     take_light(plan, model)
     if scene is None and plan.closed:
-        plan.notes.append({"kind": "street not closed", "ids": sorted(plan.closed),
-                           "text": f"the street behind {', '.join(sorted(plan.closed))} stays as it was fitted: what recorded views show "
-                                   "of it is not known (give --scene)"})  # fmt: skip
+        plan.notes.append(
+            {
+                "kind": "street not closed",
+                "ids": sorted(plan.closed),
+                "text": (
+                    f"the street behind {', '.join(sorted(plan.closed))} stays as it was fitted: what recorded views"
+                    " show of it is not known (give --scene)"
+                ),
+            }
+        )
     made = None if scene is None else edited_scene(scene, plan)
-    views = ([], []) if scene is None or made is None else tuple([frame.view for frame in s.frames] for s in (scene, made))
+    views = (
+        ([], []) if scene is None or made is None else tuple([frame.view for frame in s.frames] for s in (scene, made))
+    )
     plan.sides &= shown_anew(plan, *views)
     notes = check(plan, *views)
     for note in notes:
@@ -104,7 +118,8 @@ def carry_out(script: EditScript, model: SceneModel, scene: Scene | None = None,
 
 
 def is_recording(scene: Scene) -> bool:
-    """Whether a scene comes from sensors and not from the city generator, which has exact pictures of what an object hid."""
+    """Whether a scene comes from sensors and not from the city generator, which has exact pictures of what an object
+    hid."""
     return scene.source.recipe is None
 
 
@@ -118,8 +133,12 @@ def background_of(parts: RunParts, name: str) -> Background:
         known = ground_points(found)
         return Background(found, Motion.recorded([0.0], np.eye(4)[None]), known if len(known) else lowest_points(found))
     if parts.scene is None:
-        raise InputError("of a fit alone it is not known where its street lies", where="run", got=name,
-            expected="a folder made by `mudg run` or by `mudg asset import --kind scene`")  # fmt: skip
+        raise InputError(
+            "of a fit alone it is not known where its street lies",
+            where="run",
+            got=name,
+            expected="a folder made by `mudg run` or by `mudg asset import --kind scene`",
+        )
     scene, model = read_scene(parts.scene), load_model(parts.model)
     ground, cloud = ground_points(model), None if parts.fused is None else read_fused(parts.fused).static
     if cloud is not None and cloud.semantics is not None:

@@ -1,8 +1,10 @@
-"""edit: a drive changed as a script says -> an edited fit, or an edited run that every other command takes like any other.
+"""edit: a drive changed as a script says -> an edited fit, or an edited run that every other command takes like any
+other.
 
 of a fit:              OUT/model.json ... (as ``fit`` writes)
 of a ``mudg run``:     OUT/scene  OUT/fuse  OUT/fit/<method>  OUT/lidar.json what became of LiDAR returns
-of both:               OUT/edits.yaml the script with all defaults   OUT/edit.json what was done, collisions, seldom-seen sides
+of both:               OUT/edits.yaml the script with all defaults   OUT/edit.json what was done, collisions,
+                       seldom-seen sides
 """
 
 from __future__ import annotations
@@ -53,37 +55,62 @@ class PlannedEdit:
         drive = carry_out(script, model, loaded, None if parts.fused is None else read_fused(parts.fused))
         if parts.whole and conditions_of(script.canonical()) is not None:
             beams = "its LiDAR sweeps are in fog and rain" if drive.plan.weather_of_beams else "so do its LiDAR sweeps"
-            log.info(f"edit: `mudg render` shows weather and light; images of the edited scene stay as recorded, {beams}")
+            log.info(
+                f"edit: `mudg render` shows weather and light; images of the edited scene stay as recorded, {beams}"
+            )
         if parts.whole and drive.plan.background is not None:
-            log.info("edit: all pixels of the edited images are renders; its scene has no LiDAR sweeps, for nobody measured that street")
+            log.info(
+                "edit: all pixels of the edited images are renders; its scene has no LiDAR sweeps, for nobody measured"
+                " that street"
+            )
         if config.harmonize.on and not parts.whole:
-            raise UsageError("a fit by itself has no images to repair", where="--harmonize.on",
-                remedy="edit a whole run, or render the fit with `mudg render --edits ... --harmonize.on`")  # fmt: skip
+            raise UsageError(
+                "a fit by itself has no images to repair",
+                where="--harmonize.on",
+                remedy="edit a whole run, or render the fit with `mudg render --edits ... --harmonize.on`",
+            )
         if config.harmonize.on and loaded is not None:
-            check_paths(config.harmonize, {name: len(loaded.frames_of(name)) for name in loaded.cameras if loaded.frames_of(name)})
+            check_paths(
+                config.harmonize,
+                {name: len(loaded.frames_of(name)) for name in loaded.cameras if loaded.frames_of(name)},
+            )
         return cls(script, parts, loaded, model, drive, drive.model(model, keep_ego=not parts.whole))
 
     def write(self, config: EditConfig, work: RunDir) -> dict[str, Any]:
         """Write the edited fit or run, and what was done; returns a summary."""
         out, plan, device = work.path, self.drive.plan, drawing_device(config.device, "render", config.raster)
-        changed: dict[str, Any] = {"changed": list(plan.changes), "removed": plan.removed, "inserted": list(plan.inserted)}
+        changed: dict[str, Any] = {
+            "changed": list(plan.changes),
+            "removed": plan.removed,
+            "inserted": list(plan.inserted),
+        }
         if self.parts.whole and self.scene is not None:
-            images = EditedImages(self.model.to(device), self.edited.to(device), config, plan.moves_ego or plan.background is not None)
+            images = EditedImages(
+                self.model.to(device), self.edited.to(device), config, plan.moves_ego or plan.background is not None
+            )
             images = repairing(images, self.drive, self.scene) if config.harmonize.on else images
             changed["lidar"] = _write_run(self.drive, self.parts, self.scene, images, out)
         else:
             save_model(self.edited, out)
         store.write_text(out / "edits.yaml", self.script.text())
         conditions = {verb: settings.model_dump(mode="json") for verb, settings in plan.conditions.items()}
-        store.write_json(out / "edit.json", {
-            "schema": 1, "digest": work.inputs["edits"], **changed, "ego": plan.moves_ego, "conditions": conditions,
-            "notes": self.drive.notes,
-        })  # fmt: skip
+        store.write_json(
+            out / "edit.json",
+            {
+                "schema": 1,
+                "digest": work.inputs["edits"],
+                **changed,
+                "ego": plan.moves_ego,
+                "conditions": conditions,
+                "notes": self.drive.notes,
+            },
+        )
         return {**changed, "notes": len(self.drive.notes)}
 
 
 def _write_run(drive: EditedDrive, parts: RunParts, scene: Scene, images: EditedImages, out: Path) -> dict[str, int]:
-    """Scene, clouds and fits of an edited run; what an interrupted one finished is kept. Returns what became of LiDAR returns."""
+    """Scene, clouds and fits of an edited run; what an interrupted one finished is kept. Returns what became of LiDAR
+    returns."""
     edited, cloud = drive.scene, drive.cloud
     if edited is None or cloud is None:  # both were given
         return {}

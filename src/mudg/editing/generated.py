@@ -1,4 +1,5 @@
-"""Views of edited drives that a diffusion model generates: the drive that ``synthesize --edits`` reads in place of the recorded one."""
+"""Views of edited drives that a diffusion model generates: the drive that ``synthesize --edits`` reads in place of the
+recorded one."""
 
 from __future__ import annotations
 
@@ -26,15 +27,20 @@ def edited_scene(script: EditScript, config: SynthesizeConfig, given: JobInputs,
         UsageError: a condition that shows no edits, or an edit that the drive does not allow.
     """
     if config.condition == FREEVS:
-        raise UsageError("this condition is made of recorded sweeps, which show no edits", where="--condition", got=FREEVS,
-            remedy="edit a whole run with `mudg edit` and give its scene")  # fmt: skip
+        raise UsageError(
+            "this condition is made of recorded sweeps, which show no edits",
+            where="--condition",
+            got=FREEVS,
+            remedy="edit a whole run with `mudg edit` and give its scene",
+        )
     told = not shows_weather(config, script, given.fitted is not None)
     fitted = None if given.fitted is None else load_model(given.fitted)
     return drive_of_edits(script, scene, read_fused(given.fused), fitted, told=told).scene
 
 
 def edited_drive(script: EditScript, config: SynthesizeConfig, given: JobInputs) -> Drive:
-    """The drive as the script leaves it: its scene, clouds and fit, recorded images without what they show wrongly, and its weather."""
+    """The drive as the script leaves it: its scene, clouds and fit, recorded images without what they show wrongly, and
+    its weather."""
     scene, cloud = read_scene(given.scene), read_fused(given.fused)
     fit = None if given.fitted is None else load_model(given.fitted)
     drive = drive_of_edits(script, scene, cloud, fit)
@@ -47,8 +53,8 @@ def edited_drive(script: EditScript, config: SynthesizeConfig, given: JobInputs)
 
 
 def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:
-    """Whether views are generated in the weather and light of a script: by a published-type model, from points and a reference in that
-    weather, whose distances a fit tells."""
+    """Whether views are generated in the weather and light of a script: by a published-type model, from points and a
+    reference in that weather, whose distances a fit tells."""
     conditions = weathered.conditions_of(script.canonical())
     wanted = conditions is not None and conditions.changes_air_ground_or_light and fitted and config.condition == "full"
     return wanted and is_published(config.model)

@@ -1,14 +1,17 @@
 """Views of an edited scene in which a diffusion model repairs what the edits touched, and nothing else.
 
-1. Touched are the pixels whose renders with and without the edits differ, near the boxes of what was removed, moved or put in; and the
-   ground about them where recorded photographs of other moments show it brighter: a shadow that stayed.
-2. The model's condition is that of the edited drive (``editing/recorded.py``): points of removed objects are gone, those of moved
-   ones moved; photographs do not count where such objects or their shadows were; the renders are those of the edited scene.
-   What the photographs determined behind something that is gone (certainty of the render) stays as rendered.
-3. The sample begins from the edited render. Untouched pixels stay at it at every step; touched ones are free from the noise level on that
-   belongs to their kind (``HarmonizeConfig.uncovered``, ``.objects``).
-4. Guard: where the model shows a road user in place of one that was removed, or none where one was put, the render stays.
-5. The generated pixels are pasted into the render with a soft edge that lies inside the touched pixels: every other pixel keeps its bits.
+1. Touched are the pixels whose renders with and without the edits differ, near the boxes of what was removed, moved or
+   put in; and the ground about them where recorded photographs of other moments show it brighter: a shadow that stayed.
+2. The model's condition is that of the edited drive (``editing/recorded.py``): points of removed objects are gone,
+   those of moved ones moved; photographs do not count where such objects or their shadows were; the renders are those
+   of the edited scene. What the photographs determined behind something that is gone (certainty of the render) stays as
+   rendered.
+3. The sample begins from the edited render. Untouched pixels stay at it at every step; touched ones are free from the
+   noise level on that belongs to their kind (``HarmonizeConfig.uncovered``, ``.objects``).
+4. Guard: where the model shows a road user in place of one that was removed, or none where one was put, the render
+  stays.
+5. The generated pixels are pasted into the render with a soft edge that lies inside the touched pixels: every other
+  pixel keeps its bits.
 """
 
 from __future__ import annotations
@@ -61,7 +64,8 @@ FEATHER_PX: Final = 3
 BRIGHTER: Final = 0.02
 """Ground that other moments show brighter than the render by this, 0 to 1, lay in a shadow."""
 CONTACT_REACH: Final = 0.2
-"""The ground this far about a new place of an object, as a share of its height, is its contact shadow and no longer what was uncovered."""
+"""The ground this far about a new place of an object, as a share of its height, is its contact shadow and no longer
+what was uncovered."""
 OVERLAP: Final = 2
 """Frames that windows share."""
 PUBLISHED_OVERLAP: Final = 8
@@ -77,20 +81,32 @@ def settings_of(config: HarmonizeConfig, device: str) -> SynthesizeConfig:
     strengths = {"uncovered": config.uncovered, "objects": config.objects, "weather": config.weather}
     partial = [f"--harmonize.{name} {value:g}" for name, value in strengths.items() if 0 < value < 1]
     if partial and is_published(config.model):
-        raise UsageError("a published-type model makes views from noise: it cannot stay near a render", where=partial[0].split()[0],
-            expected="0 or 1", got=partial[0].split()[1])  # fmt: skip
+        raise UsageError(
+            "a published-type model makes views from noise: it cannot stay near a render",
+            where=partial[0].split()[0],
+            expected="0 or 1",
+            got=partial[0].split()[1],
+        )
     return SynthesizeConfig(
         model=config.model, steps=config.steps, precision=config.precision, seed=config.seed, device=device, processes=1
     )
 
 
 def check_paths(config: HarmonizeConfig, frames: Mapping[str, int]) -> None:
-    """UsageError for what a published-type model cannot do with paths of so many frames, by name, before anything is written."""
+    """UsageError for what a published-type model cannot do with paths of so many frames, by name, before anything is
+    written."""
     settings_of(config, "cpu")
-    short = {name: count for name, count in frames.items() if is_published(config.model) and count < window_of(config.model)}
+    short = {
+        name: count for name, count in frames.items() if is_published(config.model) and count < window_of(config.model)
+    }
     for name, count in short.items():
-        raise UsageError("a path is too short for a published-type model, whose clips have a fixed number of frames", where=name,
-            expected=f"at least {window_of(config.model)} frames", got=str(count), remedy="harmonise with a small model")  # fmt: skip
+        raise UsageError(
+            "a path is too short for a published-type model, whose clips have a fixed number of frames",
+            where=name,
+            expected=f"at least {window_of(config.model)} frames",
+            got=str(count),
+            remedy="harmonise with a small model",
+        )
 
 
 DrawPair = Callable[[View], tuple[Observation, Observation]]
@@ -99,8 +115,9 @@ DrawPair = Callable[[View], tuple[Observation, Observation]]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Touched:
-    """Pixels bool[H,W] of a view that edits touch, by kind: `objects` that were moved or put in, with their shadows; `uncovered`: what
-    such and removed objects stood before; `shaded`: ground where a recorded shadow may have stayed."""
+    """Pixels bool[H,W] of a view that edits touch, by kind: `objects` that were moved or put in, with their shadows;
+    `uncovered`: what such and removed objects stood before; `shaded`: ground where a recorded shadow may have
+    stayed."""
 
     objects: Tensor
     uncovered: Tensor
@@ -135,7 +152,10 @@ class EditedSources:
             fitted: edited. recorded: the scene as it was.
         """
         if drive.scene is None or drive.cloud is None:
-            raise UsageError("the diffusion model needs the fused clouds of the drive", remedy="give --fused, as `mudg fuse` wrote it")
+            raise UsageError(
+                "the diffusion model needs the fused clouds of the drive",
+                remedy="give --fused, as `mudg fuse` wrote it",
+            )
         plan, edited, cloud = drive.plan, drive.scene, drive.cloud
         photos = photos_of_edited(recorded_images(recorded, SynthesizeConfig()), plan)
         return cls(fitted, plan, cleared_cloud(cloud, plan), edited.tracks, photos)
@@ -167,21 +187,24 @@ def soft_edge(mask: NDArray[np.bool_]) -> Tensor:
 
 
 def start_clip(renders: Sequence[Observation], freedom: Sequence[Tensor], size: tuple[int, int]) -> StartClip:
-    """Renders, of whatever size, as the clip of height and width ``size`` that a sample begins from; ``freedom`` f32[H,W] of them."""
+    """Renders, of whatever size, as the clip of height and width ``size`` that a sample begins from; ``freedom``
+    f32[H,W] of them."""
     area = lambda x: functional.interpolate(x, size=size, mode="area")  # noqa: E731
     picked = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")  # noqa: E731
     unknown = torch.full_like(renders[0].rgb[0], 255)
     depth = [torch.full_like(unknown, FAR_M)[None] if r.depth is None else r.depth.nan_to_num(FAR_M) for r in renders]
     ids = [unknown if r.semantics is None else r.semantics.float() for r in renders]
     return StartClip(
-        area(torch.stack([r.rgb for r in renders])), picked(torch.stack(depth)), picked(torch.stack(ids)[:, None]).to(torch.uint8),
+        area(torch.stack([r.rgb for r in renders])),
+        picked(torch.stack(depth)),
+        picked(torch.stack(ids)[:, None]).to(torch.uint8),
         functional.adaptive_max_pool2d(torch.stack(list(freedom))[:, None].float(), size),
-    )  # fmt: skip
+    )
 
 
 def guarded(touched: Touched, render: Observation, made: Observation, other_boxes: NDArray[np.bool_]) -> Tensor:
-    """Pixels bool[H,W] of `touched` whose generated class agrees with the edits: no road user came back where one was removed (but for
-    those whose `other_boxes` bool[H,W] are there), and none vanished where the render has one."""
+    """Pixels bool[H,W] of `touched` whose generated class agrees with the edits: no road user came back where one was
+    removed (but for those whose `other_boxes` bool[H,W] are there), and none vanished where the render has one."""
     if render.semantics is None or made.semantics is None:
         return touched.any
     there, wanted = (torch.isin(seen.semantics, DYNAMIC.long()) for seen in (made, render))
@@ -191,21 +214,29 @@ def guarded(touched: Touched, render: Observation, made: Observation, other_boxe
 
 
 def pasted(render: Observation, made: Observation, weight: Tensor) -> Observation:
-    """The render with generated colours of weight f32[H,W]; depth and classes are the generated ones where these weigh more than half.
-    Where the weight is 0 every value keeps its bits."""
+    """The render with generated colours of weight f32[H,W]; depth and classes are the generated ones where these weigh
+    more than half. Where the weight is 0 every value keeps its bits."""
     inside, most = weight > 0, weight > 0.5
     rgb = torch.where(inside, torch.lerp(render.rgb, made.rgb, weight), render.rgb)
-    chosen = lambda mine, theirs: mine if mine is None or theirs is None else torch.where(most, theirs.to(mine.dtype), mine)  # noqa: E731
+
+    def chosen(mine: Tensor | None, theirs: Tensor | None) -> Tensor | None:
+        return mine if mine is None or theirs is None else torch.where(most, theirs.to(mine.dtype), mine)
+
     return replace(
-        render, rgb=rgb.clamp(0, 1) if bool(inside.any()) else rgb, depth=chosen(render.depth, made.depth),
-        semantics=chosen(render.semantics, made.semantics), confidence=torch.where(most, made.confidence, render.confidence),
-    )  # fmt: skip
+        render,
+        rgb=rgb.clamp(0, 1) if bool(inside.any()) else rgb,
+        depth=chosen(render.depth, made.depth),
+        semantics=chosen(render.semantics, made.semantics),
+        confidence=torch.where(most, made.confidence, render.confidence),
+    )
 
 
 class Harmoniser:
     """Repairs the views of an edited scene, window after window along a path."""
 
-    def __init__(self, sources: EditedSources, config: HarmonizeConfig, size: tuple[int, int], device: str = "auto") -> None:
+    def __init__(
+        self, sources: EditedSources, config: HarmonizeConfig, size: tuple[int, int], device: str = "auto"
+    ) -> None:
         """``size``: width and height of the views."""
         self._settings = loading.check_config(settings_of(config, device), fitted=not is_published(config.model))
         self._sources, self._config = sources, config
@@ -213,11 +244,18 @@ class Harmoniser:
         self.window, overlap = model.config.window, PUBLISHED_OVERLAP if model.points_alone else OVERLAP
         self._overlap = min(overlap, self.window - 1)
         width, height = model.image_size(*size, 0)
-        rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=model.points_alone)
+        rules = ConditionRules(
+            width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=model.points_alone
+        )
         given = ConditionSources(
-            sources.cloud, sources.tracks, sources.photos, rules, functools.partial(render_planes, sources.fitted), None,
+            sources.cloud,
+            sources.tracks,
+            sources.photos,
+            rules,
+            functools.partial(render_planes, sources.fitted),
+            None,
             vacated_at(sources.plan),
-        )  # fmt: skip
+        )
         self._maker = ViewMaker(model, given, self._settings, None if model.points_alone else self._start_at)
         self._parts: list[tuple[Observation, Touched]] = []
 
@@ -225,11 +263,14 @@ class Harmoniser:
         """The renders of the window that is being made, at the size that the model works at."""
         size = views[0].camera.height, views[0].camera.width
         renders, touched = [part[0] for part in self._parts], [part[1] for part in self._parts]
-        freedom = [self._config.uncovered * (t.uncovered | t.shaded) + self._config.objects * t.objects for t in touched]
+        freedom = [
+            self._config.uncovered * (t.uncovered | t.shaded) + self._config.objects * t.objects for t in touched
+        ]
         return start_clip(renders, freedom, size)
 
     def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
-        """The views of a path, in order, with the touched pixels repaired. Nothing is generated for a window that edits do not touch."""
+        """The views of a path, in order, with the touched pixels repaired. Nothing is generated for a window that edits
+        do not touch."""
         done, tail = 0, dict[Modality, Tensor]()
         parts: dict[int, tuple[Observation, Touched]] = {}
         for number, span in enumerate(windows(len(views), self.window, self._overlap)):
@@ -270,12 +311,20 @@ def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> Edit
     """
     raster, edited = raster_of(images.before, images.config.raster), drive.scene or recorded
     sources, config = EditedSources.of(drive, images.after, recorded), images.config.harmonize
-    draw = lambda view: (render_view(images.before, view, raster), render_view(images.after, view, raster))  # noqa: E731
+
+    def draw(view: View) -> tuple[Observation, Observation]:
+        return render_view(images.before, view, raster), render_view(images.after, view, raster)
+
     views = {name: [f.view for f in edited.frames if f.view.camera.name == name] for name in edited.cameras}
     made = {
-        name: Harmoniser(sources, config, (mine[0].camera.width, mine[0].camera.height), images.config.device).along(mine, draw)
-        for name, mine in views.items() if mine
-    }  # fmt: skip
+        name: (
+            Harmoniser(sources, config, (mine[0].camera.width, mine[0].camera.height), images.config.device).along(
+                mine, draw
+            )
+        )
+        for name, mine in views.items()
+        if mine
+    }
     return replace(images, repaired=made)
 
 
@@ -307,14 +356,13 @@ class RepairedViews:
         return next(made for own, made in self._left if own is view)
 
 
-# harmonised weather ---------------------------------------------------------------------------------------------------
+# harmonised weather -------------------------------------------------------------------------------
 #
 # Views in other weather or light that a published-type diffusion model makes, after the formulas of `core.weather`.
 #
-# The model is given points and a reference image in that weather, as in the paper's figure of edited backgrounds, and makes the view from
-# noise. It works at its own size: what it changes there is enlarged and added to the render, which so keeps its detail. Depth, classes
-# and
-# confidence stay as rendered.
+# The model is given points and a reference image in that weather, as in the paper's figure of edited backgrounds, and
+# makes the view from noise. It works at its own size: what it changes there is enlarged and added to the render, which
+# so keeps its detail. Depth, classes and confidence stay as rendered.
 
 
 def harmonises_weather(config: HarmonizeConfig, how: InWeather) -> bool:
@@ -347,9 +395,15 @@ class WeatherHarmoniser:
         width, height = self._model.image_size(*size, 0)
         rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=True)
         self._given = ConditionSources(
-            sources.cloud, sources.tracks, sources.photos, rules, functools.partial(render_planes, sources.fitted), None,
-            vacated_at(sources.plan), how,
-        )  # fmt: skip
+            sources.cloud,
+            sources.tracks,
+            sources.photos,
+            rules,
+            functools.partial(render_planes, sources.fitted),
+            None,
+            vacated_at(sources.plan),
+            how,
+        )
         self._kept: dict[int, WarpSource] = {}
 
     def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:

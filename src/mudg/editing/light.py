@@ -21,7 +21,8 @@ WIDTH_PX: Final = 160
 
 
 def surface_light(model: SceneModel, views: Sequence[View]) -> NDArray[np.float64] | None:
-    """Mean light f64[3] of the surfaces that a fitted scene shows, linear: of all pixels but sky, in some recorded views, drawn small.
+    """Mean light f64[3] of the surfaces that a fitted scene shows, linear: of all pixels but sky, in some recorded
+    views, drawn small.
 
     None without views, or where they show nothing.
     """
@@ -60,6 +61,8 @@ def take_light(plan: EditPlan, model: SceneModel) -> None:
 
 
 def _unmatched(names: Sequence[str]) -> dict[str, Any]:
-    text = (f"{', '.join(names)}: the colours stay as they were recorded, for the light of one of the two streets is not known "
-            "(it takes recorded views: give --scene; export assets with --scene)")  # fmt: skip
+    text = (
+        f"{', '.join(names)}: the colours stay as they were recorded, for the light of one of the two streets is not"
+        " known (it takes recorded views: give --scene; export assets with --scene)"
+    )
     return {"kind": "light not matched", "ids": list(names), "text": text}

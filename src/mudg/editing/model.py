@@ -1,4 +1,5 @@
-"""Edits of a fitted scene: its objects on other paths, taken away, put in, cut out of the background; their contact shadows.
+"""Edits of a fitted scene: its objects on other paths, taken away, put in, cut out of the background; their contact
+shadows.
 
 Everything returns a changed copy and shares what stays. How a path changes is the business of ``core/edit.py``.
 """
@@ -44,7 +45,7 @@ SHADOW_BLUR: Final = 0.15
 """Width of a contact shadow's edge, as a share of the height of what casts it."""
 
 
-# -- paths ---------------------------------------------------------------------------------------------------------------
+# -- paths -----------------------------------------------------------------------------------------
 
 
 def motion_of(node: RigidNode) -> Motion:
@@ -53,17 +54,24 @@ def motion_of(node: RigidNode) -> Motion:
 
 
 def node_along(node: RigidNode, motion: Motion) -> RigidNode:
-    """The same object on another path; what its rows do inside the box is that of the moments that the path shows (a ``DeformedNode``:
-    of the time itself).
+    """The same object on another path; what its rows do inside the box is that of the moments that the path shows (a
+    ``DeformedNode``: of the time itself).
 
     Raises:
         InputError: an object on curves, whose Gaussians have places along the recorded path.
     """
     if isinstance(node, BezierNode):
-        raise InputError("an object that was fitted on curves cannot take another path", got=node.name,
-            remedy="remove or replace it, or use a fit with boxes (mudg_s, street_gaussians)")  # fmt: skip
+        raise InputError(
+            "an object that was fitted on curves cannot take another path",
+            got=node.name,
+            remedy="remove or replace it, or use a fit with boxes (mudg_s, street_gaussians)",
+        )
     shown = np.interp(motion.source_s, node.times_s, np.arange(len(node.times_s), dtype=np.float64))
-    columns = {name: _at_keys(node.offsets[name].detach(), shown) for name in node.offsets.columns if name not in ("shift", "yaw")}
+    columns = {
+        name: _at_keys(node.offsets[name].detach(), shown)
+        for name in node.offsets.columns
+        if name not in ("shift", "yaw")
+    }
     zero = torch.zeros(len(shown), device=node.offsets.device)
     offsets = Table({"shift": zero[:, None].repeat(1, 3), "yaw": zero, **columns})
     made = type(node)(node.name, node.label, node.size_m, motion.times_s, motion.poses, offsets, node.learn_pose)
@@ -88,12 +96,13 @@ def with_motions(model: SceneModel, motions: Mapping[str, Motion]) -> SceneModel
     """
     wanted = {model.dynamic_object(name).name for name in motions}
     nodes = tuple(
-        node_along(node, motions[node.name]) if isinstance(node, RigidNode) and node.name in wanted else node for node in model.nodes
+        node_along(node, motions[node.name]) if isinstance(node, RigidNode) and node.name in wanted else node
+        for node in model.nodes
     )
     return replace(model, nodes=nodes, facts=dict(model.facts))
 
 
-# -- what belongs to an object -------------------------------------------------------------------------------------------
+# -- what belongs to an object ---------------------------------------------------------------------
 
 
 def classes_of_rows(model: SceneModel) -> NDArray[np.int64]:
@@ -113,9 +122,11 @@ def ground_points(model: SceneModel) -> NDArray[np.float32]:
 
 
 def lowest_points(model: SceneModel) -> NDArray[np.float32]:
-    """Centres f32[M, 3] of the solid Gaussians of the background that are the lowest fifth of their square metre: the ground, where no
-    class says what it is."""
-    rows = (model.table.labels["node"] == 0).cpu().numpy() & (torch.sigmoid(model.table["logits"].detach()).cpu().numpy() > SOLID_OPACITY)
+    """Centres f32[M, 3] of the solid Gaussians of the background that are the lowest fifth of their square metre: the
+    ground, where no class says what it is."""
+    rows = (model.table.labels["node"] == 0).cpu().numpy() & (
+        torch.sigmoid(model.table["logits"].detach()).cpu().numpy() > SOLID_OPACITY
+    )
     means = model.table["means"].detach().cpu().numpy()[rows]
     cells = np.floor(means[:, :2]).astype(np.int64)
     order = np.lexsort((means[:, 2], cells[:, 1], cells[:, 0]))
@@ -134,19 +145,28 @@ def cut_out(model: SceneModel, track: Track) -> SceneModel:
         UsageError: nothing of the background lies in the box, or the background changes with time.
     """
     if model.nodes[0].kind != "static":
-        raise UsageError("nothing can be cut out of a background that changes with time", where=f"track {track.id!r}",
-            expected="a fit of mudg_s or street_gaussians", got=f"a background of kind {model.nodes[0].kind}")  # fmt: skip
+        raise UsageError(
+            "nothing can be cut out of a background that changes with time",
+            where=f"track {track.id!r}",
+            expected="a fit of mudg_s or street_gaussians",
+            got=f"a background of kind {model.nodes[0].kind}",
+        )
     pose = track.world_from_object[len(track.times_s) // 2]
     table = model.table
     local = geometry.transform_points(geometry.invert(pose), table["means"].detach().cpu().numpy().astype(np.float64))
     half = track.size_m / 2 + CUT_MARGIN_M
-    inside = (np.abs(local[:, :2]) <= half[:2]).all(1) & (local[:, 2] <= half[2]) & (local[:, 2] >= -track.size_m[2] / 2)
+    inside = (
+        (np.abs(local[:, :2]) <= half[:2]).all(1) & (local[:, 2] <= half[2]) & (local[:, 2] >= -track.size_m[2] / 2)
+    )
     low = local[:, 2] < -track.size_m[2] / 2 + CUT_FLOOR_M
     ids = classes_of_rows(model)
     inside &= ~np.isin(ids, GROUND_CLASSES) & ~(low & (ids < 0)) & (table.labels["node"] == 0).cpu().numpy()
     if not inside.any():
-        raise UsageError("nothing of the fitted background lies in this box", where=f"track {track.id!r}",
-            remedy="the fit did not see it; leave it out of the script")  # fmt: skip
+        raise UsageError(
+            "nothing of the fitted background lies in this box",
+            where=f"track {track.id!r}",
+            remedy="the fit did not see it; leave it out of the script",
+        )
     rows = torch.from_numpy(np.flatnonzero(inside)).to(model.device)
     columns = {name: value.detach().clone() for name, value in table.columns.items()}
     turn = torch.from_numpy(geometry.quaternion_from_matrix(geometry.invert(pose))).float().to(model.device)
@@ -159,13 +179,16 @@ def cut_out(model: SceneModel, track: Track) -> SceneModel:
     owner[rows] = len(model.nodes)
     node = RigidNode(track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object)
     made = replace(
-        model, table=Table(columns, {**table.labels, "node": owner}), nodes=(*model.nodes, node.to(model.device)), facts=dict(model.facts)
+        model,
+        table=Table(columns, {**table.labels, "node": owner}),
+        nodes=(*model.nodes, node.to(model.device)),
+        facts=dict(model.facts),
     )
     made.sort_rows()
     return made
 
 
-# -- backgrounds -----------------------------------------------------------------------------------------------------------
+# -- backgrounds -----------------------------------------------------------------------------------
 
 
 def with_background(model: SceneModel, other: SceneModel, world_from_other: NDArray[np.float64]) -> SceneModel:
@@ -181,7 +204,9 @@ def with_background(model: SceneModel, other: SceneModel, world_from_other: NDAr
     """
     for scene in (model, other):
         if scene.nodes[0].kind != "static":
-            raise UsageError("a background that changes with time cannot be exchanged", got=f"kind {scene.nodes[0].kind}")
+            raise UsageError(
+                "a background that changes with time cannot be exchanged", got=f"kind {scene.nodes[0].kind}"
+            )
     there, mine = model.device, (model.table.labels["node"] > 0).nonzero()[:, 0]
     rows = (other.table.labels["node"] == 0).nonzero()[:, 0]
     given = {name: value.detach()[rows].cpu() for name, value in other.table.columns.items()}
@@ -195,14 +220,20 @@ def with_background(model: SceneModel, other: SceneModel, world_from_other: NDAr
             if train_id in other.classes:
                 channels[:, channel] = given["semantics"][:, other.classes.index(train_id)]
         columns["semantics"] = channels
-    labels = {key: torch.zeros(len(rows), *value.shape[1:], dtype=value.dtype) for key, value in model.table.labels.items()}
+    labels = {
+        key: torch.zeros(len(rows), *value.shape[1:], dtype=value.dtype) for key, value in model.table.labels.items()
+    }
     if CERTAINTY in labels and other.certainty is not None:
         labels[CERTAINTY] = other.certainty[rows].cpu().to(labels[CERTAINTY].dtype)
     table = Table(
-        {name: torch.cat([columns.get(name, torch.zeros(len(rows), *value.shape[1:])).to(there), value.detach()[mine]])
-         for name, value in model.table.columns.items()},
+        {
+            name: torch.cat(
+                [columns.get(name, torch.zeros(len(rows), *value.shape[1:])).to(there), value.detach()[mine]]
+            )
+            for name, value in model.table.columns.items()
+        },
         {key: torch.cat([labels[key].to(there), value[mine]]) for key, value in model.table.labels.items()},
-    )  # fmt: skip
+    )
     sky = None
     if other.sky is not None:
         shift = round(geometry.yaw_of(world_from_other) / np.pi * other.sky.rows)
@@ -211,7 +242,7 @@ def with_background(model: SceneModel, other: SceneModel, world_from_other: NDAr
     return replace(model, table=table, sky=sky, facts=dict(model.facts))
 
 
-# -- assets --------------------------------------------------------------------------------------------------------------
+# -- assets ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -219,7 +250,8 @@ class Asset:
     """One object of a fitted scene by itself.
 
     Args:
-        columns: raw columns as in ``SceneModel``, in the frame of the box, without ``semantics``; colours of degree 0 alone.
+        columns: raw columns as in ``SceneModel``, in the frame of the box, without ``semantics``; colours of degree 0
+            alone.
         class_ids: train id of every Gaussian, i64[n]; -1 = unknown.
         certainty: f32[n] in [0, 1] or None.
         label, size_m: of its box.
@@ -242,7 +274,11 @@ class Asset:
 
 
 def asset_of(
-    model: SceneModel, name: str, seen_rad: Sequence[float] = (), origin: str = "", light_rgb: NDArray[np.float64] | None = None
+    model: SceneModel,
+    name: str,
+    seen_rad: Sequence[float] = (),
+    origin: str = "",
+    light_rgb: NDArray[np.float64] | None = None,
 ) -> Asset:
     """An object of a fitted scene. What deforms is taken as it is in the middle of its track.
 
@@ -252,16 +288,23 @@ def asset_of(
     node = model.dynamic_object(name)
     index = model.nodes.index(node)
     rows = (model.table.labels["node"] == index).nonzero()[:, 0]
-    columns = {key: model.table[key].detach()[rows].cpu() for key in ("means", "quats", "log_scales", "logits", "sh_dc")}
+    columns = {
+        key: model.table[key].detach()[rows].cpu() for key in ("means", "quats", "log_scales", "logits", "sh_dc")
+    }
     if type(node) is not RigidNode:
         columns |= _shape_at_middle(model, node, rows)
     known = model.certainty
     size = (node.size_m[0], node.size_m[1], node.size_m[2])
     return Asset(
-        columns, classes_of_rows(model)[rows.cpu().numpy()], None if known is None else known[rows].float().cpu().numpy(),
-        node.label, size, None if light_rgb is None else (float(light_rgb[0]), float(light_rgb[1]), float(light_rgb[2])),
-        tuple(float(a) for a in seen_rad), origin or f"{model.facts.get('scene', 'a scene')}: {name}",
-    )  # fmt: skip
+        columns,
+        classes_of_rows(model)[rows.cpu().numpy()],
+        None if known is None else known[rows].float().cpu().numpy(),
+        node.label,
+        size,
+        None if light_rgb is None else (float(light_rgb[0]), float(light_rgb[1]), float(light_rgb[2])),
+        tuple(float(a) for a in seen_rad),
+        origin or f"{model.facts.get('scene', 'a scene')}: {name}",
+    )
 
 
 @torch.no_grad()
@@ -269,8 +312,13 @@ def _shape_at_middle(model: SceneModel, node: RigidNode, rows: Tensor) -> dict[s
     """Places and rotations of an object's Gaussians in the middle of its track, in the frame of its box, on the CPU."""
     own = {name: value.detach()[rows] for name, value in model.table.columns.items()}
     time_s = float(node.times_s[len(node.times_s) // 2])
-    given = NodeRows(own["means"], own["quats"], torch.sigmoid(own["logits"]), own["sh_dc"],
-                     {name: value for name, value in own.items() if name not in COLUMNS})  # fmt: skip
+    given = NodeRows(
+        own["means"],
+        own["quats"],
+        torch.sigmoid(own["logits"]),
+        own["sh_dc"],
+        {name: value for name, value in own.items() if name not in COLUMNS},
+    )
     now, pose = node.at_time(given, time_s), node.pose_matrix(time_s)
     if now is None or pose is None:
         return {}
@@ -281,7 +329,8 @@ def _shape_at_middle(model: SceneModel, node: RigidNode, rows: Tensor) -> dict[s
 
 
 def matched_light(asset: Asset, there: NDArray[np.float64] | None) -> tuple[Asset, NDArray[np.float64]]:
-    """The asset in the light of a scene (mean light f64[3] of its surfaces), and the gain f64[3] of its linear light (``light_gain``)."""
+    """The asset in the light of a scene (mean light f64[3] of its surfaces), and the gain f64[3] of its linear light
+    (``light_gain``)."""
     gain = light_gain(None if asset.light_rgb is None else np.asarray(asset.light_rgb), there)
     return replace(asset, columns={**asset.columns, "sh_dc": relit(asset.columns["sh_dc"], gain)}), gain
 
@@ -289,9 +338,10 @@ def matched_light(asset: Asset, there: NDArray[np.float64] | None) -> tuple[Asse
 def light_gain(here: NDArray[np.float64] | None, there: NDArray[np.float64] | None) -> NDArray[np.float64]:
     """Factor f64[3] from the light of one scene to that of another, in linear light.
 
-    The surfaces of two streets are taken to reflect alike on the whole (the assumption of a grey world), so that the ratio of their mean
-    light is that of illumination and exposure, but for what the streets are made of: hence the exponent, which is the slope of the true
-    factor over the ratio, both as logarithms, for vehicles in 17 generated cities. Kept within 1/4 to 4; 1 where either is not known.
+    The surfaces of two streets are taken to reflect alike on the whole (the assumption of a grey world), so that the
+    ratio of their mean light is that of illumination and exposure, but for what the streets are made of: hence the
+    exponent, which is the slope of the true factor over the ratio, both as logarithms, for vehicles in 17 generated
+    cities. Kept within 1/4 to 4; 1 where either is not known.
 
     Args:
         here, there: mean light of surfaces f64[3], linear.
@@ -302,7 +352,8 @@ def light_gain(here: NDArray[np.float64] | None, there: NDArray[np.float64] | No
 
 
 def relit(sh_dc: Tensor, gain: NDArray[np.float64]) -> Tensor:
-    """Colours of degree 0 f32[n, 1, 3] with their linear light multiplied by a gain f64[3]; what is below black stays."""
+    """Colours of degree 0 f32[n, 1, 3] with their linear light multiplied by a gain f64[3]; what is below black
+    stays."""
     shown = 0.5 + SH_C0 * sh_dc.detach().cpu().double().numpy()
     lit = np.where(shown > 0, display_of(linear_of(shown) * gain), shown)
     return torch.from_numpy((lit - 0.5) / SH_C0).to(sh_dc)
@@ -320,14 +371,17 @@ def display_of(linear: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def with_relit_objects(model: SceneModel, gain: NDArray[np.float64]) -> SceneModel:
-    """A copy whose objects give off their linear light times a gain f64[3]; what their colours add with direction grows with them."""
+    """A copy whose objects give off their linear light times a gain f64[3]; what their colours add with direction grows
+    with them."""
     table, mine = model.table, model.table.labels["node"] > 0
     old = table["sh_dc"].detach()
     new = torch.where(mine[:, None, None], relit(old, gain), old)
     columns = {**{name: value.detach() for name, value in table.columns.items()}, "sh_dc": new}
     if "sh_rest" in columns:
         shown = [(0.5 + SH_C0 * value).clamp(min=1 / 255) for value in (old, new)]
-        columns["sh_rest"] = torch.where(mine[:, None, None], columns["sh_rest"] * (shown[1] / shown[0]), columns["sh_rest"])
+        columns["sh_rest"] = torch.where(
+            mine[:, None, None], columns["sh_rest"] * (shown[1] / shown[0]), columns["sh_rest"]
+        )
     return replace(model, table=Table(columns, dict(table.labels)), facts=dict(model.facts))
 
 
@@ -338,7 +392,9 @@ def with_asset(model: SceneModel, asset: Asset, name: str, motion: Motion, label
         UsageError: the scene has an object of that name.
     """
     if name in model.node_names():
-        raise UsageError("there is an object of this name already", got=name, remedy="give the inserted object another id")
+        raise UsageError(
+            "there is an object of this name already", got=name, remedy="give the inserted object another id"
+        )
     table, count = model.table, len(asset)
     columns: dict[str, Tensor] = dict(asset.columns)
     if "semantics" in table.columns:
@@ -360,7 +416,9 @@ def with_asset(model: SceneModel, asset: Asset, name: str, motion: Motion, label
     return _with_rows(model, node.to(model.device), columns, labels)
 
 
-def _with_rows(model: SceneModel, node: RigidNode, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor]) -> SceneModel:
+def _with_rows(
+    model: SceneModel, node: RigidNode, columns: Mapping[str, Tensor], labels: Mapping[str, Tensor]
+) -> SceneModel:
     table, there = model.table, model.device
     grown = Table(
         {key: torch.cat([value.detach(), columns[key].to(there)]) for key, value in table.columns.items()},
@@ -369,25 +427,29 @@ def _with_rows(model: SceneModel, node: RigidNode, columns: Mapping[str, Tensor]
     return replace(model, table=grown, nodes=(*model.nodes, node), facts=dict(model.facts))
 
 
-# -- contact shadows -----------------------------------------------------------------------------------------------------
+# -- contact shadows -------------------------------------------------------------------------------
 
 
 def with_shadow(model: SceneModel, name: str, strength: float, sun: NDArray[np.float64] | None = None) -> SceneModel:
     """A copy in which an object darkens the ground that it stands on.
 
-    Under an overcast sky the ground below a box loses the share of light that the box covers. Black flat Gaussians at the bottom of
-    the box, in its frame and so with it at all times, take away ``strength`` of the light below it, less towards the edge, which is
-    as wide as `SHADOW_BLUR` of the box's height. Where the sun shines, so does the ground from which the box hides it. They carry no
-    class and hardly any depth of their own.
+    Under an overcast sky the ground below a box loses the share of light that the box covers. Black flat Gaussians at
+    the bottom of the box, in its frame and so with it at all times, take away ``strength`` of the light below it, less
+    towards the edge, which is as wide as `SHADOW_BLUR` of the box's height. Where the sun shines, so does the ground
+    from which the box hides it. They carry no class and hardly any depth of their own.
 
     Args:
         strength: share of the (linear) light that is missing below the middle of the box.
-        sun: direction f64[3] of the world towards the sun, above the ground; None = none. The shadow turns with the object: it is right
-            for the heading in the middle of its path.
+        sun: direction f64[3] of the world towards the sun, above the ground; None = none. The shadow turns with the
+            object: it is right for the heading in the middle of its path.
     """
     node = model.dynamic_object(name)
     index, (length, width, height) = model.nodes.index(node), node.size_m
-    toward = None if sun is None else node.corrected_keys(slice(len(node.times_s) // 2, len(node.times_s) // 2 + 1))[0, :3, :3].T @ sun
+    toward = (
+        None
+        if sun is None
+        else node.corrected_keys(slice(len(node.times_s) // 2, len(node.times_s) // 2 + 1))[0, :3, :3].T @ sun
+    )
     xy, share = _covered(np.array([length, width, height]), toward)
     spread = SHADOW_STEP_M
     # Overlapping Gaussians of opacity a on a grid of step s and spread s pass exp(-2 pi a) of the light, nearly.
@@ -408,9 +470,11 @@ def with_shadow(model: SceneModel, name: str, strength: float, sun: NDArray[np.f
     return made
 
 
-def _covered(size: NDArray[np.float64], sun: NDArray[np.float64] | None) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Places f64[n, 2] of the ground around a box, in its frame, and how much of their light it takes f64[n]; with the direction towards
-    the sun there, the larger of what it takes of the sky's and of the sun's."""
+def _covered(
+    size: NDArray[np.float64], sun: NDArray[np.float64] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places f64[n, 2] of the ground around a box, in its frame, and how much of their light it takes f64[n]; with the
+    direction towards the sun there, the larger of what it takes of the sky's and of the sun's."""
     length, width, height = size
     blur = SHADOW_BLUR * height
     if sun is None:
@@ -423,12 +487,17 @@ def _covered(size: NDArray[np.float64], sun: NDArray[np.float64] | None) -> tupl
     share = (edge / (2 * blur + 1e-6)).clip(0, 1).prod(1)
     if sun is None:
         return xy, share
-    around = np.array([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [0.7, 0.7], [-0.7, 0.7], [0.7, -0.7], [-0.7, -0.7]]) * blur
+    around = (
+        np.array([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [0.7, 0.7], [-0.7, 0.7], [0.7, -0.7], [-0.7, -0.7]])
+        * blur
+    )
     hidden = np.zeros(len(xy))
     beam = (sun / np.linalg.norm(sun))[None]
     for x, y in around:
         place = np.column_stack([xy + [x, y], np.full(len(xy), -height / 2)])
-        hidden += [np.isfinite(met_box(beam, geometry.from_rotation_translation(np.eye(3), -at), size)[0]) for at in place]
+        hidden += [
+            np.isfinite(met_box(beam, geometry.from_rotation_translation(np.eye(3), -at), size)[0]) for at in place
+        ]
     share = np.maximum(share, hidden / len(around))
     return xy[share > 0], share[share > 0]
 

@@ -1,7 +1,7 @@
 """From a script to what is to happen: every verb in order, on the paths of all road users and of the vehicle.
 
-Boxes of a scene and objects of a fitted scene lie almost in the same places, but not quite: a fit corrects boxes. So a plan keeps
-what is done to a path as functions, to be applied to either.
+Boxes of a scene and objects of a fitted scene lie almost in the same places, but not quite: a fit corrects boxes. So a
+plan keeps what is done to a path as functions, to be applied to either.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ OpenAsset = Callable[[AssetSource], Asset]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Background:
-    """Another street: its fit, the path of its vehicle, points f32[N, 3] of its ground; its fused points and the mean light f64[3] of its
-    surfaces, if they are known."""
+    """Another street: its fit, the path of its vehicle, points f32[N, 3] of its ground; its fused points and the mean
+    light f64[3] of its surfaces, if they are known."""
 
     model: SceneModel
     ego: Motion
@@ -79,7 +79,8 @@ class EditWorld:
     """What a script can speak of.
 
     Args:
-        actors: by id. ego: path of the vehicle, None where only a fitted scene is given. ground: None = heights are not known.
+        actors: by id. ego: path of the vehicle, None where only a fitted scene is given. ground: None = heights are not
+            known.
     """
 
     actors: Mapping[str, Actor]
@@ -104,8 +105,8 @@ class EditWorld:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Insertion:
-    """An object that is put in: what it is; how dark its shadow is; whether it takes the light of the scene; the direction f64[3] towards
-    the sun that casts its shadow, or None."""
+    """An object that is put in: what it is; how dark its shadow is; whether it takes the light of the scene; the
+    direction f64[3] towards the sun that casts its shadow, or None."""
 
     asset: Asset
     shadow: float
@@ -122,8 +123,8 @@ class EditPlan:
         changes: what is done to the path of an actor of the recording, in order.
         removed: actors of the recording that are not there any more. inserted: new ones, by id.
         sky: settings of the last `sky`, or None. background: another street, and its pose world_from_other f64[4, 4].
-        match_objects: whether the objects that are kept take the light of that street. objects_gain: by which factor f64[3] of
-            their linear light, or None.
+        match_objects: whether the objects that are kept take the light of that street. objects_gain: by which factor
+            f64[3] of their linear light, or None.
         conditions: records of weather, light and season.
         notes: what the reader should know, with numbers.
         views: recorded ones, which say what nobody saw of the street; none where there is no scene.
@@ -170,7 +171,8 @@ def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> Ed
     """Carry out a script on paths.
 
     Raises:
-        InputError: an id that does not exist, or something that cannot be done; the message names the line and the verb.
+        InputError: an id that does not exist, or something that cannot be done; the message names the line and the
+            verb.
     """
     plan = EditPlan(world, world, conditions=script.conditions())
     for edit in script.edits:
@@ -184,7 +186,11 @@ def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> Ed
         except (InputError, UsageError) as problem:
             raise _located(problem, edit) from problem
     plan.closed = {name for name in plan.closed if _left_its_place(plan, name)}
-    others = set(plan.before.actors) & set(plan.after.actors) - set(plan.changes) - set(plan.inserted) if EGO in plan.sides else set()
+    others = (
+        set(plan.before.actors) & set(plan.after.actors) - set(plan.changes) - set(plan.inserted)
+        if EGO in plan.sides
+        else set()
+    )
     plan.sides = plan.sides & set(plan.changes) - {EGO} | others  # from another path of the vehicle, all are seen anew
     return plan
 
@@ -202,7 +208,7 @@ def _located(problem: MudgError, edit: ScriptEdit) -> InputError:
     return InputError(problem.what, where=where, expected=problem.expected, got=problem.got, remedy=problem.remedy)
 
 
-# -- verbs ---------------------------------------------------------------------------------------------------------------
+# -- verbs -----------------------------------------------------------------------------------------
 
 
 def _remove(plan: EditPlan, given: Any, sources: EditSources) -> None:
@@ -237,14 +243,19 @@ def _chosen(world: EditWorld, given: Any) -> list[str]:
             names.append(name)
     if not names:
         labels = ", ".join(sorted({actor.label for actor in world.actors.values()}))
-        raise InputError("no object is of this kind", expected=f"class among {labels or 'none'}",
-            got=str(given.model_dump(exclude_none=True, by_alias=True)))  # fmt: skip
+        raise InputError(
+            "no object is of this kind",
+            expected=f"class among {labels or 'none'}",
+            got=str(given.model_dump(exclude_none=True, by_alias=True)),
+        )
     return names
 
 
 def _nearest_m(world: EditWorld, actor: Actor) -> float:
     if world.ego is None:
-        raise InputError("the vehicle's path is not known, so nothing is near it", where="within_m", remedy="give --scene")
+        raise InputError(
+            "the vehicle's path is not known, so nothing is near it", where="within_m", remedy="give --scene"
+        )
     apart = actor.motion.poses[:, None, :2, 3] - world.ego.poses[None, :, :2, 3]
     return float(np.linalg.norm(apart, axis=-1).min())
 
@@ -263,8 +274,14 @@ def _speed(plan: EditPlan, given: Any, _: EditSources) -> None:
     begin = float(motion.times_s[0]) if given.from_s is None else max(given.from_s, float(motion.times_s[0]))
     ahead = max(0.0, (given.factor - 1) * (float(motion.times_s[-1]) - begin))
     if ahead > 0:
-        plan.notes.append({"kind": "beyond the recording", "id": given.id, "seconds": round(ahead, 3),
-                           "text": f"{given.id} goes on straight for {ahead:.1f} s of its recording that do not exist"})  # fmt: skip
+        plan.notes.append(
+            {
+                "kind": "beyond the recording",
+                "id": given.id,
+                "seconds": round(ahead, 3),
+                "text": f"{given.id} goes on straight for {ahead:.1f} s of its recording that do not exist",
+            }
+        )
     _change(plan, given.id, functools.partial(paths.sped, factor=given.factor, from_s=given.from_s))
 
 
@@ -272,15 +289,29 @@ def _lane_change(plan: EditPlan, given: Any, _: EditSources) -> None:
     peak = paths.QUINTIC_PEAK * abs(given.left_m) / given.duration_s**2
     if peak > given.most_lateral_m_s2:
         least = math.sqrt(paths.QUINTIC_PEAK * abs(given.left_m) / given.most_lateral_m_s2)
-        raise InputError("the lane change is too sharp", where="duration_s", expected=f"at most {given.most_lateral_m_s2:g} m/s^2 sideways",
+        raise InputError(
+            "the lane change is too sharp",
+            where="duration_s",
+            expected=f"at most {given.most_lateral_m_s2:g} m/s^2 sideways",
             got=f"{peak:.2f} m/s^2 ({given.left_m:g} m in {given.duration_s:g} s)",
-            remedy=f"a duration_s of {math.ceil(least * 100) / 100:g} or more, or a larger most_lateral_m_s2")  # fmt: skip
-    plan.notes.append({"kind": "lateral acceleration", "id": given.id, "m_s2": round(peak, 3),
-                       "text": f"{given.id} changes lanes with at most {peak:.2f} m/s^2 sideways"})  # fmt: skip
+            remedy=f"a duration_s of {math.ceil(least * 100) / 100:g} or more, or a larger most_lateral_m_s2",
+        )
+    plan.notes.append(
+        {
+            "kind": "lateral acceleration",
+            "id": given.id,
+            "m_s2": round(peak, 3),
+            "text": f"{given.id} changes lanes with at most {peak:.2f} m/s^2 sideways",
+        }
+    )
     ground = plan.after.ground if given.ground else None
-    _change(plan, given.id, functools.partial(
-        paths.lane_changed, left_m=given.left_m, start_s=given.start_s, duration_s=given.duration_s, ground=ground
-    ))  # fmt: skip
+    _change(
+        plan,
+        given.id,
+        functools.partial(
+            paths.lane_changed, left_m=given.left_m, start_s=given.start_s, duration_s=given.duration_s, ground=ground
+        ),
+    )
 
 
 def _path(plan: EditPlan, given: Any, _: EditSources) -> None:
@@ -320,7 +351,9 @@ def _insert(plan: EditPlan, given: Any, sources: EditSources) -> None:
     asset, world = sources.asset(given.asset), plan.after
     name = given.id or _free_name(world, given.class_ or asset.label)
     if name in world.actors:
-        raise InputError("there is an object of this id already", where="id", got=name, remedy="give the new one another id")
+        raise InputError(
+            "there is an object of this id already", where="id", got=name, remedy="give the new one another id"
+        )
     ground = world.ground if given.ground else None
     height = asset.size_m[2] / 2
     if given.path is not None:
@@ -330,7 +363,9 @@ def _insert(plan: EditPlan, given: Any, sources: EditSources) -> None:
         motion = paths.along_points(points, height, ground, _floor(world))
     else:
         motion = _near(world, given.near, height, ground)
-    plan.inserted[name] = Insertion(asset, given.shadow, given.match_light, None if given.sun is None else _toward(given.sun))
+    plan.inserted[name] = Insertion(
+        asset, given.shadow, given.match_light, None if given.sun is None else _toward(given.sun)
+    )
     plan.after = replace(world, actors={**world.actors, name: Actor(given.class_ or asset.label, asset.size_m, motion)})
 
 
@@ -366,8 +401,12 @@ def _near(world: EditWorld, given: Any, height: float, ground: HeightMap | None)
     if given.at_s is not None:
         pose = placed.pose_at(given.at_s)
         if pose is None:
-            raise InputError("nobody is there at this time", where="near.at_s", got=f"{given.at_s} s",
-                expected=f"{leader.times_s[0]:.2f}..{leader.times_s[-1]:.2f} s")  # fmt: skip
+            raise InputError(
+                "nobody is there at this time",
+                where="near.at_s",
+                got=f"{given.at_s} s",
+                expected=f"{leader.times_s[0]:.2f}..{leader.times_s[-1]:.2f} s",
+            )
         points = np.array([[0.0, *pose[:2, 3], geometry.yaw_of(pose)]])
         return paths.along_points(_at_all_times(points[0], world), height, ground, _floor(world))
     yaws = np.unwrap([geometry.yaw_of(pose) for pose in placed.poses])
@@ -400,7 +439,8 @@ def _background(plan: EditPlan, given: Any, sources: EditSources) -> None:
 
 
 def place_background(world: EditWorld, other: Background) -> np.ndarray:
-    """world_from_other f64[4, 4]: both vehicles begin at the same place and drive the same way; heights agree along the path of ours."""
+    """world_from_other f64[4, 4]: both vehicles begin at the same place and drive the same way; heights agree along the
+    path of ours."""
     if world.ego is None or world.ground is None:
         raise InputError("where the other street belongs is not known", remedy="give --scene")
     mine, theirs = (_level(motion.poses[0]) for motion in (world.ego, other.ego))
@@ -418,11 +458,19 @@ def _level(pose: np.ndarray) -> np.ndarray:
 
 def _seams(world: EditWorld, ground: HeightMap) -> list[dict[str, Any]]:
     """Paths that leave the known ground of the other street."""
-    motions = {**{name: actor.motion for name, actor in world.actors.items()}, **({} if world.ego is None else {EGO: world.ego})}
+    motions = {
+        **{name: actor.motion for name, actor in world.actors.items()},
+        **({} if world.ego is None else {EGO: world.ego}),
+    }
     shares = {name: float(np.isnan(ground.height(motion.poses[:, :2, 3])).mean()) for name, motion in motions.items()}
     off = {name: round(share, 3) for name, share in shares.items() if share > 0.05}
     text = ", ".join(f"{name} ({share:.0%})" for name, share in off.items())
-    note = {"kind": "off the ground", "ids": list(off), "shares": off, "text": f"part of a path is off the other street's ground: {text}"}
+    note = {
+        "kind": "off the ground",
+        "ids": list(off),
+        "shares": off,
+        "text": f"part of a path is off the other street's ground: {text}",
+    }
     return [note] if off else []
 
 
@@ -431,12 +479,20 @@ def _sky(plan: EditPlan, given: Any, _: EditSources) -> None:
 
 
 _VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
-    "remove": _remove, "move": _move, "stop": _stop, "speed": _speed, "lane_change": _lane_change, "path": _path,
-    "replace": _replace, "insert": _insert, "background": _background, "sky": _sky,
-}  # fmt: skip
+    "remove": _remove,
+    "move": _move,
+    "stop": _stop,
+    "speed": _speed,
+    "lane_change": _lane_change,
+    "path": _path,
+    "replace": _replace,
+    "insert": _insert,
+    "background": _background,
+    "sky": _sky,
+}
 
 
-# -- helpers -------------------------------------------------------------------------------------------------------------
+# -- helpers ---------------------------------------------------------------------------------------
 
 
 def _actor(world: EditWorld, name: str) -> Actor:
@@ -444,8 +500,13 @@ def _actor(world: EditWorld, name: str) -> Actor:
         return world.actors[name]
     near = nearest(name, world.actors)
     known = ", ".join(list(world.actors)[:20]) + (", ..." if len(world.actors) > 20 else "")
-    raise InputError("there is no object of this id", where="id", expected=f"ego, or one of {known or 'none'}", got=name,
-        remedy=f"did you mean {near!r}?" if near else "tracks.json of the scene lists them")  # fmt: skip
+    raise InputError(
+        "there is no object of this id",
+        where="id",
+        expected=f"ego, or one of {known or 'none'}",
+        got=name,
+        remedy=f"did you mean {near!r}?" if near else "tracks.json of the scene lists them",
+    )
 
 
 def _motion(world: EditWorld, name: str) -> Motion:
@@ -469,7 +530,9 @@ def _change(plan: EditPlan, name: str, change: Change) -> None:
 def _toward(sun: Any) -> np.ndarray:
     """Unit vector f64[3] towards the sun."""
     azimuth, elevation = math.radians(sun.azimuth_deg), math.radians(sun.elevation_deg)
-    return np.array([math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)])
+    return np.array(
+        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
+    )
 
 
 def _three(size_m: Any) -> tuple[float, float, float]:
@@ -477,9 +540,10 @@ def _three(size_m: Any) -> tuple[float, float, float]:
     return length, width, height
 
 
-# checks ---------------------------------------------------------------------------------------------------------------
+# checks -------------------------------------------------------------------------------------------
 #
-# What a reader of an edited drive should know: collisions, and sides of objects that the recording hardly saw. With numbers.
+# What a reader of an edited drive should know: collisions, and sides of objects that the recording hardly saw. With
+# numbers.
 
 
 Array = NDArray[np.float64]
@@ -487,7 +551,8 @@ STEP_S: Final = 0.1
 LEAST_OVERLAP_M: Final = 0.05
 EGO_SIZE_M: Final = (4.6, 1.9, 1.6)
 EGO_CENTRE_AHEAD_M: Final = 0.7
-"""The vehicle as a box: its size, and how far its centre lies ahead of its origin (between that of a rear axle and of a centre)."""
+"""The vehicle as a box: its size, and how far its centre lies ahead of its origin (between that of a rear axle and of a
+centre)."""
 FARTHEST_M: Final = 80.0
 SELDOM_RAD: Final = np.radians(30.0)
 LEAST_SHARE: Final = 0.05
@@ -505,7 +570,8 @@ def check(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[Vi
 
 
 def collisions(plan: EditPlan) -> list[dict[str, Any]]:
-    """Pairs of boxes that overlap after the edits and did not before, over all times. Pairs that no edit touches are not tried."""
+    """Pairs of boxes that overlap after the edits and did not before, over all times. Pairs that no edit touches are
+    not tried."""
     after, before = _with_ego(plan.after), _with_ego(plan.before)
     touched = [*plan.touched(), *([EGO] if plan.moves_ego else [])]
     found, done = [], set()
@@ -516,12 +582,19 @@ def collisions(plan: EditPlan) -> list[dict[str, Any]]:
             done.add(frozenset((name, other)))
             depth, at_s = _deepest(after[name], after[other])
             known = name in before and other in before and name not in plan.inserted and other not in plan.inserted
-            if depth < LEAST_OVERLAP_M or (known and depth <= _deepest(before[name], before[other])[0] + LEAST_OVERLAP_M):
+            if depth < LEAST_OVERLAP_M or (
+                known and depth <= _deepest(before[name], before[other])[0] + LEAST_OVERLAP_M
+            ):
                 continue
-            found.append({
-                "kind": "collision", "ids": [name, other], "overlap_m": round(depth, 3), "at_s": round(at_s, 3),
-                "text": f"{name} and {other} overlap by {depth:.2f} m at {at_s:.2f} s",
-            })  # fmt: skip
+            found.append(
+                {
+                    "kind": "collision",
+                    "ids": [name, other],
+                    "overlap_m": round(depth, 3),
+                    "at_s": round(at_s, 3),
+                    "text": f"{name} and {other} overlap by {depth:.2f} m at {at_s:.2f} s",
+                }
+            )
     return found
 
 
@@ -572,17 +645,26 @@ def unseen_sides(plan: EditPlan, views_before: Sequence[View], views_after: Sequ
         if share < LEAST_SHARE:
             continue
         largest = float(np.degrees(apart.max()))
-        found.append({
-            "kind": "seldom-seen side", "ids": [name], "share": round(share, 3), "largest_deg": round(largest, 1),
-            "text": f"{name}: {share:.0%} of its views look at sides that the recording saw from more than 30 degrees away "
-                    f"(up to {largest:.0f})" if len(seen) else f"{name}: the recording never shows it",
-        })  # fmt: skip
+        found.append(
+            {
+                "kind": "seldom-seen side",
+                "ids": [name],
+                "share": round(share, 3),
+                "largest_deg": round(largest, 1),
+                "text": (
+                    f"{name}: {share:.0%} of its views look at sides that the recording saw from more than 30 degrees"
+                    f" away (up to {largest:.0f})"
+                    if len(seen)
+                    else f"{name}: the recording never shows it"
+                ),
+            }
+        )
     return found
 
 
 def shown_anew(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> set[str]:
-    """Objects of the recording of which some view shows a side that no recorded view shows, from more than `ANOTHER_SIDE_RAD` away,
-    because their path or that of the vehicle has changed."""
+    """Objects of the recording of which some view shows a side that no recorded view shows, from more than
+    `ANOTHER_SIDE_RAD` away, because their path or that of the vehicle has changed."""
     found = set()
     for name in plan.before.actors if plan.moves_ego else plan.changes:
         if name not in plan.before.actors or name not in plan.after.actors:
@@ -595,7 +677,8 @@ def shown_anew(plan: EditPlan, views_before: Sequence[View], views_after: Sequen
 
 
 def sides_seen(actor: Actor, views: Sequence[View]) -> Array:
-    """From which sides views show an object, f64[M] radians from its front; views that do not have its centre in the image are left out."""
+    """From which sides views show an object, f64[M] radians from its front; views that do not have its centre in the
+    image are left out."""
     poses, centres = [], []
     for view in views:
         pose = actor.motion.pose_at(view.time_s)

@@ -1,7 +1,8 @@
-"""An edited scene on disk: its images, labels and LiDAR sweeps show the edits, so that every step takes it like a recorded one.
+"""An edited scene on disk: its images, labels and LiDAR sweeps show the edits, so that every step takes it like a
+recorded one.
 
-Images keep their recorded pixels where a fitted scene renders the same with and without the edits; the rest comes from the render of
-the edited one. Where the vehicle drives another path or through another street all pixels do.
+Images keep their recorded pixels where a fitted scene renders the same with and without the edits; the rest comes from
+the render of the edited one. Where the vehicle drives another path or through another street all pixels do.
 """
 
 from __future__ import annotations
@@ -40,12 +41,13 @@ from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points
 from mudg.scene.write import SceneWriter
 
-# swept ----------------------------------------------------------------------------------------------------------------
+# swept --------------------------------------------------------------------------------------------
 #
 # LiDAR sweeps of an edited drive: beams that met what is gone go on, and meet what is new.
 #
-# The beams of a sweep are those that came back in the recording, from the place of the sensor at the sweep's time. Directions from which
-# nothing came back (the sky) are not known, so an object in front of the sky gets no returns there.
+# The beams of a sweep are those that came back in the recording, from the place of the sensor at the sweep's time.
+# Directions from which nothing came back (the sky) are not known, so an object in front of the sky gets no returns
+# there.
 
 
 BOX_MARGIN_M: Final = 0.1
@@ -58,9 +60,9 @@ Rows = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class SweptCounts:
-    """What became of returns: ``cleared`` met an object that is gone; of these ``on_ground`` meet the ground behind it; ``on_objects``
-    meet an object at its new place, of which ``hidden`` had met something behind it; ``unknown`` do not come back.
-    Of those that do, ``lost`` do not in fog or rain, and ``droplets`` come from fog."""
+    """What became of returns: ``cleared`` met an object that is gone; of these ``on_ground`` meet the ground behind it;
+    ``on_objects`` meet an object at its new place, of which ``hidden`` had met something behind it; ``unknown`` do not
+    come back. Of those that do, ``lost`` do not in fog or rain, and ``droplets`` come from fog."""
 
     cleared: int = 0
     on_ground: int = 0
@@ -79,7 +81,9 @@ class SweptCounts:
         return {name: value for name, value in asdict(self).items() if value or name not in ("lost", "droplets")}
 
 
-def edited_points(points: SweepPoints, sweep: Sweep, plan: EditPlan, cloud: FusedCloud) -> tuple[SweepPoints, SweptCounts]:
+def edited_points(
+    points: SweepPoints, sweep: Sweep, plan: EditPlan, cloud: FusedCloud
+) -> tuple[SweepPoints, SweptCounts]:
     """The points of a sweep as the sensor would see the edited drive.
 
     Args:
@@ -114,10 +118,18 @@ def edited_points(points: SweepPoints, sweep: Sweep, plan: EditPlan, cloud: Fuse
     changed = back & (fallen | taken)
     made = points.xyz.copy()
     made[changed] = (directions[changed] * met[changed, None]).astype(np.float32)
-    counts = SweptCounts(int(cleared.sum()), int((fallen & ~taken & back).sum()), int((taken & back).sum()),
-                         int((taken & np.isfinite(before)).sum()), int((usable & ~back).sum()))  # fmt: skip
+    counts = SweptCounts(
+        int(cleared.sum()),
+        int((fallen & ~taken & back).sum()),
+        int((taken & back).sum()),
+        int((taken & np.isfinite(before)).sum()),
+        int((usable & ~back).sum()),
+    )
     kept = back | ~(usable | cleared)
-    return SweepPoints(made[kept], intensity[kept], points.dt_s[kept], None if classes is None else classes[kept]), counts
+    return (
+        SweepPoints(made[kept], intensity[kept], points.dt_s[kept], None if classes is None else classes[kept]),
+        counts,
+    )
 
 
 def _pose(motion: Motion, sweep: Sweep) -> NDArray[np.float64] | None:
@@ -138,7 +150,8 @@ def _within(xyz: NDArray[np.float64], sweep: Sweep, actor: Actor) -> Rows:
 def _beyond(
     directions: NDArray[np.float64], ranges: NDArray[np.float64], rows: NDArray[np.int64], sweep: Sweep, plan: EditPlan
 ) -> NDArray[np.float64]:
-    """Range of the known ground behind what is gone, f64[N]; infinite where it is not known, or an object of the drive stands before it."""
+    """Range of the known ground behind what is gone, f64[N]; infinite where it is not known, or an object of the drive
+    stands before it."""
     found = np.full(len(directions), np.inf)
     if plan.before.ground is None or not len(rows):
         return found
@@ -174,7 +187,8 @@ def _ground_intensity(
 def _on_object(
     directions: NDArray[np.float64], sweep: Sweep, actor: Actor, surface: PointCloud | None
 ) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    """Range at which beams meet an object, f64[N] (infinite: they miss it), and the class there u8[N]. Without points: those of its box."""
+    """Range at which beams meet an object, f64[N] (infinite: they miss it), and the class there u8[N]. Without points:
+    those of its box."""
     hit = np.full(len(directions), np.inf)
     kind = ID.get(actor.label, UNLABELLED)
     ids = np.full(len(directions), kind, np.uint8)
@@ -194,7 +208,8 @@ def _on_object(
 
 
 def _object_intensity(points: SweepPoints, own: Mapping[str, Rows], name: str, sweep: Sweep, plan: EditPlan) -> float:
-    """Median intensity of an object's recorded returns; of a new one: of what else lies in boxes of this sweep, else of all of it."""
+    """Median intensity of an object's recorded returns; of a new one: of what else lies in boxes of this sweep, else of
+    all of it."""
     mine = own.get(name)
     if mine is not None and mine.any():
         return float(np.median(points.intensity[mine]))
@@ -205,13 +220,13 @@ def _object_intensity(points: SweepPoints, own: Mapping[str, Rows], name: str, s
     return float(np.median(chosen)) if len(chosen) else float("nan")
 
 
-# vacated --------------------------------------------------------------------------------------------------------------
+# vacated ------------------------------------------------------------------------------------------
 #
-# Where recorded photographs do not show an edited drive: the boxes of what was removed, moved or put in, and the ground about them.
+# Where recorded photographs do not show an edited drive: the boxes of what was removed, moved or put in, and the ground
+# about them.
 #
-# The ground about a box holds its shadow. The direction of the sun is not known on a recorded log, so as much as the box is high counts
-# on
-# every side: other photographs show that ground without it.
+# The ground about a box holds its shadow. The direction of the sun is not known on a recorded log, so as much as the
+# box is high counts on every side: other photographs show that ground without it.
 
 
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]
@@ -229,7 +244,8 @@ FARTHEST_GROUND_M: Final = 80.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveOfEdits:
-    """A drive as the diffusion model is to see it: what was planned, the edited scene, clouds and fit (None where there is none)."""
+    """A drive as the diffusion model is to see it: what was planned, the edited scene, clouds and fit (None where there
+    is none)."""
 
     plan: EditPlan
     scene: Scene
@@ -237,7 +253,9 @@ class DriveOfEdits:
     model: SceneModel | None
 
 
-def drive_of_edits(script: EditScript, scene: Scene, cloud: FusedCloud, model: SceneModel | None, *, told: bool = False) -> DriveOfEdits:
+def drive_of_edits(
+    script: EditScript, scene: Scene, cloud: FusedCloud, model: SceneModel | None, *, told: bool = False
+) -> DriveOfEdits:
     """Carry out a script on a scene and its clouds, and on its fit where there is one.
 
     Args:
@@ -247,10 +265,15 @@ def drive_of_edits(script: EditScript, scene: Scene, cloud: FusedCloud, model: S
         InputError: something in the script that cannot be done here.
     """
     if told and conditions_of(script.canonical()) is not None:
-        log.info("generated views show no weather and light (that takes --fitted and a published-type model); `mudg render` does")
+        log.info(
+            "generated views show no weather and light (that takes --fitted and a published-type model); `mudg render`"
+            " does"
+        )
     if model is not None:
         drive = carry_out(script, model, scene, cloud)
-        return DriveOfEdits(drive.plan, drive.scene or scene, cleared_cloud(drive.cloud or cloud, drive.plan), drive.model(model))
+        return DriveOfEdits(
+            drive.plan, drive.scene or scene, cleared_cloud(drive.cloud or cloud, drive.plan), drive.model(model)
+        )
     xyz = cloud.static.xyz
     xyz = xyz[:0] if cloud.static.semantics is None else xyz[np.isin(cloud.static.semantics, GROUND_CLASSES)]
     world = EditWorld.of_scene(scene, HeightMap.from_points(xyz) if len(xyz) else None)
@@ -259,7 +282,9 @@ def drive_of_edits(script: EditScript, scene: Scene, cloud: FusedCloud, model: S
 
 
 def _no_background(name: str) -> Background:
-    raise InputError("points alone cannot get another background", where="run", got=name, remedy="give a fit (--fitted)")
+    raise InputError(
+        "points alone cannot get another background", where="run", got=name, remedy="give a fit (--fitted)"
+    )
 
 
 def photos_of_edited(photos: Iterable[Photo], plan: EditPlan) -> list[Photo]:
@@ -277,8 +302,8 @@ def _usable(photo: Photo, plan: EditPlan) -> NDArray[np.bool_] | None:
 
 
 def _hidden_by(view: View, boxes: Boxes, plan: EditPlan) -> NDArray[np.bool_]:
-    """Bool[H, W]: inside the outlines of boxes or on the ground about them, but not where another moving object stands in front, nor on
-    that ground where one stands anywhere."""
+    """Bool[H, W]: inside the outlines of boxes or on the ground about them, but not where another moving object stands
+    in front, nor on that ground where one stands anywhere."""
     if not boxes:
         return np.zeros((view.camera.height, view.camera.width), bool)
     ahead = lambda box: float((view.cam_from_world @ box[0])[2, 3])  # noqa: E731
@@ -288,8 +313,8 @@ def _hidden_by(view: View, boxes: Boxes, plan: EditPlan) -> NDArray[np.bool_]:
 
 
 def touched_boxes(plan: EditPlan, time_s: float, when: str) -> list[Box]:
-    """Poses world_from_box f64[4, 4] and sizes f64[3] of what a plan removes, moves or puts in, where it is not the same at this time
-    `before` and `after` the edits. An object on its recorded place is left out."""
+    """Poses world_from_box f64[4, 4] and sizes f64[3] of what a plan removes, moves or puts in, where it is not the
+    same at this time `before` and `after` the edits. An object on its recorded place is left out."""
     found = []
     for name in dict.fromkeys((*plan.removed, *plan.changes, *plan.inserted)):
         old, new = (_pose_vacated(world.actors.get(name), time_s) for world in (plan.before, plan.after))
@@ -303,7 +328,8 @@ def touched_boxes(plan: EditPlan, time_s: float, when: str) -> list[Box]:
 
 
 def vacated_at(plan: EditPlan) -> VacatedAt:
-    """Where, in a view of the edited drive, something stood in the recording and stands no more, its shadow included."""
+    """Where, in a view of the edited drive, something stood in the recording and stands no more, its shadow
+    included."""
 
     def found(view: View) -> Vacated:
         before, after = (touched_boxes(plan, view.time_s, when) for when in ("before", "after"))
@@ -312,7 +338,9 @@ def vacated_at(plan: EditPlan) -> VacatedAt:
         ground = np.full(mask.shape, np.nan, np.float32)
         for pose, size in before:
             depth = _plane_depth(view, pose, size)
-            ground = np.where(boxes_mask(view, [(pose, size)]) | ground_mask(view, [(pose, size)]), np.fmin(ground, depth), ground)
+            ground = np.where(
+                boxes_mask(view, [(pose, size)]) | ground_mask(view, [(pose, size)]), np.fmin(ground, depth), ground
+            )
         stood = mask & boxes_mask(view, before)
         return Vacated(*(torch.from_numpy(plane) for plane in (mask, ground, shown, stood)))
 
@@ -329,8 +357,8 @@ def _plane_depth(view: View, pose: NDArray[np.float64], size: NDArray[np.float64
 
 
 def cleared_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
-    """Edited clouds without what boxes that were too small left behind of removed and moved objects along their recorded paths: static
-    points in the grown boxes that are not ground."""
+    """Edited clouds without what boxes that were too small left behind of removed and moved objects along their
+    recorded paths: static points in the grown boxes that are not ground."""
     static = cloud.static
     stray = np.zeros(len(static), bool)
     low_of = np.zeros(len(static), bool) if static.semantics is None else np.isin(static.semantics, GROUND_CLASSES)
@@ -343,13 +371,19 @@ def cleared_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
             stray |= inside & (local[:, 2] > FLOOR_M - half[2])
     kept = ~(stray & ~low_of)
     part = lambda values: None if values is None else values[kept]  # noqa: E731
-    return replace(cloud, static=replace(static, xyz=static.xyz[kept], rgb=static.rgb[kept], semantics=part(static.semantics)))
+    return replace(
+        cloud, static=replace(static, xyz=static.xyz[kept], rgb=static.rgb[kept], semantics=part(static.semantics))
+    )
 
 
 def others(plan: EditPlan, time_s: float) -> list[Box]:
     """Poses and sizes of the moving objects that a plan leaves alone."""
     touched = {*plan.removed, *plan.changes, *plan.inserted}
-    found = [(actor, _pose_vacated(actor, time_s)) for name, actor in plan.after.actors.items() if name not in touched and actor.moves]
+    found = [
+        (actor, _pose_vacated(actor, time_s))
+        for name, actor in plan.after.actors.items()
+        if name not in touched and actor.moves
+    ]
     return [(pose, np.asarray(actor.size_m, np.float64)) for actor, pose in found if pose is not None]
 
 
@@ -363,8 +397,8 @@ def boxes_mask(view: View, boxes: Boxes) -> NDArray[np.bool_]:
 
 
 def ground_mask(view: View, boxes: Boxes, reach: float = SHADOW_REACH) -> NDArray[np.bool_]:
-    """Bool[H, W]: ground below and about a box, as far as `reach` times its height, where its shadow may lie; what stands there is not
-    told apart."""
+    """Bool[H, W]: ground below and about a box, as far as `reach` times its height, where its shadow may lie; what
+    stands there is not told apart."""
     slabs = []
     for pose, size in boxes:
         about_m = 2 * reach * size[2]
@@ -377,7 +411,8 @@ def outlines(view: View, boxes: Boxes) -> NDArray[np.bool_]:
     """Bool[H, W]: inside the outline of a box."""
     covered = np.zeros((view.camera.height, view.camera.width), bool)
     for pose, size in boxes:
-        hull = geometry.box_hull(view, pose, size)  # of what lies ahead: a box beside the camera does not cover the whole image
+        # of what lies ahead: a box beside the camera does not cover the whole image
+        hull = geometry.box_hull(view, pose, size)
         if hull is not None:
             canvas = Image.new("1", (view.camera.width, view.camera.height))
             outline = [(float(x), float(y)) for x, y in hull.points[hull.vertices] - 0.5]
@@ -386,7 +421,7 @@ def outlines(view: View, boxes: Boxes) -> NDArray[np.bool_]:
     return covered
 
 
-# written --------------------------------------------------------------------------------------------------------------
+# written ------------------------------------------------------------------------------------------
 
 
 NOTE: Final = "edited: parts of the images are renders of a fitted scene"
@@ -418,7 +453,11 @@ class EditedImages:
     def of(self, recorded: NDArray[np.uint8], frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Observation]:
         """The image u8[H, W, 3] of a frame, which of its pixels [H, W] are rendered, and the render."""
         raster = raster_of(self.before, self.config.raster)
-        made = render_view(self.after, frame.view, raster) if self.repaired is None else next(self.repaired[frame.view.camera.name])
+        made = (
+            render_view(self.after, frame.view, raster)
+            if self.repaired is None
+            else next(self.repaired[frame.view.camera.name])
+        )
         if self.whole:
             return to_bytes(made.rgb), np.ones(recorded.shape[:2], bool), made
         usual = render_view(self.before, frame.view, raster)
@@ -451,7 +490,8 @@ def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, r
     with SceneWriter(root, scene.id, source) as writer:
         for camera in scene.cameras.values():
             writer.add_camera(camera)
-        for number, sweep in enumerate(scene.sweeps if drive.plan.background is None else ()):  # another street was not measured from here
+        # another street was not measured from here
+        for number, sweep in enumerate(scene.sweeps if drive.plan.background is None else ()):
             points, became = edited_points(read_points(scene, sweep), sweep, drive.plan, drive.cloud)
             if drive.plan.weather_of_beams is not None:
                 there, seed = len(points.xyz), seeds.key(SEED, number, "LiDAR in weather")
@@ -463,7 +503,9 @@ def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, r
             writer.add_track(track)
         writer.set_ego(edited.ego)
         writer.set_split(scene.split)
-        for old, new in log.progress(list(zip(scene.frames, edited.frames, strict=True)), len(scene.frames), "editing images"):
+        for old, new in log.progress(
+            list(zip(scene.frames, edited.frames, strict=True)), len(scene.frames), "editing images"
+        ):
             image, changed, made = images.of(read_image(scene, old), new)
             if not changed.any():
                 writer.copy_frame(scene, old)
@@ -481,7 +523,9 @@ def _labels(scene: Scene, frame: Frame, changed: NDArray[np.bool_], made: Observ
         return ours
     ids = made.semantics.numpy().astype(np.uint8)
     rendered = {
-        "semantics": ids, "sky": ids == ID["sky"], "dynamic": np.isin(ids, DYNAMIC_IDS),
+        "semantics": ids,
+        "sky": ids == ID["sky"],
+        "dynamic": np.isin(ids, DYNAMIC_IDS),
         "depth": np.nan_to_num(made.depth[0].numpy(), nan=np.inf),
-    }  # fmt: skip
+    }
     return ours | {name: np.where(changed, rendered[name].astype(old.dtype), old) for name, old in found.items()}

@@ -1,7 +1,7 @@
 """render: a fitted scene on recorded and shifted trajectories -> observation folders and videos.
 
-    OUT/<trajectory>/    observations (see scene/observations.py)
-    OUT/<trajectory>.mp4 colour, depth, semantics side by side
+OUT/<trajectory>/    observations (see scene/observations.py)
+OUT/<trajectory>.mp4 colour, depth, semantics side by side
 """
 
 from __future__ import annotations
@@ -64,7 +64,9 @@ Edited = tuple[Scene, SceneModel, EditedDrive | None]
 """Scene and fit as they are rendered, and what an edit script did to them."""
 
 
-def prepare(config: RenderConfig, scene: Path, model: Path, script: EditScript | None, fused: Path | None) -> Edited | None:
+def prepare(
+    config: RenderConfig, scene: Path, model: Path, script: EditScript | None, fused: Path | None
+) -> Edited | None:
     """Carry out the edit script, if there is one: what cannot be done is told before anything is written.
 
     Args:
@@ -72,8 +74,11 @@ def prepare(config: RenderConfig, scene: Path, model: Path, script: EditScript |
     """
     radiance = kind_of(model) == RADIANCE
     if radiance and (config.remove_tracks or script is not None):
-        raise UsageError("a radiance field has no objects to leave out or to edit", where=str(model),
-            remedy="leave --remove-tracks and --edits out")  # fmt: skip
+        raise UsageError(
+            "a radiance field has no objects to leave out or to edit",
+            where=str(model),
+            remedy="leave --remove-tracks and --edits out",
+        )
     choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
     edited = None if script is None else _edited(scene, model, script, fused if config.harmonize.on else None)
     if edited is not None and config.harmonize.on:
@@ -82,11 +87,12 @@ def prepare(config: RenderConfig, scene: Path, model: Path, script: EditScript |
 
 
 def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited | None, work: RunDir) -> dict[str, Any]:
-    """Render every camera and shift of the configuration, one observation folder (and video) per trajectory; returns a summary. An
-    interrupted run continues with the next missing view.
+    """Render every camera and shift of the configuration, one observation folder (and video) per trajectory; returns a
+    summary. An interrupted run continues with the next missing view.
 
     Args:
-        scene: gives cameras, times and the path of the vehicle. model: folder made by fit. edited: what ``prepare`` made of them.
+        scene: gives cameras, times and the path of the vehicle. model: folder made by fit. edited: what ``prepare``
+            made of them.
     """
     followers, out = list[RepairedViews](), work.path
     if kind_of(model) == RADIANCE:
@@ -111,8 +117,9 @@ def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited |
     threads = 1 if followers or device.type != "cpu" else native.threads()
     with (
         log.task(f"render {source}", sum(len(path) for path in paths)) as bar,
-        memory_of(device, "render"), ThreadPoolExecutor(1) as encoder,
-    ):  # fmt: skip
+        memory_of(device, "render"),
+        ThreadPoolExecutor(1) as encoder,
+    ):
         videos = list[Future[None]]()
         for path in paths:
             for follower in followers:
@@ -135,7 +142,8 @@ def _require_memory(paths: Sequence[Trajectory]) -> None:
 def _edited(
     scene: Path, model: Path, script: EditScript | None, fused: Path | None = None
 ) -> tuple[Scene, SceneModel, EditedDrive | None]:
-    """The scene, with the vehicle on the path that the fit asks for, and the fit; both edited if there is a script; and what it did."""
+    """The scene, with the vehicle on the path that the fit asks for, and the fit; both edited if there is a script; and
+    what it did."""
     fitted = load_model(Path(model))
     loaded = scene_seen_by(read_scene(Path(scene)), fitted.facts)
     if script is None:
@@ -154,16 +162,22 @@ def _repaired(
     """
     (drive, fitted), (scene, model) = edited, given
     before = load_model(model)
-    recorded, (usual, _) = scene_seen_by(read_scene(scene), before.facts), _scene_drawer(config, before.to(fitted.device))
+    recorded, (usual, _) = (
+        scene_seen_by(read_scene(scene), before.facts),
+        _scene_drawer(config, before.to(fitted.device)),
+    )
     camera = trajectories(recorded, config)[0].views[0].camera
-    harmoniser = Harmoniser(EditedSources.of(drive, fitted, recorded), config.harmonize, (camera.width, camera.height), config.device)
+    harmoniser = Harmoniser(
+        EditedSources.of(drive, fitted, recorded), config.harmonize, (camera.width, camera.height), config.device
+    )
     return RepairedViews(harmoniser, lambda view: (usual(view), draw(view)))
 
 
 def _corrected(
     config: RenderConfig, edited: tuple[EditedDrive, SceneModel], scene: Path, drawn: tuple[Drawer, InWeather]
 ) -> RepairedViews:
-    """What draws views in other weather, corrected by the diffusion model; ``drawn``: what draws them by the formulas."""
+    """What draws views in other weather, corrected by the diffusion model; ``drawn``: what draws them by the
+    formulas."""
     (drive, fitted), (draw, how) = edited, drawn
     recorded = scene_seen_by(read_scene(scene), fitted.facts)
     camera = trajectories(recorded, config)[0].views[0].camera
@@ -189,9 +203,7 @@ def _field_drawer(config: RenderConfig, model: Path, device: torch.device) -> tu
     """What draws the views of a radiance field, and its name."""
     field, budget = load_field(model)
     source = str(field.facts.get("method", "fit"))
-    return functools.partial(
-        observe, field.to(device), budget=budget, source=source
-    ), source
+    return functools.partial(observe, field.to(device), budget=budget, source=source), source
 
 
 def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
@@ -202,17 +214,22 @@ def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
     """
     cameras = config.cameras or tuple(scene.cameras)[:1]
     if not config.shifts_m and not config.paths:
-        raise UsageError("nothing to render: no shifts were given", remedy="at least one of --shifts-m; 0 is the recorded path")
+        raise UsageError(
+            "nothing to render: no shifts were given", remedy="at least one of --shifts-m; 0 is the recorded path"
+        )
     paths = []
     for camera in cameras:
         found = [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
         for path in (*found, *(trajectory.named(scene, camera, name) for name in config.paths)):
-            paths.append(Trajectory(path.name, tuple(resized_view(view, config.width_px) for view in path.views), path.origin))
+            paths.append(
+                Trajectory(path.name, tuple(resized_view(view, config.width_px) for view in path.views), path.origin)
+            )
     return tuple(paths)
 
 
 def _several(draw: Drawer, threads: int) -> Drawers:
-    """What draws views in order; small ones beforehand, in as many threads, so that a thread draws while another writes."""
+    """What draws views in order; small ones beforehand, in as many threads, so that a thread draws while another
+    writes."""
 
     def drawn(views: Sequence[View]) -> Generator[Observation, None, None]:
         if threads == 1 or any(view.camera.width * view.camera.height > AHEAD_PIXELS for view in views):

@@ -1,5 +1,5 @@
-"""The parts of a run: a fitted scene by itself, or a folder of ``mudg run`` with its scene, clouds and fits. Wherever a command
-takes one of them, it also takes the folder of the run."""
+"""The parts of a run: a fitted scene by itself, or a folder of ``mudg run`` with its scene, clouds and fits. Wherever a
+command takes one of them, it also takes the folder of the run."""
 
 from __future__ import annotations
 
@@ -53,9 +53,13 @@ def find_run(folder: Path, scene: Path | None = None, fused: Path | None = None)
     there = {"fit": bool(fits), "scene": own_scene is not None, "fuse": (own_fused / "fuse.json").is_file()}
     if not all(there.values()):
         missing = [name for name, found in there.items() if not found]
-        raise InputError("this folder holds no fitted scene", where=str(folder),
+        raise InputError(
+            "this folder holds no fitted scene",
+            where=str(folder),
             expected="a folder made by `mudg fit`, or by a finished `mudg run` or `mudg demo`",
-            got=f"no {', no '.join(missing)}" if folder.is_dir() else "no such folder", remedy=similar_path(folder))  # fmt: skip
+            got=f"no {', no '.join(missing)}" if folder.is_dir() else "no such folder",
+            remedy=similar_path(folder),
+        )
     return RunParts(fits, scene or own_scene, fused or own_fused, True)
 
 
@@ -73,7 +77,7 @@ def scene_of_run(folder: Path) -> Path | None:
     return source if (source / "scene.json").is_file() or source.suffix == ".zip" else None
 
 
-# where a part is asked for, and a run given --------------------------------------------------------------------------------
+# where a part is asked for, and a run given -------------------------------------------------------
 
 
 def scene_at(path: Path) -> Path:
@@ -87,8 +91,12 @@ def scene_at(path: Path) -> Path:
     found = scene_of_run(path)
     if found is None:
         what = "folder is not a scene: it has no scene.json" if path.is_dir() else "no such file or folder"
-        raise InputError(what, where=str(path), expected="a scene made by `mudg ingest` or `mudg annotate`, or a folder made by `mudg run`",
-            remedy=similar_path(path))  # fmt: skip
+        raise InputError(
+            what,
+            where=str(path),
+            expected="a scene made by `mudg ingest` or `mudg annotate`, or a folder made by `mudg run`",
+            remedy=similar_path(path),
+        )
     return found
 
 
@@ -97,8 +105,12 @@ def fused_at(path: Path) -> Path:
     for folder in (path, path / "fuse", known_input(path, "fused") or path):
         if (folder / "fuse.json").is_file():
             return folder
-    raise InputError("file not found", where=str(path / "fuse.json"), expected="a folder made by `mudg fuse`, or by `mudg run`",
-        remedy=similar_path(path))  # fmt: skip
+    raise InputError(
+        "file not found",
+        where=str(path / "fuse.json"),
+        expected="a folder made by `mudg fuse`, or by `mudg run`",
+        remedy=similar_path(path),
+    )
 
 
 def fit_at(path: Path, order: Sequence[str] = BEST_FIRST) -> Path:
@@ -106,8 +118,13 @@ def fit_at(path: Path, order: Sequence[str] = BEST_FIRST) -> Path:
     for folder in (path, *(path / "fit" / name for name in order)):
         if (folder / "model.json").is_file():
             return folder
-    raise InputError("this folder holds no fitted scene", where=str(path), expected="a folder made by `mudg fit`, or by `mudg run`",
-        got="" if path.is_dir() else "no such folder", remedy=similar_path(path))  # fmt: skip
+    raise InputError(
+        "this folder holds no fitted scene",
+        where=str(path),
+        expected="a folder made by `mudg fit`, or by `mudg run`",
+        got="" if path.is_dir() else "no such folder",
+        remedy=similar_path(path),
+    )
 
 
 def plain_fit_at(path: Path) -> Path:
@@ -116,25 +133,34 @@ def plain_fit_at(path: Path) -> Path:
 
 
 def views_at(path: Path, name: str = "") -> Path:
-    """The views at a path: itself, or of a run those that it rendered with a method, or without one those that it generated."""
+    """The views at a path: itself, or of a run those that it rendered with a method, or without one those that it
+    generated."""
     folders = (path / "render" / name, path / "synthesize") if name else (path / "synthesize",)
     is_run = (path / "synthesize").is_dir() and scene_of_run(path) is not None
     return next((folder for folder in folders if is_run and folder.is_dir()), path)
 
 
-PARTS: Final = {"scene": scene_at, "fused": fused_at, "model": fit_at, "fitted": plain_fit_at, "start_from": plain_fit_at}
+PARTS: Final = {
+    "scene": scene_at,
+    "fused": fused_at,
+    "model": fit_at,
+    "fitted": plain_fit_at,
+    "start_from": plain_fit_at,
+}
 """Inputs of commands, and how each is found at a path."""
 _WORDS: Final = {
-    "fused": "point clouds made by `mudg fuse`", "model": "a folder made by `mudg fit`", "fitted": "a folder made by `mudg fit`",
-}  # fmt: skip
+    "fused": "point clouds made by `mudg fuse`",
+    "model": "a folder made by `mudg fit`",
+    "fitted": "a folder made by `mudg fit`",
+}
 
 
 def parts_of(given: Mapping[str, Any], required: Sequence[str] = ()) -> dict[str, Any]:
     """The inputs of a command, each as the part that it stands for; before anything heavy is loaded.
 
     Args:
-        given: name -> path, or None; names that are not in ``PARTS`` are left as they are. required: those that a run at ``scene``
-            gives where they are None.
+        given: name -> path, or None; names that are not in ``PARTS`` are left as they are. required: those that a run
+            at ``scene`` gives where they are None.
 
     Raises:
         UsageError: one is missing. InputError: one is not there, or something else.
@@ -145,7 +171,9 @@ def parts_of(given: Mapping[str, Any], required: Sequence[str] = ()) -> dict[str
     for name, path in given.items():
         if path is None and name in required:
             if not is_run:
-                raise UsageError(f"no --{name} was given", expected=f"{_WORDS[name]}, or the folder of a run in the place of SCENE")
+                raise UsageError(
+                    f"no --{name} was given", expected=f"{_WORDS[name]}, or the folder of a run in the place of SCENE"
+                )
             path = scene
         if path is not None and name in PARTS:
             found[name] = PARTS[name](Path(path))

@@ -1,4 +1,5 @@
-"""Reading edit scripts: a list of verbs, each with its settings. What is wrong is told with file, line, verb and field."""
+"""Reading edit scripts: a list of verbs, each with its settings. What is wrong is told with file, line, verb and
+field."""
 
 from __future__ import annotations
 
@@ -18,7 +19,7 @@ from mudg.base.plain_yaml import Lines, parse_with_lines
 from mudg.base.records import Number, StrictRecord, after, checked_by, first_problem, place
 from mudg.base.weather_settings import LightSettings, SeasonSettings, WeatherSettings
 
-# records --------------------------------------------------------------------------------------------------------------
+# records ------------------------------------------------------------------------------------------
 #
 # What each verb of an edit script says. Distances in metres, times in seconds on the scene's clock, angles in degrees.
 
@@ -42,8 +43,12 @@ Name = Annotated[str, after(_named)]
 
 def _not_ego(value: str) -> str:
     if value == EGO:
-        raise InputError("the recording vehicle cannot be edited so", expected="the id of a track", got=EGO,
-            remedy="ego takes lane_change, speed, stop, move and path")  # fmt: skip
+        raise InputError(
+            "the recording vehicle cannot be edited so",
+            expected="the id of a track",
+            got=EGO,
+            remedy="ego takes lane_change, speed, stop, move and path",
+        )
     return value
 
 
@@ -51,7 +56,8 @@ ActorName = Annotated[str, after(_named), after(_not_ego)]
 
 
 class AssetSource(StrictRecord):
-    """Where an object comes from: a fitted scene (``run`` and ``id``) or an asset ``file``. Paths are relative to the script."""
+    """Where an object comes from: a fitted scene (``run`` and ``id``) or an asset ``file``. Paths are relative to the
+    script."""
 
     run: Name | None = None
     id: Name | None = None
@@ -66,12 +72,16 @@ class AssetSource(StrictRecord):
 
 def _refuse_source(source: AssetSource) -> None:
     given = [name for name in ("run", "id", "file") if getattr(source, name) is not None]
-    raise InputError("it is not clear where the object comes from", expected="run and id, or file alone",
-        got=" and ".join(given) or "none of them")  # fmt: skip
+    raise InputError(
+        "it is not clear where the object comes from",
+        expected="run and id, or file alone",
+        got=" and ".join(given) or "none of them",
+    )
 
 
 class RemoveEdit(StrictRecord):
-    """Take objects away: those of ``ids``, or those of a ``class``, all or only ``moving`` ones, all or near the vehicle's path."""
+    """Take objects away: those of ``ids``, or those of a ``class``, all or only ``moving`` ones, all or near the
+    vehicle's path."""
 
     ids: Annotated[list[ActorName], Field(min_length=1)] | None = None
     class_: Name | None = Field(default=None, alias="class")
@@ -88,8 +98,11 @@ class RemoveEdit(StrictRecord):
 
 
 def _refuse_selection(both: bool) -> None:
-    raise InputError("objects are chosen by ids or by kind", expected="ids, or any of class, moving, within_m",
-        got="both" if both else "nothing")  # fmt: skip
+    raise InputError(
+        "objects are chosen by ids or by kind",
+        expected="ids, or any of class, moving, within_m",
+        got="both" if both else "nothing",
+    )
 
 
 class MoveEdit(StrictRecord):
@@ -143,11 +156,19 @@ class LaneChangeEdit(StrictRecord):
 def _path_points(points: list[list[float]]) -> list[list[float]]:
     for index, point in enumerate(points):
         if len(point) not in (3, 4):
-            raise InputError("a point of a path has the wrong length", where=f"[{index}]", expected="[t, x, y] or [t, x, y, yaw_deg]",
-                got=str(point)[:80])  # fmt: skip
+            raise InputError(
+                "a point of a path has the wrong length",
+                where=f"[{index}]",
+                expected="[t, x, y] or [t, x, y, yaw_deg]",
+                got=str(point)[:80],
+            )
         if index and point[0] <= points[index - 1][0]:
-            raise InputError("the times of a path do not increase", where=f"[{index}]", expected=f"more than {points[index - 1][0]} s",
-                got=f"{point[0]} s")  # fmt: skip
+            raise InputError(
+                "the times of a path do not increase",
+                where=f"[{index}]",
+                expected=f"more than {points[index - 1][0]} s",
+                got=f"{point[0]} s",
+            )
     if len({len(point) for point in points}) > 1:
         raise InputError("some points of a path have a yaw and others have none", expected="all or none")
     return points
@@ -222,7 +243,9 @@ class InsertEdit(StrictRecord):
 
 
 def _refuse_place(edit: InsertEdit) -> None:
-    raise InputError("an object to insert needs one place", expected="path or near", got="both" if edit.path else "neither")
+    raise InputError(
+        "an object to insert needs one place", expected="path or near", got="both" if edit.path else "neither"
+    )
 
 
 def _with_ego(keep: list[str]) -> list[str]:
@@ -242,17 +265,28 @@ class BackgroundEdit(StrictRecord):
 
 
 class SkyEdit(StrictRecord):
-    """Another sky: a panorama of all directions (longitude across, zenith at the top), turned to the left by ``yaw_deg``."""
+    """Another sky: a panorama of all directions (longitude across, zenith at the top), turned to the left by
+    ``yaw_deg``."""
 
     image: Name
     yaw_deg: Number = 0.0
 
 
 VERBS: Final[dict[str, type[StrictRecord]]] = {
-    "remove": RemoveEdit, "move": MoveEdit, "stop": StopEdit, "speed": SpeedEdit, "lane_change": LaneChangeEdit, "path": PathEdit,
-    "replace": ReplaceEdit, "insert": InsertEdit, "background": BackgroundEdit, "sky": SkyEdit,
-    "weather": WeatherSettings, "light": LightSettings, "season": SeasonSettings,
-}  # fmt: skip
+    "remove": RemoveEdit,
+    "move": MoveEdit,
+    "stop": StopEdit,
+    "speed": SpeedEdit,
+    "lane_change": LaneChangeEdit,
+    "path": PathEdit,
+    "replace": ReplaceEdit,
+    "insert": InsertEdit,
+    "background": BackgroundEdit,
+    "sky": SkyEdit,
+    "weather": WeatherSettings,
+    "light": LightSettings,
+    "season": SeasonSettings,
+}
 CONDITIONS: Final = ("weather", "light", "season")
 """Verbs that change no geometry."""
 
@@ -264,7 +298,7 @@ def files_of(edit: Any) -> list[str]:
     return named + [value for name in ("run", "image") if isinstance(value := getattr(edit, name, None), str)]
 
 
-# script ---------------------------------------------------------------------------------------------------------------
+# script -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,8 +346,12 @@ class EditScript:
                 try:
                     contents[name] = store.digest(self.path_of(name))
                 except InputError as problem:
-                    raise InputError("the script names a file that is not there", where=f"{edit.where}: {edit.verb}",
-                        got=str(self.path_of(name)), remedy="paths are relative to the script's folder") from problem  # fmt: skip
+                    raise InputError(
+                        "the script names a file that is not there",
+                        where=f"{edit.where}: {edit.verb}",
+                        got=str(self.path_of(name)),
+                        remedy="paths are relative to the script's folder",
+                    ) from problem
         text = store.json_text(_with_contents(self.canonical(), contents), indent=None)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -355,21 +393,33 @@ def parse_edits(text: str | bytes, where: str, folder: Path = Path()) -> EditScr
     """
     entries, lines = parse_with_lines(text, where)
     if not isinstance(entries, list) or not entries:
-        raise InputError("an edit script is a list of edits", where=where, expected="lines such as `- remove: {ids: [car-003]}`",
-            got="nothing" if entries in (None, []) else type(entries).__name__)  # fmt: skip
+        raise InputError(
+            "an edit script is a list of edits",
+            where=where,
+            expected="lines such as `- remove: {ids: [car-003]}`",
+            got="nothing" if entries in (None, []) else type(entries).__name__,
+        )
     return EditScript(tuple(_one(index, value, lines, where) for index, value in enumerate(entries)), Path(folder))
 
 
 def _one(index: int, value: Any, lines: Lines, where: str) -> ScriptEdit:
     at = f"{where}, line {lines[(index,)]}"
     if not isinstance(value, dict) or len(value) != 1:
-        raise InputError("an edit is one verb with its settings", where=at, expected="e.g. `- remove: {ids: [car-003]}`",
-            got=short(value, 80))  # fmt: skip
+        raise InputError(
+            "an edit is one verb with its settings",
+            where=at,
+            expected="e.g. `- remove: {ids: [car-003]}`",
+            got=short(value, 80),
+        )
     ((verb, settings),) = value.items()
     if verb not in VERBS:
         near = nearest(verb, VERBS)
-        raise InputError(f"there is no verb {verb!r}", where=at, expected=f"one of {', '.join(VERBS)}",
-            remedy=f"did you mean {near!r}?" if near else "see docs/edit.md")  # fmt: skip
+        raise InputError(
+            f"there is no verb {verb!r}",
+            where=at,
+            expected=f"one of {', '.join(VERBS)}",
+            remedy=f"did you mean {near!r}?" if near else "see docs/edit.md",
+        )
     try:
         return ScriptEdit(verb, VERBS[verb].model_validate({} if settings is None else settings), at)
     except ValidationError as error:

@@ -14,7 +14,10 @@ from mudg.diffusion.settings.harmonize import HarmonizeConfig
 class EditConfig:
     """Change a drive as an edit script says."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"changed_above": ("harmonize", 4 / 255), "grow_px": ("harmonize", 2)}
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "changed_above": ("harmonize", 4 / 255),
+        "grow_px": ("harmonize", 2),
+    }
 
     harmonize: HarmonizeConfig = setting(default_factory=HarmonizeConfig)
     """Of a whole run: let the diffusion model repair what the edits touch in its images."""

@@ -1,14 +1,17 @@
-"""The street where an object of the recording is gone: what nobody saw goes, its shadow is brightened, gaps of the ground are closed.
+"""The street where an object of the recording is gone: what nobody saw goes, its shadow is brightened, gaps of the
+ground are closed.
 
 Five things, for the places at which the recording has the object's box:
 
-* Gaussians of the background that views show only because the object is gone were never held against a photograph: they go. How much a
-  view shows of a Gaussian is the sum of its blending weights, in pixels; `noted` keeps that of the scene as it was.
-* A road user drove there, so nothing stands there: Gaussians of the background in the space that its box swept are no surfaces. Around
-  it, those of road users are its own, which a box too small left over.
+* Gaussians of the background that views show only because the object is gone were never held against a photograph: they
+  go. How much a view shows of a Gaussian is the sum of its blending weights, in pixels; `noted` keeps that of the scene
+  as it was.
+* A road user drove there, so nothing stands there: Gaussians of the background in the space that its box swept are no
+  surfaces. Around it, those of road users are its own, which a box too small left over.
 * The ground that it darkened becomes as bright as what lies around (`street.py`).
 * The sky that only shows now continues the sky that was seen.
-* Where the ground has gaps behind and below the box, flat Gaussians that continue the colours of the seen ground close it.
+* Where the ground has gaps behind and below the box, flat Gaussians that continue the colours of the seen ground close
+  it.
 """
 
 from __future__ import annotations
@@ -38,13 +41,13 @@ from mudg.gaussians.nodes import SYMMETRIC_LABELS, RigidNode
 from mudg.gaussians.sky import SkyNode
 from mudg.gaussians.start import SH_C0
 
-# shadows --------------------------------------------------------------------------------------------------------------
+# shadows ------------------------------------------------------------------------------------------
 #
 # The shadow of what stood in a box, found by its darkness on the ground, and taken away.
 #
-# On a grid of the ground, a cell is dark that has clearly less light than lit ground of its class about it. Dark cells are the object's
-# shadow if they lie behind it in one direction, that of the light, with no lit cell between. They get the colours of the lit ground
-# around, continued, and keep a little of their texture.
+# On a grid of the ground, a cell is dark that has clearly less light than lit ground of its class about it. Dark cells
+# are the object's shadow if they lie behind it in one direction, that of the light, with no lit cell between. They get
+# the colours of the lit ground around, continued, and keep a little of their texture.
 
 
 SHADOW_CELL_M: Final = 0.25
@@ -67,7 +70,8 @@ SOURCE_M: Final = 0.6
 SOURCES: Final = 160
 """from this many of them,"""
 BRIGHT: Final = 1.25
-"""but not from those that are brighter than the `AROUND` about them by this factor, which are markings, nor from shadows."""
+"""but not from those that are brighter than the `AROUND` about them by this factor, which are markings, nor from
+shadows."""
 AROUND: Final = 40
 
 
@@ -80,8 +84,8 @@ def continued(xy: Array, places: Array, colors: Array, weights: Array) -> tuple[
     """Colours of ground continued smoothly to other places.
 
     Args:
-        xy: f64[C, 2] where colours are asked for. places: f64[M, 2]; colors: f64[M, 3] of the ground that is known; weights: how much of
-            it is seen, f64[M].
+        xy: f64[C, 2] where colours are asked for. places: f64[M, 2]; colors: f64[M, 3] of the ground that is known;
+            weights: how much of it is seen, f64[M].
 
     Returns:
         Colours f64[C, 3], and the nearest known place i64[C].
@@ -107,7 +111,8 @@ def continued(xy: Array, places: Array, colors: Array, weights: Array) -> tuple[
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cells:
-    """A grid of square cells of `CELL_M` on the ground: the place f64[2] of its first corner, and how many cells it has."""
+    """A grid of square cells of `CELL_M` on the ground: the place f64[2] of its first corner, and how many cells it
+    has."""
 
     low: Array
     shape: tuple[int, int]
@@ -120,7 +125,11 @@ class _Cells:
 
     def centres(self) -> Array:
         """Places f64[X * Y, 2]."""
-        return self.low + (np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), -1).reshape(-1, 2) + 0.5) * SHADOW_CELL_M
+        return (
+            self.low
+            + (np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), -1).reshape(-1, 2) + 0.5)
+            * SHADOW_CELL_M
+        )
 
     def below(self, size_m: tuple[float, float, float], poses: Array) -> Rows:
         """Cells bool[X, Y] below boxes."""
@@ -148,14 +157,17 @@ class _Cells:
         """Weighted mean luminance f64[X, Y] of the places near each cell; NaN where there are none."""
         index = np.floor((xy - self.low) / SHADOW_CELL_M).astype(np.int64)
         flat = np.ravel_multi_index(tuple(index.T), self.shape)
-        sums = [np.bincount(flat, values, int(np.prod(self.shape))).reshape(self.shape) for values in (weights, weights * luminance)]
+        sums = [
+            np.bincount(flat, values, int(np.prod(self.shape))).reshape(self.shape)
+            for values in (weights, weights * luminance)
+        ]
         total, shown = (ndimage.gaussian_filter(values, 0.7, truncate=2.0) for values in sums)
         return np.where(total > LEAST_PX, shown / np.maximum(total, 1e-12), np.nan)
 
 
 def shaded_cells(light: Array, below: Rows, reach_m: float) -> Rows:
-    """Cells bool[X, Y] of the shadow of what stood on some: those darker than lit ground about them that lie behind it, and behind
-    each other, in one direction: the one in which there are most.
+    """Cells bool[X, Y] of the shadow of what stood on some: those darker than lit ground about them that lie behind it,
+    and behind each other, in one direction: the one in which there are most.
 
     Args:
         light: luminance f64[X, Y] in linear light, NaN = not known. below: where it stood, bool[X, Y].
@@ -187,7 +199,8 @@ def brightened(
     """A copy without the shadow of what stood in boxes; the model itself where none is found.
 
     Args:
-        poses: world_from_box f64[V, 4, 4]. ground: rows bool[N] of each class of ground. weights: pixels that views show of each, f64[N].
+        poses: world_from_box f64[V, 4, 4]. ground: rows bool[N] of each class of ground. weights: pixels that views
+            show of each, f64[N].
     """
     means = model.table["means"].detach().cpu().numpy().astype(np.float64)[:, :2]
     shown = colors_of(model)
@@ -219,13 +232,14 @@ def brightened(
     return replace(model, table=Table({**columns, "sh_dc": changed}, dict(model.table.labels)), facts=dict(model.facts))
 
 
-# uncovered ------------------------------------------------------------------------------------------------------------
+# uncovered ----------------------------------------------------------------------------------------
 
 
 Array = NDArray[np.float64]
 Rows = NDArray[np.bool_]
 SHOWN: Final = "shown"
-"""Label column, f32[N]: what that recorded view shows of a Gaussian that shows most of it, in pixels of views `WEIGHED_PX` wide."""
+"""Label column, f32[N]: what that recorded view shows of a Gaussian that shows most of it, in pixels of views
+`WEIGHED_PX` wide."""
 WEIGHED_PX: Final = 320
 MOST_VIEWS: Final = 96
 SEEN_SHARE: Final = 0.15
@@ -236,7 +250,8 @@ ROUNDS: Final = 4
 """What goes may have hidden more that nobody saw."""
 FLOOR_M: Final = 0.15
 STRAY_M: Final = 0.4
-"""Gaussians of road users this far beside the box are parts of the object, and so are static points this high above its bottom."""
+"""Gaussians of road users this far beside the box are parts of the object, and so are static points this high above its
+bottom."""
 LEAST_GROUND: Final = 48
 CELL_M: Final = 0.3
 BEHIND_M: Final = 80.0
@@ -274,7 +289,8 @@ class Hidden:
 
     @property
     def stays(self) -> bool:
-        """Whether it gets no farther than its own length, so that views show the ground about it with its shadow alone."""
+        """Whether it gets no farther than its own length, so that views show the ground about it with its shadow
+        alone."""
         poses = self.poses
         return bool(np.linalg.norm(poses[:, :2, 3] - poses[0, :2, 3], axis=1).max() <= self.size_m[0])
 
@@ -282,8 +298,8 @@ class Hidden:
 def shown_by(
     model: SceneModel, view: View, raster: RasterConfig, absent: Collection[str] = ()
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
-    """What a view shows when some objects are absent: blending weights summed over pixels, of every Gaussian f32[N] and of every texel of
-    the sky f32[Hs, 2 Hs] (None without one)."""
+    """What a view shows when some objects are absent: blending weights summed over pixels, of every Gaussian f32[N] and
+    of every texel of the sky f32[Hs, 2 Hs] (None without one)."""
     nodes = [index for index, node in enumerate(model.nodes) if isinstance(node, RigidNode) and node.name in absent]
     there = ~torch.isin(model.table.labels["node"], torch.tensor(nodes, dtype=torch.int32, device=model.device))
     camera, width = view.camera, min(WEIGHED_PX, view.camera.width)
@@ -354,7 +370,9 @@ def without_traces(
     return replace(model, table=Table(columns, labels), sky=sky, facts=dict(model.facts))
 
 
-def _sky_continued(model: SceneModel, views: Sequence[View], raster: RasterConfig, absent: Collection[str]) -> SkyNode | None:
+def _sky_continued(
+    model: SceneModel, views: Sequence[View], raster: RasterConfig, absent: Collection[str]
+) -> SkyNode | None:
     """The sky with directions that only show because objects are absent in the colour of the nearest that was seen."""
     shows = most_shown(model, views, raster, absent)[1]
     if model.sky is None or shows is None:
@@ -389,13 +407,18 @@ def without_rows(model: SceneModel, gone: Rows) -> SceneModel:
     """A copy without some rows, bool[N]."""
     kept = torch.from_numpy(np.flatnonzero(~gone)).to(model.device)
     columns = {name: value.detach()[kept] for name, value in model.table.columns.items()}
-    return replace(model, table=Table(columns, {key: value[kept] for key, value in model.table.labels.items()}), facts=dict(model.facts))
+    return replace(
+        model,
+        table=Table(columns, {key: value[kept] for key, value in model.table.labels.items()}),
+        facts=dict(model.facts),
+    )
 
 
 def _without_unseen(
     model: SceneModel, views: Sequence[View], raster: RasterConfig, absent: Collection[str]
 ) -> tuple[SceneModel, Array]:
-    """Without the Gaussians of the background that only show because objects are absent; and the places f64[L, 3] of the ground's."""
+    """Without the Gaussians of the background that only show because objects are absent; and the places f64[L, 3] of
+    the ground's."""
     lost = [np.zeros((0, 3))]
     for _ in range(ROUNDS):
         shows, shown = most_shown(model, views, raster, absent)[0], model.table.labels[SHOWN]
@@ -408,7 +431,8 @@ def _without_unseen(
 
 
 def _left_over(one: Hidden, model: SceneModel) -> Rows:
-    """Rows of the background within the space that a moving box swept, above the ground, and of road users around the box."""
+    """Rows of the background within the space that a moving box swept, above the ground, and of road users around the
+    box."""
     means, half = _means(model), np.array(one.size_m) / 2
     users = np.isin(classes_of_rows(model), DYNAMIC_IDS)
     rows = np.flatnonzero(_still(model) & _near(one, means[:, :2], STRAY_M))
@@ -451,7 +475,9 @@ def _hidden(one: Hidden, places: Array) -> Rows:
         distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-6)
         from_eye = pose.copy()
         from_eye[:3, 3] -= view.center_world
-        hides[rows] = inside & (met_box(toward / distance[:, None], from_eye, np.array(one.size_m) + BOX_GROWTH_M) < distance)
+        hides[rows] = inside & (
+            met_box(toward / distance[:, None], from_eye, np.array(one.size_m) + BOX_GROWTH_M) < distance
+        )
     return hides
 
 
@@ -466,7 +492,9 @@ def _cells_around(one: Hidden, seen_ground: Array) -> Array:
     xy = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     tree = KDTree(seen_ground[:, :2])
     xy = xy[tree.query(xy)[0] < KNOWN_WITHIN_M]
-    return np.column_stack([xy, np.median(seen_ground[tree.query(xy, NEAREST)[1], 2], 1)]) if len(xy) else np.zeros((0, 3))
+    return (
+        np.column_stack([xy, np.median(seen_ground[tree.query(xy, NEAREST)[1], 2], 1)]) if len(xy) else np.zeros((0, 3))
+    )
 
 
 def _gaps(cells: Array, kept: Array, lost: Array) -> Rows:
@@ -492,10 +520,12 @@ def _closed(model: SceneModel, one: Hidden, lost: Array) -> SceneModel:
         return model
     colors, near = continued(cells[:, :2], means[seen, :2], colors_of(model)[seen], weights[seen])
     changed = {
-        "means": cells - [0, 0, BELOW_M], "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
+        "means": cells - [0, 0, BELOW_M],
+        "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
         "log_scales": np.tile(np.log([0.75 * CELL_M, 0.75 * CELL_M, 0.02]), (count, 1)),
-        "logits": np.full(count, np.log(FILL_OPACITY / (1 - FILL_OPACITY))), "sh_dc": ((colors - 0.5) / SH_C0)[:, None],
-    }  # fmt: skip
+        "logits": np.full(count, np.log(FILL_OPACITY / (1 - FILL_OPACITY))),
+        "sh_dc": ((colors - 0.5) / SH_C0)[:, None],
+    }
     return with_copies(model, seen[near], changed)
 
 
@@ -522,13 +552,15 @@ def with_copies(model: SceneModel, likeness: NDArray[np.int64], changed: Mapping
     return replace(model, table=made, facts=dict(model.facts))
 
 
-# sides ----------------------------------------------------------------------------------------------------------------
+# sides --------------------------------------------------------------------------------------------
 #
-# Sides of a vehicle that no view showed: they are closed with flat Gaussians that continue the colours of what was seen.
+# Sides of a vehicle that no view showed: they are closed with flat Gaussians that continue the colours of what was
+# seen.
 #
-# Who follows a car records its rear. Turned, or seen from another lane, its flanks are holes through which the street shows. So the two
-# flanks of a vehicle are covered with Gaussians wherever it has none: as far out as it reaches at that height, in the colours that it, or
-# its mirror image, has at that height. What recorded views would show of them is taken away again: there the recording knows better.
+# Who follows a car records its rear. Turned, or seen from another lane, its flanks are holes through which the street
+# shows. So the two flanks of a vehicle are covered with Gaussians wherever it has none: as far out as it reaches at
+# that height, in the colours that it, or its mirror image, has at that height. What recorded views would show of them
+# is taken away again: there the recording knows better.
 
 
 CLOSED_LABELS: Final = SYMMETRIC_LABELS - {"motorcycle"}
@@ -557,11 +589,14 @@ SHOWN_PX: Final = 0.01
 """What a recorded view shows more of than this is not hidden."""
 
 
-def with_closed_sides(model: SceneModel, names: Collection[str], views: Sequence[View], raster: RasterConfig) -> SceneModel:
+def with_closed_sides(
+    model: SceneModel, names: Collection[str], views: Sequence[View], raster: RasterConfig
+) -> SceneModel:
     """A copy in which some vehicles have flanks where the recording showed none; other objects stay as they are.
 
     Args:
-        model: with the objects on their recorded paths. names: of objects. views: recorded ones, from which nothing new is to be seen.
+        model: with the objects on their recorded paths. names: of objects. views: recorded ones, from which nothing new
+            is to be seen.
     """
     first = len(model.table)
     for name in names:
@@ -606,26 +641,34 @@ def _with_flanks(model: SceneModel, node: RigidNode) -> SceneModel:
     both = np.concatenate([places, places * [1, -1, 1]]) * ALIKE
     near = KDTree(both).query(flanks * ALIKE, min(LIKE, len(both)))[1] % len(rows)
     color, count = np.median(colors_of(model)[rows][near], 1), len(flanks)
-    return with_copies(model, rows[near[:, 0]], {
-        "means": flanks, "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
-        "log_scales": np.tile(np.log([SPREAD * STEP_M, 0.02, SPREAD * STEP_M]), (count, 1)),
-        "logits": np.full(count, np.log(OPACITY / (1 - OPACITY))), "sh_dc": ((color - 0.5) / SH_C0)[:, None],
-    })  # fmt: skip
+    return with_copies(
+        model,
+        rows[near[:, 0]],
+        {
+            "means": flanks,
+            "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
+            "log_scales": np.tile(np.log([SPREAD * STEP_M, 0.02, SPREAD * STEP_M]), (count, 1)),
+            "logits": np.full(count, np.log(OPACITY / (1 - OPACITY))),
+            "sh_dc": ((color - 0.5) / SH_C0)[:, None],
+        },
+    )
 
 
 def _flanks(places: Array, half: Array, cabin: bool) -> Array:
     """Places f64[M, 3] on a grid over both flanks of a vehicle, in the frame of its box.
 
     Args:
-        places: f64[N, 3] of its Gaussians, which say how wide it is at each height. half: of the size of its box. cabin: a car, of the
-            usual shape; else a box.
+        places: f64[N, 3] of its Gaussians, which say how wide it is at each height. half: of the size of its box.
+            cabin: a car, of the usual shape; else a box.
     """
     found = []
     for z in np.arange(SIDE_FLOOR_M + STEP_M / 2, 2 * half[2] - 0.02, STEP_M) - half[2]:
         level = np.abs(places[np.abs(places[:, 2] - z) < SAME_HEIGHT_M, 1])
         wide = float(np.quantile(level, WIDTH_QUANTILE)) if len(level) > SIDE_LEAST_ROWS else 0.9 * half[1]
         up = (z / half[2] + 1) / 2 - CABIN_FROM
-        rear, front = (-half[0], half[0]) if up < 0 or not cabin else (half[0] * (0.5 * up - 0.8), half[0] * (0.4 - 0.7 * up))
+        rear, front = (
+            (-half[0], half[0]) if up < 0 or not cabin else (half[0] * (0.5 * up - 0.8), half[0] * (0.4 - 0.7 * up))
+        )
         along = np.arange(rear + STEP_M / 2, front, STEP_M)
         side = np.full(len(along), min(wide, half[1]) - INSET_M)
         found += [np.column_stack([along, sign * side, np.full(len(along), z)]) for sign in (-1, 1)]

@@ -27,8 +27,11 @@ Drawer = Callable[[View], Observation]
 
 
 def conditions_of(script: Sequence[Mapping[str, Any]]) -> Conditions | None:
-    """Weather, light and season that a script (``EditScript.canonical``) asks for, each as its last verb says; None: it asks for none."""
-    asked = {verb: settings for edit in script for verb, settings in edit.items() if verb in ("weather", "light", "season")}
+    """Weather, light and season that a script (``EditScript.canonical``) asks for, each as its last verb says; None: it
+    asks for none."""
+    asked = {
+        verb: settings for edit in script for verb, settings in edit.items() if verb in ("weather", "light", "season")
+    }
     return Conditions.model_validate(asked) if asked else None
 
 
@@ -66,8 +69,12 @@ def in_weather(draw: Drawer, how: InWeather) -> Drawer:
 
 def _shown(seen: Observation) -> ShownView:
     if seen.depth is None or seen.semantics is None:
-        raise InputError("weather and light need depth and classes of every view", where=seen.source, got="views without them",
-            remedy="fit a scene with labels, or take weather and light out of the script")  # fmt: skip
+        raise InputError(
+            "weather and light need depth and classes of every view",
+            where=seen.source,
+            got="views without them",
+            remedy="fit a scene with labels, or take weather and light out of the script",
+        )
     depth = seen.depth[0].nan_to_num(0.0).numpy().astype(np.float32)
     return ShownView(seen.view, seen.rgb.permute(1, 2, 0).numpy(), depth, seen.semantics.numpy().astype(np.uint8))
 

@@ -54,7 +54,7 @@ from mudg.scene.clouds import read_fused
 from mudg.scene.files import open_files
 from mudg.scene.read import read_points, read_scene
 
-# a log over time: files of Foxglove and rerun, bags of ROS 2, recordings of NCore -------------------------------------
+# a log over time: files of Foxglove and rerun, bags of ROS 2, recordings of NCore -----------------
 
 
 SUFFIXES: Final = {"mcap": ".mcap", "rerun": ".rrd", "ros2": "", "ncore": ""}
@@ -127,13 +127,16 @@ def _recording(records: LogRecords, folder: Path) -> tuple[Path, dict[str, int]]
     """A recording of NCore."""
     rolling = [name for name, camera in records.scene.cameras.items() if camera.readout_s > 0]
     if rolling:
-        log.warn(f"export: a scene does not know which way the shutters of {', '.join(rolling)} roll; ncore says downwards")
+        log.warn(
+            f"export: a scene does not know which way the shutters of {', '.join(rolling)} roll; ncore says downwards"
+        )
     return ncore.write_ncore(folder, records)[0], {"boxes": len(records.scene.tracks)}
 
 
-# scenes ---------------------------------------------------------------------------------------------------------------
+# scenes -------------------------------------------------------------------------------------------
 #
-# A fitted scene as files hold it: plain arrays by object, its motion as keys, its sky as a picture; and a file's Gaussians as a scene.
+# A fitted scene as files hold it: plain arrays by object, its motion as keys, its sky as a picture; and a file's
+# Gaussians as a scene.
 
 
 SKY_COUNT: Final = 6000
@@ -146,7 +149,8 @@ def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> 
     """A fitted scene in world axes.
 
     Args:
-        time_s: at which a background that changes with time, which no file holds, is taken. names: of nodes to keep (none: all).
+        time_s: at which a background that changes with time, which no file holds, is taken. names: of nodes to keep
+            (none: all).
 
     Raises:
         UsageError: a node that the scene does not have.
@@ -181,9 +185,12 @@ def _sh(model: SceneModel, rows: Tensor) -> NDArray[np.float32]:
 
 
 def _node(
-    node: StaticNode | RigidNode, given: tuple[NodeRows, Tensor], sh: NDArray[np.float32],
-    classes: NDArray[np.uint8] | None, time_s: float,
-) -> SplatNode:  # fmt: skip
+    node: StaticNode | RigidNode,
+    given: tuple[NodeRows, Tensor],
+    sh: NDArray[np.float32],
+    classes: NDArray[np.uint8] | None,
+    time_s: float,
+) -> SplatNode:
     rows, log_scales = given
     if not isinstance(node, RigidNode):
         now = rows if type(node) is StaticNode else node.at_time(rows, time_s)
@@ -229,7 +236,7 @@ def _sampled(
     return replace(cloud, means=base), (np.stack(places) - base).astype(np.float32)
 
 
-# -- sky -----------------------------------------------------------------------------------------------------------------
+# -- sky -------------------------------------------------------------------------------------------
 
 
 def sky_picture(sky: SkyNode) -> NDArray[np.uint8]:
@@ -239,7 +246,8 @@ def sky_picture(sky: SkyNode) -> NDArray[np.uint8]:
 
 
 def with_sky_sphere(scene: SplatScene) -> SplatScene:
-    """The scene with its sky as flat Gaussians far away, for files that hold Gaussians alone; unchanged without a sky."""
+    """The scene with its sky as flat Gaussians far away, for files that hold Gaussians alone; unchanged without a
+    sky."""
     if scene.sky is None:
         return scene
     directions = harmonics.spiral(SKY_COUNT)
@@ -259,14 +267,18 @@ def with_sky_sphere(scene: SplatScene) -> SplatScene:
     return replace(scene, nodes=(*scene.nodes, SplatNode("sky", cloud)), sky=None)
 
 
-# -- from files ----------------------------------------------------------------------------------------------------------
+# -- from files ------------------------------------------------------------------------------------
 
 
 def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
     """The Gaussians of a file as a fitted scene in which nothing moves; classes where the file holds them."""
     columns = {
-        "means": cloud.means, "quats": cloud.quats, "log_scales": cloud.log_scales, "logits": cloud.logits, "sh_dc": cloud.sh[:, :1],
-    }  # fmt: skip
+        "means": cloud.means,
+        "quats": cloud.quats,
+        "log_scales": cloud.log_scales,
+        "logits": cloud.logits,
+        "sh_dc": cloud.sh[:, :1],
+    }
     if cloud.degree:
         columns["sh_rest"] = cloud.sh[:, 1:]
     known: tuple[int, ...] = ()
@@ -279,21 +291,28 @@ def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
     tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
     table = Table(tensors, {"node": torch.zeros(len(cloud), dtype=torch.int32)})
     drawing = {DRAWING: {"antialias": True}} if cloud.antialias else {}
-    return SceneModel(table, (StaticNode(),), None, known, cloud.degree, {"method": IMPORTED, "source": name, **drawing})
+    return SceneModel(
+        table, (StaticNode(),), None, known, cloud.degree, {"method": IMPORTED, "source": name, **drawing}
+    )
 
 
-# export ---------------------------------------------------------------------------------------------------------------
+# export -------------------------------------------------------------------------------------------
 
 
 CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes]]]] = {
-    "nerfstudio": nerfstudio_files, "colmap": colmap_files,
+    "nerfstudio": nerfstudio_files,
+    "colmap": colmap_files,
     "colmap-text": lambda scene, points: colmap_files(scene, points, text=True),
-}  # fmt: skip
+}
 """Formats of cameras: files beside the pictures."""
 _ALL_MOMENTS: Final = ("bundle", "alpasim")
 MOST_POINTS: Final = 500_000
 FOLDERS: Final = {
-    **{name: (1, ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/")) for name in CAMERAS}, **LOG_FOLDERS
+    **{
+        name: (1, ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/"))
+        for name in CAMERAS
+    },
+    **LOG_FOLDERS,
 }
 """Formats that are folders: version and files of each."""
 
@@ -303,7 +322,8 @@ class Exported:
     """What is exported.
 
     Args:
-        parts: where it lies. model: the fit, edited; None if cameras alone are asked for. log: the recorded scene, edited, or None.
+        parts: where it lies. model: the fit, edited; None if cameras alone are asked for. log: the recorded scene,
+            edited, or None.
         edited: whether an edit script was carried out.
     """
 
@@ -318,8 +338,12 @@ class Exported:
         """The parts of a source, with an edit script carried out."""
         recorded = None if parts.scene is None else read_scene(parts.scene)
         if not parts.fits and script is not None:
-            raise UsageError("an edit script is carried out on a fit", where="--edits", got=str(parts.scene),
-                remedy="give the folder of a run")  # fmt: skip
+            raise UsageError(
+                "an edit script is carried out on a fit",
+                where="--edits",
+                got=str(parts.scene),
+                remedy="give the folder of a run",
+            )
         if not parts.fits:
             return cls(parts, None, recorded)
         model = load_model(parts.model) if recorded is None else model_of_scene(parts.model, recorded)
@@ -336,8 +360,8 @@ def parts_of(name: str, source: Path, scene: Path | None) -> RunParts:
 
 
 def check(config: ExportConfig, name: str, out: Path) -> None:
-    """UsageError for an unknown format, a setting that it does not have, or a file whose name does not fit it; ResourceError for a package
-    that is missing."""
+    """UsageError for an unknown format, a setting that it does not have, or a file whose name does not fit it;
+    ResourceError for a package that is missing."""
     if name not in FORMATS and name not in CAMERAS and name not in SUFFIXES:
         known = ", ".join((*FORMATS, *CAMERAS, *SUFFIXES))
         raise UsageError(f"there is no export format {name!r}", expected=f"one of {known}", remedy="see docs/export.md")
@@ -383,7 +407,9 @@ def _refuse_settings(config: ExportConfig, name: str) -> None:
             "this format cannot hold motion", where="--animated", got=name, expected=able, remedy="or give --time-s"
         )
     if name in _ALL_MOMENTS and config.time_s is not None:
-        raise UsageError("a file of this format holds all moments", where="--time-s", got=name, remedy="leave it out, or export ply")
+        raise UsageError(
+            "a file of this format holds all moments", where="--time-s", got=name, remedy="leave it out, or export ply"
+        )
     set_here = [
         key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(ExportConfig(), key)
     ]
@@ -400,7 +426,7 @@ def _refuse_name(out: Path, name: str) -> None:
         raise UsageError("the name of the file does not fit its format", where="--out", expected=expected, got=str(out))
 
 
-# -- Gaussians -----------------------------------------------------------------------------------------------------------
+# -- Gaussians -------------------------------------------------------------------------------------
 
 
 def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
@@ -416,8 +442,12 @@ def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
     whole = "motion" in FORMATS[name].carries and config.time_s is None
     if not scene.nodes or not (whole or any(node.at(moment) is not None and len(node.cloud) for node in scene.nodes)):
         asked = ", ".join(config.nodes) or "everything"
-        raise UsageError("there is nothing to export", where="--nodes, --time-s", got=f"{asked} at {moment:g} s",
-            remedy="choose a time at which the object is there")  # fmt: skip
+        raise UsageError(
+            "there is nothing to export",
+            where="--nodes, --time-s",
+            got=f"{asked} at {moment:g} s",
+            remedy="choose a time at which the object is there",
+        )
     if config.sky == "sphere":
         scene = with_sky_sphere(scene)
     elif config.sky == "none":
@@ -457,16 +487,22 @@ def _gaussians(config: ExportConfig, name: str, given: Exported, out: Path) -> d
     for sentence in lost:
         log.warn(f"export: {name} does not hold {sentence}")
     return {
-        "bytes": len(content), "gaussians": count, "degree": request.scene.degree, "time_s": request.time_s, "axes": config.axes,
-        "file_from_world": request.scene.file_from_world, "nodes": [node.name for node in request.scene.nodes], "not_in_the_file": lost,
-    }  # fmt: skip
+        "bytes": len(content),
+        "gaussians": count,
+        "degree": request.scene.degree,
+        "time_s": request.time_s,
+        "axes": config.axes,
+        "file_from_world": request.scene.file_from_world,
+        "nodes": [node.name for node in request.scene.nodes],
+        "not_in_the_file": lost,
+    }
 
 
 def _count(scene: SplatScene) -> int:
     return sum(len(node.cloud) for node in scene.nodes)
 
 
-# -- cameras and messages -----------------------------------------------------------------------------------------------
+# -- cameras and messages --------------------------------------------------------------------------
 
 
 def _messages(_config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
@@ -482,8 +518,11 @@ def _messages(_config: ExportConfig, name: str, given: Exported, out: Path) -> d
 def recorded_scene(given: Exported) -> Scene:
     """The recorded scene of what is exported; InputError if none is known."""
     if given.log is None:
-        raise InputError("cameras belong to a scene, and none is known here", where=str(given.parts.model),
-            remedy="give --scene SCENE, or a folder made by `mudg run`")  # fmt: skip
+        raise InputError(
+            "cameras belong to a scene, and none is known here",
+            where=str(given.parts.model),
+            remedy="give --scene SCENE, or a folder made by `mudg run`",
+        )
     if given.edited:
         log.warn(
             "export: an edit script changes boxes and the vehicle's path here; pictures and sweeps stay as recorded"

@@ -1,4 +1,5 @@
-"""asset import: a file of Gaussians from another program -> an asset that edit scripts can insert, or a scene in which nothing moves."""
+"""asset import: a file of Gaussians from another program -> an asset that edit scripts can insert, or a scene in which
+nothing moves."""
 
 from __future__ import annotations
 
@@ -24,9 +25,15 @@ from mudg.formats.splats.formats import COARSE_M, read_cloud
 from mudg.gaussians.storage import save_model
 
 TRAIN_IDS: Final = {
-    "pedestrian": ID["person"], "adult": ID["person"], "child": ID["person"], "cyclist": ID["rider"], "van": ID["car"], "tram": ID["train"],
-    "tree": ID["vegetation"], "sign": ID["traffic sign"],
-}  # fmt: skip
+    "pedestrian": ID["person"],
+    "adult": ID["person"],
+    "child": ID["person"],
+    "cyclist": ID["rider"],
+    "van": ID["car"],
+    "tram": ID["train"],
+    "tree": ID["vegetation"],
+    "sign": ID["traffic sign"],
+}
 """Classes of labels that are not named as their class."""
 SOLID: Final = 0.3
 """Opacity from which Gaussians count for the size of an object."""
@@ -62,8 +69,12 @@ def refuse_other_settings(config: ImportConfig) -> None:
     if config.kind == "scene" and (config.label, config.length_m) != (usual.label, usual.length_m):
         raise UsageError("a scene takes no settings of objects", where="--label, --length-m", remedy="leave them out")
     if len(config.axes) == 3 and not axes.known(config.axes):
-        raise UsageError("these letters name no three axes", where="--axes", expected="one of L and R, one of U and D, one of F and B",
-            got=config.axes)  # fmt: skip
+        raise UsageError(
+            "these letters name no three axes",
+            where="--axes",
+            expected="one of L and R, one of U and D, one of F and B",
+            got=config.axes,
+        )
     if config.kind == "object" and config.origin_m is not None:
         raise UsageError(
             "an object is centred in its box", where="--origin-m", remedy="leave it out, or add --kind scene"
@@ -97,7 +108,10 @@ def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asse
     scale = 1.0 if config.length_m is None else config.length_m / float(size[0])
     means = ((cloud.means - (low + high) / 2) * scale).astype(np.float32)
     if cloud.antialias:
-        log.warn(f"{origin}: its Gaussians are meant to be drawn antialiased; an object is drawn as the scene that it stands in")
+        log.warn(
+            f"{origin}: its Gaussians are meant to be drawn antialiased; an object is drawn as the scene that it"
+            " stands in"
+        )
     logs = (cloud.log_scales + np.log(scale)).astype(np.float32)
     columns = {
         "means": means,
@@ -116,12 +130,18 @@ def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asse
 
 
 def _origin(cloud: SplatCloud, config: ImportConfig, file: Path) -> list[float]:
-    """What is taken away from the places, in f64: as set, or the middle of Gaussians so far away that f32 would be too coarse for them."""
+    """What is taken away from the places, in f64: as set, or the middle of Gaussians so far away that f32 would be too
+    coarse for them."""
     origin = [0.0, 0.0, 0.0] if config.origin_m is None else list(config.origin_m)
     if config.origin_m is None and spacing_m(cloud.means) > COARSE_M:
         origin = [float(value) for value in np.round(np.median(cloud.means, 0))]
-        log.warn(f"{file}: its Gaussians lie far from the origin of the file: {origin} becomes the origin; --origin-m sets another")
+        log.warn(
+            f"{file}: its Gaussians lie far from the origin of the file: {origin} becomes the origin; --origin-m sets"
+            " another"
+        )
     if (step := spacing_m(cloud.means - np.array(origin))) > COARSE_M:
-        log.warn(f"{file}: its Gaussians lie so far from the origin that their places are rounded to {step * 1000:.3g} mm; "
-                 "--origin-m takes an offset away before")  # fmt: skip
+        log.warn(
+            f"{file}: its Gaussians lie so far from the origin that their places are rounded to {step * 1000:.3g} mm; "
+            "--origin-m takes an offset away before"
+        )
     return origin

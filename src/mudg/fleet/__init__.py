@@ -1,4 +1,5 @@
-"""Batches: steps over long lists of driving logs. Who runs them is an engine's matter; a scene run twice does only what is missing.
+"""Batches: steps over long lists of driving logs. Who runs them is an engine's matter; a scene run twice does only what
+is missing.
 
     plan.py       the list, its shards, the steps, their commands and content keys
     records.py    what lies where in the output, and who drives the batch

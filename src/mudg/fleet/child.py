@@ -36,8 +36,8 @@ _FIELD: Final = re.compile(r"^  (where|expected|got|what to do): (.*)$")
 
 @dataclass
 class Stop:
-    """Whether work is to stop. grace_s: seconds that steps have for a checkpoint. deadline: when those that still run are killed, by the
-    monotonic clock."""
+    """Whether work is to stop. grace_s: seconds that steps have for a checkpoint. deadline: when those that still run
+    are killed, by the monotonic clock."""
 
     grace_s: float = 100.0
     deadline: float | None = None
@@ -60,7 +60,8 @@ class Stop:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a step ended. code: exit code of its process; words: why it failed, in one line; text: the end of what it said."""
+    """How a step ended. code: exit code of its process; words: why it failed, in one line; text: the end of what it
+    said."""
 
     code: int
     words: str = ""
@@ -73,19 +74,31 @@ def run_step(words: Sequence[str], folder: Path | None, threads: int, stop: Stop
     """Run a command in a process group of its own and wait for its end. It ends with this process, however that ends.
 
     Args:
-        folder: where it runs (None: here). threads: that it may use. alone: wait until no other step runs on this machine.
+        folder: where it runs (None: here). threads: that it may use. alone: wait until no other step runs on this
+            machine.
 
     Raises:
         UsageError: there is no such program. ResourceError: no process can be started.
     """
-    environment = {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": str(threads), _HELD: "1"}
+    environment = {
+        "OMP_NUM_THREADS": str(threads),
+        "OMP_WAIT_POLICY": "PASSIVE",
+        "MUDG_THREADS": str(threads),
+        _HELD: "1",
+    }
     with _turn(alone, stop), tempfile.TemporaryFile() as said, processes.life_line() as line:
         began_s = time.monotonic()
         try:
             process = subprocess.Popen(
-                _guarded(words), cwd=folder, stdin=subprocess.DEVNULL, stdout=said, stderr=said, start_new_session=True,
-                env={**os.environ, **environment, processes.LIFE_LINE: str(line)}, pass_fds=(line,),
-            )  # fmt: skip
+                _guarded(words),
+                cwd=folder,
+                stdin=subprocess.DEVNULL,
+                stdout=said,
+                stderr=said,
+                start_new_session=True,
+                env={**os.environ, **environment, processes.LIFE_LINE: str(line)},
+                pass_fds=(line,),
+            )
         except FileNotFoundError as error:
             raise UsageError("there is no such program", where="--command", got=words[0]) from error
         except OSError as error:
@@ -121,8 +134,8 @@ def _wait(process: subprocess.Popen[bytes], stop: Stop) -> tuple[int, float]:
 
 
 def _guarded(words: Sequence[str]) -> list[str]:
-    """The command such that the system ends it with this process (mudg itself watches its life line), and such that the signal with
-    which Slurm announces the end of a job reaches this process alone."""
+    """The command such that the system ends it with this process (mudg itself watches its life line), and such that the
+    signal with which Slurm announces the end of a job reaches this process alone."""
     guard = None if "mudg" in words[:3] else shutil.which("setpriv")
     guarded = [guard, "--pdeathsig", "KILL", "--", *words] if guard else list(words)
     return ["sh", "-c", 'trap "" USR1 USR2; exec "$@"', "sh", *guarded] if "SLURM_JOB_ID" in os.environ else guarded
@@ -130,7 +143,8 @@ def _guarded(words: Sequence[str]) -> list[str]:
 
 @contextlib.contextmanager
 def _turn(alone: bool, stop: Stop) -> Iterator[None]:
-    """Hold the turn of a step: beside others of this user on this machine, or alone. Who waits to be alone holds the door meanwhile."""
+    """Hold the turn of a step: beside others of this user on this machine, or alone. Who waits to be alone holds the
+    door meanwhile."""
     if fcntl is None or os.environ.get(_HELD):
         yield
         return
@@ -146,8 +160,8 @@ def _turn(alone: bool, stop: Stop) -> Iterator[None]:
 
 
 def lock(file: BinaryIO, alone: bool, stop: Stop | None) -> bool:
-    """Lock an open file until it is closed, alone or together with others. False where that could not be: work is to stop meanwhile, or
-    stop is None and it is locked already."""
+    """Lock an open file until it is closed, alone or together with others. False where that could not be: work is to
+    stop meanwhile, or stop is None and it is locked already."""
     pause_s = 0.02
     while fcntl is not None:
         try:

@@ -1,6 +1,8 @@
-"""Engines: who runs the scenes of a batch. Threads of this process, tasks of a Ray cluster, or an array job of Slurm, through submitit.
+"""Engines: who runs the scenes of a batch. Threads of this process, tasks of a Ray cluster, or an array job of Slurm,
+through submitit.
 
-Scheduling, retries of lost workers and requeueing belong to the engine. All of them call ``run_scene``, which does only what is missing.
+Scheduling, retries of lost workers and requeueing belong to the engine. All of them call ``run_scene``, which does only
+what is missing.
 """
 
 from __future__ import annotations
@@ -33,7 +35,7 @@ _AT_ONCE: Final = 2000
 _GB: Final = 1_000_000_000
 
 
-# this machine ---------------------------------------------------------------------------------------------------------
+# this machine -------------------------------------------------------------------------------------
 
 
 @dataclass
@@ -48,7 +50,8 @@ class LocalRun:
     _ahead: dict[str, threading.Thread] = field(default_factory=dict)
 
     def run(self, tell: Tell) -> None:
-        """Do them all. Ctrl-C and SIGTERM stop every step with a checkpoint, a second one at once; KeyboardInterrupt goes on then."""
+        """Do them all. Ctrl-C and SIGTERM stop every step with a checkpoint, a second one at once; KeyboardInterrupt
+        goes on then."""
         waiting, told = deque(self.entries), queue.SimpleQueue[Ended | None]()
 
         def work() -> None:
@@ -100,28 +103,35 @@ class LocalRun:
             reads = "://" in following.source and "{source}" in " ".join(first.stage.words) and not first.stage.direct
             if reads and following.name not in self._ahead and not self.job.folder.record("done", first.key).exists():
                 version = following.settings.get(REVISION, "")
-                self._ahead[following.name] = self.job.inputs.fetch_ahead(Location.of(following.source), version, self.stop)
+                self._ahead[following.name] = self.job.inputs.fetch_ahead(
+                    Location.of(following.source), version, self.stop
+                )
 
 
-# Ray ------------------------------------------------------------------------------------------------------------------
+# Ray ----------------------------------------------------------------------------------------------
 
 
 def run_on_ray(job: Job, entries: Sequence[Entry], batch: BatchConfig, tell: Tell) -> None:
     """One task of a Ray cluster per scene: the one at ``ray_address``, the one Ray finds, or one on this machine.
 
     Raises:
-        ResourceError: Ray is not installed, or no cluster answers. KeyboardInterrupt: stopped; running steps have written checkpoints.
+        ResourceError: Ray is not installed, or no cluster answers. KeyboardInterrupt: stopped; running steps have
+            written checkpoints.
     """
     try:
         import ray
     except ImportError as error:
-        raise ResourceError("the package ray is not installed", where="--engine ray", remedy="pip install 'mudg[ray]'") from error
+        raise ResourceError(
+            "the package ray is not installed", where="--engine ray", remedy="pip install 'mudg[ray]'"
+        ) from error
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if not ray.is_initialized():
         try:
             ray.init(address=batch.ray_address or None, log_to_driver=False, logging_level="warning")
         except (ConnectionError, ValueError, RuntimeError) as error:
-            raise ResourceError("no Ray cluster answers", where="--ray-address", got=str(error).split("\n")[0][:300]) from error
+            raise ResourceError(
+                "no Ray cluster answers", where="--ray-address", got=str(error).split("\n")[0][:300]
+            ) from error
     memory = {"memory": int(batch.memory_gb * _GB)} if batch.memory_gb else {}
     options: dict[str, Any] = {"num_cpus": batch.cpus, "num_gpus": batch.gpus, "max_retries": _LOST_NODES, **memory}
     task, common = ray.remote(scheduling_strategy="SPREAD", **options)(_ray_task), ray.put(job)
@@ -151,11 +161,12 @@ def _ray_task(job: Job, entry: Entry) -> list[Ended]:
     return run_scene(job, entry, Stop(job.grace_s))
 
 
-# Slurm ----------------------------------------------------------------------------------------------------------------
+# Slurm --------------------------------------------------------------------------------------------
 
 
 class SlurmTask:
-    """The scenes of one task of an array job. Told that its time ends, it writes checkpoints, and submitit puts it back into the queue."""
+    """The scenes of one task of an array job. Told that its time ends, it writes checkpoints, and submitit puts it back
+    into the queue."""
 
     def __init__(self, job: Job, entries: Sequence[Entry]) -> None:
         self._job, self._entries = job, entries
@@ -184,15 +195,20 @@ def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> t
     """Submit an array job of ``batch.jobs`` tasks; returns its number and the folder of its messages.
 
     Raises:
-        ResourceError: submitit is not installed, or there is no Slurm, or it refuses. UsageError: options that cannot be.
+        ResourceError: submitit is not installed, or there is no Slurm, or it refuses. UsageError: options that cannot
+            be.
     """
     try:
         import submitit
     except ImportError as error:
-        raise ResourceError("the package submitit is not installed", where="--engine slurm", remedy="pip install 'mudg[slurm]'") from error
+        raise ResourceError(
+            "the package submitit is not installed", where="--engine slurm", remedy="pip install 'mudg[slurm]'"
+        ) from error
     local, given = job.folder.own.local, dict(_option(text) for text in batch.slurm_options)
     if "time" not in given:
-        raise UsageError("Slurm needs to know how long a task may run", where="--slurm-options", expected="time=4:00:00 among them")
+        raise UsageError(
+            "Slurm needs to know how long a task may run", where="--slurm-options", expected="time=4:00:00 among them"
+        )
     folder = local / "slurm" if local is not None else Path.cwd() / "mudg-batch-slurm"
     store.make_folder(folder)
     folder.chmod(0o700)  # tasks are pickles that nobody else may write
@@ -200,24 +216,38 @@ def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> t
     try:
         executor = submitit.AutoExecutor(folder=folder / "%j", cluster="slurm", slurm_max_num_timeout=1000)
         executor.update_parameters(
-            name="mudg-batch", cpus_per_task=max(1, round(batch.cpus)), slurm_signal_delay_s=int(batch.grace_s) + 20,
-            slurm_array_parallelism=count, slurm_additional_parameters={**given, "requeue": True},
-            **({"mem_gb": batch.memory_gb} if batch.memory_gb else {}), **({"gpus_per_node": round(batch.gpus)} if batch.gpus else {}),
-        )  # fmt: skip
+            name="mudg-batch",
+            cpus_per_task=max(1, round(batch.cpus)),
+            slurm_signal_delay_s=int(batch.grace_s) + 20,
+            slurm_array_parallelism=count,
+            slurm_additional_parameters={**given, "requeue": True},
+            **({"mem_gb": batch.memory_gb} if batch.memory_gb else {}),
+            **({"gpus_per_node": round(batch.gpus)} if batch.gpus else {}),
+        )
         with executor.batch():
             tasks = [executor.submit(SlurmTask(job, entries[index::count])) for index in range(count)]
     except (RuntimeError, submitit.core.utils.FailedJobError, OSError) as error:
-        raise ResourceError("Slurm refused, or is not on this machine", where="sbatch", got=str(error).strip()[:500],
-            remedy="run this on a login node, or take another --engine") from error  # fmt: skip
+        raise ResourceError(
+            "Slurm refused, or is not on this machine",
+            where="sbatch",
+            got=str(error).strip()[:500],
+            remedy="run this on a login node, or take another --engine",
+        ) from error
     return str(tasks[0].job_id).partition("_")[0], folder
 
 
 def _option(text: str) -> tuple[str, str | bool]:
     name, separator, value = text.partition("=")
     if not name or name.startswith("-") or any(letter in text for letter in "\n\r") or name in _OWN_OPTIONS:
-        raise UsageError("not an option for the array job", where="--slurm-options", got=text[:80],
-            expected="NAME or NAME=VALUE without dashes, other than " + ", ".join(sorted(_OWN_OPTIONS)))  # fmt: skip
+        raise UsageError(
+            "not an option for the array job",
+            where="--slurm-options",
+            got=text[:80],
+            expected="NAME or NAME=VALUE without dashes, other than " + ", ".join(sorted(_OWN_OPTIONS)),
+        )
     return name, value if separator else True
 
 
-_OWN_OPTIONS: Final = frozenset({"array", "job-name", "signal", "requeue", "no-requeue", "open-mode", "output", "error", "cpus-per-task"})
+_OWN_OPTIONS: Final = frozenset(
+    {"array", "job-name", "signal", "requeue", "no-requeue", "open-mode", "output", "error", "cpus-per-task"}
+)

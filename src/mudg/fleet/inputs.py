@@ -1,10 +1,13 @@
-"""Inputs that lie in a store, on this machine: shared by all steps that read them, and removed when nobody needs them any more.
+"""Inputs that lie in a store, on this machine: shared by all steps that read them, and removed when nobody needs them
+any more.
 
     SCRATCH/mudg_inputs/<digest>/content/<name>     what was fetched
                                  complete           for which driver; written when it is whole
-                        <digest>.lock               held together by steps that use it, alone by the one that fetches or removes it
+                        <digest>.lock               held together by steps that use it, alone by the one that fetches or
+                                                    removes it
 
-What lies there is compared with its address, file by file, once by every driver and again after a step said that it is bad.
+What lies there is compared with its address, file by file, once by every driver and again after a step said that it is
+bad.
 """
 
 from __future__ import annotations
@@ -41,7 +44,8 @@ class InputStore:
         """The file or folder at an address, on this machine, for as long as the block runs.
 
         Args:
-            version: of what lies there, where the address alone does not tell. keep: leave it there, for others that come later.
+            version: of what lies there, where the address alone does not tell. keep: leave it there, for others that
+                come later.
 
         Raises:
             InputError: nothing is there. ResourceError: no connection, the disk is full, or work is to stop.

@@ -1,7 +1,8 @@
 """One verb over many scenes: ``mudg ingest|annotate|fuse --list FILE --out ROOT [--shard i/n] [--jobs N]``.
 
-Every scene is a process of its own and writes the folder ROOT/<name>. A finished one is verified and reused by the verb itself, so the
-same command can be repeated until nothing fails; one that fails is reported with its reason, and the others go on.
+Every scene is a process of its own and writes the folder ROOT/<name>. A finished one is verified and reused by the verb
+itself, so the same command can be repeated until nothing fails; one that fails is reported with its reason, and the
+others go on.
 """
 
 from __future__ import annotations
@@ -35,19 +36,27 @@ def exit_code(failed: int) -> int:
 
 
 def run_listed(
-    words: Sequence[str], settings: Any, entries: list[Entry], out: Path, *, jobs: int = 0, shard_text: str = "",
-    listed: Path | None = None, plan: BatchPlan | None = None,
-) -> dict[str, Any]:  # fmt: skip
+    words: Sequence[str],
+    settings: Any,
+    entries: list[Entry],
+    out: Path,
+    *,
+    jobs: int = 0,
+    shard_text: str = "",
+    listed: Path | None = None,
+    plan: BatchPlan | None = None,
+) -> dict[str, Any]:
     """Run a step over a list.
 
     Args:
-        words: its command line for a ``{source}``. settings: of the step. entries: the whole list. out: ROOT; ``ROOT/status.json`` (with a
-            shard: ``status-i-of-n.json``) tells the outcome. jobs: processes; 0 = as many as there are processors. They share the
-            processors. shard_text: ``i/n`` or empty. listed: the list, where it is a file. plan: what to do instead, for tests.
+        words: its command line for a ``{source}``. settings: of the step. entries: the whole list. out: ROOT;
+            ``ROOT/status.json`` (with a shard: ``status-i-of-n.json``) tells the outcome. jobs: processes; 0 = as many
+            as there are processors. They share the processors. shard_text: ``i/n`` or empty. listed: the list, where it
+            is a file. plan: what to do instead, for tests.
 
     Returns:
-        ``scenes`` (one record each), counts, ``text``: the table for people, and ``exit_code``: 0, or 10 plus the number of
-        failed scenes, at most 99.
+        ``scenes`` (one record each), counts, ``text``: the table for people, and ``exit_code``: 0, or 10 plus the
+        number of failed scenes, at most 99.
 
     Raises:
         UsageError: ``jobs`` is negative; an output touches a source, or the status another file. KeyboardInterrupt: the
@@ -76,12 +85,20 @@ def run_listed(
     outcomes = [_outcome(entry, told[entry.name], out / entry.name, before[entry.name]) for entry in entries]
     counts = {state: sum(one["state"] == state for one in outcomes) for state in ("done", "reused", "failed")}
     store.write_json(status, {"schema": 1, "verb": words[0], "counts": counts, "scenes": outcomes})
-    return {"scenes": outcomes, **counts, "status": status, "text": table(words[0], outcomes), "exit_code": exit_code(counts["failed"])}
+    return {
+        "scenes": outcomes,
+        **counts,
+        "status": status,
+        "text": table(words[0], outcomes),
+        "exit_code": exit_code(counts["failed"]),
+    }
 
 
 def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: Path | None) -> None:
     """UsageError where a scene's output touches any source or the list, or the status would replace another file."""
-    read: dict[str, Path | str | None] = {f"source of {entry.name}": entry.source for entry in entries if entry.source != CITY}
+    read: dict[str, Path | str | None] = {
+        f"source of {entry.name}": entry.source for entry in entries if entry.source != CITY
+    }
     read["list"] = listed if listed is not None and listed.is_file() else None
     refuse_overlaps([status, *(out / entry.name for entry in entries)], read)
     if status.exists():
@@ -90,8 +107,11 @@ def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: 
         except (InputError, TypeError):
             known = False
         if not known:
-            raise UsageError("the status file would replace a file that does not belong to this list", where=str(status),
-                remedy="choose another --out")  # fmt: skip
+            raise UsageError(
+                "the status file would replace a file that does not belong to this list",
+                where=str(status),
+                remedy="choose another --out",
+            )
 
 
 def _outcome(entry: Entry, report: Ended, folder: Path, before: str) -> dict[str, Any]:
@@ -101,8 +121,18 @@ def _outcome(entry: Entry, report: Ended, folder: Path, before: str) -> dict[str
         state = "reused" if before and before == _finished(folder) else "done"
         summary = _state(folder).get("summary")
         summary = summary if isinstance(summary, Mapping) else {}
-        words, error = ", ".join(f"{value} {name}" for name, value in summary.items() if isinstance(value, int | str)), ""
-    return {"name": entry.name, "source": entry.source, "state": state, "seconds": round(report.seconds, 2), "words": words, "error": error}
+        words, error = (
+            ", ".join(f"{value} {name}" for name, value in summary.items() if isinstance(value, int | str)),
+            "",
+        )
+    return {
+        "name": entry.name,
+        "source": entry.source,
+        "state": state,
+        "seconds": round(report.seconds, 2),
+        "words": words,
+        "error": error,
+    }
 
 
 def _state(folder: Path) -> Mapping[str, Any]:
@@ -134,5 +164,7 @@ def table(verb: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
     out = io.StringIO()
     Console(file=out, width=int(os.environ.get("COLUMNS") or 120), markup=False, highlight=False).print(grid)
     failed = sum(outcome["state"] == "failed" for outcome in outcomes)
-    out.write(f"{len(outcomes) - failed} of {len(outcomes)} scenes are there" + (f", {failed} failed" if failed else ""))
+    out.write(
+        f"{len(outcomes) - failed} of {len(outcomes)} scenes are there" + (f", {failed} failed" if failed else "")
+    )
     return out.getvalue()

@@ -39,7 +39,8 @@ SHARD_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line of a list: the source, the name of its output folder, and settings of its own (``sequence``, ``frames``, ...)."""
+    """One line of a list: the source, the name of its output folder, and settings of its own (``sequence``, ``frames``,
+    ...)."""
 
     name: str
     source: str
@@ -71,8 +72,12 @@ def read_list(listed: Path | str, settings: Sequence[str] = ()) -> list[Entry]:
     sources: dict[str, str] = {}
     for entry in entries:
         if entry.name in sources:
-            raise InputError("two entries would write the same folder", where=str(place), got=f"{sources[entry.name]} and {entry.source}",
-                remedy=f"give one of them another name: SOURCE name={entry.name}-2")  # fmt: skip
+            raise InputError(
+                "two entries would write the same folder",
+                where=str(place),
+                got=f"{sources[entry.name]} and {entry.source}",
+                remedy=f"give one of them another name: SOURCE name={entry.name}-2",
+            )
         sources[entry.name] = entry.source
     return entries
 
@@ -89,9 +94,12 @@ def _entry(line: str, where: str, folder: str, settings: Sequence[str]) -> Entry
         key, separator, value = word.partition("=")
         if not separator or key not in ("name", *settings):
             raise InputError(
-                "unknown setting in the line", where=where, got=word[:80],
+                "unknown setting in the line",
+                where=where,
+                got=word[:80],
                 expected=", ".join(f"{key}=..." for key in ("name", *settings)),
-                remedy="put quotes around a path with spaces")  # fmt: skip
+                remedy="put quotes around a path with spaces",
+            )
         given[key] = os.path.abspath(value) if key in ("poses", "boxes") and os.path.exists(value) else value
     source = words[0] if words[0] == CITY else _below(folder, words[0])
     name = given.pop("name", "") or Path(source).name.removesuffix(".zip")
@@ -115,7 +123,8 @@ def shard_of(name: str, count: int) -> int:
 
 
 def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> tuple[int, int]:
-    """(i, n) of ``"i/n"``; of ``"env"`` and ``"env/n"``, where the environment of a scheduler says i; (0, 1) of an empty text.
+    """(i, n) of ``"i/n"``; of ``"env"`` and ``"env/n"``, where the environment of a scheduler says i; (0, 1) of an
+    empty text.
 
     Raises:
         UsageError: not of this form, or the environment does not say it.
@@ -126,8 +135,12 @@ def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> tuple
     if first == "env":
         first, count = _numbered(count, environment)
     if not first.isdecimal() or not count.isdecimal() or not int(first) < int(count):
-        raise UsageError("invalid shard", where="--shard", expected="i/n with i from 0 to n-1, e.g. 0/4; or env, env/n",
-            got=text if "env" not in text else f"{text}: {first or '?'}/{count or '?'}")  # fmt: skip
+        raise UsageError(
+            "invalid shard",
+            where="--shard",
+            expected="i/n with i from 0 to n-1, e.g. 0/4; or env, env/n",
+            got=text if "env" not in text else f"{text}: {first or '?'}/{count or '?'}",
+        )
     return int(first), int(count)
 
 
@@ -138,8 +151,11 @@ def _numbered(count: str, environment: Mapping[str, str]) -> tuple[str, str]:
             lowest = environment.get(lowest_name, "") or "0"
             index = str(int(index) - int(lowest)) if index.isdecimal() and lowest.isdecimal() else index
             return index, count or environment.get(count_name, "")
-    raise UsageError("no scheduler has numbered this task", where="--shard env",
-        expected=f"one of {', '.join(names[0] for names in SHARD_VARIABLES)} in the environment")  # fmt: skip
+    raise UsageError(
+        "no scheduler has numbered this task",
+        where="--shard env",
+        expected=f"one of {', '.join(names[0] for names in SHARD_VARIABLES)} in the environment",
+    )
 
 
 def shard(entries: Sequence[Entry], part: tuple[int, int]) -> list[Entry]:
@@ -147,7 +163,7 @@ def shard(entries: Sequence[Entry], part: tuple[int, int]) -> list[Entry]:
     return [entry for entry in entries if shard_of(entry.name, part[1]) == part[0]]
 
 
-# steps ----------------------------------------------------------------------------------------------------------------
+# steps --------------------------------------------------------------------------------------------
 
 RULES_VERSION: Final = 2
 """Counts up when keys or commands change their meaning: results of older batches are then made again."""
@@ -164,8 +180,8 @@ COMMAND: Final = "command"
 
 @dataclass(frozen=True)
 class BatchStage:
-    """A step of a batch. words: its command, with names in braces; needs: steps whose results it reads; settings: what ``--config``
-    holds for it; direct: whether results are made right below the output, by the scene's name alone."""
+    """A step of a batch. words: its command, with names in braces; needs: steps whose results it reads; settings: what
+    ``--config`` holds for it; direct: whether results are made right below the output, by the scene's name alone."""
 
     name: str
     words: tuple[str, ...]
@@ -227,9 +243,16 @@ _version = functools.cache(version)
 def _key(stage: BatchStage, entry: Entry, needs: Mapping[str, str]) -> str:
     """Content key: of the log's identity, settings, version and the keys of what is read."""
     values = [
-        RULES_VERSION, _version(), stage.name, list(stage.words), without_devices(stage.settings), entry.name, entry.source,
-        dict(entry.settings), dict(needs),
-    ]  # fmt: skip
+        RULES_VERSION,
+        _version(),
+        stage.name,
+        list(stage.words),
+        without_devices(stage.settings),
+        entry.name,
+        entry.source,
+        dict(entry.settings),
+        dict(needs),
+    ]
     return hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()[:32]
 
 
@@ -239,8 +262,8 @@ def plan_of(
     """The plan of these steps.
 
     Args:
-        lines: words after ``mudg`` of every step. Names of other steps in braces stand for their results, ``{scene}`` for that of
-            annotate or ingest, or for the source.
+        lines: words after ``mudg`` of every step. Names of other steps in braces stand for their results, ``{scene}``
+            for that of annotate or ingest, or for the source.
         settings: those of ``mudg run``, as JSON values. command: a program of the user's own, as the step ``command``.
 
     Raises:
@@ -250,7 +273,9 @@ def plan_of(
         if COMMAND not in names:
             names = (*names, COMMAND)
         if "{out}" not in " ".join(command):
-            raise UsageError("a command must be told where to write", where="--command", expected="{out} among its words")
+            raise UsageError(
+                "a command must be told where to write", where="--command", expected="{out} among its words"
+            )
     known = {**lines, **({COMMAND: command} if command else {})}
     stages: list[BatchStage] = []
     for name in names:
@@ -262,7 +287,11 @@ def plan_of(
         read = set(_PLACEHOLDER.findall(" ".join(words)))
         missing = (read & set(lines)) - set(made)
         if missing and name != COMMAND:
-            raise UsageError(f"the step {name} needs {' and '.join(sorted(missing))} before it", where="--stages", got=" ".join(names))
+            raise UsageError(
+                f"the step {name} needs {' and '.join(sorted(missing))} before it",
+                where="--stages",
+                got=" ".join(names),
+            )
         own = {} if name == COMMAND else dict(settings if name == "run" else settings[name])
         stages.append(BatchStage(name, words, tuple(one for one in made if one in read), own))
     if len(set(names)) < len(names) or not names:
@@ -279,7 +308,8 @@ def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> 
     """The command line of a step of a scene.
 
     Args:
-        places: ``source`` and steps -> where they lie. out: folder to write. config: file of its settings, if it has any.
+        places: ``source`` and steps -> where they lie. out: folder to write. config: file of its settings, if it has
+            any.
     """
     filled = {**places, "out": out, "name": unit.entry.name}
     words = [_PLACEHOLDER.sub(lambda match: filled.get(match[1], match[0]), word) for word in unit.stage.words]
@@ -287,7 +317,17 @@ def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> 
         return words
     groups = {"ingest": "", "run": "ingest."}
     own = list(line_words(unit.entry.settings, groups[unit.stage.name])) if unit.stage.name in groups else []
-    return [sys.executable, "-m", "mudg", *words, "--out", out, "--quiet", *(["--config", config] if config else []), *own]
+    return [
+        sys.executable,
+        "-m",
+        "mudg",
+        *words,
+        "--out",
+        out,
+        "--quiet",
+        *(["--config", config] if config else []),
+        *own,
+    ]
 
 
 def line_words(settings: Mapping[str, str], group: str = "") -> Iterator[str]:

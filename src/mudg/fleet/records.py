@@ -1,13 +1,13 @@
 """Where everything of a batch lies, what its records must be to be used, and who drives it.
 
-    OUT/<scene>/<step>/<key>/           results
-    OUT/_batch/plan.json                steps, commands, settings, version
-              list.<digest>.json        scenes of every list that was given
-              owner*.json               the driver, or one of each shard
-              done/<key>.json           a result is one from this record on; written last
-              failed/<key>.json         why a step has no result
-              logs/<key>.txt            the end of what a failed step said
-              work/ partial/            unfinished results
+OUT/<scene>/<step>/<key>/           results
+OUT/_batch/plan.json                steps, commands, settings, version
+          list.<digest>.json        scenes of every list that was given
+          owner*.json               the driver, or one of each shard
+          done/<key>.json           a result is one from this record on; written last
+          failed/<key>.json         why a step has no result
+          logs/<key>.txt            the end of what a failed step said
+          work/ partial/            unfinished results
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class CorpusFacts(_Record):
 
 
 class Ended(_Record):
-    """How a step of a scene ended: done or failed, which is put on record; or stopped, or lost by its engine. lost_s: processor seconds
-    of attempts without a result."""
+    """How a step of a scene ended: done or failed, which is put on record; or stopped, or lost by its engine. lost_s:
+    processor seconds of attempts without a result."""
 
     scene: Name
     stage: Name
@@ -103,7 +103,9 @@ class Owner(_Record):
 
     def __str__(self) -> str:
         what = f"job {self.job}" if self.job else f"process {self.process}"
-        return f"{what} on {self.host.split(' ')[0]} since {time.strftime('%Y-%m-%d %H:%M UTC', time.gmtime(self.since))}"
+        return (
+            f"{what} on {self.host.split(' ')[0]} since {time.strftime('%Y-%m-%d %H:%M UTC', time.gmtime(self.since))}"
+        )
 
 
 class _StageRecord(_Record):
@@ -120,8 +122,13 @@ def _checked(kind: type[Kind], content: bytes, where: str, remedy: str) -> Kind:
         return kind.model_validate_json(store.json_text(store.parse_json(content, where), indent=None))
     except ValidationError as error:
         problem = first_problem(error, f"{where}: ")
-        raise InputError(f"a record of the batch is damaged: {problem.what}", where=problem.where, expected=problem.expected,
-            got=problem.got, remedy=remedy) from error  # fmt: skip
+        raise InputError(
+            f"a record of the batch is damaged: {problem.what}",
+            where=problem.where,
+            expected=problem.expected,
+            got=problem.got,
+            remedy=remedy,
+        ) from error
 
 
 def this_host() -> str:
@@ -179,7 +186,7 @@ class BatchFolder:
         content = json.dumps({"schema": 1, **ended.model_dump()}, ensure_ascii=False, allow_nan=False)
         self.record(kind, ended.key).save(content.encode())
 
-    # plan and list -----------------------------------------------------------------------------------------------------
+    # plan and list --------------------------------------------------------------------------------
 
     def begin(self, plan: BatchPlan, entries: Sequence[Entry]) -> None:
         """Put plan and list on record, or check that they are the same.
@@ -190,12 +197,18 @@ class BatchFolder:
         file, record = self.own / "plan.json", json.loads(store.json_text(plan.record()))
         names = [name for name in self.out.names() if not name.startswith(".")] if self.out.local is not None else []
         if names and BOOKKEEPING not in names:  # another shard may begin at the same moment
-            raise UsageError("the output holds files of something else", where=str(self.out), remedy="choose an empty --out")
+            raise UsageError(
+                "the output holds files of something else", where=str(self.out), remedy="choose an empty --out"
+            )
         if not file.save((store.json_text(record) + "\n").encode(), only_if_absent=True):
             before = store.parse_json(file.load(), str(file))
             if before != record:
-                raise UsageError("the output holds a batch of other steps or settings", where=str(self.out),
-                    got="; ".join(differences(before, record)[:8]), remedy="choose another --out")  # fmt: skip
+                raise UsageError(
+                    "the output holds a batch of other steps or settings",
+                    where=str(self.out),
+                    got="; ".join(differences(before, record)[:8]),
+                    remedy="choose another --out",
+                )
         values = [[one.name, one.source, dict(one.settings)] for one in sorted(entries, key=lambda one: one.name)]
         content = json.dumps(values, ensure_ascii=False).encode()
         listed = self.own / f"list.{hashlib.sha256(content).hexdigest()[:12]}.json"
@@ -207,7 +220,10 @@ class BatchFolder:
         file = self.own / "plan.json"
         if not file.exists():
             raise InputError("no batch is here", where=str(self.out), expected="the --out of a mudg batch run")
-        return [one.name for one in _checked(_PlanRecord, file.load(), str(file), "begin the batch again in another folder").stages]
+        return [
+            one.name
+            for one in _checked(_PlanRecord, file.load(), str(file), "begin the batch again in another folder").stages
+        ]
 
     def scenes(self) -> list[str]:
         """Names of the scenes of all lists that were ever given. InputError: a list is damaged."""
@@ -216,25 +232,34 @@ class BatchFolder:
             if name.startswith("list."):
                 where = str(self.own / name)
                 try:
-                    scenes.update(row[0] for row in _LISTED.validate_python(store.parse_json((self.own / name).load(), where)))
+                    scenes.update(
+                        row[0] for row in _LISTED.validate_python(store.parse_json((self.own / name).load(), where))
+                    )
                 except ValidationError as error:
                     raise first_problem(error, f"{where}: ") from error
         return sorted(scenes)
 
-    # drivers -----------------------------------------------------------------------------------------------------------
+    # drivers --------------------------------------------------------------------------------------
 
     def owners(self) -> dict[str, Owner]:
         """Drivers on record, by the names of their files. InputError: a record is damaged."""
         names = [name for name in self.own.names() if _OWNER.fullmatch(name)]
         remedy = "remove it, if no driver of this batch runs"
-        return {name: _checked(Owner, content, f"{self.own}/{name}", remedy) for name, content in self.own.load_below(names).items()}
+        return {
+            name: _checked(Owner, content, f"{self.own}/{name}", remedy)
+            for name, content in self.own.load_below(names).items()
+        }
 
     @contextlib.contextmanager
-    def owned(self, shard: tuple[int, int] = (0, 1), *, numbered: bool = False, take_over: bool = False) -> Iterator[Location]:
-        """Drive the batch, or one shard of it, alone. Yields the owner's record, which is removed at the end unless somebody changed it.
+    def owned(
+        self, shard: tuple[int, int] = (0, 1), *, numbered: bool = False, take_over: bool = False
+    ) -> Iterator[Location]:
+        """Drive the batch, or one shard of it, alone. Yields the owner's record, which is removed at the end unless
+        somebody changed it.
 
         Args:
-            numbered: a scheduler numbered this task, and runs every number once: what an earlier one left is taken over.
+            numbered: a scheduler numbered this task, and runs every number once: what an earlier one left is taken
+                over.
             take_over: take over from any other driver.
 
         Raises:
@@ -255,11 +280,16 @@ class BatchFolder:
                     continue
                 if mine.exists() and mine.load() == content:
                     mine.remove()
-                raise UsageError("another driver works on this batch" if alive else "another machine may still drive this batch",
-                    where=str(self.own / other_name), got=str(other),
-                    remedy="wait for it, or stop it" if alive else "if it is gone, add --take-over")  # fmt: skip
+                raise UsageError(
+                    "another driver works on this batch" if alive else "another machine may still drive this batch",
+                    where=str(self.own / other_name),
+                    got=str(other),
+                    remedy="wait for it, or stop it" if alive else "if it is gone, add --take-over",
+                )
             if not mine.save(content, only_if_absent=True) and mine.load() != content:
-                raise UsageError("another driver works on this batch", where=str(mine), remedy="wait for it, or stop it")
+                raise UsageError(
+                    "another driver works on this batch", where=str(mine), remedy="wait for it, or stop it"
+                )
         try:
             yield mine
         finally:

@@ -12,10 +12,11 @@ class BatchConfig:
     """What runs for every scene of a list, and where."""
 
     stages: tuple[str, ...] = ("run",)
-    """Steps of every scene, in order: run (the whole chain), or some of ingest, annotate, fuse, fit, synthesize, render, score."""
+    """Steps of every scene, in order: run (the whole chain), or some of ingest, annotate, fuse, fit, synthesize,
+    render, score."""
     command: tuple[str, ...] = ()
-    """A program of your own as the last step, e.g. --command ./label.sh {ingest} {out}. {source}, {out}, {name} and the names of
-    other steps are replaced. With it, --stages may be left out."""
+    """A program of your own as the last step, e.g. --command ./label.sh {ingest} {out}. {source}, {out}, {name} and the
+    names of other steps are replaced. With it, --stages may be left out."""
     engine: Literal["local", "ray", "slurm"] = "local"
     """Where scenes run. local: on this machine. ray: as tasks of a Ray cluster. slurm: as tasks of an array job."""
     jobs: int = setting(default=0, ge=0)

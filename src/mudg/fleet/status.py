@@ -1,4 +1,5 @@
-"""How far a batch is, from its records: steps by state, failures by reason, time and costs, and facts about the logs."""
+"""How far a batch is, from its records: steps by state, failures by reason, time and costs, and facts about the
+logs."""
 
 from __future__ import annotations
 
@@ -95,7 +96,10 @@ class BatchStatus:
             group = (one.code, one.words.split(";")[0][:80])
             groups[group] += 1
             examples.setdefault(group, f"{one.scene} {one.stage}")
-        return [(f"{code} {reason_of(code)}: {words}", count, examples[code, words]) for (code, words), count in groups.most_common()]
+        return [
+            (f"{code} {reason_of(code)}: {words}", count, examples[code, words])
+            for (code, words), count in groups.most_common()
+        ]
 
     def costs(self) -> dict[str, dict[str, float]]:
         """Core-hours and money so far, and of the rest, by step and in total."""
@@ -103,8 +107,13 @@ class BatchStatus:
         for name, one in self.stages.items():
             hours = (one.processor_s + one.lost_s) / 3600
             rest = hours / one.done * self.left(name) if one.done else 0.0
-            rows[name] = {"core_hours": hours, "lost_hours": one.lost_s / 3600, "core_hours_left": rest,
-                "money": hours * self.price, "money_left": rest * self.price}  # fmt: skip
+            rows[name] = {
+                "core_hours": hours,
+                "lost_hours": one.lost_s / 3600,
+                "core_hours_left": rest,
+                "money": hours * self.price,
+                "money_left": rest * self.price,
+            }
         rows["total"] = {key: sum(row[key] for row in rows.values()) for key in next(iter(rows.values()))}
         return {name: {key: round(value, 4) for key, value in row.items()} for name, row in rows.items()}
 
@@ -114,29 +123,49 @@ class BatchStatus:
         for log in self.logs:
             objects.update(log.objects)
         return {
-            "scenes": len(self.logs), "images": sum(log.images for log in self.logs),
+            "scenes": len(self.logs),
+            "images": sum(log.images for log in self.logs),
             "hours": round(sum(log.seconds for log in self.logs) / 3600, 4),
             "kilometres": round(sum(log.metres for log in self.logs) / 1000, 4),
-            "cameras": {str(count): scenes for count, scenes in sorted(Counter(log.cameras for log in self.logs).items())},
-            "datasets": dict(Counter(log.dataset for log in self.logs).most_common()), "objects": dict(objects.most_common()),
-        }  # fmt: skip
+            "cameras": {
+                str(count): scenes for count, scenes in sorted(Counter(log.cameras for log in self.logs).items())
+            },
+            "datasets": dict(Counter(log.dataset for log in self.logs).most_common()),
+            "objects": dict(objects.most_common()),
+        }
 
     def record(self) -> dict[str, Any]:
         """As JSON values."""
         stages = {
             name: {
-                "done": one.done, "failed": one.failed, "left": self.left(name), "seconds": round(one.seconds, 1),
-                "processor_s": round(one.processor_s, 1), "lost_s": round(one.lost_s, 1), "written_bytes": one.written_bytes,
-                "peak_bytes": one.peak_bytes, "slowest": one.slowest[1],
+                "done": one.done,
+                "failed": one.failed,
+                "left": self.left(name),
+                "seconds": round(one.seconds, 1),
+                "processor_s": round(one.processor_s, 1),
+                "lost_s": round(one.lost_s, 1),
+                "written_bytes": one.written_bytes,
+                "peak_bytes": one.peak_bytes,
+                "slowest": one.slowest[1],
             }
             for name, one in self.stages.items()
-        }  # fmt: skip
+        }
         return {
-            "out": self.out, "scenes": self.scenes, "finished": self.finished, "left": self.steps_left(), "stages": stages,
-            "reasons": [{"reason": words, "steps": count, "example": example} for words, count, example in self.reasons()],
-            "steps_per_hour": round(self.rate() * 3600, 2), "forecast_s": self.forecast_s(), "costs": self.costs(), "price": self.price,
-            "corpus": self.corpus(), "drivers": self.drivers,
-        }  # fmt: skip
+            "out": self.out,
+            "scenes": self.scenes,
+            "finished": self.finished,
+            "left": self.steps_left(),
+            "stages": stages,
+            "reasons": [
+                {"reason": words, "steps": count, "example": example} for words, count, example in self.reasons()
+            ],
+            "steps_per_hour": round(self.rate() * 3600, 2),
+            "forecast_s": self.forecast_s(),
+            "costs": self.costs(),
+            "price": self.price,
+            "corpus": self.corpus(),
+            "drivers": self.drivers,
+        }
 
 
 def reason_of(code: int) -> str:
@@ -175,7 +204,18 @@ def duration_text(seconds: float | None) -> str:
     return f"{seconds:.0f} s"
 
 
-HEADS: Final = ("step", "done", "failed", "left", "seconds each", "most memory", "written", "core-hours", "lost", "still needed")
+HEADS: Final = (
+    "step",
+    "done",
+    "failed",
+    "left",
+    "seconds each",
+    "most memory",
+    "written",
+    "core-hours",
+    "lost",
+    "still needed",
+)
 
 
 def stage_rows(state: BatchStatus) -> list[tuple[str, ...]]:
@@ -183,11 +223,20 @@ def stage_rows(state: BatchStatus) -> list[tuple[str, ...]]:
     rows, costs, money = [], state.costs(), bool(state.price)
     for name, one in state.stages.items():
         cost = costs[name]
-        rows.append((
-            name, str(one.done), str(one.failed), str(state.left(name)), f"{one.seconds / one.done:.1f}" if one.done else "",
-            in_words(one.peak_bytes) if one.peak_bytes else "", in_words(one.written_bytes) if one.written_bytes else "",
-            f"{cost['core_hours']:.3f}", f"{cost['lost_hours']:.3f}", f"{cost['core_hours_left']:.3f}",
-        ))  # fmt: skip
+        rows.append(
+            (
+                name,
+                str(one.done),
+                str(one.failed),
+                str(state.left(name)),
+                f"{one.seconds / one.done:.1f}" if one.done else "",
+                in_words(one.peak_bytes) if one.peak_bytes else "",
+                in_words(one.written_bytes) if one.written_bytes else "",
+                f"{cost['core_hours']:.3f}",
+                f"{cost['lost_hours']:.3f}",
+                f"{cost['core_hours_left']:.3f}",
+            )
+        )
     if money:
         total = costs["total"]
         rows.append((f"cost at {state.price:g}", *[""] * 6, f"{total['money']:.2f}", "", f"{total['money_left']:.2f}"))
@@ -213,8 +262,10 @@ def text_of(state: BatchStatus) -> str:
 
 
 def _lead(state: BatchStatus) -> str:
-    return (f"{state.finished} of {state.scenes} scenes are finished, {state.steps_left()} steps are left; {state.rate() * 3600:.1f} steps "
-        f"an hour, forecast for the rest: {duration_text(state.forecast_s())}")  # fmt: skip
+    return (
+        f"{state.finished} of {state.scenes} scenes are finished, {state.steps_left()} steps are left;"
+        f" {state.rate() * 3600:.1f} steps an hour, forecast for the rest: {duration_text(state.forecast_s())}"
+    )
 
 
 def page_of(state: BatchStatus) -> str:
@@ -223,17 +274,28 @@ def page_of(state: BatchStatus) -> str:
 
     corpus = state.corpus()
     return html.render(
-        "batch.html.j2", title="Batch", kicker="mudg batch", heading=state.out, lead=f"{_lead(state)}.", drivers=state.drivers,
-        funnel=[(name, one.done, one.failed, state.scenes) for name, one in state.stages.items()], heads=HEADS, rows=stage_rows(state),
+        "batch.html.j2",
+        title="Batch",
+        kicker="mudg batch",
+        heading=state.out,
+        lead=f"{_lead(state)}.",
+        drivers=state.drivers,
+        funnel=[(name, one.done, one.failed, state.scenes) for name, one in state.stages.items()],
+        heads=HEADS,
+        rows=stage_rows(state),
         slowest=[(name, one.slowest[1], f"{one.slowest[0]:.1f} s") for name, one in state.stages.items() if one.done],
-        reasons=state.reasons(), failures=state.failures[:500], failed=len(state.failures),
+        reasons=state.reasons(),
+        failures=state.failures[:500],
+        failed=len(state.failures),
         figures=[
-            ("Logs", str(corpus["scenes"])), ("Hours driven", f"{corpus['hours']:.2f}"),
-            ("Kilometres driven", f"{corpus['kilometres']:.2f}"), ("Images", str(corpus["images"])),
+            ("Logs", str(corpus["scenes"])),
+            ("Hours driven", f"{corpus['hours']:.2f}"),
+            ("Kilometres driven", f"{corpus['kilometres']:.2f}"),
+            ("Images", str(corpus["images"])),
             ("Tracked objects", str(sum(corpus["objects"].values()))),
         ],
         cameras=[(name, str(count)) for name, count in corpus["cameras"].items()],
         datasets=[(name, str(count)) for name, count in list(corpus["datasets"].items())[:30]],
         objects=[(name, str(count)) for name, count in list(corpus["objects"].items())[:40]],
         at=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
-    )  # fmt: skip
+    )

@@ -1,10 +1,12 @@
-"""One scene: its steps one after another. Each is made in a folder of its own, published when it has ended well, and put on record.
+"""One scene: its steps one after another. Each is made in a folder of its own, published when it has ended well, and
+put on record.
 
     WORK/<key>.<token>/     inputs/<step>   source   weights   settings.yaml   result
 
-A result counts from its record on. Everything before may happen twice, or be cut off at any point: what another attempt left is gone on
-with. Commands run in this folder and name what is in it by relative names, so that a result does not depend on where it was made. Results
-are named by what they are made of, so whoever runs a scene again, here or on another machine, does only what is missing.
+A result counts from its record on. Everything before may happen twice, or be cut off at any point: what another attempt
+left is gone on with. Commands run in this folder and name what is in it by relative names, so that a result does not
+depend on where it was made. Results are named by what they are made of, so whoever runs a scene again, here or on
+another machine, does only what is missing.
 """
 
 from __future__ import annotations
@@ -38,10 +40,23 @@ from mudg.fleet.records import BatchFolder, CorpusFacts, Ended
 
 DONE, FAILED, STOPPED, LOST = "done", "failed", "stopped", "lost"
 REASONS: Final[Mapping[int, str]] = {
-    1: "a mistake in the program", 2: "usage", 3: "bad input", 4: "damaged result", 5: "memory or disk", 6: "numbers",
-    130: "interrupted", KILLED: "killed, most likely for want of memory", ASKED_TO_STOP: "asked to stop",
-}  # fmt: skip
-WAITS_S: Final[dict[int, tuple[float, ...]]] = {4: (0.0,), 5: (10.0, 60.0), 130: (2.0, 2.0), KILLED: (5.0,), ASKED_TO_STOP: (2.0, 2.0)}
+    1: "a mistake in the program",
+    2: "usage",
+    3: "bad input",
+    4: "damaged result",
+    5: "memory or disk",
+    6: "numbers",
+    130: "interrupted",
+    KILLED: "killed, most likely for want of memory",
+    ASKED_TO_STOP: "asked to stop",
+}
+WAITS_S: Final[dict[int, tuple[float, ...]]] = {
+    4: (0.0,),
+    5: (10.0, 60.0),
+    130: (2.0, 2.0),
+    KILLED: (5.0,),
+    ASKED_TO_STOP: (2.0, 2.0),
+}
 """Exit code -> pauses before further tries; another signal: one more try. Other codes would come again."""
 _RESULT: Final = "result"
 _SETTINGS: Final = "settings.yaml"
@@ -55,8 +70,8 @@ class Job:
     """What every task of a batch needs to know.
 
     Args:
-        threads: of each step. grace_s: seconds that a step has to stop. scratch: folder for unfinished results (None: in the output if
-            that is a folder, else the system's) and for inputs from a store. token: of the driver.
+        threads: of each step. grace_s: seconds that a step has to stop. scratch: folder for unfinished results (None:
+            in the output if that is a folder, else the system's) and for inputs from a store. token: of the driver.
     """
 
     folder: BatchFolder
@@ -86,7 +101,8 @@ class Job:
 
 
 def run_scene(job: Job, entry: Entry, stop: Stop) -> list[Ended]:
-    """Do the steps of a scene that are not on record yet, until one fails or work is to stop; returns how they ended."""
+    """Do the steps of a scene that are not on record yet, until one fails or work is to stop; returns how they
+    ended."""
     ended: list[Ended] = []
     with contextlib.ExitStack() as held:
         for unit in job.plan.units(entry):
@@ -146,7 +162,9 @@ class _Step:
                 self._remove()  # what was made is thrown away first
                 if "://" in self._unit.entry.source:
                     self._held.close()
-                    self._job.inputs.doubt(Location.of(self._unit.entry.source), self._unit.entry.settings.get(REVISION, ""))
+                    self._job.inputs.doubt(
+                        Location.of(self._unit.entry.source), self._unit.entry.settings.get(REVISION, "")
+                    )
             log.warn(f"{self._unit.title} is tried again: {ending.words}")
             self._stop.sleep(waits[tries[ending.code]])
             tries[ending.code] += 1
@@ -160,7 +178,10 @@ class _Step:
             if adopted is None and not self._unpublished:
                 self._prepare()
                 if alone:
-                    log.warn(f"{self._unit.title} was killed, most likely for want of memory: now alone on this machine, with one thread")
+                    log.warn(
+                        f"{self._unit.title} was killed, most likely for want of memory: now alone on this machine,"
+                        " with one thread"
+                    )
                 ending = self._run_command(alone)
                 if ending.code:
                     return ending, None
@@ -183,30 +204,39 @@ class _Step:
         threads = 1 if alone else self._job.threads
         words, folder = self._command(), None if self._direct is not None else self._path
         ending = run_step(words, folder, threads, self._stop, alone=alone)
-        if ending.code == UsageError.exit_code and self._is_unfinished() and "--overwrite" not in words:  # of another state of the source
+        # of another state of the source
+        if ending.code == UsageError.exit_code and self._is_unfinished() and "--overwrite" not in words:
             ending = run_step([*words, "--overwrite"], folder, threads, self._stop, alone=alone)
         if alone and ending.code == KILLED:
-            return replace(ending, words="its process was killed by signal 9, also alone on its machine with one thread: out of memory?")
+            return replace(
+                ending,
+                words="its process was killed by signal 9, also alone on its machine with one thread: out of memory?",
+            )
         if ending.code == 0 and not self._result.exists():
             return replace(ending, code=1, words="it ended well but wrote nothing")
         return ending
 
     def _is_unfinished(self) -> bool:
         try:
-            return not self._unit.stage.is_own and store.read_json(self._result / store.RUN_STATE)["state"] in ("running", "interrupted")
+            return not self._unit.stage.is_own and store.read_json(self._result / store.RUN_STATE)["state"] in (
+                "running",
+                "interrupted",
+            )
         except (InputError, KeyError, TypeError):
             return False
 
     def _command(self) -> list[str]:
         source, settings = self._unit.entry.source, _SETTINGS if self._unit.stage.settings else ""
         if self._direct is not None:
-            return command_of(self._unit, {"source": source}, str(self._result), str(self._path / settings) if settings else "")
+            return command_of(
+                self._unit, {"source": source}, str(self._result), str(self._path / settings) if settings else ""
+            )
         if "://" in source:
             source = f"source/{Location.of(source).name}"
         places = {"source": source, **{name: f"inputs/{name}" for name in self._unit.needs}}
         return command_of(self._unit, places, _RESULT, settings)
 
-    # where it is made --------------------------------------------------------------------------------------------------
+    # where it is made -----------------------------------------------------------------------------
 
     def _adopted(self) -> Path | None:
         """The published result, where its driver was cut off before it put it on record."""
@@ -288,7 +318,8 @@ class _Step:
         link.symlink_to(os.path.abspath(local))
 
     def _with_fetched(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Settings with names below the work folder for addresses: weights are fetched once for all scenes on this machine."""
+        """Settings with names below the work folder for addresses: weights are fetched once for all scenes on this
+        machine."""
         values: dict[str, Any] = {}
         for name, value in settings.items():
             if isinstance(value, Mapping):
@@ -308,7 +339,8 @@ class _Step:
             return
         if not self._in_output or place.local is None:
             place.push(self._result)
-            if any(self._unit.stage.name in stage.needs for stage in self._job.plan.stages):  # it stays for the next step
+            # it stays for the next step
+            if any(self._unit.stage.name in stage.needs for stage in self._job.plan.stages):
                 kept = self._job.work_root / f"{self._unit.key}.input"
                 self._held.callback(shutil.rmtree, kept, True)
                 with contextlib.suppress(OSError):
@@ -319,7 +351,9 @@ class _Step:
             self._result.rename(place.local)
         except OSError as error:
             if not place.local.exists():
-                raise ResourceError("the result cannot be moved to its place", where=str(place), got=str(error)) from error
+                raise ResourceError(
+                    "the result cannot be moved to its place", where=str(place), got=str(error)
+                ) from error
         store.fsync_directory(place.local.parent)
 
     def _leave(self) -> None:
@@ -338,19 +372,38 @@ class _Step:
             if not self._in_output and self._direct is None and partial.exists():
                 partial.remove()
 
-    # ends --------------------------------------------------------------------------------------------------------------
+    # ends -----------------------------------------------------------------------------------------
 
     def _ended(self, state: str, ending: Ending, **more: Any) -> Ended:
         unit = self._unit
-        return Ended(scene=unit.entry.name, stage=unit.stage.name, key=unit.key, source=unit.entry.source, place=unit.place, state=state,
-            host=socket.gethostname(), code=ending.code, words=ending.words[:2000], ended=round(time.time(), 3),
-            seconds=round(ending.seconds, 3), processor_s=round(ending.processor_s, 3), lost_s=round(self._lost_s, 3), **more)  # fmt: skip
+        return Ended(
+            scene=unit.entry.name,
+            stage=unit.stage.name,
+            key=unit.key,
+            source=unit.entry.source,
+            place=unit.place,
+            state=state,
+            host=socket.gethostname(),
+            code=ending.code,
+            words=ending.words[:2000],
+            ended=round(time.time(), 3),
+            seconds=round(ending.seconds, 3),
+            processor_s=round(ending.processor_s, 3),
+            lost_s=round(self._lost_s, 3),
+            **more,
+        )
 
     def _record(self, result: Path, ending: Ending) -> Ended:
         if self._direct is not None:
             return self._ended(DONE, ending)
-        return self._ended(DONE, ending, digest=digest_of(result), written_bytes=folder_bytes(result), peak_bytes=peak_of(result),
-            facts=facts_of(result))  # fmt: skip
+        return self._ended(
+            DONE,
+            ending,
+            digest=digest_of(result),
+            written_bytes=folder_bytes(result),
+            peak_bytes=peak_of(result),
+            facts=facts_of(result),
+        )
 
     def _fail(self, ending: Ending) -> Ended:
         record = self._ended(FAILED, replace(ending, processor_s=0.0))
@@ -362,11 +415,12 @@ class _Step:
         return record
 
 
-# facts about results ----------------------------------------------------------------------------------------------------
+# facts about results ------------------------------------------------------------------------------
 
 
 def digest_of(folder: Path) -> str:
-    """What the bytes of a result are told by: the hash of its manifest; of a chain, of the manifests of its steps; else of all files."""
+    """What the bytes of a result are told by: the hash of its manifest; of a chain, of the manifests of its steps; else
+    of all files."""
     if (folder / store.MANIFEST).is_file():
         return store.sha256_file(folder / store.MANIFEST)
     manifests = sorted(path.relative_to(folder).as_posix() for path in folder.rglob(store.MANIFEST))
@@ -387,11 +441,13 @@ def facts_of(folder: Path) -> CorpusFacts | None:
                 times = [float(time) for time in ego.get("times_s", [])]
                 path = [(float(pose[3]), float(pose[7]), float(pose[11])) for pose in ego.get("world_from_ego", [])]
                 return CorpusFacts(
-                    dataset=str(index.get("source", {}).get("dataset", "")), cameras=len(index.get("cameras", {})),
-                    images=len(index["frames"]), seconds=round(max(times) - min(times), 3) if times else 0.0,
+                    dataset=str(index.get("source", {}).get("dataset", "")),
+                    cameras=len(index.get("cameras", {})),
+                    images=len(index["frames"]),
+                    seconds=round(max(times) - min(times), 3) if times else 0.0,
                     metres=round(sum(math.dist(one, following) for one, following in itertools.pairwise(path)), 1),
                     objects=dict(Counter(str(one.get("label")) for one in tracks.get("tracks", []))),
-                )  # fmt: skip
+                )
     return None
 
 

@@ -38,8 +38,8 @@ def is_abandoned(out: Path) -> bool:
 
 
 def write_scene(config: IngestConfig, source: Path, kind: str, work: RunDir) -> dict[str, Any]:
-    """Make the scene in its folder and draw its contact sheet; returns a summary. An import that fails in a new or empty folder leaves
-    nothing.
+    """Make the scene in its folder and draw its contact sheet; returns a summary. An import that fails in a new or
+    empty folder leaves nothing.
 
     Raises:
         InputError: the log is malformed or contradictory.
@@ -65,8 +65,8 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> dict
                 log.warn(f"ingest: {line}")
     held_out = sum(split == "test" for split in scene.split.values())
     log.info(
-        f"ingest: {len(scene.frames)} images of {len(scene.cameras)} cameras, {len(scene.sweeps)} sweeps, {len(scene.tracks)} "
-        f"tracked boxes; {held_out} images held out"
+        f"ingest: {len(scene.frames)} images of {len(scene.cameras)} cameras, {len(scene.sweeps)} sweeps,"
+        f" {len(scene.tracks)} tracked boxes; {held_out} images held out"
     )
     summary = {
         "frames": len(scene.frames),
@@ -100,8 +100,9 @@ def kind_of(config: IngestConfig, source: Path) -> str:
     if str(source) == CITY:
         return CITY
     if config.format not in ("auto", *IMPORTERS):
-        raise UsageError("there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)),
-            got=config.format)  # fmt: skip
+        raise UsageError(
+            "there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)), got=config.format
+        )
     if config.format != "auto":
         return config.format
     if is_scene(source):
@@ -112,9 +113,13 @@ def kind_of(config: IngestConfig, source: Path) -> str:
     inside = "a file"
     if source.is_dir():
         inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
-    raise InputError("the log's format was not recognised", where=str(source),
-        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}", got=inside,
-        remedy="give the folder of one drive or sequence, or name the format with --format")  # fmt: skip
+    raise InputError(
+        "the log's format was not recognised",
+        where=str(source),
+        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}",
+        got=inside,
+        remedy="give the folder of one drive or sequence, or name the format with --format",
+    )
 
 
 def _make(kind: str, config: IngestConfig, source: Path, out: Path) -> Scene:
@@ -149,8 +154,8 @@ def import_options(config: IngestConfig) -> ImportOptions:
 
 
 def source_digest(source: Path, kind: str, config: IngestConfig) -> str:
-    """What identifies a log without reading all of it: names, sizes and modification times of the files that belong to the chosen
-    one; a scene's own digest.
+    """What identifies a log without reading all of it: names, sizes and modification times of the files that belong to
+    the chosen one; a scene's own digest.
 
     Args:
         kind: format, or ``scene``.

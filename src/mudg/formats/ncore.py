@@ -1,9 +1,10 @@
-"""What writing and reading NCore files (version 4 of NVIDIA's format of recordings) share: the package, names, rotations of boxes, poses
-between keys.
+"""What writing and reading NCore files (version 4 of NVIDIA's format of recordings) share: the package, names,
+rotations of boxes, poses between keys.
 
-Conventions, as the package's own functions apply them: world right-handed with z up; rig x forward, y left, z up; cameras x right, y down,
-z forward, the centre of the top-left pixel at (0.5, 0.5); times in whole microseconds; between keys poses move in straight lines and rotate
-evenly. A LiDAR's rays are directions in the sensor's frame at their own time. A box is turned about x, then y, then z of the fixed frame.
+Conventions, as the package's own functions apply them: world right-handed with z up; rig x forward, y left, z up;
+cameras x right, y down, z forward, the centre of the top-left pixel at (0.5, 0.5); times in whole microseconds; between
+keys poses move in straight lines and rotate evenly. A LiDAR's rays are directions in the sensor's frame at their own
+time. A box is turned about x, then y, then z of the fixed frame.
 """
 
 from __future__ import annotations
@@ -60,8 +61,11 @@ def package() -> NCorePackage:
         sensors = importlib.import_module("ncore.sensors")
         return NCorePackage(data, files, sensors, importlib.import_module("ncore.impl.common.transformations"))
     except ImportError as error:
-        raise ResourceError("NCore files need the package nvidia-ncore, which is not installed",
-            got=str(error), remedy="pip install 'mudg[ncore]'") from error  # fmt: skip
+        raise ResourceError(
+            "NCore files need the package nvidia-ncore, which is not installed",
+            got=str(error),
+            remedy="pip install 'mudg[ncore]'",
+        ) from error
 
 
 def close(reader: Any) -> None:
@@ -106,8 +110,8 @@ class PoseKeys:
         return poses
 
     def covering(self, start_us: int, end_us: int) -> PoseKeys:
-        """With keys at both ends of a span of time, where it reaches beyond: the frame goes on as it did between its two nearest keys, for
-        no longer than these lie apart, and then stands."""
+        """With keys at both ends of a span of time, where it reaches beyond: the frame goes on as it did between its
+        two nearest keys, for no longer than these lie apart, and then stands."""
         times, poses = [*self.times_us.tolist()], [*self.poses]
         if start_us < times[0]:
             poses.insert(

@@ -15,25 +15,37 @@ class IngestConfig:
 
     FIXED: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "city": (
-            "rate_hz", "hfov_deg", "rig_variation", "lidar_lower_deg", "lidar_upper_deg", "lidar_range_m", "lidar_noise_m", "lidar_dropout",
-            "style", "crossing", "shift_margin_m", "sensor_noise",
+            "rate_hz",
+            "hfov_deg",
+            "rig_variation",
+            "lidar_lower_deg",
+            "lidar_upper_deg",
+            "lidar_range_m",
+            "lidar_noise_m",
+            "lidar_dropout",
+            "style",
+            "crossing",
+            "shift_margin_m",
+            "sensor_noise",
         )
-    }  # fmt: skip
+    }
 
     resolution: str = ""
-    """Image size of the scene: the longest side in pixels, e.g. 960, or WIDTHxHEIGHT (empty = as recorded). Images are never
-    enlarged."""
+    """Image size of the scene: the longest side in pixels, e.g. 960, or WIDTHxHEIGHT (empty = as recorded). Images are
+    never enlarged."""
     workers: int = setting(default=0, ge=0)
     """Threads that convert frames (0 = one per processor). The result does not depend on it."""
     contact_sheet: bool = True
-    """Write contact_sheet.jpg: frames with LiDAR points and boxes, and the scene from above. Check it after every import."""
+    """Write contact_sheet.jpg: frames with LiDAR points and boxes, and the scene from above. Check it after every
+    import."""
     test_every: int = setting(default=4, ge=0)
     """Hold out every n-th frame of all cameras for scoring (0 = none)."""
     format: str = "auto"
-    """Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, dgp, ncore or custom (auto = recognise it)."""
+    """Format of the log: kitti, kitti360, waymo, nuscenes, argoverse2, pandaset, nuplan, dgp, ncore or custom (auto =
+    recognise it)."""
     frames: str = ""
-    """Frames to import, FIRST:END without END itself, e.g. 0:40 (empty = all). kitti, kitti360, pandaset: the numbers of
-    their files; other formats: counted from 0."""
+    """Frames to import, FIRST:END without END itself, e.g. 0:40 (empty = all). kitti, kitti360, pandaset: the numbers
+    of their files; other formats: counted from 0."""
     cameras: tuple[str, ...] = ()
     """Cameras to import, by their names in the scene or in the dataset (empty = the format's default cameras)."""
     sequence: str = ""

@@ -1,7 +1,9 @@
-"""Fields in files of other programs that this program neither reads nor knows: each kind of file is named once per import.
+"""Fields in files of other programs that this program neither reads nor knows: each kind of file is named once per
+import.
 
-A reader calls ``note_unknown`` with the names that a record or table has and those that its format is known to have, whether they are read
-or not: these stand in literal tables beside the readers. What a format leaves to its users (``extras``, ``metadata``) counts as known.
+A reader calls ``note_unknown`` with the names that a record or table has and those that its format is known to have,
+whether they are read or not: these stand in literal tables beside the readers. What a format leaves to its users
+(``extras``, ``metadata``) counts as known.
 """
 
 from __future__ import annotations
@@ -38,7 +40,8 @@ def named_once() -> Iterator[None]:
 
 def note_unknown(kind: str, names: Collection[str], known: frozenset[str]) -> None:
     """Collect those of ``names`` that are not ``known``; ``kind``: of file, as the message calls it."""
-    if _unknown is not None and not known.issuperset(names):  # half a microsecond: readers of millions of records call this
+    # half a microsecond: readers of millions of records call this
+    if _unknown is not None and not known.issuperset(names):
         _collect(kind, (name for name in names if name not in known))
 
 
@@ -66,7 +69,9 @@ def _collect(kind: str, names: Iterable[str]) -> None:
 def listed(names: Iterable[str]) -> str:
     """Names of a foreign file for a message: the first eight, 60 letters each, control characters escaped."""
     every = [f"'{short(name, _MOST_LETTERS)}'" for name in names]
-    return ", ".join(every[:_MOST_NAMES]) + (f" and {len(every) - _MOST_NAMES} more" if len(every) > _MOST_NAMES else "")
+    return ", ".join(every[:_MOST_NAMES]) + (
+        f" and {len(every) - _MOST_NAMES} more" if len(every) > _MOST_NAMES else ""
+    )
 
 
 def sentence(names: Iterable[str], kind: str) -> str:

@@ -1,14 +1,16 @@
-"""Corrections of single images: exposure and colour, and small errors of camera poses, which vary although the scene does not.
+"""Corrections of single images: exposure and colour, and small errors of camera poses, which vary although the scene
+does not.
 
 Three corrections, each optional, each the identity at the start, none of them used when a fitted scene is rendered:
 
-    exposure   3x4 affine colour map per camera or per recorded image. The mean over all of them is held at the identity, so
-               that the scene keeps the average colour of the log instead of drifting against the maps.
+    exposure   3x4 affine colour map per camera or per recorded image. The mean over all of them is held at the
+               identity, so that the scene keeps the average colour of the log instead of drifting against the maps.
     cameras    6 numbers per recorded image: shift [m] and turn [rad] of the camera in its own frame.
-    virtual    3x4 affine colour map per set of virtual views. What a generator paints too dark or too blue everywhere ends up
-               here instead of in the Gaussians that recorded views share.
+    virtual    3x4 affine colour map per set of virtual views. What a generator paints too dark or too blue everywhere
+               ends up here instead of in the Gaussians that recorded views share.
 
-The affine map is that of Street Gaussians (Yan et al. 2024): ``A rgb + b``, an L1 penalty on the distance from the identity.
+The affine map is that of Street Gaussians (Yan et al. 2024): ``A rgb + b``, an L1 penalty on the distance from the
+identity.
 """
 
 from __future__ import annotations
@@ -35,8 +37,8 @@ class Appearance:
 
     Args:
         names: per group, what has a correction of its own: cameras or images, sets of virtual views, images.
-        tables: per group, one row per name: ``affine`` [n, 3, 4] (difference from the identity), or ``shift`` [n, 3] metres
-            and ``turn`` [n, 3] radians; None = identity.
+        tables: per group, one row per name: ``affine`` [n, 3, 4] (difference from the identity), or ``shift`` [n, 3]
+            metres and ``turn`` [n, 3] radians; None = identity.
 
     Raises:
         InputError: a table does not fit its names.
@@ -50,21 +52,29 @@ class Appearance:
         self.tables = dict(tables)
         for group, members in self.names.items():
             if group not in self.tables or len(self.tables[group]) != len(members):
-                raise InputError("corrections of appearance do not fit their names", where=group, expected=f"{len(members)} rows")
+                raise InputError(
+                    "corrections of appearance do not fit their names", where=group, expected=f"{len(members)} rows"
+                )
 
     @classmethod
     def of_views(
-        cls, recorded: Sequence[str], virtual: Sequence[str], exposure: Exposure = "none", cameras: bool = False,
+        cls,
+        recorded: Sequence[str],
+        virtual: Sequence[str],
+        exposure: Exposure = "none",
+        cameras: bool = False,
         virtual_color: bool = False,
-    ) -> Appearance:  # fmt: skip
+    ) -> Appearance:
         """Corrections for views named ``camera/number`` (recorded) and ``set/number`` (virtual), all the identity."""
         images = tuple(dict.fromkeys(recorded))
         colored = {"none": (), "camera": tuple(dict.fromkeys(map(owner, recorded))), "image": images}[exposure]
-        return cls({
-            RECORDED_COLOR: colored,
-            CAMERA_POSE: images if cameras else (),
-            VIRTUAL_COLOR: tuple(dict.fromkeys(map(owner, virtual))) if virtual_color else (),
-        })  # fmt: skip
+        return cls(
+            {
+                RECORDED_COLOR: colored,
+                CAMERA_POSE: images if cameras else (),
+                VIRTUAL_COLOR: tuple(dict.fromkeys(map(owner, virtual))) if virtual_color else (),
+            }
+        )
 
     def __bool__(self) -> bool:
         return bool(self.tables)
@@ -73,10 +83,11 @@ class Appearance:
         """The same corrections, with their moments, on a device."""
         return Appearance(self.names, {group: table.to(device) for group, table in self.tables.items()})
 
-    # -- use ----------------------------------------------------------------------------------------------------------
+    # -- use ---------------------------------------------------------------------------------------
 
     def colored(self, rgb: Tensor, name: str, kind: str) -> Tensor:
-        """A rendered picture ``[3, H, W]`` as the camera (or generator) of view ``name`` would show it, differentiable."""
+        """A rendered picture ``[3, H, W]`` as the camera (or generator) of view ``name`` would show it,
+        differentiable."""
         found = self._affine(name, kind)
         if found is None:
             return rgb
@@ -109,7 +120,7 @@ class Appearance:
         affine = self.tables[group]["affine"]
         return affine[row] - affine.mean(0) if group == RECORDED_COLOR else affine[row]
 
-    # -- learning -----------------------------------------------------------------------------------------------------
+    # -- learning ----------------------------------------------------------------------------------
 
     def adam_step(self, step: int, rates: Mapping[str, float], kernel: AdamKernel) -> None:
         """One Adam step on the rows that have a gradient (the others rest), then gradients are dropped."""
@@ -119,7 +130,7 @@ class Appearance:
                 table.adam_step(step, rates, kernel, torch.stack(gradients).sum(0) > 0)
             table.clear_gradients()
 
-    # -- state --------------------------------------------------------------------------------------------------------
+    # -- state -------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """JSON values and tensors that rebuild it with its moments."""
@@ -144,8 +155,8 @@ def owner(name: str) -> str:
 
 
 def rigid_motion(shift_m: Tensor, turn_rad: Tensor) -> Tensor:
-    """Rigid ``[4, 4]`` with translation ``shift_m`` [3] and the rotation about ``turn_rad`` [3] by its length; differentiable, also
-    at zero."""
+    """Rigid ``[4, 4]`` with translation ``shift_m`` [3] and the rotation about ``turn_rad`` [3] by its length;
+    differentiable, also at zero."""
     x, y, z = turn_rad.unbind()
     zero = torch.zeros_like(x)
     skew = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)

@@ -1,13 +1,14 @@
 """Densification by screen gradient: add Gaussians where the image lacks detail, remove those without effect.
 
-The published schedule (Kerbl 2023, with the thresholds of Street Gaussians): every ``every`` steps rows whose mean screen
-gradient exceeds a threshold are cloned (small) or split in two (large); rows that are transparent, grown out of proportion,
-or have left their box are removed; now and then opacities are pulled down so that what is not needed fades. The background
-is judged by absolute gradients (AbsGS: contributions of single pixels do not cancel), objects by plain ones. Growth is
-bounded by ``max_rows``: the rows with the largest gradients go first.
+The published schedule (Kerbl 2023, with the thresholds of Street Gaussians): every ``every`` steps rows whose mean
+screen gradient exceeds a threshold are cloned (small) or split in two (large); rows that are transparent, grown out of
+proportion, or have left their box are removed; now and then opacities are pulled down so that what is not needed fades.
+The background is judged by absolute gradients (AbsGS: contributions of single pixels do not cancel), objects by plain
+ones. Growth is bounded by ``max_rows``: the rows with the largest gradients go first.
 
-State is explicit: statistics belong to rows of the table, the schedule is a function of the step. The caller chooses the views that
-count (``gaussians/fit.py``: recorded views only, see ``Observation.kind``). ``gaussians/densify.py`` is the alternative.
+State is explicit: statistics belong to rows of the table, the schedule is a function of the step. The caller chooses
+the views that count (``gaussians/fit.py``: recorded views only, see ``Observation.kind``). ``gaussians/densify.py`` is
+the alternative.
 """
 
 from __future__ import annotations
@@ -77,8 +78,8 @@ class DensifySettings:
 
 @dataclass
 class DensifyStats:
-    """What was seen of each row since the last densification: ``gradient`` f32[N] (sum), ``seen`` f32[N] (views); ``time`` f32[N], the
-    sum of the gradient of ``tau``, where Gaussians have one."""
+    """What was seen of each row since the last densification: ``gradient`` f32[N] (sum), ``seen`` f32[N] (views);
+    ``time`` f32[N], the sum of the gradient of ``tau``, where Gaussians have one."""
 
     gradient: Tensor
     seen: Tensor
@@ -91,17 +92,24 @@ class DensifyStats:
 
     def to(self, device: torch.device) -> DensifyStats:
         """The same statistics on a device."""
-        return DensifyStats(self.gradient.to(device), self.seen.to(device), None if self.time is None else self.time.to(device))
+        return DensifyStats(
+            self.gradient.to(device), self.seen.to(device), None if self.time is None else self.time.to(device)
+        )
 
     def observe(
-        self, trace: RasterTrace, width: int, height: int, plain_from: int | None = None, time_gradient: Tensor | None = None
+        self,
+        trace: RasterTrace,
+        width: int,
+        height: int,
+        plain_from: int | None = None,
+        time_gradient: Tensor | None = None,
     ) -> None:
         """Add one backward pass (gradients in pixels; stored in units of half the image).
 
         Args:
             trace: of a render with absolute gradients, after backward.
-            plain_from: rows from here on (those of the objects) count with their plain gradient, where the contributions
-                of single pixels cancel; None = all rows with the absolute one.
+            plain_from: rows from here on (those of the objects) count with their plain gradient, where the
+                contributions of single pixels cancel; None = all rows with the absolute one.
             time_gradient: f32[N], that of ``tau``, or None.
         """
         if trace.abs_grad2d is None:
@@ -125,7 +133,9 @@ class DensifyStats:
     @classmethod
     def from_state(cls, tensors: Mapping[str, Tensor]) -> DensifyStats:
         """Inverse of ``state``."""
-        return cls(tensors["gradient"].clone(), tensors["seen"].clone(), tensors["time"].clone() if "time" in tensors else None)
+        return cls(
+            tensors["gradient"].clone(), tensors["seen"].clone(), tensors["time"].clone() if "time" in tensors else None
+        )
 
 
 @functools.lru_cache(maxsize=64)
@@ -134,7 +144,9 @@ def _half_size(width: int, height: int, device: torch.device) -> Tensor:
     return torch.tensor([width / 2, height / 2]).to(device)
 
 
-def densify(model: SceneModel, stats: DensifyStats, step: int, settings: DensifySettings, run_seed: int) -> dict[str, Any]:
+def densify(
+    model: SceneModel, stats: DensifyStats, step: int, settings: DensifySettings, run_seed: int
+) -> dict[str, Any]:
     """Clone, split and prune rows of the model's table in place; the caller starts new statistics.
 
     Args:
@@ -153,7 +165,10 @@ def densify(model: SceneModel, stats: DensifyStats, step: int, settings: Densify
     clone_rows = (grow & ~large).nonzero()[:, 0]
     keep = torch.ones(len(model.table), dtype=torch.bool, device=model.device)
     keep[split_rows] = False
-    for columns, labels in (copied_rows(model.table, clone_rows), *_halves(model, split_rows, step, run_seed, settings)):
+    for columns, labels in (
+        copied_rows(model.table, clone_rows),
+        *_halves(model, split_rows, step, run_seed, settings),
+    ):
         model.table.append(columns, labels)
     keep = torch.cat([keep, keep.new_ones(len(model.table) - len(keep))])
     doomed = useless_rows(model, settings.prune_opacity, settings.prune_scale_m, settings.box_margin)
@@ -173,8 +188,8 @@ def reset_opacity(model: SceneModel, settings: DensifySettings) -> None:
 def shorten_needles(table: Table, longest_to_middle: float) -> None:
     """Cut every Gaussian's longest axis down to ``longest_to_middle`` times its middle one, in place.
 
-    Cameras that all move along one line cannot tell a long thin Gaussian along that line from the right one; from the side
-    it sticks out. Discs (two long axes) stay.
+    Cameras that all move along one line cannot tell a long thin Gaussian along that line from the right one; from the
+    side it sticks out. Discs (two long axes) stay.
     """
     scales = table.columns["log_scales"].detach()
     middle = scales.median(1, keepdim=True).values
@@ -184,7 +199,9 @@ def shorten_needles(table: Table, longest_to_middle: float) -> None:
 def _rows_to_grow(model: SceneModel, stats: DensifyStats, settings: DensifySettings) -> Tensor:
     """Bool[N]: rows over their threshold, the strongest first where the budget is short."""
     mean = stats.gradient / stats.seen.clamp_min(1)
-    static = torch.tensor([not isinstance(node, RigidNode) for node in model.nodes]).to(model.device)[model.table.labels["node"].long()]
+    static = torch.tensor([not isinstance(node, RigidNode) for node in model.nodes]).to(model.device)[
+        model.table.labels["node"].long()
+    ]
     relative = mean / torch.where(static, settings.static_gradient, settings.object_gradient)
     if stats.time is not None:
         relative = torch.maximum(relative, stats.time / stats.seen.clamp_min(1) / settings.time_gradient)
@@ -208,14 +225,15 @@ def copied_rows(table: Table, rows: Tensor) -> tuple[dict[str, Tensor], dict[str
 def _halves(
     model: SceneModel, rows: Tensor, step: int, run_seed: int, settings: DensifySettings
 ) -> list[tuple[dict[str, Tensor], dict[str, Tensor]]]:
-    """Two smaller Gaussians drawn from each split one (centres sampled from its own density, times of those that have a life span
-    too; of these three, late)."""
+    """Two smaller Gaussians drawn from each split one (centres sampled from its own density, times of those that have a
+    life span too; of these three, late)."""
     halves, timed, world = [], "tau" in model.table.columns, model.nodes[0]
     late = timed and 0 < settings.late <= step
     for half in range(3 if late else 2):
         columns, labels = copied_rows(model.table, rows)
         generator = seeds.torch_generator(run_seed, step, f"split half {half}")
-        noise = torch.randn(len(rows), 3, generator=generator).to(rows.device)  # drawn on the CPU: the same on every device
+        # drawn on the CPU: the same on every device
+        noise = torch.randn(len(rows), 3, generator=generator).to(rows.device)
         local = torch.exp(columns["log_scales"]) * noise
         columns["means"] = columns["means"] + rotate(columns["quats"], local)
         columns["log_scales"] = columns["log_scales"] - torch.log(torch.tensor(SPLIT_SHRINK))
@@ -227,7 +245,8 @@ def _halves(
 
 
 def useless_rows(model: SceneModel, prune_opacity: float, prune_scale_m: float, box_margin: float) -> Tensor:
-    """Bool[N]: transparent, oversized, not finite, or outside ``box_margin`` times the box it belongs to (plus 0.1 m)."""
+    """Bool[N]: transparent, oversized, not finite, or outside ``box_margin`` times the box it belongs to (plus 0.1
+    m)."""
     table = model.table
     means = table["means"].detach()
     doomed = torch.sigmoid(table["logits"].detach()) < prune_opacity
@@ -240,23 +259,25 @@ def useless_rows(model: SceneModel, prune_opacity: float, prune_scale_m: float, 
     return doomed | (means.abs() > half_size.to(model.device)[table.labels["node"].long()]).any(1)
 
 
-# mcmc -----------------------------------------------------------------------------------------------------------------
+# mcmc ---------------------------------------------------------------------------------------------
 #
 # Densification as sampling: Gaussians without effect move to where others are, and their number stays below a cap.
 #
 # 3D Gaussian Splatting as Markov Chain Monte Carlo (Kheradmand et al. 2024). Every ``every`` steps
 #
-# * *relocation*: dead rows (transparent, oversized, outside their box) become copies of live rows of the **same node**, drawn in
-#   proportion to opacity;
+# * *relocation*: dead rows (transparent, oversized, outside their box) become copies of live rows of the **same node**,
+#   drawn in proportion to opacity;
 # * *growth*: a few per cent more copies, until the cap is reached.
 #
-# Where a Gaussian becomes N, opacity and scale of all N are corrected so that the stack looks as the one did (``stack_of``).
-# At every step the centres of nearly transparent Gaussians take a random step along their own axes (``drift``): dead ones look
-# for a better place. Two regularisers of the fit (``opacity_weight``, ``scale_weight``) let the unneeded fade.
+# Where a Gaussian becomes N, opacity and scale of all N are corrected so that the stack looks as the one did
+# (``stack_of``). At every step the centres of nearly transparent Gaussians take a random step along their own axes
+# (``drift``): dead ones look for a better place. Two regularisers of the fit (``opacity_weight``, ``scale_weight``) let
+# the unneeded fade.
 #
-# Three choices differ from the published form. Copies are drawn systematically (one random number per round, rows in the
-# order of their place), not independently: the same expectation, less scatter, and independent of the order of the rows. A stack
-# never gets so many members that they would be dead at once. The random step is bounded by the Gaussian's own size.
+# Three choices differ from the published form. Copies are drawn systematically (one random number per round, rows in
+# the order of their place), not independently: the same expectation, less scatter, and independent of the order of the
+# rows. A stack never gets so many members that they would be dead at once. The random step is bounded by the Gaussian's
+# own size.
 
 
 LARGEST_STACK = 51
@@ -274,10 +295,11 @@ class McmcSettings:
         max_rows: growth stops here; the table never has more rows.
         growth: share of the present rows that is added at a time.
         dead_opacity: rows below are relocated.
-        prune_scale_m: rows larger are relocated. box_margin: object rows outside this many half-sizes of their box, too.
-        step_per_m2: size of the random step: a Gaussian of scale s moves by ``rate * step_per_m2 * s^2`` along that axis,
-            where ``rate`` is the learning rate of the centres in metres; never by more than s. The published 5e5 belongs to
-            scenes scaled to unit size; the learning rates here belong to scenes of 10 m.
+        prune_scale_m: rows larger are relocated. box_margin: object rows outside this many half-sizes of their box,
+            too.
+        step_per_m2: size of the random step: a Gaussian of scale s moves by ``rate * step_per_m2 * s^2`` along that
+            axis, where ``rate`` is the learning rate of the centres in metres; never by more than s. The published 5e5
+            belongs to scenes scaled to unit size; the learning rates here belong to scenes of 10 m.
         gate_sharpness, gate_opacity: the step fades with ``sigmoid(sharpness * (gate_opacity - opacity))``.
     """
 
@@ -302,8 +324,9 @@ def stack_of(opacity: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
     """Opacity and scale factor of each of N equal Gaussians that together look like one.
 
     Behind each other, N Gaussians of opacity ``o'`` let ``(1 - o' g)^N`` through, ``g`` their fall-off. ``o'`` makes
-    that ``1 - o`` at the centre. The scale factor keeps the integral of the covered share along a line through the centre:
-    ``o / sum_k binomial(N, k) (-1)^(k - 1) o'^k / sqrt(k)`` (Kheradmand et al. 2024, eq. 9, with the inner sum carried out).
+    that ``1 - o`` at the centre. The scale factor keeps the integral of the covered share along a line through the
+    centre: ``o / sum_k binomial(N, k) (-1)^(k - 1) o'^k / sqrt(k)`` (Kheradmand et al. 2024, eq. 9, with the inner sum
+    carried out).
 
     Args:
         opacity: f64[M] of the one Gaussian, in (0, 1).
@@ -352,8 +375,8 @@ def order_of_place(means: Tensor) -> Tensor:
 def relocate_and_grow(model: SceneModel, step: int, settings: McmcSettings, run_seed: int) -> dict[str, Any]:
     """One round: relocate dead rows within their nodes and grow, on the model's table in place.
 
-    Parameters, moments and labels move together; the moments of every Gaussian that became several start at zero. A node whose
-    rows are all dead keeps them.
+    Parameters, moments and labels move together; the moments of every Gaussian that became several start at zero. A
+    node whose rows are all dead keeps them.
 
     Args:
         step: finished steps; with ``run_seed`` it decides all random draws.
@@ -388,7 +411,8 @@ def relocate_and_grow(model: SceneModel, step: int, settings: McmcSettings, run_
 def _draw_copies(
     model: SceneModel, weights: Tensor, dead: Tensor, step: int, settings: McmcSettings, run_seed: int
 ) -> Tensor:
-    """I64[N]: how many copies of each row are wanted, as many as there are dead rows in its node plus its share of growth."""
+    """I64[N]: how many copies of each row are wanted, as many as there are dead rows in its node plus its share of
+    growth."""
     table = model.table
     owner = table.labels["node"].long()
     order = order_of_place(table["means"].detach())
@@ -429,7 +453,9 @@ def drift(model: SceneModel, step: int, rate: float, settings: McmcSettings, run
     if len(rows) == 0:
         return
     # Drawn on the CPU: the same on every device. It is as long as the list of rows that are nearly transparent by now.
-    noise = torch.randn(len(rows), 3, generator=seeds.torch_generator(run_seed, step, "drift")).to(rows.device, non_blocking=True)
+    noise = torch.randn(len(rows), 3, generator=seeds.torch_generator(run_seed, step, "drift")).to(
+        rows.device, non_blocking=True
+    )
     means = table.columns["means"].detach()
     scales = table.columns["log_scales"].detach()[rows].exp()
     means[rows] += random_step(scales, table.columns["quats"].detach()[rows], opacity[rows], noise, rate, settings)
@@ -438,7 +464,8 @@ def drift(model: SceneModel, step: int, rate: float, settings: McmcSettings, run
 def random_step(
     scales_m: Tensor, quats: Tensor, opacity: Tensor, noise: Tensor, rate: float, settings: McmcSettings
 ) -> Tensor:
-    """Displacements ``[n, 3]`` m: noise shaped by the covariance, faded by the opacity (published eq. 8), bounded by the size.
+    """Displacements ``[n, 3]`` m: noise shaped by the covariance, faded by the opacity (published eq. 8), bounded by
+    the size.
 
     Args:
         scales_m: ``[n, 3]``. quats: ``[n, 4]`` (w, x, y, z), any length. opacity: ``[n]`` in (0, 1).

@@ -1,13 +1,15 @@
 """fit: recorded frames (and virtual observations) in, a dynamic Gaussian scene out.
 
-The loop is ``optimise`` and reads top to bottom. What it calls: ``gaussians/views.py`` (what a view is), ``gaussians/start.py`` (where the
-Gaussians start), ``models.scene.model.compose`` (the scene at a time), ``core.raster`` (the renderer), ``core.losses`` (every
-loss), ``models.scene.densify``. Nothing else touches the parameters.
+The loop is ``optimise`` and reads top to bottom. What it calls: ``gaussians/views.py`` (what a view is),
+``gaussians/start.py`` (where the Gaussians start), ``models.scene.model.compose`` (the scene at a time),
+``core.raster`` (the renderer), ``core.losses`` (every loss), ``models.scene.densify``. Nothing else touches the
+parameters.
 
     OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``) and its certainty
     OUT/appearance.json, appearance.safetensors                 corrections of cameras and colours, where learnt
     OUT/log.jsonl, preview/*.png                                how it went
-    OUT/field.safetensors                                       instead of the Gaussians, for method emernerf (``baselines/emernerf``)
+    OUT/field.safetensors                                       instead of the Gaussians, for method emernerf
+                                                                (``baselines/emernerf``)
     OUT/steps/                                                  checkpoints, while it runs
 
 With ``start`` it goes on with a finished fit (``gaussians/storage.py``).
@@ -95,16 +97,26 @@ from mudg.scene.observations import ObservationSet
 from mudg.scene.read import read_scene
 
 OUTPUT = VerbOutput(
-    "fit", 3,
-    ("model.json", "gaussians.safetensors", "nodes.safetensors", "appearance.json", "appearance.safetensors", "field.safetensors",
-     "preview/*.png", "steps/"),
-)  # fmt: skip
+    "fit",
+    3,
+    (
+        "model.json",
+        "gaussians.safetensors",
+        "nodes.safetensors",
+        "appearance.json",
+        "appearance.safetensors",
+        "field.safetensors",
+        "preview/*.png",
+        "steps/",
+    ),
+)
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
 EXPOSURE_WEIGHT = 0.01
 """Weight that pulls the colour maps of recorded and virtual views towards the identity."""
 LEAST_WITNESSES, WITNESS_SHARE = 8, 0.015
-"""Recorded views that the certainty is computed from, at most: this many, or this share of the steps (one costs about a step)."""
+"""Recorded views that the certainty is computed from, at most: this many, or this share of the steps (one costs about a
+step)."""
 MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
 """Published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes of 10 m."""
 
@@ -137,7 +149,8 @@ def check_device(config: FitConfig) -> torch.device:
 
 @dataclass(frozen=True)
 class FitInputs:
-    """What a fit reads: scene and fused cloud (folders), sets of virtual views by name, and the finished fit that it goes on with."""
+    """What a fit reads: scene and fused cloud (folders), sets of virtual views by name, and the finished fit that it
+    goes on with."""
 
     scene: Path
     fused: Path
@@ -146,7 +159,8 @@ class FitInputs:
 
 
 def write_fit(config: FitConfig, given: FitInputs, work: RunDir) -> dict[str, Any]:
-    """Fit a scene and write the model to the work folder; returns a summary. An interrupted fit goes on from its newest checkpoint.
+    """Fit a scene and write the model to the work folder; returns a summary. An interrupted fit goes on from its newest
+    checkpoint.
 
     Raises:
         NumericsError: a loss or gradient is not finite. InputError: damaged inputs.
@@ -211,22 +225,40 @@ def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
         views = replace(views, virtual=keep(load_virtual(given.virtual, classes, measured), invented, scratch))
     found = checkpoint.latest(out / "steps")
     if found is None:
-        return start_state(config, scene, fused, views, classes) if start is None else continued_state(config, start, views, classes)
+        return (
+            start_state(config, scene, fused, views, classes)
+            if start is None
+            else continued_state(config, start, views, classes)
+        )
     log.info(f"resuming at step {found.step} of {config.iterations}")
     model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
-    stats, appearance = found.tensors("stats"), Appearance.from_state(found.state["appearance"], found.tensors("appearance"))
+    stats, appearance = (
+        found.tensors("stats"),
+        Appearance.from_state(found.state["appearance"], found.tensors("appearance")),
+    )
     return FitState(
-        model, views, DensifyStats.from_state(stats), _schedule_of(config), found.step, float(found.state["seconds"]),
-        found.state["last"], appearance, 0 if start is None else begun_at(config.iterations),
-    )  # fmt: skip
+        model,
+        views,
+        DensifyStats.from_state(stats),
+        _schedule_of(config),
+        found.step,
+        float(found.state["seconds"]),
+        found.state["last"],
+        appearance,
+        0 if start is None else begun_at(config.iterations),
+    )
 
 
 def recorded_views(
-    config: FitConfig, scene: Scene, virtual: Mapping[str, ObservationSet] | None = None, start: StartFit | None = None,
+    config: FitConfig,
+    scene: Scene,
+    virtual: Mapping[str, ObservationSet] | None = None,
+    start: StartFit | None = None,
     scratch: Path | None = None,
-) -> tuple[ViewSet, tuple[int, ...]]:  # fmt: skip
-    """The recorded views of a configuration, without virtual ones, and the train ids of the model's class channels (those that
-    ``virtual`` shows and ``start`` knows included). ``scratch``: keep them in a file in this folder, not in memory."""
+) -> tuple[ViewSet, tuple[int, ...]]:
+    """The recorded views of a configuration, without virtual ones, and the train ids of the model's class channels
+    (those that ``virtual`` shows and ``start`` knows included). ``scratch``: keep them in a file in this folder, not in
+    memory."""
     frames = training_frames(scene, config.cameras)
     classes = classes_of(scene, frames, virtual or {}) if config.semantics else ()
     classes = classes if start is None else all_classes(start, classes)
@@ -235,7 +267,9 @@ def recorded_views(
     return ViewSet(keep(loaded, len(frames), scratch), ()), classes
 
 
-def start_state(config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewSet, classes: tuple[int, ...]) -> FitState:
+def start_state(
+    config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewSet, classes: tuple[int, ...]
+) -> FitState:
     """The state that a fit starts from, on the CPU: a model built from the fused cloud, nothing corrected yet."""
     model = recipe_of(config.method).start(scene, cloud, views.recorded, classes, config)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
@@ -261,34 +295,46 @@ def continued_state(config: FitConfig, start: StartFit, views: ViewSet, classes:
 def _nothing_corrected(config: FitConfig, views: ViewSet) -> Appearance:
     wanted = config.appearance
     return Appearance.of_views(
-        [head.name for head in heads_of(views.recorded)], [head.name for head in heads_of(views.virtual)],
-        wanted.exposure, wanted.cameras, wanted.virtual,
+        [head.name for head in heads_of(views.recorded)],
+        [head.name for head in heads_of(views.virtual)],
+        wanted.exposure,
+        wanted.cameras,
+        wanted.virtual,
     )
 
 
 def add_certainty(state: FitState, config: FitConfig) -> None:
     """Note in the model how well the photographs constrain every Gaussian (``gaussians/trust.py``)."""
     raster, most = raster_of(state.model, config.raster), max(LEAST_WITNESSES, round(WITNESS_SHARE * config.iterations))
-    state.model.table.labels[CERTAINTY] = certainty_of(state.model, state.views.recorded, raster, state.appearance, most)
+    state.model.table.labels[CERTAINTY] = certainty_of(
+        state.model, state.views.recorded, raster, state.appearance, most
+    )
 
 
-# ---- the loop ------------------------------------------------------------------------------------------------------
+# ---- the loop ------------------------------------------------------------------------------------
 
 
 def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
-    """Fit ``state.model`` to its views up to step ``config.iterations``, one view each (or two, see ``VirtualConfig.beside``).
+    """Fit ``state.model`` to its views up to step ``config.iterations``, one view each (or two, see
+    ``VirtualConfig.beside``).
 
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
     that changes. Ctrl-C (or SIGTERM) is taken at the end of a step: checkpoint, then KeyboardInterrupt.
     """
-    raster, perception = raster_of(state.model, config.raster, config.drawing.packed), perception_of(config.virtual, state.device)
+    raster, perception = (
+        raster_of(state.model, config.raster, config.drawing.packed),
+        perception_of(config.virtual, state.device),
+    )
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
     virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
     sizes = HalvedViews(config.virtual.half_size * config.iterations, keep=not state.views.filed)
 
     def choose(step: int) -> tuple[StoredView, ...]:
         probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
-        return tuple(sizes.sized(view, step) for view in state.views.choose(config.seed, step, probability, config.virtual.beside))
+        return tuple(
+            sizes.sized(view, step)
+            for view in state.views.choose(config.seed, step, probability, config.virtual.beside)
+        )
 
     with (
         log.task(f"fit {config.method}", config.iterations, state.step) as bar,
@@ -303,10 +349,15 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
                 start_unseen_gaussians(state, config, raster)
             views = next(upcoming)
             check = FiniteCheck(step, at_once=state.device.type == "cpu")
-            learnt = [_learn_from(state, view, LearnStep(config, raster, perception, check, step, view is views[0])) for view in views]
+            learnt = [
+                _learn_from(state, view, LearnStep(config, raster, perception, check, step, view is views[0]))
+                for view in views
+            ]
             check.refuse()
             adam_step(state.model, step, config.iterations, state.begun_at)
-            state.appearance.adam_step(step - state.begun_at, appearance_rates(step, config.iterations), native_ops.adam_columns)
+            state.appearance.adam_step(
+                step - state.begun_at, appearance_rates(step, config.iterations), native_ops.adam_columns
+            )
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.densify.longest_to_middle)
                 settle_nodes(state.model, config, step)
@@ -360,7 +411,8 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
     """Render a view and add the gradients of its loss to the parameters'.
 
     Returns:
-        The picture (not all that was rendered: that would stay in memory while the next view is), and the weighted loss terms.
+        The picture (not all that was rendered: that would stay in memory while the next view is), and the weighted loss
+        terms.
     """
     config, step, raster, recipe = how.config, how.step, how.raster, recipe_of(how.config.method)
     recorded = view.kind == "recorded"
@@ -375,7 +427,9 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
         terms |= recipe.terms(DrawnView(model, gaussians, render, view, step, config, raster))
     else:
         terms = virtual_terms(state, render, view, config, how.perception)
-    terms |= (regularisers(gaussians, config) if how.first else {}) | correction_terms(state, gaussians, view, config, raster, step)
+    terms |= (regularisers(gaussians, config) if how.first else {}) | correction_terms(
+        state, gaussians, view, config, raster, step
+    )
     how.check.terms(view.name, terms)
     torch.stack(list(terms.values())).sum().backward()
     how.check.gradients(view.name, state.model, state.appearance)
@@ -383,7 +437,9 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
         camera = view.view.camera
         timed = state.model.table["tau"].grad if "tau" in state.model.table.columns else None
         state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0], timed)
-    return LearntPicture(render.rgb.detach(), render.alpha.detach()), {name: term.detach() for name, term in terms.items()}
+    return LearntPicture(render.rgb.detach(), render.alpha.detach()), {
+        name: term.detach() for name, term in terms.items()
+    }
 
 
 def start_unseen_gaussians(state: FitState, config: FitConfig, raster: RasterConfig) -> None:
@@ -419,7 +475,9 @@ def recorded_terms(state: FitState, render: Render, view: TrainView, config: Fit
         terms["sky"] = weights.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, view.sky), labels)
     if render.extra is not None and view.channels is not None and weights.semantic_weight:
         total = labels.sum().double().clamp_min(1e-12) / weights.semantic_weight
-        terms["semantics"] = native_ops.class_loss(render.extra, view.channels, labels[0], total, sky_lift(state.model, render.alpha))
+        terms["semantics"] = native_ops.class_loss(
+            render.extra, view.channels, labels[0], total, sky_lift(state.model, render.alpha)
+        )
     return terms
 
 
@@ -433,7 +491,9 @@ def virtual_terms(
     rgb = _picture(state, render, view)
     terms: dict[str, Tensor] = {}
     if weights.color_weight:
-        terms["virtual_color"] = weights.color_weight * native_ops.photometric(rgb, view.rgb, weights.ssim_weight, weight[0])
+        terms["virtual_color"] = weights.color_weight * native_ops.photometric(
+            rgb, view.rgb, weights.ssim_weight, weight[0]
+        )
     if weights.perceptual_weight:
         terms["virtual_perceptual"] = weights.perceptual_weight * perception(rgb, view.rgb, weight)
     if view.depth is not None and weights.depth_weight:
@@ -444,7 +504,9 @@ def virtual_terms(
         loss = losses.sparse_depth(render.depth, view.lidar.pixel, view.lidar.depth_m)
         terms["virtual_lidar"] = weights.lidar_weight * loss
     if view.sky is not None and weights.sky_weight and state.model.sky is not None:
-        terms["virtual_sky"] = weights.sky_weight * losses.confident_mean(losses.sky_map(render.alpha, view.sky), weight)
+        terms["virtual_sky"] = weights.sky_weight * losses.confident_mean(
+            losses.sky_map(render.alpha, view.sky), weight
+        )
     if render.extra is not None and view.channels is not None and weights.semantic_weight:
         total, lift = weight[0].numel() / weights.semantic_weight, sky_lift(state.model, render.alpha)
         terms["virtual_semantics"] = native_ops.class_loss(render.extra, view.channels, weight[0], total, lift)
@@ -452,7 +514,8 @@ def virtual_terms(
 
 
 def regularisers(gaussians: Gaussians, config: FitConfig) -> dict[str, Tensor]:
-    """Weighted mean opacity and mean scale of all Gaussians; unset weights are those published with ``mcmc``, else 0."""
+    """Weighted mean opacity and mean scale of all Gaussians; unset weights are those published with ``mcmc``, else
+    0."""
     published = config.densify.kind == "mcmc"
     opacity_weight, scale_weight = config.loss.opacity_weight, config.loss.scale_weight
     if opacity_weight is None:
@@ -465,13 +528,18 @@ def regularisers(gaussians: Gaussians, config: FitConfig) -> dict[str, Tensor]:
 def correction_terms(
     state: FitState, gaussians: Gaussians, view: TrainView, config: FitConfig, raster: RasterConfig, step: int
 ) -> dict[str, Tensor]:
-    """Weighted terms that hold what is learnt to what is known: colour maps near the identity, objects within their boxes
-    (once densification is over)."""
+    """Weighted terms that hold what is learnt to what is known: colour maps near the identity, objects within their
+    boxes (once densification is over)."""
     terms: dict[str, Tensor] = {}
     distance = state.appearance.penalty(view.name, view.kind)
     if distance is not None:
         terms["exposure"] = EXPOSURE_WEIGHT * distance
-    if config.loss.object_weight and view.kind == "recorded" and _settled(state.schedule, step) and len(state.model.nodes) > 1:
+    if (
+        config.loss.object_weight
+        and view.kind == "recorded"
+        and _settled(state.schedule, step)
+        and len(state.model.nodes) > 1
+    ):
         alpha = rasterize(objects_only(gaussians), view.view, raster).alpha
         inside = boxes_in_view(state.model, view.view).to(state.device, non_blocking=True)
         terms["objects"] = config.loss.object_weight * losses.object_map(alpha, inside).mean()
@@ -491,11 +559,12 @@ def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
             node.after_step(share)
 
 
-# ---- the optimiser ---------------------------------------------------------------------------------------------------
+# ---- the optimiser -------------------------------------------------------------------------------
 
 
 def adam_step(model: SceneModel, step: int, iterations: int, begun_at: int = 0) -> None:
-    """One Adam step on every table of the model, then gradients are dropped; moments are those of the steps after ``begun_at``."""
+    """One Adam step on every table of the model, then gradients are dropped; moments are those of the steps after
+    ``begun_at``."""
     rates = learning_rates(step, iterations)
     for table in (model.table, *model.node_tables().values()):
         table.adam_step(step - begun_at, rates, native_ops.adam_columns)
@@ -520,7 +589,7 @@ def _densify_if_due(state: FitState, config: FitConfig, step: int) -> dict[str, 
     return report
 
 
-# ---- on disk -------------------------------------------------------------------------------------------------------
+# ---- on disk -------------------------------------------------------------------------------------
 
 
 def save_checkpoint(state: FitState, folder: Path) -> None:
@@ -533,7 +602,7 @@ def save_checkpoint(state: FitState, folder: Path) -> None:
     checkpoint.save(folder, state.step, groups, facts)
 
 
-# ---- pictures -------------------------------------------------------------------------------------------------------
+# ---- pictures ------------------------------------------------------------------------------------
 
 
 def _progress(state: FitState, view: TrainView, render: LearntPicture, terms: Mapping[str, Tensor]) -> dict[str, float]:

@@ -1,7 +1,8 @@
-"""The scene model: one table of Gaussians, the nodes they belong to, a sky; and how they become what is rendered at a time.
+"""The scene model: one table of Gaussians, the nodes they belong to, a sky; and how they become what is rendered at a
+time.
 
-All Gaussians live in **one** row-aligned ``Table`` whose rows are ordered by node, so that composing a moment touches only what
-moves. Everything else is passed to the renderer as it is.
+All Gaussians live in **one** row-aligned ``Table`` whose rows are ordered by node, so that composing a moment touches
+only what moves. Everything else is passed to the renderer as it is.
 
 Columns of the table (raw, unactivated):
 
@@ -9,12 +10,14 @@ Columns of the table (raw, unactivated):
     quats [N, 4]      (w, x, y, z), any length
     log_scales [N, 3] natural logarithm of metres
     logits [N]        opacity = sigmoid
-    sh_dc [N, 1, 3], sh_rest [N, K-1, 3]   spherical harmonics (sh_rest absent at degree 0) of directions in the node's own frame
+    sh_dc [N, 1, 3], sh_rest [N, K-1, 3]   spherical harmonics (sh_rest absent at degree 0) of directions in the node's
+                                           own frame
     semantics [N, C]  class logits of the classes in ``SceneModel.classes``
 
 and those that a kind of node needs (``baselines/pvg.py``, ...), which its ``at_time`` gets as ``NodeRows.own``.
 
-Label columns: ``node`` i32[N], the index into ``SceneModel.nodes``; of a finished fit also ``certainty`` (``SceneModel.certainty``).
+Label columns: ``node`` i32[N], the index into ``SceneModel.nodes``; of a finished fit also ``certainty``
+(``SceneModel.certainty``).
 """
 
 from __future__ import annotations
@@ -131,8 +134,10 @@ class SceneModel:
             if isinstance(node, RigidNode) and node.name == name:
                 return node
         known = ", ".join(self.node_names())
-        raise UsageError(f"the fitted scene has no dynamic object {name!r}",
-                         expected=f"one of {known}" if known else "a scene with dynamic objects")  # fmt: skip
+        raise UsageError(
+            f"the fitted scene has no dynamic object {name!r}",
+            expected=f"one of {known}" if known else "a scene with dynamic objects",
+        )
 
     def without_nodes(self, names: Sequence[str]) -> SceneModel:
         """A copy without the named dynamic objects (the rest keeps its parameters, not its moments).
@@ -141,7 +146,9 @@ class SceneModel:
             UsageError: an object that the scene has no node for.
         """
         gone = {self.dynamic_object(name).name for name in names}
-        kept = [index for index, node in enumerate(self.nodes) if node.name not in gone or not isinstance(node, RigidNode)]
+        kept = [
+            index for index, node in enumerate(self.nodes) if node.name not in gone or not isinstance(node, RigidNode)
+        ]
         renumber = torch.full((len(self.nodes),), -1, dtype=torch.int32)
         renumber[kept] = torch.arange(len(kept), dtype=torch.int32)
         owner = renumber.to(self.device)[self.table.labels["node"].long()]
@@ -166,10 +173,11 @@ class SceneModel:
         nodes = tuple(moved.moved(object_from_new) if node is moved else node for node in self.nodes)
         return replace(self, nodes=nodes, facts=dict(self.facts))
 
-    # -- state ------------------------------------------------------------------------------------------------------
+    # -- state -------------------------------------------------------------------------------------
 
     def state(self) -> tuple[dict[str, Any], dict[str, dict[str, Tensor]]]:
-        """JSON values and named groups of tensors (``gaussians``, ``nodes``) that rebuild the model with its moments."""
+        """JSON values and named groups of tensors (``gaussians``, ``nodes``) that rebuild the model with its
+        moments."""
         nodes, tensors = [], {}
         for index, node in enumerate((*self.nodes, *(() if self.sky is None else (self.sky,)))):
             facts, own = node.state()
@@ -206,18 +214,28 @@ class SceneModel:
         table = Table.from_state(groups["gaussians"])
         owner = table.labels["node"]
         if len(owner) and (int(owner.min()) < 0 or int(owner.max()) >= len(nodes)):
-            raise InputError("a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}")
+            raise InputError(
+                "a Gaussian belongs to no node of the scene", got=f"node {int(owner.max())} of {len(nodes)}"
+            )
         classes = tuple(int(value) for value in values["classes"])
         if any(not 0 <= value < len(CLASSES) for value in classes):
             raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
         if "semantics" in table.columns and table["semantics"].shape[1:] != (len(classes),):
-            raise InputError("the Gaussians have other classes than the scene", expected=f"{len(classes)} channels",
-                got=str(tuple(table["semantics"].shape)))  # fmt: skip
+            raise InputError(
+                "the Gaussians have other classes than the scene",
+                expected=f"{len(classes)} channels",
+                got=str(tuple(table["semantics"].shape)),
+            )
         colors = CameraColors.of_record(values["camera_colors"]) if "camera_colors" in values else SAME_COLORS
         degree = int(values["sh_degree"])
         if degree > 0 and values.get("harmonics") != "node":
-            raise InputError("the scene's spherical harmonics are not in the frames of its objects", where="harmonics", expected="node",
-                             got=str(values.get("harmonics")), remedy="fit the scene again")  # fmt: skip
+            raise InputError(
+                "the scene's spherical harmonics are not in the frames of its objects",
+                where="harmonics",
+                expected="node",
+                got=str(values.get("harmonics")),
+                remedy="fit the scene again",
+            )
         return cls(table, tuple(nodes), sky, classes, degree, dict(values["facts"]), colors)
 
 
@@ -231,7 +249,9 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
     """
     table, counts = model.table, model.counts()
     all_rows = NodeRows(table["means"], table["quats"], torch.sigmoid(table["logits"]), table["sh_dc"])
-    blocks = zip(*(column.split(counts) for column in (all_rows.means, all_rows.quats, all_rows.opacity, all_rows.sh_dc)))
+    blocks = zip(
+        *(column.split(counts) for column in (all_rows.means, all_rows.quats, all_rows.opacity, all_rows.sh_dc))
+    )
     own = {name: column.split(counts) for name, column in table.columns.items() if name not in COLUMNS}
     given = [NodeRows(*block, {name: parts[i] for name, parts in own.items()}) for i, block in enumerate(blocks)]
     if model.sh_degree > 0:
@@ -267,7 +287,8 @@ def composite_sky(model: SceneModel, view: View, rgb: Tensor, alpha: Tensor) -> 
 
 
 def sky_lift(model: SceneModel, alpha: Tensor) -> tuple[int, Tensor] | None:
-    """Channel of the sky among the class logits and what it gains ``[H, W]`` where nothing covers it; None without that class.
+    """Channel of the sky among the class logits and what it gains ``[H, W]`` where nothing covers it; None without that
+    class.
 
     The opacity is taken as it is (no gradient through it from here): classes do not carve geometry.
     """

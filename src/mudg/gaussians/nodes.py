@@ -1,8 +1,8 @@
 """The nodes of a scene: a static world, and one node per dynamic object. Each says how its Gaussians lie at a time.
 
-``Node.at_time`` is the one place where time changes a Gaussian: it is given the node's rows and returns them as they are then, moved,
-faded or recoloured. A rigid node moves them with its box; a deformable one also within it. A new kind of node is a class with
-``at_time`` and one row in ``model.NODES``.
+``Node.at_time`` is the one place where time changes a Gaussian: it is given the node's rows and returns them as they
+are then, moved, faded or recoloured. A rigid node moves them with its box; a deformable one also within it. A new kind
+of node is a class with ``at_time`` and one row in ``model.NODES``.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from mudg.core import harmonics
 from mudg.core.harmonics import left_product_matrix, rotation_matrix, slerp
 from mudg.core.table import Table
 
-# motion ---------------------------------------------------------------------------------------------------------------
+# motion -------------------------------------------------------------------------------------------
 #
 # How tracked objects move: the noise of a track, and its smoothest likely version.
 #
-# A detector puts a box a little wrong at every key, each time anew; a car cannot follow such a path. Two sizes decide: that of the
-# noise, which the track itself betrays, and that of usual accelerations. The likeliest
-# path between the two minimises a sum of squares (the Whittaker smoother, on second differences), with a tail for sharp manoeuvres.
+# A detector puts a box a little wrong at every key, each time anew; a car cannot follow such a path. Two sizes decide:
+# that of the noise, which the track itself betrays, and that of usual accelerations. The likeliest path between the two
+# minimises a sum of squares (the Whittaker smoother, on second differences), with a tail for sharp manoeuvres.
 
 
 ACCELERATION_M_S2: Final = 2.0
@@ -56,7 +56,8 @@ def second_differences(times_s: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def key_noise(times_s: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard deviation f64[C] of independent noise on the keys ``values`` f64[K, C]; 0 for fewer than `FEWEST_KEYS` keys.
+    """Standard deviation f64[C] of independent noise on the keys ``values`` f64[K, C]; 0 for fewer than `FEWEST_KEYS`
+    keys.
 
     Third differences are blind to constant acceleration, and the median (Gaussian consistency 0.6745) to single jerks.
     """
@@ -72,9 +73,11 @@ def key_noise(times_s: NDArray[np.float64], values: NDArray[np.float64]) -> NDAr
 
 
 def motion_weights(accelerations: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Weights [M] of the inner keys, from their accelerations f64[M, C] in units of the usual one: 1 and more for even motion.
+    """Weights [M] of the inner keys, from their accelerations f64[M, C] in units of the usual one: 1 and more for even
+    motion.
 
-    Student's t with `TAIL` degrees of freedom instead of a Gaussian: turning into a side street is rare, not impossible.
+    Student's t with `TAIL` degrees of freedom instead of a Gaussian: turning into a side street is rare, not
+    impossible.
     """
     return (TAIL + 1) / (TAIL + (accelerations**2).mean(1))
 
@@ -82,9 +85,11 @@ def motion_weights(accelerations: NDArray[np.float64]) -> NDArray[np.float64]:
 def smoothed(
     times_s: NDArray[np.float64], values: NDArray[np.float64], noise: float, acceleration: float
 ) -> NDArray[np.float64]:
-    """The likeliest values f64[K, C] behind noisy keys, given the size of noise and of acceleration (standard deviations).
+    """The likeliest values f64[K, C] behind noisy keys, given the size of noise and of acceleration (standard
+    deviations).
 
-    Reweighted least squares, five rounds. Means and straight lines stay as they are. No noise, or fewer than three keys: as given.
+    Reweighted least squares, five rounds. Means and straight lines stay as they are. No noise, or fewer than three
+    keys: as given.
     """
     if noise <= 0 or len(times_s) < 3:
         return values.copy()
@@ -96,11 +101,22 @@ def smoothed(
     return found
 
 
-# nodes ----------------------------------------------------------------------------------------------------------------
+# nodes --------------------------------------------------------------------------------------------
 
 
 LIMBED_LABELS: Final = frozenset(
-    {"pedestrian", "person", "person_sitting", "child", "adult", "cyclist", "rider", "bicyclist", "motorcyclist", "animal"}
+    {
+        "pedestrian",
+        "person",
+        "person_sitting",
+        "child",
+        "adult",
+        "cyclist",
+        "rider",
+        "bicyclist",
+        "motorcyclist",
+        "animal",
+    }
 )
 """Labels of tracks that change their shape while they move."""
 SYMMETRIC_LABELS: Final = frozenset({"car", "van", "truck", "bus", "tram", "train", "vehicle", "trailer", "motorcycle"})
@@ -118,13 +134,14 @@ class NodeRows:
     """The Gaussians of one node.
 
     Args:
-        means: f32[n, 3] metres. quats: f32[n, 4] (w, x, y, z), any length. Both in the frame of the node (world for a static one, box for
-            a rigid one) before ``Node.at_time``, in the world after it.
+        means: f32[n, 3] metres. quats: f32[n, 4] (w, x, y, z), any length. Both in the frame of the node (world for a
+            static one, box for a rigid one) before ``Node.at_time``, in the world after it.
         opacity: f32[n] in [0, 1].
         sh_dc: f32[n, 1, 3], the constant band of the colour.
-        own: raw columns of the table, f32[n, ...], that only some kind of node knows (the moment at which a Gaussian shows, say).
-        sh_rest: f32[n, K - 1, 3], the bands of the colour that depend on the direction of view, or None. Like the places: directions
-            are those of the node's frame before ``Node.at_time``, of the world after it.
+        own: raw columns of the table, f32[n, ...], that only some kind of node knows (the moment at which a Gaussian
+            shows, say).
+        sh_rest: f32[n, K - 1, 3], the bands of the colour that depend on the direction of view, or None. Like the
+            places: directions are those of the node's frame before ``Node.at_time``, of the world after it.
     """
 
     means: Tensor
@@ -136,7 +153,8 @@ class NodeRows:
 
 
 class StaticNode:
-    """Rows already in the world. Other kinds of node have the same methods, and an optimisable table of their own if they need one."""
+    """Rows already in the world. Other kinds of node have the same methods, and an optimisable table of their own if
+    they need one."""
 
     kind = "static"
     short_life: ClassVar[float] = 0.0
@@ -178,22 +196,29 @@ class StaticNode:
 class RigidNode:
     """A tracked dynamic object: rows in the frame of its box, carried by the box's pose.
 
-    The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by offsets in
-    the frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; **both** neighbours' corrected
+    The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by offsets in the
+    frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; **both** neighbours' corrected
     positions and rotations are interpolated (straight line, slerp). Outside the track's span the object does not exist.
 
-    The offsets, one row per key: ``shift`` [K, 3] metres and ``yaw`` [K] radians. ``learn_pose``: whether a fit may change them.
+    The offsets, one row per key: ``shift`` [K, 3] metres and ``yaw`` [K] radians. ``learn_pose``: whether a fit may
+    change them.
 
-    Poses are worked out on the CPU, also where the offsets are on another device: a copy of them is kept here, and what moves the
-    rows at a time goes to their device once.
+    Poses are worked out on the CPU, also where the offsets are on another device: a copy of them is kept here, and what
+    moves the rows at a time goes to their device once.
     """
 
     kind = "rigid"
 
     def __init__(
-        self, name: str, label: str, size_m: Sequence[float], times_s: NDArray[np.float64],
-        world_from_object: NDArray[np.float64], offsets: Table | None = None, learn_pose: bool = False,
-    ) -> None:  # fmt: skip
+        self,
+        name: str,
+        label: str,
+        size_m: Sequence[float],
+        times_s: NDArray[np.float64],
+        world_from_object: NDArray[np.float64],
+        offsets: Table | None = None,
+        learn_pose: bool = False,
+    ) -> None:
         self.name = name
         self.label = label
         self.size_m = tuple(float(value) for value in size_m)
@@ -201,18 +226,24 @@ class RigidNode:
         self.world_from_object = np.asarray(world_from_object, np.float64)
         self.learn_pose = learn_pose
         count = len(self.times_s)
-        self.offsets = offsets or Table({"shift": torch.zeros(count, 3), "yaw": torch.zeros(count), **self._own_columns(count)})
+        self.offsets = offsets or Table(
+            {"shift": torch.zeros(count, 3), "yaw": torch.zeros(count), **self._own_columns(count)}
+        )
         self._placements: dict[float, tuple[Tensor, Tensor, Tensor] | None] = {}
         self._mixings: dict[tuple[float, int], Tensor] = {}
         self._copied: tuple[Tensor, Tensor] | None = None
-        self._quats = torch.from_numpy(np.stack([geometry.quaternion_from_matrix(m) for m in self.world_from_object])).float()
+        self._quats = torch.from_numpy(
+            np.stack([geometry.quaternion_from_matrix(m) for m in self.world_from_object])
+        ).float()
         self._rotations = torch.from_numpy(self.world_from_object[:, :3, :3].copy()).float()
         self._positions = torch.from_numpy(self.world_from_object[:, :3, 3].copy()).float()
 
     @classmethod
     def from_track(cls, track: Track, learn_pose: bool = False) -> Self:
         """A node that follows ``track``."""
-        return cls(track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object, learn_pose=learn_pose)
+        return cls(
+            track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object, learn_pose=learn_pose
+        )
 
     @property
     def symmetric(self) -> bool:
@@ -223,7 +254,7 @@ class RigidNode:
         """Starting values of what a kind of node has per key besides the offsets."""
         return {}
 
-    # -- pose -------------------------------------------------------------------------------------------------------
+    # -- pose --------------------------------------------------------------------------------------
 
     def _offsets_here(self) -> tuple[Tensor, Tensor]:
         """Shift and yaw on the CPU: the columns themselves, or the copy of those of another device."""
@@ -249,7 +280,8 @@ class RigidNode:
         return position, left_product_matrix(self._quats[index]) @ turn
 
     def keys_around(self, time_s: float) -> tuple[int, int, float] | None:
-        """The two neighbouring keys and the fraction of the way between them (one key twice at its very time); None outside."""
+        """The two neighbouring keys and the fraction of the way between them (one key twice at its very time); None
+        outside."""
         tolerance_s = 1e-6
         times = self.times_s
         if len(times) == 0 or time_s < times[0] - tolerance_s or time_s > times[-1] + tolerance_s:
@@ -261,8 +293,8 @@ class RigidNode:
         return after - 1, after, float((time_s - times[after - 1]) / (times[after] - times[after - 1]))
 
     def pose_at(self, time_s: float) -> tuple[Tensor, Tensor] | None:
-        """Position ``[3]`` m and unit quaternion ``[4]`` at a time, on the CPU; differentiable in the offsets if they are there. None
-        outside the span."""
+        """Position ``[3]`` m and unit quaternion ``[4]`` at a time, on the CPU; differentiable in the offsets if they
+        are there. None outside the span."""
         found = self.keys_around(time_s)
         if found is None:
             return None
@@ -277,7 +309,9 @@ class RigidNode:
     def corrected_keys(self, which: slice = slice(None)) -> NDArray[np.float64]:
         """The keys, or some of them, with their offsets: world_from_object f64[K, 4, 4]."""
         shift, yaw = (values[which].double().numpy() for values in self._offsets_here())
-        return self.world_from_object[which] @ np.stack([geometry.yaw_matrix(float(turn), move) for turn, move in zip(yaw, shift)])
+        return self.world_from_object[which] @ np.stack(
+            [geometry.yaw_matrix(float(turn), move) for turn, move in zip(yaw, shift)]
+        )
 
     def pose_matrix(self, time_s: float) -> NDArray[np.float64] | None:
         """Corrected world_from_object f64[4, 4] at a time; None outside the span."""
@@ -320,7 +354,7 @@ class RigidNode:
         """Yaw of the given keys f64[K], radians, without jumps of 2 pi."""
         return np.unwrap([geometry.yaw_of(pose) for pose in self.world_from_object])
 
-    # -- rows -------------------------------------------------------------------------------------------------------
+    # -- rows --------------------------------------------------------------------------------------
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
         """See ``StaticNode``."""
@@ -329,10 +363,13 @@ class RigidNode:
             return None
         position, rotation_t, product_t = placement
         means = torch.addmm(position, rows.means, rotation_t)
-        return replace(rows, means=means, quats=rows.quats @ product_t, sh_rest=self._colors_turned(rows.sh_rest, time_s))
+        return replace(
+            rows, means=means, quats=rows.quats @ product_t, sh_rest=self._colors_turned(rows.sh_rest, time_s)
+        )
 
     def _colors_turned(self, rest: Tensor | None, time_s: float) -> Tensor | None:
-        """Bands of the colour that depend on the direction of view, from the directions of the box to those of the world."""
+        """Bands of the colour that depend on the direction of view, from the directions of the box to those of the
+        world."""
         if rest is None or rest.shape[1] == 0:
             return rest
         key = time_s, math.isqrt(rest.shape[1] + 1) - 1
@@ -345,8 +382,8 @@ class RigidNode:
         return harmonics.turned(rest, self._mixings[key])
 
     def _placement(self, time_s: float) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Position ``[3]``, transposed rotation ``[3, 3]`` and transposed quaternion product ``[4, 4]``, where the rows are;
-        remembered per time."""
+        """Position ``[3]``, transposed rotation ``[3, 3]`` and transposed quaternion product ``[4, 4]``, where the rows
+        are; remembered per time."""
         if time_s not in self._placements:
             with torch.no_grad():
                 pose = self.pose_at(time_s)
@@ -355,7 +392,8 @@ class RigidNode:
         return self._placements[time_s]
 
     def parameters(self) -> Table | None:
-        """None: offsets are not learnt by gradient steps but by ``gaussians/poses.py``, which weighs what each picture can tell."""
+        """None: offsets are not learnt by gradient steps but by ``gaussians/poses.py``, which weighs what each picture
+        can tell."""
         return None
 
     def linked(self, nodes: Sequence[StaticNode | RigidNode]) -> Self:
@@ -363,7 +401,8 @@ class RigidNode:
         return self
 
     def after_step(self, share: float) -> None:
-        """Regularise, in place, what a node learns by gradient steps; ``share`` in [0, 1] falls with the learning rate."""
+        """Regularise, in place, what a node learns by gradient steps; ``share`` in [0, 1] falls with the learning
+        rate."""
 
     def to(self, device: torch.device) -> Self:
         """See ``StaticNode``. A copy, unless it is there already."""
@@ -374,7 +413,8 @@ class RigidNode:
         return there
 
     def moved(self, object_from_new: NDArray[np.float64]) -> Self:
-        """A node displaced in its own frame: key poses ``corrected @ object_from_new``; what its rows do inside the box stays."""
+        """A node displaced in its own frame: key poses ``corrected @ object_from_new``; what its rows do inside the box
+        stays."""
         columns = {name: value.detach() for name, value in self.offsets.columns.items()}
         columns |= {"shift": torch.zeros_like(columns["shift"]), "yaw": torch.zeros_like(columns["yaw"])}
         keys = self.corrected_keys() @ object_from_new
@@ -396,22 +436,28 @@ class RigidNode:
         name, table = str(facts["name"]), Table.from_state(offsets)
         times, poses = tensors["times_s"].numpy(), tensors["world_from_object"].numpy()
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0).any():
-            raise InputError("the times of an object are out of order", where=f"times_s of {name}", got=str(times.ravel()[:8]))
+            raise InputError(
+                "the times of an object are out of order", where=f"times_s of {name}", got=str(times.ravel()[:8])
+            )
         fits = poses.shape == (len(times), 4, 4)
         problem = next(filter(None, map(geometry.rigid_problem, poses)), "") if fits else f"shape {poses.shape}"
         if problem or table["shift"].shape != (len(times), 3) or table["yaw"].shape != (len(times),):
-            raise InputError("the poses of an object do not fit its times", where=f"world_from_object of {name}", got=problem,
-                expected=f"a rigid pose, a shift and a yaw for each of {len(times)} times")  # fmt: skip
+            raise InputError(
+                "the poses of an object do not fit its times",
+                where=f"world_from_object of {name}",
+                got=problem,
+                expected=f"a rigid pose, a shift and a yaw for each of {len(times)} times",
+            )
         return cls(name, str(facts["label"]), facts["size_m"], times, poses, table, bool(facts["learn_pose"]))
 
 
 class DeformableNode(RigidNode):
     """A person or a cyclist: a rigid node whose rows also move within the box, differently at every time.
 
-    The deformation is a grid of control points that spans the box (the corners of `DEFORM_CELLS` cells); each has a displacement
-    at every key of the track, and a row moves by what its place in the grid interpolates (three-linear in space, linear in time;
-    free-form deformation, Sederberg & Parry 1986). The rows of the shared table need no column of their own for it, so cloning
-    and splitting them changes nothing, and a static Gaussian pays nothing.
+    The deformation is a grid of control points that spans the box (the corners of `DEFORM_CELLS` cells); each has a
+    displacement at every key of the track, and a row moves by what its place in the grid interpolates (three-linear in
+    space, linear in time; free-form deformation, Sederberg & Parry 1986). The rows of the shared table need no column
+    of their own for it, so cloning and splitting them changes nothing, and a static Gaussian pays nothing.
 
     Parameters: as ``RigidNode``, and ``deform`` [K, 3, z, y, x], metres in the frame of the box.
     """
@@ -429,7 +475,8 @@ class DeformableNode(RigidNode):
         return super().at_time(replace(rows, means=rows.means + self.displacement(rows.means, time_s)), time_s)
 
     def displacement(self, means: Tensor, time_s: float) -> Tensor:
-        """How far rows at ``means`` [n, 3] (frame of the box) are moved at a time, [n, 3] metres; differentiable in both."""
+        """How far rows at ``means`` [n, 3] (frame of the box) are moved at a time, [n, 3] metres; differentiable in
+        both."""
         found = self.keys_around(time_s)
         if found is None or len(means) == 0:
             return torch.zeros_like(means)
@@ -438,7 +485,9 @@ class DeformableNode(RigidNode):
         if after != before:
             control = torch.lerp(control, self.offsets["deform"][after], u)
         place = 2 * means / _size_there(self.size_m, means.dtype, means.device)
-        moved = F.grid_sample(control[None], place[None, None, None], mode="bilinear", padding_mode="border", align_corners=True)
+        moved = F.grid_sample(
+            control[None], place[None, None, None], mode="bilinear", padding_mode="border", align_corners=True
+        )
         return moved[0, :, 0, 0].T
 
     def parameters(self) -> Table:
@@ -472,7 +521,8 @@ def _sent(place: tuple[Tensor, Tensor, Tensor], device: torch.device) -> tuple[T
 
 
 def object_node(track: Track, learn_pose: bool = False, deformable: bool = False) -> RigidNode:
-    """The node of a dynamic track: with ``deformable``, one that deforms for those who walk or ride; else a rigid one."""
+    """The node of a dynamic track: with ``deformable``, one that deforms for those who walk or ride; else a rigid
+    one."""
     kind = DeformableNode if deformable and track.label.lower() in LIMBED_LABELS else RigidNode
     node = kind.from_track(track, learn_pose)
     if learn_pose:

@@ -1,4 +1,5 @@
-"""The features by which a render is compared with a virtual view: fixed filters, the shipped codec's network, or LPIPS."""
+"""The features by which a render is compared with a virtual view: fixed filters, the shipped codec's network, or
+LPIPS."""
 
 from __future__ import annotations
 
@@ -17,7 +18,8 @@ from mudg.networks.codec import shipped_codec
 from mudg.networks.featnets import CodecFeatures, FilterBank, LpipsFeatures, LpipsInput, LpipsTrunk
 
 Perception = Callable[[Tensor, Tensor, Tensor], Tensor]
-"""Render ``[3, H, W]`` and target ``[3, H, W]`` in [0, 1], weight ``[1, H, W]`` -> distance, differentiable in the render."""
+"""Render ``[3, H, W]`` and target ``[3, H, W]`` in [0, 1], weight ``[1, H, W]`` -> distance, differentiable in the
+render."""
 
 
 def perception_of(config: VirtualConfig, device: torch.device | None = None) -> Perception:
@@ -31,7 +33,9 @@ def perception_of(config: VirtualConfig, device: torch.device | None = None) -> 
     if config.perception == "codec":
         return _compared(CodecFeatures(shipped_codec().requires_grad_(False)).to(device), _lpips())
     if not config.lpips_weights:
-        raise UsageError("LPIPS needs a weight file", where="virtual.perception lpips", remedy="set virtual.lpips_weights")
+        raise UsageError(
+            "LPIPS needs a weight file", where="virtual.perception lpips", remedy="set virtual.lpips_weights"
+        )
     trunk = lpips_network(config.lpips_weights).to(device)
     return _compared(trunk, _lpips(trunk.channel_weights))
 

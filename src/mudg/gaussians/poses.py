@@ -1,17 +1,21 @@
 """Correct the boxes of dynamic objects from the pictures: a few Gauss-Newton rounds in the course of a fit.
 
-A key of a track has four unknowns: a shift along the box's three axes, and a yaw. Three kinds of evidence are solved for together:
+A key of a track has four unknowns: a shift along the box's three axes, and a yaw. Three kinds of evidence are solved
+for together:
 
     pictures   the rendered colours inside the box's outline should become the recorded ones
-    track      the correction should stay near the track, once the noise of the track is taken out (``RigidNode.settled_offsets``)
+    track      the correction should stay near the track, once the noise of the track is taken out
+               (``RigidNode.settled_offsets``)
     motion     the correction should accelerate no more than road users do (so neighbouring keys are corrected alike)
 
-Each is weighted by its expected error. What the pictures cannot tell (the yaw of a distant car) therefore stays with the track and its
-neighbours in time; a gradient method that scales its steps to the gradients, as Adam does, walks at random there. Derivatives are
-differences of renders: all objects of a view are displaced together, so a view costs five pictures without gradients.
+Each is weighted by its expected error. What the pictures cannot tell (the yaw of a distant car) therefore stays with
+the track and its neighbours in time; a gradient method that scales its steps to the gradients, as Adam does, walks at
+random there. Derivatives are differences of renders: all objects of a view are displaced together, so a view costs five
+pictures without gradients.
 
-LiDAR depth is not used: with a known scene, colours alone took 0.13 m of drift to under 0.02 m; with depths beside them it stayed
-above 0.06 m. At the edge of an object a rendered depth is a mean of near and far, and the nearest return is not that of the pixel.
+LiDAR depth is not used: with a known scene, colours alone took 0.13 m of drift to under 0.02 m; with depths beside them
+it stayed above 0.06 m. At the edge of an object a rendered depth is a mean of near and far, and the nearest return is
+not that of the pixel.
 """
 
 from __future__ import annotations
@@ -51,7 +55,8 @@ COLOR_SHARE = 1 / 120
 
 @dataclass
 class PoseEvidence:
-    """Sums of the pictures' normal equations: ``matrix`` f64[K, 4, 4] and ``vector`` f64[K, 4] per key of one object."""
+    """Sums of the pictures' normal equations: ``matrix`` f64[K, 4, 4] and ``vector`` f64[K, 4] per key of one
+    object."""
 
     matrix: NDArray[np.float64]
     vector: NDArray[np.float64]
@@ -77,7 +82,9 @@ def refine_poses(
     }
     evidence = {index: PoseEvidence.none(len(node.times_s)) for index, node in learning.items()}
     for stored in views:
-        outlines = {index: mask.to(model.device, non_blocking=True) for index, mask in _outlines(learning, stored).items()}
+        outlines = {
+            index: mask.to(model.device, non_blocking=True) for index, mask in _outlines(learning, stored).items()
+        }
         if outlines:
             _add_evidence(model, stored, outlines, evidence, raster, appearance)
     moves = [_move(node, evidence[index]) for index, node in learning.items() if evidence[index].views]
@@ -85,7 +92,8 @@ def refine_poses(
 
 
 def _outlines(learning: dict[int, RigidNode], stored: StoredView) -> dict[int, Tensor]:
-    """Bool[H, W] per node index: pixels inside the outline of its box that may be used; objects that show too few are left out."""
+    """Bool[H, W] per node index: pixels inside the outline of its box that may be used; objects that show too few are
+    left out."""
     found = {}
     for index, node in learning.items():
         pose = node.pose_matrix(stored.view.time_s)
@@ -100,14 +108,18 @@ def _outlines(learning: dict[int, RigidNode], stored: StoredView) -> dict[int, T
 
 
 def _add_evidence(
-    model: SceneModel, stored: StoredView, outlines: dict[int, Tensor], evidence: dict[int, PoseEvidence], raster: RasterConfig,
+    model: SceneModel,
+    stored: StoredView,
+    outlines: dict[int, Tensor],
+    evidence: dict[int, PoseEvidence],
+    raster: RasterConfig,
     appearance: Appearance | None,
-) -> None:  # fmt: skip
+) -> None:
     """Add what one recorded view tells about the objects in it."""
     time_s = stored.view.time_s
     here = compose(model, time_s, semantics=False)
-    rows = {index: (here.node == index).nonzero()[:, 0] for index in outlines}  # type: ignore[operator]
-    poses = {index: model.nodes[index].pose_matrix(time_s) for index in outlines}  # type: ignore[union-attr]
+    rows = {index: (here.node == index).nonzero()[:, 0] for index in outlines}
+    poses = {index: model.nodes[index].pose_matrix(time_s) for index in outlines}
     color = _picture(model, here, stored, raster, appearance)
     target = _blurred(torch.from_numpy(stored.rgb).to(model.device, non_blocking=True).permute(2, 0, 1).float() / 255)
     changes = []
@@ -118,7 +130,7 @@ def _add_evidence(
     for index, outline in outlines.items():
         jacobian = torch.stack([change[:, outline].flatten() for change in changes], 1).double()
         matrix, vector = _normal_equations(jacobian, missing[:, outline].flatten().double())
-        _add_to_keys(model.nodes[index], time_s, matrix, vector, evidence[index])  # type: ignore[arg-type]
+        _add_to_keys(model.nodes[index], time_s, matrix, vector, evidence[index])
 
 
 def _add_to_keys(
@@ -164,7 +176,9 @@ def _displaced(
         if pose is None:
             continue
         world = pose @ move @ geometry.invert(pose)
-        rotation, shift_m = (torch.from_numpy(part).float().to(means.device, non_blocking=True) for part in (world[:3, :3], world[:3, 3]))
+        rotation, shift_m = (
+            torch.from_numpy(part).float().to(means.device, non_blocking=True) for part in (world[:3, :3], world[:3, 3])
+        )
         means[mine] = means[mine] @ rotation.T + shift_m
         if axis == 3:
             turn = left_product_matrix(torch.from_numpy(geometry.quaternion_from_matrix(world)).float())
@@ -175,7 +189,8 @@ def _displaced(
 def _normal_equations(jacobian: Tensor, missing: Tensor) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """``J^T W J`` and ``J^T W r`` with Huber weights: rows whose residual exceeds two sigma count less.
 
-    Sigma is what the residuals themselves say (median, at least `COLOR_SIGMA`): a model that is still blurred has less to say.
+    Sigma is what the residuals themselves say (median, at least `COLOR_SIGMA`): a model that is still blurred has less
+    to say.
     """
     sigma = max(COLOR_SIGMA, 1.4826 * float(missing.abs().median()))
     weight = COLOR_SHARE / sigma**2 * torch.clamp(2 * sigma / missing.abs().clamp_min(1e-9), max=1.0)
@@ -186,8 +201,9 @@ def _normal_equations(jacobian: Tensor, missing: Tensor) -> tuple[NDArray[np.flo
 def _move(node: RigidNode, evidence: PoseEvidence) -> NDArray[np.float64]:
     """Solve for all keys of a track together and move them; returns the moves f64[K, 3] in metres.
 
-    Unknown is the correction c of every key beyond ``settled_offsets``, which have weighed noise against motion already: the sum of
-    squares of what the pictures miss, of c in units of `TRUST_M` and `TRUST_RAD`, and of its accelerations in usual ones.
+    Unknown is the correction c of every key beyond ``settled_offsets``, which have weighed noise against motion
+    already: the sum of squares of what the pictures miss, of c in units of `TRUST_M` and `TRUST_RAD`, and of its
+    accelerations in usual ones.
     """
     keys, base = len(node.times_s), node.world_from_object
     settled = np.column_stack(node.settled_offsets())

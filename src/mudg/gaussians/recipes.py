@@ -1,4 +1,5 @@
-"""What a published method does beyond the common loop of ``gaussians/fit.py``: its start, its own losses, what each step renders.
+"""What a published method does beyond the common loop of ``gaussians/fit.py``: its start, its own losses, what each
+step renders.
 
 A recipe is a class with the methods of ``Recipe``, which itself adds nothing, and one row in ``recipes.RECIPES``.
 """
@@ -108,8 +109,13 @@ class OwnRecipe(Recipe):
                     if group == "loss" and field in self.own_weights
                     else "knows nothing of it"
                 )
-                raise UsageError(f"{config.method} {reason}", where=name, expected=str(usual), got=str(given),
-                                 remedy="leave the setting out, or choose --method street_gaussians")  # fmt: skip
+                raise UsageError(
+                    f"{config.method} {reason}",
+                    where=name,
+                    expected=str(usual),
+                    got=str(given),
+                    remedy="leave the setting out, or choose --method street_gaussians",
+                )
         if config.densify.kind == "mcmc":
             raise UsageError(
                 f"{config.method} densifies by gradients", where="densify.kind", expected="gradient or none", got="mcmc"
@@ -126,7 +132,7 @@ class StaticRecipe(OwnRecipe):
     unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS
 
 
-# the recipe of every method that is fitted ----------------------------------------------------------------------------
+# the recipe of every method that is fitted --------------------------------------------------------
 
 
 RECIPES: Final[Mapping[str, str]] = {

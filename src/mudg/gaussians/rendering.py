@@ -1,4 +1,5 @@
-"""Renders of a fitted scene: as an observation, and as what a generator may start from, with the certainty of every pixel."""
+"""Renders of a fitted scene: as an observation, and as what a generator may start from, with the certainty of every
+pixel."""
 
 from __future__ import annotations
 
@@ -19,7 +20,7 @@ from mudg.gaussians.model import SceneModel, compose, composite_semantics, compo
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.settings import DrawingConfig, FitConfig
 
-# dynamic objects by themselves: their Gaussians alone, and where their boxes lie in a view ----------------------------
+# dynamic objects by themselves: their Gaussians alone, and where their boxes lie in a view --------
 
 
 BOX_GROWTH = 1.05
@@ -32,10 +33,16 @@ def objects_only(gaussians: Gaussians) -> Gaussians:
         raise ValueError("the Gaussians have no node index")
     rows = gaussians.node > 0
     return replace(
-        gaussians, means=gaussians.means[rows], quats=gaussians.quats[rows], scales=gaussians.scales[rows],
-        opacity=gaussians.opacity[rows], sh=gaussians.sh[rows],
-        sh_rest=None if gaussians.sh_rest is None else gaussians.sh_rest[rows], extra=None, node=gaussians.node[rows],
-    )  # fmt: skip
+        gaussians,
+        means=gaussians.means[rows],
+        quats=gaussians.quats[rows],
+        scales=gaussians.scales[rows],
+        opacity=gaussians.opacity[rows],
+        sh=gaussians.sh[rows],
+        sh_rest=None if gaussians.sh_rest is None else gaussians.sh_rest[rows],
+        extra=None,
+        node=gaussians.node[rows],
+    )
 
 
 def boxes_in_view(model: SceneModel, view: View) -> Tensor:
@@ -52,8 +59,8 @@ def boxes_in_view(model: SceneModel, view: View) -> Tensor:
 def outline_mask(
     view: View, world_from_object: NDArray[np.float64], size_m: tuple[float, ...]
 ) -> NDArray[np.bool_] | None:
-    """Bool[H, W]: inside the outline of a box, slightly grown. None: nothing of it is in view. A box that reaches behind the camera
-    covers everything."""
+    """Bool[H, W]: inside the outline of a box, slightly grown. None: nothing of it is in view. A box that reaches
+    behind the camera covers everything."""
     camera, grown_m = view.camera, BOX_GROWTH * np.asarray(size_m)
     corners = geometry.transform_points(view.cam_from_world @ world_from_object, geometry.box_corners(grown_m))
     if corners[:, 2].max() >= NEAREST_CORNER_M > corners[:, 2].min():
@@ -67,12 +74,13 @@ def outline_mask(
     return np.array(canvas, bool)
 
 
-# rendering ------------------------------------------------------------------------------------------------------------
+# rendering ----------------------------------------------------------------------------------------
 
 
 NEAR_M = 0.2
 DRAWING: Final = "drawing"
-"""Fact of a fitted scene: settings of ``RasterConfig`` that it was fitted with and that change its pictures; not there: the usual ones."""
+"""Fact of a fitted scene: settings of ``RasterConfig`` that it was fitted with and that change its pictures; not there:
+the usual ones."""
 Rendered = TypeVar("Rendered")
 
 _ROWS: Final = 128
@@ -88,8 +96,8 @@ class RenderedCondition:
         depth: f32[H, W], camera z in metres; NaN in the sky and where the scene is empty.
         alpha: f32[H, W] in [0, 1], how much of the pixel Gaussians cover; the rest is sky.
         semantics: u8[H, W] train ids, 255 = unknown.
-        certainty: f32[H, W] in [0, 1], how well photographs and LiDAR constrain what the pixel shows; at most alpha, so 0 in the sky.
-            None: unknown, for a scene fitted by a version that did not measure it.
+        certainty: f32[H, W] in [0, 1], how well photographs and LiDAR constrain what the pixel shows; at most alpha, so
+            0 in the sky. None: unknown, for a scene fitted by a version that did not measure it.
     """
 
     rgb: Tensor
@@ -115,27 +123,33 @@ def check_drawing(config: FitConfig, device: torch.device) -> None:
     """Refuse before the work what no step could draw.
 
     Raises:
-        UsageError: settings that exclude each other, that the backend of this device lacks, or that give no gradients for what is to
-            be learnt.
+        UsageError: settings that exclude each other, that the backend of this device lacks, or that give no gradients
+            for what is to be learnt.
     """
     wanted = config.drawing
     backend = config.raster if config.raster != "auto" else "gsplat" if device.type == "cuda" else "cpu"
     refuse_settings(backend, RasterConfig(backend=config.raster, near_m=NEAR_M, **asdict(wanted)))
     if (wanted.projection, wanted.primitive) != ("linear", "ellipsoid") and config.densify.kind == "gradient":
-        raise UsageError("this way of drawing has no gradients of projected means, by which Gaussians are added",
-                         where="--drawing", got=f"{wanted.projection}, {wanted.primitive}", remedy="add --densify.kind mcmc")  # fmt: skip
+        raise UsageError(
+            "this way of drawing has no gradients of projected means, by which Gaussians are added",
+            where="--drawing",
+            got=f"{wanted.projection}, {wanted.primitive}",
+            remedy="add --densify.kind mcmc",
+        )
     if wanted.projection == "unscented" and config.appearance.cameras:
-        raise UsageError("unscented projection has no gradients of camera poses", where="--appearance.cameras",
-                         remedy="leave it out, or set --drawing.projection linear")  # fmt: skip
+        raise UsageError(
+            "unscented projection has no gradients of camera poses",
+            where="--appearance.cameras",
+            remedy="leave it out, or set --drawing.projection linear",
+        )
+
 
 COVERED = 0.5
 """Opacity from which on a pixel is no sky."""
 
 
 @torch.no_grad()
-def render_view(
-    model: SceneModel, view: View, raster: RasterConfig, source: str = ""
-) -> Observation:
+def render_view(model: SceneModel, view: View, raster: RasterConfig, source: str = "") -> Observation:
     """Render one view of a fitted scene as an observation of kind "virtual", on the CPU.
 
     Where coverage is below ``COVERED``: no depth (NaN), and semantics sky if the scene has a sky; what is classed as
@@ -145,9 +159,7 @@ def render_view(
 
 
 @torch.no_grad()
-def render_condition(
-    model: SceneModel, view: View, raster: RasterConfig | None = None
-) -> RenderedCondition:
+def render_condition(model: SceneModel, view: View, raster: RasterConfig | None = None) -> RenderedCondition:
     """Render one view of a fitted scene with the certainty of its pixels, on the CPU; see ``render_view``."""
     gaussians, certainty = compose(model, view.time_s), model.certainty
     if certainty is not None:
@@ -183,7 +195,8 @@ def _observed(model: SceneModel, render: Render, view: View, source: str = "") -
     depth = torch.where(covered, render.depth, torch.nan)
     semantics = None
     if render.extra is not None:
-        rows = zip(render.extra.split(_ROWS, 1), render.alpha.split(_ROWS, 1), strict=True)  # no copy of all classes at once
+        # no copy of all classes at once
+        rows = zip(render.extra.split(_ROWS, 1), render.alpha.split(_ROWS, 1), strict=True)
         channel = torch.cat([composite_semantics(model, extra, alpha).max(0).indices for extra, alpha in rows])
         semantics = torch.tensor(model.classes).to(channel.device, non_blocking=True)[channel]
         if model.sky is not None:
@@ -194,7 +207,7 @@ def _observed(model: SceneModel, render: Render, view: View, source: str = "") -
     return Observation(view, rgb, depth, semantics, confidence.clamp(0, 1), torch.ones_like(covered), "virtual", source)
 
 
-# renders of a fitted scene as the diffusion model's condition holds them ----------------------------------------------
+# renders of a fitted scene as the diffusion model's condition holds them --------------------------
 
 
 FAR_M = 1000.0
@@ -202,8 +215,9 @@ FAR_M = 1000.0
 
 
 def render_planes(model: SceneModel, view: View) -> RenderPlanes:
-    """What a fitted scene, on any device, shows at a view: on the CPU, without the leading dimension. In the sky coverage and certainty
-    are 0; a scene fitted by a version that measured no certainty counts as half certain wherever it covers."""
+    """What a fitted scene, on any device, shows at a view: on the CPU, without the leading dimension. In the sky
+    coverage and certainty are 0; a scene fitted by a version that measured no certainty counts as half certain wherever
+    it covers."""
     seen = render_condition(model, view)
     solid = torch.isfinite(seen.depth)
     alpha = torch.where(solid, seen.alpha, 0.0)

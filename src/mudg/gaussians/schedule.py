@@ -1,6 +1,7 @@
 """When a fit does what: learning rates, densification and rounds of box corrections as functions of the step.
 
-Steps count from 1 to the length of the run; a fit that goes on with a finished one begins in the middle (``gaussians/storage.py``).
+Steps count from 1 to the length of the run; a fit that goes on with a finished one begins in the middle
+(``gaussians/storage.py``).
 """
 
 from __future__ import annotations
@@ -20,12 +21,13 @@ from mudg.gaussians.densify import DensifySettings, McmcSettings
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.settings import DensifyConfig, FitConfig, StartConfig
 
-# finite ---------------------------------------------------------------------------------------------------------------
+# finite -------------------------------------------------------------------------------------------
 #
-# Nothing that is not finite reaches the parameters: loss terms and gradients are checked before every step of the optimiser.
+# Nothing that is not finite reaches the parameters: loss terms and gradients are checked before every step of the
+# optimiser.
 #
-# On the CPU each is looked at as soon as it is known. On another device looking means waiting for all that was sent there, so the numbers
-# of a whole step are gathered there and come back in one copy.
+# On the CPU each is looked at as soon as it is known. On another device looking means waiting for all that was sent
+# there, so the numbers of a whole step are gathered there and come back in one copy.
 
 
 Complaint = Callable[[float], None]
@@ -55,17 +57,27 @@ class FiniteCheck:
         )
 
     def gradients(self, view: str, model: SceneModel, appearance: Appearance) -> None:
-        """Add the gradients after the backward pass of a view, by their sums: the cheapest pass over memory there is."""
+        """Add the gradients after the backward pass of a view, by their sums: the cheapest pass over memory there
+        is."""
         learnt = {"gaussians": (model.table, SCENE_REMEDY)}
         learnt |= {owner: (table, SCENE_REMEDY) for owner, table in model.node_tables().items()}
         learnt |= {f"appearance {group}": (table, VIEW_REMEDY) for group, table in appearance.tables.items()}
-        self._add([
-            (gradient.sum(), functools.partial(_refuse_gradient, table, gradient, f"{owner}.{name}, {self._where(view)}", remedy))
-            for owner, (table, remedy) in learnt.items() for name, gradient in table.gradients().items()
-        ])  # fmt: skip
+        self._add(
+            [
+                (
+                    gradient.sum(),
+                    functools.partial(
+                        _refuse_gradient, table, gradient, f"{owner}.{name}, {self._where(view)}", remedy
+                    ),
+                )
+                for owner, (table, remedy) in learnt.items()
+                for name, gradient in table.gradients().items()
+            ]
+        )
 
     def refuse(self) -> None:
-        """NumericsError naming the first of the numbers that is not finite, if there is one; no parameter has been touched."""
+        """NumericsError naming the first of the numbers that is not finite, if there is one; no parameter has been
+        touched."""
         added, self._added = self._added, []
         if added:
             numbers = torch.stack([number for number, _ in added]).tolist()
@@ -87,8 +99,12 @@ VIEW_REMEDY = "the parameters are those of the step before; leave this view out"
 
 
 def _refuse_term(name: str, where: str, number: float) -> None:
-    raise NumericsError(f"the loss term {name!r} is not finite", where=where, got=str(number),
-        remedy="check this view's image and labels; the parameters are those of the step before")  # fmt: skip
+    raise NumericsError(
+        f"the loss term {name!r} is not finite",
+        where=where,
+        got=str(number),
+        remedy="check this view's image and labels; the parameters are those of the step before",
+    )
 
 
 def _refuse_gradient(table: Table, gradient: Tensor, where: str, remedy: str, number: float) -> None:
@@ -98,7 +114,7 @@ def _refuse_gradient(table: Table, gradient: Tensor, where: str, remedy: str, nu
         raise NumericsError("a gradient is not finite", where=where, got=f"{count} values", remedy=remedy)
 
 
-# settings of short fits: good enough to learn from what a fit gets wrong, in a few seconds ----------------------------
+# settings of short fits: good enough to learn from what a fit gets wrong, in a few seconds --------
 
 
 MOST_GAUSSIANS, VOXEL_M = 40_000, 0.25
@@ -110,19 +126,24 @@ WIDTHS = 2
 def short_fit(iterations: int, clip_width_px: int, camera_width_px: int, seed: int, device: str = "cpu") -> FitConfig:
     """A fit to recorded views alone, for renders in the conditions of clips `clip_width_px` wide."""
     return FitConfig(
-        method="street_gaussians", iterations=iterations, width_px=min(WIDTHS * clip_width_px, camera_width_px), seed=seed,
-        device=device, preview_every=1_000_000, densify=DensifyConfig(max_gaussians=MOST_GAUSSIANS),
+        method="street_gaussians",
+        iterations=iterations,
+        width_px=min(WIDTHS * clip_width_px, camera_width_px),
+        seed=seed,
+        device=device,
+        preview_every=1_000_000,
+        densify=DensifyConfig(max_gaussians=MOST_GAUSSIANS),
         start=StartConfig(gaussians=MOST_GAUSSIANS, voxel_m=VOXEL_M),
-    )  # fmt: skip
+    )
 
 
-# schedule -------------------------------------------------------------------------------------------------------------
+# schedule -----------------------------------------------------------------------------------------
 
 
 PUBLISHED_STEPS = 30_000
 FIELD_STEPS = 55_000
-"""Published steps of the field of ``s3gaussian``, whose rates a shorter run raises more than in proportion, within bounds: the field
-starts from nothing and has as far to go, and every time is seen by few of the steps."""
+"""Published steps of the field of ``s3gaussian``, whose rates a shorter run raises more than in proportion, within
+bounds: the field starts from nothing and has as far to go, and every time is seen by few of the steps."""
 LAST_DENSIFIED = 0.6
 """Share of the run after which Gaussians are no longer added."""
 LAST_POSE_ROUND = 0.85
@@ -131,8 +152,8 @@ LAST_POSE_ROUND = 0.85
 def learning_rates(step: int, iterations: int) -> dict[str, float]:
     """Learning rate of every column at a step (from 1).
 
-    Published rates belong to 30,000 steps. A shorter run takes larger steps, by the square root of the ratio and at most
-    4 times; positions decay to a hundredth over the run, scales and colours to a fifth.
+    Published rates belong to 30,000 steps. A shorter run takes larger steps, by the square root of the ratio and at
+    most 4 times; positions decay to a hundredth over the run, scales and colours to a fifth.
     """
     boost = min(4.0, math.sqrt(max(1.0, PUBLISHED_STEPS / iterations)))
     along = step / max(1, iterations)

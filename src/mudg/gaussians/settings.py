@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
 
-# settings of ``mudg fit --method emernerf`` ---------------------------------------------------------------------------
+# settings of ``mudg fit --method emernerf`` -------------------------------------------------------
 
 
 GridSizes = tuple[int, int, int, int, int]
@@ -16,15 +16,26 @@ GridSizes = tuple[int, int, int, int, int]
 
 @settings
 class RadianceConfig:
-    """Method emernerf: sizes and samples. A grid is five numbers: levels, features per level, cells along an axis of the coarsest
-    and of the finest level, and log2 of the largest number of entries per level."""
+    """Method emernerf: sizes and samples. A grid is five numbers: levels, features per level, cells along an axis of
+    the coarsest and of the finest level, and log2 of the largest number of entries per level."""
 
     RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "error_share": ("proposal_samples", 0.25), "near_m": ("static_grid", 0.1), "far_m": ("static_grid", 1000.0), "appearance": ("", 16),
-        "rate": ("", 0.01), "weight_decay": ("", 1e-5), "proposals_every": ("", 5), "sky_weight": ("", 0.001), "lidar_weight": ("", 1.0),
-        "sight_weight": ("", 0.1), "sight_start": ("", 0.08), "sight_least_m": ("", 0.6), "dynamic_weight": ("", 0.002),
-        "shadow_weight": ("", 0.01), "cycle_weight": ("", 0.01),
-    }  # fmt: skip
+        "error_share": ("proposal_samples", 0.25),
+        "near_m": ("static_grid", 0.1),
+        "far_m": ("static_grid", 1000.0),
+        "appearance": ("", 16),
+        "rate": ("", 0.01),
+        "weight_decay": ("", 1e-5),
+        "proposals_every": ("", 5),
+        "sky_weight": ("", 0.001),
+        "lidar_weight": ("", 1.0),
+        "sight_weight": ("", 0.1),
+        "sight_start": ("", 0.08),
+        "sight_least_m": ("", 0.6),
+        "dynamic_weight": ("", 0.002),
+        "shadow_weight": ("", 0.01),
+        "cycle_weight": ("", 0.01),
+    }
 
     rays: int = setting(default=512, ge=1)
     """Pixels per step."""
@@ -37,8 +48,8 @@ class RadianceConfig:
     static_grid: GridSizes = (8, 2, 16, 1024, 17)
     """Grid of the static field, in space."""
     dynamic_grid: GridSizes = (8, 2, 8, 256, 17)
-    """Grid of the dynamic field, in space and time. Levels with more places than entries share them: 32 cells along each of four axes are
-    a million places."""
+    """Grid of the dynamic field, in space and time. Levels with more places than entries share them: 32 cells along
+    each of four axes are a million places."""
     flow_grid: GridSizes = (8, 2, 8, 128, 15)
     """Grid of the flow field, in space and time."""
     first_proposal_grid: GridSizes = (5, 1, 16, 128, 16)
@@ -51,7 +62,7 @@ class RadianceConfig:
     """Width of the proposal networks."""
 
 
-# fit ------------------------------------------------------------------------------------------------------------------
+# fit ----------------------------------------------------------------------------------------------
 
 
 @settings
@@ -63,8 +74,8 @@ class StartConfig:
     gaussians: int = setting(default=70_000, ge=50)
     """Largest number of static Gaussians taken from the fused cloud; the same limit holds for all objects together."""
     voxel_m: float = setting(default=0.15, gt=0)
-    """Static points are thinned to one per cube of this size, in metres (finer close to the recorded path). Smaller gives more
-    detail and takes longer."""
+    """Static points are thinned to one per cube of this size, in metres (finer close to the recorded path). Smaller
+    gives more detail and takes longer."""
 
 
 @settings
@@ -72,13 +83,13 @@ class DensifyConfig:
     """Adding, removing and shaping Gaussians during the fit."""
 
     kind: Literal["gradient", "mcmc", "none"] = "gradient"
-    """gradient: clone, split and prune by image gradients. mcmc: move unused Gaussians and grow to max_gaussians. none: keep the
-    initial number."""
+    """gradient: clone, split and prune by image gradients. mcmc: move unused Gaussians and grow to max_gaussians. none:
+    keep the initial number."""
     max_gaussians: int = setting(default=120_000, ge=100)
     """Largest number of Gaussians. More give finer detail and take more time and memory."""
     longest_to_middle: float = setting(default=10.0, ge=1)
-    """Largest ratio of a Gaussian's longest axis to its middle axis. Long needles look right on the recorded path only, so lower
-    it if shifted views show them."""
+    """Largest ratio of a Gaussian's longest axis to its middle axis. Long needles look right on the recorded path only,
+    so lower it if shifted views show them."""
 
 
 @settings
@@ -112,12 +123,13 @@ class AppearanceConfig:
     RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"exposure_weight": ("cameras", 0.01)}
 
     exposure: Literal["none", "camera", "image"] = "none"
-    """Learn an affine colour map per camera or per recorded image. Use it if exposure or white balance changes during the log."""
+    """Learn an affine colour map per camera or per recorded image. Use it if exposure or white balance changes during
+    the log."""
     cameras: bool = False
     """Correct the camera pose of every recorded image. Use it if calibration or vehicle poses are inaccurate."""
     virtual: bool = False
-    """mudg_s: learn an affine colour map per set of virtual views, so that a colour cast of generated views does not reach the
-    recorded path."""
+    """mudg_s: learn an affine colour map per set of virtual views, so that a colour cast of generated views does not
+    reach the recorded path."""
 
 
 @settings
@@ -125,13 +137,13 @@ class DrawingConfig:
     """How Gaussians are drawn while fitting; renders of the fitted scene draw them in the same way."""
 
     antialias: bool = False
-    """Reduce the opacity of Gaussians smaller than a pixel by what the blur of the screen adds to them (Mip-Splatting). Use it if
-    renders will be larger, smaller, nearer or further than the recorded images."""
+    """Reduce the opacity of Gaussians smaller than a pixel by what the blur of the screen adds to them (Mip-Splatting).
+    Use it if renders will be larger, smaller, nearer or further than the recorded images."""
     packed: bool = False
     """Working memory only for Gaussians that a view sees: less memory, slightly slower. Needs gsplat."""
     projection: Literal["linear", "unscented"] = "linear"
-    """linear: as published for 3D Gaussian Splatting. unscented: evaluated along the ray of each pixel (3DGUT). Needs gsplat and
-    densify.kind mcmc or none."""
+    """linear: as published for 3D Gaussian Splatting. unscented: evaluated along the ray of each pixel (3DGUT). Needs
+    gsplat and densify.kind mcmc or none."""
     primitive: Literal["ellipsoid", "disc"] = "ellipsoid"
     """ellipsoid, or disc: flat Gaussians (2DGS). Needs gsplat and densify.kind mcmc or none."""
 
@@ -151,10 +163,11 @@ class RecordedLossConfig:
     semantic_every: int = setting(default=3, ge=1)
     """Learn classes from recorded views at every n-th step only. Classes converge early and cost a third of a step."""
     object_weight: float = setting(default=0.0, ge=0)
-    """Weight of the term that makes dynamic objects opaque or empty inside their boxes and removes haze outside (published:
-    0.1)."""
+    """Weight of the term that makes dynamic objects opaque or empty inside their boxes and removes haze outside
+    (published: 0.1)."""
     opacity_weight: float | None = setting(default=None, ge=0)
-    """Weight that lowers all opacities, so that Gaussians that no view needs fade (not given: 0.01 with mcmc, else 0)."""
+    """Weight that lowers all opacities, so that Gaussians that no view needs fade (not given: 0.01 with mcmc, else
+    0)."""
     scale_weight: float | None = setting(default=None, ge=0)
     """Weight per metre that shrinks all Gaussians (not given: 0.001 with mcmc, else 0)."""
 
@@ -172,19 +185,20 @@ class VirtualConfig:
     beside: bool = True
     """A step with a virtual view also learns from its recorded view. Off: from the virtual view alone, as published."""
     start: float = setting(default=0.15, ge=0, le=1)
-    """Share of the iterations before virtual views are used, 0 to 1. A fit that continues a finished one uses them at once."""
+    """Share of the iterations before virtual views are used, 0 to 1. A fit that continues a finished one uses them at
+    once."""
     stop: float = setting(default=0.9, ge=0, le=1)
-    """Share of the iterations after which virtual views are no longer used, 0 to 1. Ending on recorded views restores quality on
-    the recorded path."""
+    """Share of the iterations after which virtual views are no longer used, 0 to 1. Ending on recorded views restores
+    quality on the recorded path."""
     half_size: float = setting(default=0.8, ge=0, le=1)
-    """Share of the iterations up to which virtual views are used at half their size, 0 to 1: faster, with little loss. 0: always at
-    full size. A fit that continues a finished one begins at 0.5. Views above 2.5 million pixels are never used at full size,
-    except with 0."""
+    """Share of the iterations up to which virtual views are used at half their size, 0 to 1: faster, with little loss.
+    0: always at full size. A fit that continues a finished one begins at 0.5. Views above 2.5 million pixels are never
+    used at full size, except with 0."""
     gaussians: int = setting(default=8000, ge=0)
     """Largest number of Gaussians initialised at surfaces that only virtual views show (0 = none)."""
     confidence_power: float = setting(default=0.5, ge=0)
-    """Every virtual loss term is weighted by the confidence of the generated pixel, raised to this power (0 = all pixels count
-    the same)."""
+    """Every virtual loss term is weighted by the confidence of the generated pixel, raised to this power (0 = all
+    pixels count the same)."""
     color_weight: float = setting(default=1.0, ge=0)
     """Weight of colour."""
     ssim_weight: float = setting(default=0.3, ge=0, le=1)
@@ -192,19 +206,20 @@ class VirtualConfig:
     perceptual_weight: float = setting(default=0.3, ge=0)
     """Weight of the perceptual distance, measured by `perception`."""
     perception: Literal["filters", "codec", "lpips"] = "filters"
-    """Features of the perceptual distance. filters: a fixed filter bank. codec: the shipped diffusion model's codec, slower.
-    lpips: the LPIPS network, which needs `lpips_weights`."""
+    """Features of the perceptual distance. filters: a fixed filter bank. codec: the shipped diffusion model's codec,
+    slower. lpips: the LPIPS network, which needs `lpips_weights`."""
     lpips_weights: str = ""
     """Safetensors file with LPIPS weights (AlexNet, version 0.1, tensor names of the lpips package)."""
     depth_weight: float = setting(default=0.3, ge=0)
     """Weight of the generated dense depth (robust relative error)."""
     lidar_weight: float = setting(default=0.2, ge=0)
-    """Weight of the fused LiDAR points' depth in virtual views (relative error; the worst 5 % of the points are ignored)."""
+    """Weight of the fused LiDAR points' depth in virtual views (relative error; the worst 5 % of the points are
+    ignored)."""
     sky_weight: float = setting(default=0.05, ge=0)
     """Weight of the term that keeps the generated sky free of Gaussians (published: none)."""
     semantic_weight: float = setting(default=0.02, ge=0)
-    """Weight of generated classes (cross-entropy). It is small because Gaussians that learned from recorded frames know classes
-    better than the shipped diffusion model."""
+    """Weight of generated classes (cross-entropy). It is small because Gaussians that learned from recorded frames know
+    classes better than the shipped diffusion model."""
 
 
 @settings
@@ -215,13 +230,16 @@ class FitConfig:
         "hexplane": ("poses", {"features": 8, "levels": 2, "space": 64, "time": 25, "width": 64})
     }
 
-    method: Literal["gs3d", "street_gaussians", "pvg", "omnire", "s3gaussian", "bezier", "emernerf", "difix", "mudg_s"] = "mudg_s"
-    """What is fitted. gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the same, supervised by
-    virtual views. pvg, s3gaussian, emernerf (without boxes), omnire, bezier, difix (which learns from repaired renders): published
-    methods for comparison (docs/baselines.md)."""
+    method: Literal[
+        "gs3d", "street_gaussians", "pvg", "omnire", "s3gaussian", "bezier", "emernerf", "difix", "mudg_s"
+    ] = "mudg_s"
+    """What is fitted. gs3d: static Gaussians only. street_gaussians: static world, dynamic objects and sky. mudg_s: the
+    same, supervised by virtual views. pvg, s3gaussian, emernerf (without boxes), omnire, bezier, difix (which learns
+    from repaired renders): published methods for comparison (docs/baselines.md)."""
     iterations: int = setting(default=2000, ge=1, le=1_000_000)
-    """Optimisation steps, each with one recorded view (mudg_s: sometimes a virtual view too). Learning rates and schedules adapt
-    to this number. With `--start-from`: further steps, the second half of a schedule of twice as many."""
+    """Optimisation steps, each with one recorded view (mudg_s: sometimes a virtual view too). Learning rates and
+    schedules adapt to this number. With `--start-from`: further steps, the second half of a schedule of twice as
+    many."""
     seed: int = 0
     """Seed of all random numbers; the same seed gives the same result."""
     cameras: tuple[str, ...] = ()
@@ -229,8 +247,8 @@ class FitConfig:
     width_px: int = setting(default=0, ge=0)
     """Image width in pixels while fitting; the height follows (0 = as recorded). Lower it to save time and memory."""
     sh_degree: int = setting(default=0, ge=0, le=3)
-    """Degree of the spherical harmonics for view-dependent colour. On short drives every degree above 0 overfits to the recorded
-    path."""
+    """Degree of the spherical harmonics for view-dependent colour. On short drives every degree above 0 overfits to the
+    recorded path."""
     semantics: bool = True
     """Learn semantic classes where the scene has labels."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
@@ -238,8 +256,8 @@ class FitConfig:
     device: DeviceName = "auto"
     """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""
     checkpoint_every: int = setting(default=500, ge=1)
-    """Steps between checkpoints; an interrupted fit resumes at the last one. Large ones are rarer: they take at most a twentieth of
-    the time."""
+    """Steps between checkpoints; an interrupted fit resumes at the last one. Large ones are rarer: they take at most a
+    twentieth of the time."""
     preview_every: int = setting(default=500, ge=1)
     """Steps between preview images."""
     start: StartConfig = setting(default_factory=StartConfig)

@@ -43,8 +43,8 @@ class SkyNode:
     def coarse_picture(self, view: View) -> Tensor:
         """Sky colour ``[3, h, w]`` on a coarse grid of a view's pixels; differentiable in the panorama.
 
-        The panorama is far coarser than an image, so it is sampled for every s-by-s block of pixels (s chosen such that samples
-        stay denser than texels), to be interpolated between them.
+        The panorama is far coarser than an image, so it is sampled for every s-by-s block of pixels (s chosen such that
+        samples stay denser than texels), to be interpolated between them.
         """
         camera = view.camera
         texel_rad = np.pi / self.rows
@@ -68,7 +68,7 @@ class SkyNode:
         """As ``_grid``, computed where the panorama is, from plain numbers: nothing is copied there."""
         camera, device = view.camera.resized(width, height), self.table.device
         columns, rows = (torch.arange(n, dtype=torch.float64, device=device) + 0.5 for n in (width, height))
-        across, down = geometry.pinhole_ray(camera.intrinsics, columns, rows)  # type: ignore[arg-type]
+        across, down = geometry.pinhole_ray(camera.intrinsics, columns, rows)
         pose = view.world_from_cam[:3, :3].tolist()
         x, y, z = (across * right + (down[:, None] * below + ahead) for right, below, ahead in pose)
         span = 2 * self.rows / (2 * self.rows + 2)
@@ -87,8 +87,8 @@ class SkyNode:
         """Start from measured sky colours: mean per texel; texels nobody saw take the nearest seen one's colour.
 
         Args:
-            measured: portions of directions in the world ``[M, 3]`` and their colours f32[M, 3] in [0, 1]. How they are divided
-                makes no difference.
+            measured: portions of directions in the world ``[M, 3]`` and their colours f32[M, 3] in [0, 1]. How they are
+                divided makes no difference.
         """
         rows, columns = self.rows, 2 * self.rows
         total, count = np.zeros((3, rows * columns)), np.zeros(rows * columns)
@@ -108,7 +108,8 @@ class SkyNode:
         self.table.columns["panorama"].detach().copy_(torch.from_numpy(filled).float()[None])
 
     def continued(self, unknown: NDArray[np.bool_], seen: NDArray[np.bool_]) -> SkyNode:
-        """The same sky with unknown texels bool[Hs, 2 Hs] in the colour of the nearest seen one; itself where none is."""
+        """The same sky with unknown texels bool[Hs, 2 Hs] in the colour of the nearest seen one; itself where none
+        is."""
         if not unknown.any() or not seen.any():
             return self
         rows_of, columns_of = (torch.from_numpy(index).to(self.table.device) for index in _nearest(seen))

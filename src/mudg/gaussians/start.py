@@ -1,9 +1,11 @@
-"""Starting values of a scene model: fused points become Gaussians, what LiDAR never reached is filled in, the sky is painted.
+"""Starting values of a scene model: fused points become Gaussians, what LiDAR never reached is filled in, the sky is
+painted.
 
-What LiDAR does not reach in a street: facades above the topmost beam, and everything beyond its range. Both are filled from
-the recorded images: a pixel that is neither sky nor a dynamic object and has no point near it takes the depth of the surface of
-the same class below it in its column (walls, trees and poles stand upright, so their camera z hardly changes upwards); where
-there is none it is put on a far shell. This needs semantic labels; without them nothing is filled and the sky stands in.
+What LiDAR does not reach in a street: facades above the topmost beam, and everything beyond its range. Both are filled
+from the recorded images: a pixel that is neither sky nor a dynamic object and has no point near it takes the depth of
+the surface of the same class below it in its column (walls, trees and poles stand upright, so their camera z hardly
+changes upwards); where there is none it is put on a far shell. This needs semantic labels; without them nothing is
+filled and the sky stands in.
 """
 
 from __future__ import annotations
@@ -31,7 +33,7 @@ from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.sky import SkyNode
 from mudg.gaussians.views import StoredView, heads_of
 
-# starting values of Gaussians: points, thinned and coloured, become rows of the table ---------------------------------
+# starting values of Gaussians: points, thinned and coloured, become rows of the table -------------
 
 
 SH_C0: Final = 0.28209479177387814
@@ -39,9 +41,10 @@ START_OPACITY: Final = 0.1
 
 
 def voxel_filter(xyz: NDArray[np.float32], size_m: NDArray[np.floating] | float) -> NDArray[np.int64]:
-    """Indices of one point per cube of side ``size_m`` (a number, or one per point, taken to powers of sqrt 2), sorted."""
+    """Indices of one point per cube of side ``size_m`` (a number, or one per point, taken to powers of sqrt 2),
+    sorted."""
     if np.isscalar(size_m):
-        level, cell = np.zeros(len(xyz), np.int64), np.floor(xyz / float(size_m)).astype(np.int64)  # type: ignore[arg-type]
+        level, cell = np.zeros(len(xyz), np.int64), np.floor(xyz / float(size_m)).astype(np.int64)
     else:
         level = np.round(2 * np.log2(np.asarray(size_m, np.float64))).astype(np.int64)
         cell = np.floor(xyz / np.exp2(level / 2)[:, None]).astype(np.int64)
@@ -61,9 +64,13 @@ def neighbour_scale(xyz: NDArray[np.float32], smallest_m: float = 0.005, largest
 
 
 def columns_from_points(
-    xyz: NDArray[np.float32], rgb: NDArray[np.uint8], semantics: NDArray[np.uint8] | None, classes: Sequence[int],
-    sh_degree: int, scale_m: NDArray[np.float32] | None = None,
-) -> dict[str, Tensor]:  # fmt: skip
+    xyz: NDArray[np.float32],
+    rgb: NDArray[np.uint8],
+    semantics: NDArray[np.uint8] | None,
+    classes: Sequence[int],
+    sh_degree: int,
+    scale_m: NDArray[np.float32] | None = None,
+) -> dict[str, Tensor]:
     """Starting columns for ``N`` coloured points: round, colour of the point, class of the point where known.
 
     Args:
@@ -92,7 +99,8 @@ def columns_from_points(
 
 
 def box_grid(size_m: Sequence[float], rgb: Sequence[float]) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Points on the surface of a box, for an object that the LiDAR hardly saw: xyz f32[M, 3] in the box frame, one colour."""
+    """Points on the surface of a box, for an object that the LiDAR hardly saw: xyz f32[M, 3] in the box frame, one
+    colour."""
     axis = np.linspace(-0.5, 0.5, 12)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     surface = grid[(np.abs(grid) > 0.5 - 1e-9).any(1)]
@@ -100,7 +108,7 @@ def box_grid(size_m: Sequence[float], rgb: Sequence[float]) -> tuple[NDArray[np.
     return xyz, np.broadcast_to(np.asarray(rgb, np.uint8), (len(xyz), 3)).copy()
 
 
-# start ----------------------------------------------------------------------------------------------------------------
+# start --------------------------------------------------------------------------------------------
 
 
 UPRIGHT_IDS = tuple(ID[n] for n in ("building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation"))
@@ -116,7 +124,8 @@ MIRROR_APART_M = 0.25
 
 @dataclass(frozen=True, eq=False)
 class StartPoints:
-    """Points that become Gaussians, in the frame of their node: xyz f32[N, 3] and scale f32[N] in metres, rgb u8[N, 3], train ids u8[N]."""
+    """Points that become Gaussians, in the frame of their node: xyz f32[N, 3] and scale f32[N] in metres, rgb u8[N, 3],
+    train ids u8[N]."""
 
     xyz: NDArray[np.float32]
     rgb: NDArray[np.uint8]
@@ -150,7 +159,9 @@ def start_model(
         InputError: the fused cloud has no points at all.
     """
     if len(fused.static) == 0:
-        raise InputError("the fused cloud has no static points", where=scene.root, remedy="check the LiDAR of the scene")
+        raise InputError(
+            "the fused cloud has no static points", where=scene.root, remedy="check the LiDAR of the scene"
+        )
     kinds = METHODS[config.method].nodes
     blocks = [_static_columns(fused, views, classes, config)]
     nodes: list[StaticNode | RigidNode] = [StaticNode()]
@@ -161,11 +172,15 @@ def start_model(
             blocks.append(_object_columns(node, cloud, classes, config, min(share, 8000)))
             nodes.append(node)
     columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
-    owner = torch.cat([torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)])
+    owner = torch.cat(
+        [torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)]
+    )
     sky = painted_sky(views, fused.colors) if "sky" in kinds else None
     static = len(blocks[0]["means"])
     log.info(f"start: {static} static Gaussians, {len(owner) - static} on {len(nodes) - 1} dynamic objects")
-    return SceneModel(Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree, colors=fused.colors)
+    return SceneModel(
+        Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree, colors=fused.colors
+    )
 
 
 def _static_columns(
@@ -184,7 +199,8 @@ def _labels(cloud: PointCloud) -> NDArray[np.uint8]:
 
 
 def thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], config: FitConfig) -> NDArray[np.int64]:
-    """Rows to keep: one point per voxel, voxels growing with the distance to the nearest camera, at most the wanted number."""
+    """Rows to keep: one point per voxel, voxels growing with the distance to the nearest camera, at most the wanted
+    number."""
     distance, _ = cKDTree(centers).query(xyz, k=1, workers=1)
     size = config.start.voxel_m * np.clip(distance / 20.0, 0.4, 3.0)
     for _ in range(12):
@@ -195,8 +211,11 @@ def thinned(xyz: NDArray[np.float32], centers: NDArray[np.float32], config: FitC
     return rows[np.sort(seeds.numpy_rng(config.seed, 0, "thin").permutation(len(rows))[: config.start.gaussians])]
 
 
-def mirrored_points(xyz: NDArray[np.float32], apart_m: float = MIRROR_APART_M) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
-    """Points reflected about y = 0 of the box, where no measured point is within ``apart_m``: xyz f32[M, 3] and their sources."""
+def mirrored_points(
+    xyz: NDArray[np.float32], apart_m: float = MIRROR_APART_M
+) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+    """Points reflected about y = 0 of the box, where no measured point is within ``apart_m``: xyz f32[M, 3] and their
+    sources."""
     if len(xyz) == 0:
         return xyz, np.zeros(0, np.int64)
     flipped = xyz * np.array([1, -1, 1], np.float32)
@@ -224,7 +243,7 @@ def _object_columns(
     return StartPoints(xyz, rgb, semantics, neighbour_scale(xyz, 0.02, 0.3)).columns(classes, config.sh_degree)
 
 
-# ---- beyond LiDAR ---------------------------------------------------------------------------------------------------
+# ---- beyond LiDAR --------------------------------------------------------------------------------
 
 
 def fill_unreached(
@@ -247,7 +266,7 @@ def _fill_view(
     center_row = (np.arange(rows) * cell + cell // 2)[:, None]
     center_column = (np.arange(columns) * cell + cell // 2)[None, :]
     train_ids = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))
-    channel = stored.channels[center_row, center_column]  # type: ignore[index]
+    channel = stored.channels[center_row, center_column]
     label = train_ids[np.minimum(channel, len(classes))]
     depth = _cell_depth(stored, xyz, rows, columns)
     covered = np.isfinite(depth)
@@ -271,11 +290,17 @@ def _fill_view(
 
 
 def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns: int) -> NDArray[np.float64]:
-    """Nearest depth of the points in each cell of the image; infinity where there is none. A cell beside a covered one in
-    its row counts as covered (LiDAR lines are sparse)."""
+    """Nearest depth of the points in each cell of the image; infinity where there is none. A cell beside a covered one
+    in its row counts as covered (LiDAR lines are sparse)."""
     uv, z = geometry.project(stored.view, xyz)
     with np.errstate(invalid="ignore"):
-        inside = (z > 1.0) & (uv[:, 0] >= 0) & (uv[:, 0] < columns * FILL_CELL_PX) & (uv[:, 1] >= 0) & (uv[:, 1] < rows * FILL_CELL_PX)
+        inside = (
+            (z > 1.0)
+            & (uv[:, 0] >= 0)
+            & (uv[:, 0] < columns * FILL_CELL_PX)
+            & (uv[:, 1] >= 0)
+            & (uv[:, 1] < rows * FILL_CELL_PX)
+        )
     column, row = (uv[inside, 0] // FILL_CELL_PX).astype(int), (uv[inside, 1] // FILL_CELL_PX).astype(int)
     depth = np.full((rows, columns), np.inf)
     np.minimum.at(depth, (row, column), z[inside])

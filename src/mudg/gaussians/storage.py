@@ -64,8 +64,13 @@ def model_of_scene(folder: Path, scene: Scene) -> SceneModel:
     """
     model = load_model(folder)
     if model.facts.get("scene", scene.id) != scene.id:
-        raise InputError("this scene was fitted to another log", where=str(folder), expected=scene.id, got=str(model.facts["scene"]),
-                         remedy="give the fit of this scene")  # fmt: skip
+        raise InputError(
+            "this scene was fitted to another log",
+            where=str(folder),
+            expected=scene.id,
+            got=str(model.facts["scene"]),
+            remedy="give the fit of this scene",
+        )
     return model
 
 
@@ -89,13 +94,17 @@ def load_model(folder: Path) -> SceneModel:
     """Read a fitted scene of Gaussians.
 
     Raises:
-        InputError: not the folder of a finished fit, a radiance field, or of another schema. IntegrityError: a file was altered.
+        InputError: not the folder of a finished fit, a radiance field, or of another schema. IntegrityError: a file was
+            altered.
     """
     folder = Path(folder)
     if kind_of(folder) != GAUSSIANS:
-        raise InputError("this fit is a radiance field, which has no Gaussians and no objects", where=str(folder),
-                         expected="a scene fitted by a method with Gaussians",
-                         remedy="`mudg render` shows it; for everything else fit with --method street_gaussians")  # fmt: skip
+        raise InputError(
+            "this fit is a radiance field, which has no Gaussians and no objects",
+            where=str(folder),
+            expected="a scene fitted by a method with Gaussians",
+            remedy="`mudg render` shows it; for everything else fit with --method street_gaussians",
+        )
     if (folder / store.MANIFEST).is_file():
         store.verify_manifest(folder)
     values = description_of(folder)
@@ -115,7 +124,8 @@ def load_model(folder: Path) -> SceneModel:
 
 
 def _try_out(model: SceneModel) -> None:
-    """Fail where the parts of a scene that no manifest vouches for do not fit together: draw a small picture while each object is there."""
+    """Fail where the parts of a scene that no manifest vouches for do not fit together: draw a small picture while each
+    object is there."""
     TypeAdapter(DrawingConfig).validate_python(model.facts.get(DRAWING, {}))
     camera = Camera("trial", 16, 12, 16.0, 16.0, 8.0, 6.0)
     for time_s in {0.0, *(float(node.times_s.mean()) for node in model.nodes if isinstance(node, RigidNode))}:
@@ -123,19 +133,20 @@ def _try_out(model: SceneModel) -> None:
             render_view(model, View(camera, np.eye(4), time_s), raster_of(model))
 
 
-# continued ------------------------------------------------------------------------------------------------------------
+# continued ----------------------------------------------------------------------------------------
 #
 # Going on with a finished fit: its Gaussians, sky and corrections are the start of another one.
 #
-# The new steps are the second half of a run of twice as many: 500 more steps are the steps 501 to 1000 of a run of 1000, with the
-# learning
-# rates, the densification and the rounds of box corrections that these have. (Going on where a run of all steps together would be, at two
-# thirds for 500 after 1000, was measured to learn less from virtual views: the steps are too short by then.)
+# The new steps are the second half of a run of twice as many: 500 more steps are the steps 501 to 1000 of a run of
+# 1000, with the learning rates, the densification and the rounds of box corrections that these have. (Going on where a
+# run of all steps together would be, at two thirds for 500 after 1000, was measured to learn less from virtual views:
+# the steps are too short by then.)
 
 
 START_METHOD = "street_gaussians"
 NEW_CLASS_LOGIT = -6.0
-"""Logit of a class that the finished fit did not know: as unlikely as classes are that a Gaussian has learnt not to show."""
+"""Logit of a class that the finished fit did not know: as unlikely as classes are that a Gaussian has learnt not to
+show."""
 
 
 @dataclass(frozen=True)
@@ -166,13 +177,23 @@ class StartFit:
         for name, expected in inputs.items():
             found = state.get("inputs", {}).get(name)
             if found != expected:
-                raise InputError(f"the finished fit belongs to another {WHAT[name]}", where=f"{folder / 'run.json'}, inputs.{name}",
-                                 expected=expected, got=str(found), remedy=f"fit street_gaussians to this {WHAT[name]} first")  # fmt: skip
+                raise InputError(
+                    f"the finished fit belongs to another {WHAT[name]}",
+                    where=f"{folder / 'run.json'}, inputs.{name}",
+                    expected=expected,
+                    got=str(found),
+                    remedy=f"fit street_gaussians to this {WHAT[name]} first",
+                )
         facts = description_of(folder).get("facts")
         method = facts.get("method") if isinstance(facts, dict) else None
         if method != START_METHOD:
-            raise InputError("a fit can only go on with one on recorded views", where=f"{folder / 'model.json'}, facts.method",
-                             expected=START_METHOD, got=str(method), remedy=remedy)  # fmt: skip
+            raise InputError(
+                "a fit can only go on with one on recorded views",
+                where=f"{folder / 'model.json'}, facts.method",
+                expected=START_METHOD,
+                got=str(method),
+                remedy=remedy,
+            )
         return cls(folder, store.digest(folder))
 
 
@@ -184,7 +205,8 @@ def _state_of(folder: Path) -> dict[str, Any]:
 
 
 def _state_of_edited(folder: Path) -> dict[str, Any]:
-    """The state of a fit that belongs to a finished edited run, RUN/fit/METHOD: its inputs are the run's own scene and clouds."""
+    """The state of a fit that belongs to a finished edited run, RUN/fit/METHOD: its inputs are the run's own scene and
+    clouds."""
     run = folder.resolve().parent.parent
     if folder.resolve().parent.name != "fit" or not (run / "scene").is_dir() or not (run / "fuse").is_dir():
         return {}
@@ -204,7 +226,8 @@ def begun_at(iterations: int) -> int:
 
 
 def whole_run(config: FitConfig) -> FitConfig:
-    """Settings of the run whose second half ``config.iterations`` steps are, with virtual views as often as they then are used."""
+    """Settings of the run whose second half ``config.iterations`` steps are, with virtual views as often as they then
+    are used."""
     virtual = replace(config.virtual, probability=config.virtual.continued_probability)
     return replace(config, iterations=2 * config.iterations, virtual=virtual)
 
@@ -218,12 +241,22 @@ def continued_model(start: StartFit, classes: Sequence[int], config: FitConfig) 
     model = load_model(start.folder)
     model.table.labels.pop(CERTAINTY, None)
     if model.sh_degree != config.sh_degree:
-        raise UsageError("the finished fit has another degree of spherical harmonics", where=str(start.folder),
-                         expected=str(config.sh_degree), got=str(model.sh_degree), remedy=f"add --sh-degree {model.sh_degree}")  # fmt: skip
+        raise UsageError(
+            "the finished fit has another degree of spherical harmonics",
+            where=str(start.folder),
+            expected=str(config.sh_degree),
+            got=str(model.sh_degree),
+            remedy=f"add --sh-degree {model.sh_degree}",
+        )
     drawn, wanted = model.facts.get(DRAWING, {}), drawing_facts(config.drawing).get(DRAWING, {})
     if drawn != wanted:
-        raise UsageError("the finished fit was drawn with other settings", where=str(start.folder), expected=str(drawn or "the usual ones"),
-                         got=str(wanted or "the usual ones"), remedy="give the finished fit's --drawing settings")  # fmt: skip
+        raise UsageError(
+            "the finished fit was drawn with other settings",
+            where=str(start.folder),
+            expected=str(drawn or "the usual ones"),
+            got=str(wanted or "the usual ones"),
+            remedy="give the finished fit's --drawing settings",
+        )
     for node in model.nodes:
         if isinstance(node, RigidNode) and config.poses.learn and not node.learn_pose:
             node.learn_pose = True
@@ -253,8 +286,12 @@ def all_classes(start: StartFit, classes: Sequence[int]) -> tuple[int, ...]:
 
 
 def continued_appearance(start: StartFit, fresh: Appearance) -> Appearance:
-    """The corrections that a new fit starts from, with those that the finished one learnt about the same images and cameras."""
+    """The corrections that a new fit starts from, with those that the finished one learnt about the same images and
+    cameras."""
     learnt = load_appearance(start.folder)
-    kept = {group: learnt.tables[group] for group in (RECORDED_COLOR, CAMERA_POSE)
-            if group in fresh.names and learnt.names.get(group) == fresh.names[group]}  # fmt: skip
+    kept = {
+        group: learnt.tables[group]
+        for group in (RECORDED_COLOR, CAMERA_POSE)
+        if group in fresh.names and learnt.names.get(group) == fresh.names[group]
+    }
     return Appearance(fresh.names, {**fresh.tables, **kept})

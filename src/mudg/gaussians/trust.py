@@ -1,10 +1,10 @@
 """Which part of a virtual view no recorded camera ever saw, and Gaussians to start there.
 
-Behind a parked bus a generated view is the best there is; nothing was measured there, so no Gaussian could start there. For every
-pixel of a virtual view, its point (at the depth of the virtual view itself) is carried to a number of recorded views, with its
-dynamic object if it lies in one's box, and compared with the depth that the model renders there. If a recorded view shows that point, or
-something behind it, the pixel is *seen*. Points that are hidden in every recorded view, or outside all their images, are *unseen*:
-``unseen_rows`` makes Gaussians of them.
+Behind a parked bus a generated view is the best there is; nothing was measured there, so no Gaussian could start there.
+For every pixel of a virtual view, its point (at the depth of the virtual view itself) is carried to a number of
+recorded views, with its dynamic object if it lies in one's box, and compared with the depth that the model renders
+there. If a recorded view shows that point, or something behind it, the pixel is *seen*. Points that are hidden in every
+recorded view, or outside all their images, are *unseen*: ``unseen_rows`` makes Gaussians of them.
 """
 
 from __future__ import annotations
@@ -27,12 +27,13 @@ from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.start import StartPoints, voxel_filter
 from mudg.gaussians.views import StoredView, TrainView, heads_of
 
-# certainty ------------------------------------------------------------------------------------------------------------
+# certainty ----------------------------------------------------------------------------------------
 #
 # How well the photographs constrain every Gaussian of a fitted scene: its certainty.
 #
-# A render beside the recorded path is right where several photographs saw the same surface and agree about it, and where LiDAR agrees
-# with its depth. Three sums per Gaussian say so, over recorded views and their pixels, with the blending weight w of the Gaussian:
+# A render beside the recorded path is right where several photographs saw the same surface and agree about it, and
+# where LiDAR agrees with its depth. Three sums per Gaussian say so, over recorded views and their pixels, with the
+# blending weight w of the Gaussian:
 #
 #     views     of each view W / (W + 1), W the sum of w in pixels: the number of photographs that show it
 #     colour    w |render - photograph| / w, the mean difference of the pixels that it is part of
@@ -40,8 +41,8 @@ from mudg.gaussians.views import StoredView, TrainView, heads_of
 #
 #     certainty = views / (views + 1) * c / (c + colour) * d / (d + depth)
 #
-# The sums are exact: w is the derivative of a rendered feature by the Gaussian's feature, so that one backward pass per view, with an
-# image in place of the loss's gradient, sums over all pixels at once.
+# The sums are exact: w is the derivative of a rendered feature by the Gaussian's feature, so that one backward pass per
+# view, with an image in place of the loss's gradient, sums over all pixels at once.
 
 
 COLOR_ERROR = 0.02
@@ -83,7 +84,8 @@ def certainty_of(
     appearance: Appearance | None = None,
     most: int = 0,
 ) -> Tensor:
-    """Certainty of every Gaussian of a model, f16[N], from recorded views, evenly chosen if there are more than ``most`` (0 = all)."""
+    """Certainty of every Gaussian of a model, f16[N], from recorded views, evenly chosen if there are more than
+    ``most`` (0 = all)."""
     return evidence_of(model, views, raster, appearance, most).certainty().half()
 
 
@@ -108,7 +110,8 @@ def evidence_of(
 def weight_sums(
     model: SceneModel, view: TrainView, raster: RasterConfig, appearance: Appearance | None = None
 ) -> Tensor:
-    """``[4, N]``: over the pixels of one view, the blending weights of every Gaussian times each of ``difference_images``."""
+    """``[4, N]``: over the pixels of one view, the blending weights of every Gaussian times each of
+    ``difference_images``."""
     with torch.no_grad():
         gaussians = compose(model, view.view.time_s, semantics=False)
         pose = None if appearance is None else appearance.world_from_cam(view.view, view.name)
@@ -123,8 +126,8 @@ def weight_sums(
 
 @torch.no_grad()
 def difference_images(model: SceneModel, render: Render, view: TrainView, appearance: Appearance | None) -> Tensor:
-    """``[4, H, W]``: 1 where the photograph counts, and its difference from the render; 1 where LiDAR measured, and the relative
-    difference (at most 1)."""
+    """``[4, H, W]``: 1 where the photograph counts, and its difference from the render; 1 where LiDAR measured, and the
+    relative difference (at most 1)."""
     rgb = composite_sky(model, view.view, render.rgb, render.alpha)
     rgb = rgb if appearance is None else appearance.colored(rgb, view.name, view.kind)
     used = view.mask[0].float()
@@ -137,7 +140,7 @@ def difference_images(model: SceneModel, render: Render, view: TrainView, appear
     return torch.stack([used, color, lidar, depth])
 
 
-# trust ----------------------------------------------------------------------------------------------------------------
+# trust --------------------------------------------------------------------------------------------
 
 
 WITNESSES = 36
@@ -194,7 +197,8 @@ def block_centres(size_px: int) -> NDArray[np.intp]:
 
 
 class _Placed:
-    """An object whose poses do not change meanwhile: each is worked out once, for every view asks for those of all witnesses."""
+    """An object whose poses do not change meanwhile: each is worked out once, for every view asks for those of all
+    witnesses."""
 
     def __init__(self, node: RigidNode) -> None:
         self.size_m = node.size_m
@@ -218,7 +222,8 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
     points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), depth)
     carried = [(node, found) for node in objects if (found := _in_box(node, points, stored.view.time_s)) is not None]
     seen = np.zeros(len(points), bool)
-    for witness in sorted(witnesses, key=lambda one: abs(one.view.time_s - stored.view.time_s)):  # who sees most comes first
+    # who sees most comes first
+    for witness in sorted(witnesses, key=lambda one: abs(one.view.time_s - stored.view.time_s)):
         left = np.flatnonzero(~seen)
         place = np.full(len(points), -1)
         place[left] = np.arange(len(left))
@@ -237,10 +242,11 @@ def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence
 def unseen_rows(
     model: SceneModel, unseen: Iterable[tuple[StoredView, NDArray[np.bool_]]], most: int, run_seed: int
 ) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor], float]:
-    """Table rows (columns, labels; on the CPU) at the surfaces that only virtual views show, thinned to one per place, at most
-    ``most``; and the mean share of pixels that show them.
+    """Table rows (columns, labels; on the CPU) at the surfaces that only virtual views show, thinned to one per place,
+    at most ``most``; and the mean share of pixels that show them.
 
-    A point in the box of a dynamic object belongs to that object. Above ``MOST_SEEDS`` points, every second one goes on.
+    A point in the box of a dynamic object belongs to that object. Above ``MOST_SEEDS`` points, every second one goes
+    on.
     """
     objects = {index: _Placed(node) for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
     found: dict[int, list[StartPoints]] = {index: [] for index in range(len(model.nodes))}
@@ -265,12 +271,16 @@ def unseen_rows(
     if not columns:
         none = {name: value.detach()[:0].cpu() for name, value in model.table.columns.items()}
         return none, {"node": torch.zeros(0, dtype=torch.int32)}, float(np.mean(shares))
-    return {name: torch.cat([c[name] for c in columns]) for name in columns[0]}, {"node": torch.cat(owners)}, float(np.mean(shares))
+    return (
+        {name: torch.cat([c[name] for c in columns]) for name in columns[0]},
+        {"node": torch.cat(owners)},
+        float(np.mean(shares)),
+    )
 
 
 def _spread(points: StartPoints, most: int, rng: np.random.Generator) -> StartPoints:
-    """At most ``most`` of the points, one per cube; the cubes, and the scales of what stands for them, grow until that suffices, so that
-    few points still leave no holes between them."""
+    """At most ``most`` of the points, one per cube; the cubes, and the scales of what stands for them, grow until that
+    suffices, so that few points still leave no holes between them."""
     size = np.maximum(2.0 * points.scale_m, 0.08)
     rows = voxel_filter(points.xyz, size)
     for _ in range(SPREAD_ROUNDS):
@@ -302,7 +312,9 @@ def _seeds_of(
     row, column, z = row[kept], column[kept], z[kept].astype(np.float64)
     points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), z)
     channel = np.full(len(row), UNLABELLED, np.uint8) if stored.channels is None else stored.channels[row, column]
-    train_id = np.append(np.array(model.classes, np.uint8), np.uint8(UNLABELLED))[np.minimum(channel, len(model.classes))]
+    train_id = np.append(np.array(model.classes, np.uint8), np.uint8(UNLABELLED))[
+        np.minimum(channel, len(model.classes))
+    ]
     scale = (0.6 * SEED_STRIDE_PX * z / stored.view.camera.fx).astype(np.float32)
     rgb = model.colors.bytes_to_common(stored.view.camera.name, stored.rgb[row, column])
     owner = np.zeros(len(row), np.int64)
@@ -313,8 +325,9 @@ def _seeds_of(
             owner[inside[0]], local[inside[0]] = index, inside[1]
     return [
         (int(index), StartPoints(local[mine].astype(np.float32), rgb[mine], train_id[mine], scale[mine]))
-        for index in np.unique(owner) for mine in [owner == index]
-    ]  # fmt: skip
+        for index in np.unique(owner)
+        for mine in [owner == index]
+    ]
 
 
 def _sees_or_sees_past(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -327,7 +340,9 @@ def _sees_or_sees_past(witness: _Witness, points: NDArray[np.float64]) -> NDArra
     return inside & (witness.depth[row, column] >= z * (1 - TOLERANCE))
 
 
-def _in_box(node: _Placed, points: NDArray[np.float64], time_s: float) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
+def _in_box(
+    node: _Placed, points: NDArray[np.float64], time_s: float
+) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
     """Indices of points in the node's box (grown by a tenth) and their coordinates in it; None if there are none."""
     pose = node.pose_matrix(time_s)
     if pose is None:

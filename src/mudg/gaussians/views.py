@@ -1,7 +1,8 @@
 """The views a fit learns from: recorded frames with their LiDAR depths, and virtual observations.
 
-Everything is stored as bytes (8-bit colour and labels) and becomes tensors when a step asks for one view. Which view a step
-gets is a function of (run seed, step) alone. Where the bytes lie, in memory or in a file, is decided in ``views.py``.
+Everything is stored as bytes (8-bit colour and labels) and becomes tensors when a step asks for one view. Which view a
+step gets is a function of (run seed, step) alone. Where the bytes lie, in memory or in a file, is decided in
+``views.py``.
 """
 
 from __future__ import annotations
@@ -98,8 +99,8 @@ class ViewHead:
 
 @dataclass(frozen=True)
 class StoredView:
-    """A ``TrainView`` in bytes: rgb u8[H, W, 3]; channels u8[H, W]; sky, mask bool[H, W]; depth f32[H, W]; confidence u8[H, W] (255 =
-    1). None where there is none; no mask: all pixels, no confidence: 1."""
+    """A ``TrainView`` in bytes: rgb u8[H, W, 3]; channels u8[H, W]; sky, mask bool[H, W]; depth f32[H, W]; confidence
+    u8[H, W] (255 = 1). None where there is none; no mask: all pixels, no confidence: 1."""
 
     name: str
     view: View
@@ -171,7 +172,9 @@ class ViewSet:
             if isinstance(views, FiledViews):
                 views.close()
 
-    def choose(self, run_seed: int, step: int, virtual_probability: float, beside: bool = False) -> tuple[StoredView, ...]:
+    def choose(
+        self, run_seed: int, step: int, virtual_probability: float, beside: bool = False
+    ) -> tuple[StoredView, ...]:
         """The views of a step: a virtual one with the given probability (if there are any), else the next recorded one.
 
         Recorded views come in a fresh random order per round, so that every one is seen equally often.
@@ -192,7 +195,7 @@ class ViewSet:
         return self.recorded[int(order[place])]
 
 
-# ---- recorded ----------------------------------------------------------------------------------------------------
+# ---- recorded ------------------------------------------------------------------------------------
 
 
 def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
@@ -203,10 +206,14 @@ def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
     """
     for name in cameras:
         if name not in scene.cameras:
-            raise UsageError(f"the scene has no camera named {name!r}", where=scene.root, expected=", ".join(scene.cameras))
+            raise UsageError(
+                f"the scene has no camera named {name!r}", where=scene.root, expected=", ".join(scene.cameras)
+            )
     frames = tuple(f for f in scene.frames_in("train") if not cameras or f.view.camera.name in cameras)
     if not frames:
-        raise UsageError("the scene has no training frames", where=scene.root, remedy="ingest with a larger --test-every, or 0")
+        raise UsageError(
+            "the scene has no training frames", where=scene.root, remedy="ingest with a larger --test-every, or 0"
+        )
     return frames
 
 
@@ -235,8 +242,8 @@ def load_recorded(
 ) -> LoadedViews:
     """Read frames, labels and LiDAR depths, resized to ``width_px`` (0 = as recorded).
 
-    Several threads read, in the order of time, so that all cameras need a sweep at once. Frames whose time is further than 0.1 s from
-    every sweep get no LiDAR depth; how many is said once.
+    Several threads read, in the order of time, so that all cameras need a sweep at once. Frames whose time is further
+    than 0.1 s from every sweep get no LiDAR depth; how many is said once.
     """
     points = _SweepCache(scene)
 
@@ -251,11 +258,16 @@ def load_recorded(
         semantics = labels["semantics"]
         sky = labels["sky"] if labels["sky"] is not None else (None if semantics is None else semantics == ID["sky"])
         return StoredView(
-            frame.id, view, "recorded", resize_area(read_image(scene, frame), *size[::-1]),
-            None if semantics is None or not classes else to_channels(semantics, classes), sky,
-            None if labels["ego"] is None else ~labels["ego"].astype(bool), points.pixels_of(view) if with_lidar else None,
+            frame.id,
+            view,
+            "recorded",
+            resize_area(read_image(scene, frame), *size[::-1]),
+            None if semantics is None or not classes else to_channels(semantics, classes),
+            sky,
+            None if labels["ego"] is None else ~labels["ego"].astype(bool),
+            points.pixels_of(view) if with_lidar else None,
             confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
-        )  # fmt: skip
+        )
 
     order = sorted(range(len(frames)), key=lambda index: frames[index].view.time_s)
     without_lidar = 0
@@ -263,7 +275,9 @@ def load_recorded(
         without_lidar += stored.lidar is None
         yield index, stored
     if with_lidar and without_lidar:
-        log.warn(f"{without_lidar} of {len(frames)} frames have no LiDAR sweep within {NEAREST_SWEEP_S} s: no depth there")
+        log.warn(
+            f"{without_lidar} of {len(frames)} frames have no LiDAR sweep within {NEAREST_SWEEP_S} s: no depth there"
+        )
 
 
 def _read_by_threads(order: Sequence[int], read: Callable[[int], StoredView], doing: str) -> LoadedViews:
@@ -275,7 +289,8 @@ def _read_by_threads(order: Sequence[int], read: Callable[[int], StoredView], do
 
 
 def virtual_sets(folders: Sequence[Path]) -> dict[str, ObservationSet]:
-    """The sets of virtual observations in some folders, of all trajectories or of one, by name; only their indices are read.
+    """The sets of virtual observations in some folders, of all trajectories or of one, by name; only their indices are
+    read.
 
     Raises:
         InputError: a folder has none, two have sets of one name, or one of them holds recorded views.
@@ -284,16 +299,26 @@ def virtual_sets(folders: Sequence[Path]) -> dict[str, ObservationSet]:
     for path in folders:
         found = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
         if not found:
-            raise InputError("this folder holds no finished virtual views", where=str(path), remedy="run `mudg synthesize` first")
+            raise InputError(
+                "this folder holds no finished virtual views", where=str(path), remedy="run `mudg synthesize` first"
+            )
         if twice := sorted(set(found) & set(sets)):
-            raise InputError("two folders hold virtual views of the same name", where=str(path), got=", ".join(twice[:4]),
-                             remedy="give one of them")  # fmt: skip
+            raise InputError(
+                "two folders hold virtual views of the same name",
+                where=str(path),
+                got=", ".join(twice[:4]),
+                remedy="give one of them",
+            )
         sets |= found
     for found in sets.values():
         if found.kind == "recorded":
-            raise InputError("recorded views among the virtual ones: held-out views must not be trained on", where=str(found.path),
-                             expected="views of kind virtual", got=f"kind recorded, source {found.source}",
-                             remedy="give the folder that `mudg synthesize` wrote")  # fmt: skip
+            raise InputError(
+                "recorded views among the virtual ones: held-out views must not be trained on",
+                where=str(found.path),
+                expected="views of kind virtual",
+                got=f"kind recorded, source {found.source}",
+                remedy="give the folder that `mudg synthesize` wrote",
+            )
     return sets
 
 
@@ -308,18 +333,24 @@ def load_virtual(
         view, arrays = observations.views[index], observations.arrays(index)
         semantics, confidence = arrays.get("semantics"), arrays["confidence"].astype(np.float32).clip(0, 1)
         return StoredView(
-            f"{name}/{index:06d}", view, "virtual", observations.rgb_u8(index).copy(),
+            f"{name}/{index:06d}",
+            view,
+            "virtual",
+            observations.rgb_u8(index).copy(),
             None if semantics is None or not classes else to_channels(semantics, classes),
-            None if semantics is None else semantics == ID["sky"], arrays["mask"].astype(bool),
-            None if measured is None else measured(view), arrays["depth"].copy() if "depth" in arrays else None,
+            None if semantics is None else semantics == ID["sky"],
+            arrays["mask"].astype(bool),
+            None if measured is None else measured(view),
+            arrays["depth"].copy() if "depth" in arrays else None,
             (confidence * 255).round().astype(np.uint8),
-        )  # fmt: skip
+        )
 
     yield from _read_by_threads(range(len(every)), read, "reading virtual views")
 
 
 def fused_lidar(cloud: FusedCloud, tracks: Sequence[Track]) -> Callable[[View], LidarPixels]:
-    """A function view -> depths of the fused points seen there: the static ones, and those of objects where they are then.
+    """A function view -> depths of the fused points seen there: the static ones, and those of objects where they are
+    then.
 
     Points behind others are left out as in the diffusion model's condition (``ConditionRules``).
     """
@@ -348,12 +379,13 @@ def resized_view(view: View, width_px: int) -> View:
     return view.resized(width_px, max(1, round(camera.height * width_px / camera.width)))
 
 
-# ---- LiDAR depth of a recorded view ---------------------------------------------------------------------------------
+# ---- LiDAR depth of a recorded view --------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class _WorldSweep:
-    """World points f32[N, 3] of a sweep, their times after it f32[N] in seconds, and the largest angle between its beams."""
+    """World points f32[N, 3] of a sweep, their times after it f32[N] in seconds, and the largest angle between its
+    beams."""
 
     xyz: NDArray[np.float32]
     dt_s: NDArray[np.float32]
@@ -361,7 +393,8 @@ class _WorldSweep:
 
 
 class _SweepCache:
-    """World points of the sweeps nearest in time; several cameras share a sweep, and the last few are kept. Any thread may ask."""
+    """World points of the sweeps nearest in time; several cameras share a sweep, and the last few are kept. Any thread
+    may ask."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -394,7 +427,8 @@ class _SweepCache:
         return found
 
     def _points_at(self, found: _WorldSweep, sweep: Sweep, time_s: float) -> NDArray[np.float32]:
-        """World points of a sweep, the points of every tracked box carried from when they were measured to ``time_s``."""
+        """World points of a sweep, the points of every tracked box carried from when they were measured to
+        ``time_s``."""
         world, dt_s = found.xyz, found.dt_s
         moved = world.copy()
         for track in self._scene.tracks:
@@ -413,7 +447,8 @@ class _SweepCache:
 
 
 def _within(xyz: NDArray[np.float32], center: NDArray[np.float32], reach_m: float) -> NDArray[np.int64]:
-    """Indices of the points in the axis-aligned cube around ``center``; axis by axis, so that most points cost one test."""
+    """Indices of the points in the axis-aligned cube around ``center``; axis by axis, so that most points cost one
+    test."""
     near = np.flatnonzero(np.abs(xyz[:, 0] - center[0]) < reach_m)
     for axis in (1, 2):
         near = near[np.abs(xyz[near, axis] - center[axis]) < reach_m]
@@ -421,21 +456,23 @@ def _within(xyz: NDArray[np.float32], center: NDArray[np.float32], reach_m: floa
 
 
 def lidar_pixels(view: View, xyz_world: NDArray[np.float32], gap_deg: float) -> LidarPixels:
-    """Depth of the points that the camera sees (``core.visible``); ``gap_deg``: largest angle between neighbouring beams."""
+    """Depth of the points that the camera sees (``core.visible``); ``gap_deg``: largest angle between neighbouring
+    beams."""
     depth = visible_depth(view, xyz_world, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=MAX_LIDAR_M).reshape(-1)
     pixel = np.flatnonzero(np.isfinite(depth))
     return LidarPixels(torch.from_numpy(pixel), torch.from_numpy(depth[pixel]))
 
 
-# kept -----------------------------------------------------------------------------------------------------------------
+# kept ---------------------------------------------------------------------------------------------
 #
-# Where the views of a fit lie: small sets in memory, large ones in a scratch file, read ahead of the steps that need them.
+# Where the views of a fit lie: small sets in memory, large ones in a scratch file, read ahead of the steps that need
+# them.
 #
-# Decoded views of a long log at full size need more memory than the fit itself: 1,000 of 1600 x 1066 pixels 8 to 11 GiB, 1,000 virtual
-# ones with dense depth 18. Above ``IN_MEMORY_BYTES`` they go to a file without a name in the folder of the fit, plane by plane as they
-# are (masks in bits), so that a view costs one read and no decoding, and what a step gets is the same to the bit. The system keeps as
-# much of the file in memory as it can spare. Which views a step gets is a function of the step, so threads read those of the next steps
-# beforehand.
+# Decoded views of a long log at full size need more memory than the fit itself: 1,000 of 1600 x 1066 pixels 8 to 11
+# GiB, 1,000 virtual ones with dense depth 18. Above ``IN_MEMORY_BYTES`` they go to a file without a name in the folder
+# of the fit, plane by plane as they are (masks in bits), so that a view costs one read and no decoding, and what a step
+# gets is the same to the bit. The system keeps as much of the file in memory as it can spare. Which views a step gets
+# is a function of the step, so threads read those of the next steps beforehand.
 
 
 IN_MEMORY_BYTES = GIB
@@ -448,7 +485,7 @@ _PLANES = ("depth", "rgb", "channels", "confidence", "sky", "mask")
 """Depth first, so that it lies at a multiple of its element's size."""
 
 
-# ---- how much there is -----------------------------------------------------------------------------------------------
+# ---- how much there is ---------------------------------------------------------------------------
 
 
 def recorded_bytes(frames: Sequence[Frame], width_px: int) -> int:
@@ -478,7 +515,8 @@ def virtual_bytes(sets: Mapping[str, ObservationSet]) -> int:
 
 
 def scratch_folder(count: int, needed: int, folder: Path) -> Path | None:
-    """Where ``count`` views of ``needed`` bytes are to be kept: in a file in this folder, or None: in memory. Says which.
+    """Where ``count`` views of ``needed`` bytes are to be kept: in a file in this folder, or None: in memory. Says
+    which.
 
     Raises:
         ResourceError: the disk has less room than the file needs.
@@ -487,21 +525,26 @@ def scratch_folder(count: int, needed: int, folder: Path) -> Path | None:
         return None
     free = shutil.disk_usage(folder).free
     if free < needed:
-        raise ResourceError("the disk has too little room for the decoded views", where=str(folder),
-            expected=f"{needed / GIB:.1f} GiB free for {count} views while the fit runs", got=f"{free / GIB:.1f} GiB",
-            remedy="free disk space, choose --out on another disk, or lower --width-px")  # fmt: skip
+        raise ResourceError(
+            "the disk has too little room for the decoded views",
+            where=str(folder),
+            expected=f"{needed / GIB:.1f} GiB free for {count} views while the fit runs",
+            got=f"{free / GIB:.1f} GiB",
+            remedy="free disk space, choose --out on another disk, or lower --width-px",
+        )
     log.info(
         f"views: {count}, {needed / GIB:.1f} GiB decoded: kept in a scratch file in {folder}, gone when the fit ends"
     )
     return folder
 
 
-# ---- a file of views -------------------------------------------------------------------------------------------------
+# ---- a file of views -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Slot:
-    """Where a view lies: its head, the first byte, its planes (name, type, shape) in order, the number of LiDAR pixels (None: none)."""
+    """Where a view lies: its head, the first byte, its planes (name, type, shape) in order, the number of LiDAR pixels
+    (None: none)."""
 
     head: ViewHead
     begins: int
@@ -536,7 +579,7 @@ class ViewFile(FiledViews):
         return found
 
     @property
-    def heads(self) -> Sequence[ViewHead]:  # type: ignore[override]
+    def heads(self) -> Sequence[ViewHead]:
         """All views without their pixels."""
         return [self._slot(index).head for index in range(len(self))]
 
@@ -589,7 +632,7 @@ def keep(loaded: LoadedViews, count: int, folder: Path | None) -> Sequence[Store
         return filed
 
 
-# ---- views of later steps --------------------------------------------------------------------------------------------
+# ---- views of later steps ------------------------------------------------------------------------
 
 
 @contextlib.contextmanager
@@ -598,8 +641,9 @@ def chosen_ahead(
 ) -> Iterator[Iterator[tuple[TrainView, ...]]]:
     """The views that ``choose`` gives for each of these steps, as tensors on a device.
 
-    Where views lie in a file, threads read those of a few steps beforehand; they end with the block. What goes wrong in a thread is
-    raised at its step. Tensors are made by the caller's thread: in another one, every large allocation costs its page faults anew.
+    Where views lie in a file, threads read those of a few steps beforehand; they end with the block. What goes wrong in
+    a thread is raised at its step. Tensors are made by the caller's thread: in another one, every large allocation
+    costs its page faults anew.
     """
     chosen: Generator[tuple[StoredView, ...], None, None]
     if views.filed:
@@ -610,13 +654,12 @@ def chosen_ahead(
         yield (tuple(view.as_tensors(device) for view in found) for found in chosen)
 
 
-# halved ---------------------------------------------------------------------------------------------------------------
+# halved -------------------------------------------------------------------------------------------
 #
 # Virtual views at half their size, for the steps of a fit that need no more.
 #
-# Their finest structure is blurred by the diffusion model and teaches a scene little (docs/supervision.md), and a step costs about as
-# much
-# per pixel as it costs per Gaussian.
+# Their finest structure is blurred by the diffusion model and teaches a scene little (docs/supervision.md), and a step
+# costs about as much per pixel as it costs per Gaussian.
 
 
 LEAST_PX: Final = 96
@@ -624,7 +667,8 @@ LEAST_PX: Final = 96
 
 
 class HalvedViews:
-    """Gives the steps up to ``until`` virtual views at half their size; of views above ``WHOLE_PIXELS`` all steps, for want of memory.
+    """Gives the steps up to ``until`` virtual views at half their size; of views above ``WHOLE_PIXELS`` all steps, for
+    want of memory.
 
     Args:
         until: 0 leaves every view as it is.
@@ -649,18 +693,21 @@ class HalvedViews:
 
 
 def halved(view: StoredView) -> StoredView:
-    """The view at half its size: colours and confidence are means, labels and depth those of the nearest pixel. A pixel is masked where
-    any of those that it is made of is."""
+    """The view at half its size: colours and confidence are means, labels and depth those of the nearest pixel. A pixel
+    is masked where any of those that it is made of is."""
     height, width = (side // 2 for side in view.rgb.shape[:2])
     if min(height, width) < LEAST_PX:
         return view
     nearest = {name: getattr(view, name) for name in ("channels", "sky", "depth")}
     return replace(
-        view, view=view.view.resized(width, height), rgb=resize_area(view.rgb, width, height), lidar=_lidar(view, width, height),
+        view,
+        view=view.view.resized(width, height),
+        rgb=resize_area(view.rgb, width, height),
+        lidar=_lidar(view, width, height),
         mask=None if view.mask is None else resize_area(view.mask.astype(np.uint8) * 255, width, height) == 255,
         confidence=None if view.confidence is None else resize_area(view.confidence, width, height),
         **{name: None if plane is None else resize_nearest(plane, height, width) for name, plane in nearest.items()},
-    )  # fmt: skip
+    )
 
 
 def _lidar(view: StoredView, width: int, height: int) -> LidarPixels | None:
@@ -669,5 +716,7 @@ def _lidar(view: StoredView, width: int, height: int) -> LidarPixels | None:
         return None
     tall, wide = view.rgb.shape[:2]
     row, column = view.lidar.pixel // wide, view.lidar.pixel % wide
-    row, column = ((2 * place + 1) * new // (2 * old) for place, new, old in ((row, height, tall), (column, width, wide)))
+    row, column = (
+        (2 * place + 1) * new // (2 * old) for place, new, old in ((row, height, tall), (column, width, wide))
+    )
     return LidarPixels(row * width + column, view.lidar.depth_m)

@@ -1,8 +1,9 @@
-"""``mudg annotate``: a scene -> the same scene with dense depth, classes, sky and dynamic objects, each pixel with a confidence.
+"""``mudg annotate``: a scene -> the same scene with dense depth, classes, sky and dynamic objects, each pixel with a
+confidence.
 
-The result is a complete new scene; the given one is not touched. A label that a frame has already is kept, one that it lacks
-is made; a scene whose frames lack nothing is copied as it is. What made the labels is written into the scene's notes, so that
-nobody takes them for truth.
+The result is a complete new scene; the given one is not touched. A label that a frame has already is kept, one that it
+lacks is made; a scene whose frames lack nothing is copied as it is. What made the labels is written into the scene's
+notes, so that nobody takes them for truth.
 
 Frames are labelled in separate processes, and each is staged when it is done: repeat the command to resume where it was
 stopped.
@@ -48,12 +49,13 @@ from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.write import SceneWriter
 
-# depth ----------------------------------------------------------------------------------------------------------------
+# depth --------------------------------------------------------------------------------------------
 #
-# Networks of ``mudg annotate``: where they compute, what tells them apart in a scene's notes, and their depth in place of the filled.
+# Networks of ``mudg annotate``: where they compute, what tells them apart in a scene's notes, and their depth in place
+# of the filled.
 #
-# A frame whose LiDAR returns are too few, or do not fit the network's depth, keeps the depth that was filled from them; it is marked by
-# a small file beside its labels, warned of, and counted in the notes.
+# A frame whose LiDAR returns are too few, or do not fit the network's depth, keeps the depth that was filled from them;
+# it is marked by a small file beside its labels, warned of, and counted in the notes.
 
 
 _FILLED: Final = ".filled.json"
@@ -89,7 +91,8 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
     """Field of the configuration that names a network's folder -> digest of the folder, for the networks that are used.
 
     Raises:
-        UsageError: a depth network, but no depth. ResourceError: its folder is missing. InputError: it holds another kind.
+        UsageError: a depth network, but no depth. ResourceError: its folder is missing. InputError: it holds another
+            kind.
     """
     found: dict[str, str] = {}
     if config.labeller == "network" and config.weights and (weights := find(config.weights)).is_dir():
@@ -98,8 +101,9 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
         found["weights"] = street_net.digest(config.weights or street_net.EMBEDDED)
     if config.depth_network:
         if not config.depth:
-            raise UsageError("--depth-network contradicts --no-depth", where="--depth-network",
-                             remedy="leave out one of them")  # fmt: skip
+            raise UsageError(
+                "--depth-network contradicts --no-depth", where="--depth-network", remedy="leave out one of them"
+            )
         kind_of(config.depth_network)
         found["depth_network"] = store.digest(find(config.depth_network))
     return found
@@ -127,7 +131,10 @@ def with_network(network: DepthNetwork, given: LabelInput, labels: Labels, frame
         found = align_to_lidar(network(asked), asked, RULES)
         if found.dense is not None:
             return replace(labels, depth=found.dense.depth, depth_confidence=found.dense.confidence)
-        reason = f"the network's depth does not fit the LiDAR (half of the returns off by more than {found.fit.residual:.0%})"
+        reason = (
+            "the network's depth does not fit the LiDAR (half of the returns off by more than"
+            f" {found.fit.residual:.0%})"
+        )
         if not np.isfinite(found.fit.residual):
             reason = "the network's depth does not increase with the LiDAR's"
     log.warn(f"frame {frame_id}: {reason}; its depth is filled from LiDAR instead")
@@ -142,14 +149,15 @@ def depth_origin(config: AnnotateConfig, networks: Mapping[str, str], made: Sequ
         return filled
     without = sum(_mark(staging, frame_id).is_file() for frame_id in made)
     words = (
-        f"network '{kind_of(config.depth_network)}'{describe_folder(config.depth_network, networks['depth_network'])}, aligned to "
-        f"points of {config.sweeps} sweeps, sky at a fixed distance"
+        f"network '{kind_of(config.depth_network)}'{describe_folder(config.depth_network, networks['depth_network'])},"
+        f" aligned to points of {config.sweeps} sweeps, sky at a fixed distance"
     )
     return words + (f"; {without} of them, where it did not fit: {filled}" if without else "")
 
 
 def describe_folder(folder: str, digest: str) -> str:
-    """Name (of one that did not come with the package) and digest of a network's folder, in words for the scene's notes."""
+    """Name (of one that did not come with the package) and digest of a network's folder, in words for the scene's
+    notes."""
     where = f" in folder '{title(find(folder))}'" if folder else ""
     return f"{where} (sha256 {digest[:16]})"
 
@@ -204,9 +212,10 @@ def steady_bottom(grey: NDArray[np.floating]) -> NDArray[np.bool_]:
     return ndimage.binary_fill_holes(np.isin(pieces, joined)) if joined else np.zeros((height, width), bool)
 
 
-# points ---------------------------------------------------------------------------------------------------------------
+# points -------------------------------------------------------------------------------------------
 #
-# LiDAR returns for an image: points of the sweeps around it, dynamic objects standing where they are at the image's time.
+# LiDAR returns for an image: points of the sweeps around it, dynamic objects standing where they are at the image's
+# time.
 
 
 MAX_GAP_S = 2.0
@@ -294,12 +303,13 @@ def _highest(sweep: Sweep, world: NDArray[np.float32]) -> float:
     return float(np.quantile(elevation, 0.998))
 
 
-# annotate page --------------------------------------------------------------------------------------------------------
+# annotate page ------------------------------------------------------------------------------------
 #
 # ``labels.html`` of an annotated scene: pictures of some frames beside what was made of them.
 #
-# Columns: image; depth (near warm, far cold, darker where unsure); classes over the image, dynamic objects outlined in red; confidence
-# of the classes. What to look for: edges of the depth lie on edges of the image, the road has no steps, sky ends at the roofs.
+# Columns: image; depth (near warm, far cold, darker where unsure); classes over the image, dynamic objects outlined in
+# red; confidence of the classes. What to look for: edges of the depth lie on edges of the image, the road has no steps,
+# sky ends at the roofs.
 
 
 NAME: Final = "labels.html"
@@ -318,11 +328,17 @@ def write_page(scene: Scene, made: set[str], out: Path) -> Path:
             store.write_image(out / name, picture(scene, frame), quality=88)
             pictures.append({"file": name, "caption": _caption(scene, frame)})
     text = html.render(
-        "labels.html.j2", title=f"Labels of {scene.id}", kicker="mudg annotate", notes=scene.source.notes, pictures=pictures,
-        lead="Image; depth (near warm, far cold, darker where unsure); classes, with dynamic objects outlined in red; "
-        "confidence of the classes.",
+        "labels.html.j2",
+        title=f"Labels of {scene.id}",
+        kicker="mudg annotate",
+        notes=scene.source.notes,
+        pictures=pictures,
+        lead=(
+            "Image; depth (near warm, far cold, darker where unsure); classes, with dynamic objects outlined in red; "
+            "confidence of the classes."
+        ),
         class_legend=html.class_legend(),
-    )  # fmt: skip
+    )
     store.write_text(out / NAME, text)
     return out / NAME
 
@@ -365,7 +381,7 @@ def _depth_picture(scene: Scene, frame: Frame) -> NDArray[np.uint8]:
     return colors
 
 
-# annotate -------------------------------------------------------------------------------------------------------------
+# annotate -----------------------------------------------------------------------------------------
 
 
 _STAGING = "labelled"
@@ -376,7 +392,8 @@ _FRAMES_PER_PROCESS = 8
 
 
 def write_labelled(config: AnnotateConfig, scene: Path, work: RunDir) -> dict[str, Any]:
-    """Label a scene; the work folder becomes a scene with labels, and ``labels.html`` shows some of them. Returns a summary."""
+    """Label a scene; the work folder becomes a scene with labels, and ``labels.html`` shows some of them. Returns a
+    summary."""
     loaded, out = read_scene(scene), work.path
     wanted = wanted_labels(config)
     missing = [frame for frame in loaded.frames if not wanted <= set(frame.labels)]
@@ -399,9 +416,12 @@ def write_labelled(config: AnnotateConfig, scene: Path, work: RunDir) -> dict[st
 
 def wanted_labels(config: AnnotateConfig) -> set[str]:
     """Names of the labels that every frame shall have; a confidence comes only with a label that was made."""
-    return {"semantics", "sky"} | ({"depth"} if config.depth else set()) | ({"dynamic"} if config.dynamic else set()) | (
-        {"ego"} if config.ego else set()
-    )  # fmt: skip
+    return (
+        {"semantics", "sky"}
+        | ({"depth"} if config.depth else set())
+        | ({"dynamic"} if config.dynamic else set())
+        | ({"ego"} if config.ego else set())
+    )
 
 
 def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str, str], staging: Path) -> Iterator[str]:
@@ -410,15 +430,20 @@ def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str
     if "weights" in inputs:
         made_by += describe_folder(config.weights, inputs["weights"])
     depth = depth_origin(config, inputs, [frame.id for frame in missing if "depth" not in frame.labels], staging)
-    origins = {"semantics": made_by, "sky": made_by, "depth": depth, "dynamic": "tracked boxes that move and dense depth",
-               "ego": "pixels that stay the same while the vehicle moves"}  # fmt: skip
+    origins = {
+        "semantics": made_by,
+        "sky": made_by,
+        "depth": depth,
+        "dynamic": "tracked boxes that move and dense depth",
+        "ego": "pixels that stay the same while the vehicle moves",
+    }
     for name, origin in origins.items():
         count = sum(name in wanted_labels(config) and name not in frame.labels for frame in missing)
         if count:
             yield f"{name} of {count} frames: {origin}, not truth"
 
 
-# --- one frame after the other ----------------------------------------------------------------------------------------
+# --- one frame after the other --------------------------------------------------------------------
 
 
 def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Sequence[Frame], staging: Path) -> None:
@@ -443,8 +468,8 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
 
 
 def _usual_processes(config: AnnotateConfig) -> int:
-    """One per core; fewer where networks share a device: one with a pretrained network, which fills it, and a few with the shipped one,
-    whose evidence is gathered on the CPU meanwhile."""
+    """One per core; fewer where networks share a device: one with a pretrained network, which fills it, and a few with
+    the shipped one, whose evidence is gathered on the CPU meanwhile."""
     cores = native.default_threads()
     if config.device == "cpu" or (config.labeller == "geometry" and not config.depth_network):
         return cores
@@ -467,8 +492,16 @@ def label_into_staging(config: AnnotateConfig, scene: Scene, ids: Sequence[str],
     for frame_id in ids:
         frame = frames[frame_id]
         near = returns.of(frame)
-        given = LabelInput(frame.view, read_image(scene, frame), near.xyz_world, scene.tracks, path, near.beam_gap_deg,
-                           near.highest_rad, returns.moving)  # fmt: skip
+        given = LabelInput(
+            frame.view,
+            read_image(scene, frame),
+            near.xyz_world,
+            scene.tracks,
+            path,
+            near.beam_gap_deg,
+            near.highest_rad,
+            returns.moving,
+        )
         with one_torch_thread():
             labels = label(given)
             if network is not None and "depth" not in frame.labels:
@@ -485,8 +518,10 @@ def staged_labels(staging: Path, frame_id: str) -> Path:
 def label_arrays(config: AnnotateConfig, labels: Labels) -> dict[str, NDArray[Any]]:
     """Labels under the names that a scene has for them; what was not asked for is left out."""
     arrays: dict[str, NDArray[Any]] = {
-        "semantics": labels.semantics, "sky": labels.sky, "semantics_confidence": labels.confidence,
-    }  # fmt: skip
+        "semantics": labels.semantics,
+        "sky": labels.sky,
+        "semantics_confidence": labels.confidence,
+    }
     if config.depth:
         arrays |= {"depth": labels.depth, "depth_confidence": labels.depth_confidence}
     if config.dynamic:

@@ -1,10 +1,11 @@
 """Labels from rules on LiDAR, tracked boxes and colour, with a confidence, for images that came without labels.
 
-The rules hold no parameters and need no download. They start from dense depth (``core.complete``), know few classes and give 255
-(unlabelled) where they cannot tell:
+The rules hold no parameters and need no download. They start from dense depth (``core.complete``), know few classes and
+give 255 (unlabelled) where they cannot tell:
 
 * **road**: what lies near a ground plane fitted to the LiDAR. Green ground is **terrain**; other ground that the path
-  does not reach without a step or a detour (``ground.map_ground``) is **sidewalk**. Far beside the path all of it has less confidence.
+  does not reach without a step or a detour (``ground.map_ground``) is **sidewalk**. Far beside the path all of it has
+  less confidence.
 * **car, truck, bus, train, person, rider, ...**: tracked boxes, where the dense surface lies in them.
 * **sky**: bright or blue, smooth, above the horizon, connected to the top of the image, and without LiDAR returns.
 * **vegetation**: what rises from the ground, or stands above the horizon, and is green.
@@ -43,7 +44,8 @@ _THIN: Final = (ID["person"], ID["rider"], ID["bicycle"], ID["motorcycle"])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Measured:
-    """Visible returns of an image: ``depth_m`` f32[H, W], NaN = none, and ``away_px`` f32[H, W], distance to the nearest."""
+    """Visible returns of an image: ``depth_m`` f32[H, W], NaN = none, and ``away_px`` f32[H, W], distance to the
+    nearest."""
 
     depth_m: NDArray[np.float32]
     away_px: NDArray[np.float32]
@@ -56,7 +58,8 @@ class _Measured:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Surface:
-    """Dense depth in space: ``xyz_world`` f32[H, W, 3] (NaN = unknown), depth f32[H, W] metres, ``confidence`` f32[H, W]."""
+    """Dense depth in space: ``xyz_world`` f32[H, W, 3] (NaN = unknown), depth f32[H, W] metres, ``confidence`` f32[H,
+    W]."""
 
     xyz_world: NDArray[np.float32]
     depth: NDArray[np.float32]
@@ -85,15 +88,20 @@ def label_by_geometry(given: LabelInput) -> Labels:
 
 
 def label_by_network(given: LabelInput, semantics: NDArray[np.uint8], confidence: NDArray[np.float32]) -> Labels:
-    """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, depth and dynamic objects as by rules."""
+    """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, depth and dynamic
+    objects as by rules."""
     measured = _measure(given)
     sky = (semantics == ID["sky"]) & ~np.isfinite(measured.depth_m)
     return _with_surface(given, semantics, confidence, sky, _complete(given, measured, sky))
 
 
 def _with_surface(
-    given: LabelInput, semantics: NDArray[np.uint8], confidence: NDArray[np.float32], sky: NDArray[np.bool_], surface: _Surface
-) -> Labels:  # fmt: skip
+    given: LabelInput,
+    semantics: NDArray[np.uint8],
+    confidence: NDArray[np.float32],
+    sky: NDArray[np.bool_],
+    surface: _Surface,
+) -> Labels:
     depth, depth_confidence = surface.depth.copy(), surface.confidence.copy()
     depth[sky] = RULES.sky_m
     painted_over = ~sky & (depth == RULES.sky_m)  # a box before the sky that nothing measured
@@ -121,9 +129,12 @@ def _complete(given: LabelInput, measured: _Measured, sky: NDArray[np.bool_]) ->
 
 
 def _paint_surface(
-    semantics: NDArray[np.uint8], confidence: NDArray[np.float32], given: LabelInput, surface: _Surface,
+    semantics: NDArray[np.uint8],
+    confidence: NDArray[np.float32],
+    given: LabelInput,
+    surface: _Surface,
     greenness: NDArray[np.float32],
-) -> None:  # fmt: skip
+) -> None:
     """Each pixel of known depth by its height above the ground, its place beside the path, and its colour."""
     known = np.isfinite(surface.depth)
     height = np.full(known.shape, np.inf, np.float32)
@@ -147,7 +158,8 @@ def _paint_surface(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BoxPixels:
-    """Pixels of a box: the part of the image around it; in there its outline, and where the surface lies in the box, both bool[h, w]."""
+    """Pixels of a box: the part of the image around it; in there its outline, and where the surface lies in the box,
+    both bool[h, w]."""
 
     window: tuple[slice, slice]
     outline: NDArray[np.bool_]
@@ -167,9 +179,15 @@ def _box_pixels(box: PlacedBox, view: View, surface: _Surface) -> _BoxPixels | N
 
 
 def _paint_box(
-    semantics: NDArray[np.uint8], confidence: NDArray[np.float32], box: PlacedBox, view: View, measured: _Measured, surface: _Surface
-) -> None:  # fmt: skip
-    """Paint a tracked box: surely where the surface lies in it, less surely in the rest of its outline; not behind nearer things."""
+    semantics: NDArray[np.uint8],
+    confidence: NDArray[np.float32],
+    box: PlacedBox,
+    view: View,
+    measured: _Measured,
+    surface: _Surface,
+) -> None:
+    """Paint a tracked box: surely where the surface lies in it, less surely in the rest of its outline; not behind
+    nearer things."""
     pixels = _box_pixels(box, view, surface)
     if pixels is None:
         return
@@ -202,7 +220,8 @@ def _span(present: NDArray[np.bool_], margin: int) -> slice:
 
 
 def greenness_of(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Positive where a smoothed pixel is green rather than red or blue, or the dark mottled colour of leaves; f32[H, W]."""
+    """Positive where a smoothed pixel is green rather than red or blue, or the dark mottled colour of leaves; f32[H,
+    W]."""
     smooth = ndimage.uniform_filter(rgb.astype(np.float32), (5, 5, 1))
     red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]
     return green - np.maximum(red * 0.97, blue * 1.04) - 1.5
@@ -211,13 +230,15 @@ def greenness_of(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
 def find_sky(
     rgb: NDArray[np.uint8], elevation: NDArray[np.float32], away_px: NDArray[np.float32], gap_px: float
 ) -> NDArray[np.bool_]:
-    """Sky mask bool[H, W]: above the horizon, without returns, bright or blue, smooth, connected to the top of the image.
+    """Sky mask bool[H, W]: above the horizon, without returns, bright or blue, smooth, connected to the top of the
+    image.
 
     Args:
         rgb: u8[H, W, 3].
         elevation: of the rays, radians, f32[H, W].
         away_px: distance to the nearest LiDAR return f32[H, W].
-        gap_px: sky is found farther from returns than this, and then extended up to them where the image looks the same.
+        gap_px: sky is found farther from returns than this, and then extended up to them where the image looks the
+            same.
     """
     candidates = (elevation > 0) & (away_px > gap_px)
     if not candidates.any():

@@ -1,10 +1,12 @@
-"""Measured facts about each pixel, from LiDAR, calibration, driven path and boxes, as input planes for a segmentation network.
+"""Measured facts about each pixel, from LiDAR, calibration, driven path and boxes, as input planes for a segmentation
+network.
 
-Unlike colours, these numbers mean the same in a generated city and in a recorded log: height above the ground, distance to the camera
-and to the driven path, whether a kerb lies between, surface orientation, roughness of the returns, distance to the nearest return,
-elevation of the ray, and the tracked boxes that contain the pixel.
+Unlike colours, these numbers mean the same in a generated city and in a recorded log: height above the ground, distance
+to the camera and to the driven path, whether a kerb lies between, surface orientation, roughness of the returns,
+distance to the nearest return, elevation of the ray, and the tracked boxes that contain the pixel.
 
-Depth is filled from the returns at the size of the given view, also in the sky; ``away_deg`` says how far the nearest return is.
+Depth is filled from the returns at the size of the given view, also in the sky; ``away_deg`` says how far the nearest
+return is.
 """
 
 from __future__ import annotations
@@ -25,15 +27,29 @@ from mudg.labels.ground import GroundMap, above_plane, beside_path, map_ground
 from mudg.labels.inputs import LabelInput, far_to_near, surface_points
 
 BOX_GROUPS: Final[tuple[tuple[str, ...], ...]] = (
-    ("car",), ("truck",), ("bus", "train"), ("person",), ("rider", "motorcycle", "bicycle"),
-)  # fmt: skip
+    ("car",),
+    ("truck",),
+    ("bus", "train"),
+    ("person",),
+    ("rider", "motorcycle", "bicycle"),
+)
 """Classes of boxes that share a plane."""
 GROUP_OF: Final[Mapping[int, int]] = {ID[name]: n for n, names in enumerate(BOX_GROUPS) for name in names}
 """Number of the group of each class that boxes have."""
 PLANES: Final = (
-    "height, fine", "height", "log depth", "distance to a return", "upwards", "beside the path", "elevation", "silent", "roughness",
-    "measured at all", "reachable from the path", "raised",
-)  # fmt: skip
+    "height, fine",
+    "height",
+    "log depth",
+    "distance to a return",
+    "upwards",
+    "beside the path",
+    "elevation",
+    "silent",
+    "roughness",
+    "measured at all",
+    "reachable from the path",
+    "raised",
+)
 """Planes that ``encode`` makes, before one for each of ``BOX_GROUPS``."""
 PLANE_COUNT: Final = len(PLANES) + len(BOX_GROUPS)
 NO_PATH_M: Final = 60.0
@@ -89,8 +105,22 @@ def gather(given: LabelInput) -> Evidence:
     zero = np.zeros(shape, np.float32)
     if not known.any():
         box, in_box, labels = _boxes(given, None, np.full(shape, np.nan, np.float32), known)
-        return Evidence(zero, np.full(shape, np.nan, np.float32), np.full(shape, 90, np.float32), zero, zero,
-                        zero > 1, zero > 1, zero, elevation, zero > 1, zero, box, in_box, labels)  # fmt: skip
+        return Evidence(
+            zero,
+            np.full(shape, np.nan, np.float32),
+            np.full(shape, 90, np.float32),
+            zero,
+            zero,
+            zero > 1,
+            zero > 1,
+            zero,
+            elevation,
+            zero > 1,
+            zero,
+            box,
+            in_box,
+            labels,
+        )
     away_px = np.asarray(ndimage.distance_transform_edt(~known), np.float32)
     beyond = beyond_reach(view, measured, given.highest_rad, gap_deg=gap_deg)
     depth = complete_depth(given.rgb, measured, None, beyond).depth
@@ -100,10 +130,21 @@ def gather(given: LabelInput) -> Evidence:
     reachable, direct, raised = (zero > 1, zero > 1, zero) if ground is None else ground.under(xyz)
     beside = beside_path(xyz, given.path_world, 2) if len(given.path_world) else np.full(shape, NO_PATH_M, np.float32)
     return Evidence(
-        _height(ground, xyz), depth, np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32), _upwards(xyz),
-        beside, reachable, direct, raised, elevation, beyond,
-        _roughness(measured, gap_deg, view.camera.fy), box, in_box, labels,
-    )  # fmt: skip
+        _height(ground, xyz),
+        depth,
+        np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32),
+        _upwards(xyz),
+        beside,
+        reachable,
+        direct,
+        raised,
+        elevation,
+        beyond,
+        _roughness(measured, gap_deg, view.camera.fy),
+        box,
+        in_box,
+        labels,
+    )
 
 
 def encode(evidence: Evidence) -> NDArray[np.float32]:
@@ -111,11 +152,19 @@ def encode(evidence: Evidence) -> NDArray[np.float32]:
     known = np.isfinite(evidence.depth_m)
     depth = np.where(known, evidence.depth_m, 20)
     planes = [
-        np.tanh(evidence.height_m / 0.3), np.tanh(evidence.height_m / 4), np.log(depth / 20) / 1.5,
-        np.where(known, np.tanh(evidence.away_deg / 1.5), 1), evidence.upwards, np.tanh(evidence.beside_m / 12),
-        np.clip(evidence.elevation_rad / 0.4, -2, 2), evidence.silent, np.tanh(evidence.rough / 0.04), known,
-        evidence.reachable, np.tanh(evidence.raised_m / 0.15),
-    ]  # fmt: skip
+        np.tanh(evidence.height_m / 0.3),
+        np.tanh(evidence.height_m / 4),
+        np.log(depth / 20) / 1.5,
+        np.where(known, np.tanh(evidence.away_deg / 1.5), 1),
+        evidence.upwards,
+        np.tanh(evidence.beside_m / 12),
+        np.clip(evidence.elevation_rad / 0.4, -2, 2),
+        evidence.silent,
+        np.tanh(evidence.rough / 0.04),
+        known,
+        evidence.reachable,
+        np.tanh(evidence.raised_m / 0.15),
+    ]
     group = np.full(256, 255)
     group[1 : 1 + len(evidence.box_labels)] = [GROUP_OF[int(label)] for label in evidence.box_labels]
     group_here = group[evidence.box]
@@ -124,7 +173,7 @@ def encode(evidence: Evidence) -> NDArray[np.float32]:
     return np.stack(planes).astype(np.float32)
 
 
-# --- the facts --------------------------------------------------------------------------------------------------------
+# --- the facts ------------------------------------------------------------------------------------
 
 
 def _height(ground: GroundMap | None, xyz: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -162,7 +211,8 @@ def _roughness(measured: NDArray[np.float32], gap_deg: float, fy_px: float) -> N
 def _boxes(
     given: LabelInput, xyz: NDArray[np.float32] | None, depth: NDArray[np.float32], known: NDArray[np.bool_]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.int64]]:
-    """Nearest tracked box of each pixel, see ``Evidence``: where the surface lies in it, or, with nothing nearer, in its outline.
+    """Nearest tracked box of each pixel, see ``Evidence``: where the surface lies in it, or, with nothing nearer, in
+    its outline.
 
     A box without a return in it is left out where there are returns at all: it is hidden, or empty.
     """

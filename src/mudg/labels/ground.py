@@ -1,7 +1,7 @@
 """The ground around a vehicle: its plane, and the part that can be reached from the driven path without a step.
 
-A kerb of a decimetre separates a road from a sidewalk better than anything else that a scanner measures, and unlike colour it is the
-same in every town. ``map_ground`` finds it from above, in cells of ``CELL_M``.
+A kerb of a decimetre separates a road from a sidewalk better than anything else that a scanner measures, and unlike
+colour it is the same in every town. ``map_ground`` finds it from above, in cells of ``CELL_M``.
 """
 
 from __future__ import annotations
@@ -81,7 +81,8 @@ def above_plane(plane: NDArray[np.float64], xyz_world: NDArray[np.floating]) -> 
 
 
 def driven_path(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places f64[M, 3] of a vehicle with poses f64[T, 4, 4]; of one that stood, 1 m behind and ahead of it too, for its direction."""
+    """Places f64[M, 3] of a vehicle with poses f64[T, 4, 4]; of one that stood, 1 m behind and ahead of it too, for its
+    direction."""
     places = world_from_ego[:, :3, 3]
     if len(places) == 0 or np.linalg.norm(places[:, :2] - places[0, :2], axis=1).max() > _STOOD_M:
         return places
@@ -89,9 +90,11 @@ def driven_path(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def distance_to_path(xyz_world: NDArray[np.floating], path_world: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Horizontal distance of points ``[N, 2 or 3]`` to the driven path, gone on straight for 80 m at both ends; metres f64[N].
+    """Horizontal distance of points ``[N, 2 or 3]`` to the driven path, gone on straight for 80 m at both ends; metres
+    f64[N].
 
-    A path shorter than half a metre has no direction (``driven_path`` gives it one); then it is the distance to its first place.
+    A path shorter than half a metre has no direction (``driven_path`` gives it one); then it is the distance to its
+    first place.
     """
     if len(path_world) == 0 or len(xyz_world) == 0:
         return np.zeros(len(xyz_world))
@@ -109,8 +112,8 @@ def distance_to_path(xyz_world: NDArray[np.floating], path_world: NDArray[np.flo
 
 
 def beside_path(xyz_world: NDArray[np.float32], path_world: NDArray[np.float64], step: int) -> NDArray[np.float32]:
-    """``distance_to_path`` of the points f32[H, W, 3] of an image, worked out at every ``step``-th pixel; metres f32[H, W], infinite where
-    a point is not finite."""
+    """``distance_to_path`` of the points f32[H, W, 3] of an image, worked out at every ``step``-th pixel; metres f32[H,
+    W], infinite where a point is not finite."""
     coarse = xyz_world[::step, ::step]
     beside = np.full(coarse.shape[:2], np.inf, np.float32)
     known = np.isfinite(coarse).all(-1)
@@ -126,7 +129,8 @@ class GroundMap:
     Args:
         corner_m: world x and y, f64[2]. plane: of ``fit_ground``, f64[3].
         reachable: bool[N, N], reached from the driven path over known ground without a step.
-        direct: bool[N, N], and that without much of a detour: one lowered kerb joins a whole sidewalk, but not directly.
+        direct: bool[N, N], and that without much of a detour: one lowered kerb joins a whole sidewalk, but not
+            directly.
         raised_m: f32[N, N], height above the lowest ground within 3 m, 0 where unknown.
     """
 
@@ -136,8 +140,11 @@ class GroundMap:
     direct: NDArray[np.bool_]
     raised_m: NDArray[np.float32]
 
-    def under(self, xyz_world: NDArray[np.floating]) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
-        """``reachable``, ``direct`` and ``raised_m`` under points ``[..., 3]``; False and 0 outside the map and for what is no ground."""
+    def under(
+        self, xyz_world: NDArray[np.floating]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
+        """``reachable``, ``direct`` and ``raised_m`` under points ``[..., 3]``; False and 0 outside the map and for
+        what is no ground."""
         place = np.floor(np.nan_to_num((xyz_world[..., :2] - self.corner_m) / CELL_M, nan=-1.0)).astype(np.int64)
         last = len(self.reachable) - 1
         low = (place >= 0).all(-1) & (place <= last).all(-1) & (np.abs(above_plane(self.plane, xyz_world)) < LOW_M)
@@ -200,8 +207,8 @@ def _dilated(mask: NDArray[np.bool_], diagonally: bool = False) -> NDArray[np.bo
 def _cell_heights(
     xyz_world: NDArray[np.floating], plane: NDArray[np.float64], corner_m: NDArray[np.float64], side: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Height above the plane of each cell, f64[side, side]: the lower quartile of its low points, else that of the nearest cell with any;
-    and how far away that is, metres."""
+    """Height above the plane of each cell, f64[side, side]: the lower quartile of its low points, else that of the
+    nearest cell with any; and how far away that is, metres."""
     place = np.floor((xyz_world[:, :2] - corner_m) / CELL_M).astype(np.int64)
     above = above_plane(plane, xyz_world)
     low = (place >= 0).all(1) & (place < side).all(1) & (np.abs(above) < LOW_M)

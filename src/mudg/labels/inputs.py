@@ -15,11 +15,23 @@ from mudg.base.types import Track, View
 from mudg.core.fusion import points_in_box
 
 TRAIN_ID_OF: Final[Mapping[str, int]] = {
-    "car": ID["car"], "van": ID["car"], "vehicle": ID["car"], "misc": ID["car"], "truck": ID["truck"], "bus": ID["bus"],
-    "tram": ID["train"], "train": ID["train"], "person": ID["person"], "pedestrian": ID["person"],
-    "person_sitting": ID["person"], "cyclist": ID["rider"], "rider": ID["rider"], "motorcycle": ID["motorcycle"],
-    "motorcyclist": ID["rider"], "bicycle": ID["bicycle"],
-}  # fmt: skip
+    "car": ID["car"],
+    "van": ID["car"],
+    "vehicle": ID["car"],
+    "misc": ID["car"],
+    "truck": ID["truck"],
+    "bus": ID["bus"],
+    "tram": ID["train"],
+    "train": ID["train"],
+    "person": ID["person"],
+    "pedestrian": ID["person"],
+    "person_sitting": ID["person"],
+    "cyclist": ID["rider"],
+    "rider": ID["rider"],
+    "motorcycle": ID["motorcycle"],
+    "motorcyclist": ID["rider"],
+    "bicycle": ID["bicycle"],
+}
 """Class of a tracked box by its label; labels not listed here are not painted."""
 GAP_DEG: Final = 0.6
 """Beams of a turning LiDAR are at most this far apart; between two returns closer than this the surface goes on."""
@@ -36,7 +48,8 @@ class LabelInput:
     Args:
         view: camera and pose.
         rgb: u8[H, W, 3].
-        xyz_world: f32[N, 3] metres: LiDAR returns of the static scene, and of dynamic objects where they are at the image's time.
+        xyz_world: f32[N, 3] metres: LiDAR returns of the static scene, and of dynamic objects where they are at the
+            image's time.
         tracks: tracked boxes.
         path_world: f64[M, 3], places of the vehicle (``ground.driven_path``).
         beam_gap_deg: largest angle between neighbouring beams of the LiDAR.
@@ -56,8 +69,9 @@ class LabelInput:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Labels:
-    """``semantics`` u8[H, W] train ids, 255 = cannot tell; ``confidence`` f32[H, W] in 0..1; ``sky`` and ``dynamic`` bool[H, W];
-    ``depth`` f32[H, W] metres, the sky at ``CompletionRules.sky_m``, NaN = unknown; ``depth_confidence`` f32[H, W] in 0..1."""
+    """``semantics`` u8[H, W] train ids, 255 = cannot tell; ``confidence`` f32[H, W] in 0..1; ``sky`` and ``dynamic``
+    bool[H, W]; ``depth`` f32[H, W] metres, the sky at ``CompletionRules.sky_m``, NaN = unknown; ``depth_confidence``
+    f32[H, W] in 0..1."""
 
     semantics: NDArray[np.uint8]
     confidence: NDArray[np.float32]
@@ -116,7 +130,8 @@ def far_to_near(given: LabelInput) -> list[PlacedBox]:
 def box_outline(
     view: View, world_from_box: NDArray[np.float64], size_m: NDArray[np.float64]
 ) -> NDArray[np.bool_] | None:
-    """Convex outline of a projected box bool[H, W], cut at the camera's near plane; None if it lies outside the image."""
+    """Convex outline of a projected box bool[H, W], cut at the camera's near plane; None if it lies outside the
+    image."""
     camera, hull = view.camera, geometry.box_hull(view, world_from_box, size_m)
     if hull is None:
         return None

@@ -1,8 +1,8 @@
 """The labellers of ``mudg annotate``.
 
 * ``geometry``: rules on LiDAR, tracked boxes and colour (``models.labels.by_geometry``). No parameters.
-* ``embedded``: classes from the small network that comes with the package (``models.labels.street_labels``), which reads the same
-  evidence and the image.
+* ``embedded``: classes from the small network that comes with the package (``models.labels.street_labels``), which
+  reads the same evidence and the image.
 * ``network``: classes from a segmentation network in a folder (``models.labels.segmenters``).
 
 Depth and dynamic objects are found in the same way for all three.
@@ -30,8 +30,8 @@ LABELLERS: Mapping[str, Callable[[str, Place], Labeller]] = {
     "embedded": StreetLabeller.load,
     "network": _network,
 }
-"""Name -> what makes a labeller of one image from a folder of weights and a place to compute (unused by those that hold no
-parameters)."""
+"""Name -> what makes a labeller of one image from a folder of weights and a place to compute (unused by those that hold
+no parameters)."""
 
 
 def labeller(name: str, weights: str = "", place: Place = CPU) -> Labeller:

@@ -1,9 +1,10 @@
-"""Classes by a pretrained segmentation network from a folder on disk: SegFormer, Mask2Former or EoMT with Cityscapes classes.
+"""Classes by a pretrained segmentation network from a folder on disk: SegFormer, Mask2Former or EoMT with Cityscapes
+classes.
 
-The networks come from the ``transformers`` package (see ``models.folders``); nothing is downloaded: the folder holds ``config.json``,
-``preprocessor_config.json`` and ``model.safetensors`` as that package writes them. Class names of the folder are matched with ours
-by name. Large images are cut into overlapping tiles whose probabilities are averaged. EoMT reads squares of one size only: images
-are scaled until their shorter side has that size.
+The networks come from the ``transformers`` package (see ``models.folders``); nothing is downloaded: the folder holds
+``config.json``, ``preprocessor_config.json`` and ``model.safetensors`` as that package writes them. Class names of the
+folder are matched with ours by name. Large images are cut into overlapping tiles whose probabilities are averaged. EoMT
+reads squares of one size only: images are scaled until their shorter side has that size.
 """
 
 from __future__ import annotations
@@ -36,7 +37,8 @@ def _dense(output: Any, size: tuple[int, int]) -> Tensor:
 
 
 def _masks(output: Any, size: tuple[int, int]) -> Tensor:
-    """Mask2Former, EoMT: classes [B, Q, C + 1] (the last: none) and masks [B, Q, h, w] -> probabilities [B, C, H, W]."""
+    """Mask2Former, EoMT: classes [B, Q, C + 1] (the last: none) and masks [B, Q, h, w] -> probabilities [B, C, H,
+    W]."""
     classes = output.class_queries_logits.float().softmax(-1)[..., :-1]
     masks = functional.interpolate(output.masks_queries_logits.float(), size=size, mode="bilinear", align_corners=False)
     scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
@@ -45,8 +47,8 @@ def _masks(output: Any, size: tuple[int, int]) -> Tensor:
 
 @dataclass(frozen=True, slots=True)
 class _Kind:
-    """Class of transformers that holds the network, how its output becomes probabilities, and whether it reads squares of the one
-    size that its configuration names."""
+    """Class of transformers that holds the network, how its output becomes probabilities, and whether it reads squares
+    of the one size that its configuration names."""
 
     class_name: str
     probabilities: Callable[[Any, tuple[int, int]], Tensor]
@@ -65,11 +67,17 @@ class Segmenter:
     """A network ready for use; ``load`` makes one from a folder."""
 
     def __init__(
-        self, network: Any, kind: str, train_ids: NDArray[np.intp], mean: Sequence[float], deviation: Sequence[float],
-        square_px: int = 0, place: Place = CPU,
-    ) -> None:  # fmt: skip
-        """``train_ids`` [C]: our class of each of the network's, UNLABELLED = none; mean and deviation of colours in 0..1;
-        ``square_px``: side of the only tile that the network reads, 0 = any."""
+        self,
+        network: Any,
+        kind: str,
+        train_ids: NDArray[np.intp],
+        mean: Sequence[float],
+        deviation: Sequence[float],
+        square_px: int = 0,
+        place: Place = CPU,
+    ) -> None:
+        """``train_ids`` [C]: our class of each of the network's, UNLABELLED = none; mean and deviation of colours in
+        0..1; ``square_px``: side of the only tile that the network reads, 0 = any."""
         self._network, self._kind, self._train_ids = network, KINDS[kind], train_ids
         self._mean = torch.tensor(mean, dtype=torch.float32)[:, None, None]
         self._deviation = torch.tensor(deviation, dtype=torch.float32)[:, None, None]
@@ -80,26 +88,35 @@ class Segmenter:
         """Read a network from a local folder, or from the Hugging Face cache by its name (``folders.find``).
 
         Raises:
-            ResourceError: the folder, the device or the transformers package is missing. InputError: another kind of network, one
-            that lacks weights, or none of its class names is one of ours.
+            ResourceError: the folder, the device or the transformers package is missing. InputError: another kind of
+            network, one that lacks weights, or none of its class names is one of ours.
         """
         path = folders.find(folder)
         if not folder or not (path / "config.json").is_file():
-            raise ResourceError("the labeller's weights are missing", where=str(folder) or "weights",
+            raise ResourceError(
+                "the labeller's weights are missing",
+                where=str(folder) or "weights",
                 expected="a folder with config.json and model.safetensors",
-                remedy="give the folder of a segmentation network with Cityscapes classes as --weights, or its name in the Hugging Face "
-                "cache, or use --labeller geometry")  # fmt: skip
+                remedy=(
+                    "give the folder of a segmentation network with Cityscapes classes as --weights, or its name in the"
+                    " Hugging Face cache, or use --labeller geometry"
+                ),
+            )
         settings = folders.read_settings(path / "config.json")
         kind = str(settings.get("model_type"))
         if kind not in KINDS:
-            raise InputError("the folder holds another kind of network", where=str(path / "config.json"),
-                expected=", ".join(KINDS), got=kind)  # fmt: skip
+            raise InputError(
+                "the folder holds another kind of network",
+                where=str(path / "config.json"),
+                expected=", ".join(KINDS),
+                got=kind,
+            )
         train_ids = match_classes(settings.get("id2label", {}), str(path / "config.json"))
         prepared = path / "preprocessor_config.json"
         colors = folders.read_settings(prepared) if prepared.is_file() else {}
         network_class = folders.member(folders.package("transformers"), KINDS[kind].class_name)
         network = folders.load_network(network_class, path, place)
-        square_px = int(network.config.image_size) if KINDS[kind].square else 0  # type: ignore[union-attr, arg-type]
+        square_px = int(network.config.image_size) if KINDS[kind].square else 0
         mean, deviation = colors.get("image_mean", folders.MEAN), colors.get("image_std", folders.DEVIATION)
         return cls(network, kind, train_ids, mean, deviation, square_px, place)
 
@@ -160,8 +177,12 @@ def match_classes(names: Mapping[str, str], where: str) -> NDArray[np.intp]:
     ordered = [names[key] for key in sorted(names, key=int)]
     found = [wanted.get(str(name).replace(" ", "").replace("_", "").lower(), UNLABELLED) for name in ordered]
     if not any(index != UNLABELLED for index in found):
-        raise InputError("none of the network's classes is a Cityscapes class", where=where,
-            expected=", ".join(CLASSES), got=", ".join(map(str, ordered[:8])) or "no id2label")  # fmt: skip
+        raise InputError(
+            "none of the network's classes is a Cityscapes class",
+            where=where,
+            expected=", ".join(CLASSES),
+            got=", ".join(map(str, ordered[:8])) or "no id2label",
+        )
     return np.array(found, np.intp)
 
 

@@ -14,17 +14,18 @@ class AnnotateConfig:
     confidence."""
 
     labeller: Literal["embedded", "geometry", "network"] = "embedded"
-    """Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on heights
-    and boxes, without a network. network: a segmentation network from `weights`."""
+    """Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on
+    heights and boxes, without a network. network: a segmentation network from `weights`."""
     weights: str = ""
-    """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes in the transformers format, or its
-    name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with
-    tools/train_segmenter.py (empty = the shipped network)."""
+    """labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes in the transformers format,
+    or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network
+    trained with tools/train_segmenter.py (empty = the shipped network)."""
     depth: bool = True
     """Write dense depth, by default from the LiDAR points of several sweeps, filled with the image as guide."""
     depth_network: str = ""
-    """Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a PromptDepthAnything,
-    Depth Anything (transformers) or Marigold (diffusers) model; or folder of a DepthLab written by mudg convert."""
+    """Take dense depth from a network and align it to LiDAR: folder, or name in the Hugging Face cache, of a
+    PromptDepthAnything, Depth Anything (transformers) or Marigold (diffusers) model; or folder of a DepthLab written by
+    mudg convert."""
     depth_guided: bool = True
     """Marigold: use LiDAR in every denoising step (slower). Off: only align the result to LiDAR."""
     depth_steps: int = setting(default=0, ge=0)
@@ -32,13 +33,15 @@ class AnnotateConfig:
     device: DeviceName = "auto"
     """Device of the networks of labeller and `depth_network`: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of these networks. auto is float32; bfloat16 is faster on some devices and rounds depth to 0.4 percent."""
+    """Number format of these networks. auto is float32; bfloat16 is faster on some devices and rounds depth to 0.4
+    percent."""
     sweeps: int = setting(default=6, ge=1, le=100)
     """Number of sweeps per LiDAR, nearest in time, whose points are merged for dense depth."""
     dynamic: bool = True
     """Write masks of dynamic objects, from the tracked boxes."""
     ego: bool = False
-    """Write masks of the own vehicle: pixels at the bottom of the image that stay the same while it drives. Use it if the bonnet
-    is visible."""
+    """Write masks of the own vehicle: pixels at the bottom of the image that stay the same while it drives. Use it if
+    the bonnet is visible."""
     processes: int = setting(default=0, ge=0)
-    """Number of frames labelled at the same time (0 = one per core; one if a pretrained network computes on another device)."""
+    """Number of frames labelled at the same time (0 = one per core; one if a pretrained network computes on another
+    device)."""

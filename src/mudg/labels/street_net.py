@@ -1,8 +1,8 @@
 """Labels by the network that comes with the package: ``mudg annotate --labeller embedded``.
 
-Images of a longer focal length than in training are made smaller, so that objects have the size they had there; the measured
-evidence of ``models.labels.evidence`` has the same size. Rules then correct what evidence and colour decide (``settled``,
-``settled_by_color``), and the probabilities are resampled to the image's size.
+Images of a longer focal length than in training are made smaller, so that objects have the size they had there; the
+measured evidence of ``models.labels.evidence`` has the same size. Rules then correct what evidence and colour decide
+(``settled``, ``settled_by_color``), and the probabilities are resampled to the image's size.
 """
 
 from __future__ import annotations
@@ -31,12 +31,13 @@ from mudg.labels.evidence import BOX_GROUPS, GROUP_OF, PLANE_COUNT, Evidence, en
 from mudg.labels.inputs import GAP_DEG, TRAIN_ID_OF, LabelInput, Labels
 from mudg.networks.folders import CPU, Place
 
-# street net -----------------------------------------------------------------------------------------------------------
+# street net ---------------------------------------------------------------------------------------
 #
 # A small segmentation network: Cityscapes classes of a street from colour and measured evidence.
 #
-# An encoder and decoder with skips at strides 2 to 32. Colour and the planes of ``models.labels.evidence`` enter together as cells of
-# 2x2 pixels, and the scores of a cell's four pixels leave together: nothing is computed at full size, and nothing of it is lost.
+# An encoder and decoder with skips at strides 2 to 32. Colour and the planes of ``models.labels.evidence`` enter
+# together as cells of 2x2 pixels, and the scores of a cell's four pixels leave together: nothing is computed at full
+# size, and nothing of it is lost.
 
 
 MODEL_FILE: Final = "model.json"
@@ -83,7 +84,8 @@ class _Block(nn.Module):
 
 
 class StreetNet(nn.Module):
-    """Class scores f32[N, 19, H, W] of colours f32[N, 3, H, W] in 0..1 and evidence f32[N, 17, H, W]; H, W multiples of 32."""
+    """Class scores f32[N, 19, H, W] of colours f32[N, 3, H, W] in 0..1 and evidence f32[N, 17, H, W]; H, W multiples of
+    32."""
 
     def __init__(self, config: StreetNetConfig) -> None:
         super().__init__()
@@ -115,7 +117,8 @@ class StreetNet(nn.Module):
 
     @torch.inference_mode()
     def probabilities(self, rgb: NDArray[np.uint8], evidence: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Probability of each class f32[19, H, W] of an image u8[H, W, 3] and its evidence f32[17, H, W], of any size."""
+        """Probability of each class f32[19, H, W] of an image u8[H, W, 3] and its evidence f32[17, H, W], of any
+        size."""
         height, width = rgb.shape[:2]
         pad = (0, -width % STRIDE, 0, -height % STRIDE)
         color = functional.pad(torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None].float() / 255, pad, mode="replicate")
@@ -125,7 +128,7 @@ class StreetNet(nn.Module):
         return (scores / self.config.temperature).softmax(0).cpu().numpy()
 
 
-# files ----------------------------------------------------------------------------------------------------------------
+# files --------------------------------------------------------------------------------------------
 
 
 def save(net: StreetNet, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
@@ -136,9 +139,14 @@ def save(net: StreetNet, folder: Path, card: str, facts: Mapping[str, Any]) -> N
     store.write_text(folder / "MODEL_CARD.md", card)
     store.write_json(
         folder / MODEL_FILE,
-        {"schema": 1, "kind": "street_net", "config": asdict(net.config),
-         "files": {WEIGHTS_FILE: store.sha256_file(folder / WEIGHTS_FILE)}, "facts": dict(facts)},
-    )  # fmt: skip
+        {
+            "schema": 1,
+            "kind": "street_net",
+            "config": asdict(net.config),
+            "files": {WEIGHTS_FILE: store.sha256_file(folder / WEIGHTS_FILE)},
+            "facts": dict(facts),
+        },
+    )
 
 
 def load(folder: Path | str = EMBEDDED) -> StreetNet:
@@ -151,7 +159,9 @@ def load(folder: Path | str = EMBEDDED) -> StreetNet:
     where = _described(folder)
     content = store.parse_json(store.read_bytes(where), str(where))
     if not isinstance(content, dict) or content.get("schema") != 1 or content.get("kind") != "street_net":
-        raise InputError("not a segmentation network of this package", where=str(where), expected="kind street_net, schema 1")
+        raise InputError(
+            "not a segmentation network of this package", where=str(where), expected="kind street_net, schema 1"
+        )
     with records.understood("a segmentation network", str(where)):
         net = StreetNet(records.parse_dataclass(StreetNetConfig, content.get("config"), f"{where}: config"))
     state = checkpoint.read_shards(where.parent, content.get("files"))
@@ -173,12 +183,16 @@ def _described(folder: Path | str) -> Path:
     """The description in a folder."""
     where = Path(folder) / MODEL_FILE
     if not where.is_file():
-        raise ResourceError("the labeller's weights are missing", where=str(folder), expected=f"a folder with {MODEL_FILE}",
-                            remedy="leave out --weights to use the network that comes with the package")  # fmt: skip
+        raise ResourceError(
+            "the labeller's weights are missing",
+            where=str(folder),
+            expected=f"a folder with {MODEL_FILE}",
+            remedy="leave out --weights to use the network that comes with the package",
+        )
     return where
 
 
-# street labels --------------------------------------------------------------------------------------------------------
+# street labels ------------------------------------------------------------------------------------
 
 
 RETURN_DEG: Final = 0.12
@@ -197,8 +211,8 @@ _SMALL: Final = 1e-3
 _RARE: Final = 0.1
 """Remaining share where the evidence is sometimes wrong: objects that were not given a box."""
 _RARER: Final = 0.02
-"""Remaining share where rules are better than the network on recorded roads: sunlit lanes resemble generated sidewalks, and dark
-treetops resemble what the network takes for sky."""
+"""Remaining share where rules are better than the network on recorded roads: sunlit lanes resemble generated sidewalks,
+and dark treetops resemble what the network takes for sky."""
 
 
 class StreetLabeller:
@@ -240,10 +254,10 @@ def reduced(given: LabelInput, focal_px: float) -> LabelInput:
 def settled(probabilities: NDArray[np.float32], evidence: Evidence, boxes_known: bool = False) -> NDArray[np.float32]:
     """Probabilities f32[19, H, W], with sum 1, without the classes that the evidence rules out.
 
-    No sky at returns and below the horizon; no road high above the ground; the ground that was driven on is road; where the surface
-    lies in a box, no classes but those of the box; where it lies beside or behind a box of a person or a bicycle, no such class.
-    Ground that the path reaches directly is road rather than sidewalk; where the log has boxes (``boxes_known``), there is hardly
-    anything outside them that boxes are drawn around.
+    No sky at returns and below the horizon; no road high above the ground; the ground that was driven on is road; where
+    the surface lies in a box, no classes but those of the box; where it lies beside or behind a box of a person or a
+    bicycle, no such class. Ground that the path reaches directly is road rather than sidewalk; where the log has boxes
+    (``boxes_known``), there is hardly anything outside them that boxes are drawn around.
     """
     found = probabilities.copy()
     measured = evidence.away_deg < RETURN_DEG
@@ -274,10 +288,12 @@ def settled(probabilities: NDArray[np.float32], evidence: Evidence, boxes_known:
 def settled_by_color(
     probabilities: NDArray[np.float32], rgb: NDArray[np.uint8], evidence: Evidence
 ) -> NDArray[np.float32]:
-    """Probabilities f32[19, H, W], with sum 1, without the classes that the colours of the image u8[H, W, 3] contradict.
+    """Probabilities f32[19, H, W], with sum 1, without the classes that the colours of the image u8[H, W, 3]
+    contradict.
 
-    Hardly any sky where the image does not look like it (``labellers.find_sky``: bright or blue, smooth), unless nothing in it does,
-    as at night. Ground that the path reaches directly and that is not green is road rather than terrain.
+    Hardly any sky where the image does not look like it (``labellers.find_sky``: bright or blue, smooth), unless
+    nothing in it does, as at night. Ground that the path reaches directly and that is not green is road rather than
+    terrain.
     """
     found = probabilities.copy()
     px_per_deg = 1 / max(1e-6, float(np.rad2deg(np.abs(np.diff(evidence.elevation_rad, axis=0)).max(initial=0))))

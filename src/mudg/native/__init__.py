@@ -1,11 +1,12 @@
-"""Loads the C++ library that holds the hot loops (rasteriser, z-buffer, SSIM, hash grids, planes, Adam, the city's ray caster).
+"""Loads the C++ library that holds the hot loops (rasteriser, z-buffer, SSIM, hash grids, planes, Adam, the city's ray
+caster).
 
 The library is optional: an install on a machine without any C++ compiler works without it, slower. `status()` says in
 words which of both it is and why; `require()` raises when a caller cannot do without it.
 
 Environment: ``MUDG_THREADS`` = number of threads of the native loops (default: the processors this process may use);
-``MUDG_NATIVE=off`` leaves the library alone even if it is installed; ``MUDG_ISA`` = avx512, avx2 or portable asks for one
-instruction set instead of the best one.
+``MUDG_NATIVE=off`` leaves the library alone even if it is installed; ``MUDG_ISA`` = avx512, avx2 or portable asks for
+one instruction set instead of the best one.
 """
 
 from __future__ import annotations
@@ -133,8 +134,9 @@ def _load() -> tuple[ctypes.CDLL | None, str]:
     found.mudg_set_threads(default_threads())
     wanted = os.environ.get("MUDG_ISA", "").strip()
     if wanted and found.mudg_set_isa(wanted.encode()) != 0:
-        raise UsageError("MUDG_ISA names an instruction set that cannot run here", got=wanted,
-            expected="avx512, avx2, portable")  # fmt: skip
+        raise UsageError(
+            "MUDG_ISA names an instruction set that cannot run here", got=wanted, expected="avx512, avx2, portable"
+        )
     return found, ""
 
 

@@ -1,10 +1,11 @@
 """The OpenCLIP ViT-H/14 towers of the published model, as plain modules; weights come from the checkpoint.
 
-Text: the output of the last block but one, after the final norm, all 77 tokens. Image: all 257 tokens after the last block,
-without the final norm and projection. Both frozen (Radford et al., "Learning transferable visual models"; Cherti et al.,
-"Reproducible scaling laws").
+Text: the output of the last block but one, after the final norm, all 77 tokens. Image: all 257 tokens after the last
+block, without the final norm and projection. Both frozen (Radford et al., "Learning transferable visual models"; Cherti
+et al., "Reproducible scaling laws").
 
-The published model only ever saw one caption and the empty one, so their tokens are written down here and no tokenizer is needed.
+The published model only ever saw one caption and the empty one, so their tokens are written down here and no tokenizer
+is needed.
 """
 
 from __future__ import annotations
@@ -127,8 +128,8 @@ class ImageTower(nn.Module):
 def prepare_image(image: Tensor, side: int = 224) -> Tensor:
     """Images f32[N,3,H,W] in [-1,1] squashed to side x side, in the tower's units of colour.
 
-    Where the image shrinks it is blurred first (Gaussian of deviation (factor - 1) / 2 pixels per axis, reflected at the border),
-    then read off bicubically with the corner pixels' centres kept in place.
+    Where the image shrinks it is blurred first (Gaussian of deviation (factor - 1) / 2 pixels per axis, reflected at
+    the border), then read off bicubically with the corner pixels' centres kept in place.
     """
     image = image.float()
     factors = (image.shape[-2] / side, image.shape[-1] / side)

@@ -1,7 +1,8 @@
-"""CLIP's image embedding (Radford et al. 2021) for scores: ViT-L/14 at 336 pixels, from tensors under either of the names in use.
+"""CLIP's image embedding (Radford et al. 2021) for scores: ViT-L/14 at 336 pixels, from tensors under either of the
+names in use.
 
-Another tower than that of the published diffusion model (``networks/clip.py``): it has the quick GELU, the last norm and the
-projection. Sizes follow from the tensors.
+Another tower than that of the published diffusion model (``networks/clip.py``): it has the quick GELU, the last norm
+and the projection. Sizes follow from the tensors.
 """
 
 from __future__ import annotations
@@ -22,16 +23,22 @@ from mudg.networks.folders import checked_state
 HEAD_WIDTH: Final = 64
 EPSILON: Final = 1e-5
 _BLOCK: Final = (
-    ("ln_1", "layer_norm1"), ("ln_2", "layer_norm2"), ("attn.out_proj", "self_attn.out_proj"), ("mlp.c_fc", "mlp.fc1"),
+    ("ln_1", "layer_norm1"),
+    ("ln_2", "layer_norm2"),
+    ("attn.out_proj", "self_attn.out_proj"),
+    ("mlp.c_fc", "mlp.fc1"),
     ("mlp.c_proj", "mlp.fc2"),
-)  # fmt: skip
+)
 _FIXED: Final = (
     ("visual.class_embedding", "vision_model.embeddings.class_embedding"),
     ("visual.positional_embedding", "vision_model.embeddings.position_embedding.weight"),
     ("visual.conv1.weight", "vision_model.embeddings.patch_embedding.weight"),
-    *((f"visual.{a}.{leaf}", f"vision_model.{b}.{leaf}") for a, b in (("ln_pre", "pre_layrnorm"), ("ln_post", "post_layernorm"))
-      for leaf in ("weight", "bias")),
-)  # fmt: skip
+    *(
+        (f"visual.{a}.{leaf}", f"vision_model.{b}.{leaf}")
+        for a, b in (("ln_pre", "pre_layrnorm"), ("ln_post", "post_layernorm"))
+        for leaf in ("weight", "bias")
+    ),
+)
 """OpenAI's name, and that of the transformers package."""
 
 
@@ -58,9 +65,11 @@ def with_openai_names(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
 def tensor_shapes(width: int, blocks: int, patch: int, places: int, out: int) -> dict[str, tuple[int, ...]]:
     """OpenAI's name -> shape of the tensors of an image tower."""
     shapes: dict[str, tuple[int, ...]] = {
-        "visual.class_embedding": (width,), "visual.positional_embedding": (places + 1, width),
-        "visual.conv1.weight": (width, 3, patch, patch), "visual.proj": (width, out),
-    }  # fmt: skip
+        "visual.class_embedding": (width,),
+        "visual.positional_embedding": (places + 1, width),
+        "visual.conv1.weight": (width, 3, patch, patch),
+        "visual.proj": (width, out),
+    }
     for name in ("ln_pre", "ln_post", *(f"transformer.resblocks.{n}.ln_{k}" for n in range(blocks) for k in (1, 2))):
         shapes |= {f"visual.{name}.weight": (width,), f"visual.{name}.bias": (width,)}
     for number in range(blocks):
@@ -79,7 +88,8 @@ class ClipImageFeatures(nn.Module):
     """The tower with its projection, always in evaluation mode.
 
     Args:
-        state: tensors of a whole CLIP model or of its image tower, under OpenAI's names or those of the transformers package.
+        state: tensors of a whole CLIP model or of its image tower, under OpenAI's names or those of the transformers
+            package.
         where: file name for errors.
 
     Raises:
@@ -93,8 +103,12 @@ class ClipImageFeatures(nn.Module):
             found.get(f"visual.{name}") for name in ("positional_embedding", "conv1.weight", "proj")
         )
         if places is None or kernel is None or projection is None or kernel.shape[0] % HEAD_WIDTH:
-            raise InputError("these are not the weights of a CLIP image tower", where=where, got=", ".join(list(state)[:5]),
-                expected="visual.* as OpenAI names them, or vision_model.* and visual_projection.weight")  # fmt: skip
+            raise InputError(
+                "these are not the weights of a CLIP image tower",
+                where=where,
+                got=", ".join(list(state)[:5]),
+                expected="visual.* as OpenAI names them, or vision_model.* and visual_projection.weight",
+            )
         self.width, self.patch, self.out = int(kernel.shape[0]), int(kernel.shape[-1]), int(projection.shape[-1])
         self.side = round((len(places) - 1) ** 0.5) * self.patch
         self.blocks = len({name.split(".")[3] for name in found if name.startswith("visual.transformer.resblocks.")})
@@ -137,8 +151,8 @@ class ClipImageFeatures(nn.Module):
 
 
 def prepared(rgb: NDArray[np.uint8], side: int = 336) -> Tensor:
-    """An image u8[H, W, 3] as f32[3, side, side]: bicubic without antialiasing (aspect not kept), then CLIP's mean and deviation, as CMMD's
-    PyTorch code does it."""
+    """An image u8[H, W, 3] as f32[3, side, side]: bicubic without antialiasing (aspect not kept), then CLIP's mean and
+    deviation, as CMMD's PyTorch code does it."""
     image = torch.from_numpy(np.array(rgb)).permute(2, 0, 1).float()[None] / 255
     image = F.interpolate(image, size=(side, side), mode="bicubic", align_corners=False)[0]
     mean, deviation = (torch.tensor(values).view(3, 1, 1) for values in (MEAN, DEVIATION))

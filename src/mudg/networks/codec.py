@@ -132,9 +132,9 @@ class PatchCodec(nn.Module):
         self.blocks = nn.ModuleList(DecoderBlock(width) for _ in range(config.decoder_blocks))
         self.leave = nn.Conv2d(width, outside, 1)
         nn.init.zeros_(self.leave.weight)
-        nn.init.zeros_(self.leave.bias)  # type: ignore[arg-type]
+        nn.init.zeros_(self.leave.bias)
 
-    # linear parts -----------------------------------------------------------------------------------------------------
+    # linear parts ---------------------------------------------------------------------------------
 
     @torch.no_grad()
     def fit_color(self, rgb: Tensor) -> None:
@@ -176,8 +176,8 @@ class PatchCodec(nn.Module):
         return depth_to_code(depth_m, self.config)
 
     def encode_semantics(self, ids: Tensor) -> Tensor:
-        """i64[..,H,W] -> latent [..,19,H/2,W/2]: the share of each class among a patch's labelled pixels, times 2, minus its mean
-        over classes; a patch without labels is all zero."""
+        """i64[..,H,W] -> latent [..,19,H/2,W/2]: the share of each class among a patch's labelled pixels, times 2,
+        minus its mean over classes; a patch without labels is all zero."""
         return self.shares_to_latent(semantic_shares(ids))
 
     @staticmethod
@@ -185,7 +185,7 @@ class PatchCodec(nn.Module):
         """Class shares [..,19,h,w] (sum 1, or 0 where unlabelled) -> centred latent of the same shape."""
         return 2.0 * (shares - shares.mean(-3, keepdim=True))
 
-    # decoding ---------------------------------------------------------------------------------------------------------
+    # decoding -------------------------------------------------------------------------------------
 
     def decode_raw(self, latents: dict[Modality, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
         """Decode latents [N,C,h,w] to rgb in [-1,1] [N,3,H,W], depth code [N,1,H,W] and class scores [N,19,H,W].
@@ -234,5 +234,7 @@ def shipped_codec() -> PatchCodec:
     content, prefix = store.read_json(SHIPPED / "model.json"), "codec."
     codec = PatchCodec(records.parse_dataclass(CodecConfig, content["config"]["codec"], "codec: "))
     state = checkpoint.read_shards(SHIPPED, content["files"])
-    codec.load_state_dict({name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)})
+    codec.load_state_dict(
+        {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
+    )
     return codec.eval()

@@ -1,9 +1,9 @@
 """DINOv2 image features (Oquab et al. 2023), from tensors under the names of the published files.
 
-A plain vision transformer with patches of 14 pixels and a scale on every residual; sizes follow from the tensors (ViT-S/14: 384 values
-an image, ViT-B/14: 768, ViT-L/14: 1024). Position embeddings are those of 37 x 37 patches; images of 224 pixels have 16 x 16, and the
-embeddings are resized as the published code does it: bicubic by the factor (16 + 0.1) / 37. Other packages pass the size instead of
-the factor, which gives slightly different features.
+A plain vision transformer with patches of 14 pixels and a scale on every residual; sizes follow from the tensors
+(ViT-S/14: 384 values an image, ViT-B/14: 768, ViT-L/14: 1024). Position embeddings are those of 37 x 37 patches; images
+of 224 pixels have 16 x 16, and the embeddings are resized as the published code does it: bicubic by the factor (16 +
+0.1) / 37. Other packages pass the size instead of the factor, which gives slightly different features.
 """
 
 from __future__ import annotations
@@ -35,9 +35,11 @@ def tensor_shapes(width: int, blocks: int, places: int = 37 * 37, feed: int = 0)
     """Name -> shape of the tensors of a network; ``feed``: width of the hidden layer (0 = 4 ``width``)."""
     feed = feed or 4 * width
     shapes: dict[str, tuple[int, ...]] = {
-        "cls_token": (1, 1, width), "pos_embed": (1, places + 1, width),
-        "patch_embed.proj.weight": (width, 3, PATCH_PX, PATCH_PX), "patch_embed.proj.bias": (width,),
-    }  # fmt: skip
+        "cls_token": (1, 1, width),
+        "pos_embed": (1, places + 1, width),
+        "patch_embed.proj.weight": (width, 3, PATCH_PX, PATCH_PX),
+        "patch_embed.proj.bias": (width,),
+    }
     for number in range(blocks):
         block = f"blocks.{number}"
         for name in ("norm1", "norm2"):
@@ -68,9 +70,15 @@ class DinoFeatures(nn.Module):
         super().__init__()
         places, first = state.get("pos_embed"), state.get("blocks.0.mlp.fc1.weight")
         if places is None or first is None or places.dim() != 3 or places.shape[2] % HEAD_WIDTH:
-            raise InputError("these are not the weights of a DINOv2 network", where=where, expected="pos_embed, blocks.0, ...",
+            raise InputError(
+                "these are not the weights of a DINOv2 network",
+                where=where,
+                expected="pos_embed, blocks.0, ...",
                 got=", ".join(list(state)[:5]),
-                remedy="use dinov2_vits14_pretrain.pth or dinov2_vitl14_pretrain.pth, not those with registers, nor ViT-g")  # fmt: skip
+                remedy=(
+                    "use dinov2_vits14_pretrain.pth or dinov2_vitl14_pretrain.pth, not those with registers, nor ViT-g"
+                ),
+            )
         self.width = int(places.shape[2])
         self.blocks = 1 + max(
             int(name.split(".")[1]) for name in state if name.startswith("blocks.") and name.split(".")[1].isdigit()
@@ -85,7 +93,8 @@ class DinoFeatures(nn.Module):
         return NAMES.get((self.width, self.blocks), f"a network of {self.blocks} blocks of {self.width}")
 
     def forward(self, images: Tensor) -> Tensor:
-        """Features ``[n, width]`` of prepared images ``[n, 3, H, W]``, H and W multiples of 14: the class token after the last norm."""
+        """Features ``[n, width]`` of prepared images ``[n, 3, H, W]``, H and W multiples of 14: the class token after
+        the last norm."""
         return self._norm("norm", self.tokens(images))[:, 0]
 
     def tokens(self, images: Tensor) -> Tensor:
@@ -130,8 +139,8 @@ class DinoFeatures(nn.Module):
 
 
 def prepared(rgb: NDArray[np.uint8]) -> Tensor:
-    """An image u8[H, W, 3] as f32[3, 224, 224]: Pillow's bicubic on 8 bits (aspect not kept), then ImageNet's mean and deviation, as
-    dgm-eval does it."""
+    """An image u8[H, W, 3] as f32[3, 224, 224]: Pillow's bicubic on 8 bits (aspect not kept), then ImageNet's mean and
+    deviation, as dgm-eval does it."""
     image = torch.from_numpy(np.array(resize_bicubic(rgb, SIDE_PX, SIDE_PX))).permute(2, 0, 1).float() / 255
     mean, deviation = (torch.tensor(values).view(3, 1, 1) for values in (MEAN, DEVIATION))
     return (image - mean) / deviation

@@ -2,12 +2,12 @@
 
 By default fits use the filter bank and scores the codec.
 
-Each takes an image and returns a list of feature maps. ``FilterBank`` needs no weights; it follows what is known of early vision
-(Gabor-like energy at several scales and orientations, divisive contrast normalisation, opponent colours):
+Each takes an image and returns a list of feature maps. ``FilterBank`` needs no weights; it follows what is known of
+early vision (Gabor-like energy at several scales and orientations, divisive contrast normalisation, opponent colours):
 
 * opponent colours: luminance and two chroma axes, compared on blurred images only (the eye resolves colour coarsely);
-* per scale (1, 1/2, 1/4 of the size): first-derivative responses in four orientations, divided by the local contrast, so that
-  a weak texture in shadow counts as much as a strong one in the sun;
+* per scale (1, 1/2, 1/4 of the size): first-derivative responses in four orientations, divided by the local contrast,
+  so that a weak texture in shadow counts as much as a strong one in the sun;
 * the responses' *energy*, pooled over a few pixels: two images of the same texture that are misaligned by a
   pixel are close, where L1 sees two different images and answers with blur.
 
@@ -45,8 +45,8 @@ class FilterBank(nn.Module):
         scales: number of octaves; the image must be at least ``4 * 2**scales`` pixels in each direction.
 
     Returns (from ``forward``):
-        Per scale one tensor ``[C, h, w]``: normalised signed derivatives (2), their pooled energy (4 orientations) and the
-        blurred opponent colours (3); C = 9.
+        Per scale one tensor ``[C, h, w]``: normalised signed derivatives (2), their pooled energy (4 orientations) and
+        the blurred opponent colours (3); C = 9.
     """
 
     CONTRAST_FLOOR: Final = 0.02
@@ -67,7 +67,7 @@ class FilterBank(nn.Module):
         return features
 
     def _features(self, colors: Tensor) -> Tensor:
-        slope: Tensor = _Slope.apply(F.pad(colors[:, :1], (1, 1, 1, 1), mode="replicate"))  # type: ignore[assignment]
+        slope: Tensor = _Slope.apply(F.pad(colors[:, :1], (1, 1, 1, 1), mode="replicate"))
         power = (slope**2).sum(1, keepdim=True)
         contrast = torch.sqrt(box_mean(power, 7) + self.CONTRAST_FLOOR**2)
         dx, dy = slope[:, :1] / contrast, slope[:, 1:] / contrast
@@ -78,8 +78,8 @@ class FilterBank(nn.Module):
 
 
 class _Slope(torch.autograd.Function):
-    """Differences along x and y of a plane, smoothed across: ``[1, 1, H + 2, W + 2]`` -> ``[1, 2, H, W]``. The same as a convolution with
-    two kernels of 3x3, whose backward pass takes ten times as long for a single channel."""
+    """Differences along x and y of a plane, smoothed across: ``[1, 1, H + 2, W + 2]`` -> ``[1, 2, H, W]``. The same as
+    a convolution with two kernels of 3x3, whose backward pass takes ten times as long for a single channel."""
 
     @staticmethod
     def forward(ctx: Any, padded: Tensor) -> Tensor:
@@ -108,9 +108,10 @@ class _Slope(torch.autograd.Function):
 class CodecFeatures(nn.Module):
     """Features of an image ``[3, H, W]`` in [0, 1]: activations of the codec's decoder network on the image's own code.
 
-    The codec's encoder is one linear map of 2x2 pixels; what the codec has learned about images lies in the decoder network, which
-    was trained to restore what the code lost. Its stages (the first convolution and each residual block) are the features, for
-    the image at full, half and quarter size. Depth and classes are withheld, as in a part of the codec's training.
+    The codec's encoder is one linear map of 2x2 pixels; what the codec has learned about images lies in the decoder
+    network, which was trained to restore what the code lost. Its stages (the first convolution and each residual block)
+    are the features, for the image at full, half and quarter size. Depth and classes are withheld, as in a part of the
+    codec's training.
 
     Returns (from ``forward``):
         Per size, largest first, and per stage one tensor ``[C, h, w]``.
@@ -126,8 +127,8 @@ class CodecFeatures(nn.Module):
 
     @property
     def reach_rows(self) -> int:
-        """Rows of the image above and below a row that its features depend on, rounded up to ``STEP``: one convolution and two per
-        block, at the smallest size."""
+        """Rows of the image above and below a row that its features depend on, rounded up to ``STEP``: one convolution
+        and two per block, at the smallest size."""
         return self.STEP * (2 + 2 * len(self.codec.blocks))
 
     def forward(self, rgb: Tensor) -> list[Tensor]:
@@ -204,23 +205,35 @@ def _vgg(first: int, channels: tuple[int, ...]) -> tuple[_Layer, ...]:
 
 TRUNKS: Final[dict[LpipsTrunk, tuple[_Stage, ...]]] = {
     "alex": (
-        (_Layer("0", 64, 3, 11, 4, 2),), (_POOL, _Layer("3", 192, 64, 5, 1, 2)), (_POOL, _Layer("6", 384, 192)), (_Layer("8", 256, 384),),
+        (_Layer("0", 64, 3, 11, 4, 2),),
+        (_POOL, _Layer("3", 192, 64, 5, 1, 2)),
+        (_POOL, _Layer("6", 384, 192)),
+        (_Layer("8", 256, 384),),
         (_Layer("10", 256, 256),),
     ),
     "vgg": (
-        _vgg(0, (3, 64, 64)), (_Maximum(2), *_vgg(5, (64, 128, 128))), (_Maximum(2), *_vgg(10, (128, 256, 256, 256))),
-        (_Maximum(2), *_vgg(17, (256, 512, 512, 512))), (_Maximum(2), *_vgg(24, (512, 512, 512, 512))),
+        _vgg(0, (3, 64, 64)),
+        (_Maximum(2), *_vgg(5, (64, 128, 128))),
+        (_Maximum(2), *_vgg(10, (128, 256, 256, 256))),
+        (_Maximum(2), *_vgg(17, (256, 512, 512, 512))),
+        (_Maximum(2), *_vgg(24, (512, 512, 512, 512))),
     ),
     "squeeze": (
-        (_Layer("0", 64, 3, 3, 2, 0),), (_SQUEEZE_POOL, _Fire("3", 64, 16, 64), _Fire("4", 128, 16, 64)),
-        (_SQUEEZE_POOL, _Fire("6", 128, 32, 128), _Fire("7", 256, 32, 128)), (_SQUEEZE_POOL, _Fire("9", 256, 48, 192)),
-        (_Fire("10", 384, 48, 192),), (_Fire("11", 384, 64, 256),), (_Fire("12", 512, 64, 256),),
+        (_Layer("0", 64, 3, 3, 2, 0),),
+        (_SQUEEZE_POOL, _Fire("3", 64, 16, 64), _Fire("4", 128, 16, 64)),
+        (_SQUEEZE_POOL, _Fire("6", 128, 32, 128), _Fire("7", 256, 32, 128)),
+        (_SQUEEZE_POOL, _Fire("9", 256, 48, 192)),
+        (_Fire("10", 384, 48, 192),),
+        (_Fire("11", 384, 64, 256),),
+        (_Fire("12", 512, 64, 256),),
     ),
-}  # fmt: skip
+}
 """Stages of each network; features are read after each. Places are those of torchvision's networks."""
 WIDTHS: Final[dict[LpipsTrunk, tuple[int, ...]]] = {
-    "alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512), "squeeze": (64, 128, 256, 384, 384, 512, 512),
-}  # fmt: skip
+    "alex": (64, 192, 384, 256, 256),
+    "vgg": (64, 128, 256, 512, 512),
+    "squeeze": (64, 128, 256, 384, 384, 512, 512),
+}
 
 
 def lpips_shapes(trunk: LpipsTrunk) -> dict[str, tuple[int, ...]]:
@@ -229,7 +242,10 @@ def lpips_shapes(trunk: LpipsTrunk) -> dict[str, tuple[int, ...]]:
     for number, stage in enumerate(TRUNKS[trunk]):
         for layer in _layers(stage):
             named = f"net.slice{number + 1}.{layer.place}"
-            shapes |= {f"{named}.weight": (layer.out, layer.into, layer.size, layer.size), f"{named}.bias": (layer.out,)}
+            shapes |= {
+                f"{named}.weight": (layer.out, layer.into, layer.size, layer.size),
+                f"{named}.bias": (layer.out,),
+            }
         shapes[f"lin{number}.model.1.weight"] = (1, WIDTHS[trunk][number], 1, 1)
     return shapes
 
@@ -246,10 +262,12 @@ class LpipsFeatures(nn.Module):
     """A trunk of LPIPS 0.1 (Zhang et al. 2018) and its weights per channel, from tensors under the usual names.
 
     Args:
-        state: ``net.slice1.0.weight``, ..., ``lin0.model.1.weight``, ..., as the lpips package names them; other entries are left alone.
+        state: ``net.slice1.0.weight``, ..., ``lin0.model.1.weight``, ..., as the lpips package names them; other
+            entries are left alone.
         where: file name for errors.
         trunk: AlexNet, VGG-16 or SqueezeNet 1.1.
-        given: correct: colours are brought to [-1, 1] first. unscaled: they stay in [0, 1], as in much published code of Gaussian scenes.
+        given: correct: colours are brought to [-1, 1] first. unscaled: they stay in [0, 1], as in much published code
+            of Gaussian scenes.
 
     Raises:
         InputError: a tensor is missing or has another shape.
@@ -260,7 +278,11 @@ class LpipsFeatures(nn.Module):
     SMALLEST_PX: Final = 31
 
     def __init__(
-        self, state: Mapping[str, Tensor], where: str = "LPIPS weights", trunk: LpipsTrunk = "alex", given: LpipsInput = "correct"
+        self,
+        state: Mapping[str, Tensor],
+        where: str = "LPIPS weights",
+        trunk: LpipsTrunk = "alex",
+        given: LpipsInput = "correct",
     ) -> None:
         super().__init__()
         self.trunk: LpipsTrunk = trunk
@@ -306,7 +328,9 @@ def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], wher
     found = state.get(name)
     if found is None or tuple(found.shape) != shape:
         got = "missing" if found is None else str(tuple(found.shape))
-        raise InputError("LPIPS weights are incomplete or of another network", where=f"{where}: {name}", expected=str(shape), got=got)
+        raise InputError(
+            "LPIPS weights are incomplete or of another network", where=f"{where}: {name}", expected=str(shape), got=got
+        )
     return found.float()
 
 
@@ -315,7 +339,8 @@ class _Band:
     """Rows of a large image whose features are made together.
 
     Args:
-        begins, ends: rows that count. above, below: rows that are read besides, for features at the border to be as in the whole.
+        begins, ends: rows that count. above, below: rows that are read besides, for features at the border to be as in
+            the whole.
     """
 
     begins: int
@@ -359,11 +384,13 @@ def reduced(image: Tensor) -> Tensor:
 class PerceptualDistance:
     """``lpips_distance`` of a pair's colours in the features of a network; threads may call it.
 
-    The same truth is compared with one method after another: each thread keeps its features until another truth comes. Pairs come on the
-    CPU; what is compared goes to the device of the network here, and the number comes back.
+    The same truth is compared with one method after another: each thread keeps its features until another truth comes.
+    Pairs come on the CPU; what is compared goes to the device of the network here, and the number comes back.
     """
 
-    def __init__(self, features: nn.Module, weights: list[Tensor] | None = None, device: torch.device | None = None) -> None:
+    def __init__(
+        self, features: nn.Module, weights: list[Tensor] | None = None, device: torch.device | None = None
+    ) -> None:
         self._device = device or torch.device("cpu")
         self._features = features.to(self._device)
         self._weights = None if weights is None else [weight.to(self._device) for weight in weights]
@@ -379,12 +406,16 @@ class PerceptualDistance:
             if getattr(self._known, "image", None) is not pair.truth_rgb:
                 self._known.features = unit_features(self._features(pair.truth_rgb.to(self._device)))
                 self._known.image = pair.truth_rgb
-            made, mask = self._features(pair.rgb.to(self._device)), None if pair.mask is None else pair.mask.to(self._device)
+            made, mask = (
+                self._features(pair.rgb.to(self._device)),
+                (None if pair.mask is None else pair.mask.to(self._device)),
+            )
             distance = lpips_distance(made, self._known.features, mask, self._weights, over_weight=True)
             return float(distance)
 
     def in_bands(self, pair: Pair) -> bool:
-        """Whether images of this size are compared band by band: no machine should hold all features of them at once."""
+        """Whether images of this size are compared band by band: no machine should hold all features of them at
+        once."""
         if pair.rgb is None or pair.truth_rgb is None or not isinstance(self._features, CodecFeatures):
             return False
         return pair.rgb.shape[-2] * pair.rgb.shape[-1] > WHOLE_PIXELS
@@ -393,13 +424,18 @@ class PerceptualDistance:
         """The distances of large images (``in_bands``) from one truth, whose features are made once for all of them.
 
         Args:
-            pairs: of one truth and mask. threads: bands that are worked on at the same time; the values do not depend on it.
+            pairs: of one truth and mask. threads: bands that are worked on at the same time; the values do not depend
+                on it.
         """
         network, truth, mask = self._features, pairs[0].truth_rgb, pairs[0].mask
         if truth is None or not isinstance(network, CodecFeatures):
-            raise UsageError("only distances in the features of the codec are made band by band", where="PerceptualDistance.of_all")
+            raise UsageError(
+                "only distances in the features of the codec are made band by band", where="PerceptualDistance.of_all"
+            )
         images = [reduced(pair.rgb) for pair in pairs if pair.rgb is not None]
-        given = _Compared(network, self._device, images, reduced(truth), None if mask is None else reduced(mask.float()))
+        given = _Compared(
+            network, self._device, images, reduced(truth), None if mask is None else reduced(mask.float())
+        )
         height, width = given.truth.shape[-2:]
         with ThreadPoolExecutor(threads) as pool:
             parts = list(pool.map(given.sums_of, _bands(height, width, network)))
@@ -414,7 +450,8 @@ def _mean_of_stages(bands: Sequence[Sequence[tuple[float, float]]]) -> float:
 
 @dataclass(frozen=True)
 class _Compared:
-    """Images that are held against one truth band by band: ``[3, H, W]`` each, and the pixels that count f32[1, H, W]."""
+    """Images that are held against one truth band by band: ``[3, H, W]`` each, and the pixels that count f32[1, H,
+    W]."""
 
     network: CodecFeatures
     device: torch.device
@@ -431,7 +468,9 @@ class _Compared:
         return [
             [
                 (float((places * share).double().sum()), float(share.expand_as(places).double().sum()))
-                for features, target, share in zip(band.features(self.network, image.to(self.device)), true, shares, strict=True)
+                for features, target, share in zip(
+                    band.features(self.network, image.to(self.device)), true, shares, strict=True
+                )
                 for places in [distance_places(features, target)]
             ]
             for image in self.images

@@ -1,9 +1,9 @@
-"""Pretrained networks in folders, as the packages transformers and diffusers write them, or in the Hugging Face cache; nothing is
-downloaded, and a folder is read completely or not at all.
+"""Pretrained networks in folders, as the packages transformers and diffusers write them, or in the Hugging Face cache;
+nothing is downloaded, and a folder is read completely or not at all.
 
-The packages are extras, imported at first use. Which class reads a folder is decided by our tables: no name in a
-file becomes an import, and code that lies in a folder never runs. Weights come from safetensors only. A weight that the network
-has and the folder lacks is an error, where the packages would leave it random and say so in a log.
+The packages are extras, imported at first use. Which class reads a folder is decided by our tables: no name in a file
+becomes an import, and code that lies in a folder never runs. Weights come from safetensors only. A weight that the
+network has and the folder lacks is an error, where the packages would leave it random and say so in a log.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mudg.base import store
 from mudg.base.devices import NETWORK_KINDS, DeviceName, choose_device
 from mudg.base.errors import InputError, ResourceError
 
-# the check that every network of a score makes of its weights ---------------------------------------------------------
+# the check that every network of a score makes of its weights -------------------------------------
 
 
 def checked_state(
@@ -38,8 +38,8 @@ def checked_state(
     """The wanted tensors of a file as float32.
 
     Args:
-        wanted: name -> shape of all that the network needs. where: file name for errors. network: its name. ignored: names that may be
-            there and are not read; all other names are refused.
+        wanted: name -> shape of all that the network needs. where: file name for errors. network: its name. ignored:
+            names that may be there and are not read; all other names are refused.
 
     Raises:
         InputError: a tensor is missing, has another shape, holds values that are not finite, or is unknown.
@@ -58,12 +58,15 @@ def checked_state(
             raise InputError(f"{network} weights hold values that are not finite", where=f"{where}: {name}")
     for name in state:
         if name not in wanted and not ignored(name):
-            raise InputError(f"{network} weights hold a tensor that the network has not", where=f"{where}: {name}",
-                expected=f"{len(wanted)} tensors")  # fmt: skip
+            raise InputError(
+                f"{network} weights hold a tensor that the network has not",
+                where=f"{where}: {name}",
+                expected=f"{len(wanted)} tensors",
+            )
     return {name: state[name].detach().float() for name in wanted}
 
 
-# folders --------------------------------------------------------------------------------------------------------------
+# folders ------------------------------------------------------------------------------------------
 
 
 _REMEDY: Final = "pip install 'mudg[models]'"
@@ -71,7 +74,8 @@ _REMEDY: Final = "pip install 'mudg[models]'"
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Device of a network, one that `choose_device` accepts, and whether its convolutions and matrix products are computed in bfloat16."""
+    """Device of a network, one that `choose_device` accepts, and whether its convolutions and matrix products are
+    computed in bfloat16."""
 
     device: DeviceName = "cpu"
     bf16: bool = False
@@ -102,8 +106,8 @@ _IN_HUB: Final = re.compile(r"(?P<repository>[\w.-]+/[\w.-]+)(@(?P<revision>[\w.
 
 
 def find(name: str | Path) -> Path:
-    """Folder of a network: ``name`` itself where it is a folder, else the copy of the repository "owner/name" or "owner/name@revision"
-    that lies in the Hugging Face cache of this machine. Nothing is downloaded.
+    """Folder of a network: ``name`` itself where it is a folder, else the copy of the repository "owner/name" or
+    "owner/name@revision" that lies in the Hugging Face cache of this machine. Nothing is downloaded.
 
     Raises:
         ResourceError: neither is there, or the package that knows the cache is missing.
@@ -115,14 +119,21 @@ def find(name: str | Path) -> Path:
     try:
         hub = package("huggingface_hub")
     except ResourceError as error:
-        raise ResourceError("no such folder, nor the package that knows the Hugging Face cache", where=text,
-            remedy=f"name a folder that exists; for names of repositories: {_REMEDY}") from error  # fmt: skip
+        raise ResourceError(
+            "no such folder, nor the package that knows the Hugging Face cache",
+            where=text,
+            remedy=f"name a folder that exists; for names of repositories: {_REMEDY}",
+        ) from error
     try:
         found = hub.snapshot_download(parts["repository"], revision=parts["revision"], local_files_only=True)
     except (OSError, ValueError) as error:
-        raise ResourceError("no such folder, and no copy of such a repository in the Hugging Face cache", where=text,
-            got=str(error).splitlines()[0], expected=f"a folder, or a copy below {hub.constants.HF_HUB_CACHE}",
-            remedy=f"hf download {parts['repository']}") from error  # fmt: skip
+        raise ResourceError(
+            "no such folder, and no copy of such a repository in the Hugging Face cache",
+            where=text,
+            got=str(error).splitlines()[0],
+            expected=f"a folder, or a copy below {hub.constants.HF_HUB_CACHE}",
+            remedy=f"hf download {parts['repository']}",
+        ) from error
     return Path(found)
 
 
@@ -146,8 +157,9 @@ def package(name: Literal["transformers", "diffusers", "huggingface_hub"]) -> Mo
             case "huggingface_hub":
                 found = importlib.import_module("huggingface_hub")
     except ImportError as error:
-        raise ResourceError(f"the {name} package is missing", where="pretrained network", got=str(error),
-            remedy=_REMEDY) from error  # fmt: skip
+        raise ResourceError(
+            f"the {name} package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
+        ) from error
     return _quiet(found)
 
 
@@ -163,9 +175,13 @@ def member(owner: ModuleType, class_name: str) -> Any:
     """A class of a package; ResourceError where the installed version is too old to have it."""
     found = getattr(owner, class_name, None)
     if found is None:
-        raise ResourceError(f"the installed {owner.__name__} package has no {class_name}", where="pretrained network",
-            expected="a newer version", got=str(getattr(owner, "__version__", "")),
-            remedy=f"pip install --upgrade {owner.__name__}")  # fmt: skip
+        raise ResourceError(
+            f"the installed {owner.__name__} package has no {class_name}",
+            where="pretrained network",
+            expected="a newer version",
+            got=str(getattr(owner, "__version__", "")),
+            remedy=f"pip install --upgrade {owner.__name__}",
+        )
     return found
 
 
@@ -198,13 +214,21 @@ def load_network(network_class: Any, folder: Path, place: Place = CPU, subfolder
         network, report = network_class.from_pretrained(str(folder), **options)
     except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(f"the folder cannot be read as {network_class.__name__}", where=where, got=lines[0][:300],
-            expected="the configuration and the safetensors file that save_pretrained writes") from error  # fmt: skip
+        raise InputError(
+            f"the folder cannot be read as {network_class.__name__}",
+            where=where,
+            got=lines[0][:300],
+            expected="the configuration and the safetensors file that save_pretrained writes",
+        ) from error
     lacking = sorted(str(name) for key in ("missing_keys", "mismatched_keys") for name in report.get(key) or ())
     if lacking:
-        raise InputError(f"weights of the {network_class.__name__} are missing, or have another shape", where=where,
-            expected="a value for every parameter", got=", ".join(lacking[:4]) + (" ..." if len(lacking) > 4 else ""),
-            remedy="take the folder of the whole network, with its task's head")  # fmt: skip
+        raise InputError(
+            f"weights of the {network_class.__name__} are missing, or have another shape",
+            where=where,
+            expected="a value for every parameter",
+            got=", ".join(lacking[:4]) + (" ..." if len(lacking) > 4 else ""),
+            remedy="take the folder of the whole network, with its task's head",
+        )
     if any(value.dtype != torch.float32 for value in network.parameters()):
         network = network.float()
     return network.to(device).eval().requires_grad_(False)

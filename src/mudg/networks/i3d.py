@@ -1,8 +1,9 @@
 """FVD's feature extractor: the I3D network trained on Kinetics-400, from tensors under either of the names in use.
 
-The two files that hold it (``i3d_torchscript.pt`` and ``i3d_pretrained_400.pt``) name their tensors differently, and their packages use
-different epsilons in the norms; features at 1e-5 differ by a percent from those at 1e-3. Paddings follow TensorFlow's rule SAME, which
-depends on the size and is not symmetric. How frames get to 224x224 is part of the definition (``VideoRule``).
+The two files that hold it (``i3d_torchscript.pt`` and ``i3d_pretrained_400.pt``) name their tensors differently, and
+their packages use different epsilons in the norms; features at 1e-5 differ by a percent from those at 1e-3. Paddings
+follow TensorFlow's rule SAME, which depends on the size and is not symmetric. How frames get to 224x224 is part of the
+definition (``VideoRule``).
 """
 
 from __future__ import annotations
@@ -63,25 +64,49 @@ class _Mixed(NamedTuple):
     def units(self) -> dict[str, _Cube]:
         """The convolutions by branch name."""
         b0, b1a, b1b, b2a, b2b, b3b = self.widths
-        rows = {"b0": (self.into, b0, 1), "b1a": (self.into, b1a, 1), "b1b": (b1a, b1b, 3), "b2a": (self.into, b2a, 1),
-                "b2b": (b2a, b2b, 3), "b3b": (self.into, b3b, 1)}  # fmt: skip
+        rows = {
+            "b0": (self.into, b0, 1),
+            "b1a": (self.into, b1a, 1),
+            "b1b": (b1a, b1b, 3),
+            "b2a": (self.into, b2a, 1),
+            "b2b": (b2a, b2b, 3),
+            "b3b": (self.into, b3b, 1),
+        }
         return {branch: _Cube(f"{self.name}.{branch}", *row) for branch, row in rows.items()}
 
 
 _STEPS: Final[tuple[_Cube | _Pool | _Mixed, ...]] = (
-    _Cube("Conv3d_1a_7x7", 3, 64, 7, 2), _Pool((1, 3, 3), (1, 2, 2)),
-    _Cube("Conv3d_2b_1x1", 64, 64), _Cube("Conv3d_2c_3x3", 64, 192, 3), _Pool((1, 3, 3), (1, 2, 2)),
-    _Mixed("Mixed_3b", 192, (64, 96, 128, 16, 32, 32)), _Mixed("Mixed_3c", 256, (128, 128, 192, 32, 96, 64)), _Pool((3, 3, 3), (2, 2, 2)),
-    _Mixed("Mixed_4b", 480, (192, 96, 208, 16, 48, 64)), _Mixed("Mixed_4c", 512, (160, 112, 224, 24, 64, 64)),
-    _Mixed("Mixed_4d", 512, (128, 128, 256, 24, 64, 64)), _Mixed("Mixed_4e", 512, (112, 144, 288, 32, 64, 64)),
-    _Mixed("Mixed_4f", 528, (256, 160, 320, 32, 128, 128)), _Pool((2, 2, 2), (2, 2, 2)),
-    _Mixed("Mixed_5b", 832, (256, 160, 320, 32, 128, 128)), _Mixed("Mixed_5c", 832, (384, 192, 384, 48, 128, 128)),
-)  # fmt: skip
+    _Cube("Conv3d_1a_7x7", 3, 64, 7, 2),
+    _Pool((1, 3, 3), (1, 2, 2)),
+    _Cube("Conv3d_2b_1x1", 64, 64),
+    _Cube("Conv3d_2c_3x3", 64, 192, 3),
+    _Pool((1, 3, 3), (1, 2, 2)),
+    _Mixed("Mixed_3b", 192, (64, 96, 128, 16, 32, 32)),
+    _Mixed("Mixed_3c", 256, (128, 128, 192, 32, 96, 64)),
+    _Pool((3, 3, 3), (2, 2, 2)),
+    _Mixed("Mixed_4b", 480, (192, 96, 208, 16, 48, 64)),
+    _Mixed("Mixed_4c", 512, (160, 112, 224, 24, 64, 64)),
+    _Mixed("Mixed_4d", 512, (128, 128, 256, 24, 64, 64)),
+    _Mixed("Mixed_4e", 512, (112, 144, 288, 32, 64, 64)),
+    _Mixed("Mixed_4f", 528, (256, 160, 320, 32, 128, 128)),
+    _Pool((2, 2, 2), (2, 2, 2)),
+    _Mixed("Mixed_5b", 832, (256, 160, 320, 32, 128, 128)),
+    _Mixed("Mixed_5c", 832, (384, 192, 384, 48, 128, 128)),
+)
 _OTHER_NAMES: Final = (
-    ("batch3d.", "bn."), ("conv3d_0c_1x1.", "logits."), ("conv3d_1a", "Conv3d_1a"), ("conv3d_2b", "Conv3d_2b"),
-    ("conv3d_2c", "Conv3d_2c"), ("mixed_", "Mixed_"), ("branch_0.", "b0."), ("branch_1.0.", "b1a."), ("branch_1.1.", "b1b."),
-    ("branch_2.0.", "b2a."), ("branch_2.1.", "b2b."), ("branch_3.1.", "b3b."),
-)  # fmt: skip
+    ("batch3d.", "bn."),
+    ("conv3d_0c_1x1.", "logits."),
+    ("conv3d_1a", "Conv3d_1a"),
+    ("conv3d_2b", "Conv3d_2b"),
+    ("conv3d_2c", "Conv3d_2c"),
+    ("mixed_", "Mixed_"),
+    ("branch_0.", "b0."),
+    ("branch_1.0.", "b1a."),
+    ("branch_1.1.", "b1b."),
+    ("branch_2.0.", "b2a."),
+    ("branch_2.1.", "b2b."),
+    ("branch_3.1.", "b3b."),
+)
 """Parts of names in the first layout -> in the second."""
 
 
@@ -106,7 +131,8 @@ class I3DFeatures(nn.Module):
     """The network, always in evaluation mode.
 
     Args:
-        state: the tensors of ``tensor_shapes``, in either layout; ``num_batches_tracked`` is left alone, anything else is refused.
+        state: the tensors of ``tensor_shapes``, in either layout; ``num_batches_tracked`` is left alone, anything else
+            is refused.
         where: file name for errors. epsilon: of the norms.
 
     Raises:
@@ -134,8 +160,11 @@ class I3DFeatures(nn.Module):
             or clips.shape[3:] != (SIDE_PX, SIDE_PX)
             or clips.shape[2] < SHORTEST
         ):
-            raise InputError("FVD's network takes clips of one size", expected=f"[n, 3, T >= {SHORTEST}, {SIDE_PX}, {SIDE_PX}]",
-                got=str(tuple(clips.shape)))  # fmt: skip
+            raise InputError(
+                "FVD's network takes clips of one size",
+                expected=f"[n, 3, T >= {SHORTEST}, {SIDE_PX}, {SIDE_PX}]",
+                got=str(tuple(clips.shape)),
+            )
         x = clips
         for step in _STEPS:
             if isinstance(step, _Cube):
@@ -208,15 +237,25 @@ def _checked(state: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
         value = found.get(name)
         if value is None or tuple(value.shape) != shape or not value.is_floating_point():
             got = "missing" if value is None else f"{value.dtype} {tuple(value.shape)}"
-            raise InputError("I3D weights are incomplete or of another network", where=f"{where}: {given.get(name, name)}",
-                expected=str(shape), got=got)  # fmt: skip
+            raise InputError(
+                "I3D weights are incomplete or of another network",
+                where=f"{where}: {given.get(name, name)}",
+                expected=str(shape),
+                got=got,
+            )
         if not bool(torch.isfinite(value).all()) or (name.endswith("running_var") and bool((value < 0).any())):
-            raise InputError("I3D weights hold impossible values", where=f"{where}: {given[name]}",
-                expected="finite numbers, variances of at least 0")  # fmt: skip
+            raise InputError(
+                "I3D weights hold impossible values",
+                where=f"{where}: {given[name]}",
+                expected="finite numbers, variances of at least 0",
+            )
     for name in found:
         if name not in wanted and not name.endswith(".bn.num_batches_tracked"):
-            raise InputError("I3D weights hold a tensor that FVD's network has not", where=f"{where}: {given[name]}",
-                expected=f"{len(wanted)} tensors")  # fmt: skip
+            raise InputError(
+                "I3D weights hold a tensor that FVD's network has not",
+                where=f"{where}: {given[name]}",
+                expected=f"{len(wanted)} tensors",
+            )
     return {name: found[name].detach().float() for name in wanted}
 
 

@@ -1,8 +1,10 @@
-"""FID's feature extractor: the Inception-v3 network of the TensorFlow release of 2015, from tensors under their usual names.
+"""FID's feature extractor: the Inception-v3 network of the TensorFlow release of 2015, from tensors under their usual
+names.
 
-It differs from torchvision's Inception-v3: averages leave padding out of their count, the last block takes maxima where the one
-before averages, there are 1008 classes and no auxiliary head, and the weights are others. Numbers made with another network are
-not FID. How an image is brought to 299x299 is part of the definition, too; five rules are in use (``ResizeRule``).
+It differs from torchvision's Inception-v3: averages leave padding out of their count, the last block takes maxima where
+the one before averages, there are 1008 classes and no auxiliary head, and the weights are others. Numbers made with
+another network are not FID. How an image is brought to 299x299 is part of the definition, too; five rules are in use
+(``ResizeRule``).
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ ResizeRule = Literal["pytorch-fid", "tf1", "clean", "tm", "neurad"]
 """How an image u8[H, W, 3] becomes f32[3, 299, 299]; the aspect is not kept by any.
 
 * pytorch-fid: bilinear, half-pixel centres, no antialiasing; 2 x / 255 - 1.
-* tf1: bilinear, pixel k of the result at k * in / out, no antialiasing; (x - 128) / 128, as the other rules. TTUR, torch-fidelity.
+* tf1: bilinear, pixel k of the result at k * in / out, no antialiasing; (x - 128) / 128, as the other rules. TTUR,
+  torch-fidelity.
 * clean: bicubic with antialiasing, clipped to 0..255, not rounded. clean-fid.
 * tm: bilinear with antialiasing. torchmetrics.
 * neurad: Pillow's bicubic on 8 bits. neurad-studio.
@@ -38,8 +41,8 @@ ResizeRule = Literal["pytorch-fid", "tf1", "clean", "tm", "neurad"]
 RULES: Final[tuple[ResizeRule, ...]] = get_args(ResizeRule)
 
 Tap = Literal["64", "192", "768", "2048", "logits_unbiased"]
-"""Where features are read, by their width: after the first and the second maximum pool and after Mixed_6e, averaged over places; the
-global average that FID uses; its classes without bias."""
+"""Where features are read, by their width: after the first and the second maximum pool and after Mixed_6e, averaged
+over places; the global average that FID uses; its classes without bias."""
 
 
 class _Unit(NamedTuple):
@@ -84,19 +87,28 @@ def _block_c(width: int) -> tuple[_Branch, ...]:
     return (
         (_unit("branch1x1", 192),),
         (_unit("branch7x7_1", width), _unit("branch7x7_2", width, flat), _unit("branch7x7_3", 192, tall)),
-        (_unit("branch7x7dbl_1", width), _unit("branch7x7dbl_2", width, tall), _unit("branch7x7dbl_3", width, flat),
-         _unit("branch7x7dbl_4", width, tall), _unit("branch7x7dbl_5", 192, flat)),
+        (
+            _unit("branch7x7dbl_1", width),
+            _unit("branch7x7dbl_2", width, tall),
+            _unit("branch7x7dbl_3", width, flat),
+            _unit("branch7x7dbl_4", width, tall),
+            _unit("branch7x7dbl_5", 192, flat),
+        ),
         (_AVERAGE, _unit("branch_pool", 192)),
-    )  # fmt: skip
+    )
 
 
 def _block_d() -> tuple[_Branch, ...]:
     return (
         (_unit("branch3x3_1", 192), _unit("branch3x3_2", 320, 3, 2)),
-        (_unit("branch7x7x3_1", 192), _unit("branch7x7x3_2", 192, (1, 7)), _unit("branch7x7x3_3", 192, (7, 1)),
-         _unit("branch7x7x3_4", 192, 3, 2)),
+        (
+            _unit("branch7x7x3_1", 192),
+            _unit("branch7x7x3_2", 192, (1, 7)),
+            _unit("branch7x7x3_3", 192, (7, 1)),
+            _unit("branch7x7x3_4", 192, 3, 2),
+        ),
         (_MAXIMUM_HALF,),
-    )  # fmt: skip
+    )
 
 
 def _block_e(pool: str) -> tuple[_Branch, ...]:
@@ -104,24 +116,40 @@ def _block_e(pool: str) -> tuple[_Branch, ...]:
     return (
         (_unit("branch1x1", 320),),
         (_unit("branch3x3_1", 384), (_unit("branch3x3_2a", 384, flat), _unit("branch3x3_2b", 384, tall))),
-        (_unit("branch3x3dbl_1", 448), _unit("branch3x3dbl_2", 384, 3),
-         (_unit("branch3x3dbl_3a", 384, flat), _unit("branch3x3dbl_3b", 384, tall))),
+        (
+            _unit("branch3x3dbl_1", 448),
+            _unit("branch3x3dbl_2", 384, 3),
+            (_unit("branch3x3dbl_3a", 384, flat), _unit("branch3x3dbl_3b", 384, tall)),
+        ),
         (pool, _unit("branch_pool", 192)),
-    )  # fmt: skip
+    )
 
 
 _STEM: Final[tuple[_Unit | str, ...]] = (
-    _Unit("Conv2d_1a_3x3", 32, (3, 3), 2, False), _Unit("Conv2d_2a_3x3", 32, (3, 3), 1, False),
-    _Unit("Conv2d_2b_3x3", 64, (3, 3), 1, True), "64",
-    _Unit("Conv2d_3b_1x1", 80, (1, 1), 1, False), _Unit("Conv2d_4a_3x3", 192, (3, 3), 1, False), "192",
-)  # fmt: skip
-"""Convolutions from the image on; a name of a tap stands for a maximum pool, 3x3 at every second place, and the tap after it."""
+    _Unit("Conv2d_1a_3x3", 32, (3, 3), 2, False),
+    _Unit("Conv2d_2a_3x3", 32, (3, 3), 1, False),
+    _Unit("Conv2d_2b_3x3", 64, (3, 3), 1, True),
+    "64",
+    _Unit("Conv2d_3b_1x1", 80, (1, 1), 1, False),
+    _Unit("Conv2d_4a_3x3", 192, (3, 3), 1, False),
+    "192",
+)
+"""Convolutions from the image on; a name of a tap stands for a maximum pool, 3x3 at every second place, and the tap
+after it."""
 
 _BLOCKS: Final[dict[str, tuple[_Branch, ...]]] = {
-    "Mixed_5b": _block_a(32), "Mixed_5c": _block_a(64), "Mixed_5d": _block_a(64), "Mixed_6a": _block_b(),
-    "Mixed_6b": _block_c(128), "Mixed_6c": _block_c(160), "Mixed_6d": _block_c(160), "Mixed_6e": _block_c(192),
-    "Mixed_7a": _block_d(), "Mixed_7b": _block_e(_AVERAGE), "Mixed_7c": _block_e(_MAXIMUM),
-}  # fmt: skip
+    "Mixed_5b": _block_a(32),
+    "Mixed_5c": _block_a(64),
+    "Mixed_5d": _block_a(64),
+    "Mixed_6a": _block_b(),
+    "Mixed_6b": _block_c(128),
+    "Mixed_6c": _block_c(160),
+    "Mixed_6d": _block_c(160),
+    "Mixed_6e": _block_c(192),
+    "Mixed_7a": _block_d(),
+    "Mixed_7b": _block_e(_AVERAGE),
+    "Mixed_7c": _block_e(_MAXIMUM),
+}
 _MIDDLE_TAP: Final = "Mixed_6e"
 
 
@@ -163,11 +191,13 @@ class InceptionFeatures(nn.Module):
     """The network, always in evaluation mode.
 
     Args:
-        state: the tensors of ``tensor_shapes``. ``num_batches_tracked`` entries are left alone; anything else is refused.
+        state: the tensors of ``tensor_shapes``. ``num_batches_tracked`` entries are left alone; anything else is
+            refused.
         where: file name for errors.
 
     Raises:
-        InputError: a tensor is missing, has another shape, holds values that are not finite or a variance below 0, or is unknown.
+        InputError: a tensor is missing, has another shape, holds values that are not finite or a variance below 0, or
+            is unknown.
     """
 
     def __init__(self, state: Mapping[str, Tensor], where: str = "Inception weights") -> None:
@@ -180,7 +210,8 @@ class InceptionFeatures(nn.Module):
         """Features of prepared images.
 
         Args:
-            images: ``[n, 3, 299, 299]`` from ``prepared``. taps: what to return; nothing after the last one is computed.
+            images: ``[n, 3, 299, 299]`` from ``prepared``. taps: what to return; nothing after the last one is
+                computed.
 
         Returns:
             Tap -> ``[n, width]``; ``logits_unbiased`` ``[n, 1008]``.
@@ -250,15 +281,27 @@ def _checked(state: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
         found = state.get(name)
         if found is None or tuple(found.shape) != shape or not found.is_floating_point():
             got = "missing" if found is None else f"{found.dtype} {tuple(found.shape)}"
-            raise InputError("Inception weights are incomplete or of another network", where=f"{where}: {name}",
-                expected=str(shape), got=got, remedy="use pt_inception-2015-12-05-6726825d.pth or a copy of it as safetensors")  # fmt: skip
+            raise InputError(
+                "Inception weights are incomplete or of another network",
+                where=f"{where}: {name}",
+                expected=str(shape),
+                got=got,
+                remedy="use pt_inception-2015-12-05-6726825d.pth or a copy of it as safetensors",
+            )
         if not bool(torch.isfinite(found).all()) or (name.endswith("running_var") and bool((found < 0).any())):
-            raise InputError("Inception weights hold impossible values", where=f"{where}: {name}",
-                expected="finite numbers, variances of at least 0")  # fmt: skip
+            raise InputError(
+                "Inception weights hold impossible values",
+                where=f"{where}: {name}",
+                expected="finite numbers, variances of at least 0",
+            )
     for name in state:
         if name not in wanted and not name.endswith(".bn.num_batches_tracked"):
-            raise InputError("Inception weights hold a tensor that FID's network has not", where=f"{where}: {name}",
-                expected=f"{len(wanted)} tensors", remedy="torchvision's Inception-v3 is another network")  # fmt: skip
+            raise InputError(
+                "Inception weights hold a tensor that FID's network has not",
+                where=f"{where}: {name}",
+                expected=f"{len(wanted)} tensors",
+                remedy="torchvision's Inception-v3 is another network",
+            )
     return {name: state[name].detach().float() for name in wanted}
 
 

@@ -22,7 +22,7 @@ from mudg.scene.labels import read_label
 from mudg.scene.motion import VEHICLES
 from mudg.scene.read import load_scene, read_image, read_points
 
-# how well the LiDAR fits each camera of a scene, by edges; see ``core/calibration.py`` --------------------------------
+# how well the LiDAR fits each camera of a scene, by edges; see ``core/calibration.py`` ------------
 
 
 IMAGES_PER_CAMERA = 6
@@ -30,7 +30,8 @@ MAX_GAP_S = 0.06
 
 
 def sweeps_beside(scene: Scene, frame: Frame, max_gap_s: float) -> list[Sweep]:
-    """The nearest sweep of each LiDAR within ``max_gap_s`` seconds of the image, in the order of their distance in time."""
+    """The nearest sweep of each LiDAR within ``max_gap_s`` seconds of the image, in the order of their distance in
+    time."""
     nearest: dict[str, Sweep] = {}
     for sweep in scene.sweeps:
         best = nearest.get(sweep.sensor)
@@ -70,34 +71,41 @@ def describe(name: str, found: EdgeAlignment) -> str:
             why = f"no turn of up to {TURNS_DEG[-1]:g} degrees stands out"
         elif max(abs(angle) for angle in found.best_turn_deg) == TURNS_DEG[-1]:
             why = "the best turn is at the end of the range tried"
-        return f"camera {name}: {found.jumps} depth edges do not tell whether LiDAR and images agree ({why}); look at the contact sheet"
+        return (
+            f"camera {name}: {found.jumps} depth edges do not tell whether LiDAR and images agree ({why}); look at the"
+            " contact sheet"
+        )
     score = f"score {found.score:.2f}, {found.jumps} depth edges"
     if found.verdict == "right":
         return f"camera {name}: LiDAR and image edges agree ({score})"
     right, up = found.best_turn_deg
     return (
-        f"camera {name}: LiDAR edges fit the image better when moved by {right:+.1f} degrees to the right and {up:+.1f} up "
-        f"({score}); check calibration, poses and clocks"
+        f"camera {name}: LiDAR edges fit the image better when moved by {right:+.1f} degrees to the right and {up:+.1f}"
+        f" up ({score}); check calibration, poses and clocks"
     )
 
 
 def to_json(found: EdgeAlignment) -> dict[str, Any]:
     """Plain values for JSON."""
     return {
-        "verdict": found.verdict, "score": round(found.score, 3), "best_turn_deg": list(found.best_turn_deg),
-        "contrast": round(found.contrast, 3), "sigmas": round(found.sigmas, 2), "depth_edges": found.jumps,
-    }  # fmt: skip
+        "verdict": found.verdict,
+        "score": round(found.score, 3),
+        "best_turn_deg": list(found.best_turn_deg),
+        "contrast": round(found.contrast, 3),
+        "sigmas": round(found.sigmas, 2),
+        "depth_edges": found.jumps,
+    }
 
 
-# point classes --------------------------------------------------------------------------------------------------------
+# point classes ------------------------------------------------------------------------------------
 #
 # Recorded classes of LiDAR points where they fall in an image: truth for what labels an image or renders classes.
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImagePointClasses:
-    """Points that an image shows: ``row`` and ``column`` i64[N] of the pixel, ``depth_m`` f32[N] (camera z), ``classes`` u8[N] train
-    ids, 255 where people gave the point none."""
+    """Points that an image shows: ``row`` and ``column`` i64[N] of the pixel, ``depth_m`` f32[N] (camera z),
+    ``classes`` u8[N] train ids, 255 where people gave the point none."""
 
     row: NDArray[np.intp]
     column: NDArray[np.intp]
@@ -108,8 +116,9 @@ class ImagePointClasses:
 def image_point_classes(scene: Scene, frame: Frame, max_gap_s: float = MAX_GAP_S) -> ImagePointClasses | None:
     """Class of each LiDAR point that ``frame`` shows; None where no sweep beside it has classes.
 
-    The sweep of each LiDAR that is nearest in time is taken. Points of moving boxes stand where they are at the image's time; points behind
-    nearer surfaces are left out, by the rules of the fusion. Nothing that ``mudg annotate`` makes is read or changed.
+    The sweep of each LiDAR that is nearest in time is taken. Points of moving boxes stand where they are at the image's
+    time; points behind nearer surfaces are left out, by the rules of the fusion. Nothing that ``mudg annotate`` makes
+    is read or changed.
 
     Args:
         scene: a scene whose log has classes of points (``SweepPoints.classes``).
@@ -131,7 +140,7 @@ def image_point_classes(scene: Scene, frame: Frame, max_gap_s: float = MAX_GAP_S
     return ImagePointClasses(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
 
 
-# check ----------------------------------------------------------------------------------------------------------------
+# check --------------------------------------------------------------------------------------------
 
 
 Level = Literal["error", "warning", "note"]
@@ -153,14 +162,15 @@ _SAME_RANGE_POINTS: Final = 50
 
 
 WITHOUT_LIDAR: Final = (
-    "no LiDAR sweeps: there is nothing to fuse, so `mudg fuse`, `mudg run`, and what starts from a fused cloud refuse this log; ingest, "
-    "annotate, export, and fit with emernerf work"
+    "no LiDAR sweeps: there is nothing to fuse, so `mudg fuse`, `mudg run`, and what starts from a fused cloud refuse"
+    " this log; ingest, annotate, export, and fit with emernerf work"
 )
 
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing a person should know: ``error`` = cannot be used, ``warning`` = probably wrong, ``note`` = worth knowing."""
+    """One thing a person should know: ``error`` = cannot be used, ``warning`` = probably wrong, ``note`` = worth
+    knowing."""
 
     level: Level
     where: str
@@ -171,7 +181,8 @@ Findings = Iterator[Finding]
 
 
 def folded(findings: Sequence[Finding], rest: str) -> list[str]:
-    """A line per finding; many that say the same of different things become one line with their number and three examples.
+    """A line per finding; many that say the same of different things become one line with their number and three
+    examples.
 
     Args:
         rest: the command that lists them all.
@@ -302,32 +313,41 @@ def _check_ego(scene: Scene) -> Findings:
 
 def check_distance(scene: Scene) -> Findings:
     """Whether float32 numbers hold the places of a scene: vehicle, cameras, sensors, and boxes."""
-    places = np.concatenate([
-        scene.ego.world_from_ego[:, :3, 3],
-        *(frame.view.center_world[None] for frame in scene.frames),
-        *(sweep.world_from_lidar[None, :3, 3] for sweep in scene.sweeps),
-        *(track.world_from_object[:, :3, 3] for track in scene.tracks),
-    ])  # fmt: skip
+    places = np.concatenate(
+        [
+            scene.ego.world_from_ego[:, :3, 3],
+            *(frame.view.center_world[None] for frame in scene.frames),
+            *(sweep.world_from_lidar[None, :3, 3] for sweep in scene.sweeps),
+            *(track.world_from_object[:, :3, 3] for track in scene.tracks),
+        ]
+    )
     spacing_m = float32_spacing_m(places)
     if spacing_m > FLOAT32_SPACING_M:
         yield _warning(
             "world",
-            f"the log reaches {np.linalg.norm(places, axis=1).max():.0f} m from the origin; float32 rounds points there to "
-            f"{spacing_m * 1e3:.3g} mm: put the origin near the first pose, subtracted in float64",
+            f"the log reaches {np.linalg.norm(places, axis=1).max():.0f} m from the origin; float32 rounds points there"
+            f" to {spacing_m * 1e3:.3g} mm: put the origin near the first pose, subtracted in float64",
         )
 
 
 def _check_keys(
     where: str, times_s: NDArray[np.float64], poses: NDArray[np.float64], most_rad_s: float, *, of_box: bool
 ) -> Findings:
-    """Headings that flip, turns, jumps and accelerations that nothing on wheels makes: of each, how many and the first or largest."""
+    """Headings that flip, turns, jumps and accelerations that nothing on wheels makes: of each, how many and the first
+    or largest."""
     if len(times_s) < 2:
         return
     flips = motion.heading_flips(times_s, poses, most_rad_s)
     if len(flips):
-        mended = "ingest turns it back" if len(motion.unflipped(times_s, poses, most_rad_s)[1]) else "which side is right is not clear"
+        mended = (
+            "ingest turns it back"
+            if len(motion.unflipped(times_s, poses, most_rad_s)[1])
+            else "which side is right is not clear"
+        )
         yield _warning(
-            where, f"its heading flips by 180 degrees {len(flips)} times, first after {times_s[flips[0]]:.3f} s (key {flips[0]}): {mended}"
+            where,
+            f"its heading flips by 180 degrees {len(flips)} times, first after {times_s[flips[0]]:.3f} s (key"
+            f" {flips[0]}): {mended}",
         )
     angle, rate = motion.turns(times_s, poses)
     fast = np.flatnonzero((rate > most_rad_s) & (angle > np.deg2rad(motion.MIN_TURN_DEG)))
@@ -344,13 +364,16 @@ def _check_keys(
         key, off_m, acceleration = jumps[0]
         yield _warning(
             where,
-            f"it jumps by {off_m:.1f} m after {times_s[key]:.3f} s (key {key}, {acceleration:.0f} m/s^2; {len(jumps)} such steps); "
-            "check poses, times and ids",
+            f"it jumps by {off_m:.1f} m after {times_s[key]:.3f} s (key {key}, {acceleration:.0f} m/s^2; {len(jumps)}"
+            " such steps); check poses, times and ids",
         )
         return
     key, acceleration = motion.largest_acceleration(times_s, poses)
     if acceleration > (motion.MOST_BOX_ACCELERATION_M_S2 if of_box else motion.MOST_ACCELERATION_M_S2):
-        yield _warning(where, f"it accelerates by {acceleration:.0f} m/s^2 at {times_s[key]:.3f} s (key {key}); check poses and times")
+        yield _warning(
+            where,
+            f"it accelerates by {acceleration:.0f} m/s^2 at {times_s[key]:.3f} s (key {key}); check poses and times",
+        )
 
 
 def _check_gaps(scene: Scene) -> Findings:
@@ -414,7 +437,8 @@ def _moves_between_keys(track: Track) -> NDArray[np.bool_]:
 
 
 def _check_course(track: Track, where: str) -> Findings:
-    """Whether a dynamic box faces its direction of travel: a quarter turn means swapped sides or another zero of the yaw."""
+    """Whether a dynamic box faces its direction of travel: a quarter turn means swapped sides or another zero of the
+    yaw."""
     steps = np.diff(track.world_from_object[:, :2, 3], axis=0)
     length = np.linalg.norm(steps, axis=1)
     moving = length > MIN_STEP_M
@@ -492,8 +516,8 @@ def check_points(scene: Scene, sweep: Sweep, points: SweepPoints) -> Findings:
     if farthest >= max(_SAME_RANGE_POINTS, _SAME_RANGE_SHARE * len(ranges)):
         yield _warning(
             where,
-            f"{farthest} of {len(ranges)} points lie at the same largest range, {ranges.max():.2f} m: does it mark beams without a return? "
-            "leave them out",
+            f"{farthest} of {len(ranges)} points lie at the same largest range, {ranges.max():.2f} m: does it mark"
+            " beams without a return? leave them out",
         )
     reach = np.median(ranges)
     if reach > 500:

@@ -20,13 +20,14 @@ from mudg.base.errors import InputError, IntegrityError
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, FusedCloud, PointCloud, SweepPoints
 
-# returns --------------------------------------------------------------------------------------------------------------
+# returns ------------------------------------------------------------------------------------------
 #
-# Beams without a return. Sensors and drivers write them among the points: as (0, 0, 0), as NaN, or with a range of zero.
+# Beams without a return. Sensors and drivers write them among the points: as (0, 0, 0), as NaN, or with a range of
+# zero.
 #
-# In a file of points in the sensor's own frame such rows are told by their numbers (``is_return``). Once a format or an importer has
-# moved
-# points (to the vehicle's frame, to one moment), the zeros lie at the sensor's own place (``at_sensor``), where no real return can be.
+# In a file of points in the sensor's own frame such rows are told by their numbers (``is_return``). Once a format or an
+# importer has moved points (to the vehicle's frame, to one moment), the zeros lie at the sensor's own place
+# (``at_sensor``), where no real return can be.
 
 
 LEAST_RANGE_M: Final = 0.05
@@ -48,7 +49,9 @@ def near_places(xyz: NDArray[Any], places: Iterable[NDArray[np.float64]]) -> NDA
     return near
 
 
-def at_sensor(points: SweepPoints, time_s: float, world_from_lidar: NDArray[np.float64], ego: EgoPath) -> NDArray[np.bool_]:
+def at_sensor(
+    points: SweepPoints, time_s: float, world_from_lidar: NDArray[np.float64], ego: EgoPath
+) -> NDArray[np.bool_]:
     """Points within 0.05 m of where the sensor was at the sweep's time or at the point's own, bool[N].
 
     Args:
@@ -64,12 +67,15 @@ def at_sensor(points: SweepPoints, time_s: float, world_from_lidar: NDArray[np.f
     first, last = float(ego.times_s[0]), float(ego.times_s[-1])
     moments = np.linspace(float(points.dt_s.min()), float(points.dt_s.max()), _MOMENTS)
     lidar_from_world, ego_from_lidar = invert(world_from_lidar), invert(mount) @ world_from_lidar
-    places = np.stack([
-        (lidar_from_world @ pose @ ego_from_lidar)[:3, 3] if pose is not None else np.zeros(3)
-        for pose in (ego.pose_at(min(max(time_s + float(moment), first), last)) for moment in moments)
-    ])  # fmt: skip
+    places = np.stack(
+        [
+            (lidar_from_world @ pose @ ego_from_lidar)[:3, 3] if pose is not None else np.zeros(3)
+            for pose in (ego.pose_at(min(max(time_s + float(moment), first), last)) for moment in moments)
+        ]
+    )
     reach = float(np.linalg.norm(places, axis=1).max()) + LEAST_RANGE_M
-    close = np.flatnonzero((np.abs(points.xyz) < reach).all(1))  # few: the rest is farther away than the sensor ever was
+    # few: the rest is farther away than the sensor ever was
+    close = np.flatnonzero((np.abs(points.xyz) < reach).all(1))
     place = np.stack([np.interp(points.dt_s[close], moments, places[:, axis]) for axis in range(3)], 1)
     near[close] |= np.linalg.norm(points.xyz[close] - place, axis=1) < LEAST_RANGE_M
     return near
@@ -80,7 +86,7 @@ def float32_spacing_m(places: NDArray[Any]) -> float:
     return float(np.spacing(np.float32(np.abs(places).max(initial=0.0))))
 
 
-# cloudfile ------------------------------------------------------------------------------------------------------------
+# cloudfile ----------------------------------------------------------------------------------------
 
 
 def write_fused(folder: Path | str, cloud: FusedCloud, report: Mapping[str, Any]) -> None:
@@ -135,10 +141,11 @@ def _read_cloud(folder: Path, entry: Mapping[str, Any], frame: str) -> PointClou
     if not path.is_file():
         raise IntegrityError("a cloud is missing", where=str(path), remedy="run `mudg fuse` again")
     if store.sha256_file(path) != entry["sha256"]:
-        raise IntegrityError("a cloud was altered after it was written", where=str(path),
-            remedy="run `mudg fuse` again")  # fmt: skip
+        raise IntegrityError(
+            "a cloud was altered after it was written", where=str(path), remedy="run `mudg fuse` again"
+        )
     arrays = store.read_safetensors(path)
     xyz = arrays["xyz"]
     if not np.isfinite(xyz).all():
         raise InputError("a cloud holds coordinates that are not finite", where=str(path))
-    return PointCloud(xyz, arrays["rgb"], frame, arrays.get("semantics"))  # type: ignore[arg-type]
+    return PointCloud(xyz, arrays["rgb"], frame, arrays.get("semantics"))

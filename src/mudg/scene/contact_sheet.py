@@ -1,8 +1,9 @@
-"""A picture of a whole scene for a first look: some frames of each camera with LiDAR and boxes drawn in, and a view from above.
+"""A picture of a whole scene for a first look: some frames of each camera with LiDAR and boxes drawn in, and a view
+from above.
 
 What to look for: points lie on the surfaces they belong to (edges of posts and cars), boxes sit on their objects, and
-standing things stay single lines from above. Near points are warm, far ones cold; boxes of vehicles are green, of people violet, of
-all else light blue, and the edges of their fronts red.
+standing things stay single lines from above. Near points are warm, far ones cold; boxes of vehicles are green, of
+people violet, of all else light blue, and the edges of their fronts red.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from mudg.scene.check import sweeps_beside
 from mudg.scene.motion import VEHICLES
 from mudg.scene.read import read_image, read_points
 
-# a scene from above: points, the recorded path, boxes and their courses -----------------------------------------------
+# a scene from above: points, the recorded path, boxes and their courses ---------------------------
 
 
 GROUND_COLOR: Final = (18, 18, 18)
@@ -37,9 +38,19 @@ _COURSE_COLOR: Final = (150, 110, 60)
 _MARGIN_M: Final = 8.0
 
 PEOPLE: Final = frozenset(
-    ("pedestrian", "person", "person_sitting", "person (sitting)", "cyclist", "rider", "motorcyclist", "bicyclist", "stroller",
-     "wheelchair")
-)  # fmt: skip
+    (
+        "pedestrian",
+        "person",
+        "person_sitting",
+        "person (sitting)",
+        "cyclist",
+        "rider",
+        "motorcyclist",
+        "bicyclist",
+        "stroller",
+        "wheelchair",
+    )
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,9 +118,12 @@ def _points(uv: Floats, content: TopView, width: int, height: int) -> NDArray[np
 def _legend(draw: ImageDraw.ImageDraw, width: int, height: int) -> None:
     """What the colours mean, at the lower right."""
     entries = (
-        ("vehicles", VEHICLE_COLOR), ("people", PEOPLE_COLOR), ("other boxes", OTHER_COLOR), ("fronts", FRONT_COLOR),
+        ("vehicles", VEHICLE_COLOR),
+        ("people", PEOPLE_COLOR),
+        ("other boxes", OTHER_COLOR),
+        ("fronts", FRONT_COLOR),
         ("path", PATH_COLOR),
-    )  # fmt: skip
+    )
     left = width - 12 - sum(draw.textlength(text) + 14 for text, _ in entries)
     draw.rectangle((left - 6, height - 32, width - 6, height - 8), fill=GROUND_COLOR)
     for text, color in entries:
@@ -134,7 +148,7 @@ def pairs(points: Floats) -> list[tuple[float, float]]:
     return [(float(x), float(y)) for x, y in points]
 
 
-# contact sheet --------------------------------------------------------------------------------------------------------
+# contact sheet ------------------------------------------------------------------------------------
 
 
 NAME: Final = "contact_sheet.jpg"
@@ -203,7 +217,7 @@ def _beside(tiles: list[Image.Image]) -> Image.Image:
     return row
 
 
-# --- from the cameras -------------------------------------------------------------------------------------------------
+# --- from the cameras -----------------------------------------------------------------------------
 
 
 def frame_tile(scene: Scene, frame: Frame, width: int = TILE_WIDTH_PX) -> Image.Image:
@@ -230,7 +244,8 @@ def frame_tile(scene: Scene, frame: Frame, width: int = TILE_WIDTH_PX) -> Image.
 
 
 def draw_points(pixels: NDArray[np.uint8], view: View, xyz_world: Floats) -> None:
-    """Colour the pixels u8[H, W, 3] that points fall on, nearer ones over farther ones; few points become dots of 2x2."""
+    """Colour the pixels u8[H, W, 3] that points fall on, nearer ones over farther ones; few points become dots of
+    2x2."""
     uv, z = geometry.project(view, xyz_world)
     with np.errstate(invalid="ignore"):
         inside = (z > NEAR_M) & (uv >= 0).all(1) & (uv[:, 0] < view.camera.width) & (uv[:, 1] < view.camera.height)
@@ -277,8 +292,8 @@ def cut_near(ends: Floats) -> Floats | None:
 
 
 def draw_box(draw: ImageDraw.ImageDraw, view: View, world_from_object: Floats, track: Track) -> None:
-    """A box as lines in its class' colour, those of its front red; on a dark edge where it is large enough, so that points do not
-    hide it."""
+    """A box as lines in its class' colour, those of its front red; on a dark edge where it is large enough, so that
+    points do not hide it."""
     edges = visible_edges(view, geometry.transform_points(world_from_object, geometry.box_corners(track.size_m)))
     if not edges:
         return
@@ -292,11 +307,12 @@ def draw_box(draw: ImageDraw.ImageDraw, view: View, world_from_object: Floats, t
         draw.line(pairs(uv), fill=FRONT_COLOR if front else box_color(track.label), width=line)
 
 
-# --- from above ---------------------------------------------------------------------------------------------------------
+# --- from above -----------------------------------------------------------------------------------
 
 
 def top_view(scene: Scene, width: int, height: int) -> Image.Image:
-    """Points of up to 24 sweeps by height above the vehicle's path, the path, boxes at the middle of the log and their courses."""
+    """Points of up to 24 sweeps by height above the vehicle's path, the path, boxes at the middle of the log and their
+    courses."""
     xyz = _sample(scene)
     height_m = (xyz[:, 2] - np.median(scene.ego.world_from_ego[:, 2, 3])).clip(-2.5, 4.0)
     grey = np.repeat((60 + 170 * (height_m + 2.5) / 6.5).astype(np.uint8)[:, None], 3, 1)

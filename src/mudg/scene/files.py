@@ -34,7 +34,8 @@ class SceneFiles(Protocol):
         ...
 
     def is_hashed(self, ref: str) -> bool:
-        """Whether the manifest holds a hash of ``ref``, so that what ``read`` returns is known to be as it was written."""
+        """Whether the manifest holds a hash of ``ref``, so that what ``read`` returns is known to be as it was
+        written."""
         ...
 
     def problem(self, ref: str) -> str | None:
@@ -91,9 +92,11 @@ class _Manifest:
         expected = self.hashes.get(ref)
         if expected is not None and hashlib.sha256(content).hexdigest() != expected:
             raise IntegrityError(
-                "a file differs from what was written", where=f"{self.root}: {ref}", expected=f"sha256 {expected[:16]}...",
+                "a file differs from what was written",
+                where=f"{self.root}: {ref}",
+                expected=f"sha256 {expected[:16]}...",
                 remedy="restore the file or ingest again; delete manifest.json if you edited the scene on purpose",
-            )  # fmt: skip
+            )
         return content
 
 
@@ -155,9 +158,12 @@ class ZipFiles:
                 infos = archive.infolist()
         except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
             raise InputError(
-                "file is neither a scene directory nor a readable zip", where=root, got=str(error),
-                expected="a stored zip of a scene directory", remedy="is it cut off? copy it again",
-            ) from error  # fmt: skip
+                "file is neither a scene directory nor a readable zip",
+                where=root,
+                got=str(error),
+                expected="a stored zip of a scene directory",
+                remedy="is it cut off? copy it again",
+            ) from error
         entries: dict[str, _ZipEntry] = {}
         for info in infos:
             if info.is_dir():

@@ -1,4 +1,5 @@
-"""``mudg fuse``: scene -> one static coloured cloud and one cloud per moving object. The rules are in ``core/fusion.py``.
+"""``mudg fuse``: scene -> one static coloured cloud and one cloud per moving object. The rules are in
+``core/fusion.py``.
 
 Images of held-out frames give no colours, so that nothing of what is scored later leaks into the clouds.
 """
@@ -48,14 +49,13 @@ MATCHED_SWEEPS, MATCHED_IMAGES, MATCHED_WITHIN_S = 8, 5, 1.0
 
 
 def write_fusion(config: FuseConfig, scene: Scene, work: RunDir) -> dict[str, Any]:
-    """Fuse a scene; writes ``static.safetensors``, ``objects/*.safetensors``, ``fuse.json`` and ``top.png``. Returns counts."""
+    """Fuse a scene; writes ``static.safetensors``, ``objects/*.safetensors``, ``fuse.json`` and ``top.png``. Returns
+    counts."""
     for finding in check_distance(scene):
         log.warn(f"fuse: {finding.message}")
     cloud, report = fuse_scene(scene, config)
     if report.sweeps and not len(cloud.static):
-        log.warn(
-            "fuse: no static point projects into any image; check calibration and clocks with `mudg doctor`"
-        )
+        log.warn("fuse: no static point projects into any image; check calibration and clocks with `mudg doctor`")
     for words in (*describe(report), *describe_colors(cloud.colors)):
         log.info(f"fuse: {words}")
     write_fused(work.path, cloud, report_record(report, rules_of(config)))
@@ -64,11 +64,16 @@ def write_fusion(config: FuseConfig, scene: Scene, work: RunDir) -> dict[str, An
 
 
 def refuse_without_lidar(scene: Scene) -> None:
-    """InputError for a scene without LiDAR sweeps: there is nothing to fuse, and no method starts without a fused cloud."""
+    """InputError for a scene without LiDAR sweeps: there is nothing to fuse, and no method starts without a fused
+    cloud."""
     if not scene.sweeps:
-        raise InputError("the log has no LiDAR sweeps, which a fused cloud, and what starts from it, need", where=scene.root,
-            expected="sweeps of at least one LiDAR", got=f"{len(scene.frames)} images only",
-            remedy="give a log with LiDAR; ingest, annotate, export, and fit with emernerf work without")  # fmt: skip
+        raise InputError(
+            "the log has no LiDAR sweeps, which a fused cloud, and what starts from it, need",
+            where=scene.root,
+            expected="sweeps of at least one LiDAR",
+            got=f"{len(scene.frames)} images only",
+            remedy="give a log with LiDAR; ingest, annotate, export, and fit with emernerf work without",
+        )
 
 
 def fuse_scene(scene: Scene, config: FuseConfig) -> tuple[FusedCloud, FusionReport]:
@@ -79,8 +84,8 @@ def fuse_scene(scene: Scene, config: FuseConfig) -> tuple[FusedCloud, FusionRepo
 
 
 def fused_without_boxes(scene: Scene, folder: Path) -> FusedCloud:
-    """The cloud of a scene as if it had no tracks, with the settings of the clouds in ``folder``. Clouds of an edited run have none of
-    their own; then the usual ones."""
+    """The cloud of a scene as if it had no tracks, with the settings of the clouds in ``folder``. Clouds of an edited
+    run have none of their own; then the usual ones."""
     settings = folder / "run.yaml"
     config = configuration.load(FuseConfig, None, settings if settings.is_file() else None)
     log.info("fusing again, without tracked boxes")
@@ -105,7 +110,8 @@ def scene_sweeps(scene: Scene, config: FuseConfig) -> Iterator[SweepShots]:
 
 
 def camera_colors(scene: Scene, config: FuseConfig, rules: FusionRules) -> CameraColors:
-    """How the colours of the scene's cameras differ, from static points of some sweeps in images of about the same time."""
+    """How the colours of the scene's cameras differ, from static points of some sweeps in images of about the same
+    time."""
     frames = scene.frames_in("train")
     by_camera = {name: found for name in scene.cameras if (found := [f for f in frames if f.view.camera.name == name])}
     if len(by_camera) < 2 or not scene.sweeps:
@@ -134,7 +140,8 @@ def camera_colors(scene: Scene, config: FuseConfig, rules: FusionRules) -> Camer
 
 
 def mean_around(rgb: NDArray[np.uint8], row: NDArray[np.intp], column: NDArray[np.intp]) -> NDArray[np.uint8]:
-    """Mean colours u8[n, 3] of the 5x5 pixels around places of an image: a point that is a pixel off has about its colour."""
+    """Mean colours u8[n, 3] of the 5x5 pixels around places of an image: a point that is a pixel off has about its
+    colour."""
     height, width = rgb.shape[:2]
     total = np.zeros((len(row), 3), np.uint32)
     for down in range(-2, 3):
@@ -177,9 +184,14 @@ def describe(report: FusionReport) -> list[str]:
     dynamic = [track_id for track_id, verdict in report.verdicts.items() if verdict.moving]
     total = max(report.points_in, 1)
     lines = [
-        f"{report.sweeps} sweeps, {report.points_in} points: {report.points_colored / total:.0%} coloured, "
-        f"{report.points_hidden / total:.1%} occluded, {report.points_unseen / total:.0%} in no image",
-        f"{len(dynamic)} of {len(report.verdicts)} tracked boxes are dynamic; {report.points_static} points in the static cloud",
+        (
+            f"{report.sweeps} sweeps, {report.points_in} points: {report.points_colored / total:.0%} coloured, "
+            f"{report.points_hidden / total:.1%} occluded, {report.points_unseen / total:.0%} in no image"
+        ),
+        (
+            f"{len(dynamic)} of {len(report.verdicts)} tracked boxes are dynamic; {report.points_static} points in the"
+            " static cloud"
+        ),
     ]
     shown = list(report.left_out.items())[:MOST_NAMED]
     lines += [f"dynamic object {track_id} left out: {words}" for track_id, words in shown]

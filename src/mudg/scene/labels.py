@@ -45,19 +45,23 @@ def read_label(scene: Scene, frame: Frame, name: str) -> NDArray[Any]:
     ref = frame.labels.get(name)
     if ref is None:
         raise InputError(
-            f"frame has no label {name!r}", where=f"{scene.root}: {frame.id}", got=", ".join(frame.labels) or "no labels",
+            f"frame has no label {name!r}",
+            where=f"{scene.root}: {frame.id}",
+            got=", ".join(frame.labels) or "no labels",
             remedy="run `mudg annotate`, which makes a scene with labels",
-        )  # fmt: skip
+        )
     return _decode_label(name, open_files(scene.root).read(ref.path), f"{scene.root}: {ref.path}", frame.view.camera)
 
 
 def photographs(scene: Scene) -> tuple[Frame, ...]:
-    """Frames to learn from whose images a camera recorded whole: not held out, and without pixels that an edit of the drive rendered."""
+    """Frames to learn from whose images a camera recorded whole: not held out, and without pixels that an edit of the
+    drive rendered."""
     return tuple(frame for frame in scene.frames_in("train") if "rendered" not in frame.labels)
 
 
 def read_trusted_classes(scene: Scene, frame: Frame, least: float = TRUSTED_LABELS) -> NDArray[np.uint8] | None:
-    """Class ids u8[H, W] of a frame, 255 where unlabelled or where their confidence is below ``least``; None without labels."""
+    """Class ids u8[H, W] of a frame, 255 where unlabelled or where their confidence is below ``least``; None without
+    labels."""
     if "semantics" not in frame.labels:
         return None
     ids = read_label(scene, frame, "semantics")

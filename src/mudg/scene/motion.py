@@ -1,7 +1,7 @@
 """What keys of poses tell about a motion: gaps between them, headings that flip, jumps and turns that no vehicle makes.
 
-Poses between two keys lie on the straight line through both (``geometry.pose_at``). Where keys are missing, the path between was
-another: a cubic curve with the velocities on either side says how far off the line may be.
+Poses between two keys lie on the straight line through both (``geometry.pose_at``). Where keys are missing, the path
+between was another: a cubic curve with the velocities on either side says how far off the line may be.
 """
 
 from __future__ import annotations
@@ -18,9 +18,21 @@ Matrix = NDArray[np.float64]
 Times = NDArray[np.float64]
 
 VEHICLES: Final = frozenset(
-    ("car", "van", "truck", "bus", "vehicle", "trailer", "towed_object", "construction_vehicle", "tram", "train", "motorcycle",
-     "bicycle")
-)  # fmt: skip
+    (
+        "car",
+        "van",
+        "truck",
+        "bus",
+        "vehicle",
+        "trailer",
+        "towed_object",
+        "construction_vehicle",
+        "tram",
+        "train",
+        "motorcycle",
+        "bicycle",
+    )
+)
 """Labels of what drives. These are longer than wide; barriers, signs and people need not be."""
 GAP_STEPS: Final = 2.5
 GAP_S: Final = 0.25
@@ -51,13 +63,13 @@ _ALONG: Final = 0.8
 _CLEAR_SHARE: Final = 1 / 3
 
 
-# --- gaps -------------------------------------------------------------------------------------------------------------
+# --- gaps -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Gap:
-    """Keys that are missing after key ``key``: for how long, how far the vehicle moved meanwhile, and how far from a straight line, as
-    the velocities on either side have it, it may have been."""
+    """Keys that are missing after key ``key``: for how long, how far the vehicle moved meanwhile, and how far from a
+    straight line, as the velocities on either side have it, it may have been."""
 
     key: int
     start_s: float
@@ -72,8 +84,8 @@ class Gap:
 
     def __str__(self) -> str:
         return (
-            f"no pose for {self.end_s - self.start_s:.2f} s after {self.start_s:.3f} s (key {self.key}), while it moved "
-            f"{self.moved_m:.1f} m; a straight line between may be {self.off_m:.2f} m off"
+            f"no pose for {self.end_s - self.start_s:.2f} s after {self.start_s:.3f} s (key {self.key}), while it moved"
+            f" {self.moved_m:.1f} m; a straight line between may be {self.off_m:.2f} m off"
         )
 
 
@@ -86,14 +98,21 @@ def gaps(times_s: Times, poses: Matrix) -> list[Gap]:
     long = np.flatnonzero(steps > max(GAP_S, GAP_STEPS * usual))
     moved = np.linalg.norm(poses[long + 1, :3, 3] - poses[long, :3, 3], axis=1)
     return [
-        Gap(key, float(times_s[key]), float(times_s[key + 1]), float(m), max(_off_m(times_s, poses, key, u) for u in (0.25, 0.5, 0.75)))
+        Gap(
+            key,
+            float(times_s[key]),
+            float(times_s[key + 1]),
+            float(m),
+            max(_off_m(times_s, poses, key, u) for u in (0.25, 0.5, 0.75)),
+        )
         for key, m in zip(long.tolist(), moved, strict=True)
         if m >= GAP_M
     ]
 
 
 def gap_at(path: EgoPath, time_s: float) -> Gap | None:
-    """The gap in which a pose at ``time_s`` would be a guess: in a curve, or far from any key of a long gap; None elsewhere."""
+    """The gap in which a pose at ``time_s`` would be a guess: in a curve, or far from any key of a long gap; None
+    elsewhere."""
     after = int(np.searchsorted(path.times_s, time_s))
     if after in (0, len(path.times_s)) or path.times_s[after] - path.times_s[after - 1] <= GAP_S:
         return None
@@ -106,7 +125,8 @@ def gap_at(path: EgoPath, time_s: float) -> Gap | None:
 
 
 def bridged(path: EgoPath) -> EgoPath:
-    """The path with keys every 0.1 s in its gaps, on cubic curves with the velocities on either side; turns as between keys."""
+    """The path with keys every 0.1 s in its gaps, on cubic curves with the velocities on either side; turns as between
+    keys."""
     times, poses = [path.times_s], [path.world_from_ego]
     for gap in gaps(path.times_s, path.world_from_ego):
         inner = np.linspace(gap.start_s, gap.end_s, int((gap.end_s - gap.start_s) / BRIDGE_STEP_S) + 2)[1:-1]
@@ -135,7 +155,8 @@ def _bulge(times_s: Times, poses: Matrix, key: int, share: float) -> Matrix:
 
 
 def _velocity(times_s: Times, poses: Matrix, key: int, way: int) -> Matrix | None:
-    """Velocity f64[3] at a key by the keys before (-1) or after (1) it, over a tenth of a second where they are that close."""
+    """Velocity f64[3] at a key by the keys before (-1) or after (1) it, over a tenth of a second where they are that
+    close."""
     other = key + way
     while 0 <= other + way < len(times_s) and abs(times_s[other] - times_s[key]) < _VELOCITY_OVER_S - 1e-9:
         other += way
@@ -144,7 +165,7 @@ def _velocity(times_s: Times, poses: Matrix, key: int, way: int) -> Matrix | Non
     return (poses[other, :3, 3] - poses[key, :3, 3]) / (times_s[other] - times_s[key])
 
 
-# --- headings ---------------------------------------------------------------------------------------------------------
+# --- headings -------------------------------------------------------------------------------------
 
 
 def turns(times_s: Times, poses: Matrix) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -160,7 +181,8 @@ def most_turn_rad_s(label: str) -> float:
 
 
 def heading_flips(times_s: Times, poses: Matrix, most_rad_s: float) -> NDArray[np.intp]:
-    """Keys after which the heading is turned by about 180 degrees at once, faster than ``most_rad_s``; what lies down does not count."""
+    """Keys after which the heading is turned by about 180 degrees at once, faster than ``most_rad_s``; what lies down
+    does not count."""
     angle, rate = turns(times_s, poses)
     upright = np.einsum("ni,ni->n", poses[:-1, :3, 2], poses[1:, :3, 2]) > 0.5
     return np.flatnonzero((angle > np.deg2rad(FLIP_DEG)) & (rate > most_rad_s) & upright)
@@ -169,8 +191,8 @@ def heading_flips(times_s: Times, poses: Matrix, most_rad_s: float) -> NDArray[n
 def unflipped(times_s: Times, poses: Matrix, most_rad_s: float) -> tuple[Matrix, NDArray[np.intp]]:
     """Poses with flipped headings turned back, and the keys that were.
 
-    Headings agree but for their sign. The sign of the rarer third or less is wrong; where it is more, the direction of travel
-    decides; where nothing moves either, nothing is changed.
+    Headings agree but for their sign. The sign of the rarer third or less is wrong; where it is more, the direction of
+    travel decides; where nothing moves either, nothing is changed.
     """
     flips = heading_flips(times_s, poses, most_rad_s)
     if not len(flips):
@@ -195,7 +217,7 @@ def unflipped(times_s: Times, poses: Matrix, most_rad_s: float) -> tuple[Matrix,
     return poses, turned
 
 
-# --- jumps ------------------------------------------------------------------------------------------------------------
+# --- jumps ----------------------------------------------------------------------------------------
 
 
 def jumps(times_s: Times, poses: Matrix, least_m: float) -> list[tuple[int, float, float]]:
@@ -221,7 +243,8 @@ def jumps(times_s: Times, poses: Matrix, least_m: float) -> list[tuple[int, floa
 
 
 def largest_acceleration(times_s: Times, poses: Matrix) -> tuple[int, float]:
-    """The key at which the velocity changes fastest, and by how much, m/s^2: of the velocities over a fifth of a second on either side."""
+    """The key at which the velocity changes fastest, and by how much, m/s^2: of the velocities over a fifth of a second
+    on either side."""
     best = 0, 0.0
     for key in range(1, len(times_s) - 1):
         before = int(np.searchsorted(times_s, times_s[key] - _ACCELERATION_OVER_S + 1e-9, side="right")) - 1

@@ -55,9 +55,14 @@ class ObservationWriter:
         name = f"{len(self._records):06d}"
         if not bool(torch.isfinite(observation.rgb).all()):
             count = int((~torch.isfinite(observation.rgb)).sum())
-            raise InputError("colours of an observation are not finite", where=f"{self._out}, view {name}", got=f"{count} values")
+            raise InputError(
+                "colours of an observation are not finite", where=f"{self._out}, view {name}", got=f"{count} values"
+            )
         store.write_image(self._out / "rgb" / f"{name}.png", to_bytes(observation.rgb), compress_level=1)
-        arrays = {"confidence": _numpy(observation.confidence[0], np.float16), "mask": _numpy(observation.mask[0], np.uint8)}
+        arrays = {
+            "confidence": _numpy(observation.confidence[0], np.float16),
+            "mask": _numpy(observation.mask[0], np.uint8),
+        }
         if observation.depth is not None:
             arrays["depth"] = _numpy(observation.depth[0], np.float32)
         if observation.semantics is not None:
@@ -108,8 +113,8 @@ class ObservationSet:
         return read_image_file(self.path / "rgb" / f"{index:06d}.png", self.views[index].camera)
 
     def arrays(self, index: int) -> dict[str, NDArray[Any]]:
-        """What the data file of one observation holds, as stored: confidence f16, mask u8, and where there are any depth f32 and
-        semantics u8, [H, W] each; InputError where an array is missing or of another size."""
+        """What the data file of one observation holds, as stored: confidence f16, mask u8, and where there are any
+        depth f32 and semantics u8, [H, W] each; InputError where an array is missing or of another size."""
         if not 0 <= index < len(self):
             raise IndexError(index)
         camera = self.views[index].camera
@@ -120,8 +125,9 @@ class ObservationSet:
         for name in wanted:
             if name not in arrays or arrays[name].shape != shape:
                 got = "missing" if name not in arrays else str(arrays[name].shape)
-                raise InputError("an observation file does not fit its view", where=f"{path}: {name}",
-                    expected=str(shape), got=got)  # fmt: skip
+                raise InputError(
+                    "an observation file does not fit its view", where=f"{path}: {name}", expected=str(shape), got=got
+                )
         return {name: arrays[name] for name in wanted}
 
     def __getitem__(self, index: int) -> Observation:
@@ -144,8 +150,12 @@ def read_image_file(path: Path, camera: Camera) -> NDArray[np.uint8]:
     try:
         with Image.open(io.BytesIO(content)) as image:
             if image.size != (camera.width, camera.height):
-                raise InputError("an image has another size than its camera", where=str(path),
-                    expected=f"{camera.width}x{camera.height}", got=f"{image.size[0]}x{image.size[1]}")  # fmt: skip
+                raise InputError(
+                    "an image has another size than its camera",
+                    where=str(path),
+                    expected=f"{camera.width}x{camera.height}",
+                    got=f"{image.size[0]}x{image.size[1]}",
+                )
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise InputError("an image cannot be decoded", where=str(path), got=str(error)) from error
@@ -163,8 +173,9 @@ def read_observations(path: Path) -> ObservationSet:
     content = store.read_json(index)
     try:
         if content["schema"] != _SCHEMA:
-            raise InputError("unknown schema version", where=str(index), expected=str(_SCHEMA),
-                got=str(content["schema"]))  # fmt: skip
+            raise InputError(
+                "unknown schema version", where=str(index), expected=str(_SCHEMA), got=str(content["schema"])
+            )
         records = content["observations"]
         if not records:
             raise InputError("no views are listed", where=str(index))

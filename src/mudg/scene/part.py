@@ -1,8 +1,9 @@
-"""A part of a scene as a scene of its own: some frames and sweeps as they are, and frames of which only the place is told.
+"""A part of a scene as a scene of its own: some frames and sweeps as they are, and frames of which only the place is
+told.
 
-For measurements on held-out frames. What is held out is not in the files: an image is replaced by a black one, labels and sweeps are
-left out, and so are the classes of LiDAR points, which are truth that is scored, and the recipe by which a generated city could be
-drawn again. Whatever reads the part cannot have seen more.
+For measurements on held-out frames. What is held out is not in the files: an image is replaced by a black one, labels
+and sweeps are left out, and so are the classes of LiDAR points, which are truth that is scored, and the recipe by which
+a generated city could be drawn again. Whatever reads the part cannot have seen more.
 """
 
 from __future__ import annotations
@@ -24,8 +25,13 @@ PlacedSweep = tuple[str, float, Matrix, SweepPoints]
 
 
 def write_photos(
-    folder: Path, source: Source, ego: EgoPath, tracks: Sequence[Track], photos: Sequence[Photo], sweeps: Iterable[PlacedSweep]
-) -> None:  # fmt: skip
+    folder: Path,
+    source: Source,
+    ego: EgoPath,
+    tracks: Sequence[Track],
+    photos: Sequence[Photo],
+    sweeps: Iterable[PlacedSweep],
+) -> None:
     """Write a scene of some photographs, with their classes where they have any, all of them for training.
 
     Frames and sweeps are numbered per camera and sensor in the order given. Photographs of one camera have one size.
@@ -50,20 +56,25 @@ def write_photos(
         writer.finish()
 
 
-# part -----------------------------------------------------------------------------------------------------------------
+# part ---------------------------------------------------------------------------------------------
 
 
 def write_part(
-    scene: Scene, root: Path, frames: Collection[str], sweeps: Collection[str], places: Sequence[Frame] = (),
+    scene: Scene,
+    root: Path,
+    frames: Collection[str],
+    sweeps: Collection[str],
+    places: Sequence[Frame] = (),
     held_out: Collection[str] = (),
-) -> Scene:  # fmt: skip
+) -> Scene:
     """Write some frames and sweeps of a scene, with all tracks and the whole ego path, without classes of points.
 
     Args:
         scene: what is copied, byte by byte where its manifest allows.
-        frames, sweeps: ids of what is shown; these frames are for training, but for those of ``held_out``, which are for scoring.
-        places: frames of which camera, pose and time are told, with a black image; they are held out. They may belong to a larger
-            scene of the same log.
+        frames, sweeps: ids of what is shown; these frames are for training, but for those of ``held_out``, which are
+            for scoring.
+        places: frames of which camera, pose and time are told, with a black image; they are held out. They may belong
+            to a larger scene of the same log.
     """
     shown = [frame for frame in scene.frames if frame.id in frames]
     cameras = {frame.view.camera.name: frame.view.camera for frame in (*shown, *places)}

@@ -108,10 +108,12 @@ def _opened(content: bytes, where: str, camera: Camera | None) -> Iterator[Image
     with _explained(content, where), Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
         if camera is not None and image.size != (camera.width, camera.height):
             raise InputError(
-                "image does not have its camera's size", where=where, got=f"{image.width}x{image.height}",
+                "image does not have its camera's size",
+                where=where,
+                got=f"{image.width}x{image.height}",
                 expected=f"{camera.width}x{camera.height}",
                 remedy="correct the camera's size and intrinsics, or the image",
-            )  # fmt: skip
+            )
         if max(image.size) > schema.MAX_IMAGE_SIDE_PX:
             raise InputError("image is too large", where=where, got=f"{image.width}x{image.height}")
         if image.getexif().get(_EXIF_ORIENTATION, 1) != 1:
@@ -121,9 +123,12 @@ def _opened(content: bytes, where: str, camera: Camera | None) -> Iterator[Image
         if image.mode not in ("RGB", "L", "P", "RGBA") or sixteen_bits:
             got = "16 bits a channel" if sixteen_bits else f"mode {image.mode}"
             raise InputError(
-                "image is not 8-bit RGB or grey", where=where, expected="8 bits a channel", got=got,
+                "image is not 8-bit RGB or grey",
+                where=where,
+                expected="8 bits a channel",
+                got=got,
                 remedy="convert it to 8-bit RGB",
-            )  # fmt: skip
+            )
         if image.mode == "RGBA" and image.getchannel("A").getextrema() != (255, 255):
             raise InputError("image has transparent pixels", where=where, expected="an opaque image")
         yield image
@@ -176,9 +181,12 @@ def checked_points(arrays: Mapping[str, NDArray[Any]], where: str) -> SweepPoint
         if not np.isfinite(array).all():
             bad = int((~np.isfinite(array.reshape(count, -1)).all(1)).sum())
             raise InputError(
-                "sweep holds values that are not finite", where=f"{where}: {name}", got=f"{bad} of {count} points",
-                expected="finite metres", remedy="drop missing returns when importing",
-            )  # fmt: skip
+                "sweep holds values that are not finite",
+                where=f"{where}: {name}",
+                got=f"{bad} of {count} points",
+                expected="finite metres",
+                remedy="drop missing returns when importing",
+            )
     if classes is not None:
         _check_classes(classes, count, f"{where}: classes")
     return SweepPoints(arrays["xyz"], arrays["intensity"], arrays["dt_s"], classes)

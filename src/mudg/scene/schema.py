@@ -1,8 +1,9 @@
-"""``scene.json`` and ``tracks.json``: what a record may hold, parsing into the types of ``base/types.py``, and the text written.
+"""``scene.json`` and ``tracks.json``: what a record may hold, parsing into the types of ``base/types.py``, and the text
+written.
 
 Every refusal is an ``InputError`` that names file, record and field, says what was expected and found, and what to do.
-Parsers take ``complain``: the reader passes a function that raises at the first problem, ``mudg doctor`` passes one that
-collects them all, so that a person sees every mistake of a hand-made scene at once.
+Parsers take ``complain``: the reader passes a function that raises at the first problem, ``mudg doctor`` passes one
+that collects them all, so that a person sees every mistake of a hand-made scene at once.
 """
 
 from __future__ import annotations
@@ -29,9 +30,16 @@ MAX_IMAGE_SIDE_PX: Final = 32768
 MAX_BOX_SIDE_M: Final = 200.0
 
 LABEL_NAMES: Final = (
-    "depth", "semantics", "sky", "ego", "dynamic", "instance", "semantics_confidence", "depth_confidence",
+    "depth",
+    "semantics",
+    "sky",
+    "ego",
+    "dynamic",
+    "instance",
+    "semantics_confidence",
+    "depth_confidence",
     "rendered",
-)  # fmt: skip
+)
 """Labels a frame may carry; see ``read_label`` for the array each of them is."""
 
 NAME_PATTERN: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.\-+]{0,63}")
@@ -55,7 +63,7 @@ def parse_object(data: bytes, where: str) -> dict[str, Any]:
     return parsed
 
 
-# --- fields ---------------------------------------------------------------------------------------------------------
+# --- fields ---------------------------------------------------------------------------------------
 
 
 def ref_problem(text: object) -> str | None:
@@ -154,7 +162,7 @@ def matrices_of(poses: list[list[float]]) -> NDArray[np.float64]:
     return np.array(poses, np.float64).reshape(len(poses), 4, 4)
 
 
-# --- records --------------------------------------------------------------------------------------------------------
+# --- records --------------------------------------------------------------------------------------
 
 
 class CameraEntry(StrictRecord):
@@ -296,7 +304,7 @@ def parse_track(value: object, where: str) -> Track:
         return Track(record.id, record.label, size_m, times_s, matrices_of(record.world_from_object))
 
 
-# --- whole files ----------------------------------------------------------------------------------------------------
+# --- whole files ----------------------------------------------------------------------------------
 
 
 def parse_scene(
@@ -373,9 +381,12 @@ def _check_format(top: dict[str, Any], name: str, where: str) -> None:
     if top.get("schema_version") != SCHEMA_VERSION:
         remedy = "ingest the log again with this version, or use the version that wrote it"
         raise InputError(
-            "schema version is not one this program reads", where=f"{where}: schema_version",
-            expected=str(SCHEMA_VERSION), got=version, remedy=remedy,
-        )  # fmt: skip
+            "schema version is not one this program reads",
+            where=f"{where}: schema_version",
+            expected=str(SCHEMA_VERSION),
+            got=version,
+            remedy=remedy,
+        )
 
 
 def repeated(names: Iterable[str]) -> list[str]:
@@ -384,7 +395,8 @@ def repeated(names: Iterable[str]) -> list[str]:
 
 
 def check_relations(scene: Scene, where: str, complain: Complain = raise_first) -> None:
-    """Checks that span records: frames exist, ids are unique, times increase per sensor, the split names real frames."""
+    """Checks that span records: frames exist, ids are unique, times increase per sensor, the split names real
+    frames."""
     if not scene.frames:
         complain(InputError("scene has no frames", where=f"{where}: frames", expected="at least one image"))
     for kind, records in (("frames", scene.frames), ("sweeps", scene.sweeps), ("tracks", scene.tracks)):
@@ -410,7 +422,7 @@ def check_relations(scene: Scene, where: str, complain: Complain = raise_first) 
         complain(InputError(what, where=f"{where}: split", got=got))
 
 
-# --- writing --------------------------------------------------------------------------------------------------------
+# --- writing --------------------------------------------------------------------------------------
 
 
 def scene_to_json_text(scene: Scene) -> str:
@@ -420,12 +432,17 @@ def scene_to_json_text(scene: Scene) -> str:
         "format": FORMAT,
         "schema_version": SCHEMA_VERSION,
         "id": scene.id,
-        "conventions": "metres, seconds, pixels; world z up; camera x right, y down, z forward; a_from_b row-major 3x4; "
-        "the centre of the top-left pixel is (0.5, 0.5)",
+        "conventions": (
+            "metres, seconds, pixels; world z up; camera x right, y down, z forward; a_from_b row-major 3x4; "
+            "the centre of the top-left pixel is (0.5, 0.5)"
+        ),
         "source": {
-            "dataset": source.dataset, "licence": source.licence, "recipe": source.recipe, "notes": list(source.notes),
+            "dataset": source.dataset,
+            "licence": source.licence,
+            "recipe": source.recipe,
+            "notes": list(source.notes),
         },
-    }  # fmt: skip
+    }
     cameras = [f"{json.dumps(name)}: {_dumps(camera_to_json(camera))}" for name, camera in scene.cameras.items()]
     ego = {"times_s": scene.ego.times_s.tolist(), "world_from_ego": _poses_to_json(scene.ego.world_from_ego)}
     lines = [f" {json.dumps(key)}: {_dumps(value)}," for key, value in head.items()]
@@ -441,11 +458,14 @@ def tracks_to_json_text(tracks: Iterable[Track]) -> str:
     """The text of ``tracks.json``, one track a line."""
     records = (
         {
-            "id": track.id, "label": track.label, "size_m": track.size_m.tolist(), "times_s": track.times_s.tolist(),
+            "id": track.id,
+            "label": track.label,
+            "size_m": track.size_m.tolist(),
+            "times_s": track.times_s.tolist(),
             "world_from_object": _poses_to_json(track.world_from_object),
         }
         for track in tracks
-    )  # fmt: skip
+    )
     head = f'"format": "{TRACKS_FORMAT}",\n "schema_version": {SCHEMA_VERSION}'
     return f'{{\n {head},\n "tracks": [{_record_lines(records)}]\n}}\n'
 
@@ -464,18 +484,24 @@ def _poses_to_json(poses: NDArray[np.float64]) -> list[list[float]]:
 def _frame_to_json(frame: Frame) -> dict[str, Any]:
     view = frame.view
     return {
-        "id": frame.id, "camera": view.camera.name, "time_s": view.time_s,
+        "id": frame.id,
+        "camera": view.camera.name,
+        "time_s": view.time_s,
         "world_from_cam": _poses_to_json(view.world_from_cam[None])[0],
-        "image": frame.image.path, "labels": {name: ref.path for name, ref in frame.labels.items()},
-    }  # fmt: skip
+        "image": frame.image.path,
+        "labels": {name: ref.path for name, ref in frame.labels.items()},
+    }
 
 
 def _sweep_to_json(sweep: Sweep) -> dict[str, Any]:
     pose = _poses_to_json(sweep.world_from_lidar[None])[0]
     return {
-        "id": sweep.id, "sensor": sweep.sensor, "time_s": sweep.time_s, "world_from_lidar": pose,
+        "id": sweep.id,
+        "sensor": sweep.sensor,
+        "time_s": sweep.time_s,
+        "world_from_lidar": pose,
         "points": sweep.points.path,
-    }  # fmt: skip
+    }
 
 
 def _record_lines(records: Iterable[dict[str, Any]]) -> str:

@@ -47,7 +47,8 @@ class SceneWriter:
             scene = writer.finish()
 
     Args:
-        root: destination directory; it must not hold a scene yet. Other files there (a run's bookkeeping) are left alone.
+        root: destination directory; it must not hold a scene yet. Other files there (a run's bookkeeping) are left
+            alone.
         scene_id: name of the scene.
         source: where the log comes from and under which licence.
         jpeg_quality: store images given as arrays as JPEG of this quality instead of lossless PNG.
@@ -171,7 +172,8 @@ class SceneWriter:
     def add_sweep(
         self, sweep_id: str, sensor: str, time_s: float, world_from_lidar: NDArray[np.float64], points: SweepPoints
     ) -> None:
-        """Add a LiDAR sweep: points in the LiDAR frame at ``time_s``, with classes if they have any. Ids are ``<sensor>/<digits>``."""
+        """Add a LiDAR sweep: points in the LiDAR frame at ``time_s``, with classes if they have any. Ids are
+        ``<sensor>/<digits>``."""
         sweep = Sweep(sweep_id, sensor, time_s, world_from_lidar, _sweep_ref(sweep_id))
         arrays: dict[str, NDArray[Any]] = {"xyz": points.xyz, "intensity": points.intensity, "dt_s": points.dt_s}
         if points.classes is not None:
@@ -211,7 +213,8 @@ class SceneWriter:
                 self.add_label(frame.id, name, array)
 
     def copy_all_but_frames(self, scene: Scene, point_classes: bool = True) -> None:
-        """Add everything of another scene but its frames: cameras, sweeps (as in ``copy_frame``), tracks, ego path, split.
+        """Add everything of another scene but its frames: cameras, sweeps (as in ``copy_frame``), tracks, ego path,
+        split.
 
         Args:
             point_classes: whether the classes of LiDAR points are kept.
@@ -266,9 +269,16 @@ class SceneWriter:
         sweeps = sorted(self._sweeps.values(), key=lambda s: (s.time_s, s.sensor))
         split: dict[str, Literal["train", "test"]] = {**dict.fromkeys((f.id for f in frames), "train"), **self._split}
         scene = Scene(
-            self._scene_id, str(self.root), self._cameras, tuple(frames), tuple(sweeps), tuple(self._tracks.values()),
-            self._ego, split, self._source,
-        )  # fmt: skip
+            self._scene_id,
+            str(self.root),
+            self._cameras,
+            tuple(frames),
+            tuple(sweeps),
+            tuple(self._tracks.values()),
+            self._ego,
+            split,
+            self._source,
+        )
         schema.check_relations(scene, where)
         self._write("tracks.json", schema.tracks_to_json_text(scene.tracks).encode())
         self._write("scene.json", schema.scene_to_json_text(scene).encode())

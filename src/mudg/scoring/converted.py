@@ -1,4 +1,5 @@
-"""Converting weights of the networks of the scores: a published file -> a folder with ``weights.safetensors`` and its origin."""
+"""Converting weights of the networks of the scores: a published file -> a folder with ``weights.safetensors`` and its
+origin."""
 
 from __future__ import annotations
 
@@ -25,11 +26,12 @@ Names = Mapping[str, str]
 
 @dataclass(frozen=True)
 class ScoreNetwork:
-    """A network of the scores: what its files are called when they are used, and how its tensors are found in a published file.
+    """A network of the scores: what its files are called when they are used, and how its tensors are found in a
+    published file.
 
     Args:
-        flag: of ``mudg score``. check: tensors -> nothing, or an InputError. named: tensors of a file -> those of the network under
-            the names that are written.
+        flag: of ``mudg score``. check: tensors -> nothing, or an InputError. named: tensors of a file -> those of the
+            network under the names that are written.
         published: SHA-256 of published files -> their names.
     """
 
@@ -53,10 +55,15 @@ def _without_counts(found: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 NETWORKS: Final[Mapping[str, ScoreNetwork]] = {
     "inception": ScoreNetwork(
-        "--fid-weights", inception.InceptionFeatures, _without_counts, {inception.KNOWN_SHA256: "pt_inception-2015-12-05-6726825d.pth"}
+        "--fid-weights",
+        inception.InceptionFeatures,
+        _without_counts,
+        {inception.KNOWN_SHA256: "pt_inception-2015-12-05-6726825d.pth"},
     ),
     "i3d": ScoreNetwork(
-        "--fvd-weights", i3d.I3DFeatures, i3d.with_known_names,
+        "--fvd-weights",
+        i3d.I3DFeatures,
+        i3d.with_known_names,
         {"bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2": "i3d_torchscript.pt"},
     ),
     "dinov2": ScoreNetwork("--dino-weights", dinov2.DinoFeatures, dict, {}),
@@ -64,7 +71,7 @@ NETWORKS: Final[Mapping[str, ScoreNetwork]] = {
     "lpips": _lpips("alex", "--lpips-weights"),
     "lpips-vgg": _lpips("vgg", "--lpips-vgg-weights"),
     "lpips-squeeze": _lpips("squeeze", "--lpips-squeeze-weights"),
-}  # fmt: skip
+}
 """Networks by the name that ``mudg convert --network`` takes."""
 
 
@@ -114,7 +121,8 @@ def _renamed(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list
 
 
 def source_sha256(weights: Path) -> str:
-    """SHA-256 of the published file that weights were converted from, if their folder says so; else that of the file itself."""
+    """SHA-256 of the published file that weights were converted from, if their folder says so; else that of the file
+    itself."""
     own, description = store.sha256_file(weights), weights.parent / DESCRIPTION_FILE
     if weights.name != WEIGHTS_FILE or not description.is_file():
         return own

@@ -1,7 +1,8 @@
 """NTA-IoU and NTL-IoU from what detectors made of the images, read from files: boxes as COCO results, lanes as masks.
 
-No detector is part of the program. Images are named ``METHOD/TRAJECTORY/000003``, as in the folders of views; ``truth/TRAJECTORY/...`` and
-``recorded/CAMERA/...`` name true and recorded images, which give the anchors that stand beside every value.
+No detector is part of the program. Images are named ``METHOD/TRAJECTORY/000003``, as in the folders of views;
+``truth/TRAJECTORY/...`` and ``recorded/CAMERA/...`` name true and recorded images, which give the anchors that stand
+beside every value.
 """
 
 from __future__ import annotations
@@ -38,7 +39,8 @@ from mudg.scoring import tables as score_tables
 from mudg.scoring.truth import SAME_SWEEP_S
 
 CAR_AND_BUS: Final = (2, 5)
-"""Numbers of two of the 80 classes of COCO, as YOLO counts them: those that ReconDreamer's score keeps; DriveDreamer4D's keeps all."""
+"""Numbers of two of the 80 classes of COCO, as YOLO counts them: those that ReconDreamer's score keeps;
+DriveDreamer4D's keeps all."""
 TRUTH: Final = "truth"
 RECORDED: Final = "recorded"
 _BOXES: Final = "a list of records with image_id, category_id, bbox [x, y, width, height] and score"
@@ -73,8 +75,9 @@ class ViewImages:
 def read_detections(path: Path) -> dict[str, list[Detection]]:
     """Boxes by image name, without those of a confidence of at most 0.5.
 
-    Understood are COCO's result form, a list whose boxes are in pixels of images resized to 480 x 320, as the published score does it;
-    and a mapping with ``images`` (id, file_name, width, height) and ``annotations``, whose boxes are in pixels of these images.
+    Understood are COCO's result form, a list whose boxes are in pixels of images resized to 480 x 320, as the published
+    score does it; and a mapping with ``images`` (id, file_name, width, height) and ``annotations``, whose boxes are in
+    pixels of these images.
 
     Raises:
         InputError: anything else.
@@ -88,8 +91,12 @@ def read_detections(path: Path) -> dict[str, list[Detection]]:
                 sizes[image["id"]] = (str(image["file_name"]), *scale)
             content = content["annotations"]
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-            raise InputError("malformed file of boxes", where=str(path), expected="images (id, file_name, width, height) and annotations",
-                got=repr(error)) from error  # fmt: skip
+            raise InputError(
+                "malformed file of boxes",
+                where=str(path),
+                expected="images (id, file_name, width, height) and annotations",
+                got=repr(error),
+            ) from error
     if not isinstance(content, list):
         raise InputError("a file of boxes holds no list", where=str(path), expected=_BOXES, got=type(content).__name__)
     found: dict[str, list[Detection]] = {}
@@ -111,8 +118,12 @@ def _parsed(record: Any, sizes: Mapping[Any, tuple[str, float, float]], where: s
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError("a detected box is malformed", where=where, expected=_BOXES, got=repr(record)[:120]) from error
     if not all(map(math.isfinite, (x, y, width, height, score))) or width < 0 or height < 0 or not 0 <= score <= 1:
-        raise InputError("a detected box is impossible", where=where, expected="finite numbers, sizes of at least 0, a score in 0..1",
-            got=repr(record)[:120])  # fmt: skip
+        raise InputError(
+            "a detected box is impossible",
+            where=where,
+            expected="finite numbers, sizes of at least 0, a score in 0..1",
+            got=repr(record)[:120],
+        )
     if sizes and given not in sizes:
         raise InputError(
             "a detected box belongs to no image", where=where, got=str(given), expected="an id of the images"
@@ -131,7 +142,8 @@ class BoxDetections:
     """NTA-IoU of methods.
 
     Args:
-        scene: whose tracked boxes are the truth. path: file of boxes. as_published: true boxes also of corners behind the camera.
+        scene: whose tracked boxes are the truth. path: file of boxes. as_published: true boxes also of corners behind
+            the camera.
     """
 
     def __init__(self, scene: Scene, path: Path, as_published: bool) -> None:
@@ -157,12 +169,23 @@ class BoxDetections:
     def record(self) -> dict[str, Any]:
         """How the numbers were made, for metrics.json."""
         return {
-            "file_sha256": self.sha256, "confidence_above": NTA_CONFIDENCE, "reach_px": street_scores.NTA_REACH_PX,
-            "size": [NTA_WIDTH_PX, NTA_HEIGHT_PX], "classes": "all; beside it COCO's car and bus alone (2 and 5)",
-            "boxes": "as published: corners behind the camera are not cut off" if self._as_published else "cut at the near plane",
+            "file_sha256": self.sha256,
+            "confidence_above": NTA_CONFIDENCE,
+            "reach_px": street_scores.NTA_REACH_PX,
+            "size": [NTA_WIDTH_PX, NTA_HEIGHT_PX],
+            "classes": "all; beside it COCO's car and bus alone (2 and 5)",
+            "boxes": (
+                "as published: corners behind the camera are not cut off"
+                if self._as_published
+                else "cut at the near plane"
+            ),
             "fewest_points": NTA_FEWEST_POINTS if self._scene.sweeps else None,
-            "points": "counted in the sweeps taken with the view" if self._scene.sweeps else "no sweeps: boxes of any number count",
-        }  # fmt: skip
+            "points": (
+                "counted in the sweeps taken with the view"
+                if self._scene.sweeps
+                else "no sweeps: boxes of any number count"
+            ),
+        }
 
     def _tracks_at(self, view: View) -> Sequence[Track]:
         """Tracks with at least ten LiDAR points at a view's time; all of them where no sweep was taken then."""
@@ -189,7 +212,8 @@ class LaneDetections:
     """NTL-IoU of methods.
 
     Args:
-        scene: a generated city, whose markings and kerbs take the place of a map. folder: masks ``METHOD/TRAJECTORY/000003.png``.
+        scene: a generated city, whose markings and kerbs take the place of a map. folder: masks
+            ``METHOD/TRAJECTORY/000003.png``.
 
     Raises:
         InputError: the scene has no lane lines, or the folder is missing.
@@ -197,8 +221,13 @@ class LaneDetections:
 
     def __init__(self, scene: Scene, folder: Path) -> None:
         if scene.source.recipe is None:
-            raise InputError("the log has no lane lines to hold detected lanes against", where=scene.root, got=scene.source.dataset,
-                expected="a generated city: prepared logs keep no map", remedy="leave out --lanes")  # fmt: skip
+            raise InputError(
+                "the log has no lane lines to hold detected lanes against",
+                where=scene.root,
+                got=scene.source.dataset,
+                expected="a generated city: prepared logs keep no map",
+                remedy="leave out --lanes",
+            )
         if not folder.is_dir():
             raise InputError("no such folder of lane masks", where=str(folder))
         self._lines = CityWorld.from_source(scene.source).lane_lines()
@@ -226,7 +255,8 @@ class LaneDetections:
         }
 
     def against(self, images: ViewImages, true: ViewImages) -> float | None:
-        """The second convention: masks of the images against the detector's own masks of the true images; None where those are missing."""
+        """The second convention: masks of the images against the detector's own masks of the true images; None where
+        those are missing."""
         pairs = [
             (self._folder / f"{a}.png", self._folder / f"{b}.png")
             for a, b in zip(images.names(), true.names(), strict=True)

@@ -1,4 +1,5 @@
-"""Facts about views beside their true image: LiDAR points, vehicles, markings; and what recorded images score on them."""
+"""Facts about views beside their true image: LiDAR points, vehicles, markings; and what recorded images score on
+them."""
 
 from __future__ import annotations
 
@@ -62,7 +63,8 @@ class FactMaker:
         return ViewFacts(points, None, None if frame is None else self._carried_lanes(view, frame))
 
     def recorded(self, camera: str) -> dict[str, float]:
-        """What the recorded images of a camera score at their own views, by metric; empty where exact truth is missing there."""
+        """What the recorded images of a camera score at their own views, by metric; empty where exact truth is missing
+        there."""
         if camera not in self._anchors:
             self._anchors[camera] = self._recorded(camera) if self._scene.source.recipe is not None else {}
         return self._anchors[camera]
@@ -78,7 +80,8 @@ class FactMaker:
         )
 
     def _carried_lanes(self, view: View, frame: Frame) -> LaneFacts | None:
-        """Markings of a recorded image where the ground shows them in another view. Without LiDAR there is no ground."""
+        """Markings of a recorded image where the ground shows them in another view. Without LiDAR there is no
+        ground."""
         points = self._points.around(view.time_s)
         if points is None:
             return None
@@ -115,7 +118,7 @@ class FactMaker:
             seen = recorded_truth(self._scene, frame)
             pair = recorded_pair(frame.view, seen, world, self._vehicles)
             for metric in found.values():
-                metric.add(metric.source(pair))  # type: ignore[arg-type]
+                metric.add(metric.source(pair))
         values = {name: metric.value() for name, metric in found.items()}
         return {name: round(value, 6) for name, value in values.items() if value is not None}
 
@@ -162,7 +165,7 @@ def known_of(facts: ViewFacts) -> set[str]:
     return names
 
 
-# trajectories ---------------------------------------------------------------------------------------------------------
+# trajectories -------------------------------------------------------------------------------------
 #
 # What a score is about: trajectories with the methods that have them, and what the methods are held against.
 
@@ -192,16 +195,23 @@ class ScoredTrajectory:
     indices: Mapping[str, tuple[int, ...]]
 
     def counted(self, held_out: frozenset[str]) -> list[int]:
-        """The views that count. Recorded training frames were seen by the fit and do not; views off the path never were."""
+        """The views that count. Recorded training frames were seen by the fit and do not; views off the path never
+        were."""
         return [n for n, frame in enumerate(self.frames) if frame is None or frame.id in held_out]
 
     def record(self) -> dict[str, Any]:
         """The trajectory as JSON values."""
         camera = self.views[0].camera
         return {
-            "name": self.name, "camera": self.camera, "shift_m": self.shift_m, "views": len(self.views), "width": camera.width,
-            "height": camera.height, "methods": list(self.sets), "indices": {m: list(i) for m, i in self.indices.items()},
-        }  # fmt: skip
+            "name": self.name,
+            "camera": self.camera,
+            "shift_m": self.shift_m,
+            "views": len(self.views),
+            "width": camera.width,
+            "height": camera.height,
+            "methods": list(self.sets),
+            "indices": {m: list(i) for m, i in self.indices.items()},
+        }
 
 
 @dataclass(frozen=True)
@@ -210,8 +220,10 @@ class Reference:
 
     Args:
         truth, baseline: of any view. held_out: ids of the recorded frames that count.
-        distances: what computes the rows of the table that need weights, at ``distance_views`` views of a trajectory (0 = all).
-        facts: makes what is known of views beside their true image. vehicles: numbers in instance maps, and their tracks.
+        distances: what computes the rows of the table that need weights, at ``distance_views`` views of a trajectory (0
+            = all).
+        facts: makes what is known of views beside their true image. vehicles: numbers in instance maps, and their
+            tracks.
     """
 
     truth: Truth
@@ -236,8 +248,11 @@ def trajectories_of(config: ScoreConfig, scene: Scene, methods: Mapping[str, Pat
     }
     names = sorted({name for found in sets.values() for name in found}, key=_order)
     if not names:
-        raise InputError("none of the folders holds rendered views", where=", ".join(str(p) for p in methods.values()),
-            expected="output of mudg render or mudg synthesize")  # fmt: skip
+        raise InputError(
+            "none of the folders holds rendered views",
+            where=", ".join(str(p) for p in methods.values()),
+            expected="output of mudg render or mudg synthesize",
+        )
     return [
         _matched(config, scene, name, {m: found[name] for m, found in sets.items() if name in found}) for name in names
     ]
@@ -260,8 +275,11 @@ def _matched(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, Ob
         for method, index in nearest.items():
             distance_m = apart_m(sets[method].views[index], view)
             if distance_m > SAME_PLACE_M:
-                raise InputError("two methods rendered the same trajectory from different positions",
-                                 where=f"{name}: {method}, view {index}", got=f"{distance_m:.3f} m apart")  # fmt: skip
+                raise InputError(
+                    "two methods rendered the same trajectory from different positions",
+                    where=f"{name}: {method}, view {index}",
+                    got=f"{distance_m:.3f} m apart",
+                )
             indices[method].append(index)
         camera = scene.cameras.get(view.camera.name, view.camera)
         width = config.width_px or camera.width

@@ -65,12 +65,19 @@ DEPTH_LIMIT_M: Final = 80.0
 
 
 def write_scores(
-    config: ScoreConfig, scene: Path, methods: Mapping[str, Path], work: RunDir, *, fused: Path | None = None, truth: Path | None = None
-) -> dict[str, Any]:  # fmt: skip
+    config: ScoreConfig,
+    scene: Path,
+    methods: Mapping[str, Path],
+    work: RunDir,
+    *,
+    fused: Path | None = None,
+    truth: Path | None = None,
+) -> dict[str, Any]:
     """Score every trajectory of every method; returns a summary.
 
     Args:
-        scene: the scene that was rendered. methods: name -> folder of observation folders (output of render or synthesize).
+        scene: the scene that was rendered. methods: name -> folder of observation folders (output of render or
+            synthesize).
         fused: clouds made by fuse, for the baseline; without them there is none.
         truth: folder of ``DrawTruth`` for this scene, to be read instead of drawing the truth again.
 
@@ -83,9 +90,12 @@ def write_scores(
         truth=truth_of(recorded) if truth is None else stored_truth(truth),
         baseline=baseline_of(recorded, read_fused(fused)) if fused is not None and config.baseline else None,
         held_out=frozenset(f.id for f in recorded.frames_in("test") or recorded.frames),
-        error_pictures=config.error_pictures, distances=_distances(config), distance_views=config.perceptual_views,
-        facts=FactMaker(recorded), vehicles=vehicles_of(recorded),
-    )  # fmt: skip
+        error_pictures=config.error_pictures,
+        distances=_distances(config),
+        distance_views=config.perceptual_views,
+        facts=FactMaker(recorded),
+        vehicles=vehicles_of(recorded),
+    )
     sets = set_scores_of(config, recorded, out)  # before the work: the weights may be unusable
     results: list[dict[str, Any]] = []
     with log.task("score", sum(len(trajectory.views) for trajectory in trajectories)) as bar:
@@ -100,8 +110,15 @@ def write_scores(
     }
     anchors = anchors_of(results, trajectories, reference)
     records = [trajectory.record() for trajectory in trajectories]
-    document = score_tables.document(recorded, reference.truth.exact, records, names, results, rows,
-        {"depth_limit_m": DEPTH_LIMIT_M, "anchors": anchors, "lpips": _lpips_record(config), **sets.records()})  # fmt: skip
+    document = score_tables.document(
+        recorded,
+        reference.truth.exact,
+        records,
+        names,
+        results,
+        rows,
+        {"depth_limit_m": DEPTH_LIMIT_M, "anchors": anchors, "lpips": _lpips_record(config), **sets.records()},
+    )
     store.write_json(out / "metrics.json", document)
     store.write_text(out / "metrics.md", score_tables.markdown(document))
     return {"trajectories": len(trajectories), "methods": names}
@@ -170,11 +187,15 @@ def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.f
         semantics = torch.from_numpy(ids[row, column].astype(np.int64))
     depth = drawn.depth.numpy()[:, row, column]
     return Observation(
-        view=view, rgb=torch.from_numpy(drawn.color.numpy()[:, row, column]),
-        depth=torch.from_numpy(np.where(depth > 0, depth, np.nan).astype(np.float32)), semantics=semantics,
-        confidence=drawn.valid.float(), mask=torch.ones(1, height, width, dtype=torch.bool),
-        kind="virtual", source=BASELINE,
-    )  # fmt: skip
+        view=view,
+        rgb=torch.from_numpy(drawn.color.numpy()[:, row, column]),
+        depth=torch.from_numpy(np.where(depth > 0, depth, np.nan).astype(np.float32)),
+        semantics=semantics,
+        confidence=drawn.valid.float(),
+        mask=torch.ones(1, height, width, dtype=torch.bool),
+        kind="virtual",
+        source=BASELINE,
+    )
 
 
 # ---- one trajectory ----
@@ -196,7 +217,9 @@ def _score(
     """Score all methods on one trajectory; writes its truth, its baseline and its error picture."""
     names = [*([BASELINE] if reference.baseline is not None else []), *trajectory.sets]
     motion, exact_motion = metrics.StaticMotion(), view_metrics.ExactMotion(reference.vehicles)
-    sums = {name: metrics.build_all(reference.distances, motion, view_metrics.build_facts(exact_motion)) for name in names}
+    sums = {
+        name: metrics.build_all(reference.distances, motion, view_metrics.build_facts(exact_motion)) for name in names
+    }
     sums[TRUTH] = view_metrics.build_facts(exact_motion)
     counted = trajectory.counted(reference.held_out)
     wanted = _wanted(trajectory, reference, counted)
@@ -204,7 +227,9 @@ def _score(
     scored = 0
 
     def measure(number: int) -> MeasuredView:
-        return _measured(trajectory, reference, number, {m: {k: of[k] for k in wanted[number] if k in of} for m, of in sums.items()})
+        return _measured(
+            trajectory, reference, number, {m: {k: of[k] for k in wanted[number] if k in of} for m, of in sums.items()}
+        )
 
     threads = native.threads()
     with native.one_thread() if _is_small(trajectory) else contextlib.nullcontext(), contextlib.ExitStack() as stack:
@@ -217,7 +242,8 @@ def _score(
         if reference.baseline is not None:
             fills = stack.enter_context(ObservationWriter(out / BASELINE / trajectory.name, trajectory.name, BASELINE))
         views = _in_order(measure, trajectory, threads)
-        for number in range(len(trajectory.views)):  # not over `views`: the last one would stay in memory while the next is made
+        # not over `views`: the last one would stay in memory while the next is made
+        for number in range(len(trajectory.views)):
             made = next(views)
             if fills is not None:
                 fills.add(made.seen[BASELINE])
@@ -238,13 +264,22 @@ def _score(
             advance()
     anchors = _values(sums.pop(TRUTH), truth_has)
     return [
-        {"method": name, "trajectory": trajectory.name, "views": scored, "values": _values(of, truth_has), "iou": _iou(of),
-         "details": view_metrics.details(of), "truth": {k: v for k, v in anchors.items() if not isinstance(v, str)}}
+        {
+            "method": name,
+            "trajectory": trajectory.name,
+            "views": scored,
+            "values": _values(of, truth_has),
+            "iou": _iou(of),
+            "details": view_metrics.details(of),
+            "truth": {k: v for k, v in anchors.items() if not isinstance(v, str)},
+        }
         for name, of in sums.items()
-    ]  # fmt: skip
+    ]
 
 
-def _in_order(measure: Callable[[int], MeasuredView], trajectory: ScoredTrajectory, threads: int) -> Iterator[MeasuredView]:
+def _in_order(
+    measure: Callable[[int], MeasuredView], trajectory: ScoredTrajectory, threads: int
+) -> Iterator[MeasuredView]:
     """The measured views of a trajectory in order; of large ones, no two are in memory at the same time."""
     if _is_small(trajectory):
         yield from computed_ahead(measure, len(trajectory.views), threads)
@@ -260,9 +295,13 @@ def _is_small(trajectory: ScoredTrajectory) -> bool:
 def _wanted(trajectory: ScoredTrajectory, reference: Reference, counted: Sequence[int]) -> list[set[str]]:
     """The metrics that each view of a trajectory enters."""
     sampled = set(evenly(counted, reference.distance_views or len(counted)))
-    every_frame = {"temporal_flickering"} | ({"flicker", "warp_error"} if reference.truth.exact else set())  # wants all, in order
+    # wants all, in order
+    every_frame = {"temporal_flickering"} | ({"flicker", "warp_error"} if reference.truth.exact else set())
     needs_weights = reference.distances.keys()
-    usual = {name for name, row in metrics.METRICS.items() if row.build is not None} | {*view_metrics.FACTS, *view_metrics.PARTS}
+    usual = {name for name, row in metrics.METRICS.items() if row.build is not None} | {
+        *view_metrics.FACTS,
+        *view_metrics.PARTS,
+    }
     usual -= {*needs_weights, "flicker", "temporal_flickering"}
     return [
         every_frame | (usual if n in counted else set()) | (needs_weights if n in sampled else set())
@@ -288,9 +327,11 @@ def _measured(
 
     if _is_small(trajectory):  # whose views are measured at the same time
         return MeasuredView(
-            truth, facts, seen,
+            truth,
+            facts,
+            seen,
             {name: metrics.measure(pair_of(one, truth, view, facts), wanted[name]) for name, one in compared.items()},
-        )  # fmt: skip
+        )
     pairs = {name: pair_of(one, truth, view, facts) for name, one in compared.items()}
     known = _in_bands(pairs, wanted)
     with ThreadPoolExecutor(native.threads()) as pool:
@@ -301,14 +342,19 @@ def _measured(
 def _in_bands(
     pairs: Mapping[str, metrics.Pair], wanted: Mapping[str, Mapping[str, metrics.Metric]]
 ) -> dict[str, dict[Callable[[metrics.Pair], Any], Any]]:
-    """What is measured of all methods together, for the features of the truth are made once then: by method, source -> value."""
+    """What is measured of all methods together, for the features of the truth are made once then: by method, source ->
+    value."""
     found: dict[str, dict[Callable[[metrics.Pair], Any], Any]] = {name: {} for name in pairs}
     sources = {metric.source: None for of in wanted.values() for metric in of.values()}
     for source in sources:
         if not isinstance(source, PerceptualDistance):
             continue
-        asked = [n for n, pair in pairs.items() if source in {m.source for m in wanted[n].values()} and source.in_bands(pair)]
-        for name, value in zip(asked, source.of_all([pairs[n] for n in asked], native.threads()) if asked else (), strict=True):
+        asked = [
+            n for n, pair in pairs.items() if source in {m.source for m in wanted[n].values()} and source.in_bands(pair)
+        ]
+        for name, value in zip(
+            asked, source.of_all([pairs[n] for n in asked], native.threads()) if asked else (), strict=True
+        ):
             found[name][source] = value
     return found
 
@@ -371,9 +417,18 @@ def pair_of(
     if true.depth is not None:
         valid = torch.isfinite(true.depth) & (true.depth > 0) & (true.depth <= DEPTH_LIMIT_M)
     return metrics.Pair(
-        rgb=rgb, depth=depth, semantics=semantics, truth_rgb=true.rgb, truth_depth=true.depth, truth_depth_valid=valid,
-        truth_semantics=true.semantics, mask=true.mask, moving=truth.moving, view=true.view, facts=facts,
-    )  # fmt: skip
+        rgb=rgb,
+        depth=depth,
+        semantics=semantics,
+        truth_rgb=true.rgb,
+        truth_depth=true.depth,
+        truth_depth_valid=valid,
+        truth_semantics=true.semantics,
+        mask=true.mask,
+        moving=truth.moving,
+        view=true.view,
+        facts=facts,
+    )
 
 
 def _write_error_picture(path: Path, seen: Mapping[str, Observation], true: Observation) -> None:

@@ -1,11 +1,11 @@
 """FID and KID of a method on a trajectory: its images as a set, against the recorded frames of the same camera.
 
-The reference is the recorded video, as in published tables, so there is a number off the recorded path of a driving log, too, where no
-other metric has a truth. Sets are small, and FID of small sets is mostly bias: every trajectory also gets a floor, what the truth itself
-would score.
+The reference is the recorded video, as in published tables, so there is a number off the recorded path of a driving
+log, too, where no other metric has a truth. Sets are small, and FID of small sets is mostly bias: every trajectory also
+gets a floor, what the truth itself would score.
 
-Features are kept in the folder of the scores, in a file whose name is the hash of weights, rule and pixels: an interrupted run does not
-compute a set again.
+Features are kept in the folder of the scores, in a file whose name is the hash of weights, rule and pixels: an
+interrupted run does not compute a set again.
 """
 
 from __future__ import annotations
@@ -114,7 +114,8 @@ class EmbeddingFiles:
     """Embeddings of sets of images by a network, kept in a folder.
 
     Args:
-        network: images ``[n, 3, h, w]`` -> ``[n, width]``. prepare: an image u8[H, W, 3] as the network wants it. width: of the embedding.
+        network: images ``[n, 3, h, w]`` -> ``[n, width]``. prepare: an image u8[H, W, 3] as the network wants it.
+            width: of the embedding.
         key: weights and rules, by which kept files are found. folder: where they lie. device: of the network.
     """
 
@@ -148,7 +149,8 @@ class FeatureFiles:
     """Features of sets of images by FID's network, kept in a folder.
 
     Args:
-        weights: file with the network's weights. rule: how images get its size. folder: where features are kept. device: of the network.
+        weights: file with the network's weights. rule: how images get its size. folder: where features are kept.
+            device: of the network.
 
     Raises:
         InputError: the file is missing, damaged, or holds another network.
@@ -160,9 +162,13 @@ class FeatureFiles:
         self.sha256, self.source_sha256 = store.sha256_file(weights), source_sha256(weights)
         network = inception.InceptionFeatures(state, str(weights)).to(device)
         self._files = EmbeddingFiles(
-            lambda batch: network(batch)["2048"], lambda rgb: inception.prepared(rgb, rule), inception.WIDTH,
-            f"Inception {self.sha256} {rule}", folder, device,
-        )  # fmt: skip
+            lambda batch: network(batch)["2048"],
+            lambda rgb: inception.prepared(rgb, rule),
+            inception.WIDTH,
+            f"Inception {self.sha256} {rule}",
+            folder,
+            device,
+        )
 
     def of(self, images: ImageSet) -> NDArray[np.float32]:
         """Features f32[n, 2048] of a set."""
@@ -176,11 +182,12 @@ class FeatureFiles:
 def kept_features(
     folder: Path, key: str, images: ImageSet, shape: tuple[int, int], compute: Callable[[], NDArray[np.float32]]
 ) -> tuple[str, NDArray[np.float32]]:
-    """The name of the file with the features of a set, and the features: from a folder if these very pixels went through the same network
-    before, else computed and kept there.
+    """The name of the file with the features of a set, and the features: from a folder if these very pixels went
+    through the same network before, else computed and kept there.
 
     Args:
-        folder: where files lie. key: weights and rules. images: what is described. shape: of the features. compute: makes them.
+        folder: where files lie. key: weights and rules. images: what is described. shape: of the features. compute:
+            makes them.
     """
     content = hashlib.sha256(f"{key} {images.count}".encode())
     for number in range(images.count):
@@ -197,14 +204,16 @@ def kept_features(
 
 
 def recorded_images(scene: Scene, sets: TrajectorySets) -> ImageSet:
-    """The recorded frames of a trajectory's camera at the common size, in order of time; none if the scene lacks the camera."""
+    """The recorded frames of a trajectory's camera at the common size, in order of time; none if the scene lacks the
+    camera."""
     frames = scene.frames_of(sets.camera) if sets.camera in scene.cameras else ()
     return ImageSet(len(frames), lambda number: read_image(scene, frames[number])).resized(sets.width, sets.height)
 
 
 @dataclass(frozen=True)
 class FeatureSets:
-    """Which files of features were compared, so that sets of several logs can be pooled: one record per method and trajectory."""
+    """Which files of features were compared, so that sets of several logs can be pooled: one record per method and
+    trajectory."""
 
     records: list[dict[str, str]] = field(default_factory=list)
 
@@ -234,8 +243,12 @@ class Distributions:
         """
         counts = {method: images.count for method, images in sets.methods.items()}
         if len(set(counts.values())) > 1:
-            raise InputError("FID of sets of different size cannot be compared", where=sets.name, expected="the same views for all methods",
-                got=", ".join(f"{method}: {count}" for method, count in counts.items()))  # fmt: skip
+            raise InputError(
+                "FID of sets of different size cannot be compared",
+                where=sets.name,
+                expected="the same views for all methods",
+                got=", ".join(f"{method}: {count}" for method, count in counts.items()),
+            )
         name, reference = self._reference(sets)
         if not len(reference):
             return dict.fromkeys(counts, score_tables.NO_TRUTH)
@@ -252,10 +265,15 @@ class Distributions:
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors, for metrics.json."""
         return {
-            "network": "Inception-v3 of 2015, global average, 2048 values", "weights_sha256": self._features.sha256,
-            "published_weights": self._features.source_sha256 == inception.KNOWN_SHA256, "resize": self._features.rule,
-            "reference": "recorded frames of the same camera", "covariance": "n - 1", "floors": self._floors, "sets": self._sets.records,
-        }  # fmt: skip
+            "network": "Inception-v3 of 2015, global average, 2048 values",
+            "weights_sha256": self._features.sha256,
+            "published_weights": self._features.source_sha256 == inception.KNOWN_SHA256,
+            "resize": self._features.rule,
+            "reference": "recorded frames of the same camera",
+            "covariance": "n - 1",
+            "floors": self._floors,
+            "sets": self._sets.records,
+        }
 
     def _reference(self, sets: TrajectorySets) -> tuple[str, NDArray[np.float32]]:
         key = (sets.camera, sets.width, sets.height)
@@ -297,19 +315,26 @@ def distances(made: NDArray[np.float32], reference: NDArray[np.float32]) -> SetD
         error = feature_distances.kernel_distance_error(made, reference, blocks, seeds.numpy_rng(0, 0, "blocks of KID"))
     many = min(len(made), len(reference)) >= FEWEST_TO_EXTRAPOLATE
     return SetDistances(
-        n=len(made), n_reference=len(reference), fid=feature_distances.frechet_distance(made, reference),
-        kid=feature_distances.kernel_distance(made, reference), kid_standard_error=error,
+        n=len(made),
+        n_reference=len(reference),
+        fid=feature_distances.frechet_distance(made, reference),
+        kid=feature_distances.kernel_distance(made, reference),
+        kid_standard_error=error,
         mind=feature_distances.mind_distance(made, reference, seeds.numpy_rng(0, 0, "directions of MIND")),
-        fid_at_infinity=feature_distances.frechet_at_infinity(made, reference, seeds.numpy_rng(0, 0, "sizes of FID")) if many else None,
-    )  # fmt: skip
+        fid_at_infinity=(
+            feature_distances.frechet_at_infinity(made, reference, seeds.numpy_rng(0, 0, "sizes of FID"))
+            if many
+            else None
+        ),
+    )
 
 
-# videos ---------------------------------------------------------------------------------------------------------------
+# videos -------------------------------------------------------------------------------------------
 #
 # FVD of a method on a trajectory: its clips as a set, against the clips of the recorded video of the same camera.
 #
-# All views count, in order: held-out frames alone are no video. Clips have 16 frames and begin at every eighth, so that a drive of 40
-# frames gives four.
+# All views count, in order: held-out frames alone are no video. Clips have 16 frames and begin at every eighth, so that
+# a drive of 40 frames gives four.
 
 
 CLIP_FRAMES: Final = 16
@@ -320,7 +345,8 @@ class ClipFiles:
     """Features of the clips of a video by FVD's network, kept in a folder.
 
     Args:
-        weights: file with the network's weights. rule: how frames get its size. folder: where features are kept. device: of the network.
+        weights: file with the network's weights. rule: how frames get its size. folder: where features are kept.
+            device: of the network.
 
     Raises:
         InputError: the file is missing, damaged, or holds another network.
@@ -380,7 +406,8 @@ class VideoDistances:
         self._sets = FeatureSets()
 
     def of(self, sets: TrajectorySets) -> dict[str, dict[str, Any] | str]:
-        """By method ``{"fvd", "n", "n_reference"}``, or why there is none; the floor of the trajectory is noted for ``record``.
+        """By method ``{"fvd", "n", "n_reference"}``, or why there is none; the floor of the trajectory is noted for
+        ``record``.
 
         Args:
             sets: with all views of every method, in order of time.
@@ -410,11 +437,17 @@ class VideoDistances:
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors, for metrics.json."""
         return {
-            "network": "I3D, Kinetics-400, scores before the softmax, 400 values", "weights_sha256": self._clips.sha256,
-            "norm_epsilon": i3d.NORM_EPSILON, "resize": self._clips.rule, "clip_frames": CLIP_FRAMES, "hop_frames": HOP_FRAMES,
-            "reference": "recorded video of the same camera", "covariance": "n - 1", "floors": self._floors,
+            "network": "I3D, Kinetics-400, scores before the softmax, 400 values",
+            "weights_sha256": self._clips.sha256,
+            "norm_epsilon": i3d.NORM_EPSILON,
+            "resize": self._clips.rule,
+            "clip_frames": CLIP_FRAMES,
+            "hop_frames": HOP_FRAMES,
+            "reference": "recorded video of the same camera",
+            "covariance": "n - 1",
+            "floors": self._floors,
             "sets": self._sets.records,
-        }  # fmt: skip
+        }
 
 
 def compared(made: NDArray[np.float32], reference: NDArray[np.float32]) -> dict[str, Any]:
@@ -434,14 +467,14 @@ def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> VideoDistances | 
     return VideoDistances(scene, ClipFiles(Path(config.fvd_weights), config.fvd_resize, out / FEATURES_FOLDER, device))
 
 
-# video features -------------------------------------------------------------------------------------------------------
+# video features -----------------------------------------------------------------------------------
 #
 # Distances of videos in features that an extractor elsewhere made of their clips, such as V-JEPA (JEDi) or VideoMAE.
 #
-# Extractors are not run here: a saved program (TorchScript, or an exported one) would be code from a file, and this package executes no
-# data.
-# What they give is a table of numbers, and that is what is read: ``METHOD/TRAJECTORY.safetensors`` and ``recorded/CAMERA.safetensors``,
-# each with one tensor ``features`` [clips, values].
+# Extractors are not run here: a saved program (TorchScript, or an exported one) would be code from a file, and this
+# package executes no data. What they give is a table of numbers, and that is what is read:
+# ``METHOD/TRAJECTORY.safetensors`` and ``recorded/CAMERA.safetensors``, each with one tensor ``features`` [clips,
+# values].
 
 
 RECORDED: Final = "recorded"
@@ -460,15 +493,22 @@ class VideoFeatures:
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
-            raise InputError("no such folder of features", where=str(folder),
-                expected="METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors, each with a tensor features [clips, values]",
-                remedy="run the extractor yourself and save what it gives; programs (TorchScript) are not read")  # fmt: skip
+            raise InputError(
+                "no such folder of features",
+                where=str(folder),
+                expected=(
+                    "METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors, each with a tensor features [clips,"
+                    " values]"
+                ),
+                remedy="run the extractor yourself and save what it gives; programs (TorchScript) are not read",
+            )
         self._folder = folder
         self._floors: list[dict[str, Any]] = []
         self._width: int | None = None
 
     def of(self, trajectory: str, camera: str, methods: Sequence[str]) -> dict[str, dict[str, Any] | str]:
-        """By method ``values`` and numbers of clips, or why there are none; the floor of the trajectory is noted for ``record``."""
+        """By method ``values`` and numbers of clips, or why there are none; the floor of the trajectory is noted for
+        ``record``."""
         reference = self._read(f"{RECORDED}/{camera}")
         if reference is None:
             return dict.fromkeys(methods, score_tables.NO_FEATURES)
@@ -485,10 +525,14 @@ class VideoFeatures:
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors."""
         return {
-            "features": "made elsewhere", "width": self._width, "folder_sha256": store.digest(self._folder), "covariance": "n - 1",
-            "kernel": "(x.y / d)^2, biased, times 100", "reference": "clips of the recorded video of the same camera",
+            "features": "made elsewhere",
+            "width": self._width,
+            "folder_sha256": store.digest(self._folder),
+            "covariance": "n - 1",
+            "kernel": "(x.y / d)^2, biased, times 100",
+            "reference": "clips of the recorded video of the same camera",
             "floors": self._floors,
-        }  # fmt: skip
+        }
 
     def _read(self, name: str) -> NDArray[np.float64] | None:
         path = self._folder / f"{name}.safetensors"
@@ -496,8 +540,12 @@ class VideoFeatures:
             return None
         found = store.read_safetensors(path).get("features")
         if found is None or found.ndim != 2 or not np.issubdtype(found.dtype, np.floating):
-            raise InputError("a table of video features is malformed", where=str(path), expected="one tensor features [clips, values]",
-                got="no such tensor" if found is None else f"{found.dtype} {found.shape}")  # fmt: skip
+            raise InputError(
+                "a table of video features is malformed",
+                where=str(path),
+                expected="one tensor features [clips, values]",
+                got="no such tensor" if found is None else f"{found.dtype} {found.shape}",
+            )
         self._width = int(found.shape[1])
         return found.astype(np.float64)
 
@@ -509,13 +557,12 @@ def _compared(made: NDArray[np.float64], reference: NDArray[np.float64]) -> dict
     return {"values": {k: round(v, 6) for k, v in values.items()}, "n": len(made), "n_reference": len(reference)}
 
 
-# embeddings -----------------------------------------------------------------------------------------------------------
+# embeddings ---------------------------------------------------------------------------------------
 #
 # Scores of images through one embedding each: FD-DINOv2 and consistency with DINOv2, CMMD, CLIP-F and CLIP-V with CLIP.
 #
-# Distances of sets compare the counted views of a trajectory with the recorded frames of the same camera, as FID does. CLIP-F and
-# consistency
-# follow the video, so all views count.
+# Distances of sets compare the counted views of a trajectory with the recorded frames of the same camera, as FID does.
+# CLIP-F and consistency follow the video, so all views count.
 
 
 Rows = NDArray[np.float32]
@@ -525,7 +572,8 @@ class SetDistance:
     """A distance of counted views from the recorded frames, with its floors.
 
     Args:
-        scene: whose recorded frames are the reference. files: makes embeddings. name: of the metric. distance: of two sets.
+        scene: whose recorded frames are the reference. files: makes embeddings. name: of the metric. distance: of two
+            sets.
     """
 
     def __init__(self, scene: Scene, files: EmbeddingFiles, name: str, distance: Callable[[Rows, Rows], float]) -> None:
@@ -600,7 +648,8 @@ class ClipScores:
     def of(
         self, sets: TrajectorySets, counted: Sequence[int], views: Sequence[View]
     ) -> dict[str, dict[str, Any] | str]:
-        """By method ``values`` and sizes; ``sets`` holds all views, of which those ``counted`` enter the distance and CLIP-V."""
+        """By method ``values`` and sizes; ``sets`` holds all views, of which those ``counted`` enter the distance and
+        CLIP-V."""
         reference, found = self._sets.recorded(sets), {}
         frames = self._scene.frames_of(sets.camera) if sets.camera in self._scene.cameras else ()
         times = np.array([frame.view.time_s for frame in frames])
@@ -633,8 +682,8 @@ def _units(rows: Rows) -> NDArray[np.float64]:
 
 
 def subject_consistency(rows: NDArray[np.floating]) -> float | None:
-    """Mean over frames from the second on of (max(0, cosine with the one before) + max(0, cosine with the first)) / 2, as VBench's subject
-    consistency does it; None with fewer than two frames ``[n, d]``."""
+    """Mean over frames from the second on of (max(0, cosine with the one before) + max(0, cosine with the first)) / 2,
+    as VBench's subject consistency does it; None with fewer than two frames ``[n, d]``."""
     if len(rows) < 2:
         return None
     units = _units(np.asarray(rows, np.float32))
@@ -655,10 +704,13 @@ def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> DinoScores | None:
     sha256 = store.sha256_file(path)
     files = EmbeddingFiles(network, dinov2.prepared, network.width, f"DINOv2 {sha256}", out / FEATURES_FOLDER, device)
     made = {
-        "network": f"DINOv2 {network.name}, class token, {network.width} values", "weights_sha256": sha256,
-        "resize": "dgm-eval: Pillow's bicubic on 8 bits to 224x224", "positions": "bicubic by the factor (16 + 0.1) / 37",
-        "reference": "recorded frames of the same camera", "covariance": "n - 1",
-    }  # fmt: skip
+        "network": f"DINOv2 {network.name}, class token, {network.width} values",
+        "weights_sha256": sha256,
+        "resize": "dgm-eval: Pillow's bicubic on 8 bits to 224x224",
+        "positions": "bicubic by the factor (16 + 0.1) / 37",
+        "reference": "recorded frames of the same camera",
+        "covariance": "n - 1",
+    }
     return DinoScores(scene, files, made)
 
 
@@ -679,8 +731,10 @@ def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> ClipScores | None:
 
     files = EmbeddingFiles(network, prepare, network.out, f"CLIP {sha256}", out / FEATURES_FOLDER, device)
     made = {
-        "network": f"CLIP {network.name}, projected, {network.out} values", "weights_sha256": sha256,
-        "resize": "bicubic without antialiasing, squashed", "kernel": "Gaussian, sigma 10, biased, times 1000",
+        "network": f"CLIP {network.name}, projected, {network.out} values",
+        "weights_sha256": sha256,
+        "resize": "bicubic without antialiasing, squashed",
+        "kernel": "Gaussian, sigma 10, biased, times 1000",
         "reference": "recorded frames of the same camera",
-    }  # fmt: skip
+    }
     return ClipScores(scene, files, made)

@@ -18,22 +18,40 @@ UNEQUAL: Final = "unequal n"
 NO_DETECTIONS: Final = "no detections"
 NO_FEATURES: Final = "no features"
 WEIGHT_FLAGS: Final = {
-    "lpips": "--lpips-weights", "lpips_vgg": "--lpips-vgg-weights", "lpips_squeeze": "--lpips-squeeze-weights",
-    "fid": "--fid-weights", "kid": "--fid-weights", "fvd": "--fvd-weights",
-    "fd_dinov2": "--dino-weights", "subject_consistency": "--dino-weights",
-    "cmmd": "--clip-weights", "clip_f": "--clip-weights", "clip_v": "--clip-weights",
-    "video_frechet": "--video-features", "video_mmd": "--video-features", "nta_iou": "--detections", "ntl_iou": "--lanes",
-}  # fmt: skip
+    "lpips": "--lpips-weights",
+    "lpips_vgg": "--lpips-vgg-weights",
+    "lpips_squeeze": "--lpips-squeeze-weights",
+    "fid": "--fid-weights",
+    "kid": "--fid-weights",
+    "fvd": "--fvd-weights",
+    "fd_dinov2": "--dino-weights",
+    "subject_consistency": "--dino-weights",
+    "cmmd": "--clip-weights",
+    "clip_f": "--clip-weights",
+    "clip_v": "--clip-weights",
+    "video_frechet": "--video-features",
+    "video_mmd": "--video-features",
+    "nta_iou": "--detections",
+    "ntl_iou": "--lanes",
+}
 """Metric -> the flag of ``mudg score`` that names the weights or files it needs."""
 SET_METRICS: Final = {
-    "fid": "distributions", "kid": "distributions", "fvd": "videos", "fd_dinov2": "dinov2", "cmmd": "clip",
-    "video_frechet": "video_features", "video_mmd": "video_features",
-}  # fmt: skip
+    "fid": "distributions",
+    "kid": "distributions",
+    "fvd": "videos",
+    "fd_dinov2": "dinov2",
+    "cmmd": "clip",
+    "video_frechet": "video_features",
+    "video_mmd": "video_features",
+}
 """Metric of sets of images or clips -> the entry of metrics.json that says how it was made."""
 SET_SIZES: Final = {
-    "distribution": ("fid", "kid"), "video": ("fvd",), "dinov2": ("fd_dinov2",), "clip": ("cmmd",),
+    "distribution": ("fid", "kid"),
+    "video": ("fvd",),
+    "dinov2": ("fd_dinov2",),
+    "clip": ("cmmd",),
     "video_features": ("video_frechet", "video_mmd"),
-}  # fmt: skip
+}
 """Entry of a result with the sizes of its sets -> their metrics."""
 FLOOR: Final = "Floor: the truth itself"
 TITLES: Final[dict[str, str]] = {
@@ -45,10 +63,24 @@ TERMINAL_METRICS: Final = ("psnr", "ssim", "perceptual", "abs_rel", "rmse_m", "d
 WITHOUT_TRUTH: Final = ("lidar_abs_rel", "lidar_rmse_m", "lidar_psnr", "agreement", "lane_correlation")
 """Shown in a terminal where no true image exists."""
 _DIGITS: Final = {
-    "psnr": 2, "psnr_movers": 2, "flicker": 2, "rmse_m": 2, "fid": 1, "kid": 4, "fvd": 1, "lidar_rmse_m": 2, "lidar_psnr": 2,
+    "psnr": 2,
+    "psnr_movers": 2,
+    "flicker": 2,
+    "rmse_m": 2,
+    "fid": 1,
+    "kid": 4,
+    "fvd": 1,
+    "lidar_rmse_m": 2,
+    "lidar_psnr": 2,
     "lane_psnr": 2,
-    "warp_error": 4, "temporal_flickering": 4, "ntl_iou": 2, "fd_dinov2": 1, "clip_f": 4, "clip_v": 4, "subject_consistency": 4,
-}  # fmt: skip
+    "warp_error": 4,
+    "temporal_flickering": 4,
+    "ntl_iou": 2,
+    "fd_dinov2": 1,
+    "clip_f": 4,
+    "clip_v": 4,
+    "subject_consistency": 4,
+}
 
 
 def title_of(method: str) -> str:
@@ -57,38 +89,53 @@ def title_of(method: str) -> str:
 
 
 def number_text(metric: str, value: float | str | None) -> str:
-    """A metric's value with its usual digits, or the reason why there is none; what needs weights names the flag that takes them."""
+    """A metric's value with its usual digits, or the reason why there is none; what needs weights names the flag that
+    takes them."""
     if isinstance(value, str):
         return f"{value} ({WEIGHT_FLAGS[metric]})" if value == NOT_COMPUTED and metric in WEIGHT_FLAGS else value
     return "" if value is None else f"{value:.{_DIGITS.get(metric, 3)}f}"
 
 
 def document(
-    scene: Scene, exact: bool, trajectories: Sequence[Mapping[str, Any]], methods: Sequence[str],
-    results: Sequence[Mapping[str, Any]], rows: Mapping[str, Mapping[str, Any]], made: Mapping[str, Any],
-) -> dict[str, Any]:  # fmt: skip
+    scene: Scene,
+    exact: bool,
+    trajectories: Sequence[Mapping[str, Any]],
+    methods: Sequence[str],
+    results: Sequence[Mapping[str, Any]],
+    rows: Mapping[str, Mapping[str, Any]],
+    made: Mapping[str, Any],
+) -> dict[str, Any]:
     """Everything ``metrics.json`` holds.
 
     Args:
         scene: what was scored. exact: whether truth exists at any view.
         trajectories: as JSON values. methods: in the order of the tables.
         results: one entry per method and trajectory. rows: title, unit, better and needs of each metric.
-        made: how the numbers were made: ``depth_limit_m``, beyond which depths do not count; ``anchors``; and by the entries of
-            ``SET_METRICS``, ``detections`` and ``lpips`` what is known of their metrics; entries that are missing were not computed.
+        made: how the numbers were made: ``depth_limit_m``, beyond which depths do not count; ``anchors``; and by the
+            entries of ``SET_METRICS``, ``detections`` and ``lpips`` what is known of their metrics; entries that are
+            missing were not computed.
     """
     depth_limit_m, distributions, videos = made["depth_limit_m"], made.get("distributions"), made.get("videos")
     held_out = len(scene.frames_in("test"))
     rules = [
-        "All methods are scored at one size, that of the scene's camera unless another was requested; "
-        "colour is resized bilinearly, depth and classes take the nearest pixel.",
-        "On the recorded path only held-out frames count."
-        if held_out
-        else "No frame was held out: on the recorded path the frames that were learned from are scored.",
-        "Views off the recorded path were never seen by any method."
-        if exact
-        else "A recorded log has no ground truth off its path: shifted views are shown, not scored.",
-        f"Depth counts where the truth is known and at most {depth_limit_m:g} m; "
-        f"where a method gives none, it counts as {depth_limit_m:g} m.",
+        (
+            "All methods are scored at one size, that of the scene's camera unless another was requested; "
+            "colour is resized bilinearly, depth and classes take the nearest pixel."
+        ),
+        (
+            "On the recorded path only held-out frames count."
+            if held_out
+            else "No frame was held out: on the recorded path the frames that were learned from are scored."
+        ),
+        (
+            "Views off the recorded path were never seen by any method."
+            if exact
+            else "A recorded log has no ground truth off its path: shifted views are shown, not scored."
+        ),
+        (
+            f"Depth counts where the truth is known and at most {depth_limit_m:g} m; "
+            f"where a method gives none, it counts as {depth_limit_m:g} m."
+        ),
         "Class scores are pooled over all views of a trajectory; mIoU is the mean over the classes in its truth.",
         *([_rule_of_sets(distributions)] if distributions else []),
         *([_rule_of_videos(videos)] if videos else []),
@@ -97,9 +144,14 @@ def document(
     return {
         "schema": 1,
         "scene": {
-            "id": scene.id, "dataset": scene.source.dataset, "licence": scene.source.licence,
-            "notes": list(scene.source.notes), "frames": len(scene.frames), "held_out": held_out,
-            "cameras": {c.name: [c.width, c.height] for c in scene.cameras.values()}, "tracks": len(scene.tracks),
+            "id": scene.id,
+            "dataset": scene.source.dataset,
+            "licence": scene.source.licence,
+            "notes": list(scene.source.notes),
+            "frames": len(scene.frames),
+            "held_out": held_out,
+            "cameras": {c.name: [c.width, c.height] for c in scene.cameras.values()},
+            "tracks": len(scene.tracks),
         },
         "truth": "exact" if exact else "recorded",
         "rules": rules,
@@ -109,24 +161,24 @@ def document(
         "results": list(results),
         "by_distance": by_distance(trajectories, methods, results, list(rows)),
         **{name: value for name, value in made.items() if name != "depth_limit_m" and value},
-    }  # fmt: skip
+    }
 
 
 def _rule_of_sets(made: Mapping[str, Any]) -> str:
     other = f"weights that are not the published file ({made['weights_sha256'][:12]})"
     weights = "the published weights" if made["published_weights"] else other
     return (
-        f"FID and KID compare the views of a trajectory with the {made['reference']}, with {weights} and the resize rule {made['resize']}. "
-        "They depend on the number of images: compare methods within a column only, and read them beside the floor, "
-        "which the truth itself scores."
+        f"FID and KID compare the views of a trajectory with the {made['reference']}, with {weights} and the resize"
+        f" rule {made['resize']}. They depend on the number of images: compare methods within a column only, and read"
+        " them beside the floor, which the truth itself scores."
     )
 
 
 def _rule_of_videos(made: Mapping[str, Any]) -> str:
     return (
-        f"FVD compares clips of {made['clip_frames']} views, one at every {made['hop_frames']}th, with those of the {made['reference']} "
-        f"(resize rule {made['resize']}, epsilon {made['norm_epsilon']:g}); all views count. With so few clips it is mostly bias: read "
-        "it beside the floor."
+        f"FVD compares clips of {made['clip_frames']} views, one at every {made['hop_frames']}th, with those of the"
+        f" {made['reference']} (resize rule {made['resize']}, epsilon {made['norm_epsilon']:g}); all views count. With"
+        " so few clips it is mostly bias: read it beside the floor."
     )
 
 
@@ -134,7 +186,9 @@ def _further_rules(made: Mapping[str, Any]) -> list[str]:
     """One sentence for each other metric whose definition has variants."""
     rules = []
     if made.get("lpips"):
-        rules.append(f"LPIPS gets its colours {'in -1..1' if made['lpips']['input'] == 'correct' else 'unscaled, in 0..1'}.")
+        rules.append(
+            f"LPIPS gets its colours {'in -1..1' if made['lpips']['input'] == 'correct' else 'unscaled, in 0..1'}."
+        )
     if made.get("dinov2"):
         rules.append(f"FD-DINOv2 is made with {made['dinov2']['network']}; read it beside the floor.")
     if made.get("clip"):
@@ -144,7 +198,8 @@ def _further_rules(made: Mapping[str, Any]) -> list[str]:
     if "nta_iou" in detections:
         of = detections["nta_iou"]
         rules.append(
-            f"NTA-IoU: true boxes {of['boxes']}; classes: {of['classes']}; points: {of['points']}. What hides a box is not asked."
+            f"NTA-IoU: true boxes {of['boxes']}; classes: {of['classes']}; points: {of['points']}. What hides a box is"
+            " not asked."
         )
     if "ntl_iou" in detections:
         rules.append(f"NTL-IoU: {detections['ntl_iou']['lines']}. An image without any lane scores 47 to 50.")
@@ -172,9 +227,14 @@ def by_distance(
             rows = [r for r in results if r["method"] == method and r["trajectory"] in here]
             values = {name: _mean([r["values"].get(name) for r in rows]) for name in names}
             table.append(
-                {"method": method, "distance_m": distance, "sides": sides, "trajectories": [r["trajectory"] for r in rows],
-                 "values": {**values, **uneven}}
-            )  # fmt: skip
+                {
+                    "method": method,
+                    "distance_m": distance,
+                    "sides": sides,
+                    "trajectories": [r["trajectory"] for r in rows],
+                    "values": {**values, **uneven},
+                }
+            )
     return table
 
 
@@ -214,7 +274,9 @@ def floors_by_distance(document: Mapping[str, Any]) -> dict[float, dict[str, flo
             here = [floor for floor in floors if floor["trajectory"] in row["trajectories"]]
             if here:
                 equal = len({floor["n"] for floor in here}) == 1
-                found.setdefault(float(row["distance_m"]), {})[name] = _mean([f[name] for f in here]) if equal else UNEQUAL
+                found.setdefault(float(row["distance_m"]), {})[name] = (
+                    _mean([f[name] for f in here]) if equal else UNEQUAL
+                )
     return found
 
 
@@ -262,17 +324,25 @@ def _has_numbers(values: Sequence[Mapping[str, Any]], metrics: Sequence[Mapping[
 def markdown(document: Mapping[str, Any]) -> str:
     """All trajectories and metrics as Markdown, with the rules."""
     lines = [f"# Scores of {document['scene']['id']}", "", *(f"* {rule}" for rule in document["rules"])]
-    absent = [m for m in document["metrics"] if all(r["values"].get(m["name"]) == NOT_COMPUTED for r in document["results"])]
+    absent = [
+        m for m in document["metrics"] if all(r["values"].get(m["name"]) == NOT_COMPUTED for r in document["results"])
+    ]
     names = [m["name"] for m in document["metrics"] if m not in absent]
     if absent and document["results"]:
         flags = dict.fromkeys(WEIGHT_FLAGS.get(m["name"], "") for m in absent)
         of_flag = {f: ", ".join(m["title"] for m in absent if WEIGHT_FLAGS.get(m["name"], "") == f) for f in flags}
-        lines.append(f"* Not computed: {'; '.join(f'{titles} ({flag})' if flag else titles for flag, titles in of_flag.items())}.")
+        lines.append(
+            "* Not computed:"
+            f" {'; '.join(f'{titles} ({flag})' if flag else titles for flag, titles in of_flag.items())}."
+        )
     for trajectory in document["trajectories"]:
         results = [r for r in document["results"] if r["trajectory"] == trajectory["name"]]
         unknown = [n for n in names if results and all(r["values"].get(n) == NO_TRUTH for r in results)]
         shown = [n for n in names if n not in unknown]
-        rows = [[title_of(r["method"]), str(r["views"]), *(number_text(n, r["values"].get(n)) for n in shown)] for r in results]
+        rows = [
+            [title_of(r["method"]), str(r["views"]), *(number_text(n, r["values"].get(n)) for n in shown)]
+            for r in results
+        ]
         lines += ["", f"## {trajectory['name']}", ""]
         if any(isinstance(r["values"].get(n), float) for r in results for n in shown):
             lines += html.markdown_table(["method", "views", *shown], rows)
@@ -290,17 +360,27 @@ def _lines_of_sets(document: Mapping[str, Any], trajectory: str) -> list[str]:
     for row in rows[:1]:
         of = row["distribution"]
         lines += ["", f"* FID and KID: {of['n']} views of every method against {of['n_reference']} recorded frames."]
-    errors = [f"{title_of(r['method'])} {r['distribution']['kid_standard_error']:.4f}" for r in rows
-              if r["distribution"]["kid_standard_error"] is not None]  # fmt: skip
+    errors = [
+        f"{title_of(r['method'])} {r['distribution']['kid_standard_error']:.4f}"
+        for r in rows
+        if r["distribution"]["kid_standard_error"] is not None
+    ]
     lines += [f"* Standard error of KID: {', '.join(errors)}."] if errors else []
     for row in [r for r in document["results"] if r["trajectory"] == trajectory and "video" in r][:1]:
         of = row["video"]
-        lines += [*([] if lines else [""]), f"* FVD: {of['n']} clips of every method against {of['n_reference']} recorded clips."]
+        lines += [
+            *([] if lines else [""]),
+            f"* FVD: {of['n']} clips of every method against {of['n_reference']} recorded clips.",
+        ]
     titles = {m["name"]: m["title"] for m in document["metrics"]}
-    floors = [floor for entry in dict.fromkeys(SET_METRICS.values()) for floor in document.get(entry, {}).get("floors", [])]
+    floors = [
+        floor for entry in dict.fromkeys(SET_METRICS.values()) for floor in document.get(entry, {}).get("floors", [])
+    ]
     for floor in floors:
         if floor["trajectory"] == trajectory:
-            values = ", ".join(f"{titles[name]} {number_text(name, floor[name])}" for name in SET_METRICS if name in floor)
+            values = ", ".join(
+                f"{titles[name]} {number_text(name, floor[name])}" for name in SET_METRICS if name in floor
+            )
             lines.append(f"* {FLOOR}: {values} ({floor['how']}, {floor['n']} against {floor['n_reference']}).")
     return lines
 
@@ -308,10 +388,16 @@ def _lines_of_sets(document: Mapping[str, Any], trajectory: str) -> list[str]:
 def _lines_of_anchors(document: Mapping[str, Any], trajectory: str) -> list[str]:
     """What true and recorded images and the baseline score on a trajectory."""
     titles = {m["name"]: m["title"] for m in document["metrics"]}
-    places = {"truth": "true images", "recorded": "recorded images at their own views", "nearest_fill": title_of("nearest_fill").lower()}
+    places = {
+        "truth": "true images",
+        "recorded": "recorded images at their own views",
+        "nearest_fill": title_of("nearest_fill").lower(),
+    }
     lines = []
     for anchor in document.get("anchors", []):
-        found = [f"{title} {number_text(anchor['metric'], anchor[key])}" for key, title in places.items() if key in anchor]
+        found = [
+            f"{title} {number_text(anchor['metric'], anchor[key])}" for key, title in places.items() if key in anchor
+        ]
         if anchor["trajectory"] == trajectory and found:
             lines.append(f"* {titles[anchor['metric']]}: {', '.join(found)}.")
     return ["", *lines] if lines else []

@@ -1,8 +1,9 @@
-"""What views are held against: the generated city drawn again, held-out recorded frames, or truth drawn by an earlier run.
+"""What views are held against: the generated city drawn again, held-out recorded frames, or truth drawn by an earlier
+run.
 
 A folder of truth (``write_truth``) holds one observation folder per trajectory and, beside the observations,
-``moving.safetensors``: ``moving`` u8[T, H, W], 1 where a dynamic object is seen, ``instance`` i32[T, H, W], and ``marking`` u8[T, H, W], 1
-where there is paint on the road.
+``moving.safetensors``: ``moving`` u8[T, H, W], 1 where a dynamic object is seen, ``instance`` i32[T, H, W], and
+``marking`` u8[T, H, W], 1 where there is paint on the road.
 """
 
 from __future__ import annotations
@@ -43,8 +44,9 @@ SAME_PLACE_M: Final = 1e-3
 
 @dataclass(frozen=True)
 class ViewTruth:
-    """The truth at a view, with what is known only of generated cities: ``moving`` bool[1, H, W], true pixels of dynamic objects;
-    ``instance`` i32[H, W], number of the object that is seen; ``marking`` bool[H, W], paint on the road."""
+    """The truth at a view, with what is known only of generated cities: ``moving`` bool[1, H, W], true pixels of
+    dynamic objects; ``instance`` i32[H, W], number of the object that is seen; ``marking`` bool[H, W], paint on the
+    road."""
 
     seen: Observation
     moving: Tensor | None = None
@@ -77,9 +79,12 @@ def truth_of(scene: Scene) -> Truth:
         for frame in scene.frames:
             there, stated = world.ego_path().pose_at(frame.view.time_s), scene.ego.pose_at(frame.view.time_s)
             if there is None or stated is None or not np.allclose(there, stated, atol=1e-3):
-                raise InputError("the scene is not the generated city that its recipe names, so its truth would be another street's",
-                    where=f"{scene.root}: source.recipe, frame {frame.id}", expected="the path of the vehicle that the recipe makes",
-                    remedy="generate the city again; in scenes of other origin, leave the recipe out")  # fmt: skip
+                raise InputError(
+                    "the scene is not the generated city that its recipe names, so its truth would be another street's",
+                    where=f"{scene.root}: source.recipe, frame {frame.id}",
+                    expected="the path of the vehicle that the recipe makes",
+                    remedy="generate the city again; in scenes of other origin, leave the recipe out",
+                )
         moving = np.array(city_logs.moving_instances(world), np.int32)
         return Truth(True, lambda view, _frame, _name: _city_view(world, moving, view))
     return Truth(False, lambda view, frame, _name: None if frame is None else ViewTruth(_recorded(scene, frame, view)))
@@ -107,7 +112,9 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path) -> N
                 for view in path.views:
                     true = truth.at_view(view, None, path.name)
                     if true is None or true.moving is None or true.instance is None or true.marking is None:
-                        raise InputError("the city has no ground truth at this view", where=f"{path.name}, {view.time_s:g} s")
+                        raise InputError(
+                            "the city has no ground truth at this view", where=f"{path.name}, {view.time_s:g} s"
+                        )
                     own = (true.moving[0].numpy().astype(np.uint8), true.instance, true.marking.astype(np.uint8))
                     for found, value in zip(maps.values(), own, strict=True):
                         found.append(value)
@@ -136,10 +143,11 @@ def stored_truth(folder: Path) -> Truth:
         same_size = (there.camera.width, there.camera.height) == (view.camera.width, view.camera.height)
         if abs(there.time_s - view.time_s) > SAME_TIME_S or distance_m > SAME_PLACE_M or not same_size:
             raise InputError(
-                "the stored ground truth shows another view", where=f"{folder / name}, view {index}",
+                "the stored ground truth shows another view",
+                where=f"{folder / name}, view {index}",
                 expected=f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}",
                 got=f"{there.time_s:.4f} s, {there.camera.width}x{there.camera.height}, {distance_m:.3f} m apart",
-            )  # fmt: skip
+            )
         own = maps[name]
         moving = torch.from_numpy(own["moving"][index].astype(bool))[None]
         return ViewTruth(stored[index], moving, own["instance"][index], own["marking"][index].astype(bool))
@@ -166,8 +174,9 @@ def _recorded(scene: Scene, frame: Frame, view: View) -> Observation:
         semantics=None if semantics is None else torch.from_numpy(semantics.astype(np.int64)),
         confidence=torch.ones(1, height, width),
         mask=torch.ones(1, height, width, dtype=torch.bool) if ego is None else torch.from_numpy(ego == 0)[None],
-        kind="recorded", source="camera",
-    )  # fmt: skip
+        kind="recorded",
+        source="camera",
+    )
 
 
 def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
@@ -176,12 +185,14 @@ def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
     if not sweeps:
         return None
     clouds = [(sweep, read_points(scene, sweep).xyz) for sweep in sweeps]
-    world = np.concatenate([geometry.transform_points(sweep.world_from_lidar, xyz) for sweep, xyz in clouds]).astype(np.float32)
+    world = np.concatenate([geometry.transform_points(sweep.world_from_lidar, xyz) for sweep, xyz in clouds]).astype(
+        np.float32
+    )
     gap_deg = max(largest_beam_gap(xyz) for _, xyz in clouds)
     return torch.from_numpy(visible_depth(view, world, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=MAX_LIDAR_M))[None]
 
 
-# the LiDAR points of a log, for truth at views that no camera recorded ------------------------------------------------
+# the LiDAR points of a log, for truth at views that no camera recorded ----------------------------
 
 
 MERGED_SWEEPS: Final = 6
@@ -218,7 +229,8 @@ class LogPoints:
     def colors(
         self, frame: Frame, points: OwnedPoints, world: NDArray[np.float32]
     ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
-        """Colours u8[N + 1, 3] that points have in a recorded image, and where it shows them (``points_seen.carried``)."""
+        """Colours u8[N + 1, 3] that points have in a recorded image, and where it shows them
+        (``points_seen.carried``)."""
         return lidar.carried(frame.view, read_image(self.scene, frame), world, points.gap_deg)
 
     def truth_at(self, view: View, frame: Frame | None) -> PointTruth | None:
@@ -277,6 +289,4 @@ def shown_frame(scene: Scene, frame: Frame, rgb: NDArray[np.uint8]) -> ShownFram
     if "depth" not in frame.labels:
         return None
     depth = read_label(scene, frame, "depth")
-    return ShownFrame(
-        frame.view, np.where(np.isfinite(depth), depth, np.inf).astype(np.float32), lidar.blurred(rgb)
-    )
+    return ShownFrame(frame.view, np.where(np.isfinite(depth), depth, np.inf).astype(np.float32), lidar.blurred(rgb))

@@ -1,4 +1,5 @@
-"""What compares whole sets of views after they have been scored one by one: distances of images and clips, detectors, and anchors."""
+"""What compares whole sets of views after they have been scored one by one: distances of images and clips, detectors,
+and anchors."""
 
 from __future__ import annotations
 
@@ -92,9 +93,12 @@ class SetScores:
     def records(self) -> dict[str, Any]:
         """How the numbers were made, by entry of metrics.json."""
         given = {
-            "distributions": self.distributions, "videos": self.videos, "dinov2": self.dinov2, "clip": self.clip,
+            "distributions": self.distributions,
+            "videos": self.videos,
+            "dinov2": self.dinov2,
+            "clip": self.clip,
             "video_features": self.video_features,
-        }  # fmt: skip
+        }
         found = {name: source.record() for name, source in given.items() if source is not None}
         return {**found, **({"detections": made} if (made := self.detections.record()) else {})}
 
@@ -106,16 +110,20 @@ def set_scores_of(config: ScoreConfig, scene: Scene, out: Path) -> SetScores:
         InputError: a file is missing, damaged, or holds another network.
     """
     return SetScores(
-        distributions_of(config, scene, out), videos_of(config, scene, out), dino_of(config, scene, out), clip_of(config, scene, out),
-        VideoFeatures(Path(config.video_features)) if config.video_features else None, detections_of(config, scene),
-    )  # fmt: skip
+        distributions_of(config, scene, out),
+        videos_of(config, scene, out),
+        dino_of(config, scene, out),
+        clip_of(config, scene, out),
+        VideoFeatures(Path(config.video_features)) if config.video_features else None,
+        detections_of(config, scene),
+    )
 
 
 def anchors_of(
     results: Sequence[dict[str, Any]], trajectories: Sequence[ScoredTrajectory], reference: Reference
 ) -> list[dict[str, Any]]:
-    """What stands beside a metric's values on a trajectory: the same of the true images (``truth``), of the recorded images at their own
-    views (``recorded``), and of ``nearest_fill``. Taken out of the results."""
+    """What stands beside a metric's values on a trajectory: the same of the true images (``truth``), of the recorded
+    images at their own views (``recorded``), and of ``nearest_fill``. Taken out of the results."""
     found = []
     for trajectory in trajectories:
         rows = [row for row in results if row["trajectory"] == trajectory.name]

@@ -28,18 +28,33 @@ class Adapt(Output):
     section = "single steps, in the order of use"
     examples = (
         "mudg adapt scenes/kitti --fused runs/fused --fitted runs/plain --out runs/adapted",
-        "mudg synthesize scenes/kitti --fused runs/fused --fitted runs/plain --model runs/adapted/model --out runs/virtual",
+        (
+            "mudg synthesize scenes/kitti --fused runs/fused --fitted runs/plain --model runs/adapted/model --out"
+            " runs/virtual"
+        ),
     )
     smaller = "one process (--processes 1), or smaller images (mudg ingest --resolution)"
     result = "model"
     from_run = ("fused", "fitted")
     version, files = 2, ("model/*", "model.part/", "adapt.json", "before.png", "after.png", "work/")
     idle = ("processes",)
-    short = ("model", "cameras", "shifts_m", "steps", "lr", "fit_iterations", "precision", "device", "processes", "seed")
+    short = (
+        "model",
+        "cameras",
+        "shifts_m",
+        "steps",
+        "lr",
+        "fit_iterations",
+        "precision",
+        "device",
+        "processes",
+        "seed",
+    )
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     fused: Annotated[Path | None, Flag("FOLDER", "second", "fused")] = None
-    """Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at SCENE)."""
+    """Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at
+    SCENE)."""
     fitted: Annotated[Path | None, Flag("FOLDER", "", "fitted")] = None
     """Gaussian scene written by fit, without virtual views (not given: that of the run at SCENE)."""
     settings: AdaptConfig
@@ -63,7 +78,10 @@ class Adapt(Output):
     def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.diffusion.adapt import PlannedAdaptation
 
-        return partial(adapt_model, PlannedAdaptation.of(self.settings, self.scene, cast("Path", self.fused), cast("Path", self.fitted)))
+        return partial(
+            adapt_model,
+            PlannedAdaptation.of(self.settings, self.scene, cast("Path", self.fused), cast("Path", self.fitted)),
+        )
 
     def resulting(self, folder: Path) -> Path:
         return folder / "model"

@@ -30,7 +30,8 @@ class AssetExport(Result):
     out: Annotated[Path, Flag("FILE.safetensors")]
     """File to write."""
     scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None
-    """Scene directory that a Gaussian scene was fitted to; it tells from which sides the object was seen. A run has its own."""
+    """Scene directory that a Gaussian scene was fitted to; it tells from which sides the object was seen. A run has its
+    own."""
     overwrite: bool = False
     """Replace the output if it exists."""
 
@@ -60,7 +61,9 @@ class AssetExport(Result):
 def refuse_other_name(out: Path) -> None:
     """UsageError for a file with another suffix than assets have."""
     if out.suffix != ".safetensors":
-        raise UsageError("an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out))
+        raise UsageError(
+            "an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out)
+        )
 
 
 class AssetImport(Result):

@@ -30,8 +30,14 @@ class BatchRun(Step):
     section = "many drives"
     examples = (
         "mudg batch run --list logs.txt --out runs --stages ingest annotate fuse --jobs 2",
-        "mudg batch run --list logs.txt --out /shared/runs --engine slurm --jobs 500 --slurm-options time=4:00:00 --config recipe.yaml",
-        "mudg batch run --list s3://data/logs.txt --out s3://data/runs --engine ray --ray-address auto --cpus 4 --gpus 1",
+        (
+            "mudg batch run --list logs.txt --out /shared/runs --engine slurm --jobs 500 --slurm-options time=4:00:00"
+            " --config recipe.yaml"
+        ),
+        (
+            "mudg batch run --list s3://data/logs.txt --out s3://data/runs --engine ray --ray-address auto --cpus 4"
+            " --gpus 1"
+        ),
     )
     smaller = "fewer --jobs, or smaller images (--set ingest.resolution=960)"
     short = ("stages", "command", "engine", "jobs", "cpus", "gpus")
@@ -50,8 +56,8 @@ class BatchRun(Step):
     dry_run: bool = False
     """Only say what there is to do."""
     shard: Annotated[str, Flag("I/N")] = ""
-    """Only the I-th of N parts of the list, from 0. env, env/N: the I-th as the scheduler numbers this task (SLURM_ARRAY_TASK_ID,
-    JOB_COMPLETION_INDEX, SKYPILOT_NODE_RANK or AWS_BATCH_JOB_ARRAY_INDEX)."""
+    """Only the I-th of N parts of the list, from 0. env, env/N: the I-th as the scheduler numbers this task
+    (SLURM_ARRAY_TASK_ID, JOB_COMPLETION_INDEX, SKYPILOT_NODE_RANK or AWS_BATCH_JOB_ARRAY_INDEX)."""
     wait: bool = False
     """With --engine slurm, wait for the end of the job."""
     take_over: bool = False
@@ -68,24 +74,35 @@ class BatchRun(Step):
 
         settings = batching.settings_of(self.preset, self.config, self.set)
         return batching.run(
-            self.list, self.out, self.settings, settings, stage_lines(), shard_text=self.shard, wait=self.wait, scratch=self.scratch,
-            take_over=self.take_over, dry=self.dry_run,
-        )  # fmt: skip
+            self.list,
+            self.out,
+            self.settings,
+            settings,
+            stage_lines(),
+            shard_text=self.shard,
+            wait=self.wait,
+            scratch=self.scratch,
+            take_over=self.take_over,
+            dry=self.dry_run,
+        )
 
 
 def stage_lines() -> dict[str, tuple[str, ...]]:
-    """Command lines of the steps that a batch can do for each of its scenes, with names of other steps for their results."""
+    """Command lines of the steps that a batch can do for each of its scenes, with names of other steps for their
+    results."""
     from mudg.steps.command import words_of
 
     scene = {"scene": "{scene}", "fused": "{fuse}"}
     steps = (
-        Run.build({"source": "{source}", "out": "{out}"}), Ingest.build({"log": "{source}", "out": "{out}"}),
-        Annotate.build({"scene": "{scene}", "out": "{out}"}), Fuse.build({"scene": "{scene}", "out": "{out}"}),
+        Run.build({"source": "{source}", "out": "{out}"}),
+        Ingest.build({"log": "{source}", "out": "{out}"}),
+        Annotate.build({"scene": "{scene}", "out": "{out}"}),
+        Fuse.build({"scene": "{scene}", "out": "{out}"}),
         Fit.build({**scene, "out": "{out}"}, {"method": "street_gaussians"}),
         Synthesize.build({**scene, "fitted": "{fit}", "out": "{out}"}),
         RenderViews.build({"scene": "{scene}", "model": "{fit}", "out": "{out}"}),
         Score.build({**scene, "views": {"fit": "{render}"}, "out": "{out}"}),
-    )  # fmt: skip
+    )
     return {step.verb(): tuple(words_of(step)) for step in steps}
 
 

@@ -34,23 +34,32 @@ _POLL_S = 10.0
 
 
 def run(
-    listed: str, out: str, batch: BatchConfig, settings: RunConfig, lines: Mapping[str, Sequence[str]], *, shard_text: str = "",
-    wait: bool = False, scratch: Path | None = None, take_over: bool = False, dry: bool = False,
-) -> dict[str, Any]:  # fmt: skip
+    listed: str,
+    out: str,
+    batch: BatchConfig,
+    settings: RunConfig,
+    lines: Mapping[str, Sequence[str]],
+    *,
+    shard_text: str = "",
+    wait: bool = False,
+    scratch: Path | None = None,
+    take_over: bool = False,
+    dry: bool = False,
+) -> dict[str, Any]:
     """Run the steps of a batch, or submit the tasks that do.
 
     Args:
-        listed: path or address of the list. out: path or address of the results. batch: where scenes run. settings: of the steps.
-            lines: words of every step (``plan_of``). shard_text: ``i/n``, ``env`` or ``env/n``, or empty. wait: for the end of an array
-            job. scratch: folder for unfinished results. take_over: drive the batch even if another driver may be alive elsewhere.
-            dry: only say what there is to do.
+        listed: path or address of the list. out: path or address of the results. batch: where scenes run. settings: of
+            the steps. lines: words of every step (``plan_of``). shard_text: ``i/n``, ``env`` or ``env/n``, or empty.
+            wait: for the end of an array job. scratch: folder for unfinished results. take_over: drive the batch even
+            if another driver may be alive elsewhere. dry: only say what there is to do.
 
     Returns:
         Counts, ``text``, and ``exit_code``: 0, or 10 plus the number of failed steps of this call (at most 99).
 
     Raises:
-        UsageError: settings that contradict each other, an output that belongs to another batch, or to another driver. InputError: a
-            bad list. KeyboardInterrupt: asked to stop; running steps have written checkpoints.
+        UsageError: settings that contradict each other, an output that belongs to another batch, or to another driver.
+            InputError: a bad list. KeyboardInterrupt: asked to stop; running steps have written checkpoints.
     """
     scenes = read_list(listed, (*OF_A_LINE, REVISION))
     part = parse_shard(shard_text)
@@ -66,10 +75,19 @@ def run(
     entries = [entry for entry in ours if is_open(plan, entry, done, failed)]
     if dry:
         keys = [unit.key for entry in ours for unit in plan.units(entry)]
-        counts = {"scenes": len(ours), "steps": len(keys), DONE: len(done.intersection(keys)), "failed": len(failed.intersection(keys))}
+        counts = {
+            "scenes": len(ours),
+            "steps": len(keys),
+            DONE: len(done.intersection(keys)),
+            "failed": len(failed.intersection(keys)),
+        }
         left = counts["steps"] - counts[DONE] - counts["failed"]
         text = f"{len(ours)} scenes: {' -> '.join(stage.name for stage in plan.stages)}"
-        return {**counts, "left": left, "text": f"{text}\n{counts[DONE]} steps done, {counts['failed']} failed, {left} to do"}
+        return {
+            **counts,
+            "left": left,
+            "text": f"{text}\n{counts[DONE]} steps done, {counts['failed']} failed, {left} to do",
+        }
     job = Job(folder, plan, max(1, round(batch.cpus)), batch.grace_s, _absolute(scratch))
     with folder.owned(part, numbered=shard_text.startswith("env"), take_over=take_over) as owner:
         if batch.engine == "slurm" and entries:
@@ -79,8 +97,12 @@ def run(
             return _submitted(folder, plan, entries, number, messages, wait)
         counts = _run(job, entries, batch)
     text = ", ".join(f"{count} {state}" for state, count in sorted(counts.items())) or "nothing was left to do here"
-    return {"counts": dict(counts), "out": str(folder.out), "text": f"{text}\nmudg batch status {folder.out}",
-            "exit_code": exit_code(counts.total() - counts[DONE])}  # fmt: skip
+    return {
+        "counts": dict(counts),
+        "out": str(folder.out),
+        "text": f"{text}\nmudg batch status {folder.out}",
+        "exit_code": exit_code(counts.total() - counts[DONE]),
+    }
 
 
 def _absolute(path: Path | None) -> Path | None:
@@ -112,7 +134,11 @@ def _run(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> Counter[str]
 def _submitted(
     folder: BatchFolder, plan: BatchPlan, entries: Sequence[Entry], number: str, messages: Path, wait: bool
 ) -> dict[str, Any]:
-    result = {"job": number, "out": str(folder.out), "text": f"job {number}; its messages: {messages}\nmudg batch status {folder.out}"}
+    result = {
+        "job": number,
+        "out": str(folder.out),
+        "text": f"job {number}; its messages: {messages}\nmudg batch status {folder.out}",
+    }
     if not wait:
         return result
     try:
@@ -121,24 +147,36 @@ def _submitted(
     except OSError as error:
         raise ResourceError("Slurm does not answer", where="squeue", got=str(error)) from error
     done = folder.keys("done")
-    return {**result, "exit_code": exit_code(sum(any(unit.key not in done for unit in plan.units(entry)) for entry in entries))}
+    return {
+        **result,
+        "exit_code": exit_code(sum(any(unit.key not in done for unit in plan.units(entry)) for entry in entries)),
+    }
 
 
 def plan_for(batch: BatchConfig, settings: RunConfig, lines: Mapping[str, Sequence[str]]) -> BatchPlan:
-    """The plan that settings ask for; paths in the settings that exist from here are made absolute, since steps run elsewhere."""
+    """The plan that settings ask for; paths in the settings that exist from here are made absolute, since steps run
+    elsewhere."""
     values = _with_absolute_paths(configuration.to_dict(settings))
     own = bool(batch.command) and batch.stages == BatchConfig().stages
-    command = tuple(os.path.abspath(word) if "/" in word and "{" not in word and os.path.isfile(word) else word for word in batch.command)
+    command = tuple(
+        os.path.abspath(word) if "/" in word and "{" not in word and os.path.isfile(word) else word
+        for word in batch.command
+    )
     names = () if own else tuple(name for name in batch.stages if name != COMMAND or command)
     return plan_of(names, lines, values, command)
 
 
 def _with_absolute_paths(values: Mapping[str, Any]) -> dict[str, Any]:
     return {
-        name: _with_absolute_paths(value) if isinstance(value, Mapping)
-        else os.path.abspath(value) if isinstance(value, str) and "/" in value and os.path.exists(value) else value
+        name: (
+            _with_absolute_paths(value)
+            if isinstance(value, Mapping)
+            else os.path.abspath(value)
+            if isinstance(value, str) and "/" in value and os.path.exists(value)
+            else value
+        )
         for name, value in values.items()
-    }  # fmt: skip
+    }
 
 
 def _refuse_overlap(entries: Sequence[Entry], folder: BatchFolder, listed: str) -> None:
@@ -146,7 +184,9 @@ def _refuse_overlap(entries: Sequence[Entry], folder: BatchFolder, listed: str) 
     if out is None:
         return
     read: dict[str, Path | str | None] = {
-        f"source of {entry.name}": entry.source for entry in entries if entry.source != CITY and "://" not in entry.source
+        f"source of {entry.name}": entry.source
+        for entry in entries
+        if entry.source != CITY and "://" not in entry.source
     }
     read["list"] = place if place is not None and place.is_file() else None
     refuse_overlaps([out], read)
@@ -156,7 +196,8 @@ def show_status(out: str, html: bool = False, price: float = 0.0, every_s: float
     """How far a batch is, what has failed and what it took.
 
     Args:
-        html: also write ``status.html`` in its folder. price: of a core-hour. every_s: show it again until nothing is left (0: once).
+        html: also write ``status.html`` in its folder. price: of a core-hour. every_s: show it again until nothing is
+            left (0: once).
     """
     while True:
         state = status.read_status(BatchFolder(Location.of(out)), price)
@@ -181,13 +222,16 @@ def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -
     for text in given:
         name, separator, value = text.partition("=")
         if not separator or not name:
-            raise UsageError("not a setting", where="--set", got=text, expected="STEP.NAME=VALUE, as fit.iterations=500")
+            raise UsageError(
+                "not a setting", where="--set", got=text, expected="STEP.NAME=VALUE, as fit.iterations=500"
+            )
         values[name] = parse_yaml(value.encode(), f"--set {name}") if value else ""
     return configuration.load(RunConfig, run_preset(preset), config, configuration.nested(values))
 
 
 def retry(out: str, reason: str = "") -> dict[str, Any]:
-    """Forget failures, so that the next ``mudg batch run`` tries them again. reason: exit codes with commas (empty: all).
+    """Forget failures, so that the next ``mudg batch run`` tries them again. reason: exit codes with commas (empty:
+    all).
 
     Raises:
         InputError: no batch is here, or nothing failed for this reason. UsageError: not a list of exit codes.
@@ -201,6 +245,13 @@ def retry(out: str, reason: str = "") -> dict[str, Any]:
     for one in chosen:
         folder.record("failed", one.key).remove()
     if words and not chosen:
-        raise InputError("nothing failed for this reason", where=str(folder.out), got=reason,
-            expected=", ".join(sorted({str(one.code) for one in failures})) or "no failures at all")  # fmt: skip
-    return {"forgotten": len(chosen), "text": f"{len(chosen)} failed steps will be tried again by the next mudg batch run"}
+        raise InputError(
+            "nothing failed for this reason",
+            where=str(folder.out),
+            got=reason,
+            expected=", ".join(sorted({str(one.code) for one in failures})) or "no failures at all",
+        )
+    return {
+        "forgotten": len(chosen),
+        "text": f"{len(chosen)} failed steps will be tried again by the next mudg batch run",
+    }

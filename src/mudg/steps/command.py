@@ -29,8 +29,8 @@ class Common:
     json: bool = False
     """Print the result as JSON."""
     scratch: Path | None = None
-    """Where inputs and outputs that are addresses (s3://bucket/folder) lie while the command works on them (not given: the system's folder
-    for temporary files)."""
+    """Where inputs and outputs that are addresses (s3://bucket/folder) lie while the command works on them (not given:
+    the system's folder for temporary files)."""
     debug: bool = False
     """Show the full traceback of an error."""
 
@@ -44,7 +44,8 @@ def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
     """The words behind a verb as its step, and the flags that every command has.
 
     Raises:
-        UsageError: an unknown flag (the nearest is named), a missing or wrong value. InputError: --config cannot be read.
+        UsageError: an unknown flag (the nearest is named), a missing or wrong value. InputError: --config cannot be
+            read.
     """
     listed = {option.name: option for option in _all_options(cls)}
     parser = _Parser(prog=f"mudg {cls.verb()}", add_help=False, allow_abbrev=False)
@@ -57,14 +58,17 @@ def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
     given: dict[str, Any] = {name: value for name, value in vars(found).items() if name in listed}
     own = {name: _value(listed[name].kind, given.pop(name)) for name in list(given) if listed[name].own}
     its_own = {field.name for field in dataclasses.fields(cls)}
-    common = Common(**{f.name: own.pop(f.name) for f in dataclasses.fields(Common) if f.name in own and f.name not in its_own})
+    common = Common(
+        **{f.name: own.pop(f.name) for f in dataclasses.fields(Common) if f.name in own and f.name not in its_own}
+    )
     by_words = cls.from_words(found.words, own)
     for name in by_words.keys() & (own.keys() | given.keys()):
         twice = f"{by_words[name]!r} and {(own | given)[name]!r}"
         raise UsageError(f"{flag_name(name)} was given twice", got=twice, expected=usage(cls))
     given |= {name: by_words.pop(name) for name in by_words.keys() - its_own}
     common = dataclasses.replace(
-        common, **{name: Path(value) for name in ("config", "scratch") if isinstance(value := getattr(common, name), str)}
+        common,
+        **{name: Path(value) for name in ("config", "scratch") if isinstance(value := getattr(common, name), str)},
     )
     settings = configuration.nested({name: _value(listed[name].kind, value) for name, value in given.items()})
     return cls.build({**by_words, **own}, settings, common.config), common
@@ -109,7 +113,8 @@ def _plain_flags(words: Iterable[str]) -> list[str]:
 
 
 def _second_named(cls: type[Step], words: list[str]) -> list[str]:
-    """The second of two words before all flags as the input it stands for: ``render SCENE FIT`` as ``render SCENE --model FIT``."""
+    """The second of two words before all flags as the input it stands for: ``render SCENE FIT`` as ``render SCENE
+    --model FIT``."""
     second = next((name for name in positions(cls) if flag_of(cls, name).position == "second"), None)
     if second is None or len(words) < 2 or any(word.startswith("-") for word in words[:2]):
         return words
@@ -121,9 +126,12 @@ def _second_named(cls: type[Step], words: list[str]) -> list[str]:
 def _refuse_unknown(cls: type[Step], word: str, listed: dict[str, Option]) -> NoReturn:
     flag = word.partition("=")[0]
     known = [flag_name(name) for name in listed]
-    near = nearest(flag, known, 0.6) or next((one for one in known if one.endswith(flag.removeprefix("--")) and len(flag) > 4), None)
+    near = nearest(flag, known, 0.6) or next(
+        (one for one in known if one.endswith(flag.removeprefix("--")) and len(flag) > 4), None
+    )
     raise UsageError(
-        f"mudg {cls.verb()} has no flag {flag}", remedy=f"did you mean {near}?" if near else f"see mudg {cls.verb()} --help-all"
+        f"mudg {cls.verb()} has no flag {flag}",
+        remedy=f"did you mean {near}?" if near else f"see mudg {cls.verb()} --help-all",
     )
 
 
@@ -139,7 +147,11 @@ def _value(kind: Any, value: Any) -> Any:
         pairs = [word.partition("=") for word in value]
         for name, equals, folder in pairs:
             if not equals or not name or not folder:
-                raise UsageError("a value is not a name and a folder", expected="NAME=FOLDER", got="=".join(filter(None, (name, folder))))
+                raise UsageError(
+                    "a value is not a name and a folder",
+                    expected="NAME=FOLDER",
+                    got="=".join(filter(None, (name, folder))),
+                )
         return {name: folder for name, _, folder in pairs}
     if isinstance(value, str):
         if value == "None" and type(None) in get_args(kind):
@@ -150,7 +162,8 @@ def _value(kind: Any, value: Any) -> Any:
 
 
 def words_of(step: Step) -> list[str]:
-    """The command line of a step behind ``mudg``, without its output and what has its default: `parse` makes the same step of it."""
+    """The command line of a step behind ``mudg``, without its output and what has its default: `parse` makes the same
+    step of it."""
     cls, words, flags = type(step), step.verb().split(" "), list[str]()
     own = {field.name: getattr(step, field.name) for field in dataclasses.fields(step) if field.name != "settings"}
     for field in dataclasses.fields(step):
@@ -176,7 +189,7 @@ def _flag_words(name: str, value: Any) -> list[str]:
     return [flag_name(name), *(map(str, value) if isinstance(value, tuple | list) else [str(value)])]
 
 
-# help ------------------------------------------------------------------------------------------------------------------
+# help ---------------------------------------------------------------------------------------------
 
 _FLAG_COLUMNS = 26
 
@@ -185,13 +198,18 @@ def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
     """A verb's page of help.
 
     Args:
-        everything: all settings with their whole texts; else those that most people need, with the first sentence of each.
+        everything: all settings with their whole texts; else those that most people need, with the first sentence of
+            each.
         part: only what this part of the verb takes.
     """
     head = f"mudg {cls.verb()}{f' {part}' if part else ''}"
     examples = [line for line in cls.examples if line.startswith(f"{head} ") or not part]
     shown = examples if everything or part else examples[:3]
-    lines = [f"{cls.parts[part] if part else cls.summary()}", "", f"usage: {usage(cls) if not part else f'{head} [words] [flags]'}"]
+    lines = [
+        f"{cls.parts[part] if part else cls.summary()}",
+        "",
+        f"usage: {usage(cls) if not part else f'{head} [words] [flags]'}",
+    ]
     if shown:
         lines += ["", "examples:", *(f"  {line}" for line in shown)]
     if cls.parts and not part:
@@ -207,7 +225,11 @@ def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
         hidden, settings = len(settings) - len(chosen), chosen
     names = {one.name for one in own}
     common = [one for one in common_options() if one.name not in names]
-    for title, rows in (("inputs and outputs:", own), ("settings:", settings), ("every command:", common if everything else [])):
+    for title, rows in (
+        ("inputs and outputs:", own),
+        ("settings:", settings),
+        ("every command:", common if everything else []),
+    ):
         if rows:
             lines += ["", title, *(line for one in rows for line in _row(cls, one, everything))]
     if not everything:

@@ -27,14 +27,14 @@ class Convert(Step):
     smaller = "a larger --memory-gb, where the machine has it"
     result = "model"
     checkpoint: Annotated[Path, Flag("CKPT", "first")]
-    """Checkpoint file of MuDG, DynamiCrafter-512 or DynamiCrafter-1024 (.ckpt, .pt or .safetensors); or, for DepthLab, the folder
-    that contains DepthLab's files, Marigold's folder and the image encoder's folder; or, with --network, weights of a
-    network of the scores."""
+    """Checkpoint file of MuDG, DynamiCrafter-512 or DynamiCrafter-1024 (.ckpt, .pt or .safetensors); or, for DepthLab,
+    the folder that contains DepthLab's files, Marigold's folder and the image encoder's folder; or, with --network,
+    weights of a network of the scores."""
     to: Annotated[Path, Flag()]
     """Model folder to write."""
     overwrite: bool = False
-    """Replace the model that --to already holds. The old model stays until the new one is finished, so the disk must hold both.
-    Files that do not belong to the model are kept."""
+    """Replace the model that --to already holds. The old model stays until the new one is finished, so the disk must
+    hold both. Files that do not belong to the model are kept."""
     settings: ConvertConfig
 
     def act(self) -> Path:
@@ -52,17 +52,23 @@ class Convert(Step):
         if config.network != "diffusion":
             if config.resolution != "auto" or config.towers or config.dtype != "keep":
                 raise UsageError(
-                    "--resolution, --towers and --dtype apply to diffusion models only", where=f"--network {config.network}"
+                    "--resolution, --towers and --dtype apply to diffusion models only",
+                    where=f"--network {config.network}",
                 )
             if not source.is_file():
                 raise InputError("no such checkpoint", where=str(source))
             # read, and converted to float32
-            return functools.partial(convert_weights, config.network, source, to), convert.memory_limit(config, source, source)
+            return functools.partial(convert_weights, config.network, source, to), convert.memory_limit(
+                config, source, source
+            )
         if not source.is_dir():
             return convert.of_diffusion(config, source, to)
         if config.resolution != "auto" or config.towers:
-            raise UsageError("--resolution and --towers do not apply to a DepthLab folder", where=str(source),
-                             remedy="leave them out, or give a checkpoint file")  # fmt: skip
+            raise UsageError(
+                "--resolution and --towers do not apply to a DepthLab folder",
+                where=str(source),
+                remedy="leave them out, or give a checkpoint file",
+            )
         files = depthlab.find(source).files()
         work = functools.partial(depthlab.convert_folder, source, to, convert.DTYPES[config.dtype], convert.SHARD_BYTES)
         return work, convert.memory_limit(config, *files)

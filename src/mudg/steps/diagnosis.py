@@ -64,12 +64,13 @@ def report_machine() -> dict[str, Any]:
 
 
 def report_scene(scene: Path) -> dict[str, Any]:
-    """Check a scene directory or zip, that of a run, or a log in the neutral layout, and say in words what is wrong or odd.
+    """Check a scene directory or zip, that of a run, or a log in the neutral layout, and say in words what is wrong or
+    odd.
 
     Returns:
-        Plain values for ``--json``; ``text`` is the same for people; ``exit_code`` is 3 if it cannot be used. Of a sound
-        scene, ``alignment`` tells for each camera whether LiDAR and image edges agree, and ``presets`` what every preset of
-        ``mudg run`` will take.
+        Plain values for ``--json``; ``text`` is the same for people; ``exit_code`` is 3 if it cannot be used. Of a
+        sound scene, ``alignment`` tells for each camera whether LiDAR and image edges agree, and ``presets`` what every
+        preset of ``mudg run`` will take.
     """
     from mudg.editing.runs import scene_of_run
     from mudg.formats.importers import RECOGNISERS
@@ -101,14 +102,19 @@ def report_scene(scene: Path) -> dict[str, Any]:
         lines.append(f"{scene} can be used: {count['warning']} warnings, {count['note']} notes")
     lines += cost_lines
     return {
-        "scene": scene, "findings": [{"level": f.level, "where": f.where, "words": f.message} for f in found],
-        "alignment": alignment, "presets": costs, "usable": not count["error"], "text": plain_lines(lines),
+        "scene": scene,
+        "findings": [{"level": f.level, "where": f.where, "words": f.message} for f in found],
+        "alignment": alignment,
+        "presets": costs,
+        "usable": not count["error"],
+        "text": plain_lines(lines),
         "exit_code": 3 if count["error"] else 0,
-    }  # fmt: skip
+    }
 
 
 def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
-    """What every preset would take on a scene on this machine's CPU and, if there is one, its first CUDA card: for JSON, and in words."""
+    """What every preset would take on a scene on this machine's CPU and, if there is one, its first CUDA card: for
+    JSON, and in words."""
     import torch
 
     from mudg import native
@@ -132,13 +138,21 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
         found = cost.of_presets(size, cores, speed, device)
         lines += cost.in_words(found, free, device, disk)
         records[device] = {
-            name: {"seconds": one.seconds, "total_s": one.total_s, "memory_bytes": one.memory_bytes, "written_bytes": one.written_bytes,
-                   "processor_s": one.processor_s, "fits": one.fits(free, disk) if free else None}
+            name: {
+                "seconds": one.seconds,
+                "total_s": one.total_s,
+                "memory_bytes": one.memory_bytes,
+                "written_bytes": one.written_bytes,
+                "processor_s": one.processor_s,
+                "fits": one.fits(free, disk) if free else None,
+            }
             for name, one in found.items()
-        }  # fmt: skip
+        }
     log_px = int(str(PRESETS["fast"]["ingest.resolution"]))
     if max(size.width, size.height) > log_px and not size.exact:
-        lines.append(f"of the log itself, in place of this scene, --preset fast makes images {log_px} pixels wide and takes less")
+        lines.append(
+            f"of the log itself, in place of this scene, --preset fast makes images {log_px} pixels wide and takes less"
+        )
     lines.append(
         f"speed of this machine at the moment: {speed:.2f} of the one that forecasts were measured on, {cores} threads"
     )
@@ -146,7 +160,8 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def scene_size(scene: Scene, config: RunConfig | None = None) -> SceneSize:
-    """What forecasts depend on. The first sweep stands for all. config: of the run, whose cameras are shifted (None: the first)."""
+    """What forecasts depend on. The first sweep stands for all. config: of the run, whose cameras are shifted (None:
+    the first)."""
     from mudg.diffusion.adapt import why_not
     from mudg.scene.read import read_points
     from mudg.steps.settings.cost import SceneSize
@@ -158,10 +173,15 @@ def scene_size(scene: Scene, config: RunConfig | None = None) -> SceneSize:
     config = config or run_preset()
     cameras = [name for name in config.synthesize.cameras or (first.name,) if name in scene.cameras]
     return SceneSize(
-        len(scene.frames), sum(len(scene.frames_of(name)) for name in cameras), first.width, first.height, points, exact,
+        len(scene.frames),
+        sum(len(scene.frames_of(name)) for name in cameras),
+        first.width,
+        first.height,
+        points,
+        exact,
         labelled=all("semantics" in frame.labels for frame in scene.frames),
         adapts=not exact and not why_not(scene, replace(config.adapt, cameras=tuple(cameras))),
-    )  # fmt: skip
+    )
 
 
 def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:

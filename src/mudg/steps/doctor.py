@@ -14,7 +14,8 @@ class Doctor(Step):
     section = "start here"
     examples = ("mudg doctor", "mudg doctor runs/kitti/scene", "mudg doctor --json")
     scene: Annotated[Path | None, Flag("[SCENE]", "first")] = None
-    """Scene directory, folder of mudg run, or log in the custom format, to check (not given: report on this machine)."""
+    """Scene directory, folder of mudg run, or log in the custom format, to check (not given: report on this
+    machine)."""
 
     def act(self) -> dict[str, Any]:
         from mudg.steps import diagnosis

@@ -29,17 +29,25 @@ class Edit(Output):
     )
     result = "edited"
     version = 3
-    files = ("edits.yaml", "edit.json", "lidar.json", *_MODELS, *below("scene", (*SCENE_FILES, "manifest.json")), *below("fuse", _CLOUDS))
+    files = (
+        "edits.yaml",
+        "edit.json",
+        "lidar.json",
+        *_MODELS,
+        *below("scene", (*SCENE_FILES, "manifest.json")),
+        *below("fuse", _CLOUDS),
+    )
     short = ("device", "harmonize.on", "harmonize.model", "harmonize.steps")
     source: Annotated[Path, RUN]
     """Gaussian scene written by fit, or folder of a finished mudg run."""
     script: Annotated[Path, Flag("EDITS.yaml", "first")]
     """Edit script (docs/edit.md)."""
     scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None
-    """Scene directory that a Gaussian scene was fitted to. With it, the vehicle's path and parked objects can be edited. A run has its
-    own."""
+    """Scene directory that a Gaussian scene was fitted to. With it, the vehicle's path and parked objects can be
+    edited. A run has its own."""
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
-    """Point clouds written by fuse, for the height of the ground (not given: the Gaussians give it). A run has its own."""
+    """Point clouds written by fuse, for the height of the ground (not given: the Gaussians give it). A run has its
+    own."""
     settings: EditConfig
 
     def run_parts(self) -> RunParts:
@@ -57,7 +65,9 @@ class Edit(Output):
 
         parts = self.run_parts()
         fits = {f"fit {name}".strip(): path for name, path in parts.fits.items()}
-        return {"edits": read_edits(self.script).digest()} | self.digests({**fits, "scene": parts.scene, "fused": parts.fused})
+        return {"edits": read_edits(self.script).digest()} | self.digests(
+            {**fits, "scene": parts.scene, "fused": parts.fused}
+        )
 
     def places(self) -> dict[str, Path | None]:
         parts = self.run_parts()

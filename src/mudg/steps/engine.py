@@ -1,4 +1,5 @@
-"""What is done for every verb that makes a folder or file: output and inputs apart, the key, reuse, resume, replacement."""
+"""What is done for every verb that makes a folder or file: output and inputs apart, the key, reuse, resume,
+replacement."""
 
 from __future__ import annotations
 
@@ -18,10 +19,11 @@ Make = Callable[[Any], dict[str, Any]]
 
 
 class Result(Step):
-    """A step that makes a folder of its own, which is verified and reused, resumed, or replaced when the new one is finished.
+    """A step that makes a folder of its own, which is verified and reused, resumed, or replaced when the new one is
+    finished.
 
-    A subclass says what it writes (`version`, `files`), and how (`prepare`, or `make`). What it reads follows from its fields; the methods
-    below are overridden where it reads more, or less.
+    A subclass says what it writes (`version`, `files`), and how (`prepare`, or `make`). What it reads follows from its
+    fields; the methods below are overridden where it reads more, or less.
     """
 
     version: ClassVar[int]
@@ -49,7 +51,8 @@ class Result(Step):
         return False
 
     def checked(self) -> Self:
-        """This step as it is carried out, with all that follows from the machine filled in. Refuses what can be refused without reading."""
+        """This step as it is carried out, with all that follows from the machine filled in. Refuses what can be refused
+        without reading."""
         return self
 
     def reads(self) -> dict[str, Path | str | None]:
@@ -65,14 +68,16 @@ class Result(Step):
         return self.digests(paths_of(self))
 
     def digests(self, paths: Mapping[str, Path | str | None]) -> dict[str, str]:
-        """Digests of files and folders by name, without those that are None or empty; of edit scripts by what they say."""
+        """Digests of files and folders by name, without those that are None or empty; of edit scripts by what they
+        say."""
         from mudg.base import store
         from mudg.editing.script import read_edits
 
         return {
             name: read_edits(Path(path)).digest() if is_script(self, name) else store.digest(Path(path))
-            for name, path in paths.items() if path
-        }  # fmt: skip
+            for name, path in paths.items()
+            if path
+        }
 
     def key_settings(self) -> dict[str, Any]:
         """Settings that the result depends on, the other part of the key."""
@@ -93,8 +98,8 @@ class Result(Step):
         return self.make
 
     def make(self, work: Any) -> dict[str, Any]:
-        """Fill the work folder (`RunDir`; of a single file its `ResultFile`), or go on with what an interrupted run left there. Returns the
-        summary for its record."""
+        """Fill the work folder (`RunDir`; of a single file its `ResultFile`), or go on with what an interrupted run
+        left there. Returns the summary for its record."""
         raise NotImplementedError
 
     def resulting(self, folder: Path) -> Path:
@@ -125,7 +130,8 @@ def fill(step: Result) -> Path:
 
 
 def ready(step: Result) -> tuple[Result, dict[str, str], Make]:
-    """A step as it is carried out, digests of what it reads, and what makes it: all that can be refused is, and nothing is written."""
+    """A step as it is carried out, digests of what it reads, and what makes it: all that can be refused is, and nothing
+    is written."""
     from mudg.base.run_folder import refuse_overlap
 
     refuse_overlap(step.out, step.reads())
@@ -135,7 +141,8 @@ def ready(step: Result) -> tuple[Result, dict[str, str], Make]:
 
 
 def opened(step: Result) -> tuple[Result, RunDir, Make]:
-    """A step as it is carried out, its folder, and what fills it; a finished result is verified and said to be reused."""
+    """A step as it is carried out, its folder, and what fills it; a finished result is verified and said to be
+    reused."""
     from mudg.base.run_folder import RunDir
 
     step, inputs, make = ready(step)
@@ -153,7 +160,10 @@ def paths_of(step: Step) -> dict[str, Path | str | None]:
         if field.name in ("out", "list") or not is_path(hint_of(type(step), field.name)):
             continue
         for name, inner in value.items() if isinstance(value, Mapping) else [(field.name, value)]:
-            paths |= {f"{name} {n}" if n else name: path for n, path in enumerate(inner if isinstance(inner, tuple) else (inner,))}
+            paths |= {
+                f"{name} {n}" if n else name: path
+                for n, path in enumerate(inner if isinstance(inner, tuple) else (inner,))
+            }
     return paths
 
 

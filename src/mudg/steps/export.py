@@ -20,15 +20,18 @@ class Export(Result):
 
     section = "other programs"
     examples = (
-        "mudg export ply runs/kitti --out kitti.ply --time-s 1.5", "mudg export usdz runs/kitti --out kitti.usdz",
+        "mudg export ply runs/kitti --out kitti.ply --time-s 1.5",
+        "mudg export usdz runs/kitti --out kitti.usdz",
         "mudg export glb runs/mudg_s --scene scenes/city --edits edits.yaml --out city.glb",
-        "mudg export alpasim runs/kitti --out kitti_sim.usdz", "mudg export colmap scenes/city --out city_colmap",
-        "mudg export ros2 scenes/city --out city_bag", "mudg export ncore scenes/city --out city_ncore",
-    )  # fmt: skip
+        "mudg export alpasim runs/kitti --out kitti_sim.usdz",
+        "mudg export colmap scenes/city --out city_colmap",
+        "mudg export ros2 scenes/city --out city_bag",
+        "mudg export ncore scenes/city --out city_ncore",
+    )
     result = "exported"
     format: Annotated[str, Flag("FORMAT", "first")]
-    """Gaussians: ply, bundle, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap, colmap-text.
-    The log over time: mcap, ros2, rerun, ncore."""
+    """Gaussians: ply, bundle, alpasim, spz, glb, usda, usdz, compressed-ply, sog, splat. Cameras: nerfstudio, colmap,
+    colmap-text. The log over time: mcap, ros2, rerun, ncore."""
     source: Annotated[Path, RUN]
     """Gaussian scene written by fit, or folder of a finished mudg run; for cameras also a scene directory."""
     out: Annotated[Path, Flag("OUT")]

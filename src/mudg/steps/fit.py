@@ -25,21 +25,28 @@ class Fit(Output):
     examples = (
         "mudg fit scenes/city --fused runs/fused --method street_gaussians --out runs/plain",
         "mudg fit scenes/city --fused runs/fused --observations runs/virtual --out runs/mudg_s",
-        "mudg fit scenes/city --fused runs/fused --observations runs/virtual --start-from runs/plain --iterations 1000 --out runs/mudg_s",
+        (
+            "mudg fit scenes/city --fused runs/fused --observations runs/virtual --start-from runs/plain --iterations"
+            " 1000 --out runs/mudg_s"
+        ),
     )
     smaller = "smaller images (mudg ingest --resolution), fewer Gaussians (--start.gaussians, --densify.max-gaussians)"
     result = "model"
-    version, files = 3, (*MODEL_FILES, "appearance.json", "appearance.safetensors", "field.safetensors", "preview/*.png", "steps/")
+    version, files = (
+        3,
+        (*MODEL_FILES, "appearance.json", "appearance.safetensors", "field.safetensors", "preview/*.png", "steps/"),
+    )
     short = ("method", "iterations", "cameras", "width_px", "sh_degree", "seed", "device", "densify.max_gaussians")
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     fused: Annotated[Path | None, Flag("FOLDER", "second", "fused")] = None
-    """Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE without the flag."""
+    """Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE
+    without the flag."""
     observations: Annotated[tuple[Path, ...], Flag("FOLDER ...", "", "views")] = ()
     """Virtual views written by synthesize, in one folder or several; required by method mudg_s."""
     start_from: Annotated[Path | None, Flag("FOLDER", "", "start_from")] = None
-    """Finished fit of method street_gaussians to the same scene, to continue for `iterations` more steps. Virtual views are used
-    from the first of them on."""
+    """Finished fit of method street_gaussians to the same scene, to continue for `iterations` more steps. Virtual views
+    are used from the first of them on."""
     settings: FitConfig
 
     def required(self) -> tuple[str, ...]:
@@ -54,16 +61,23 @@ class Fit(Output):
         return METHODS[self.settings.method].scene == "radiance"
 
     def output(self) -> VerbOutput:
-        """Methods without boxes fuse the clouds again; results of those that took the ones of `mudg fuse` are made again."""
+        """Methods without boxes fuse the clouds again; results of those that took the ones of `mudg fuse` are made
+        again."""
         from mudg.gaussians.methods import METHODS
 
         own = super().output()
-        return own if self.reads_scene_alone or METHODS[self.settings.method].boxes else replace(own, version=own.version + 1)
+        return (
+            own
+            if self.reads_scene_alone or METHODS[self.settings.method].boxes
+            else replace(own, version=own.version + 1)
+        )
 
     def checked(self) -> Self:
         if self.reads_scene_alone:
             if self.start_from is not None:
-                raise UsageError(f"{self.settings.method} cannot go on with a finished fit", remedy="leave --start-from out")
+                raise UsageError(
+                    f"{self.settings.method} cannot go on with a finished fit", remedy="leave --start-from out"
+                )
             return self
         from mudg.gaussians import fit
 
@@ -77,7 +91,9 @@ class Fit(Output):
         return super().reads() | {"virtual.lpips-weights": self.settings.virtual.lpips_weights}
 
     def inputs(self) -> dict[str, str]:
-        return self.digests({"scene": self.scene} if self.reads_scene_alone else {"scene": self.scene, "fused": self.fused})
+        return self.digests(
+            {"scene": self.scene} if self.reads_scene_alone else {"scene": self.scene, "fused": self.fused}
+        )
 
     def places(self) -> dict[str, Path | None]:
         return {"scene": self.scene} if self.reads_scene_alone else {"scene": self.scene, "fused": self.fused}
@@ -96,7 +112,11 @@ class Fit(Output):
         inputs |= {} if begun is None else {"start": begun.digest}
         if fit.learns_virtual(self.settings.method):
             virtual = virtual_sets(self.observations)
-            inputs |= self.digests({name: path for name, path in paths_of(self).items() if name.startswith("observations")})
+            inputs |= self.digests(
+                {name: path for name, path in paths_of(self).items() if name.startswith("observations")}
+            )
         inputs |= self.digests({"lpips_weights": self.settings.virtual.lpips_weights})
         fit.check_device(self.settings)
-        return partial(fit.write_fit, self.settings, fit.FitInputs(self.scene, cast("Path", self.fused), virtual, begun))
+        return partial(
+            fit.write_fit, self.settings, fit.FitInputs(self.scene, cast("Path", self.fused), virtual, begun)
+        )

@@ -60,7 +60,8 @@ class FittedScene:
             device: where it is rendered: ``auto`` (CUDA if there is one), ``cpu``, ``cuda``, ``cuda:N``.
 
         Raises:
-            InputError: not such a folder, or of another version. IntegrityError: a file was altered. ResourceError: no such device.
+            InputError: not such a folder, or of another version. IntegrityError: a file was altered. ResourceError: no
+                such device.
         """
         from mudg.core.raster.place import drawing_device
         from mudg.editing.runs import fit_at
@@ -102,7 +103,8 @@ class FittedScene:
         """The scene with one object displaced in its own frame (x forward, y left, z up, metres) at all times.
 
         Args:
-            object_from_new: rigid 4x4; the new pose is ``object_pose @ object_from_new``. A translation by (3, 0, 0) moves it 3 m ahead.
+            object_from_new: rigid 4x4; the new pose is ``object_pose @ object_from_new``. A translation by (3, 0, 0)
+                moves it 3 m ahead.
 
         Raises:
             UsageError: no such object. InputError: the displacement is not rigid.
@@ -117,7 +119,8 @@ class FittedScene:
         """The scene with an edit script carried out (``docs/edit.md``).
 
         Args:
-            script: YAML file. scene: the log that it was fitted to; with it, parked objects and the vehicle can be edited.
+            script: YAML file. scene: the log that it was fitted to; with it, parked objects and the vehicle can be
+                edited.
 
         Raises:
             InputError: the script is not valid, or asks for what cannot be done here.
@@ -132,7 +135,8 @@ class FittedScene:
         """Write one object to a file that edit scripts can insert.
 
         Args:
-            out: a name that ends in ``.safetensors``; replaced if it exists. scene: the log, for the sides from which it was seen.
+            out: a name that ends in ``.safetensors``; replaced if it exists. scene: the log, for the sides from which
+                it was seen.
         """
         from mudg.base.run_folder import ResultFile
         from mudg.editing.assets import complete_asset, write_asset
@@ -150,7 +154,8 @@ class FittedScene:
         Args:
             camera: size and intrinsics in pixels.
             world_from_cam: rigid 4x4 pose; camera axes x right, y down, z forward.
-            time_s: seconds on the scene's clock. Objects stand where they were then; outside their tracks they are absent.
+            time_s: seconds on the scene's clock. Objects stand where they were then; outside their tracks they are
+                absent.
             backend: ``auto``, ``cpu``, ``torch`` or ``gsplat``.
 
         Raises:

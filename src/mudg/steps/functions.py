@@ -1,4 +1,5 @@
-"""Verbs as functions: ``mudg.fit(...)``. Built from the steps on first use; what type checkers and editors read is in ``functions.pyi``."""
+"""Verbs as functions: ``mudg.fit(...)``. Built from the steps on first use; what type checkers and editors read is in
+``functions.pyi``."""
 
 from __future__ import annotations
 
@@ -9,10 +10,27 @@ from mudg import steps
 from mudg.steps.step import python_function
 
 VERBS: Final = {
-    "adapt": "adapt", "annotate": "annotate", "bench": "bench", "convert": "convert", "demo": "demo", "doctor": "doctor", "edit": "edit",
-    "export": "export", "export_asset": "asset export", "fit": "fit", "fuse": "fuse", "import_asset": "asset import", "ingest": "ingest",
-    "learn": "learn", "page": "page", "render": "render", "report": "report", "run": "run", "score": "score", "synthesize": "synthesize",
-}  # fmt: skip
+    "adapt": "adapt",
+    "annotate": "annotate",
+    "bench": "bench",
+    "convert": "convert",
+    "demo": "demo",
+    "doctor": "doctor",
+    "edit": "edit",
+    "export": "export",
+    "export_asset": "asset export",
+    "fit": "fit",
+    "fuse": "fuse",
+    "import_asset": "asset import",
+    "ingest": "ingest",
+    "learn": "learn",
+    "page": "page",
+    "render": "render",
+    "report": "report",
+    "run": "run",
+    "score": "score",
+    "synthesize": "synthesize",
+}
 """Functions, and the verbs that they are."""
 
 

@@ -144,7 +144,8 @@ def bench(
     fit: Mapping[str, Any] = ...,
     score: Mapping[str, Any] = ...,
 ) -> Any:
-    """Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of papers.
+    """Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of
+    papers.
 
     Args:
         name: Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off the recorded path), real (complete methods on real logs) or paper (a table of a paper).

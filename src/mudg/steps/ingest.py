@@ -27,21 +27,32 @@ class Ingest(Listed):
 
     section = "single steps, in the order of use"
     examples = (
-        "mudg ingest city scenes/city", "mudg ingest ~/kitti/2011_09_26_drive_0001_sync scenes/kitti --resolution 960",
+        "mudg ingest city scenes/city",
+        "mudg ingest ~/kitti/2011_09_26_drive_0001_sync scenes/kitti --resolution 960",
         "mudg ingest custom my_log scenes/mine --cameras front --frames 0:40",
         "mudg ingest kitti --list drives.txt --out scenes --shard 0/4 --jobs 2",
-    )  # fmt: skip
+    )
     smaller = "smaller images (--resolution; of a city --city.width), fewer --frames, one image at a time (--workers 1)"
     result = "scene"
     version, files = 1, (*SCENE_FILES, "contact_sheet.jpg")
     idle = ("workers",)
-    short = ("resolution", "frames", "cameras", "sequence", "test_every", "city.seed", "city.n_frames", "city.width", "city.height")
+    short = (
+        "resolution",
+        "frames",
+        "cameras",
+        "sequence",
+        "test_every",
+        "city.seed",
+        "city.n_frames",
+        "city.width",
+        "city.height",
+    )
     parts = {"city": "Generate a city: a scene with exact truth."} | {
         name: f"Convert a log in the format {name} to a scene directory." for name in FORMATS
     }
     log: Annotated[str, Flag("[FORMAT] LOG [OUT]", "first")] = ""
-    """LOG: folder of a dataset log, a scene directory, or the word city. FORMAT: its format, only needed if it is not recognised. OUT: the
-    folder to write, in place of --out."""
+    """LOG: folder of a dataset log, a scene directory, or the word city. FORMAT: its format, only needed if it is not
+    recognised. OUT: the folder to write, in place of --out."""
     settings: IngestConfig
     of_a_line = ("format", "frames", "cameras", "sequence", "poses", "boxes", "seed")
 
@@ -49,7 +60,11 @@ class Ingest(Listed):
     def from_words(cls, words: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
         """``[FORMAT] LOG [OUT]``, with ``--list`` ``[FORMAT] [OUT]``; the format is a setting."""
         left, values, many, named = list(words), dict[str, Any](), "list" in given, "out" in given
-        if left and left[0] in ("auto", *FORMATS) and (len(left) > (not many) + (not named) or not Path(left[0]).exists()):
+        if (
+            left
+            and left[0] in ("auto", *FORMATS)
+            and (len(left) > (not many) + (not named) or not Path(left[0]).exists())
+        ):
             values["format"] = left.pop(0)
         if not many and not left:
             raise UsageError("no log was given", expected=usage(cls))
@@ -58,7 +73,9 @@ class Ingest(Listed):
         if left and not named:
             values["out"] = left.pop(0)
         if left and not many and values["log"] != "city" and not Path(values["log"]).exists():
-            raise UsageError("no such format and no such log", expected=", ".join(("auto", *FORMATS)), got=values["log"])
+            raise UsageError(
+                "no such format and no such log", expected=", ".join(("auto", *FORMATS)), got=values["log"]
+            )
         if left:
             raise UsageError("too many words", expected=usage(cls), got=" ".join(words))
         return values
@@ -81,8 +98,12 @@ class Ingest(Listed):
 
     def reads(self) -> dict[str, Path | str | None]:
         if self.log != "city" and not Path(self.log).exists():
-            raise InputError("driving log does not exist", where=str(self.log), expected="a folder, a scene zip, or the word city",
-                remedy=similar_path(self.log))  # fmt: skip
+            raise InputError(
+                "driving log does not exist",
+                where=str(self.log),
+                expected="a folder, a scene zip, or the word city",
+                remedy=similar_path(self.log),
+            )
         from mudg.formats import ingest
 
         log = "" if self.log == "city" else self.log

@@ -18,19 +18,43 @@ class Learn(Output):
 
     section = "single steps, in the order of use"
     examples = (
-        "mudg learn --out runs/mdm", "mudg learn --config recipe.yaml --out runs/mdm",
+        "mudg learn --out runs/mdm",
+        "mudg learn --config recipe.yaml --out runs/mdm",
         "mudg learn --data.scenes runs/kitti --start embedded --optimizer.lr 1e-4 --steps 500 --out runs/tuned",
         "torchrun --nproc-per-node 8 -m mudg learn --compute.parallel fsdp --config recipe.yaml --out runs/mdm",
-    )  # fmt: skip
+    )
     smaller = "smaller clips (--data.width, --data.height), a smaller batch, fewer --compute.workers"
     result = "model"
     version, idle = 1, ("compute",)
-    files = ("clips/*.safetensors", "clips/log_clips.json", "codec/", "steps/", "cache/", "samples/*.png", "tensorboard/", "loss.png",
-             "metrics.json", "model/*", "model.part/")  # fmt: skip
+    files = (
+        "clips/*.safetensors",
+        "clips/log_clips.json",
+        "codec/",
+        "steps/",
+        "cache/",
+        "samples/*.png",
+        "tensorboard/",
+        "loss.png",
+        "metrics.json",
+        "model/*",
+        "model.part/",
+    )
     short = (
-        "start", "steps", "seed", "precision", "data.scenes", "data.clips", "data.cities", "data.width", "data.height",
-        "data.window", "optimizer.lr", "optimizer.batch_frames", "compute.device", "compute.workers",
-    )  # fmt: skip
+        "start",
+        "steps",
+        "seed",
+        "precision",
+        "data.scenes",
+        "data.clips",
+        "data.cities",
+        "data.width",
+        "data.height",
+        "data.window",
+        "optimizer.lr",
+        "optimizer.batch_frames",
+        "compute.device",
+        "compute.workers",
+    )
     settings: LearnConfig
 
     def act(self) -> Path:

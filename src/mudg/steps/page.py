@@ -17,9 +17,10 @@ class Page(Step):
     section = "look at a drive"
     result = "page"
     examples = (
-        "mudg page runs/kitti --out kitti.html", "mudg page runs/kitti --compare runs/kitti --out both.html",
+        "mudg page runs/kitti --out kitti.html",
+        "mudg page runs/kitti --compare runs/kitti --out both.html",
         "mudg page runs/mudg_s --scene scenes/city --out city.html",
-    )  # fmt: skip
+    )
     source: Annotated[Path, RUN]
     """Folder of a finished mudg run, or Gaussian scene written by fit."""
     out: Annotated[Path, Flag("FILE.html")]
@@ -35,4 +36,6 @@ class Page(Step):
     def act(self) -> dict[str, Any]:
         from mudg.viewer import view
 
-        return view.run_page(self.settings, self.source, self.out, scene=self.scene, compare=self.compare, overwrite=self.overwrite)
+        return view.run_page(
+            self.settings, self.source, self.out, scene=self.scene, compare=self.compare, overwrite=self.overwrite
+        )

@@ -1,6 +1,7 @@
 """The pipeline behind ``mudg demo`` and ``mudg run``: steps in order, each skipped when its result verifies.
 
-OUT/scene  OUT/fuse  OUT/adapt  OUT/synthesize/<trajectory>  OUT/fit/<method>  OUT/render/<method>/<trajectory>  OUT/score
+OUT/scene  OUT/fuse  OUT/adapt  OUT/synthesize/<trajectory>  OUT/fit/<method>  OUT/render/<method>/<trajectory>
+OUT/score
 OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, seconds per step over all continuations)
 """
 
@@ -41,8 +42,8 @@ CONTINUED_SHARE = 0.5
 
 
 def fits_of(config: FitConfig, continued: bool = True) -> tuple[FitConfig, FitConfig]:
-    """Settings of the chain's two fits: the one on recorded views, and the one under virtual views, which goes on with it unless
-    ``continued`` is off."""
+    """Settings of the chain's two fits: the one on recorded views, and the one under virtual views, which goes on with
+    it unless ``continued`` is off."""
     further = max(1, round(CONTINUED_SHARE * config.iterations)) if continued else config.iterations
     return replace(config, method=WITHOUT_DIFFUSION), replace(config, method=WITH_DIFFUSION, iterations=further)
 
@@ -51,8 +52,8 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
     """Run the whole chain on a generated city, a dataset log or a scene, and write ``OUT/report.html``.
 
     A step whose folder holds a finished result of the same settings and inputs is verified and reused; an interrupted
-    one continues. The seconds of each step are summed over all continuations. A scene at ``OUT/scene`` may be the source: nothing
-    is written there then.
+    one continues. The seconds of each step are summed over all continuations. A scene at ``OUT/scene`` may be the
+    source: nothing is written there then.
 
     Args:
         config: settings of all verbs.
@@ -64,8 +65,8 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
         Paths of the report and the metrics, the seconds per step, and ``text``: the tables for people.
 
     Raises:
-        InputError: no such log. UsageError: ``out`` holds a run of other settings or files of something else, or touches what is
-            read. Whatever a verb raises.
+        InputError: no such log. UsageError: ``out`` holds a run of other settings or files of something else, or
+            touches what is read. Whatever a verb raises.
     """
     import torch
 
@@ -73,7 +74,12 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
 
     out = Path(out)
     if str(source) != CITY and not Path(source).exists():
-        raise InputError("no such driving log", where=str(source), expected=f"a folder, or the word {CITY}", remedy=similar_path(source))
+        raise InputError(
+            "no such driving log",
+            where=str(source),
+            expected=f"a folder, or the word {CITY}",
+            remedy=similar_path(source),
+        )
     _refuse_overlap(config, source, out)
     refuse_missing(config.synthesize, config.fit)
     torch.set_num_threads(native.default_threads())
@@ -108,13 +114,16 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
         run_report.write_page(out, reels)
         ledger.remember_report(key)
     return {
-        "report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(),
+        "report": page,
+        "metrics": out / "score" / "metrics.json",
+        "seconds": ledger.seconds(),
         "text": _closing_text(out, page, ledger),
-    }  # fmt: skip
+    }
 
 
 def _write_viewer(out: Path) -> Path:
-    """Write the page that shows the fitted scene in a browser. Its record is OUT/run.json: it has no description beside it."""
+    """Write the page that shows the fitted scene in a browser. Its record is OUT/run.json: it has no description beside
+    it."""
     from mudg.base.run_folder import description_path
     from mudg.viewer import view
     from mudg.viewer.report import VIEWER
@@ -126,8 +135,8 @@ def _write_viewer(out: Path) -> Path:
 
 
 def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--synthesize.model") -> None:
-    """UsageError where weights that are not shipped are asked for and not given; InputError where there is no diffusion model. Before
-    anything is written: the first of these is needed only after a fit.
+    """UsageError where weights that are not shipped are asked for and not given; InputError where there is no diffusion
+    model. Before anything is written: the first of these is needed only after a fit.
 
     Args:
         flag: what names the diffusion model on this command line.
@@ -137,32 +146,48 @@ def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--s
 
     if generator.model == NO_MODEL:
         raise UsageError(
-            "the preset paper needs a published-type diffusion model, which mudg does not ship", where=flag,
-            expected="a folder written by mudg convert", remedy="convert a checkpoint that you have (docs/published.md)",
-        )  # fmt: skip
+            "the preset paper needs a published-type diffusion model, which mudg does not ship",
+            where=flag,
+            expected="a folder written by mudg convert",
+            remedy="convert a checkpoint that you have (docs/published.md)",
+        )
     if fit.virtual.perception == "lpips" and not fit.virtual.lpips_weights:
         raise UsageError(
-            "LPIPS needs a weight file, which mudg does not ship", where="--fit.virtual.lpips-weights", expected="a safetensors file",
+            "LPIPS needs a weight file, which mudg does not ship",
+            where="--fit.virtual.lpips-weights",
+            expected="a safetensors file",
             remedy="give one, or --fit.virtual.perception filters",
-        )  # fmt: skip
+        )
     read_description(generator.model)
     if generator.guidance is not None and not is_published(generator.model):
-        raise UsageError("guidance applies to published-type models only", where=flag, got=generator.model,
-                         expected="a folder written by mudg convert")  # fmt: skip
+        raise UsageError(
+            "guidance applies to published-type models only",
+            where=flag,
+            got=generator.model,
+            expected="a folder written by mudg convert",
+        )
 
 
 def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
-    """UsageError where the chain would write into, over or around what it reads. Its own scene is no such case: with a scene as
-    source it writes none."""
+    """UsageError where the chain would write into, over or around what it reads. Its own scene is no such case: with a
+    scene as source it writes none."""
     from mudg.diffusion.files import folder_of
 
-    refuse_overlap(out, {
-        "log": None if str(source) == CITY or _is_own_scene(source, out) else source,
-        "ingest.poses": config.ingest.poses, "ingest.boxes": config.ingest.boxes, "annotate.weights": config.annotate.weights,
-        "annotate.depth-network": config.annotate.depth_network, "synthesize.model": folder_of(config.synthesize.model),
-        "fit.virtual.lpips-weights": config.fit.virtual.lpips_weights, "score.lpips-weights": config.score.lpips_weights,
-        "score.fid-weights": config.score.fid_weights, "score.fvd-weights": config.score.fvd_weights,
-    })  # fmt: skip
+    refuse_overlap(
+        out,
+        {
+            "log": None if str(source) == CITY or _is_own_scene(source, out) else source,
+            "ingest.poses": config.ingest.poses,
+            "ingest.boxes": config.ingest.boxes,
+            "annotate.weights": config.annotate.weights,
+            "annotate.depth-network": config.annotate.depth_network,
+            "synthesize.model": folder_of(config.synthesize.model),
+            "fit.virtual.lpips-weights": config.fit.virtual.lpips_weights,
+            "score.lpips-weights": config.score.lpips_weights,
+            "score.fid-weights": config.score.fid_weights,
+            "score.fvd-weights": config.score.fvd_weights,
+        },
+    )
 
 
 def _is_scene(source: str | Path) -> bool:
@@ -174,11 +199,13 @@ def _is_own_scene(source: str | Path, out: Path) -> bool:
 
 
 def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Ledger, overwrite: bool) -> Path:
-    """Ingest (unless ``source`` is a scene already) and, where semantic labels are absent, annotate. InputError without LiDAR."""
+    """Ingest (unless ``source`` is a scene already) and, where semantic labels are absent, annotate. InputError without
+    LiDAR."""
     if str(source) != CITY and _is_scene(source):
         scene = Path(source)
     else:
-        of_preset = config.ingest.resolution == PRESETS["fast"]["ingest.resolution"]  # which is for logs: a city has a size of its own
+        # which is for logs: a city has a size of its own
+        of_preset = config.ingest.resolution == PRESETS["fast"]["ingest.resolution"]
         settings = replace(config.ingest, resolution="") if str(source) == CITY and of_preset else config.ingest
         ingest = Ingest(log=str(source), out=out / "scene", overwrite=overwrite, settings=settings)
         scene = ledger.timed("ingest", ingest.out, ingest.run)
@@ -224,7 +251,8 @@ class _DiffusionUse:
 
 
 def _diffusion_of(config: RunConfig, scene: Path) -> _DiffusionUse:
-    """How the chain is to use its diffusion model, said in a line where that is not what the settings say at first sight.
+    """How the chain is to use its diffusion model, said in a line where that is not what the settings say at first
+    sight.
 
     Raises:
         UsageError: adaptation is asked for, but the model cannot be adapted or the log is too short.
@@ -239,7 +267,12 @@ def _diffusion_of(config: RunConfig, scene: Path) -> _DiffusionUse:
         return _DiffusionUse(renders, False)  # what the model was trained on
     reason = reason if renders else "the model does not use renders"
     if reason and config.adaptation == "on":
-        raise UsageError("the diffusion model cannot be adapted to this log", where="--adaptation", got=reason, remedy="leave it at auto")
+        raise UsageError(
+            "the diffusion model cannot be adapted to this log",
+            where="--adaptation",
+            got=reason,
+            remedy="leave it at auto",
+        )
     if reason:
         log.info(f"adapt: left out, {reason}")
     return _DiffusionUse(renders, not reason)
@@ -255,27 +288,45 @@ def _teaches(config: RunConfig, scene: Path) -> tuple[bool, str]:
 
 
 def steps_of(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> dict[str, Output]:
-    """The pipeline on a labelled scene, by the names that tables give its steps: each reads what others before it write."""
+    """The pipeline on a labelled scene, by the names that tables give its steps: each reads what others before it
+    write."""
     diffusion = _diffusion_of(config, scene)
     plain, guided = fits_of(config.fit, config.continue_fit)
     first, last = out / "fit" / WITHOUT_DIFFUSION, out / "fit" / WITH_DIFFUSION
     fused, adapted, virtual, render = out / "fuse", out / "adapt", out / "synthesize", out / "render"
     adaptation = replace(config.adapt, model=config.synthesize.model, cameras=config.synthesize.cameras)
     generator = replace(config.synthesize, model=str(adapted / "model")) if diffusion.adapts else config.synthesize
-    compared = {WITHOUT_DIFFUSION: render / WITHOUT_DIFFUSION, DIFFUSION: virtual, WITH_DIFFUSION: render / WITH_DIFFUSION}
+    compared = {
+        WITHOUT_DIFFUSION: render / WITHOUT_DIFFUSION,
+        DIFFUSION: virtual,
+        WITH_DIFFUSION: render / WITH_DIFFUSION,
+    }
     steps: dict[str, Output] = {
         "fuse": Fuse(scene=scene, out=fused, settings=config.fuse),
         "fit without diffusion": Fit(scene=scene, fused=fused, out=first, settings=plain),
         "adapt": Adapt(scene=scene, fused=fused, fitted=first, out=adapted, settings=adaptation),
-        "synthesize": Synthesize(scene=scene, fused=fused, fitted=first if diffusion.renders else None, out=virtual, settings=generator),
-        "fit with diffusion": Fit(
-            scene=scene, fused=fused, observations=(virtual,), start_from=first if config.continue_fit else None, out=last, settings=guided
+        "synthesize": Synthesize(
+            scene=scene, fused=fused, fitted=first if diffusion.renders else None, out=virtual, settings=generator
         ),
-        "render without diffusion": RenderViews(scene=scene, model=first, out=render / WITHOUT_DIFFUSION, settings=config.render),
-        "render with diffusion": RenderViews(scene=scene, model=last, out=render / WITH_DIFFUSION, settings=config.render),
+        "fit with diffusion": Fit(
+            scene=scene,
+            fused=fused,
+            observations=(virtual,),
+            start_from=first if config.continue_fit else None,
+            out=last,
+            settings=guided,
+        ),
+        "render without diffusion": RenderViews(
+            scene=scene, model=first, out=render / WITHOUT_DIFFUSION, settings=config.render
+        ),
+        "render with diffusion": RenderViews(
+            scene=scene, model=last, out=render / WITH_DIFFUSION, settings=config.render
+        ),
         "score": Score(scene=scene, views=compared, fused=fused, out=out / "score", settings=config.score),
     }
-    return {name: replace(step, overwrite=overwrite) for name, step in steps.items() if name != "adapt" or diffusion.adapts}
+    return {
+        name: replace(step, overwrite=overwrite) for name, step in steps.items() if name != "adapt" or diffusion.adapts
+    }
 
 
 def _report_key(out: Path) -> str:
@@ -298,9 +349,9 @@ def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     )
     total = sum(ledger.seconds().values())
     return (
-        f"{score.summary_table(out / 'score')}\n\n  {'step':<26}{'time':>10}{'processor':>13}{'memory':>12}{'written':>12}\n{rows}\n"
-        f"  {'total':<26}{total:8.1f} s\n\n"
-        f"report: {report.resolve()}"
+        f"{score.summary_table(out / 'score')}\n\n "
+        f" {'step':<26}{'time':>10}{'processor':>13}{'memory':>12}{'written':>12}\n{rows}\n  {'total':<26}{total:8.1f}"
+        f" s\n\nreport: {report.resolve()}"
     )
 
 
@@ -332,7 +383,8 @@ class _Ledger:
 
     @classmethod
     def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
-        """Open or begin the ledger of ``out``; UsageError if it belongs to other settings, or the folder to something else."""
+        """Open or begin the ledger of ``out``; UsageError if it belongs to other settings, or the folder to something
+        else."""
         asked = {"verb": "run", "source": source, **configuration.result_settings(config)}
         before: dict[str, Any] = {}
         known = out / "run.json"
@@ -344,9 +396,11 @@ class _Ledger:
                 before = {}
             else:
                 raise UsageError(
-                    "the output folder holds a run with other settings", where=str(out),
+                    "the output folder holds a run with other settings",
+                    where=str(out),
                     got="; ".join(configuration.differences(before["asked"], asked)[:8]) or "another program version",
-                    remedy="choose another --out, or add --overwrite to replace it")  # fmt: skip
+                    remedy="choose another --out, or add --overwrite to replace it",
+                )
         ledger = cls(out, asked, before)
         ledger.save("running")
         store.write_text(out / "run.yaml", configuration.dump_yaml(config))
@@ -372,18 +426,27 @@ class _Ledger:
         if not own:
             raise cls._foreign(path.parent)
         if not store.check_holds(content):
-            raise IntegrityError("the record of the run was altered after it was written", where=str(path),
-                remedy="choose another --out, or restore the file")  # fmt: skip
+            raise IntegrityError(
+                "the record of the run was altered after it was written",
+                where=str(path),
+                remedy="choose another --out, or restore the file",
+            )
         return dict(content)
 
     @staticmethod
     def _foreign(out: Path) -> UsageError:
-        return UsageError("the output folder holds files that do not belong to this run", where=str(out), remedy="choose an empty --out")
+        return UsageError(
+            "the output folder holds files that do not belong to this run",
+            where=str(out),
+            remedy="choose an empty --out",
+        )
 
     def has_report(self, key: str) -> bool:
         """Whether report.html was made of just this and is unchanged."""
         page = self._out / "report.html"
-        return self._report.get("key") == key and page.is_file() and self._report.get("sha256") == store.sha256_file(page)
+        return (
+            self._report.get("key") == key and page.is_file() and self._report.get("sha256") == store.sha256_file(page)
+        )
 
     def remember_report(self, key: str) -> None:
         """Note what the page was made of, and its size: it is written after its step was noted."""
@@ -397,8 +460,8 @@ class _Ledger:
         return self._steps.get(step, {}).get("state") == "complete"
 
     def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
-        """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result adds none. The
-        next step begins with the memory that this one took given back."""
+        """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result
+        adds none. The next step begins with the memory that this one took given back."""
         from mudg.core.raster.cpu import release_memory
 
         finished = self.has_done(name) and result.exists()
@@ -425,13 +488,19 @@ class _Ledger:
         """Seconds, processor seconds, most memory and bytes written per step, in order."""
         spent = {name: Usage.of_record(entry) for name, entry in self._steps.items()}
         return {
-            name: (of.seconds, of.processor_s, of.peak_bytes, int(self._steps[name].get("written_bytes", 0))) for name, of in spent.items()
+            name: (of.seconds, of.processor_s, of.peak_bytes, int(self._steps[name].get("written_bytes", 0)))
+            for name, of in spent.items()
         }
 
     def save(self, state: str) -> None:
         """Write OUT/run.json."""
         record = {
-            "schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "digests": self.digests,
-            "report": self._report, "environment": environment(),
-        }  # fmt: skip
+            "schema": 1,
+            "state": state,
+            "asked": self._asked,
+            "steps": self._steps,
+            "digests": self.digests,
+            "report": self._report,
+            "environment": environment(),
+        }
         store.write_json(self._out / "run.json", store.with_check(record))

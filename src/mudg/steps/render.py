@@ -29,11 +29,22 @@ class RenderViews(Output):
     result = "views"
     from_run = ("model",)
     version, files = 2, ("*.mp4", *below("*", OBSERVATION_FILES))
-    short = ("cameras", "shifts_m", "paths", "width_px", "video", "remove_tracks", "device", "harmonize.on", "harmonize.model")
+    short = (
+        "cameras",
+        "shifts_m",
+        "paths",
+        "width_px",
+        "video",
+        "remove_tracks",
+        "device",
+        "harmonize.on",
+        "harmonize.model",
+    )
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
     """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
     model: Annotated[Path | None, Flag("FOLDER", "second", "model")] = None
-    """Gaussian scene written by fit, or edit. It may also follow SCENE without the flag (not given: that of the run at SCENE)."""
+    """Gaussian scene written by fit, or edit. It may also follow SCENE without the flag (not given: that of the run at
+    SCENE)."""
     edits: Annotated[Path | None, FILE_YAML] = None
     """Edit script (docs/edit.md) to carry out before rendering."""
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
@@ -42,8 +53,12 @@ class RenderViews(Output):
 
     def checked(self) -> Self:
         if self.settings.harmonize.on and (self.edits is None or self.fused is None):
-            raise UsageError("harmonising repairs what an edit script touched, from the fused clouds", where="--harmonize.on",
-                got=f"no --{'edits' if self.edits is None else 'fused'}", remedy="give --edits and --fused, or leave it out")  # fmt: skip
+            raise UsageError(
+                "harmonising repairs what an edit script touched, from the fused clouds",
+                where="--harmonize.on",
+                got=f"no --{'edits' if self.edits is None else 'fused'}",
+                remedy="give --edits and --fused, or leave it out",
+            )
         return self
 
     def inputs(self) -> dict[str, str]:

@@ -13,27 +13,32 @@ if TYPE_CHECKING:
     from mudg.steps.settings.presets import PresetName
     from mudg.steps.settings.run import RunConfig
 
+
 class Run(Output):
     """Run all steps on your own driving log or scene and write a report page."""
 
     section = "start here"
-    examples = ("mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti", "mudg run scenes/a --out runs/a --preset quality")
+    examples = (
+        "mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti",
+        "mudg run scenes/a --out runs/a --preset quality",
+    )
     short = ("device", "adaptation", "continue_fit")
     source: Annotated[str, Flag("SOURCE", "first")]
     """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
     preset: PresetName | None = None
-    """Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000
-    iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md)."""
+    """Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores.
+    quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type
+    model (docs/presets.md)."""
     fast: bool = False
-    """The same as --preset fast: images of a log 480 pixels wide, 3 m to each side, no adaptation. One to two minutes on 2 cores for
-    16 frames of one camera; a line at the start forecasts what it takes here."""
+    """The same as --preset fast: images of a log 480 pixels wide, 3 m to each side, no adaptation. One to two minutes
+    on 2 cores for 16 frames of one camera; a line at the start forecasts what it takes here."""
     seed: Annotated[int | None, Flag("INT")] = None
     """Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
     cameras: tuple[str, ...] = ()
     """Cameras for which shifted trajectories are made (not given: the first camera)."""
     shifts_m: tuple[float, ...] = ()
-    """Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize,
-    render and score."""
+    """Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply
+    to synthesize, render and score."""
     settings: RunConfig
 
     @classmethod
@@ -63,9 +68,11 @@ class Demo(Run):
     out: Annotated[Path, Flag()] = Path("mudg_demo")
     """Folder to write. Repeat the same command to resume an interrupted demo."""
     preset: PresetName | None = None
-    """Settings to start from. fast: smaller images, fewer frames and iterations. default: about 6 minutes on 2 cores. quality: 30,000
-    iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md)."""
+    """Settings to start from. fast: smaller images, fewer frames and iterations. default: about 6 minutes on 2 cores.
+    quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type
+    model (docs/presets.md)."""
     fast: bool = False
     """The same as --preset fast, 3 m to each side: one to two minutes on 2 cores."""
     seed: Annotated[int | None, Flag("INT")] = None
-    """Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
+    """Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in
+    --config)."""

@@ -17,8 +17,18 @@ if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
     from mudg.editing.view_settings import ScoreConfig
 
-_FILES = ("lpips_weights", "lpips_vgg_weights", "lpips_squeeze_weights", "fid_weights", "fvd_weights", "dino_weights", "clip_weights",
-          "video_features", "detections", "lanes")  # fmt: skip
+_FILES = (
+    "lpips_weights",
+    "lpips_vgg_weights",
+    "lpips_squeeze_weights",
+    "fid_weights",
+    "fvd_weights",
+    "dino_weights",
+    "clip_weights",
+    "video_features",
+    "detections",
+    "lanes",
+)
 """Settings that name files and folders to read."""
 
 
@@ -28,16 +38,25 @@ class Score(Output):
     section = "single steps, in the order of use"
     examples = ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",)
     smaller = "smaller views (--width-px), fewer --views"
-    version, files = 6, ("metrics.json", "metrics.md", "errors/*.png", "features/*.safetensors",
-                         *below("truth/*", OBSERVATION_FILES), *below("nearest_fill/*", OBSERVATION_FILES))  # fmt: skip
+    version, files = (
+        6,
+        (
+            "metrics.json",
+            "metrics.md",
+            "errors/*.png",
+            "features/*.safetensors",
+            *below("truth/*", OBSERVATION_FILES),
+            *below("nearest_fill/*", OBSERVATION_FILES),
+        ),
+    )
     short = ("baseline", "lpips_weights", "fid_weights", "fvd_weights", "perceptual_views", "device")
     scene: Annotated[Path, SCENE]
     """Scene directory that the views belong to, or folder of mudg run."""
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
     """Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline)."""
     views: Annotated[Mapping[str, Path], Flag("NAME=FOLDER ...", "second", "views")]
-    """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also stand after SCENE
-    without the flag."""
+    """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also
+    stand after SCENE without the flag."""
     settings: ScoreConfig
     truth: Annotated[Path | None, Flag(hidden=True)] = None
     """Folder of `DrawTruth` for the scene, read instead of drawing the truth again."""
@@ -78,7 +97,11 @@ class DrawTruth(Output):
     """Each a `Trajectory`."""
 
     def key_settings(self) -> dict[str, Any]:
-        views = [[v.time_s, *v.world_from_cam.ravel().tolist(), v.camera.width] for path in self.trajectories for v in path.views]
+        views = [
+            [v.time_s, *v.world_from_cam.ravel().tolist(), v.camera.width]
+            for path in self.trajectories
+            for v in path.views
+        ]
         return {"trajectories": [path.name for path in self.trajectories], "views": views}
 
     def make(self, work: RunDir) -> dict[str, Any]:

@@ -1,5 +1,5 @@
-"""A verb is a `Step`: one frozen dataclass of what it reads, writes and can be told. Command line, Python function, help and checks of
-its inputs follow from the declaration. Imports neither torch nor pydantic before a step is built."""
+"""A verb is a `Step`: one frozen dataclass of what it reads, writes and can be told. Command line, Python function,
+help and checks of its inputs follow from the declaration. Imports neither torch nor pydantic before a step is built."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class Flag:
 
     Args:
         metavar: what stands for the value in the help. FILE.yaml: an edit script.
-        position: "first": a word without a flag. "second": its word may also follow the first one without the flag. "rest": all further
-            words.
-        part: the part of a run that the field reads ("scene", "fused", "model", "fitted", "start_from", "views"): the folder of a run
-            is taken for it.
+        position: "first": a word without a flag. "second": its word may also follow the first one without the flag.
+            "rest": all further words.
+        part: the part of a run that the field reads ("scene", "fused", "model", "fitted", "start_from", "views"): the
+            folder of a run is taken for it.
         hidden: only other steps set it; the command line and the function do not have it.
     """
 
@@ -50,8 +50,8 @@ FILE_YAML = Flag("FILE.yaml")
 class Step:
     """Base of all verbs. A subclass is a frozen dataclass by being one; the first line of its docstring is its summary.
 
-    Fields are what it reads (with a `Flag`), `out`, `overwrite`, and `settings`: a frozen configuration whose fields are flags, too. The
-    text below a field is its help.
+    Fields are what it reads (with a `Flag`), `out`, `overwrite`, and `settings`: a frozen configuration whose fields
+    are flags, too. The text below a field is its help.
     """
 
     verb_name: ClassVar[str] = ""
@@ -75,8 +75,8 @@ class Step:
         dataclass(frozen=True, kw_only=True)(cls)
 
     def run(self) -> Any:
-        """Do it. Returns the path of the result, or what the command shows by name. Where it takes a part of a run, the folder of a run
-        will do."""
+        """Do it. Returns the path of the result, or what the command shows by name. Where it takes a part of a run, the
+        folder of a run will do."""
         names = [field.name for field in fields(self) if flag_of(type(self), field.name).part]
         return (self.with_parts(names) if names else self).act()
 
@@ -85,11 +85,17 @@ class Step:
         from mudg.editing import runs
 
         given = {name: getattr(self, name) for name in names}
-        found = runs.parts_of({name: path for name, path in given.items() if flag_of(type(self), name).part != "views"}, self.required())
+        found = runs.parts_of(
+            {name: path for name, path in given.items() if flag_of(type(self), name).part != "views"}, self.required()
+        )
         for name in given.keys() - found.keys():
             views = given[name]
             named = isinstance(views, Mapping)
-            found[name] = {key: runs.views_at(path, key) for key, path in views.items()} if named else tuple(map(runs.views_at, views))
+            found[name] = (
+                {key: runs.views_at(path, key) for key, path in views.items()}
+                if named
+                else tuple(map(runs.views_at, views))
+            )
         return replace(self, **found)
 
     def act(self) -> Any:
@@ -124,7 +130,10 @@ class Step:
                 values[name] = left.pop(0)
         if left:
             raise UsageError(
-                "too many words", expected=usage(cls), got=" ".join(map(repr, left)), remedy="a value needs its flag before it"
+                "too many words",
+                expected=usage(cls),
+                got=" ".join(map(repr, left)),
+                remedy="a value needs its flag before it",
             )
         return values
 
@@ -146,7 +155,9 @@ class Step:
         return True
 
     @classmethod
-    def build(cls, values: Mapping[str, Any], settings: Mapping[str, Any] | None = None, file: Path | None = None) -> Self:
+    def build(
+        cls, values: Mapping[str, Any], settings: Mapping[str, Any] | None = None, file: Path | None = None
+    ) -> Self:
         """The step of plain values, as they come from a command line or a caller.
 
         Args:
@@ -171,7 +182,11 @@ class Step:
                 raise refused(cls, name, error) from error
         missing = [name for name, field in known.items() if name not in checked and field.default is MISSING]
         if missing:
-            raise UsageError(f"no {shown_name(cls, missing[0])} was given", expected=usage(cls), remedy=f"see mudg {cls.verb()} --help")
+            raise UsageError(
+                f"no {shown_name(cls, missing[0])} was given",
+                expected=usage(cls),
+                remedy=f"see mudg {cls.verb()} --help",
+            )
         if cls.settings_type() is not None:
             defaults = {name: field.default for name, field in known.items()} | checked
             checked["settings"] = cls.settings_from(defaults, file, settings or {})
@@ -188,11 +203,12 @@ class Step:
         return (cls.__doc__ or "").strip().splitlines()[0]
 
 
-# what a declaration says -----------------------------------------------------------------------------------------------
+# what a declaration says --------------------------------------------------------------------------
 
 
 class _Settings(dict[str, Any]):
-    """Names that annotations of steps use and that only type checkers import: classes of settings, looked up when needed."""
+    """Names that annotations of steps use and that only type checkers import: classes of settings, looked up when
+    needed."""
 
     def __missing__(self, name: str) -> Any:
         from mudg.steps.settings import HOMES
@@ -209,13 +225,21 @@ def hints(cls: type[Any]) -> dict[str, Any]:
 def hint_of(cls: type[Any], name: str) -> Any:
     """Type of a field, without its `Flag`."""
     kind = hints(cls)[name]
-    return get_args(kind)[0] if get_origin(kind) is Annotated and any(isinstance(item, Flag) for item in get_args(kind)[1:]) else kind
+    return (
+        get_args(kind)[0]
+        if get_origin(kind) is Annotated and any(isinstance(item, Flag) for item in get_args(kind)[1:])
+        else kind
+    )
 
 
 def flag_of(cls: type[Any], name: str) -> Flag:
     """What the command line knows of a field."""
     kind = hints(cls)[name]
-    return next((item for item in get_args(kind)[1:] if isinstance(item, Flag)), Flag("")) if get_origin(kind) is Annotated else Flag("")
+    return (
+        next((item for item in get_args(kind)[1:] if isinstance(item, Flag)), Flag(""))
+        if get_origin(kind) is Annotated
+        else Flag("")
+    )
 
 
 def field_of(cls: type[Any], name: str) -> Any:
@@ -270,7 +294,11 @@ def in_reading_order(cls: type[Any]) -> list[dataclasses.Field[Any]]:
     def rank(field: dataclasses.Field[Any]) -> int:
         if flag_of(cls, field.name).position in ("first", "rest"):
             return 0
-        return 1 + (flag_of(cls, field.name).position != "second") + (field.default is not MISSING or field.name == "overwrite")
+        return (
+            1
+            + (flag_of(cls, field.name).position != "second")
+            + (field.default is not MISSING or field.name == "overwrite")
+        )
 
     return sorted(own, key=rank)
 
@@ -279,9 +307,12 @@ def refused(cls: type[Step], name: str, error: ValidationError) -> UsageError:
     """The first wrong value of a field in words."""
     first = error.errors(include_url=False)[0]
     return UsageError(
-        "a value is not valid", where=shown_name(cls, name), expected=first["msg"], got=repr(first.get("input"))[:120],
+        "a value is not valid",
+        where=shown_name(cls, name),
+        expected=first["msg"],
+        got=repr(first.get("input"))[:120],
         remedy=f"see mudg {cls.verb()} --help",
-    )  # fmt: skip
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -289,7 +320,8 @@ class Option:
     """A field of a step, or one of its settings.
 
     Args:
-        name: dotted, without the word settings. kind: its type. default: `MISSING` where it has none. text: its help. own: not a setting.
+        name: dotted, without the word settings. kind: its type. default: `MISSING` where it has none. text: its help.
+            own: not a setting.
     """
 
     name: str
@@ -321,16 +353,20 @@ def _setting_options(group: Any, values: Any, path: str, fixed: Sequence[str] = 
             yield from _setting_options(type(value), value, f"{name}.", getattr(group, "FIXED", {}).get(field.name, ()))
         elif field.name not in fixed:
             kind = types[field.name]
-            kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind  # constraints do not matter to the command line
+            # constraints do not matter to the command line
+            kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
             yield Option(name, kind, value, texts.get(field.name, ""), False)
 
 
 def texts_of(kind: type[Any]) -> dict[str, str]:
-    """By field: the string that stands below it in the source, as one line; of inherited fields, too. Empty without a source file."""
+    """By field: the string that stands below it in the source, as one line; of inherited fields, too. Empty without a
+    source file."""
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         if base.__dict__.get("__annotations__"):
-            texts |= _texts_of_module(getattr(sys.modules[base.__module__], "__file__", None) or "").get(base.__qualname__, {})
+            texts |= _texts_of_module(getattr(sys.modules[base.__module__], "__file__", None) or "").get(
+                base.__qualname__, {}
+            )
     return texts
 
 
@@ -355,23 +391,27 @@ def _texts_of_class(node: ast.ClassDef) -> Iterator[tuple[str, str]]:
                 yield field.target.id, " ".join(below.value.value.split())
 
 
-# the function of a verb ------------------------------------------------------------------------------------------------
+# the function of a verb ---------------------------------------------------------------------------
 
 
 def python_function(cls: type[Step], name: str) -> Callable[..., Any]:
     """``mudg.fit(...)`` of a step: its inputs and settings as arguments, its result returned.
 
-    A setting has the name and default that the command shows, without the dashes; a group of settings is a dictionary, or its
-    configuration. ``config`` names a YAML file that is read before the settings.
+    A setting has the name and default that the command shows, without the dashes; a group of settings is a dictionary,
+    or its configuration. ``config`` names a YAML file that is read before the settings.
     """
 
     def call(*args: Any, config: str | Path | None = None, **given: Any) -> Any:
         names = [
-            parameter.name for parameter in inspect.signature(call).parameters.values() if parameter.kind != inspect.Parameter.KEYWORD_ONLY
+            parameter.name
+            for parameter in inspect.signature(call).parameters.values()
+            if parameter.kind != inspect.Parameter.KEYWORD_ONLY
         ]
         if len(args) > len(names):
             raise UsageError(
-                f"mudg.{name} takes {len(names)} arguments without a name", expected=", ".join(names), got=f"{len(args)} of them"
+                f"mudg.{name} takes {len(names)} arguments without a name",
+                expected=", ".join(names),
+                got=f"{len(args)} of them",
             )
         values = dict(zip(names, args, strict=False))
         twice = sorted(values.keys() & given.keys())
@@ -382,8 +422,11 @@ def python_function(cls: type[Step], name: str) -> Callable[..., Any]:
         settings = {key: _plain(value) for key, value in given.items() if key not in own}
         if settings and cls.settings_type() is None:
             near = nearest(next(iter(settings)), own, 0.5)
-            raise UsageError(f"mudg.{name} has no argument {next(iter(settings))!r}", expected=", ".join(sorted(own)),
-                remedy=f"did you mean {near}?" if near else "")  # fmt: skip
+            raise UsageError(
+                f"mudg.{name} has no argument {next(iter(settings))!r}",
+                expected=", ".join(sorted(own)),
+                remedy=f"did you mean {near}?" if near else "",
+            )
         outcome = cls.build(values, settings, None if config is None else Path(config)).run()
         return outcome[cls.result] if isinstance(outcome, dict) and cls.result in outcome else outcome
 
@@ -408,7 +451,8 @@ def _plain(value: Any) -> Any:
 
 
 def signature(cls: type[Step]) -> inspect.Signature:
-    """Arguments of the function: inputs in order, then by name alone the output, other inputs, the YAML file and every setting."""
+    """Arguments of the function: inputs in order, then by name alone the output, other inputs, the YAML file and every
+    setting."""
     kinds = inspect.Parameter
     first, later = [], []
     for field in fields(cls):

@@ -43,10 +43,11 @@ class Synthesize(Output):
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     fused: Annotated[Path | None, Flag("FOLDER", "second", "fused")] = None
-    """Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at SCENE)."""
+    """Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at
+    SCENE)."""
     fitted: Annotated[Path | None, Flag("FOLDER", "", "fitted")] = None
-    """Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For models that were
-    trained with renders."""
+    """Gaussian scene written by fit, without virtual views. Its renders become part of the diffusion model's input. For
+    models that were trained with renders."""
     edits: Annotated[Path | None, FILE_YAML] = None
     """Edit script (docs/edit.md): make views of the drive as it says."""
     settings: SynthesizeConfig
@@ -68,7 +69,9 @@ class Synthesize(Output):
         from mudg.diffusion.files import digest
 
         first = self.digests({"scene": self.scene, "fused": self.fused})
-        return first | {"model": digest(self.settings.model)} | self.digests({"edits": self.edits, "fitted": self.fitted})
+        return (
+            first | {"model": digest(self.settings.model)} | self.digests({"edits": self.edits, "fitted": self.fitted})
+        )
 
     def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.diffusion.synthesize import JobInputs, write_views
@@ -81,5 +84,8 @@ class Synthesize(Output):
             model_of_scene(self.fitted, scene)  # refuses the fit of another scene
         job = JobInputs(self.scene, cast("Path", self.fused), self.fitted)
         if script is not None:
-            scene, job = edited_scene(script, self.settings, job, scene), replace(job, edited=partial(edited_drive, script))
+            scene, job = (
+                edited_scene(script, self.settings, job, scene),
+                replace(job, edited=partial(edited_drive, script)),
+            )
         return partial(write_views, self.settings, job, scene)

@@ -16,7 +16,11 @@ class ViewScene(Step):
 
     verb_name = "view"
     section = "look at a drive"
-    examples = ("mudg view runs/kitti", "mudg view runs/a runs/b", "mudg view runs/mudg_s --scene scenes/city --port 8080")
+    examples = (
+        "mudg view runs/kitti",
+        "mudg view runs/a runs/b",
+        "mudg view runs/mudg_s --scene scenes/city --port 8080",
+    )
     source: Annotated[Path, RUN]
     """Folder of a finished mudg run, or Gaussian scene written by fit."""
     compare: Annotated[Path | None, Flag("[RUN2]", "first")] = None

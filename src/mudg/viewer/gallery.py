@@ -1,4 +1,5 @@
-"""``mudg report``: one page over many finished runs. A run that cannot be read is listed with its reason; the others go on."""
+"""``mudg report``: one page over many finished runs. A run that cannot be read is listed with its reason; the others go
+on."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ from mudg.base.run_folder import ResultFile
 from mudg.scoring.tables import TERMINAL_METRICS, number_text
 from mudg.viewer.report import viewer_address
 
-# gallery --------------------------------------------------------------------------------------------------------------
+# gallery ------------------------------------------------------------------------------------------
 #
 # The gallery of ``mudg report``: one page over many finished runs, with a card per run and one table of all scores.
 
@@ -84,15 +85,22 @@ def _run_or_scores(folder: Path) -> GalleryEntry:
 def _require_finished(folder: Path, state: Mapping[str, Any]) -> None:
     if state.get("state") != "complete":
         raise InputError(
-            "the run is not finished", where=str(folder), got=str(state.get("state"))[:40], remedy="repeat its command: it resumes"
-        )  # fmt: skip
+            "the run is not finished",
+            where=str(folder),
+            got=str(state.get("state"))[:40],
+            remedy="repeat its command: it resumes",
+        )
 
 
 def _run(folder: Path, state: Mapping[str, Any]) -> GalleryEntry:
     _require_finished(folder, state)
     scores = _scores(folder / "score" / "metrics.json")
     seconds = sum(float(step.get("seconds", 0)) for step in state.get("steps", {}).values())
-    known = {"report": folder / "report.html", "viewer": folder / viewer_address(folder), "scores": folder / "score" / "metrics.md"}
+    known = {
+        "report": folder / "report.html",
+        "viewer": folder / viewer_address(folder),
+        "scores": folder / "score" / "metrics.md",
+    }
     pages = {title: path for title, path in known.items() if path.is_file()}
     minutes, rest = divmod(round(seconds), 60)
     return GalleryEntry(folder, "run", scores, f"{minutes} min {rest} s", _picture(folder), pages)
@@ -101,14 +109,20 @@ def _run(folder: Path, state: Mapping[str, Any]) -> GalleryEntry:
 def _bench(folder: Path) -> GalleryEntry:
     found = store.read_json(folder / "bench.json")
     name = str(found.get("bench", "")) if isinstance(found, dict) else ""
-    pages = {title: folder / file for title, file in (("page", "page.html"), ("tables", "bench.md")) if (folder / file).is_file()}
+    pages = {
+        title: folder / file
+        for title, file in (("page", "page.html"), ("tables", "bench.md"))
+        if (folder / file).is_file()
+    }
     return GalleryEntry(folder, f"bench {name}".strip(), None, "", None, pages)
 
 
 def _scores(path: Path) -> Mapping[str, Any]:
     found = store.read_json(path)
     if not isinstance(found, dict) or not {"scene", "methods", "metrics", "by_distance"} <= found.keys():
-        raise InputError("the scores are malformed", where=str(path), expected="what mudg score wrote", remedy="score the run again")
+        raise InputError(
+            "the scores are malformed", where=str(path), expected="what mudg score wrote", remedy="score the run again"
+        )
     return found
 
 
@@ -137,11 +151,16 @@ def page(shown: Sequence[GalleryEntry], unread: Sequence[Unread], out: Path) -> 
     metrics = _metrics(shown)
     rows = [row for one, name in zip(shown, names, strict=True) for row in _rows(one, name, metrics)]
     return html.render(
-        "gallery.html.j2", title="Runs", kicker="mudg report", lead=f"{len(shown)} finished runs, {len(rows)} rows of scores.", cards=cards,
-        metrics=[{"title": m["title"], "unit": m["unit"], "better": m["better"]} for m in metrics], rows=rows,
+        "gallery.html.j2",
+        title="Runs",
+        kicker="mudg report",
+        lead=f"{len(shown)} finished runs, {len(rows)} rows of scores.",
+        cards=cards,
+        metrics=[{"title": m["title"], "unit": m["unit"], "better": m["better"]} for m in metrics],
+        rows=rows,
         places=list(dict.fromkeys(row["place"] for row in rows)),
         unread=[{"name": str(one.folder), "reason": one.reason} for one in unread],
-    )  # fmt: skip
+    )
 
 
 def _names(folders: Sequence[Path]) -> list[str]:
@@ -156,11 +175,22 @@ def _names(folders: Sequence[Path]) -> list[str]:
 def _card(one: GalleryEntry, name: str, out: Path, width: int) -> dict[str, Any]:
     scene = {} if one.scores is None else one.scores["scene"]
     facts = [
-        one.kind, scene.get("id", ""), scene.get("dataset", ""),
-        f"{scene['frames']} frames of {len(scene['cameras'])} cameras" if scene else "", one.facts,
-    ]  # fmt: skip
-    links = [{"title": title, "href": quote(os.path.relpath(path, out.parent).replace(os.sep, "/"))} for title, path in one.pages.items()]
-    return {"name": name, "facts": [str(fact) for fact in facts if fact], "links": links, "picture": _thumbnail(one.picture, width)}
+        one.kind,
+        scene.get("id", ""),
+        scene.get("dataset", ""),
+        f"{scene['frames']} frames of {len(scene['cameras'])} cameras" if scene else "",
+        one.facts,
+    ]
+    links = [
+        {"title": title, "href": quote(os.path.relpath(path, out.parent).replace(os.sep, "/"))}
+        for title, path in one.pages.items()
+    ]
+    return {
+        "name": name,
+        "facts": [str(fact) for fact in facts if fact],
+        "links": links,
+        "picture": _thumbnail(one.picture, width),
+    }
 
 
 def _thumbnail(picture: Path | None, width: int) -> str:
@@ -193,16 +223,25 @@ def _rows(one: GalleryEntry, name: str, metrics: Sequence[Mapping[str, Any]]) ->
         values = [entry["values"].get(metric["name"]) for metric in metrics]
         if not any(isinstance(value, float) for value in values):
             continue
-        rows.append({
-            "run": name, "scene": str(one.scores["scene"]["id"]), "method": str(titles.get(entry["method"], entry["method"])),
-            "place": "recorded path" if distance == 0 else f"{distance:g} m aside",
-            "cells": [{"text": number_text(m["name"], v) if isinstance(v, float) else "", "value": v if isinstance(v, float) else ""}
-                      for m, v in zip(metrics, values, strict=True)],
-        })  # fmt: skip
+        rows.append(
+            {
+                "run": name,
+                "scene": str(one.scores["scene"]["id"]),
+                "method": str(titles.get(entry["method"], entry["method"])),
+                "place": "recorded path" if distance == 0 else f"{distance:g} m aside",
+                "cells": [
+                    {
+                        "text": number_text(m["name"], v) if isinstance(v, float) else "",
+                        "value": v if isinstance(v, float) else "",
+                    }
+                    for m, v in zip(metrics, values, strict=True)
+                ],
+            }
+        )
     return rows
 
 
-# gallery --------------------------------------------------------------------------------------------------------------
+# gallery ------------------------------------------------------------------------------------------
 
 
 def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str, Any]:
@@ -234,9 +273,11 @@ def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str
             unread.append(Unread(folder, f"access was refused: {error.filename}"))
     if not shown:
         raise InputError(
-            "no finished run to show", where=", ".join(str(one.folder) for one in unread[:4]),
-            got="; ".join(dict.fromkeys(one.reason for one in unread[:4])), expected="folders of mudg run, score or bench",
-        )  # fmt: skip
+            "no finished run to show",
+            where=", ".join(str(one.folder) for one in unread[:4]),
+            got="; ".join(dict.fromkeys(one.reason for one in unread[:4])),
+            expected="folders of mudg run, score or bench",
+        )
     content = page(shown, unread, out.resolve()).encode()
     with ResultFile.open(out, "report", {}, {"page": hashlib.sha256(content).hexdigest()}, overwrite=overwrite) as file:
         if file.complete:
@@ -256,5 +297,5 @@ def _folders(runs: Sequence[Path]) -> list[Path]:
         own = any((given / name).is_file() for name in (store.RUN_STATE, "bench.json"))
         below = [] if own or not given.is_dir() else sorted(given.iterdir())
         inside = [one for one in below if one.is_dir() and not one.name.startswith((".", "_"))]
-        found += [one for one in (inside or [given]) if one.resolve() not in {known.resolve() for known in found}]
+        found += [one for one in inside or [given] if one.resolve() not in {known.resolve() for known in found}]
     return found

@@ -38,9 +38,10 @@ from mudg.gaussians.rendering import raster_of, render_view
 from mudg.viewer.page import begin_of, key_rows
 from mudg.viewer.report import FAR_M, NEAR_M
 
-# edits ----------------------------------------------------------------------------------------------------------------
+# edits --------------------------------------------------------------------------------------------
 #
-# Edits made on the viewer's page: checked and carried out by the functions that ``mudg edit`` uses, and saved as a script.
+# Edits made on the viewer's page: checked and carried out by the functions that ``mudg edit`` uses, and saved as a
+# script.
 
 
 MARK: Final = "# Edits made in mudg view. For mudg edit, mudg render --edits and mudg view --edits.\n"
@@ -56,7 +57,8 @@ STREETS: Final = 3
 
 @dataclass(frozen=True, slots=True)
 class EditFiles:
-    """The script that a page begins with, where edits are saved (None: beside the run), and whether a foreign file may be replaced."""
+    """The script that a page begins with, where edits are saved (None: beside the run), and whether a foreign file may
+    be replaced."""
 
     script: Path | None = None
     out: Path | None = None
@@ -75,7 +77,8 @@ class EditDesk:
     """Carries out scripts on what a page shows.
 
     Args:
-        models: the fits, on the CPU. scene, cloud: the log; the cloud may be unknown. begin: the script that the page begins with.
+        models: the fits, on the CPU. scene, cloud: the log; the cloud may be unknown. begin: the script that the page
+            begins with.
         place: file to save to. overwrite: even if it is not one of ours.
         run: the finished run that is shown, whose objects a page may insert; empty where it is a fit alone.
     """
@@ -138,8 +141,12 @@ class EditDesk:
                 )
                 foreign = sorted(set(script.files()) - known - {self.run})
                 if foreign:
-                    raise InputError("a page may name no files but those of --edits", where=NAME, got=foreign[0],
-                        remedy="write them into the script by hand")  # fmt: skip
+                    raise InputError(
+                        "a page may name no files but those of --edits",
+                        where=NAME,
+                        got=foreign[0],
+                        remedy="write them into the script by hand",
+                    )
                 drive = carry_out(script, self.models[0], self.scene, self.cloud)
                 self._planned = {**_last(self._planned, KEPT - 1), text: drive}
             return self._planned[text]
@@ -150,15 +157,18 @@ class EditDesk:
         if asked.script.strip():
             drive = self._checked(asked.script)
             said |= {
-                "paths": self._paths(drive), "removed": list(drive.plan.removed), "inserted": list(drive.plan.inserted),
+                "paths": self._paths(drive),
+                "removed": list(drive.plan.removed),
+                "inserted": list(drive.plan.inserted),
                 "notes": [note["text"] for note in drive.notes] + _unseen(drive),
-            }  # fmt: skip
+            }
         if asked.save:
             said["saved"] = str(self.save(asked.script))
         return store.json_text(said, indent=None).encode(), "application/json"
 
     def _checked(self, text: str) -> EditedDrive:
-        """A script that can be carried out on the fits, too. Streets and sides are closed later, when a frame is asked for."""
+        """A script that can be carried out on the fits, too. Streets and sides are closed later, when a frame is asked
+        for."""
         drive = self._carried(text)
         if not (drive.plan.closed or drive.plan.sides):
             self.edited(text)
@@ -168,7 +178,8 @@ class EditDesk:
         return drive
 
     def _paths(self, drive: EditedDrive) -> dict[str, Any]:
-        """Keys of changed objects: ``rows`` as in ``key_rows``, ``source`` the moments of the recording that they show."""
+        """Keys of changed objects: ``rows`` as in ``key_rows``, ``source`` the moments of the recording that they
+        show."""
         begin = begin_of(self.scene)
         nodes = {node.name: node for node in self.models[0].nodes if isinstance(node, RigidNode)}
 
@@ -193,8 +204,11 @@ class EditDesk:
         if not text.strip():
             raise InputError("there are no edits to save", remedy="hide, move or remove an object first")
         if self.place.exists() and not self.overwrite and not store.read_bytes(self.place).startswith(MARK.encode()):
-            raise InputError("the file was not written by mudg view", where=str(self.place),
-                remedy="start mudg view with another --edits-out, or add --overwrite")  # fmt: skip
+            raise InputError(
+                "the file was not written by mudg view",
+                where=str(self.place),
+                remedy="start mudg view with another --edits-out, or add --overwrite",
+            )
         store.atomic_write(self.place, (MARK + text).encode())
         return self.place
 
@@ -208,10 +222,14 @@ def _unseen(drive: EditedDrive) -> list[str]:
     """What the page, or its exact frames, do not show of a script."""
     found = []
     if drive.plan.closed and drive.plan.views:
-        found.append("exact frames close the street that objects leave (close_street), the first one after some seconds; the page's own "
-                     "picture shows it as it was fitted")  # fmt: skip
+        found.append(
+            "exact frames close the street that objects leave (close_street), the first one after some seconds; the"
+            " page's own picture shows it as it was fitted"
+        )
     if drive.plan.moves_ego:
-        found.append("the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle")
+        found.append(
+            "the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle"
+        )
     return found
 
 
@@ -239,8 +257,12 @@ def place_for(run: Path, given: Path | None) -> Path:
     """
     if given is not None:
         if _sealed(given) or given.is_dir():
-            raise UsageError("edits are not saved into the result of a command", where="--edits-out", got=str(given),
-                expected="a file outside of runs")  # fmt: skip
+            raise UsageError(
+                "edits are not saved into the result of a command",
+                where="--edits-out",
+                got=str(given),
+                expected="a file outside of runs",
+            )
         return given
     beside = Path(run).resolve().parent / NAME
     return Path(NAME) if _sealed(beside) else beside
@@ -250,7 +272,7 @@ def _sealed(path: Path) -> bool:
     return any((folder / name).is_file() for folder in path.resolve().parents for name in SEALED)
 
 
-# frames ---------------------------------------------------------------------------------------------------------------
+# frames -------------------------------------------------------------------------------------------
 
 
 LAYERS: Final = ("color", "depth", "class")
@@ -299,7 +321,8 @@ class VideoRequest(Wanted):
 
 @dataclass(frozen=True, slots=True)
 class _Shown:
-    """The scenes with a script carried out, on the device, and the weather of those that were asked for in colour, by their number."""
+    """The scenes with a script carried out, on the device, and the weather of those that were asked for in colour, by
+    their number."""
 
     edits: str
     models: list[SceneModel]
@@ -315,12 +338,14 @@ class FrameSource:
     """Draws frames of one or two fitted scenes, one at a time.
 
     Args:
-        edited: the scenes with a script carried out; "" = as they are. scene: the log; its recorded views tell the light of the drive,
-            where a script asks for other weather or light.
+        edited: the scenes with a script carried out; "" = as they are. scene: the log; its recorded views tell the
+            light of the drive, where a script asks for other weather or light.
         widest: pixels of the widest frame.
     """
 
-    def __init__(self, edited: Callable[[str], Sequence[SceneModel]], scene: Scene, widest: int, device: torch.device) -> None:
+    def __init__(
+        self, edited: Callable[[str], Sequence[SceneModel]], scene: Scene, widest: int, device: torch.device
+    ) -> None:
         self._edited = edited
         self._scene = scene
         self._device = device
@@ -336,16 +361,19 @@ class FrameSource:
             InputError: a camera that is none, or edits that cannot be carried out.
         """
         content = io.BytesIO()
-        picture = self._picture(asked.layer, self._drawer(asked), View(self._camera(asked), _pose(asked), float(asked.time_s)))
+        picture = self._picture(
+            asked.layer, self._drawer(asked), View(self._camera(asked), _pose(asked), float(asked.time_s))
+        )
         Image.fromarray(picture).save(content, "PNG", compress_level=1)
         return content.getvalue()
 
     def film(self, asked: VideoRequest, send: Callable[[bytes], None]) -> None:
-        """Make a video and send it: after each frame a line of JSON with its number, then one with the number of bytes, then the MP4
-        file. Frames that are asked for meanwhile are drawn in between.
+        """Make a video and send it: after each frame a line of JSON with its number, then one with the number of bytes,
+        then the MP4 file. Frames that are asked for meanwhile are drawn in between.
 
         Raises:
-            InputError: as ``png``, or too many pixels. ResourceError: another video is being made. OSError: of ``send``; nothing is left.
+            InputError: as ``png``, or too many pixels. ResourceError: another video is being made. OSError: of
+                ``send``; nothing is left.
         """
         camera, count = self._camera(asked), len(asked.moments)
         if camera.width * camera.height * count > MOST_PIXELS:
@@ -357,7 +385,9 @@ class FrameSource:
                 remedy="start mudg view with a smaller --width-px, or use mudg render",
             )
         if not self._filming.acquire(blocking=False):
-            raise ResourceError("another video is being made", remedy="wait for it, or cancel it where it was asked for")
+            raise ResourceError(
+                "another video is being made", remedy="wait for it, or cancel it where it was asked for"
+            )
         try:
             content = mp4_bytes(self._pictures(asked, camera, send), asked.fps, crf=VIDEO_CRF)
         finally:
@@ -365,7 +395,9 @@ class FrameSource:
         send(_line(bytes=len(content)))
         send(content)
 
-    def _pictures(self, asked: VideoRequest, camera: Camera, send: Callable[[bytes], None]) -> Iterator[NDArray[np.uint8]]:
+    def _pictures(
+        self, asked: VideoRequest, camera: Camera, send: Callable[[bytes], None]
+    ) -> Iterator[NDArray[np.uint8]]:
         draw = self._drawer(asked)
         for number, moment in enumerate(asked.moments, 1):
             yield self._picture(asked.layer, draw, View(camera, _pose(moment), float(moment.time_s)))

@@ -1,4 +1,5 @@
-"""The viewer page as files: one HTML file that works without a network, or the page and its data in a folder for a web server."""
+"""The viewer page as files: one HTML file that works without a network, or the page and its data in a folder for a web
+server."""
 
 from __future__ import annotations
 
@@ -34,16 +35,17 @@ from mudg.gaussians.nodes import DeformableNode, RigidNode
 from mudg.scene.read import read_image, read_points
 from mudg.viewer.report import FAR_M, NEAR_M
 
-# chunks ---------------------------------------------------------------------------------------------------------------
+# chunks -------------------------------------------------------------------------------------------
 #
-# Which Gaussians a page keeps, and how they are cut into chunks, so that the first one alone is a coarse picture of the whole scene.
+# Which Gaussians a page keeps, and how they are cut into chunks, so that the first one alone is a coarse picture of the
+# whole scene.
 #
-# The Gaussians are ranked by what they cover in the recorded views. Chunk 0 holds the first `CHUNK` of them, from everywhere in the
-# scene,
-# the two chunks after it the next 2 `CHUNK`, then 4, 8, ...: one level of detail after another, each as large as all before it and one
-# chunk more. Within a level the rows are ordered by node, within a node along a Morton curve, and cut into chunks: each is a region,
-# and a page fetches those near its camera first. Every chunk is full except for the last. A scene of at most `SMALL` chunks is cut into
-# halves of chunks, because its first picture, of one chunk, comes sooner that way.
+# The Gaussians are ranked by what they cover in the recorded views. Chunk 0 holds the first `CHUNK` of them, from
+# everywhere in the scene, the two chunks after it the next 2 `CHUNK`, then 4, 8, ...: one level of detail after
+# another, each as large as all before it and one chunk more. Within a level the rows are ordered by node, within a node
+# along a Morton curve, and cut into chunks: each is a region, and a page fetches those near its camera first. Every
+# chunk is full except for the last. A scene of at most `SMALL` chunks is cut into halves of chunks, because its first
+# picture, of one chunk, comes sooner that way.
 
 
 CHUNK: Final = 65_536
@@ -90,8 +92,12 @@ def level_of(chunk: int) -> int:
 
 
 def lay_out(
-    columns: Mapping[str, NDArray[Any]], node: NDArray[np.integer], path: NDArray[np.floating] | None, most: int = 0, size: int = CHUNK
-) -> Layout:  # fmt: skip
+    columns: Mapping[str, NDArray[Any]],
+    node: NDArray[np.integer],
+    path: NDArray[np.floating] | None,
+    most: int = 0,
+    size: int = CHUNK,
+) -> Layout:
     """Choose and order rows.
 
     Args:
@@ -110,8 +116,13 @@ def lay_out(
         lost = float(worth[ranks[most:]].sum() / max(worth.sum(), 1e-300))
         ranks = ranks[:most]
     if len(ranks) > MOST_CHUNKS * size:
-        raise UsageError("more Gaussians than a page can hold", where="--budget", got=f"{len(ranks):,}",
-                         expected=f"at most {MOST_CHUNKS * size:,}", remedy="set --budget to keep those that cover most")  # fmt: skip
+        raise UsageError(
+            "more Gaussians than a page can hold",
+            where="--budget",
+            got=f"{len(ranks):,}",
+            expected=f"at most {MOST_CHUNKS * size:,}",
+            remedy="set --budget to keep those that cover most",
+        )
     rows, size = rows[ranks], chunk_rows(len(ranks), size)
     level = np.repeat([np.int8(level_of(k)) for k in range(-(-len(rows) // size))], size)[: len(rows)]
     order = np.lexsort((morton_codes(columns["means"], node, rows), node[rows], level))
@@ -136,7 +147,8 @@ def _slices(count: int) -> Iterator[slice]:
 def coverage(
     columns: Mapping[str, NDArray[Any]], node: NDArray[np.integer], path: NDArray[np.floating] | None
 ) -> NDArray[np.float64]:
-    """Opacity times the area that each Gaussian covers in an image taken where the path is nearest: f64[n], square radians."""
+    """Opacity times the area that each Gaussian covers in an image taken where the path is nearest: f64[n], square
+    radians."""
     from scipy.spatial import cKDTree
 
     tree = cKDTree(path) if path is not None and len(path) else None
@@ -170,20 +182,23 @@ def morton_codes(
     return codes
 
 
-# packed ---------------------------------------------------------------------------------------------------------------
+# packed -------------------------------------------------------------------------------------------
 #
-# A fitted scene as few bytes as a browser needs to draw it: quantised per block of neighbours, laid out as planes, a blob per chunk.
+# A fitted scene as few bytes as a browser needs to draw it: quantised per block of neighbours, laid out as planes, a
+# blob per chunk.
 #
-# ``page.py`` says which rows a chunk holds. Its rows are cut into blocks of at most `BLOCK` rows of one node. Sections of its blob
-# (little-endian; every one starts at a multiple of 4; n rows, b blocks):
+# ``page.py`` says which rows a chunk holds. Its rows are cut into blocks of at most `BLOCK` rows of one node. Sections
+# of its blob (little-endian; every one starts at a multiple of 4; n rows, b blocks):
 #
 #     block     f32[b, 12]   least position [3], step [3]; least natural logarithm of the scale [3], step [3]
 #     block_of  u32[b, 2]    node and rows of each block
 #     position  u8[6, n]     x y z low bytes, then x y z high bytes: least + value * step, metres, frame of the node
 #     scale     u8[3, n]     least + value * step, natural logarithm of metres
-#     rotation  u8[4, n]     bytes of a u32: the three smaller parts of the unit quaternion (w x y z) as 10 bits each, offset 512, and in
+#     rotation  u8[4, n]     bytes of a u32: the three smaller parts of the unit quaternion (w x y z) as 10 bits each,
+#               offset 512, and in
 #                            the highest two bits which part is left out; it is positive
-#     color     u8[4, n]     r - g, g, b - g of the constant band (modulo 256: most surfaces are nearly grey, so this compresses better);
+#     color     u8[4, n]     r - g, g, b - g of the constant band (modulo 256: most surfaces are nearly grey, so this
+#               compresses better);
 #                            r g b are between ``color_low`` and ``color_high``; then opacity of 255
 #     class     u8[2, n]     channel of the likeliest class (255: none), and its lead over the second in `LEAD_STEP`
 #     certainty u8[n]        of 255 (only if it was measured)
@@ -206,7 +221,8 @@ DEFORM_STEP_M: Final = 1e-4
 SAMPLE: Final = 100_000
 SH_BAND_0: Final = 0.28209479177387814
 COLOR_LIMITS: Final = (-0.5, 2.0)
-"""Colours of Gaussians beyond these are cut; a Gaussian may be darker than black or brighter than white where others cover it."""
+"""Colours of Gaussians beyond these are cut; a Gaussian may be darker than black or brighter than white where others
+cover it."""
 
 Sections = dict[str, NDArray[Any]]
 
@@ -233,7 +249,8 @@ class Packed:
         return len(self.layout.rows)
 
     def chunk(self, index: int) -> tuple[Sections, dict[str, Any]]:
-        """Sections of a chunk, and its record: rows, level, box of what stands still (None: nothing does), whether something moves."""
+        """Sections of a chunk, and its record: rows, level, box of what stands still (None: nothing does), whether
+        something moves."""
         rows, columns, facts = self.layout.chunk(index), _columns(self.model), self.facts
         node = self.model.table.labels["node"].numpy()[rows].astype(np.int64)
         blocks = list(_blocks(node))
@@ -269,10 +286,18 @@ def pack_scene(
     low, high = _color_range(columns["sh_dc"], layout, model.sh_degree)
     nodes, moving = motion_sections(model, begin_s)
     facts: dict[str, Any] = {
-        "rows": len(layout.rows), "chunk_rows": layout.size, "degree": model.sh_degree, "classes": list(model.classes),
-        "lead_step": LEAD_STEP, "color_low": low, "color_high": high, "certainty": model.certainty is not None,
-        "antialias": bool(_drawing(model).get("antialias", False)), "nodes": nodes, "deform_step": DEFORM_STEP_M,
-    }  # fmt: skip
+        "rows": len(layout.rows),
+        "chunk_rows": layout.size,
+        "degree": model.sh_degree,
+        "classes": list(model.classes),
+        "lead_step": LEAD_STEP,
+        "color_low": low,
+        "color_high": high,
+        "certainty": model.certainty is not None,
+        "antialias": bool(_drawing(model).get("antialias", False)),
+        "nodes": nodes,
+        "deform_step": DEFORM_STEP_M,
+    }
     if model.sh_degree:
         facts["harmonic_step"] = _harmonic_step(columns["sh_rest"], layout)
     if model.sky is not None:
@@ -296,7 +321,8 @@ def _notes(model: SceneModel) -> tuple[str, ...]:
     notes = []
     if any(isinstance(node, (VibrationNode, HexPlaneNode, DeformedNode, BezierNode)) for node in model.nodes):
         notes.append(
-            "Gaussians of this method change on their own with time. The page shows them at rest; boxes still carry them."
+            "Gaussians of this method change on their own with time. The page shows them at rest; boxes still carry"
+            " them."
         )
     if set(_drawing(model)) - {"antialias", "packed"}:
         notes.append("This scene was fitted to be drawn along rays or as discs. The page draws the usual ellipsoids.")
@@ -329,7 +355,8 @@ def _geometry(columns: Mapping[str, Any], rows: Any, blocks: list[tuple[int, Any
 
 
 def _quantised(values: NDArray[np.float64], levels: int, least_step: float) -> tuple[Any, Any, Any]:
-    """Least value, step (both as f32 holds them) and levels, per column. Few levels leave high bytes that compress well."""
+    """Least value, step (both as f32 holds them) and levels, per column. Few levels leave high bytes that compress
+    well."""
     low = values.min(0).astype(np.float32)
     step = np.maximum((values.max(0) - low) / levels, least_step).astype(np.float32)
     return low, step, np.clip(np.rint((values - low) / step), 0, levels).astype(np.uint16 if levels > 255 else np.uint8)
@@ -384,23 +411,27 @@ def to_u8(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
 
 
-# motion ---------------------------------------------------------------------------------------------------------------
+# motion -------------------------------------------------------------------------------------------
 
 
 def motion_sections(model: SceneModel, begin_s: float) -> tuple[list[dict[str, Any]], Sections]:
     """What carries the rows of each node.
 
     Returns:
-        One record per node (name, kind, label, size_m, ``keys``: first row and number of its keys in section "keys", ``grid``: first
-        value and cells of its displacements in "deform"), and the sections: ``keys`` f32[k, 8] (time since ``begin_s``, position,
-        quaternion w x y z, world from box), ``deform`` i16[...] as [key, xyz, z, y, x] per deformable node, in `DEFORM_STEP_M`.
+        One record per node (name, kind, label, size_m, ``keys``: first row and number of its keys in section "keys",
+        ``grid``: first value and cells of its displacements in "deform"), and the sections: ``keys`` f32[k, 8] (time
+        since ``begin_s``, position, quaternion w x y z, world from box), ``deform`` i16[...] as [key, xyz, z, y, x] per
+        deformable node, in `DEFORM_STEP_M`.
     """
     records, keys, grids = [], [np.zeros((0, 8), np.float32)], [np.zeros(0, np.int16)]
     for node in model.nodes:
         record: dict[str, Any] = {"name": node.name, "kind": node.kind}
         if isinstance(node, RigidNode):
-            record |= {"label": node.label, "size_m": [round(float(v), 4) for v in node.size_m],
-                       "keys": [sum(map(len, keys)), len(node.times_s)]}  # fmt: skip
+            record |= {
+                "label": node.label,
+                "size_m": [round(float(v), 4) for v in node.size_m],
+                "keys": [sum(map(len, keys)), len(node.times_s)],
+            }
             keys.append(key_rows(node.times_s - begin_s, node.corrected_keys()))
             if isinstance(node, DeformableNode):
                 grid = node.offsets["deform"].detach().float().numpy()
@@ -416,7 +447,7 @@ def key_rows(times_s: NDArray[np.floating], poses: NDArray[np.float64]) -> NDArr
     return np.column_stack([np.asarray(times_s), poses[:, :3, 3], turns]).astype(np.float32)
 
 
-# the blob -------------------------------------------------------------------------------------------------------------
+# the blob -----------------------------------------------------------------------------------------
 
 
 def blob_of(sections: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, list[Any]]]:
@@ -431,12 +462,14 @@ def blob_of(sections: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, list
     return b"".join(parts), directory
 
 
-# facts ----------------------------------------------------------------------------------------------------------------
+# facts --------------------------------------------------------------------------------------------
 #
-# What the viewer page knows about a log besides Gaussians: cameras, frames with small images, boxes, the vehicle's path, LiDAR points.
+# What the viewer page knows about a log besides Gaussians: cameras, frames with small images, boxes, the vehicle's
+# path, LiDAR points.
 #
-# Times on the page are seconds since the first frame. Sections of the log's blob (see ``page.py``): ``keys`` f32[k, 8] and ``lidar``
-# u16[3, m], places in the world as ``lidar_low + value * lidar_step``, ``ground`` u16[x, y] (see ``with_ground``).
+# Times on the page are seconds since the first frame. Sections of the log's blob (see ``page.py``): ``keys`` f32[k, 8]
+# and ``lidar`` u16[3, m], places in the world as ``lidar_low + value * lidar_step``, ``ground`` u16[x, y] (see
+# ``with_ground``).
 
 
 WEBP_QUALITY: Final = 50
@@ -487,32 +520,59 @@ def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images:
     places, images = _images(scene, frames, image_width, most_images)
     sweeps, points = _lidar(scene, begin)
     facts = {
-        "title": scene.id, "end_s": max(frame.view.time_s for frame in frames) - begin, "begin_s": begin,
+        "title": scene.id,
+        "end_s": max(frame.view.time_s for frame in frames) - begin,
+        "begin_s": begin,
         "cameras": {name: _camera(camera, colors) for name, camera in scene.cameras.items()},
         "frames": [
-            {"id": frame.id, "camera": frame.view.camera.name, "t": round(frame.view.time_s - begin, 6), "image": place,
-             "split": scene.split.get(frame.id, "train"), "pose": np.round(frame.view.world_from_cam[:3], 7).ravel().tolist()}
+            {
+                "id": frame.id,
+                "camera": frame.view.camera.name,
+                "t": round(frame.view.time_s - begin, 6),
+                "image": place,
+                "split": scene.split.get(frame.id, "train"),
+                "pose": np.round(frame.view.world_from_cam[:3], 7).ravel().tolist(),
+            }
             for frame, place in zip(frames, places)
         ],
-        "ego_keys": [0, len(scene.ego.times_s)], "tracks": tracks, **sweeps, "images": {"count": sum(p is not None for p in places)},
-        "class_names": list(palette.CLASSES), "class_colors": palette.DISPLAY_COLORS.tolist(), "depth_range_m": [NEAR_M, FAR_M],
-        "depth_colors": depth_colors(np.geomspace(NEAR_M, FAR_M, 256).astype(np.float32)[None], NEAR_M, FAR_M)[0].tolist(),
-    }  # fmt: skip
+        "ego_keys": [0, len(scene.ego.times_s)],
+        "tracks": tracks,
+        **sweeps,
+        "images": {"count": sum(p is not None for p in places)},
+        "class_names": list(palette.CLASSES),
+        "class_colors": palette.DISPLAY_COLORS.tolist(),
+        "depth_range_m": [NEAR_M, FAR_M],
+        "depth_colors": (
+            depth_colors(np.geomspace(NEAR_M, FAR_M, 256).astype(np.float32)[None], NEAR_M, FAR_M)[0].tolist()
+        ),
+    }
     return PageFacts(facts, {"keys": np.concatenate(keys), "lidar": points}, images)
 
 
 def with_ground(page: PageFacts, ground: HeightMap | None) -> PageFacts:
-    """The page with heights of the ground, for objects that are moved on it; without them where they are not known or too many.
+    """The page with heights of the ground, for objects that are moved on it; without them where they are not known or
+    too many.
 
-    Section ``ground``: world z as ``low + value * step``, steps of `LEAST_STEP_M`, larger where heights span more than 33 m; `UNKNOWN`
-    where it is not known.
+    Section ``ground``: world z as ``low + value * step``, steps of `LEAST_STEP_M`, larger where heights span more than
+    33 m; `UNKNOWN` where it is not known.
     """
-    if ground is None or ground.heights.size > MOST_CELLS or not np.isfinite(ground.heights).any() or min(ground.heights.shape) < 2:
+    if (
+        ground is None
+        or ground.heights.size > MOST_CELLS
+        or not np.isfinite(ground.heights).any()
+        or min(ground.heights.shape) < 2
+    ):
         return replace(page, facts=page.facts | {"ground": None})
     low, high = float(np.nanmin(ground.heights)), float(np.nanmax(ground.heights))
     step = max((high - low) / (UNKNOWN - 1), LEAST_STEP_M)
     levels = np.where(np.isfinite(ground.heights), np.rint((ground.heights - low) / step), UNKNOWN).astype(np.uint16)
-    record = {"origin": ground.origin.tolist(), "cell_m": ground.cell_m, "shape": list(levels.shape), "low": low, "step": step}
+    record = {
+        "origin": ground.origin.tolist(),
+        "cell_m": ground.cell_m,
+        "shape": list(levels.shape),
+        "low": low,
+        "step": step,
+    }
     return replace(page, facts=page.facts | {"ground": record}, sections=page.sections | {"ground": levels})
 
 
@@ -529,10 +589,15 @@ def _camera(camera: Camera, colors: CameraColors) -> dict[str, Any]:
     known = colors.to_common.get(camera.name)
     shown = None if known is None else known.inverse()
     return {
-        "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy, "cx": camera.cx, "cy": camera.cy,
+        "width": camera.width,
+        "height": camera.height,
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "cx": camera.cx,
+        "cy": camera.cy,
         "gain": [1, 1, 1] if shown is None else list(shown.gain),
         "offset": [0, 0, 0] if shown is None else list(shown.offset),
-    }  # fmt: skip
+    }
 
 
 def _images(scene: Scene, frames: Sequence[Frame], width: int, most: int) -> tuple[list[list[int] | None], bytes]:
@@ -574,7 +639,7 @@ def _lidar(scene: Scene, begin: float) -> tuple[dict[str, Any], NDArray[np.uint1
     return {"lidar": records, "lidar_low": low.tolist(), "lidar_step": step.tolist()}, levels
 
 
-# page -----------------------------------------------------------------------------------------------------------------
+# page ---------------------------------------------------------------------------------------------
 
 
 ONE_FILE_BYTES: Final = 32 * 2**20
@@ -584,9 +649,28 @@ TEXELS: Final = (2, 3, 4, 5)
 SORT_BYTES: Final = 38
 """Per Gaussian in the sorter of a page (`assets/viewer/sorter.js`)."""
 MODULES: Final = (
-    "math", "data", "sorter", "shaders", "edits", "particles", "weather", "renderer", "cameras", "state", "overlay", "arrival", "app",
-    "zip", "share", "gizmo", "editor", "ui", "input", "exact", "main",
-)  # fmt: skip
+    "math",
+    "data",
+    "sorter",
+    "shaders",
+    "edits",
+    "particles",
+    "weather",
+    "renderer",
+    "cameras",
+    "state",
+    "overlay",
+    "arrival",
+    "app",
+    "zip",
+    "share",
+    "gizmo",
+    "editor",
+    "ui",
+    "input",
+    "exact",
+    "main",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -632,7 +716,8 @@ class ViewerPage:
     effort: int = 9
 
     def files(self, facts: dict[str, Any]) -> Iterator[PageFile]:
-        """The data files, made one at a time; `facts` becomes what the page says about them and is complete after the last one."""
+        """The data files, made one at a time; `facts` becomes what the page says about them and is complete after the
+        last one."""
         facts |= self.log.facts | {"live": None if self.live is None else dict(self.live), "scenes": []}
         made = PageFile("images", self.log.images)
         facts["images"] = facts["images"] | {"file": made.record()}
@@ -677,12 +762,24 @@ class ViewerPage:
         near, far = facts["depth_range_m"]
         imports, entry = import_map(), 'import "mudg/main";'
         text = html.render(
-            "viewer.html.j2", title=self.title, subtitle=self.subtitle, about=self.about, report=self.report,
-            css=Markup(asset("viewer.css")), import_map=Markup(imports), policy=policy(imports, entry),  # noqa: S704
-            size=f"{size / 1e6:.1f} MB", near=f"{near:g}", far=f"{far:g}", class_legend=html.class_legend(),
+            "viewer.html.j2",
+            title=self.title,
+            subtitle=self.subtitle,
+            about=self.about,
+            report=self.report,
+            css=Markup(asset("viewer.css")),  # noqa: S704
+            import_map=Markup(imports),  # noqa: S704
+            policy=policy(imports, entry),
+            size=f"{size / 1e6:.1f} MB",
+            near=f"{near:g}",
+            far=f"{far:g}",
+            class_legend=html.class_legend(),
             notes=[note for _, packed in self.scenes for note in packed.notes],
-            payloads=inside, live=self.live is not None, facts=Markup(script_json(facts)), entry=Markup(entry),  # noqa: S704
-        )  # fmt: skip
+            payloads=inside,
+            live=self.live is not None,
+            facts=Markup(script_json(facts)),  # noqa: S704
+            entry=Markup(entry),  # noqa: S704
+        )
         return text.encode()
 
 
@@ -695,7 +792,12 @@ def scene_bytes(rows: int, size: int, degree: int) -> tuple[int, int]:
 def most_within(limit_bytes: float, degree: int, size: int) -> int:
     """The most rows whose graphics memory and memory for sorting are together within a limit."""
     most = int(limit_bytes // (16 * TEXELS[degree] + 4 + SORT_BYTES))
-    return bisect.bisect_right(range(most + 1), limit_bytes, key=lambda n: sum(scene_bytes(n, chunk_rows(n, size), degree))) - 1
+    return (
+        bisect.bisect_right(
+            range(most + 1), limit_bytes, key=lambda n: sum(scene_bytes(n, chunk_rows(n, size), degree))
+        )
+        - 1
+    )
 
 
 def asset(name: str) -> str:
@@ -704,7 +806,8 @@ def asset(name: str) -> str:
 
 
 def import_map() -> str:
-    """The viewer's modules as an import map of data addresses: a page opened by double click may not load files beside it."""
+    """The viewer's modules as an import map of data addresses: a page opened by double click may not load files beside
+    it."""
     sources = {f"mudg/{name}": asset(f"{name}.js") for name in MODULES}
     coded = {
         name: "data:text/javascript;base64," + base64.b64encode(text.encode()).decode()
@@ -719,8 +822,8 @@ def policy(*scripts: str) -> str:
         f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in scripts
     )
     return (
-        f"default-src 'none'; script-src {hashes} data: blob:; worker-src blob:; style-src 'unsafe-inline'; "
-        "img-src 'self' data: blob:; media-src blob:; connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'"
+        f"default-src 'none'; script-src {hashes} data: blob:; worker-src blob:; style-src 'unsafe-inline'; img-src"
+        " 'self' data: blob:; media-src blob:; connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'"
     )
 
 

@@ -42,19 +42,30 @@ from mudg.scoring.tables import (
     values_by_distance,
 )
 
-# command lines for the report of a run: what to do with it next, and its steps one by one -----------------------------
+# command lines for the report of a run: what to do with it next, and its steps one by one ---------
 
 
 PLAIN: Final = "fit/street_gaussians"
 GUIDED: Final = "fit/mudg_s"
 STEPS: Final = (
-    "scene", "annotate", "fuse", PLAIN, "adapt", "synthesize", GUIDED, "render/street_gaussians", "render/mudg_s", "score",
-)  # fmt: skip
+    "scene",
+    "annotate",
+    "fuse",
+    PLAIN,
+    "adapt",
+    "synthesize",
+    GUIDED,
+    "render/street_gaussians",
+    "render/mudg_s",
+    "score",
+)
 """Folders of the chain, in the order in which they are made."""
 INPUTS: Final = {
-    "fused": ("--fused", "fuse"), "fitted": ("--fitted", PLAIN), "start": ("--start-from", PLAIN),
+    "fused": ("--fused", "fuse"),
+    "fitted": ("--fitted", PLAIN),
+    "start": ("--start-from", PLAIN),
     "observations": ("--observations", "synthesize"),
-}  # fmt: skip
+}
 """Inputs that a step's record names: their flag, and the folder of the chain."""
 VIEWS: Final = {"street_gaussians": "render/street_gaussians", "mudg_r": "synthesize", "mudg_s": "render/mudg_s"}
 
@@ -74,24 +85,34 @@ def next_commands(out: Path, source: str) -> list[CommandBlock]:
     blocks = [
         ("Fly through the scene in a browser; the second line compares both fits", [["view", run], ["view", run, run]]),
         ("One page to send to others", [["page", run, "--out", f"{run}.html"]]),
-        ("Change the drive, and look at it", [
-            [f"printf '%s\\n' {shlex.quote(edit)} > edits.yaml"], ["edit", run, "edits.yaml", "--out", f"{run}_edited"],
-            ["view", run, "--edits", "edits.yaml"],
-        ]),
-        ("Pictures, depth and classes of another path", [
-            ["render", scene, "--model", f"{run}/{GUIDED}", "--shifts-m", "1.5", "--out", f"{run}_views"],
-        ]),
-        ("Files for other programs (docs: export)", [
-            ["export", "ply", run, "--out", f"{run}.ply"], ["export", "usdz", run, "--out", f"{run}.usdz"],
-            *([["asset", "export", run, movable, "--out", f"{run}_object.safetensors"]] if movable else []),
-        ]),
+        (
+            "Change the drive, and look at it",
+            [
+                [f"printf '%s\\n' {shlex.quote(edit)} > edits.yaml"],
+                ["edit", run, "edits.yaml", "--out", f"{run}_edited"],
+                ["view", run, "--edits", "edits.yaml"],
+            ],
+        ),
+        (
+            "Pictures, depth and classes of another path",
+            [["render", scene, "--model", f"{run}/{GUIDED}", "--shifts-m", "1.5", "--out", f"{run}_views"]],
+        ),
+        (
+            "Files for other programs (docs: export)",
+            [
+                ["export", "ply", run, "--out", f"{run}.ply"],
+                ["export", "usdz", run, "--out", f"{run}.usdz"],
+                *([["asset", "export", run, movable, "--out", f"{run}_object.safetensors"]] if movable else []),
+            ],
+        ),
         ("The same on your own log", [["run", "LOG", "--out", "runs/mine"]]),
-    ]  # fmt: skip
+    ]
     return [CommandBlock(title, tuple(_line(words) for words in lines)) for title, lines in blocks]
 
 
 def step_commands(out: Path, source: str) -> list[str]:
-    """The steps of a run, each as a command with the settings that it had: as it stands it verifies the result and reuses it."""
+    """The steps of a run, each as a command with the settings that it had: as it stands it verifies the result and
+    reuses it."""
     found = []
     for folder in STEPS:
         try:
@@ -130,7 +151,7 @@ def _first_object(out: Path) -> str:
         return ""
 
 
-# page -----------------------------------------------------------------------------------------------------------------
+# page ---------------------------------------------------------------------------------------------
 #
 # The report page: what ``templates/report.html.j2`` shows, worked out from plain values. No torch, no files.
 
@@ -192,28 +213,48 @@ class Adaptation:
 
 
 def page(
-    scores: Mapping[str, Any], ledger: Mapping[str, Any], settings: str, videos: Sequence[TrajectoryVideo],
-    columns: Sequence[str], adaptation: Adaptation | None = None, viewer: str = "", out: Path = Path(),
-) -> str:  # fmt: skip
+    scores: Mapping[str, Any],
+    ledger: Mapping[str, Any],
+    settings: str,
+    videos: Sequence[TrajectoryVideo],
+    columns: Sequence[str],
+    adaptation: Adaptation | None = None,
+    viewer: str = "",
+    out: Path = Path(),
+) -> str:
     """The text of the page.
 
     Args:
         scores: ``metrics.json``. ledger: ``run.json`` of the chain. settings: ``run.yaml``. videos: one per trajectory.
-        columns: panel columns in the order in which they stand in the videos. adaptation: of the diffusion model, if there was one.
-        viewer: relative address of the page that shows the fitted scene, or empty. out: folder of the run, for commands.
+        columns: panel columns in the order in which they stand in the videos. adaptation: of the diffusion model, if
+            there was one.
+        viewer: relative address of the page that shows the fitted scene, or empty. out: folder of the run, for
+            commands.
     """
     scene = scores["scene"]
     heading, lead = headline(scores)
     source = str(ledger.get("asked", {}).get("source", "LOG"))
     return html.render(
-        "report.html.j2", title=f"{scene['id']}: mudg report", kicker=f"mudg report, {scene['id']} ({scene['dataset']})",
-        heading=heading, lead=lead, scene=scene, viewer=viewer, facts=_facts(scores, ledger), rules=scores["rules"],
-        methods=scores["methods"], settings=settings, provenance=_provenance(scores, ledger),
+        "report.html.j2",
+        title=f"{scene['id']}: mudg report",
+        kicker=f"mudg report, {scene['id']} ({scene['dataset']})",
+        heading=heading,
+        lead=lead,
+        scene=scene,
+        viewer=viewer,
+        facts=_facts(scores, ledger),
+        rules=scores["rules"],
+        methods=scores["methods"],
+        settings=settings,
+        provenance=_provenance(scores, ledger),
         adaptation=None if adaptation is None else adaptation.record,
         adaptation_pictures=() if adaptation is None else adaptation.pictures,
-        next_commands=next_commands(out, source), step_commands=step_commands(out, source),
-        **_player_values(scores, videos, columns), **_score_values(scores), **_time_values(ledger),
-    )  # fmt: skip
+        next_commands=next_commands(out, source),
+        step_commands=step_commands(out, source),
+        **_player_values(scores, videos, columns),
+        **_score_values(scores),
+        **_time_values(ledger),
+    )
 
 
 # ---- text at the top ----
@@ -242,8 +283,8 @@ def headline(scores: Mapping[str, Any]) -> tuple[str, str]:
     if abs(gain) < 0.05:
         verdict = "diffusion makes no difference to colour"
     sentences = [
-        f"{distance_title(scores, far)} of the recorded path, colour reaches {with_['psnr']:.1f} dB against exact ground truth "
-        f"({without['psnr']:.1f} dB without diffusion)."
+        f"{distance_title(scores, far)} of the recorded path, colour reaches {with_['psnr']:.1f} dB against exact"
+        f" ground truth ({without['psnr']:.1f} dB without diffusion)."
     ]
     for metric, text in (("abs_rel", "relative depth error"), ("miou", "class overlap (mIoU)")):
         if isinstance(with_.get(metric), float) and isinstance(without.get(metric), float):
@@ -296,20 +337,32 @@ def _player_values(
             {"camera": v.camera, "name": v.name, "title": v.place, "checked": v is first} for v in ordered
         ],
         "depth_scale": {
-            "near": f"{NEAR_M:g}", "far": f"{FAR_M:g}",
+            "near": f"{NEAR_M:g}",
+            "far": f"{FAR_M:g}",
             "stops": ", ".join("#{:02x}{:02x}{:02x}".format(*c) for c in depth_colors(steps, NEAR_M, FAR_M)[0]),
         },
         "class_legend": html.class_legend(),
         "player": {
-            "fps": FPS, "columns": list(columns), "rows": [{"name": name, "title": title} for name, title in PANEL_ROWS],
+            "fps": FPS,
+            "columns": list(columns),
+            "rows": [{"name": name, "title": title} for name, title in PANEL_ROWS],
             "titles": {c: title_of(c) if exact or c != "truth" else "Recorded path" for c in columns},
             "trajectories": [
-                {"index": i, "name": v.name, "camera": v.camera, "title": v.place, "width": v.width, "height": v.height,
-                 "frames": v.frames, "panels": {c: list(p) for c, p in v.panels.items()}}
-                for i, v in enumerate(videos) if v.video
+                {
+                    "index": i,
+                    "name": v.name,
+                    "camera": v.camera,
+                    "title": v.place,
+                    "width": v.width,
+                    "height": v.height,
+                    "frames": v.frames,
+                    "panels": {c: list(p) for c, p in v.panels.items()},
+                }
+                for i, v in enumerate(videos)
+                if v.video
             ],
         },
-    }  # fmt: skip
+    }
 
 
 # ---- numbers ----
@@ -349,10 +402,17 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
         "charts": [c for c in (_chart(scores, metrics[n]) for n in CHARTED if n in metrics) if c],
         "result_metrics": numeric,
         "results": [
-            [r["trajectory"], title_of(r["method"]), r["views"], *(number_text(m["name"], r["values"].get(m["name"])) for m in numeric)]
-            for t in scores["trajectories"] for r in scores["results"] if r["trajectory"] == t["name"]
+            [
+                r["trajectory"],
+                title_of(r["method"]),
+                r["views"],
+                *(number_text(m["name"], r["values"].get(m["name"])) for m in numeric),
+            ]
+            for t in scores["trajectories"]
+            for r in scores["results"]
+            if r["trajectory"] == t["name"]
         ],
-    }  # fmt: skip
+    }
 
 
 def _shown(values: Mapping[tuple[str, float], Mapping[str, Any]], names: Sequence[str], distance: float) -> bool:
@@ -393,7 +453,11 @@ def _remedy_of(metric: Mapping[str, Any]) -> str:
 def _with_floor(scores: Mapping[str, Any], group: dict[str, Any], distances: Sequence[float]) -> dict[str, Any]:
     """The group with a last row: what the truth itself scores."""
     floors = floors_by_distance(scores)
-    cells = [{"text": number_text(m["name"], floors.get(d, {}).get(m["name"])), "classes": ""} for d in distances for m in group["metrics"]]
+    cells = [
+        {"text": number_text(m["name"], floors.get(d, {}).get(m["name"])), "classes": ""}
+        for d in distances
+        for m in group["metrics"]
+    ]
     return {**group, "rows": [*group["rows"], {"method": "truth", "title": FLOOR, "cells": cells}]}
 
 
@@ -439,12 +503,18 @@ def _chart(scores: Mapping[str, Any], metric: Mapping[str, Any]) -> dict[str, An
 
     better = SENSES[metric["better"]]
     return {
-        "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""), "better": better,
-        "label": f"{metric['title']} over the lateral shift, {better}", "left": left, "right": right, "bottom": bottom,
+        "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""),
+        "better": better,
+        "label": f"{metric['title']} over the lateral shift, {better}",
+        "left": left,
+        "right": right,
+        "bottom": bottom,
         "y_ticks": [{"at": y(value), "text": number_text(metric["name"], value)} for value in ticks],
-        "x_ticks": [{"at": x(shift), "text": f"{abs(shift):g}"} for shift in shifts], "to_left": shifts[-1] > 0, "to_right": shifts[0] < 0,
+        "x_ticks": [{"at": x(shift), "text": f"{abs(shift):g}"} for shift in shifts],
+        "to_left": shifts[-1] > 0,
+        "to_right": shifts[0] < 0,
         "lines": [{"method": m, "points": [(x(s), y(v)) for s, v in line]} for m, line in points.items()],
-    }  # fmt: skip
+    }
 
 
 # ---- times, settings ----
@@ -455,10 +525,17 @@ def _time_values(ledger: Mapping[str, Any]) -> dict[str, Any]:
     total, longest = sum(seconds.values()) or 1.0, max(seconds.values(), default=1.0) or 1.0
     size = lambda step, name: memory.in_words(step[name]) if step.get(name) else ""  # noqa: E731
     steps = [
-        {"name": name, "seconds": step["seconds"], "processor_s": step.get("processor_s"), "memory": size(step, "peak_bytes"),
-         "written": size(step, "written_bytes"), "share": step["seconds"] / total, "of_longest": step["seconds"] / longest}
+        {
+            "name": name,
+            "seconds": step["seconds"],
+            "processor_s": step.get("processor_s"),
+            "memory": size(step, "peak_bytes"),
+            "written": size(step, "written_bytes"),
+            "share": step["seconds"] / total,
+            "of_longest": step["seconds"] / longest,
+        }
         for name, step in ledger.get("steps", {}).items()
-    ]  # fmt: skip
+    ]
     return {"steps": steps, "total_time": _duration(total)}
 
 
@@ -483,7 +560,7 @@ def _provenance(scores: Mapping[str, Any], ledger: Mapping[str, Any]) -> list[tu
     return [(name, value) for name, value in rows if value]
 
 
-# panels of a video: several methods' views of one moment side by side, one row per modality ---------------------------
+# panels of a video: several methods' views of one moment side by side, one row per modality -------
 
 
 BLANK: Final = 24
@@ -503,7 +580,8 @@ def panel_grid(
 
     Args:
         views: column -> what it shows. rows: of ``rgb``, ``depth``, ``semantics``, ``error``.
-        size: width and height of a panel, pixels. truth: what colour errors are measured against; its own column has none.
+        size: width and height of a panel, pixels. truth: what colour errors are measured against; its own column has
+            none.
     """
     width, height = size
     grid = np.full((height * len(rows), width * len(views), 3), BLANK, np.uint8)
@@ -535,7 +613,7 @@ def _panel(seen: Observation, row: str, size: tuple[int, int], true_rgb: Tensor 
     return to_bytes(rgb)
 
 
-# run report -----------------------------------------------------------------------------------------------------------
+# run report ---------------------------------------------------------------------------------------
 
 
 PANEL_WIDTH: Final = 320
@@ -562,7 +640,8 @@ class Columns:
 
 
 def film(out: Path) -> list[TrajectoryVideo]:
-    """The costly half of ``OUT/report.html``: one video per trajectory, from what the chain left in ``out`` (see ``steps.pipeline``).
+    """The costly half of ``OUT/report.html``: one video per trajectory, from what the chain left in ``out`` (see
+    ``steps.pipeline``).
 
     Raises:
         InputError: the run is not scored yet, or a folder of views is damaged.
@@ -576,7 +655,9 @@ def film(out: Path) -> list[TrajectoryVideo]:
     if not playable:
         log.warn("PyAV has no H.264 encoder here: the report shows one picture per trajectory instead of a video")
     budget = BUDGET_BYTES // max(1, len(trajectories)) if playable else 0
-    videos = computed_ahead(lambda n: _video(trajectories[n], folders, budget), len(trajectories), native.default_threads())
+    videos = computed_ahead(
+        lambda n: _video(trajectories[n], folders, budget), len(trajectories), native.default_threads()
+    )
     return list(log.progress(videos, len(trajectories), "report"))
 
 
@@ -587,13 +668,23 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     text = store.read_text(settings) if settings.is_file() else ""
     with understood("a scored run", str(out)):
         scores, ledger = store.read_json(out / "score" / "metrics.json"), store.read_json(out / "run.json")
-        content = page(scores, ledger, text, videos, list(_folders(out, scores)), _adaptation(out / "adapt"), viewer_address(out), out)
+        content = page(
+            scores,
+            ledger,
+            text,
+            videos,
+            list(_folders(out, scores)),
+            _adaptation(out / "adapt"),
+            viewer_address(out),
+            out,
+        )
     store.write_text(out / "report.html", content)
     return out / "report.html"
 
 
 def viewer_address(out: Path) -> str:
-    """The viewer page of a run, relative to its folder: one file, or the first page of a folder; empty if there is none."""
+    """The viewer page of a run, relative to its folder: one file, or the first page of a folder; empty if there is
+    none."""
     return next((name for name in (VIEWER, VIEWER_FOLDER) if (out / name).is_file()), "")
 
 
@@ -628,16 +719,23 @@ def _video(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Pat
     video = mp4_within(lambda: _frames(columns, order, size), ENCODING, budget) if budget else b""
     poster = jpeg_bytes(next(_frames(columns, order, size, first=columns.frames // 2)), quality=60)
     return TrajectoryVideo(
-        name=trajectory["name"], camera=str(trajectory["camera"]), shift_m=trajectory["shift_m"], width=size[0], height=size[1],
-        frames=columns.frames, panels={column: _rows(columns, column) for column in columns.sets},
-        video=_data_uri("video/mp4", video) if video else "", poster=_data_uri("image/jpeg", poster),
-    )  # fmt: skip
+        name=trajectory["name"],
+        camera=str(trajectory["camera"]),
+        shift_m=trajectory["shift_m"],
+        width=size[0],
+        height=size[1],
+        frames=columns.frames,
+        panels={column: _rows(columns, column) for column in columns.sets},
+        video=_data_uri("video/mp4", video) if video else "",
+        poster=_data_uri("image/jpeg", poster),
+    )
 
 
 def _columns(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, Path]]) -> Columns:
     """Truth and baseline have just the scored views; of the methods' views the scorer's indices pick the same.
 
-    Where a trajectory has no truth (a shifted view of a recorded log), its column shows the recorded path at the same moments.
+    Where a trajectory has no truth (a shifted view of a recorded log), its column shows the recorded path at the same
+    moments.
     """
     name, frames, picked = trajectory["name"], int(trajectory["views"]), trajectory["indices"]
     sets = {column: read_observations(found[name]) for column, found in folders.items() if name in found}
@@ -659,9 +757,11 @@ def _rows(columns: Columns, column: str) -> tuple[str, ...]:
     """The rows that a column has, as its first view says."""
     first = columns.sets[column][columns.indices[column][0]]
     there = {
-        "rgb": True, "depth": first.depth is not None, "semantics": first.semantics is not None,
+        "rgb": True,
+        "depth": first.depth is not None,
+        "semantics": first.semantics is not None,
         "error": columns.has_truth and column != "truth",
-    }  # fmt: skip
+    }
     return tuple(row for row in ROWS if there[row])
 
 

@@ -1,7 +1,8 @@
-"""A small web server for one page on this machine. It serves names from a table, never paths, and answers only to its own page.
+"""A small web server for one page on this machine. It serves names from a table, never paths, and answers only to its
+own page.
 
-Whoever reaches the port may send anything, with or without the token: what cannot be read is answered with 400 or not at all, who says
-nothing is cut off, and there are never more than `MOST_CONNECTIONS`.
+Whoever reaches the port may send anything, with or without the token: what cannot be read is answered with 400 or not
+at all, who says nothing is cut off, and there are never more than `MOST_CONNECTIONS`.
 """
 
 from __future__ import annotations
@@ -47,7 +48,8 @@ _LENGTH: Final = re.compile(r"[0-9]{1,9}")
 Answer = Callable[[Any], tuple[bytes, str]]
 """From a JSON value to content and its type."""
 Stream = Callable[[Any, Callable[[bytes], None]], None]
-"""From a JSON value to content that is sent piece by piece while it is made. Sending raises OSError when nobody listens any more."""
+"""From a JSON value to content that is sent piece by piece while it is made. Sending raises OSError when nobody listens
+any more."""
 TYPES: Final = {"html": "text/html; charset=utf-8", "bin": "application/octet-stream"}
 
 
@@ -56,8 +58,10 @@ class Site:
     """What is served.
 
     Args:
-        files: name -> content; "" is the page. answers: name -> what answers a POST with JSON there: bytes and their type.
-        streams: the same for answers that take long. token: secret that every request must bring, in the address, a cookie or a header.
+        files: name -> content; "" is the page. answers: name -> what answers a POST with JSON there: bytes and their
+            type.
+        streams: the same for answers that take long. token: secret that every request must bring, in the address, a
+            cookie or a header.
     """
 
     files: Mapping[str, bytes]
@@ -73,8 +77,13 @@ def token_for(host: str, token: str) -> str:
         UsageError: another address without a token, or a token that is too short.
     """
     if not is_loopback(host) and not token:
-        raise UsageError("this address can be reached by other machines", where="--host", got=host, expected="127.0.0.1",
-                         remedy="leave --host out and use an ssh tunnel, or add --token SECRET")  # fmt: skip
+        raise UsageError(
+            "this address can be reached by other machines",
+            where="--host",
+            got=host,
+            expected="127.0.0.1",
+            remedy="leave --host out and use an ssh tunnel, or add --token SECRET",
+        )
     if token and len(token) < 12:
         raise UsageError("the token is too short to be a secret", where="--token", expected="at least 12 characters")
     return token or secrets.token_urlsafe(16)
@@ -89,7 +98,8 @@ def is_loopback(host: str) -> bool:
 
 
 class SiteServer(ThreadingHTTPServer):
-    """Answers each connection in a thread. Those that only wait are cut off when they are late, or when others need their room."""
+    """Answers each connection in a thread. Those that only wait are cut off when they are late, or when others need
+    their room."""
 
     request_queue_size = MOST_CONNECTIONS
     daemon_threads = True
@@ -103,7 +113,7 @@ class SiteServer(ThreadingHTTPServer):
     def server_bind(self) -> None:
         """Without the look-up of the machine's name that http.server makes, which may ask the network."""
         socketserver.TCPServer.server_bind(self)
-        self.server_name, self.server_port = self.server_address[:2]  # type: ignore[assignment]
+        self.server_name, self.server_port = self.server_address[:2]
 
     def wait_for(self, connection: socket.socket, seconds: float) -> None:
         """Let a connection be cut off after so long."""
@@ -111,7 +121,8 @@ class SiteServer(ThreadingHTTPServer):
             self._until[connection] = time.monotonic() + seconds
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """The next connection; where the system has no room for it, half of those that wait make room, and nothing spins."""
+        """The next connection; where the system has no room for it, half of those that wait make room, and nothing
+        spins."""
         try:
             return super().get_request()
         except OSError as error:
@@ -132,7 +143,9 @@ class SiteServer(ThreadingHTTPServer):
     def _make_room(self, count: int) -> bool:
         """Cut off so many of the connections that wait, those first whose patience ends first; whether any was."""
         with self._lock:
-            waiting = sorted((one for one, until in self._until.items() if until < math.inf), key=self._until.__getitem__)
+            waiting = sorted(
+                (one for one, until in self._until.items() if until < math.inf), key=self._until.__getitem__
+            )
             self._cut_off(waiting[:count])
             return bool(waiting)
 
@@ -300,8 +313,9 @@ class SiteRequest(BaseHTTPRequestHandler):
         return None if self._refused(parse_qs(parts.query)) else parts.path.removeprefix("/")
 
     def _refused(self, query: Mapping[str, list[str]]) -> bool:
-        """Whether the request was refused: another name for this server (a page elsewhere whose name was pointed here), or no token."""
-        host, port = self.server.server_address[:2]  # type: ignore[misc]
+        """Whether the request was refused: another name for this server (a page elsewhere whose name was pointed here),
+        or no token."""
+        host, port = self.server.server_address[:2]
         names = {f"{host}:{port}"} | ({f"localhost:{port}", f"127.0.0.1:{port}"} if is_loopback(str(host)) else set())
         given = self.headers.get("Host", "")
         if given not in names and (is_loopback(str(host)) or str(host) not in ("0.0.0.0", "::")):  # noqa: S104
@@ -332,9 +346,13 @@ class SiteRequest(BaseHTTPRequestHandler):
     def _head(self, status: HTTPStatus, named: Mapping[str, str]) -> None:
         self.send_response(status)
         for name, value in {
-            **named, "Cache-Control": "no-store", "X-Content-Type-Options": "nosniff", "Referrer-Policy": "no-referrer",
-            "Cross-Origin-Resource-Policy": "same-origin", "X-Frame-Options": "DENY",
-        }.items():  # fmt: skip
+            **named,
+            "Cache-Control": "no-store",
+            "X-Content-Type-Options": "nosniff",
+            "Referrer-Policy": "no-referrer",
+            "Cross-Origin-Resource-Policy": "same-origin",
+            "X-Frame-Options": "DENY",
+        }.items():
             self.send_header(name, value)
         self.end_headers()
 

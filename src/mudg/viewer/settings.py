@@ -18,11 +18,11 @@ class PageConfig:
     method: str = ""
     """Fit of a run to show (empty = the best one: mudg_s, else street_gaussians)."""
     budget: int = setting(default=3_000_000, ge=0)
-    """Most Gaussians on the page (0 = all). Where a fit has more, those that the recorded cameras would see smallest and
-    faintest are left out."""
+    """Most Gaussians on the page (0 = all). Where a fit has more, those that the recorded cameras would see smallest
+    and faintest are left out."""
     memory_mb: int = setting(default=0, ge=0)
-    """Most graphics memory and memory for sorting that the page may take in a browser, together, in megabytes (0 = no limit).
-    Gaussians are left out as for the budget."""
+    """Most graphics memory and memory for sorting that the page may take in a browser, together, in megabytes (0 = no
+    limit). Gaussians are left out as for the budget."""
     images: int = setting(default=150, ge=0)
     """Most recorded images on the page, taken evenly."""
 
@@ -31,7 +31,10 @@ class PageConfig:
 class ViewConfig(PageConfig):
     """What ``mudg view`` shows, and where."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"image_width_px": ("images", 640), "lidar_points": ("port", 20_000)}
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "image_width_px": ("images", 640),
+        "lidar_points": ("port", 20_000),
+    }
 
     budget: int = setting(default=0, ge=0)
     """Most Gaussians on the page (0 = all)."""
@@ -40,7 +43,8 @@ class ViewConfig(PageConfig):
     host: str = "127.0.0.1"
     """Address to listen on. Any other than this machine's own loopback needs --token."""
     token: str = ""
-    """Secret that the address of the page carries; who does not know it gets nothing (empty: a random one on the loopback address)."""
+    """Secret that the address of the page carries; who does not know it gets nothing (empty: a random one on the
+    loopback address)."""
     browser: bool = True
     """Open the page in a browser where there is one."""
     exact: bool = True

@@ -1,5 +1,5 @@
-"""``mudg page``: a fitted scene as a page that anyone can open. ``mudg view``: the same page from a server on this machine, with exact
-frames where the camera rests. The page is ``assets/viewer``; what it is made of, ``viewer/page``.
+"""``mudg page``: a fitted scene as a page that anyone can open. ``mudg view``: the same page from a server on this
+machine, with exact frames where the camera rests. The page is ``assets/viewer``; what it is made of, ``viewer/page``.
 """
 
 from __future__ import annotations
@@ -67,17 +67,24 @@ class Shown:
 
 
 def run_page(
-    config: PageConfig, run: Path, out: Path, *, scene: Path | None = None, compare: Path | None = None, report: str = "",
+    config: PageConfig,
+    run: Path,
+    out: Path,
+    *,
+    scene: Path | None = None,
+    compare: Path | None = None,
+    report: str = "",
     overwrite: bool = False,
-) -> dict[str, Any]:  # fmt: skip
+) -> dict[str, Any]:
     """Write the page of a run or a fit.
 
     Args:
-        run: a folder of ``mudg run``, or of ``mudg fit`` with ``scene``. out: the file to write. compare: another run or fit of the same
-            log. report: address of the run's report, relative to the page.
+        run: a folder of ``mudg run``, or of ``mudg fit`` with ``scene``. out: the file to write. compare: another run
+            or fit of the same log. report: address of the run's report, relative to the page.
 
     Returns:
-        ``page``: the file (of a folder, its ``index.html``); ``bytes``: of everything; ``gaussians``: on the page; ``text``.
+        ``page``: the file (of a folder, its ``index.html``); ``bytes``: of everything; ``gaussians``: on the page;
+        ``text``.
 
     Raises:
         UsageError: another page is there, or the output is an input. InputError: no fitted scene, or another log.
@@ -99,12 +106,21 @@ def run_page(
             place = file.finish({"bytes": made["bytes"], "gaussians": made["gaussians"], "inputs": inputs}, form)
     size = f"{made['bytes'] / 1e6:.1f} MB"
     if place == folder:
-        place, size = folder / "index.html", f"{size}; needs a web server: python -m http.server --directory {folder.name}"
-    return {"page": place, "bytes": made["bytes"], "gaussians": made["gaussians"], "text": f"page: {place.resolve()} ({size})"}
+        place, size = (
+            folder / "index.html",
+            f"{size}; needs a web server: python -m http.server --directory {folder.name}",
+        )
+    return {
+        "page": place,
+        "bytes": made["bytes"],
+        "gaussians": made["gaussians"],
+        "text": f"page: {place.resolve()} ({size})",
+    }
 
 
 def write_page(page: ViewerPage, out: Path, folder: Path) -> dict[str, Any]:
-    """Write a page: one file where it is small enough, else a folder. At most `ONE_FILE_BYTES` of it are held at a time.
+    """Write a page: one file where it is small enough, else a folder. At most `ONE_FILE_BYTES` of it are held at a
+    time.
 
     Returns:
         ``page``, ``bytes`` and ``gaussians``, as ``run_page``.
@@ -133,9 +149,12 @@ def _refuse_foreign(folder: Path) -> None:
 def _write_folder(
     page: ViewerPage, folder: Path, begun: list[PageFile], more: Iterable[PageFile], facts: dict[str, Any]
 ) -> tuple[Path, int]:
-    """Write a page as a folder, file by file, completely or not at all; its ``index.html`` and the bytes of everything."""
+    """Write a page as a folder, file by file, completely or not at all; its ``index.html`` and the bytes of
+    everything."""
     page = replace(page, report=f"../{page.report}") if page.report else page  # the run's report lies beside the folder
-    log.info(needs_text(page, "to be written", f"about {_forecast(page, begun) / 1e6:.0f} MB in {page.chunks()} chunks"))
+    log.info(
+        needs_text(page, "to be written", f"about {_forecast(page, begun) / 1e6:.0f} MB in {page.chunks()} chunks")
+    )
     size = 0
     with store.atomic_directory(folder) as place:
         for file in chain(begun, more):
@@ -161,7 +180,8 @@ def _inside(out: Path, run: Path) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class ShownSources:
-    """Where the log and the fits of a page lie. fits: (folder, whether it is part of a run). cloud: fused points, where they are known."""
+    """Where the log and the fits of a page lie. fits: (folder, whether it is part of a run). cloud: fused points, where
+    they are known."""
 
     scene: Path
     fits: tuple[tuple[Path, bool], ...]
@@ -169,7 +189,9 @@ class ShownSources:
 
     def digests(self) -> dict[str, str]:
         """Digests of everything that is read."""
-        named = {"scene": self.scene, "fused": self.cloud} | {f"fit {n}": folder for n, (folder, _) in enumerate(self.fits)}
+        named = {"scene": self.scene, "fused": self.cloud} | {
+            f"fit {n}": folder for n, (folder, _) in enumerate(self.fits)
+        }
         return {name: store.digest(path) for name, path in named.items() if path is not None}
 
     def read(self) -> Shown:
@@ -233,14 +255,22 @@ def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, 
     """The page of what is shown."""
     scene, begin = shown.scene, begin_of(shown.scene)
     path = np.stack([frame.view.center_world for frame in scene.frames])
-    packed = [(name, pack_scene(model, begin, path, _most(config, model, len(shown.fits)), CHUNK)) for name, model in shown.fits]
+    packed = [
+        (name, pack_scene(model, begin, path, _most(config, model, len(shown.fits)), CHUNK))
+        for name, model in shown.fits
+    ]
     facts = log_facts(scene, shown.fits[0][1].colors, PAGE_IMAGE_PX if live is None else LIVE_IMAGE_PX, config.images)
     facts = with_particles(with_ground(facts, shown.ground()), SEED)
     first = packed[0][1]
     return ViewerPage(
-        title=scene.id, subtitle=", ".join(f"{name} ({NAMES[name]})" if name in NAMES else name for name, _ in packed),
-        about=about_text(scene, first), report=report, scenes=packed, log=facts, live=live,
-    )  # fmt: skip
+        title=scene.id,
+        subtitle=", ".join(f"{name} ({NAMES[name]})" if name in NAMES else name for name, _ in packed),
+        about=about_text(scene, first),
+        report=report,
+        scenes=packed,
+        log=facts,
+        live=live,
+    )
 
 
 def _most(config: PageConfig, model: SceneModel, fits: int) -> int:
@@ -254,10 +284,10 @@ def _most(config: PageConfig, model: SceneModel, fits: int) -> int:
 def about_text(scene: Scene, first: Packed) -> str:
     """A few sentences on the page."""
     return (
-        f"{kept_text(first)}, {len(scene.frames)} recorded frames of "
-        f"{_counted(len(scene.cameras), 'camera')}, {_counted(len(scene.tracks), 'tracked object')}. Places, sizes and colours are rounded "
-        f"for the page. Data: {scene.source.dataset}, licence {scene.source.licence}. This page loads nothing from elsewhere "
-        "and sends nothing."
+        f"{kept_text(first)}, {len(scene.frames)} recorded frames of {_counted(len(scene.cameras), 'camera')},"
+        f" {_counted(len(scene.tracks), 'tracked object')}. Places, sizes and colours are rounded for the page. Data:"
+        f" {scene.source.dataset}, licence {scene.source.licence}. This page loads nothing from elsewhere and sends"
+        " nothing."
     )
 
 
@@ -298,7 +328,8 @@ def run_view(
         files: the script that it begins with, and where edits are saved.
 
     Raises:
-        UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As ``run_page``.
+        UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As
+            ``run_page``.
     """
     server, site = server_of(config, run, compare, scene, files)
     address = address_of(server, site)

@@ -4,8 +4,8 @@
     dynamic   4-D grid -> the same, averaged over where the place comes from and goes to (flow aggregation)
     flow      4-D grid -> motion to the next and from the previous time step, metres
 
-One colour network reads the features of both, the direction and the camera's appearance; a shadow head lets what moves darken what stands;
-the sky is a network of the direction. Two proposal networks say where samples are worth taking.
+One colour network reads the features of both, the direction and the camera's appearance; a shadow head lets what moves
+darken what stands; the sky is a network of the direction. Two proposal networks say where samples are worth taking.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ from mudg.base import seeds
 from mudg.base.errors import InputError
 from mudg.core.grids import HashGrid, encode
 
-# sampling -------------------------------------------------------------------------------------------------------------
+# sampling -----------------------------------------------------------------------------------------
 #
-# Where rays are sampled and what samples weigh: spacing, contraction of space, volume rendering weights, resampling, and the loss that
-# teaches proposal networks.
+# Where rays are sampled and what samples weigh: spacing, contraction of space, volume rendering weights, resampling,
+# and the loss that teaches proposal networks.
 
 
 def contract(xyz: Tensor, center: Tensor, half: Tensor) -> Tensor:
     """World places ``[..., 3]`` into the unit cube: a box fills its inner half evenly, everything outside the rest.
 
-    With ``p = (xyz - center) / half`` and n the largest ``|p|``: p within the box, ``(2 - 1/n) p/n`` outside; [-2, 2] becomes [0, 1].
+    With ``p = (xyz - center) / half`` and n the largest ``|p|``: p within the box, ``(2 - 1/n) p/n`` outside; [-2, 2]
+    becomes [0, 1].
 
     Args:
         center, half: f32[3], middle and half size of the box in metres.
@@ -43,8 +44,8 @@ def contract(xyz: Tensor, center: Tensor, half: Tensor) -> Tensor:
 
 
 def distances(along: Tensor, near_m: float, middle_m: float, far_m: float) -> Tensor:
-    """Distance in metres of a normalised place on a ray in [0, 1]: its first half is linear in distance up to ``middle_m``, its second in
-    one over distance up to ``far_m``."""
+    """Distance in metres of a normalised place on a ray in [0, 1]: its first half is linear in distance up to
+    ``middle_m``, its second in one over distance up to ``far_m``."""
     linear = near_m + (middle_m - near_m) * 2 * along
     share = (2 * along - 1).clamp(0, 1)
     inverse = 1 / ((1 - share) / middle_m + share / far_m)
@@ -52,7 +53,8 @@ def distances(along: Tensor, near_m: float, middle_m: float, far_m: float) -> Te
 
 
 def even_edges(rays: int, count: int, jitter: Tensor) -> Tensor:
-    """Edges ``[rays, count + 1]`` of even intervals of [0, 1], moved by ``jitter`` f32[rays, 1] in [0, 1] of an interval (0.5: not)."""
+    """Edges ``[rays, count + 1]`` of even intervals of [0, 1], moved by ``jitter`` f32[rays, 1] in [0, 1] of an
+    interval (0.5: not)."""
     steps = torch.linspace(0, 1, count + 1, device=jitter.device).expand(rays, -1)
     moved = (steps + (jitter - 0.5) / count).clamp(0, 1)
     return torch.cat([steps[:, :1], moved[:, 1:-1], steps[:, -1:]], 1)
@@ -90,7 +92,8 @@ def resampled_edges(edges: Tensor, weights: Tensor, count: int, jitter: Tensor, 
 
 
 def blurred_mass(edges: Tensor, weights: Tensor, wanted: Tensor, radius: float) -> Tensor:
-    """Mass of a histogram, blurred by a box of half width ``radius``, in the intervals of other edges (zip-NeRF, section 4).
+    """Mass of a histogram, blurred by a box of half width ``radius``, in the intervals of other edges (zip-NeRF,
+    section 4).
 
     The blurred histogram is linear between the edges moved by +- radius; its integral is read off at the wanted edges.
 
@@ -118,7 +121,8 @@ def blurred_mass(edges: Tensor, weights: Tensor, wanted: Tensor, radius: float) 
 
 
 def interlevel_loss(edges: Tensor, weights: Tensor, proposed: Tensor, proposal: Tensor, radius: float) -> Tensor:
-    """How far a proposal falls short of the (blurred) histogram that it should cover: sum of ``max(0, target - w)^2 / w``, mean of rays.
+    """How far a proposal falls short of the (blurred) histogram that it should cover: sum of ``max(0, target - w)^2 /
+    w``, mean of rays.
 
     Args:
         edges, weights: of the final samples, ``[R, n + 1]`` and ``[R, n]``; data.
@@ -129,7 +133,7 @@ def interlevel_loss(edges: Tensor, weights: Tensor, proposed: Tensor, proposal: 
     return ((target - proposal).clamp_min(0).square() / (proposal + 1e-5)).sum(1).mean()
 
 
-# field ----------------------------------------------------------------------------------------------------------------
+# field --------------------------------------------------------------------------------------------
 
 
 OCTAVES = 5
@@ -140,7 +144,8 @@ LARGEST_LOG_DENSITY = 12.0
 
 @dataclass(frozen=True)
 class FieldSizes:
-    """Sizes of all networks; a grid is (levels, features per level, coarsest, finest, log2 of the entries of a level)."""
+    """Sizes of all networks; a grid is (levels, features per level, coarsest, finest, log2 of the entries of a
+    level)."""
 
     static: tuple[int, int, int, int, int]
     dynamic: tuple[int, int, int, int, int]
@@ -153,7 +158,8 @@ class FieldSizes:
 
 @dataclass(frozen=True)
 class Extent:
-    """Where and when the log is: a box (center, half size, metres), the first time, the time span, and one time step (all seconds)."""
+    """Where and when the log is: a box (center, half size, metres), the first time, the time span, and one time step
+    (all seconds)."""
 
     center: tuple[float, float, float]
     half: tuple[float, float, float]
@@ -173,8 +179,8 @@ class Extent:
 
 @dataclass(frozen=True, eq=False)
 class FieldValues:
-    """What the fields say at N samples: features ``[N, width]``, densities ``[N]`` per metre, flow ``[N, 6]`` (forward, backward) in metres
-    per time step."""
+    """What the fields say at N samples: features ``[N, width]``, densities ``[N]`` per metre, flow ``[N, 6]`` (forward,
+    backward) in metres per time step."""
 
     static: Tensor
     dynamic: Tensor
@@ -245,14 +251,15 @@ class RadianceField(nn.Module):
         return torch.cat([encoded_direction(directions), self.appearance[camera]], 1)
 
     def cycle_loss(self, xyz: Tensor, time: Tensor, flow: Tensor) -> Tensor:
-        """How far the flow there and back misses its start: half the mean of both squares. What it is compared with is data."""
+        """How far the flow there and back misses its start: half the mean of both squares. What it is compared with is
+        data."""
         forward, backward, step = flow[:, :3], flow[:, 3:], self.extent.step
         with torch.no_grad():
             back = self.flow_at(xyz + forward, (time + step).clamp(0, 1))[:, 3:]
             forth = self.flow_at(xyz + backward, (time - step).clamp(0, 1))[:, :3]
         return 0.5 * ((forward + back).square() + (backward + forth).square()).mean()
 
-    # -- state ------------------------------------------------------------------------------------------------------
+    # -- state -------------------------------------------------------------------------------------
 
     def description(self) -> dict[str, Any]:
         """Everything but the parameters, as JSON values."""
@@ -375,7 +382,7 @@ def _drawn(inner: int, outer: int, draw: torch.Generator, columns: int = 0) -> n
     return nn.Parameter(limit * (2 * torch.rand(outer, columns or inner, generator=draw) - 1))
 
 
-# rays through the radiance field: samples, light, distance, and the loss terms of a batch of rays ---------------------
+# rays through the radiance field: samples, light, distance, and the loss terms of a batch of rays -
 
 
 MIDDLE_RANGE_M = 200.0
@@ -386,7 +393,8 @@ TINY = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class Rays:
-    """R rays: origins and unit directions ``[R, 3]`` in the world, times ``[R, 1]`` in [0, 1], camera numbers i64[R]."""
+    """R rays: origins and unit directions ``[R, 3]`` in the world, times ``[R, 1]`` in [0, 1], camera numbers
+    i64[R]."""
 
     origins: Tensor
     directions: Tensor
@@ -409,7 +417,8 @@ class Rays:
 
 @dataclass(frozen=True)
 class Budget:
-    """How finely rays are sampled: intervals of each proposal round and of the fields, nearest and farthest sample in metres."""
+    """How finely rays are sampled: intervals of each proposal round and of the fields, nearest and farthest sample in
+    metres."""
 
     proposals: tuple[int, ...]
     samples: int
@@ -419,8 +428,8 @@ class Budget:
 
 @dataclass(frozen=True, eq=False)
 class RayDraws:
-    """Random numbers of a training batch, uniform in [0, 1): per ray and round ``[R, rounds + 1]``; of the flow, per sample ``[R * n, 1]``;
-    samples of the cycle loss i64[K]."""
+    """Random numbers of a training batch, uniform in [0, 1): per ray and round ``[R, rounds + 1]``; of the flow, per
+    sample ``[R * n, 1]``; samples of the cycle loss i64[K]."""
 
     jitter: Tensor
     share: Tensor
@@ -441,7 +450,8 @@ class Marched:
     """Rays after marching, n samples each.
 
     Args:
-        along: normalised edges ``[R, n + 1]``; edges_m: the same as distances; middles_m: distances ``[R, n]``; weights ``[R, n]``.
+        along: normalised edges ``[R, n + 1]``; edges_m: the same as distances; middles_m: distances ``[R, n]``; weights
+            ``[R, n]``.
         xyz, times: of all samples, ``[R * n, 3]`` and ``[R * n, 1]``.
         values: of the fields there.
         proposals: edges and weights of every proposal round.
@@ -518,7 +528,8 @@ def _places(rays: Rays, middles_m: Tensor) -> Tensor:
 
 
 def colors(field: RadianceField, rays: Rays, marched: Marched) -> tuple[Tensor, Tensor]:
-    """Colours ``[R, 3]`` over the sky, and the shadow ``[R * n, 1]`` that what moves casts on what stands, 0 (none) to 1."""
+    """Colours ``[R, 3]`` over the sky, and the shadow ``[R * n, 1]`` that what moves casts on what stands, 0 (none) to
+    1."""
     context, size = field.context(rays.directions, rays.cameras), (*marched.weights.shape, -1)
     values, moving = marched.values, marched.dynamic_weights()
     shadow = field.shadow(values.dynamic).sigmoid()
@@ -528,7 +539,7 @@ def colors(field: RadianceField, rays: Rays, marched: Marched) -> tuple[Tensor, 
     return rgb + (1 - marched.opacity)[:, None] * field.sky(context).sigmoid(), shadow
 
 
-# ---- losses ----------------------------------------------------------------------------------------------------------
+# ---- losses --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -588,10 +599,11 @@ def lidar_terms(
 
 
 def line_of_sight(weights: Tensor, edges_m: Tensor, range_m: Tensor, sight_m: float) -> Tensor:
-    """How far weights are from a narrow bell at the measured range, and from 0 before it: sums along rays, mean of rays.
+    """How far weights are from a narrow bell at the measured range, and from 0 before it: sums along rays, mean of
+    rays.
 
-    The weight of an interval is compared with the mass of the bell N(z, sight_m / 3) in it, by the square of the difference; what begins
-    more than ``sight_m`` behind the range is free.
+    The weight of an interval is compared with the mass of the bell N(z, sight_m / 3) in it, by the square of the
+    difference; what begins more than ``sight_m`` behind the range is free.
 
     Args:
         weights: ``[R, n]``. edges_m: ``[R, n + 1]``. range_m: ``[R]``.

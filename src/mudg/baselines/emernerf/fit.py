@@ -1,5 +1,5 @@
-"""The fit of a radiance field (method emernerf): two batches of rays per step, one of pixels and one of LiDAR, each with its own gradient
-step.
+"""The fit of a radiance field (method emernerf): two batches of rays per step, one of pixels and one of LiDAR, each
+with its own gradient step.
 
     OUT/model.json, field.safetensors    the field (``fit.py``)
     OUT/preview/*.png                    truth, colour, depth, what moves, flow
@@ -50,9 +50,10 @@ from mudg.gaussians.storage import RADIANCE, description_of, kind_of
 from mudg.gaussians.views import StoredView, load_recorded, training_frames
 from mudg.scene.read import read_points, read_scene
 
-# rays -----------------------------------------------------------------------------------------------------------------
+# rays ---------------------------------------------------------------------------------------------
 #
-# What a radiance field learns from: pixels of recorded frames and LiDAR rays, as rays in the world. Tracked boxes are not read.
+# What a radiance field learns from: pixels of recorded frames and LiDAR rays, as rays in the world. Tracked boxes are
+# not read.
 
 
 MOST_LIDAR_RAYS = 8_000_000
@@ -84,7 +85,8 @@ class LidarRays:
 
 
 def lidar_rays(scene: Scene) -> LidarRays | None:
-    """All returns of all sweeps as rays; None where there are none. Each has its own time and, along the vehicle's path, its own origin."""
+    """All returns of all sweeps as rays; None where there are none. Each has its own time and, along the vehicle's
+    path, its own origin."""
     share = 1.0
     parts: list[tuple[np.ndarray, ...]] = []
     for sweep in log.progress(scene.sweeps, len(scene.sweeps), "reading LiDAR rays"):
@@ -115,7 +117,8 @@ def extent_of(scene: Scene, lidar: LidarRays | None) -> Extent:
         places = np.stack([frame.view.center_world for frame in scene.frames])
         low, high = places.min(0) - AROUND_CAMERAS_M, places.max(0) + AROUND_CAMERAS_M
         log.warn(
-            f"no LiDAR: the inner box reaches {AROUND_CAMERAS_M:.0f} m around the cameras, and nothing measures distance"
+            f"no LiDAR: the inner box reaches {AROUND_CAMERAS_M:.0f} m around the cameras, and nothing measures"
+            " distance"
         )
     else:
         points = (lidar.origins + lidar.range_m[:, None] * lidar.directions).numpy()
@@ -135,9 +138,12 @@ def view_rays(view: View, extent: Extent, camera: int, stride: int = 1) -> tuple
     plane = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x)), torch.ones(len(y), len(x))], -1).reshape(
         -1, 3
     )
-    return _rays(plane, torch.tensor(view.world_from_cam, dtype=torch.float32).expand(len(plane), 4, 4),
-                 torch.full((len(plane), 1), extent.normalised(view.time_s)),
-                 torch.full((len(plane),), camera, dtype=torch.int64)), 1 / plane.norm(dim=1)  # fmt: skip
+    return _rays(
+        plane,
+        torch.tensor(view.world_from_cam, dtype=torch.float32).expand(len(plane), 4, 4),
+        torch.full((len(plane), 1), extent.normalised(view.time_s)),
+        torch.full((len(plane),), camera, dtype=torch.int64),
+    ), 1 / plane.norm(dim=1)
 
 
 def _rays(plane: Tensor, poses: Tensor, times: Tensor, cameras: Tensor) -> Rays:
@@ -147,7 +153,8 @@ def _rays(plane: Tensor, poses: Tensor, times: Tensor, cameras: Tensor) -> Rays:
 
 @dataclass(frozen=True, eq=False)
 class PixelBatch:
-    """Rays of pixels with what they show: colours f32[R, 3], whether they count f32[R], sky bool[R] or None; cells of the error map."""
+    """Rays of pixels with what they show: colours f32[R, 3], whether they count f32[R], sky bool[R] or None; cells of
+    the error map."""
 
     rays: Rays
     rgb: Tensor
@@ -252,8 +259,8 @@ FULL_FLOW_M = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """A view of a field, on the CPU: rgb ``[3, H, W]``; depth (of the median, along z, metres), opacity and share of what moves ``[H, W]``;
-    flow to the next time step ``[3, H, W]`` in metres, of what moves."""
+    """A view of a field, on the CPU: rgb ``[3, H, W]``; depth (of the median, along z, metres), opacity and share of
+    what moves ``[H, W]``; flow to the next time step ``[3, H, W]`` in metres, of what moves."""
 
     rgb: Tensor
     depth: Tensor
@@ -284,10 +291,9 @@ def _part(field: RadianceField, rays: Rays, budget: Budget) -> Tensor:
     return torch.cat([colors(field, rays, marched)[0], rest, flow], 1).cpu()
 
 
-def observe(
-    field: RadianceField, view: View, budget: Budget, source: str = ""
-) -> Observation:
-    """One view as an observation of kind "virtual", without classes; where opacity is below ``COVERED`` there is no depth."""
+def observe(field: RadianceField, view: View, budget: Budget, source: str = "") -> Observation:
+    """One view as an observation of kind "virtual", without classes; where opacity is below ``COVERED`` there is no
+    depth."""
     seen = see(field, view, budget)
     covered = seen.opacity[None] >= COVERED
     opacity = seen.opacity[None].clamp(0, 1)
@@ -299,7 +305,8 @@ def observe(
 
 
 def write_preview(field: RadianceField, stored: StoredView, budget: Budget, path: Path, whole: bool = False) -> None:
-    """A picture of five panels: truth, colour, depth, opacity of what moves, its flow. Coarser than the view unless ``whole``."""
+    """A picture of five panels: truth, colour, depth, opacity of what moves, its flow. Coarser than the view unless
+    ``whole``."""
     pixels = stored.view.camera.width * stored.view.camera.height
     stride = 1 if whole else max(1, round((pixels / PREVIEW_RAYS) ** 0.5))
     seen = see(field, stored.view, budget, stride)
@@ -315,14 +322,15 @@ def write_preview(field: RadianceField, stored: StoredView, budget: Budget, path
 
 
 def flow_colors(flow: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Flow ``[3, H, W]`` in metres as a picture: the hue is the direction on the ground, black is at rest, bright one metre or more."""
+    """Flow ``[3, H, W]`` in metres as a picture: the hue is the direction on the ground, black is at rest, bright one
+    metre or more."""
     angle = np.arctan2(flow[1], flow[0])
     strength = np.clip(np.hypot(flow[0], flow[1]) / FULL_FLOW_M, 0, 1)
     hues = [0.5 + 0.5 * np.cos(angle - turn) for turn in (0.0, 2 * np.pi / 3, 4 * np.pi / 3)]
     return (255 * np.stack(hues, -1) * strength[..., None]).round().astype(np.uint8)
 
 
-# a fitted radiance field on disk: ``model.json`` of kind radiance, and ``field.safetensors`` --------------------------
+# a fitted radiance field on disk: ``model.json`` of kind radiance, and ``field.safetensors`` ------
 
 
 def save_field(field: RadianceField, budget: Budget, folder: Path) -> None:
@@ -354,13 +362,14 @@ def load_field(folder: Path) -> tuple[RadianceField, Budget]:
         return RadianceField.from_state(values, tensors), budget
 
 
-# loop -----------------------------------------------------------------------------------------------------------------
+# loop ---------------------------------------------------------------------------------------------
 
 
 WARM_UP = 0.1
 FALLS_AT, FALL = (0.25, 0.5, 0.75, 0.9), 0.33
 RATE, BETAS, EPSILON, WEIGHT_DECAY = 0.01, (0.9, 0.99), 1e-15, 1e-5
-"""Of Adam. The rate rises over the first WARM_UP of the run and falls at the shares FALLS_AT; the decay is added to the gradient."""
+"""Of Adam. The rate rises over the first WARM_UP of the run and falls at the shares FALLS_AT; the decay is added to the
+gradient."""
 PROPOSALS_EVERY = 5
 """After the warm-up the proposal networks learn at every n-th step only."""
 ERROR_SHARE = 0.25
@@ -372,10 +381,11 @@ APPEARANCE = 16
 WEIGHTS = Weights(sky=0.001, lidar=1.0, sight=0.1, dynamic=0.002, shadow=0.01, cycle=0.01)
 """Published, but for the dynamic density: 0.01, at once."""
 SIGHT_START, SIGHT_M, SIGHT_LEAST_M, SIGHT_HALVES = 0.08, 6.0, 0.6, 0.2
-"""Share of the run before the line of sight counts; half width of its surface then, and at the end (published: 2.5 m); share of the run in
-which it halves."""
+"""Share of the run before the line of sight counts; half width of its surface then, and at the end (published: 2.5 m);
+share of the run in which it halves."""
 DYNAMIC_RISE = (0.1, 0.5)
-"""Shares of the run between which the weight of the dynamic density grows. From the first step on it would empty that field."""
+"""Shares of the run between which the weight of the dynamic density grows. From the first step on it would empty that
+field."""
 LOG_EVERY = 20
 
 
@@ -400,7 +410,8 @@ class RadianceState:
 
 
 def fit_radiance(config: FitConfig, scene: Path, device: torch.device, folder: RunDir) -> dict[str, Any]:
-    """Fit a field to a scene and write it to the folder; an interrupted fit goes on from its newest checkpoint. Returns a summary."""
+    """Fit a field to a scene and write it to the folder; an interrupted fit goes on from its newest checkpoint. Returns
+    a summary."""
     with one_torch_thread(), memory_of(device, "fit"):
         state = prepare(config, read_scene(scene), folder, device)
         optimise(state, config, folder)
@@ -433,8 +444,15 @@ def prepare(config: FitConfig, scene: Scene, folder: RunDir, device: torch.devic
 def sizes_of(settings: RadianceConfig) -> FieldSizes:
     """The sizes of the networks."""
     proposals = (settings.first_proposal_grid, settings.second_proposal_grid)
-    return FieldSizes(settings.static_grid, settings.dynamic_grid, settings.flow_grid, proposals, settings.width,
-                      settings.proposal_width, APPEARANCE)  # fmt: skip
+    return FieldSizes(
+        settings.static_grid,
+        settings.dynamic_grid,
+        settings.flow_grid,
+        proposals,
+        settings.width,
+        settings.proposal_width,
+        APPEARANCE,
+    )
 
 
 def budget_of(settings: RadianceConfig) -> Budget:
@@ -442,7 +460,7 @@ def budget_of(settings: RadianceConfig) -> Budget:
     return Budget(settings.proposal_samples, settings.samples, NEAR_M, FAR_M)
 
 
-# ---- the loop --------------------------------------------------------------------------------------------------------
+# ---- the loop ------------------------------------------------------------------------------------
 
 
 def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
@@ -516,8 +534,12 @@ def _learn(state: RadianceState, terms: Mapping[str, Tensor], marched: Marched, 
     total = total + proposal_loss(marched) if learns else total
     if not bool(torch.isfinite(total)):
         odd = [name for name, value in terms.items() if not bool(torch.isfinite(value))]
-        raise NumericsError("a loss term is not finite", where=where, got=", ".join(odd) or "proposals",
-                            remedy="the parameters are those of the step before; another --seed draws other rays")  # fmt: skip
+        raise NumericsError(
+            "a loss term is not finite",
+            where=where,
+            got=", ".join(odd) or "proposals",
+            remedy="the parameters are those of the step before; another --seed draws other rays",
+        )
     for optimiser in state.optimisers:
         optimiser.zero_grad(set_to_none=True)
     total.backward()
@@ -526,8 +548,12 @@ def _learn(state: RadianceState, terms: Mapping[str, Tensor], marched: Marched, 
     if not bool(torch.isfinite(sums).all()):
         odd = [name for name, gradient in named if not bool(torch.isfinite(gradient).all())]
         if odd:
-            raise NumericsError("a gradient is not finite", where=where, got=", ".join(odd[:3]),
-                                remedy="the parameters are those of the step before; another --seed draws other rays")  # fmt: skip
+            raise NumericsError(
+                "a gradient is not finite",
+                where=where,
+                got=", ".join(odd[:3]),
+                remedy="the parameters are those of the step before; another --seed draws other rays",
+            )
     for optimiser in state.optimisers[: 2 if learns else 1]:
         optimiser.step()
 
@@ -556,7 +582,7 @@ def _progress(terms: Mapping[str, Tensor]) -> dict[str, float]:
     return {"psnr": round(-10 * math.log10(max(named["loss_color"], 1e-10)), 3), **named}
 
 
-# ---- the optimisers, and checkpoints ---------------------------------------------------------------------------------
+# ---- the optimisers, and checkpoints -------------------------------------------------------------
 
 
 def _optimisers(field: RadianceField) -> tuple[torch.optim.Adam, torch.optim.Adam]:
@@ -564,9 +590,7 @@ def _optimisers(field: RadianceField) -> tuple[torch.optim.Adam, torch.optim.Ada
     own = {id(value) for value in proposals}
     fused = field.device.type in ("cpu", "cuda")
     first, second = (
-        torch.optim.Adam(
-            given, RATE, BETAS, EPSILON, WEIGHT_DECAY, fused=fused, foreach=None if fused else False
-        )
+        torch.optim.Adam(given, RATE, BETAS, EPSILON, WEIGHT_DECAY, fused=fused, foreach=None if fused else False)
         for given in ([value for value in field.parameters() if id(value) not in own], proposals)
     )
     return first, second
@@ -585,8 +609,9 @@ def save_checkpoint(state: RadianceState, folder: RunDir) -> None:
     """All that changes: parameters, moments, the error map, the step."""
     groups = {
         "field": {name: value.cpu() for name, value in state.field.state_dict().items()},
-        "moments": _moments(state), "errors": {"errors": state.pixels.errors},
-    }  # fmt: skip
+        "moments": _moments(state),
+        "errors": {"errors": state.pixels.errors},
+    }
     checkpoint.save(
         folder.path / "steps", state.step, groups, {"seconds": state.seconds, "last": dict(state.last or {})}
     )

@@ -1,7 +1,8 @@
 """Backend "cpu": the native rasteriser as a torch autograd function. float32 on the CPU.
 
 The forward pass keeps its working memory in a context of the library until the backward pass is over (or the graph is
-dropped); contexts are then reused, so that a training loop allocates once. Images do not depend on the number of threads.
+dropped); contexts are then reused, so that a training loop allocates once. Images do not depend on the number of
+threads.
 """
 
 from __future__ import annotations
@@ -31,12 +32,26 @@ PHASES: Final = ("project", "sort", "bin", "blend", "blend_backward", "project_b
 # Mirrors of the structs in native/raster_types.h.
 class _Scene(ctypes.Structure):
     _fields_ = [
-        *((name, _I) for name in ("count", "width", "height", "extra_channels", "sh_coefficients", "sh_degree",
-                                  "antialias", "want_abs_gradient")),
+        *(
+            (name, _I)
+            for name in (
+                "count",
+                "width",
+                "height",
+                "extra_channels",
+                "sh_coefficients",
+                "sh_degree",
+                "antialias",
+                "want_abs_gradient",
+            )
+        ),
         *((name, _F) for name in ("near_m", "far_m", "blur_px2", "alpha_max", "fx", "fy", "cx", "cy")),
-        ("rotation", _F * 9), ("center_high", _F * 3), ("center_low", _F * 3), ("background", _F * 3),
+        ("rotation", _F * 9),
+        ("center_high", _F * 3),
+        ("center_low", _F * 3),
+        ("background", _F * 3),
         *((name, _P) for name in ("means", "quats", "scales", "opacities", "sh", "extra", "sh_rest")),
-    ]  # fmt: skip
+    ]
 
 
 class _Image(ctypes.Structure):
@@ -49,9 +64,14 @@ class _ImageGradient(ctypes.Structure):
 
 class _Gradient(ctypes.Structure):
     _fields_ = [
-        *((name, _P) for name in ("means", "quats", "scales", "opacities", "sh", "extra", "means2d", "abs_means2d", "sh_rest")),
-        ("rotation", _F * 9), ("center", _F * 3), ("background", _F * 3),
-    ]  # fmt: skip
+        *(
+            (name, _P)
+            for name in ("means", "quats", "scales", "opacities", "sh", "extra", "means2d", "abs_means2d", "sh_rest")
+        ),
+        ("rotation", _F * 9),
+        ("center", _F * 3),
+        ("background", _F * 3),
+    ]
 
 
 class _Context:
@@ -117,8 +137,8 @@ def _recycled_like(tensor: Tensor) -> Tensor:
 
 
 def release_memory() -> None:
-    """Free the working memory that is not in use, contexts of the library and memory kept for gradients, and hand all that is free to
-    the system: for work that follows and renders nothing for a while, here or in other processes."""
+    """Free the working memory that is not in use, contexts of the library and memory kept for gradients, and hand all
+    that is free to the system: for work that follows and renders nothing for a while, here or in other processes."""
     global _last_handle
     _last_handle = 0
     _Loan.free.clear()
@@ -150,8 +170,12 @@ def render(request: Request) -> Render:
     gaussians = request.gaussians
     _library()
     if gaussians.means.dtype != torch.float32 or gaussians.means.device.type != "cpu":
-        raise InputError("the native rasteriser works on float32 CPU tensors", where="gaussians.means",
-                         expected="torch.float32 on cpu", got=f"{gaussians.means.dtype} on {gaussians.means.device}")  # fmt: skip
+        raise InputError(
+            "the native rasteriser works on float32 CPU tensors",
+            where="gaussians.means",
+            expected="torch.float32 on cpu",
+            got=f"{gaussians.means.dtype} on {gaussians.means.device}",
+        )
     tensors = (*(getattr(gaussians, name) for name in _PARTS), *request.backgrounds, *request.poses)
     keeps_graph = torch.is_grad_enabled() and any(t is not None and t.requires_grad for t in tensors)
     means2d, leaves = trace_leaves(request, gaussians.means, keeps_graph)
@@ -167,9 +191,14 @@ def render(request: Request) -> Render:
 def _draw(request: Request, index: int, means2d: Tensor, abs_grad2d: Tensor | None, keeps_graph: bool) -> Drawn:
     g = request.gaussians
     call = _Call(
-        library=_library(), camera=request.views[index].camera, config=request.config, sh_degree=request.sh_degree,
-        keeps_graph=keeps_graph, radii=torch.empty(len(g), 2, dtype=torch.int32), abs_grad2d=abs_grad2d,
-    )  # fmt: skip
+        library=_library(),
+        camera=request.views[index].camera,
+        config=request.config,
+        sh_degree=request.sh_degree,
+        keeps_graph=keeps_graph,
+        radii=torch.empty(len(g), 2, dtype=torch.int32),
+        abs_grad2d=abs_grad2d,
+    )
     parts = (getattr(g, name) for name in _PARTS)
     rgb, depth, alpha, extra = _Rasterize.apply(call, request.pose(index), request.backgrounds[index], means2d, *parts)
     return Drawn(rgb, depth, alpha, None if g.extra is None else extra, call.radii)
@@ -181,7 +210,8 @@ def last_statistics() -> dict[str, float]:
     return {} if library is None or not _last_handle else _statistics(library, _last_handle)
 
 
-# Only the number: holding the context itself would keep it from being reused. Contexts are freed by release_memory alone.
+# Only the number: holding the context itself would keep it from being reused. Contexts are freed by release_memory
+# alone.
 _last_handle = 0
 
 
@@ -219,13 +249,16 @@ class _Rasterize(torch.autograd.Function):
     def backward(
         ctx: Any, of_rgb: Tensor | None, of_depth: Tensor | None, of_alpha: Tensor | None, of_extra: Tensor | None
     ) -> tuple[Tensor | None, ...]:
-        parts, call, needs = ctx.saved_tensors, ctx.call, ctx.needs_input_grad[4:]  # reading them checks for edits in place
+        # reading them checks for edits in place
+        parts, call, needs = ctx.saved_tensors, ctx.call, ctx.needs_input_grad[4:]
         count = parts[0].shape[0]
         upstream = [None if g is None else g.contiguous() for g in (of_rgb, of_depth, of_alpha, of_extra)]
         out = [_recycled_like(t) for t in parts[:4]]
         colors = needs[4] or needs[6]  # harmonics in two tensors are written together
         asked = (colors, needs[5], colors)
-        out += [_recycled_like(t) if t is not None and needed else None for t, needed in zip(parts[4:], asked, strict=True)]
+        out += [
+            _recycled_like(t) if t is not None and needed else None for t, needed in zip(parts[4:], asked, strict=True)
+        ]
         of_means2d = torch.empty(count, 2)
         absolute = None if call.abs_grad2d is None else torch.empty(count, 2)
         gradient = _Gradient(*(_at(t) for t in (*out[:6], of_means2d, absolute, out[6])))
@@ -235,14 +268,17 @@ class _Rasterize(torch.autograd.Function):
             _raise(status, ctx.context, parts)
         if absolute is not None and call.abs_grad2d is not None:
             call.abs_grad2d.add_(absolute)
-        of_background = torch.tensor(list(gradient.background), dtype=ctx.background_type) if ctx.needs_input_grad[2] else None
+        of_background = (
+            torch.tensor(list(gradient.background), dtype=ctx.background_type) if ctx.needs_input_grad[2] else None
+        )
         of_pose = _pose_gradient(gradient, ctx.pose_type) if ctx.needs_input_grad[1] else None
         wanted = [g if needed else None for g, needed in zip(out, needs)]
         return (None, of_pose, of_background, of_means2d, *wanted)
 
 
 def _pose_gradient(gradient: _Gradient, dtype: torch.dtype) -> Tensor:
-    """d loss / d world_from_cam: its rotation is the transpose of the one the library knows, its last column the centre."""
+    """d loss / d world_from_cam: its rotation is the transpose of the one the library knows, its last column the
+    centre."""
     of_pose = torch.zeros(4, 4, dtype=dtype)
     of_pose[:3, :3] = torch.tensor(list(gradient.rotation), dtype=dtype).view(3, 3).T
     of_pose[:3, 3] = torch.tensor(list(gradient.center), dtype=dtype)
@@ -262,12 +298,28 @@ def _scene(parts: list[Tensor | None], background: Tensor | None, world_from_cam
     low = (center - high.double()).float()
     color = [0.0] * 3 if background is None else background.detach().float().tolist()
     return _Scene(
-        means.shape[0], camera.width, camera.height, 0 if extra is None else extra.shape[1],
-        sh.shape[1] + (0 if sh_rest is None else sh_rest.shape[1]), call.sh_degree,
-        int(config.antialias), int(call.abs_grad2d is not None), config.near_m, config.far_m, config.blur_px2,
-        config.alpha_max, camera.fx, camera.fy, camera.cx, camera.cy, (_F * 9)(*pose[:3, :3].T.flatten().tolist()),
-        (_F * 3)(*high.tolist()), (_F * 3)(*low.tolist()), (_F * 3)(*color), *(_at(t) for t in parts),
-    )  # fmt: skip
+        means.shape[0],
+        camera.width,
+        camera.height,
+        0 if extra is None else extra.shape[1],
+        sh.shape[1] + (0 if sh_rest is None else sh_rest.shape[1]),
+        call.sh_degree,
+        int(config.antialias),
+        int(call.abs_grad2d is not None),
+        config.near_m,
+        config.far_m,
+        config.blur_px2,
+        config.alpha_max,
+        camera.fx,
+        camera.fy,
+        camera.cx,
+        camera.cy,
+        (_F * 9)(*pose[:3, :3].T.flatten().tolist()),
+        (_F * 3)(*high.tolist()),
+        (_F * 3)(*low.tolist()),
+        (_F * 3)(*color),
+        *(_at(t) for t in parts),
+    )
 
 
 def _raise(status: int, context: _Context, parts: list[Tensor | None] | tuple[Tensor | None, ...]) -> None:
@@ -276,10 +328,11 @@ def _raise(status: int, context: _Context, parts: list[Tensor | None] | tuple[Te
         row = int(found["first_not_finite"])
         bad = [n for n, t in zip(_PARTS, parts, strict=True) if t is not None and not torch.isfinite(t[row]).all()]
         raise NumericsError(
-            "a Gaussian is not finite", where=f"Gaussian {row}: {', '.join(bad) or 'its colour overflows'}",
+            "a Gaussian is not finite",
+            where=f"Gaussian {row}: {', '.join(bad) or 'its colour overflows'}",
             got=f"{int(found['not_finite'])} such Gaussians",
             remedy="a loss or an optimiser step went wrong earlier; lower the learning rate or check the data",
-        )  # fmt: skip
+        )
     what = {1: "the rasteriser ran out of memory", 2: "too many Gaussian-tile pairs for one image"}[status]
     raise ResourceError(what, remedy="use fewer or smaller Gaussians, or a smaller image")
 

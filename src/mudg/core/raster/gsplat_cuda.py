@@ -1,9 +1,9 @@
 """Backend "gsplat": an adapter to the CUDA rasteriser of the same mathematics (gsplat >= 1.5.3). Importable without it.
 
-What differs: gsplat caps alpha at 0.999 whatever ``alpha_max`` says, calls a Gaussian visible whose rectangle reaches the
-image's border before its first pixel centre, and rounds radii up without our thousandth of a pixel. Everything else agrees to
-rounding. Colours are evaluated here with gsplat's spherical harmonics, and depths here, so that colours, features and
-depth go through one pass whose gradients are complete in every mode.
+What differs: gsplat caps alpha at 0.999 whatever ``alpha_max`` says, calls a Gaussian visible whose rectangle reaches
+the image's border before its first pixel centre, and rounds radii up without our thousandth of a pixel. Everything else
+agrees to rounding. Colours are evaluated here with gsplat's spherical harmonics, and depths here, so that colours,
+features and depth go through one pass whose gradients are complete in every mode.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from mudg.base.types import Gaussians, RasterTrace, Render
 from mudg.core.raster import torch_twin
 from mudg.core.raster.request import Request, harmonics
 
-# whether the package gsplat can be used here, and why not. Imports it only in ``load`` --------------------------------
+# whether the package gsplat can be used here, and why not. Imports it only in ``load`` ------------
 
 
 MINIMUM_VERSION: Final = (1, 5, 3)
@@ -64,7 +64,8 @@ def compiled_kernels() -> Path | None:
 
 
 def nvcc() -> str | None:
-    """The CUDA compiler that gsplat would use, looked for where torch looks: CUDA_HOME, CUDA_PATH, PATH, /usr/local/cuda."""
+    """The CUDA compiler that gsplat would use, looked for where torch looks: CUDA_HOME, CUDA_PATH, PATH,
+    /usr/local/cuda."""
     home = os.environ.get("CUDA_HOME") or os.environ.get("CUDA_PATH")
     named = [Path(home) / "bin" / "nvcc"] if home else []
     found = shutil.which("nvcc")
@@ -75,7 +76,10 @@ def nvcc() -> str | None:
 def _compiler_problem() -> str:
     """What is missing to compile the kernels: gsplat itself would only fail at the first picture."""
     if nvcc() is None:
-        return "its kernels are not compiled and there is no CUDA toolkit to compile them (nvcc was not found; set CUDA_HOME)"
+        return (
+            "its kernels are not compiled and there is no CUDA toolkit to compile them (nvcc was not found; set"
+            " CUDA_HOME)"
+        )
     if shutil.which("ninja") is None and importlib.util.find_spec("ninja") is None:
         return "its kernels are not compiled and ninja, which compiles them, is missing (pip install ninja)"
     if not any(shutil.which(name) for name in (os.environ.get("CXX", "c++"), "g++", "clang++", "cl")):
@@ -103,12 +107,15 @@ def load() -> ModuleType:
     """
     reason = problem()
     if reason:
-        raise ResourceError("raster backend 'gsplat' is not available", got=reason,
-                            remedy="see docs/gsplat.md; pip install 'mudg[gsplat]'")  # fmt: skip
+        raise ResourceError(
+            "raster backend 'gsplat' is not available",
+            got=reason,
+            remedy="see docs/gsplat.md; pip install 'mudg[gsplat]'",
+        )
     return importlib.import_module("gsplat")
 
 
-# gsplat cuda ----------------------------------------------------------------------------------------------------------
+# gsplat cuda --------------------------------------------------------------------------------------
 
 
 ALPHA_MAX: Final = 0.999
@@ -120,8 +127,9 @@ _LARGEST_PX: Final = 1e9
 
 @dataclass(frozen=True, slots=True)
 class _Cameras:
-    """The views relative to ``origin`` [3]: viewmats [V, 4, 4] (cam from world; with a rolling shutter when the first row is
-    read, and ``last`` when the last one is), centers [V, 3], optical axes ``forward`` [V, 3], intrinsics [V, 3, 3]."""
+    """The views relative to ``origin`` [3]: viewmats [V, 4, 4] (cam from world; with a rolling shutter when the first
+    row is read, and ``last`` when the last one is), centers [V, 3], optical axes ``forward`` [V, 3], intrinsics [V, 3,
+    3]."""
 
     origin: Tensor
     viewmats: Tensor
@@ -176,17 +184,21 @@ def _refuse(request: Request) -> None:
     if g.means.dtype != torch.float32:
         raise InputError("gsplat works on float32 tensors", where="gaussians.means", got=str(g.means.dtype))
     if request.absgrad and (config.projection, config.primitive) != ("linear", "ellipsoid"):
-        raise UsageError("gsplat gives absolute gradients of projected means only of linearly projected ellipsoids",
-                         got=f"projection={config.projection!r}, primitive={config.primitive!r}",
-                         remedy="densify without them (mcmc), or draw linearly projected ellipsoids")  # fmt: skip
+        raise UsageError(
+            "gsplat gives absolute gradients of projected means only of linearly projected ellipsoids",
+            got=f"projection={config.projection!r}, primitive={config.primitive!r}",
+            remedy="densify without them (mcmc), or draw linearly projected ellipsoids",
+        )
     if config.projection == "unscented" and any(pose is not None and pose.requires_grad for pose in request.poses):
-        raise UsageError("gsplat gives no gradients of camera poses with projection='unscented'",
-                         remedy="keep the poses fixed, or set projection='linear'")  # fmt: skip
+        raise UsageError(
+            "gsplat gives no gradients of camera poses with projection='unscented'",
+            remedy="keep the poses fixed, or set projection='linear'",
+        )
 
 
 def _finite(g: Gaussians) -> tuple[Gaussians, Tensor | None]:
-    """Refuse geometry that is not finite. Harmonics and features that are not are replaced by 0, since only those of drawn
-    Gaussians count; the second value [N] says where. One transfer to the CPU."""
+    """Refuse geometry that is not finite. Harmonics and features that are not are replaced by 0, since only those of
+    drawn Gaussians count; the second value [N] says where. One transfer to the CPU."""
     colors = {"sh": g.sh, "sh_rest": g.sh_rest, "extra": g.extra}
     given = {name: tensor for name, tensor in colors.items() if tensor is not None}
     geometry = {name: getattr(g, name) for name in ("means", "quats", "scales", "opacity")}
@@ -198,12 +210,24 @@ def _finite(g: Gaussians) -> tuple[Gaussians, Tensor | None]:
         return g, None
     bad = torch.stack([~torch.isfinite(tensor).flatten(1).all(1) for tensor in given.values()]).any(0)
     clean = {n: torch.where(bad.view(-1, *[1] * (t.ndim - 1)), 0, t) for n, t in given.items()}
-    return Gaussians(means=g.means, quats=g.quats, scales=g.scales, opacity=g.opacity, sh=clean["sh"],
-                     extra=clean.get("extra"), node=g.node, sh_rest=clean.get("sh_rest")), bad  # fmt: skip
+    return (
+        Gaussians(
+            means=g.means,
+            quats=g.quats,
+            scales=g.scales,
+            opacity=g.opacity,
+            sh=clean["sh"],
+            extra=clean.get("extra"),
+            node=g.node,
+            sh_rest=clean.get("sh_rest"),
+        ),
+        bad,
+    )
 
 
 def _cameras(request: Request) -> _Cameras:
-    """Poses are inverted in float64 and taken relative to the first camera, so that float32 serves far from the world's origin."""
+    """Poses are inverted in float64 and taken relative to the first camera, so that float32 serves far from the world's
+    origin."""
     like = request.gaussians.means
     poses = torch.stack([request.pose(i).to(like.device, torch.float64) for i in range(len(request.views))])
     origin = poses.detach().reshape(-1, 4, 4)[0, :3, 3].to(like.dtype)
@@ -241,18 +265,31 @@ def _draw(gsplat: Any, request: Request, cameras: _Cameras, splats: _Splats) -> 
     """Image [V, H, W, C or more], alpha [V, H, W, 1] and gsplat's intermediate results."""
     config, camera = request.config, request.views[0].camera
     common: dict[str, Any] = {
-        "means": splats.means, "quats": splats.quats, "scales": splats.scales, "opacities": splats.opacity,
-        "width": camera.width, "height": camera.height, "near_plane": config.near_m, "far_plane": config.far_m,
-        "eps2d": config.blur_px2, "sh_degree": None, "render_mode": "RGB",
-    }  # fmt: skip
+        "means": splats.means,
+        "quats": splats.quats,
+        "scales": splats.scales,
+        "opacities": splats.opacity,
+        "width": camera.width,
+        "height": camera.height,
+        "near_plane": config.near_m,
+        "far_plane": config.far_m,
+        "eps2d": config.blur_px2,
+        "sh_degree": None,
+        "render_mode": "RGB",
+    }
     if config.primitive == "disc":
         return _draw_discs(gsplat, common, cameras, splats)
     if config.projection == "unscented":
         return _draw_unscented(gsplat, common, cameras, splats, config.shutter)
     return gsplat.rasterization(
-        **common, colors=splats.channels, viewmats=cameras.viewmats, Ks=cameras.intrinsics, packed=config.packed,
-        rasterize_mode="antialiased" if config.antialias else "classic", absgrad=request.absgrad,
-    )  # fmt: skip
+        **common,
+        colors=splats.channels,
+        viewmats=cameras.viewmats,
+        Ks=cameras.intrinsics,
+        packed=config.packed,
+        rasterize_mode="antialiased" if config.antialias else "classic",
+        absgrad=request.absgrad,
+    )
 
 
 def _draw_discs(
@@ -276,19 +313,27 @@ def _draw_unscented(
     drawn = []
     for index in range(len(cameras.viewmats)):
         one = slice(index, index + 1)
-        drawn.append(gsplat.rasterization(
-            **common, rolling_shutter=gsplat.RollingShutterType[name], colors=splats.channels[one], viewmats=cameras.viewmats[one].detach(),
-            viewmats_rs=None if cameras.last is None else cameras.last[one].detach(), Ks=cameras.intrinsics[one],
-            packed=False, with_ut=True, with_eval3d=True,
-        ))  # fmt: skip
+        drawn.append(
+            gsplat.rasterization(
+                **common,
+                rolling_shutter=gsplat.RollingShutterType[name],
+                colors=splats.channels[one],
+                viewmats=cameras.viewmats[one].detach(),
+                viewmats_rs=None if cameras.last is None else cameras.last[one].detach(),
+                Ks=cameras.intrinsics[one],
+                packed=False,
+                with_ut=True,
+                with_eval3d=True,
+            )
+        )
     images, alphas, metas = zip(*drawn, strict=True)
     meta = {name: torch.cat([one[name] for one in metas]) for name in ("means2d", "radii")}
     return torch.cat(images), torch.cat(alphas), meta
 
 
 def _trace(meta: dict[str, Any], request: Request) -> RasterTrace:
-    """Trace whose means2d is a leaf: a hook copies the gradient of gsplat's own tensor to it. Rows that are not drawn are 0:
-    gsplat leaves them uninitialised, and out if it packs."""
+    """Trace whose means2d is a leaf: a hook copies the gradient of gsplat's own tensor to it. Rows that are not drawn
+    are 0: gsplat leaves them uninitialised, and out if it packs."""
     means2d, radii = meta["means2d"], meta["radii"]
     shape = (len(request.views), len(request.gaussians), 2)
     rows = None if meta.get("gaussian_ids") is None else (meta["camera_ids"], meta["gaussian_ids"])
@@ -304,7 +349,8 @@ def _trace(meta: dict[str, Any], request: Request) -> RasterTrace:
     trace = RasterTrace(leaf, torch.where(visible[..., None], size, 0).int(), visible, absolute)
     if not means2d.requires_grad:
         return trace
-    # The trace owns gsplat's tensor and the hook knows the trace's only weakly: in a circle, both would outlive their use.
+    # The trace owns gsplat's tensor and the hook knows the trace's only weakly: in a circle, both would outlive their
+    # use.
     leaf.drawn_by_gsplat = means2d  # type: ignore[attr-defined]
     reference = weakref.ref(leaf)
 
@@ -314,7 +360,8 @@ def _trace(meta: dict[str, Any], request: Request) -> RasterTrace:
             return
         mine.grad = shaped(gradient) if mine.grad is None else mine.grad + shaped(gradient)
         if absolute is not None:
-            absolute.add_(shaped(mine.drawn_by_gsplat.absgrad))  # type: ignore[attr-defined]  # set by gsplat in its backward
+            # set by gsplat in its backward
+            absolute.add_(shaped(mine.drawn_by_gsplat.absgrad))  # type: ignore[attr-defined]
 
     meta.get("gradient_2dgs", means2d).register_hook(keep)  # of discs gsplat keeps it beside
     return trace

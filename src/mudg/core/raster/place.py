@@ -39,6 +39,11 @@ def drawing_device(wanted: str, purpose: str, backend: Backend = "auto") -> torc
         wanted = kinds[0] if len(kinds) == 1 else "cpu" if problem else "auto"
     chosen = choose_device(wanted, purpose)
     if chosen.type in ("cpu", "cuda") and chosen.type not in kinds:
-        raise UsageError(f"raster backend {backend!r} does not draw on this device", where="--raster",
-                         expected=f"--device {kinds[0]}", got=f"--device {wanted}", remedy="leave --raster at auto")  # fmt: skip
+        raise UsageError(
+            f"raster backend {backend!r} does not draw on this device",
+            where="--raster",
+            expected=f"--device {kinds[0]}",
+            got=f"--device {wanted}",
+            remedy="leave --raster at auto",
+        )
     return chosen

@@ -15,7 +15,8 @@ from mudg.core.raster.rasterize import RasterConfig, rasterize
 
 GAUSSIANS, WIDTH, HEIGHT = 20_000, 240, 160
 REFERENCE_S: Final = 0.0108
-"""Seconds of one pass, forward and backward, on one undisturbed core of the machine on which `steps/settings/cost.py` was measured."""
+"""Seconds of one pass, forward and backward, on one undisturbed core of the machine on which `steps/settings/cost.py`
+was measured."""
 
 
 def scene() -> tuple[Gaussians, View]:
@@ -28,10 +29,14 @@ def scene() -> tuple[Gaussians, View]:
     quats = torch.zeros(GAUSSIANS, 4)
     quats[:, 0] = 1
     gaussians = Gaussians(
-        means=f32(means), quats=quats, scales=f32(scales), opacity=f32(rng.uniform(0.3, 0.95, GAUSSIANS)),
-        sh=f32(rng.normal(0, 0.5, (GAUSSIANS, 1, 3))), extra=f32(rng.normal(0, 1, (GAUSSIANS, 8))),
+        means=f32(means),
+        quats=quats,
+        scales=f32(scales),
+        opacity=f32(rng.uniform(0.3, 0.95, GAUSSIANS)),
+        sh=f32(rng.normal(0, 0.5, (GAUSSIANS, 1, 3))),
+        extra=f32(rng.normal(0, 1, (GAUSSIANS, 8))),
         node=torch.zeros(GAUSSIANS, dtype=torch.int32),
-    )  # fmt: skip
+    )
     return gaussians, View(Camera("probe", WIDTH, HEIGHT, 200.0, 200.0, WIDTH / 2, HEIGHT / 2), np.eye(4), 0.0)
 
 
@@ -43,7 +48,8 @@ class Speed(NamedTuple):
 
 
 def speed(passes: int = 12) -> Speed:
-    """Measure the speed of a core of this machine, by the processor time of one thread: other programs at work hardly change that."""
+    """Measure the speed of a core of this machine, by the processor time of one thread: other programs at work hardly
+    change that."""
     gaussians, view = scene()
     before = torch.get_num_threads()
     torch.set_num_threads(1)

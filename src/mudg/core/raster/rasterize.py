@@ -54,9 +54,9 @@ class RasterConfig:
 
     Only gsplat (CUDA) has these; other backends refuse any value but the first:
         packed: False, or True = keep working memory only for Gaussians that a view sees: less memory, slightly slower.
-        projection: "linear" = the image of a Gaussian is linearised at its mean; "unscented" = sigma points find where it
-            is seen and its response is evaluated along each pixel's ray (3DGUT, Wu et al. 2025). Without ``blur_px2``, without
-            gradients of projected means and of poses.
+        projection: "linear" = the image of a Gaussian is linearised at its mean; "unscented" = sigma points find where
+            it is seen and its response is evaluated along each pixel's ray (3DGUT, Wu et al. 2025). Without
+            ``blur_px2``, without gradients of projected means and of poses.
         primitive: "ellipsoid", or "disc" = flat Gaussians, the third scale is not used (2DGS, Huang et al. 2024).
         shutter: "global", or the direction in which a rolling shutter reads the image; needs projection="unscented" and
             poses at the first and the last row (or column) in ``world_from_cam``.
@@ -87,7 +87,9 @@ class RasterConfig:
             raise UsageError("sh_degree is out of range", expected=f"0 to {MAX_SH_DEGREE}", got=str(self.sh_degree))
         for name, allowed in (("projection", Projection), ("primitive", Primitive), ("shutter", Shutter)):
             if (value := getattr(self, name)) not in get_args(allowed):
-                raise UsageError(f"unknown {name} of the rasterizer", expected=", ".join(get_args(allowed)), got=repr(value))
+                raise UsageError(
+                    f"unknown {name} of the rasterizer", expected=", ".join(get_args(allowed)), got=repr(value)
+                )
         for together, remedy in self._contradictions():
             raise UsageError(f"the rasterizer cannot combine {together}", remedy=remedy)
 
@@ -95,7 +97,11 @@ class RasterConfig:
         """Settings that gsplat does not offer together, and what to do."""
         unscented, disc = self.projection == "unscented", self.primitive == "disc"
         rows = [
-            (self.shutter != "global" and not unscented, "a rolling shutter with projection='linear'", "set projection='unscented'"),
+            (
+                self.shutter != "global" and not unscented,
+                "a rolling shutter with projection='linear'",
+                "set projection='unscented'",
+            ),
             (unscented and disc, "projection='unscented' with primitive='disc'", "choose one of them"),
             (unscented and self.packed, "projection='unscented' with packed", "set packed=False"),
             (disc and self.packed, "primitive='disc' with packed", "set packed=False"),
@@ -131,20 +137,21 @@ def rasterize(
         config: see ``RasterConfig``.
         background: colour behind everything, in [0, 1]: [3] or [3, H, W], or one per view: [V, 3] or [V, 3, H, W];
             None = black. Differentiable.
-        world_from_cam: [4, 4] (with several views [V, 4, 4]) rigid, differentiable poses used instead of the views'. With a
-            rolling shutter [2, 4, 4] ([V, 2, 4, 4]): the poses when the first and the last row (or column) are read.
+        world_from_cam: [4, 4] (with several views [V, 4, 4]) rigid, differentiable poses used instead of the views'.
+            With a rolling shutter [2, 4, 4] ([V, 2, 4, 4]): the poses when the first and the last row (or column) are
+            read.
         absgrad: also fill ``trace.abs_grad2d`` in backward (sum over pixels of |d loss / d mean2d|, pixels).
 
     Returns:
         Render with rgb [3, H, W], depth [1, H, W] (expected z; times alpha = the accumulated z; 0 where alpha is 0),
-        alpha [1, H, W], extra [C, H, W] accumulated, and the trace. ``trace.means2d`` is a leaf whose ``.grad`` backward
-        fills (pixels); rows of Gaussians that were not drawn are 0.
+        alpha [1, H, W], extra [C, H, W] accumulated, and the trace. ``trace.means2d`` is a leaf whose ``.grad``
+        backward fills (pixels); rows of Gaussians that were not drawn are 0.
 
     Raises:
         InputError: shapes, devices or types that do not fit; views of different sizes, or none.
         ResourceError: the backend asked for is not available here, or memory ran out.
-        NumericsError: a parameter is NaN or infinite (in any Gaussian), or the colour or a feature of a drawn one. Finite
-            but absurd values (zero quaternion, scale of 1e38) are drawn or culled, never spread NaN.
+        NumericsError: a parameter is NaN or infinite (in any Gaussian), or the colour or a feature of a drawn one.
+            Finite but absurd values (zero quaternion, scale of 1e38) are drawn or culled, never spread NaN.
     """
     config = config or RasterConfig()
     batched = not isinstance(view, View)
@@ -175,8 +182,11 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
     if config.backend != "auto":
         problem = available(config.backend)
         if problem:
-            raise ResourceError(f"raster backend {config.backend!r} is not available", got=problem,
-                                remedy="install what is missing or use backend='auto'")  # fmt: skip
+            raise ResourceError(
+                f"raster backend {config.backend!r} is not available",
+                got=problem,
+                remedy="install what is missing or use backend='auto'",
+            )
         wanted = {"cpu": "cpu", "gsplat": "cuda"}.get(config.backend)
         if wanted is not None and device.type != wanted:
             raise ResourceError(f"raster backend {config.backend!r} works on {wanted} tensors", got=str(device))
@@ -184,8 +194,11 @@ def _choose_backend(gaussians: Gaussians, config: RasterConfig) -> str:
     if device.type == "cuda":
         problem = available("gsplat")
         if problem:
-            raise ResourceError("drawing on a GPU needs gsplat", got=problem,
-                                remedy="pip install 'mudg[gsplat]', or keep the Gaussians on the CPU")  # fmt: skip
+            raise ResourceError(
+                "drawing on a GPU needs gsplat",
+                got=problem,
+                remedy="pip install 'mudg[gsplat]', or keep the Gaussians on the CPU",
+            )
         log.info_once("rasterizer: gsplat (CUDA)")
         return "gsplat"
     if device.type == "cpu" and dtype == torch.float32 and not available("cpu"):
@@ -205,8 +218,11 @@ def refuse_settings(backend: str, config: RasterConfig) -> None:
     for name, common in ONLY_GSPLAT.items():
         value = getattr(config, name)
         if backend != "gsplat" and value != common:
-            raise UsageError(f"raster backend {backend!r} has no {name}={value!r}; only gsplat on a CUDA device has",
-                             expected=f"{name}={common!r}", remedy=f"leave {name} at {common!r}, or use backend='gsplat'")  # fmt: skip
+            raise UsageError(
+                f"raster backend {backend!r} has no {name}={value!r}; only gsplat on a CUDA device has",
+                expected=f"{name}={common!r}",
+                remedy=f"leave {name} at {common!r}, or use backend='gsplat'",
+            )
 
 
 def _check(gaussians: Gaussians, config: RasterConfig) -> int:
@@ -215,22 +231,38 @@ def _check(gaussians: Gaussians, config: RasterConfig) -> int:
     allowed = math.isqrt(coefficients) - 1
     degree = allowed if config.sh_degree is None else config.sh_degree
     if not 0 <= degree <= min(allowed, MAX_SH_DEGREE):
-        raise InputError("spherical harmonics do not have enough coefficients for their degree", where="gaussians.sh",
-                         expected=f"[N, {(max(degree, 0) + 1) ** 2}, 3]", got=f"[{len(gaussians)}, {coefficients}, 3]")  # fmt: skip
-    parts = {"means": gaussians.means, "quats": gaussians.quats, "scales": gaussians.scales,
-             "opacity": gaussians.opacity, "sh": gaussians.sh}  # fmt: skip
+        raise InputError(
+            "spherical harmonics do not have enough coefficients for their degree",
+            where="gaussians.sh",
+            expected=f"[N, {(max(degree, 0) + 1) ** 2}, 3]",
+            got=f"[{len(gaussians)}, {coefficients}, 3]",
+        )
+    parts = {
+        "means": gaussians.means,
+        "quats": gaussians.quats,
+        "scales": gaussians.scales,
+        "opacity": gaussians.opacity,
+        "sh": gaussians.sh,
+    }
     if gaussians.sh_rest is not None:
         parts["sh_rest"] = gaussians.sh_rest
     if gaussians.extra is not None:
         parts["extra"] = gaussians.extra
         if gaussians.extra.shape[1] > MAX_EXTRA_CHANNELS:
-            raise InputError("too many feature channels", where="gaussians.extra", expected=f"at most {MAX_EXTRA_CHANNELS}",
-                             got=str(gaussians.extra.shape[1]))  # fmt: skip
+            raise InputError(
+                "too many feature channels",
+                where="gaussians.extra",
+                expected=f"at most {MAX_EXTRA_CHANNELS}",
+                got=str(gaussians.extra.shape[1]),
+            )
     for name, tensor in parts.items():
         if tensor.device != gaussians.means.device or tensor.dtype != gaussians.means.dtype:
-            raise InputError("all parameters must share device and type", where=f"gaussians.{name}",
-                             expected=f"{gaussians.means.dtype} on {gaussians.means.device}",
-                             got=f"{tensor.dtype} on {tensor.device}")  # fmt: skip
+            raise InputError(
+                "all parameters must share device and type",
+                where=f"gaussians.{name}",
+                expected=f"{gaussians.means.dtype} on {gaussians.means.device}",
+                got=f"{tensor.dtype} on {tensor.device}",
+            )
     return degree
 
 
@@ -241,26 +273,36 @@ def _check_views(views: tuple[View, ...], config: RasterConfig) -> None:
     for index, view in enumerate(views):
         camera = view.camera
         if (camera.width, camera.height) != size:
-            raise InputError("views drawn together must share one image size", where=f"view {index}, camera {camera.name!r}",
-                             expected=f"{size[0]}x{size[1]}", got=f"{camera.width}x{camera.height}")  # fmt: skip
+            raise InputError(
+                "views drawn together must share one image size",
+                where=f"view {index}, camera {camera.name!r}",
+                expected=f"{size[0]}x{size[1]}",
+                got=f"{camera.width}x{camera.height}",
+            )
         if camera.readout_s > 0 and config.shutter == "global":
-            log.info_once(f"rasterizer: the rolling shutter of camera {camera.name!r} ({camera.readout_s} s) is not followed; "
-                          "drawn as a global shutter at the view's time")  # fmt: skip
+            log.info_once(
+                f"rasterizer: the rolling shutter of camera {camera.name!r} ({camera.readout_s} s) is not followed; "
+                "drawn as a global shutter at the view's time"
+            )
 
 
-def _poses(
-    world_from_cam: Tensor | None, views: int, batched: bool, config: RasterConfig
-) -> tuple[Tensor | None, ...]:
+def _poses(world_from_cam: Tensor | None, views: int, batched: bool, config: RasterConfig) -> tuple[Tensor | None, ...]:
     rolling = config.shutter != "global"
     wanted = (*((views,) if batched else ()), *((2,) if rolling else ()), 4, 4)
     if world_from_cam is None:
         if rolling:
-            raise InputError("a rolling shutter needs the poses at its first and last row", where="world_from_cam",
-                             expected=str(list(wanted)), got="None",
-                             remedy="give both poses, or set shutter='global'")  # fmt: skip
+            raise InputError(
+                "a rolling shutter needs the poses at its first and last row",
+                where="world_from_cam",
+                expected=str(list(wanted)),
+                got="None",
+                remedy="give both poses, or set shutter='global'",
+            )
         return (None,) * views
     if tuple(world_from_cam.shape) != wanted:
-        raise InputError("world_from_cam has the wrong shape", expected=str(list(wanted)), got=str(list(world_from_cam.shape)))
+        raise InputError(
+            "world_from_cam has the wrong shape", expected=str(list(wanted)), got=str(list(world_from_cam.shape))
+        )
     return world_from_cam.unbind(0) if batched else (world_from_cam,)
 
 
@@ -280,4 +322,6 @@ def _backgrounds(
     if shape in ((3, height, width), (*per_view, 3, height, width)):
         return black, background
     also = f", [{len(views)}, 3] or [{len(views)}, 3, {height}, {width}]" if batched else ""
-    raise InputError("the background has the wrong shape", expected=f"[3], [3, {height}, {width}]{also}", got=str(list(shape)))
+    raise InputError(
+        "the background has the wrong shape", expected=f"[3], [3, {height}, {width}]{also}", got=str(list(shape))
+    )

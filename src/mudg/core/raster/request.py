@@ -23,8 +23,8 @@ class Request:
         views: one or more, all of one image size.
         batched: whether the result has a leading view dimension (always so for more than one view).
         backgrounds: one colour [3] (or None, black) per view.
-        poses: world_from_cam [4, 4] per view, or None where the view's own is meant. With a rolling shutter [2, 4, 4]: when
-            the first and when the last row (or column) is read.
+        poses: world_from_cam [4, 4] per view, or None where the view's own is meant. With a rolling shutter [2, 4, 4]:
+            when the first and when the last row (or column) is read.
     """
 
     gaussians: Gaussians
@@ -59,7 +59,8 @@ def harmonics(gaussians: Gaussians) -> Tensor:
 
 
 def trace_leaves(request: Request, like: Tensor, requires_grad: bool) -> tuple[Tensor, tuple[Tensor, ...]]:
-    """The leaf ``means2d`` of the trace ([N, 2], or [V, N, 2] for a batch), and the part of it that belongs to each view."""
+    """The leaf ``means2d`` of the trace ([N, 2], or [V, N, 2] for a batch), and the part of it that belongs to each
+    view."""
     count, views = len(request.gaussians), len(request.views)
     if not request.batched:
         leaf = torch.zeros(count, 2, dtype=like.dtype, device=like.device, requires_grad=requires_grad)

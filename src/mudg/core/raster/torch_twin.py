@@ -1,7 +1,7 @@
 """Backend "torch": Gaussian splatting in plain differentiable torch. This file is the specification of all backends.
 
-Any floating type, any device, gradients by autograd. It goes tile by tile and keeps everything for the backward pass, so it is
-slow; it is what an installation without a compiler falls back to.
+Any floating type, any device, gradients by autograd. It goes tile by tile and keeps everything for the backward pass,
+so it is slow; it is what an installation without a compiler falls back to.
 
 Symbols follow Zwicker et al. 2001 (EWA splatting) and Kerbl et al. 2023: a Gaussian with mean mu, rotation R(q) and
 scales S has covariance R S S^T R^T; the camera maps it to the image with the Jacobian J of the projection.
@@ -75,7 +75,9 @@ def _draw(request: Request, index: int, probe: Tensor, absolute: Tensor | None) 
         radii = torch.where(touched[:, None], splats.extents.clamp(0, 1e9).ceil().clamp_min(1), 0).int()
     channels = torch.cat([colors, splats.depth[:, None], *([] if g.extra is None else [g.extra])], 1)[order]
     if not (torch.isfinite(channels).all() and torch.isfinite(sh[order]).all()):
-        raise NumericsError("the colour or a feature of a Gaussian is not finite", where="gaussians.sh, gaussians.extra")
+        raise NumericsError(
+            "the colour or a feature of a Gaussian is not finite", where="gaussians.sh, gaussians.extra"
+        )
     blended, alpha = _blend_tiles(splats, probe, order, channels, absolute, size, config.alpha_max)
     rgb, depth_sum, extra = blended[:3], blended[3:4], blended[4:]
     if background is not None:
@@ -85,8 +87,8 @@ def _draw(request: Request, index: int, probe: Tensor, absolute: Tensor | None) 
 
 
 def project(g: Gaussians, world_from_cam: Tensor, camera: Camera, config: RasterConfig) -> Splats:
-    """Means and covariances into the image. What cannot be drawn (in front of ``near_m``, a covariance that overflows) gets
-    extent 0 and harmless stand-in values, so that it can spoil neither images nor gradients."""
+    """Means and covariances into the image. What cannot be drawn (in front of ``near_m``, a covariance that overflows)
+    gets extent 0 and harmless stand-in values, so that it can spoil neither images nor gradients."""
     with torch.no_grad():
         first = _project((g.means, g.quats, g.scales, g.opacity), world_from_cam, camera, config)
         proper = torch.isfinite(torch.cat([first.means2d, first.conics, first.extents], 1)).all(1)
@@ -134,9 +136,17 @@ def _project(
 def rotation_matrices(quats: Tensor) -> Tensor:
     """[N, 4] (w, x, y, z), any length, to rotations [N, 3, 3]. A zero quaternion gives the identity."""
     w, x, y, z = (quats / quats.square().sum(1, keepdim=True).clamp_min(1e-24).sqrt()).unbind(1)
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]  # fmt: skip
+    rows = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - w * z),
+        2 * (x * z + w * y),
+        2 * (x * y + w * z),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - w * x),
+        2 * (x * z - w * y),
+        2 * (y * z + w * x),
+        1 - 2 * (x * x + y * y),
+    ]
     return torch.stack(rows, 1).view(-1, 3, 3)
 
 
@@ -148,14 +158,25 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     if degree >= 1:
         basis += [-0.48860251190292 * y, 0.48860251190292 * z, -0.48860251190292 * x]
     if degree >= 2:
-        basis += [0.5462742152960395 * sin2, -1.092548430592079 * y * z, 0.9461746957575601 * z * z - 0.3153915652525201,
-                  -1.092548430592079 * x * z, 0.5462742152960395 * cos2]  # fmt: skip
+        basis += [
+            0.5462742152960395 * sin2,
+            -1.092548430592079 * y * z,
+            0.9461746957575601 * z * z - 0.3153915652525201,
+            -1.092548430592079 * x * z,
+            0.5462742152960395 * cos2,
+        ]
     if degree >= 3:
         cos3, sin3 = x * cos2 - y * sin2, x * sin2 + y * cos2
         c = 0.4570457994644658 - 2.285228997322329 * z * z
-        basis += [-0.5900435899266435 * sin3, 1.445305721320277 * z * sin2, c * y,
-                  z * (1.865881662950577 * z * z - 1.119528997770346), c * x,
-                  1.445305721320277 * z * cos2, -0.5900435899266435 * cos3]  # fmt: skip
+        basis += [
+            -0.5900435899266435 * sin3,
+            1.445305721320277 * z * sin2,
+            c * y,
+            z * (1.865881662950577 * z * z - 1.119528997770346),
+            c * x,
+            1.445305721320277 * z * cos2,
+            -0.5900435899266435 * cos3,
+        ]
     return torch.stack(basis, 1)
 
 
@@ -167,9 +188,14 @@ def sh_colors(sh: Tensor, directions: Tensor, degree: int) -> Tensor:
 
 
 def _blend_tiles(
-    splats: Splats, probe: Tensor, order: Tensor, channels: Tensor, absolute: Tensor | None, size: tuple[int, int],
+    splats: Splats,
+    probe: Tensor,
+    order: Tensor,
+    channels: Tensor,
+    absolute: Tensor | None,
+    size: tuple[int, int],
     alpha_max: float,
-) -> tuple[Tensor, Tensor]:  # fmt: skip
+) -> tuple[Tensor, Tensor]:
     """Blend front to back. Returns accumulated channels [C, H, W] and alpha [1, H, W]."""
     width, height = size
     means, conics, opacity = (splats.means2d + probe)[order], splats.conics[order], splats.opacity[order]
@@ -197,7 +223,9 @@ def _blend_tiles(
     return image[:-1], image[-1:]
 
 
-def _blend(pixels: Tensor, means: Tensor, conics: Tensor, opacity: Tensor, channels: Tensor, alpha_max: float) -> Tensor:
+def _blend(
+    pixels: Tensor, means: Tensor, conics: Tensor, opacity: Tensor, channels: Tensor, alpha_max: float
+) -> Tensor:
     """Blend M splats, front to back, at P pixels [P, 2]; means [1 or P, M, 2]. Returns [P, C + 1], alpha last."""
     delta = means - pixels[:, None]
     dx, dy = delta[..., 0], delta[..., 1]
@@ -215,10 +243,13 @@ def _blend(pixels: Tensor, means: Tensor, conics: Tensor, opacity: Tensor, chann
 
 
 class _SumAbsolute(torch.autograd.Function):
-    """Copies means [M, 2] to every pixel [P, M, 2]; backward also adds the absolute gradients of each copy to a table."""
+    """Copies means [M, 2] to every pixel [P, M, 2]; backward also adds the absolute gradients of each copy to a
+    table."""
 
     @staticmethod
-    def forward(ctx: torch.autograd.function.FunctionCtx, means: Tensor, table: Tensor, rows: Tensor, count: int) -> Tensor:
+    def forward(
+        ctx: torch.autograd.function.FunctionCtx, means: Tensor, table: Tensor, rows: Tensor, count: int
+    ) -> Tensor:
         ctx.table, ctx.rows = table, rows  # type: ignore[attr-defined]
         return means[None].expand(count, -1, -1).clone()
 
@@ -235,5 +266,6 @@ def _refuse_not_finite(g: Gaussians) -> None:
         bad = ~torch.isfinite(values if values.ndim > 1 else values[:, None]).all(1)
         if bad.any():
             row = int(torch.nonzero(bad)[0, 0])
-            raise NumericsError("a Gaussian is not finite", where=f"Gaussian {row}: {name}",
-                                got=f"{int(bad.sum())} such Gaussians")  # fmt: skip
+            raise NumericsError(
+                "a Gaussian is not finite", where=f"Gaussian {row}: {name}", got=f"{int(bad.sum())} such Gaussians"
+            )

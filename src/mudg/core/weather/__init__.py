@@ -1,4 +1,5 @@
-"""Weather and light as pure functions of a G-buffer, in linear light. Models, sources and assumptions: docs/weather.md."""
+"""Weather and light as pure functions of a G-buffer, in linear light. Models, sources and assumptions:
+docs/weather.md."""
 
 from mudg.core.weather.apply import DriveFacts, ShownView, Weathered, apply, drive_facts, edited_view
 from mudg.core.weather.gbuffer import (
@@ -14,6 +15,21 @@ from mudg.core.weather.gbuffer import (
 from mudg.core.weather.light import FilmicResponse, ToneCurve, curve_of
 
 __all__ = [
-    "BufferRules", "DriveFacts", "FilmicResponse", "GBuffer", "OccluderMap", "ShownView", "Surroundings", "ToneCurve", "Weathered", "apply",
-    "curve_of", "drive_facts", "edited_view", "estimate_surroundings", "from_render", "mirror_view", "sun_visibility",
-]  # fmt: skip
+    "BufferRules",
+    "DriveFacts",
+    "FilmicResponse",
+    "GBuffer",
+    "OccluderMap",
+    "ShownView",
+    "Surroundings",
+    "ToneCurve",
+    "Weathered",
+    "apply",
+    "curve_of",
+    "drive_facts",
+    "edited_view",
+    "estimate_surroundings",
+    "from_render",
+    "mirror_view",
+    "sun_visibility",
+]

@@ -1,12 +1,14 @@
-"""Falling rain and snow: size distributions, drops and flakes as particles of world cells, and what they cover in an image.
+"""Falling rain and snow: size distributions, drops and flakes as particles of world cells, and what they cover in an
+image.
 
-Every size falls with its own speed. Particles of one size stand still in a frame that falls with them; that frame is cut into cells,
-and a hash of the cell says how many particles it holds and where. So any camera at any time sees the same ones, without a simulation.
+Every size falls with its own speed. Particles of one size stand still in a frame that falls with them; that frame is
+cut into cells, and a hash of the cell says how many particles it holds and where. So any camera at any time sees the
+same ones, without a simulation.
 
-Sources: Marshall and Palmer 1948 (drop sizes), Atlas et al. 1973 (fall speed), Gunn and Marshall 1958 (snow, melted diameters), Garg
-and Nayar 2007 (streaks: a drop covers a pixel for a share of the exposure and shows about 0.94 of the mean light of the upper
-hemisphere), Weber et al. 2015 (extinction of rain). Assumed: flakes have a tenth of the density of water, fall with 1.0 m/s and sway by
-0.1 m.
+Sources: Marshall and Palmer 1948 (drop sizes), Atlas et al. 1973 (fall speed), Gunn and Marshall 1958 (snow, melted
+diameters), Garg and Nayar 2007 (streaks: a drop covers a pixel for a share of the exposure and shows about 0.94 of the
+mean light of the upper hemisphere), Weber et al. 2015 (extinction of rain). Assumed: flakes have a tenth of the density
+of water, fall with 1.0 m/s and sway by 0.1 m.
 """
 
 from __future__ import annotations
@@ -22,11 +24,12 @@ from mudg.base.types import View
 from mudg.base.weather_settings import FogSettings
 from mudg.core.weather.noise import hash_bits, unit
 
-# fog ------------------------------------------------------------------------------------------------------------------
+# fog ----------------------------------------------------------------------------------------------
 #
 # Fog and haze: Koschmieder's law in linear light, ``L = L0 t + A (1 - t)`` with transmittance t and airlight A.
 #
-# Extinction is 3.0 / visibility, as contrast falls to 5 % at the meteorological optical range. Distances are along the ray, not camera z.
+# Extinction is 3.0 / visibility, as contrast falls to 5 % at the meteorological optical range. Distances are along the
+# ray, not camera z.
 
 
 LEAST_SHARE = 0.05
@@ -84,7 +87,7 @@ def unveiled(color: NDArray[np.floating], share: Array, airlight: Array) -> NDAr
     return np.maximum((color - airlight * (1 - t)) / t, 0).astype(np.float32)
 
 
-# particles ------------------------------------------------------------------------------------------------------------
+# particles ----------------------------------------------------------------------------------------
 
 
 Array = NDArray[np.float64]
@@ -118,7 +121,8 @@ class ParticleSize:
 
 
 def _exponential(intercept: float, slope: float, edges_mm: tuple[float, ...]) -> list[tuple[float, float]]:
-    """Numbers per cubic metre and root mean square diameters in mm of an exponential distribution, per interval of diameters."""
+    """Numbers per cubic metre and root mean square diameters in mm of an exponential distribution, per interval of
+    diameters."""
 
     def tails(d: float) -> tuple[float, float]:  # integrals of N and N D^2 from d to infinity
         e = intercept * math.exp(-slope * d)
@@ -173,8 +177,12 @@ def _inside(view: View, xyz: Array, reach_m: float, margin_m: float) -> NDArray[
     local = (xyz - view.center_world) @ view.world_from_cam[:3, :3]
     x, y, z = local.T
     ok = (z > -margin_m) & (np.linalg.norm(local, axis=1) < reach_m + margin_m)
-    edges = ((-1, 0, camera.cx / camera.fx), (1, 0, (camera.width - camera.cx) / camera.fx),
-             (0, -1, camera.cy / camera.fy), (0, 1, (camera.height - camera.cy) / camera.fy))  # fmt: skip
+    edges = (
+        (-1, 0, camera.cx / camera.fx),
+        (1, 0, (camera.width - camera.cx) / camera.fx),
+        (0, -1, camera.cy / camera.fy),
+        (0, 1, (camera.height - camera.cy) / camera.fy),
+    )
     for along_x, along_y, slope in edges:
         ok &= (along_x * x + along_y * y - slope * z) / math.hypot(1, slope) < margin_m
     return ok
@@ -190,7 +198,8 @@ def _corners(view: View, reach_m: float) -> Array:
 
 
 def places(size: ParticleSize, velocity: Array, view: View, reach_m: float, key: int) -> Array:
-    """World places f64[N, 3] at ``view.time_s`` of the particles that stand in the view's pyramid within the reach, and a few beside it.
+    """World places f64[N, 3] at ``view.time_s`` of the particles that stand in the view's pyramid within the reach, and
+    a few beside it.
 
     Args:
         size: how many there are in a cubic metre.
@@ -229,7 +238,8 @@ def places(size: ParticleSize, velocity: Array, view: View, reach_m: float, key:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moving:
-    """Particles at the middle of an exposure: world places f64[N, 3], velocity f64[3] against the camera, diameter, exposure time."""
+    """Particles at the middle of an exposure: world places f64[N, 3], velocity f64[3] against the camera, diameter,
+    exposure time."""
 
     xyz: Array
     velocity: Array
@@ -240,9 +250,9 @@ class Moving:
 def covered(view: View, depth: NDArray[np.floating], moving: Moving) -> Array:
     """Optical depth f64[H, W] of particles before the surfaces.
 
-    A ball of w pixels that moves during the exposure covers, summed over pixels, pi/4 w^2 of one pixel on the axis, however long its
-    streak is; off the axis its image is longer, by range over depth. That sum is spread evenly over the streak; large balls have soft
-    edges.
+    A ball of w pixels that moves during the exposure covers, summed over pixels, pi/4 w^2 of one pixel on the axis,
+    however long its streak is; off the axis its image is longer, by range over depth. That sum is spread evenly over
+    the streak; large balls have soft edges.
 
     Args:
         view: camera and pose.
@@ -299,7 +309,8 @@ def _splat(at: Array, mass: Array, z: Array, depth: NDArray[np.floating]) -> Arr
 
 @dataclass(frozen=True, slots=True)
 class Falling:
-    """What falls: sizes, wind along x and y in m/s, how near it is drawn, exposure time, and a name for the random numbers."""
+    """What falls: sizes, wind along x and y in m/s, how near it is drawn, exposure time, and a name for the random
+    numbers."""
 
     sizes: list[ParticleSize]
     wind_m_s: tuple[float, float]

@@ -57,8 +57,13 @@ class Weathered:
 
 
 def apply(
-    gbuffer: GBuffer, settings: Conditions, view: View, time_s: float, seed: int, surroundings: Surroundings | None = None
-) -> Weathered:  # fmt: skip
+    gbuffer: GBuffer,
+    settings: Conditions,
+    view: View,
+    time_s: float,
+    seed: int,
+    surroundings: Surroundings | None = None,
+) -> Weathered:
     """Weather and light on one view. The same arguments give the same result; frames and cameras agree with each other.
 
     Args:
@@ -67,7 +72,8 @@ def apply(
         view: camera and pose.
         time_s: moment of falling drops and flakes, on the scene's clock (``view.time_s`` is not used).
         seed: run seed; puddles, patches of snow and drops follow from it.
-        surroundings: light and ground of the drive; None = estimated from this view alone, so frames may differ a little.
+        surroundings: light and ground of the drive; None = estimated from this view alone, so frames may differ a
+            little.
     """
     view = View(view.camera, view.world_from_cam, time_s)
     light = surroundings if surroundings is not None else estimate_surroundings([(view, gbuffer)])
@@ -110,7 +116,7 @@ def _without_haze(gbuffer: GBuffer, view: View, visibility_m: float, light: Surr
 
 def _in_new_light(
     gbuffer: GBuffer, view: View, light: Surroundings, settings: LightSettings
-) -> tuple[GBuffer, Surroundings, Plane]:  # fmt: skip
+) -> tuple[GBuffer, Surroundings, Plane]:
     target = relight.target_light(light, settings)
     lamps, scale = None, relight.NIGHT_LEVEL * relight.ground_level(light)
     if settings.time == "night":
@@ -134,7 +140,8 @@ def _snowed(gbuffer: GBuffer, view: View, light: Surroundings, snow: SnowSetting
 
 
 def _through_air(gbuffer: GBuffer, view: View, light: Surroundings, weather: WeatherSettings) -> tuple[Image, Plane]:
-    """Fog, or the haze of the recording again, and the veil of distant rain and snow; and the share of light that comes through."""
+    """Fog, or the haze of the recording again, and the veil of distant rain and snow; and the share of light that comes
+    through."""
     distance, rise, height = _air_path(gbuffer, view, light.ground_z_m)
     share = np.ones(distance.shape)
     if weather.fog is not None:
@@ -151,7 +158,7 @@ def _through_air(gbuffer: GBuffer, view: View, light: Surroundings, weather: Wea
 
 def _with_particles(
     color: Image, gbuffer: GBuffer, view: View, light: Surroundings, settings: Conditions, seed: int
-) -> Image:  # fmt: skip
+) -> Image:
     """Drops and flakes near the camera, one by one."""
     kinds: list[tuple[RainSettings | SnowSettings, list[air.ParticleSize], Array, str]] = []
     if settings.weather.rain is not None:
@@ -169,7 +176,7 @@ def _with_particles(
     return color
 
 
-# a whole drive: what all its frames share, and one call per image -----------------------------------------------------
+# a whole drive: what all its frames share, and one call per image ---------------------------------
 
 
 LEAST_POINTS = 2
@@ -178,8 +185,8 @@ LEAST_POINTS = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ShownView:
-    """What a camera shows: view, display values f32[H, W, 3] in [0, 1], camera z f32[H, W] (not finite or 0 in the sky), train ids
-    u8[H, W]."""
+    """What a camera shows: view, display values f32[H, W, 3] in [0, 1], camera z f32[H, W] (not finite or 0 in the
+    sky), train ids u8[H, W]."""
 
     view: View
     rgb: Image

@@ -36,10 +36,11 @@ class GBuffer:
         classes: u8[H, W] Cityscapes train ids, 255 = unknown.
         normal: f32[H, W, 3] unit vectors of the world, towards the camera; 0 in the sky.
         openness: f32[H, W] share of the sky that the surface sees, 0 to 1.
-        sunlit: f32[H, W] share of the recorded sun that reaches the surface, or None (then it is guessed from brightness).
+        sunlit: f32[H, W] share of the recorded sun that reaches the surface, or None (then it is guessed from
+            brightness).
         new_sunlit: the same for the sun of the light to change to, or None (then everything that faces it is lit).
-        mirror: f32[H, W, 3] linear light of the scene without ground, mirrored in the road (``mirror_view``), or None (then it is found
-            in the image itself).
+        mirror: f32[H, W, 3] linear light of the scene without ground, mirrored in the road (``mirror_view``), or None
+            (then it is found in the image itself).
         camera_velocity: f64[3] of the camera, metres per second along the world's axes.
     """
 
@@ -75,7 +76,8 @@ class GBuffer:
 
 
 def world_rays(view: View) -> tuple[Array, Array]:
-    """Directions f64[H, W, 3] in the world through pixel centres, scaled to camera z = 1, and their lengths f64[H, W]."""
+    """Directions f64[H, W, 3] in the world through pixel centres, scaled to camera z = 1, and their lengths f64[H,
+    W]."""
     x, y = geometry.pixel_rays(view.camera)
     local = np.stack([*np.broadcast_arrays(x[None, :], y[:, None]), np.ones((len(y), len(x)))], -1)
     return local @ view.world_from_cam[:3, :3].T, np.linalg.norm(local, axis=-1)
@@ -97,7 +99,8 @@ _SUB_PIXELS = ((-0.125, -0.375), (0.375, -0.125), (-0.375, 0.125), (0.125, 0.375
 
 
 def places_within_pixels(view: View, gbuffer: GBuffer, where: NDArray[np.bool_]) -> list[Array]:
-    """World places f64[N, 3] of four points in each of the N pixels that a mask names, on the planes through the surfaces there.
+    """World places f64[N, 3] of four points in each of the N pixels that a mask names, on the planes through the
+    surfaces there.
 
     Patterns of the ground are finer than a pixel a little way off; they are averaged over these.
     """
@@ -130,9 +133,9 @@ def _smaller_step(w: Array, axis: int) -> Array:
 def normals_from_depth(view: View, depth: NDArray[np.floating], classes: NDArray[np.uint8] | None = None) -> Image:
     """Unit normals f32[H, W, 3] in the world, towards the camera; 0 in the sky.
 
-    The inverse depth of a plane is linear in the pixel, so its gradient gives the normal exactly. At edges the smaller of two
-    one-sided differences is taken. With ``classes``, ground that comes out steeper than 30 degrees is taken as level, other than kerbs:
-    nearer than ``KERBS_WITHIN_M`` and steeper than 65 degrees.
+    The inverse depth of a plane is linear in the pixel, so its gradient gives the normal exactly. At edges the smaller
+    of two one-sided differences is taken. With ``classes``, ground that comes out steeper than 30 degrees is taken as
+    level, other than kerbs: nearer than ``KERBS_WITHIN_M`` and steeper than 65 degrees.
     """
     camera = view.camera
     w = np.where(np.isfinite(depth) & (depth > 0), 1.0 / np.maximum(depth, 1e-6), 0.0).astype(np.float64)
@@ -155,8 +158,8 @@ def normals_from_depth(view: View, depth: NDArray[np.floating], classes: NDArray
 
 
 def openness_by_class(classes: NDArray[np.uint8], normal: Image) -> Plane:
-    """A first estimate of the visible share of the sky, f32[H, W]: the half space above the surface, less under trees, for use where
-    there is no height map. A level open surface sees all of it, a wall half."""
+    """A first estimate of the visible share of the sky, f32[H, W]: the half space above the surface, less under trees,
+    for use where there is no height map. A level open surface sees all of it, a wall half."""
     share = 0.5 + 0.5 * normal[..., 2]
     share = np.where(np.isin(classes, (ID["vegetation"], UNLABELLED)), 0.6 * share, share)
     return np.where(classes == ID["sky"], 1.0, share).astype(np.float32)
@@ -166,8 +169,9 @@ GROUND_SMOOTHING = 12
 
 
 def steadied(normal: Image, classes: NDArray[np.uint8], radius: int) -> Image:
-    """Unit normals f32[H, W, 3], each the mean of those of its class within a square of ``2 radius + 1`` pixels, on the ground of
-    ``GROUND_SMOOTHING`` times that radius: under a low sun a ripple of a few degrees would light and shade it. 0 stays 0."""
+    """Unit normals f32[H, W, 3], each the mean of those of its class within a square of ``2 radius + 1`` pixels, on the
+    ground of ``GROUND_SMOOTHING`` times that radius: under a low sun a ripple of a few degrees would light and shade
+    it. 0 stays 0."""
     if radius == 0:
         return normal
     mean = np.zeros(normal.shape, np.float64)
@@ -187,8 +191,8 @@ class BufferRules:
 
     Args:
         heights: height map of the drive; None = the sky's visibility is a guess by class.
-        smooth_px: radius in pixels over which inverse depth (median) and normals (mean, per class) are smoothed: 0 for exact depth, about
-            2 for the depth of a fitted scene.
+        smooth_px: radius in pixels over which inverse depth (median) and normals (mean, per class) are smoothed: 0 for
+            exact depth, about 2 for the depth of a fitted scene.
     """
 
     heights: OccluderMap | None = None
@@ -197,7 +201,7 @@ class BufferRules:
 
 def from_render(
     view: View, light: Image, depth: NDArray[np.floating], classes: NDArray[np.uint8], rules: BufferRules | None = None
-) -> GBuffer:  # fmt: skip
+) -> GBuffer:
     """A G-buffer from the planes of a render.
 
     Args:
@@ -223,10 +227,11 @@ def from_render(
     return GBuffer(np.maximum(light, 0).astype(np.float32), clean, classes, normal, openness)
 
 
-# --- what stands above ------------------------------------------------------------------------------------------------
+# --- what stands above ----------------------------------------------------------------------------
 
 WHITE_IN_SUN = 1.4
-"""Cameras expose so that a white surface in the sun is about at their limit of 1: light that is guessed is no brighter than this."""
+"""Cameras expose so that a white surface in the sun is about at their limit of 1: light that is guessed is no brighter
+than this."""
 _LIFT_M = 0.35
 BRIGHTEST_FOG = 0.8
 """Airlight that is guessed from a sky is no brighter: cameras expose for fog, and a clipped sky says little."""
@@ -278,7 +283,8 @@ class OccluderMap:
         return cls(float(low[0]), float(low[1]), cell_m, top.reshape(rows, columns))
 
     def clear_of(self, normal: NDArray[np.floating]) -> Array:
-        """How far places f64[N, 3] are moved along normals [N, 3] before rays start, so that a wall does not stand in its own light."""
+        """How far places f64[N, 3] are moved along normals [N, 3] before rays start, so that a wall does not stand in
+        its own light."""
         return CLEAR_CELLS * self.cell_m * normal.astype(np.float64)
 
     def at(self, xy: Array) -> Array:
@@ -290,7 +296,8 @@ class OccluderMap:
         return np.where(inside, self.top_m[np.clip(row, 0, rows - 1), np.clip(column, 0, columns - 1)], -np.inf)
 
     def free(self, xyz: Array, direction: Array, reach_m: float = 40.0) -> NDArray[np.bool_]:
-        """Whether light from a direction f64[3] reaches places [N, 3]: bool[N]. The ray is followed in steps of one cell."""
+        """Whether light from a direction f64[3] reaches places [N, 3]: bool[N]. The ray is followed in steps of one
+        cell."""
         d = np.asarray(direction, np.float64) / np.linalg.norm(direction)
         flat = float(np.hypot(d[0], d[1]))
         if d[2] <= 0:
@@ -314,7 +321,8 @@ class OccluderMap:
 
 
 def sun_visibility(gbuffer: GBuffer, view: View, heights: OccluderMap, direction: Array) -> Plane:
-    """f32[H, W]: 1 where light from a direction f64[3] reaches a surface that faces it, by the height map; 0 in the sky."""
+    """f32[H, W]: 1 where light from a direction f64[3] reaches a surface that faces it, by the height map; 0 in the
+    sky."""
     out = np.zeros(gbuffer.depth.shape, np.float32)
     facing = ~gbuffer.sky & (gbuffer.normal @ np.asarray(direction) > 0)
     points = world_points(view, gbuffer.depth)
@@ -323,13 +331,13 @@ def sun_visibility(gbuffer: GBuffer, view: View, heights: OccluderMap, direction
     return out
 
 
-# --- light of a drive -------------------------------------------------------------------------------------------------
+# --- light of a drive -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surroundings:
-    """Light and ground of a drive, the same for all its frames and cameras. Radiances are f64[3] linear light; irradiances are divided
-    by pi, so that a white level surface in the open shows ``ambient + sun * cos``.
+    """Light and ground of a drive, the same for all its frames and cameras. Radiances are f64[3] linear light;
+    irradiances are divided by pi, so that a white level surface in the open shows ``ambient + sun * cos``.
 
     Args:
         horizon, zenith: radiance of the sky.
@@ -360,10 +368,10 @@ def _quantile_color(colors: Image, share: float, otherwise: Array) -> Array:
 def estimate_surroundings(views: Iterable[tuple[View, GBuffer]], ground_z_m: float | None = None) -> Surroundings:
     """Light of a drive from its own images.
 
-    Sky pixels below 20 degrees give the horizon, those above the zenith, and the lowest tenth of them the airlight. Without sky, the
-    brightest tenth of everything stands for it. The sky's irradiance is a third horizon and two thirds zenith (cosine weights of both
-    bands, rounded). Level ground in light and shadow gives the sun: what the brightest ground has beyond the darkest, over the same albedo.
-    Its direction is not found: straight above is assumed.
+    Sky pixels below 20 degrees give the horizon, those above the zenith, and the lowest tenth of them the airlight.
+    Without sky, the brightest tenth of everything stands for it. The sky's irradiance is a third horizon and two thirds
+    zenith (cosine weights of both bands, rounded). Level ground in light and shadow gives the sun: what the brightest
+    ground has beyond the darkest, over the same albedo. Its direction is not found: straight above is assumed.
 
     Args:
         views: views and G-buffers of some frames.
@@ -401,7 +409,8 @@ def estimate_surroundings(views: Iterable[tuple[View, GBuffer]], ground_z_m: flo
 
 
 def mirror_view(view: View, ground_z_m: float) -> View:
-    """The view that sees what level ground at a height mirrors. Its image is upside down: flip the rows of what it renders.
+    """The view that sees what level ground at a height mirrors. Its image is upside down: flip the rows of what it
+    renders.
 
     A mirrored camera is left-handed; turning its y axis over makes it a rotation again and the image a flipped one.
     """

@@ -1,8 +1,8 @@
 """Wet ground, puddles and snow cover.
 
-Wet ground is darker (Lagarde 2013: the pores of asphalt fill with water) and mirrors by Fresnel's law for water,
-``F = 0.02 + 0.98 (1 - cos)^5``. Standing water mirrors sharply, a film on rough asphalt weakly and blurred upwards. Puddles and patches of
-snow are value noise of world places, the same in every frame and camera.
+Wet ground is darker (Lagarde 2013: the pores of asphalt fill with water) and mirrors by Fresnel's law for water, ``F =
+0.02 + 0.98 (1 - cos)^5``. Standing water mirrors sharply, a film on rough asphalt weakly and blurred upwards. Puddles
+and patches of snow are value noise of world places, the same in every frame and camera.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ def fresnel(cosine: NDArray[np.floating]) -> Array:
 
 
 def puddle_mask(xy: Array, share: float, seed: int) -> Array:
-    """Standing water f64[...] in [0, 1] at world places [..., 2] of the ground; ``share`` of a large area is under water."""
+    """Standing water f64[...] in [0, 1] at world places [..., 2] of the ground; ``share`` of a large area is under
+    water."""
     noise = noise_seed(seed, "puddles")
     level = patch_threshold(share, noise)
     return smoothstep(level - 0.02, level + 0.02, patches(xy[..., 0], xy[..., 1], PUDDLE_M, noise))
@@ -66,11 +67,12 @@ def sky_light(surroundings: Surroundings, rise: NDArray[np.floating]) -> Array:
 def screen_mirror(gbuffer: GBuffer, view: View, surroundings: Surroundings) -> tuple[Image, Plane]:
     """What level ground mirrors, found in the image itself.
 
-    Rays are followed from the ground in steps that grow with distance, until they pass behind a surface by less than a step. Rays
-    that leave the image see what stands at its edge there, or else the sky's gradient.
+    Rays are followed from the ground in steps that grow with distance, until they pass behind a surface by less than a
+    step. Rays that leave the image see what stands at its edge there, or else the sky's gradient.
 
     Returns:
-        Mirrored light f32[H, W, 3] on the ground pixels (0 elsewhere), and whether it was seen in the image f32[H, W], 0 or 1.
+        Mirrored light f32[H, W, 3] on the ground pixels (0 elsewhere), and whether it was seen in the image f32[H, W],
+        0 or 1.
     """
     wet = np.isin(gbuffer.classes, _WET_IDS) & ~gbuffer.sky
     mirror, found = np.zeros_like(gbuffer.color), np.zeros(wet.shape, np.float32)
@@ -124,7 +126,8 @@ def screen_mirror(gbuffer: GBuffer, view: View, surroundings: Surroundings) -> t
 
 
 def _upward_blur(mirror: Image, where: NDArray[np.bool_], focal_px: float) -> Image:
-    """The mirror image as a film of water shows it: blurred along the columns, little across. Only pixels of ``where`` count."""
+    """The mirror image as a film of water shows it: blurred along the columns, little across. Only pixels of ``where``
+    count."""
     sigma = 2 * FILM_TILT * focal_px
     blur = (sigma, 0.15 * sigma)
     weight = ndimage.gaussian_filter(where.astype(np.float32), blur)
@@ -134,8 +137,9 @@ def _upward_blur(mirror: Image, where: NDArray[np.bool_], focal_px: float) -> Im
 
 def wet_ground(
     gbuffer: GBuffer, view: View, surroundings: Surroundings, wet: float, puddles: float, seed: int
-) -> tuple[Image, Plane]:  # fmt: skip
-    """Linear light f32[H, W, 3] with wet road and sidewalk, and confidence f32[H, W]: less where the mirror image was not seen.
+) -> tuple[Image, Plane]:
+    """Linear light f32[H, W, 3] with wet road and sidewalk, and confidence f32[H, W]: less where the mirror image was
+    not seen.
 
     Args:
         gbuffer, view, surroundings: what is shown, dry.
@@ -161,7 +165,7 @@ def wet_ground(
     return light.astype(np.float32), (1 - (film + pool) * (1 - found)).astype(np.float32)
 
 
-# --- snow -------------------------------------------------------------------------------------------------------------
+# --- snow -----------------------------------------------------------------------------------------
 
 
 def snow_weight(
@@ -169,8 +173,8 @@ def snow_weight(
 ) -> Array:
     """Cover f64[...] in [0, 1] of surfaces by place, normal and visible share of the sky, whatever their class.
 
-    ``smoothstep(0.3, 0.8, n_z)`` times a patch of noise times ``smoothstep(0.2, 0.7, openness)``; ``cover`` is the share of open
-    level ground.
+    ``smoothstep(0.3, 0.8, n_z)`` times a patch of noise times ``smoothstep(0.2, 0.7, openness)``; ``cover`` is the
+    share of open level ground.
     """
     noise = noise_seed(seed, "snow")
     level = patch_threshold(cover, noise)
@@ -179,7 +183,8 @@ def snow_weight(
 
 
 def wheel_tracks(xy: Array, path: Array) -> Array:
-    """1 at places [..., 2] where the two wheels of a vehicle went whose centre followed a path [N, 3] of x, y, yaw; 0 elsewhere."""
+    """1 at places [..., 2] where the two wheels of a vehicle went whose centre followed a path [N, 3] of x, y, yaw; 0
+    elsewhere."""
     steps = np.linalg.norm(np.diff(path[:, :2], axis=0), axis=1)
     along = np.concatenate([[0.0], np.cumsum(steps)])
     at = np.arange(0, along[-1] + 0.1, 0.1)

@@ -1,8 +1,9 @@
 """What fog and rain take from and add to a LiDAR sweep.
 
-Fog (Hahner et al. 2021): the hard return of a surface falls by ``exp(-2 alpha r)``; water droplets near the sensor return a soft pulse; the
-stronger of the two is recorded. Rain (Goodin et al. 2019): power ``rho / r^2 exp(-0.02 R^0.6 r)`` and range noise. Powers are relative:
-only ratios count, and the sensor's threshold is set by the range at which it still sees a surface of 10 % reflectance in clear air.
+Fog (Hahner et al. 2021): the hard return of a surface falls by ``exp(-2 alpha r)``; water droplets near the sensor
+return a soft pulse; the stronger of the two is recorded. Rain (Goodin et al. 2019): power ``rho / r^2 exp(-0.02 R^0.6
+r)`` and range noise. Powers are relative: only ratios count, and the sensor's threshold is set by the range at which it
+still sees a surface of 10 % reflectance in clear air.
 """
 
 from __future__ import annotations
@@ -34,8 +35,8 @@ class LidarSensor:
 
     Args:
         range_10_m: distance at which a surface of 10 % reflectance is just detected in clear air, metres.
-        cross_from_m, cross_to_m: the receiver sees nothing of the beam before the first distance, and all of it after the second. The
-            farther, the fewer soft returns: fog is strongest near the sensor.
+        cross_from_m, cross_to_m: the receiver sees nothing of the beam before the first distance, and all of it after
+            the second. The farther, the fewer soft returns: fog is strongest near the sensor.
     """
 
     range_10_m: float = 90.0
@@ -83,8 +84,8 @@ def soft_response(
 ) -> tuple[Array, Array]:
     """Power of the fog alone by recorded distance, in the units of ``LidarSensor.threshold``.
 
-    ``beta_b`` times the integral over r' of ``exp(-2 alpha r') / r'^2`` x crossover x pulse, by the midpoint rule; the pulse is
-    centred on the recorded distance and scaled so that a surface at r returns ``reflectance / pi / r^2``.
+    ``beta_b`` times the integral over r' of ``exp(-2 alpha r') / r'^2`` x crossover x pulse, by the midpoint rule; the
+    pulse is centred on the recorded distance and scaled so that a surface at r returns ``reflectance / pi / r^2``.
 
     Returns:
         Distances f64[M] in metres and powers f64[M].
@@ -122,9 +123,7 @@ def in_fog(
     place = np.maximum.accumulate(np.where(powers >= best, np.arange(len(powers)), 0))
     index = np.clip(np.searchsorted(distances, range_m) - 1, 0, len(distances) - 1)
     soft = best[index]
-    kind = np.where(np.maximum(hard, soft) < sensor.threshold, LOST, np.where(soft > hard, SOFT, HARD)).astype(
-        np.uint8
-    )
+    kind = np.where(np.maximum(hard, soft) < sensor.threshold, LOST, np.where(soft > hard, SOFT, HARD)).astype(np.uint8)
     jitter = seeds.numpy_rng(seed, len(range_m), "soft returns").normal(0, SOFT_JITTER_M, len(range_m))
     near = np.clip(distances[place[index]] + jitter, np.minimum(sensor.cross_from_m, range_m), range_m)
     shown = np.where(kind == SOFT, near, range_m)
@@ -135,15 +134,19 @@ def in_fog(
 def in_rain(
     range_m: Array, reflectance: Array, mm_h: float, seed: int, sensor: LidarSensor | None = None
 ) -> BeamReturns:
-    """A sweep in rain of a rate in mm/h: weaker and lost returns, and noise of the range. Arguments as of ``in_fog``."""
+    """A sweep in rain of a rate in mm/h: weaker and lost returns, and noise of the range. Arguments as of
+    ``in_fog``."""
     sensor = sensor or LidarSensor()
     range_m, reflectance = np.asarray(range_m, np.float64), np.asarray(reflectance, np.float64)
     share = rain_share(range_m, mm_h)
     kept = reflectance / math.pi / range_m**2 * share >= sensor.threshold
     sigma = 0.02 * range_m * (1 - math.exp(-mm_h)) ** 2
     noise = seeds.numpy_rng(seed, len(range_m), "rain range").normal(0, 1, len(range_m)) * sigma
-    return BeamReturns(np.where(kept, np.maximum(range_m + noise, 0.1), range_m), np.where(kept, reflectance * share, 0.0),
-                   np.where(kept, HARD, LOST).astype(np.uint8))  # fmt: skip
+    return BeamReturns(
+        np.where(kept, np.maximum(range_m + noise, 0.1), range_m),
+        np.where(kept, reflectance * share, 0.0),
+        np.where(kept, HARD, LOST).astype(np.uint8),
+    )
 
 
 def rain_share(range_m: Array, mm_h: float) -> Array:
@@ -153,11 +156,11 @@ def rain_share(range_m: Array, mm_h: float) -> Array:
 
 def sweep_in_weather(
     points: SweepPoints, weather: WeatherSettings, seed: int, sensor: LidarSensor | None = None
-) -> tuple[SweepPoints, NDArray[np.uint8]]:  # fmt: skip
+) -> tuple[SweepPoints, NDArray[np.uint8]]:
     """A sweep as it would have been in fog and rain.
 
-    The recorded intensity is taken as reflectance times the cosine of incidence, 0 to 1: sensors whose intensity means something else
-    need it converted first. Snow in the air is not modelled.
+    The recorded intensity is taken as reflectance times the cosine of incidence, 0 to 1: sensors whose intensity means
+    something else need it converted first. Snow in the air is not modelled.
 
     Args:
         points: in the LiDAR's frame, recorded in clear air.

@@ -1,9 +1,9 @@
 """Another light on the same surfaces: overcast, dusk, night.
 
-A photograph holds reflected light only, so an albedo is estimated first: light divided by the irradiance of the recorded sun and sky. What
-that assumes: surfaces are matt; the recorded light is known (``Surroundings``); and where a shadow lies is known (``GBuffer.sunlit``) or
-can be guessed from brightness, which fails where dark and bright materials of one class mix. Glass, puddles and lamps of the recording keep
-their recorded look, scaled.
+A photograph holds reflected light only, so an albedo is estimated first: light divided by the irradiance of the
+recorded sun and sky. What that assumes: surfaces are matt; the recorded light is known (``Surroundings``); and where a
+shadow lies is known (``GBuffer.sunlit``) or can be guessed from brightness, which fails where dark and bright materials
+of one class mix. Glass, puddles and lamps of the recording keep their recorded look, scaled.
 """
 
 from __future__ import annotations
@@ -83,7 +83,8 @@ def curve_of(settings: ResponseSettings) -> ToneCurve:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FilmicResponse:
-    """A camera with exposure, white balance, vignetting, a filmic shoulder, saturation and contrast (the generated city's camera).
+    """A camera with exposure, white balance, vignetting, a filmic shoulder, saturation and contrast (the generated
+    city's camera).
 
     Args:
         exposure: factor on linear light.
@@ -128,16 +129,20 @@ class FilmicResponse:
         return (v / self._gains(display.shape)).astype(np.float32)
 
 
-# season ---------------------------------------------------------------------------------------------------------------
+# season -------------------------------------------------------------------------------------------
 #
 # Other seasons, as far as colours go: green leaves and grass take the colours of autumn or of winter.
 #
-# Luminance is kept but for one factor per season, so light, shadow and texture stay; only chromaticity changes, and only as far as a
-# surface of class vegetation or terrain is green: bark, flowers and soil stay. Which tree turns yellow and which brown follows from
-# value noise over the ground, so that all frames and cameras agree. Shapes stay: bare trees keep closed crowns, in the colour of twigs.
+# Luminance is kept but for one factor per season, so light, shadow and texture stay; only chromaticity changes, and
+# only as far as a surface of class vegetation or terrain is green: bark, flowers and soil stay. Which tree turns yellow
+# and which brown follows from value noise over the ground, so that all frames and cameras agree. Shapes stay: bare
+# trees keep closed crowns, in the colour of twigs.
 
 
-LEAVES: Final = {"autumn": ((0.62, 0.36, 0.06), (0.55, 0.17, 0.04), (0.30, 0.16, 0.06)), "bare": ((0.21, 0.18, 0.15), (0.25, 0.22, 0.19))}
+LEAVES: Final = {
+    "autumn": ((0.62, 0.36, 0.06), (0.55, 0.17, 0.04), (0.30, 0.16, 0.06)),
+    "bare": ((0.21, 0.18, 0.15), (0.25, 0.22, 0.19)),
+}
 """Reflectances of what is left on trees, between which patches change."""
 GRASS: Final = {"autumn": (0.30, 0.27, 0.11), "bare": (0.29, 0.25, 0.16)}
 BRIGHTER: Final = {"autumn": 1.15, "bare": 0.8}
@@ -150,7 +155,9 @@ GREEN_FROM, GREEN_TO = 0.02, 0.12
 def greenness(color: NDArray[np.floating]) -> Array:
     """How green linear light [..., 3] is, f64 0 to 1."""
     total = np.maximum(color.sum(-1), 1e-6)
-    return np.asarray(smoothstep(GREEN_FROM, GREEN_TO, (color[..., 1] - np.maximum(color[..., 0], color[..., 2])) / total), np.float64)
+    return np.asarray(
+        smoothstep(GREEN_FROM, GREEN_TO, (color[..., 1] - np.maximum(color[..., 0], color[..., 2])) / total), np.float64
+    )
 
 
 def in_season(gbuffer: GBuffer, view: View, season: SeasonSettings, seed: int) -> GBuffer:
@@ -178,7 +185,7 @@ def in_season(gbuffer: GBuffer, view: View, season: SeasonSettings, seed: int) -
     return replace(gbuffer, color=made)
 
 
-# relight --------------------------------------------------------------------------------------------------------------
+# relight ------------------------------------------------------------------------------------------
 
 
 Array = NDArray[np.float64]
@@ -221,7 +228,8 @@ _LIT_IDS = (ID["traffic light"],)
 def irradiance(
     normal: NDArray[np.floating], openness: NDArray[np.floating], sunlit: NDArray[np.floating], light: Surroundings
 ) -> Array:
-    """Irradiance over pi f64[..., 3] of surfaces: sun where it reaches, sky by the normal, and light from the ground below."""
+    """Irradiance over pi f64[..., 3] of surfaces: sun where it reaches, sky by the normal, and light from the ground
+    below."""
     facing = np.maximum(normal @ light.sun_direction, 0) * sunlit
     bounce = (0.30 * light.ambient + 0.22 * max(float(light.sun_direction[2]), 0.0) * light.sun) * GROUND_ALBEDO
     up = (0.5 + 0.5 * normal[..., 2])[..., None]
@@ -232,8 +240,9 @@ def irradiance(
 def refined_sunlit(gbuffer: GBuffer, light: Surroundings, given: Plane, trust: float = 2.0) -> Plane:
     """Where the recorded sun reaches, f32[H, W], from a first guess and the image.
 
-    Each pixel is explained twice, lit and in shadow. The albedo of its class, halfway between typical and found, and the guess, blurred
-    by a pixel or two as shadows of a height map are, decide between the two. Surfaces that face away from the sun are in shadow.
+    Each pixel is explained twice, lit and in shadow. The albedo of its class, halfway between typical and found, and
+    the guess, blurred by a pixel or two as shadows of a height map are, decide between the two. Surfaces that face away
+    from the sun are in shadow.
 
     Args:
         gbuffer: the image.
@@ -278,8 +287,8 @@ def sunlit_of(gbuffer: GBuffer, light: Surroundings) -> Plane:
 def albedo_of(gbuffer: GBuffer, light: Surroundings, sunlit: Plane) -> Array:
     """Albedo f64[H, W, 3]: light over irradiance, between ``LEAST_ALBEDO`` and ``MOST_ALBEDO``; 0 in the sky.
 
-    An albedo of more than four times the median of its class, or less than a quarter, is taken halfway back to that limit (in
-    logarithms): there the estimate of light is wrong more often than the surface is special.
+    An albedo of more than four times the median of its class, or less than a quarter, is taken halfway back to that
+    limit (in logarithms): there the estimate of light is wrong more often than the surface is special.
     """
     raw = gbuffer.color / np.maximum(irradiance(gbuffer.normal, gbuffer.openness, sunlit, light), 1e-4)
     albedo = np.clip(raw, LEAST_ALBEDO, MOST_ALBEDO)
@@ -299,8 +308,9 @@ def ground_level(light: Surroundings) -> float:
 
 
 def target_light(recorded: Surroundings, settings: LightSettings) -> Surroundings:
-    """The light that settings name, in the unit of the recorded one, as a camera with automatic exposure shows it: ground as bright
-    as recorded under an overcast sky, half as bright at dusk; at night a lamp's 50 lux stand for ``NIGHT_LEVEL`` of the recorded light."""
+    """The light that settings name, in the unit of the recorded one, as a camera with automatic exposure shows it:
+    ground as bright as recorded under an overcast sky, half as bright at dusk; at night a lamp's 50 lux stand for
+    ``NIGHT_LEVEL`` of the recorded light."""
     level = ground_level(recorded)
     azimuth, elevation = np.radians(settings.sun_azimuth_deg), np.radians(settings.sun_elevation_deg)
     low_sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
@@ -308,8 +318,15 @@ def target_light(recorded: Surroundings, settings: LightSettings) -> Surrounding
 
     def light(scale: float, sky: tuple[Array, Array, Array], sun: Array, direction: Array) -> Surroundings:
         horizon, zenith, ambient = (scale * part for part in sky)
-        return replace(recorded, horizon=horizon, zenith=zenith, ambient=ambient, sun=scale * sun, sun_direction=direction,
-                       airlight=0.9 * horizon)  # fmt: skip
+        return replace(
+            recorded,
+            horizon=horizon,
+            zenith=zenith,
+            ambient=ambient,
+            sun=scale * sun,
+            sun_direction=direction,
+            airlight=0.9 * horizon,
+        )
 
     if settings.time == "overcast":
         grey = np.array([0.97, 1.0, 1.04])
@@ -326,7 +343,8 @@ def target_light(recorded: Surroundings, settings: LightSettings) -> Surrounding
 
 
 def lamp_light(xyz: Array, normal: NDArray[np.floating], lamps: Array) -> Array:
-    """Irradiance over pi f64[N, 3] of street lamps at world places [M, 3] that shine down in a cone; nothing casts shadows."""
+    """Irradiance over pi f64[N, 3] of street lamps at world places [M, 3] that shine down in a cone; nothing casts
+    shadows."""
     total = np.zeros(len(xyz))
     edge = np.cos(np.radians(LAMP_HALF_ANGLE_DEG))
     for lamp in lamps:
@@ -385,8 +403,8 @@ def relit(
         point_lights: irradiance over pi f64[H, W, 3] of lamps, added to the target's.
 
     Returns:
-        Linear light f32[H, W, 3]; the sky is the target's gradient. Confidence is low where the recorded light was little of what the
-        new one needs (deep shadow made bright) and in the sky.
+        Linear light f32[H, W, 3]; the sky is the target's gradient. Confidence is low where the recorded light was
+        little of what the new one needs (deep shadow made bright) and in the sky.
     """
     sunlit = sunlit_of(gbuffer, recorded)
     new_sunlit = gbuffer.new_sunlit if gbuffer.new_sunlit is not None else np.ones_like(sunlit)

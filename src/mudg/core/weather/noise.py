@@ -1,7 +1,7 @@
 """Hashes and value noise of world places: the same numbers for every camera and frame.
 
-Twins of ``hash_bits``, ``hash01`` and ``noise2`` in native/city_math.h, so that the generated city can show the same puddles and patches
-of snow.
+Twins of ``hash_bits``, ``hash01`` and ``noise2`` in native/city_math.h, so that the generated city can show the same
+puddles and patches of snow.
 """
 
 from __future__ import annotations

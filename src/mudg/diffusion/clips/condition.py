@@ -9,11 +9,11 @@
    falls inside and is not hidden there (`warp`); elsewhere it keeps the colour of its point, or of the nearest point;
 5. the nearest recorded image is also carried over as if everything in it were far away, for what lies above the LiDAR;
 6. the classes of labelled points and images travel with their colours;
-7. renders of a scene fitted to the recorded images, if there is one, are given too, and in steps 3 to 5 tell the depth of what no
-   point was measured on.
+7. renders of a scene fitted to the recorded images, if there is one, are given too, and in steps 3 to 5 tell the depth
+   of what no point was measured on.
 
-Steps 2 to 7 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead: points
-only, zero where nothing is known, the reference image in frame 0 being put in by the model.
+Steps 2 to 7 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead:
+points only, zero where nothing is known, the reference image in frame 0 being put in by the model.
 
 Training clips are made of these in `from_city.py` and `from_log.py`.
 """
@@ -42,12 +42,13 @@ if TYPE_CHECKING:
     from mudg.base.types import RenderPlanes
 
 
-# vacated --------------------------------------------------------------------------------------------------------------
+# vacated ------------------------------------------------------------------------------------------
 #
 # Conditions of an edited drive where something stood that is not there any more.
 #
-# No photograph taken then shows what is behind it. Other photographs may, taken earlier or later from elsewhere: they are warped in as
-# everywhere. What is left is a hole: its colours continue those around it, and nothing in it counts as seen.
+# No photograph taken then shows what is behind it. Other photographs may, taken earlier or later from elsewhere: they
+# are warped in as everywhere. What is left is a hole: its colours continue those around it, and nothing in it counts as
+# seen.
 
 
 GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
@@ -73,14 +74,14 @@ class Vacated:
     stood: Tensor
 
     def known(self, render: RenderPlanes | None) -> Tensor:
-        """Pixels bool[H,W] behind what is gone that other photographs determined: the fit knows what is there. Not in its shadow, which
-        a fit knows just as well."""
+        """Pixels bool[H,W] behind what is gone that other photographs determined: the fit knows what is there. Not in
+        its shadow, which a fit knows just as well."""
         return torch.zeros_like(self.stood) if render is None else self.stood & determined(render, ~self.mask)
 
 
 def determined(render: RenderPlanes, usual: Tensor) -> Tensor:
-    """Pixels bool[H,W] that photographs determined about as well as the `usual` ones bool[H,W] of the view, by the median. A longer fit is
-    more certain everywhere, so only the share counts."""
+    """Pixels bool[H,W] that photographs determined about as well as the `usual` ones bool[H,W] of the view, by the
+    median. A longer fit is more certain everywhere, so only the share counts."""
     covered = (render.alpha[0] > 0.5) & usual
     if not bool(covered.any()):
         return torch.zeros_like(covered)
@@ -91,14 +92,15 @@ VacatedAt = Callable[[View], Vacated]
 
 
 def ground_behind(depth: Tensor, measured: Tensor, vacated: Vacated) -> Tensor:
-    """Depth f32[H,W] in which vacated pixels without a `measured` bool[H,W] surface lie on the ground, where there is some."""
+    """Depth f32[H,W] in which vacated pixels without a `measured` bool[H,W] surface lie on the ground, where there is
+    some."""
     there = vacated.mask & ~measured & torch.isfinite(vacated.ground)
     return torch.where(there, vacated.ground, depth)
 
 
 def continued(color: Tensor, ids: Tensor, vacated: Vacated, hole: Tensor) -> tuple[Tensor, Tensor]:
-    """Colours f32[3,H,W] and classes u8[H,W] with those of a `hole` bool[H,W] continued smoothly from around it: ground from ground, what
-    is above it from what stands there or from the sky, nothing from objects that move."""
+    """Colours f32[3,H,W] and classes u8[H,W] with those of a `hole` bool[H,W] continued smoothly from around it: ground
+    from ground, what is above it from what stands there or from the sky, nothing from objects that move."""
     ground, moving = torch.isin(ids, GROUND_IDS), torch.isin(ids, DYNAMIC)
     low = torch.isfinite(vacated.ground)
     for part, given in ((hole & low, ground), (hole & ~low, ~ground & ~moving)):
@@ -112,7 +114,9 @@ def continued(color: Tensor, ids: Tensor, vacated: Vacated, hole: Tensor) -> tup
 def _pulled(color: Tensor, weight: Tensor) -> Tensor:
     """Colours where weight is 1, continued where it is 0; `color` [1,C,H,W] is 0 there."""
     if min(color.shape[-2:]) <= 2:
-        return color.sum((-2, -1), keepdim=True) / weight.sum((-2, -1), keepdim=True).clamp(min=1e-6) + torch.zeros_like(color)
+        return color.sum((-2, -1), keepdim=True) / weight.sum((-2, -1), keepdim=True).clamp(
+            min=1e-6
+        ) + torch.zeros_like(color)
     pool = lambda x: functional.avg_pool2d(x, 2, ceil_mode=True, count_include_pad=False)  # noqa: E731
     share = pool(weight)
     coarse = pool(color) / share.clamp(min=1e-6)
@@ -128,14 +132,14 @@ def _nearest(ids: Tensor, source: Tensor) -> Tensor:
 
 
 def uncertain_there(render: RenderPlanes, vacated: Vacated, hole: Tensor, color: Tensor) -> RenderPlanes:
-    """A render that claims to know nothing where something stood, but for what other photographs determined, and shows in the hole what the
-    condition does."""
+    """A render that claims to know nothing where something stood, but for what other photographs determined, and shows
+    in the hole what the condition does."""
     unknown = vacated.mask & ~vacated.known(render)
     certainty = torch.where(unknown, torch.zeros_like(render.certainty), render.certainty)
     return replace(render, color=torch.where(hole, color, render.color), certainty=certainty)
 
 
-# condition ------------------------------------------------------------------------------------------------------------
+# condition ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,9 +172,11 @@ class ConditionRules:
     occluder_m: float = 0.2
     """Side of the square with which points hide what lies behind them."""
     measured_reach_px: int = 4
-    """A pixel this near to a measured one takes that one's depth; farther ones take the depth of the render, where there is one."""
+    """A pixel this near to a measured one takes that one's depth; farther ones take the depth of the render, where
+    there is one."""
     sure_alpha: float = 0.9
-    """A pixel near to a measured one takes the depth of the render all the same where the render covers it by more than this ..."""
+    """A pixel near to a measured one takes the depth of the render all the same where the render covers it by more than
+    this ..."""
     another_surface: float = 0.1
     """... and is farther from the measured depth than this share of it: the outlines of surfaces are the render's."""
     solid_alpha: float = 0.5
@@ -180,17 +186,20 @@ class ConditionRules:
     published: bool = False
     """The published system's condition: points only, 0 where nothing was seen, no filling, no warping.
 
-    With a fine size it is projected at that size (the camera's) and brought down as the published training did: colour by
-    the nearest pixel, depth and reference bilinearly, zeros of missing depth mixed in. What the points measured goes beside it
-    (`Condition.measured`).
+    With a fine size it is projected at that size (the camera's) and brought down as the published training did: colour
+    by the nearest pixel, depth and reference bilinearly, zeros of missing depth mixed in. What the points measured goes
+    beside it (`Condition.measured`).
     """
 
     def project(self, cloud: FusedCloud, tracks: Sequence[Track], view: View) -> ProjectedPoints:
         """The cloud's points in a view of the condition's resolution."""
         drawn = ProjectConfig(
-            static_splat_px=self.point_px, object_splat_px=self.point_px, near_m=self.near_m, far_m=self.far_m,
+            static_splat_px=self.point_px,
+            object_splat_px=self.point_px,
+            near_m=self.near_m,
+            far_m=self.far_m,
             occluder_m=0.0 if self.published else self.occluder_m,
-        )  # fmt: skip
+        )
         return project_sparse(cloud, tracks, view, drawn, hide=not self.published)
 
 
@@ -230,11 +239,12 @@ class DrawnCloud:
     """Where something stood that an edit took away."""
 
     def look(self, view: View, far_ids: Tensor) -> Surfaces:
-        """The surfaces at a view: measured ones, and between them those of the render or else of the nearest measured pixel.
+        """The surfaces at a view: measured ones, and between them those of the render or else of the nearest measured
+        pixel.
 
-        What the render does not cover is taken for sky, unless it lies below the horizon or `far_ids` u8[H,W], the classes of what
-        a recorded image shows in the same direction (255 = unknown), are something else: there a surface stands that no image
-        shows, and the nearest measured pixel stands for it, in the render too.
+        What the render does not cover is taken for sky, unless it lies below the horizon or `far_ids` u8[H,W], the
+        classes of what a recorded image shows in the same direction (255 = unknown), are something else: there a
+        surface stands that no image shows, and the nearest measured pixel stands for it, in the render too.
         """
         sparse = self.rules.project(self.cloud, self.tracks, view)
         nearest = _nearest_measured(sparse)
@@ -244,22 +254,31 @@ class DrawnCloud:
             depth = depth if vacated is None else ground_behind(depth, sparse.valid, vacated)
             return Surfaces(sparse.valid, color, depth, moving, ids, None, vacated)
         render = self.render_at(view)
-        near = torch.from_numpy(ndimage.binary_dilation(sparse.valid.numpy(), iterations=max(self.rules.measured_reach_px, 1)))
+        near = torch.from_numpy(
+            ndimage.binary_dilation(sparse.valid.numpy(), iterations=max(self.rules.measured_reach_px, 1))
+        )
         solid = render.alpha[0] >= self.rules.solid_alpha
         near &= _among_measured(sparse, depth, self.rules) | ~_another_surface(depth, render, self.rules)
         surface_seen = (far_ids != palette.ID["sky"]) & (far_ids != palette.UNLABELLED)
         hidden = ~solid & (below_horizon(view, self.rules.ground_slope) | surface_seen) & bool(sparse.valid.any())
         depth = torch.where(sparse.valid, depth, _levelled(view, depth, ids, nearest).clamp(max=self.rules.far_m))
-        render = replace(render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics))
-        shown = torch.where(solid, render.depth[0], torch.full_like(depth, self.rules.far_m)).clamp(max=self.rules.far_m)
+        render = replace(
+            render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics)
+        )
+        shown = torch.where(solid, render.depth[0], torch.full_like(depth, self.rules.far_m)).clamp(
+            max=self.rules.far_m
+        )
         pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)  # noqa: E731
         depth = pick(depth, shown)
         depth = depth if vacated is None else ground_behind(depth, sparse.valid, vacated)
         moving = (moving & near) | self._in_objects(view, depth, ~near & torch.isin(render.semantics[0], MOVING_IDS))
-        return Surfaces(sparse.valid, pick(color, render.color), depth, moving, pick(ids, render.semantics[0]), render, vacated)
+        return Surfaces(
+            sparse.valid, pick(color, render.color), depth, moving, pick(ids, render.semantics[0]), render, vacated
+        )
 
     def _in_objects(self, view: View, depth: Tensor, asked: Tensor) -> Tensor:
-        """Which of the `asked` pixels bool[H,W], at `depth` f32[H,W], lie in the box of an object that has a cloud of its own."""
+        """Which of the `asked` pixels bool[H,W], at `depth` f32[H,W], lie in the box of an object that has a cloud of
+        its own."""
         found = torch.zeros_like(asked)
         rows, columns = torch.nonzero(asked, as_tuple=True)
         if not len(rows):
@@ -278,8 +297,9 @@ class DrawnCloud:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Surfaces:
-    """What is known of a view before images are warped in: measured bool[H,W]; color f32[3,H,W], depth f32[H,W] m, moving bool[H,W]
-    and ids u8[H,W] of every pixel; the render, if there is one; and where something stood that an edit took away."""
+    """What is known of a view before images are warped in: measured bool[H,W]; color f32[3,H,W], depth f32[H,W] m,
+    moving bool[H,W] and ids u8[H,W] of every pixel; the render, if there is one; and where something stood that an edit
+    took away."""
 
     measured: Tensor
     color: Tensor
@@ -290,9 +310,10 @@ class Surfaces:
     vacated: Vacated | None = None
 
     def with_hole(self, color: Tensor, ids: Tensor, found: Tensor) -> tuple[Surfaces, Tensor, Tensor, Tensor]:
-        """These surfaces, colours, classes and `found` bool[H,W] of a view after images were warped in to these pixels: what was vacated
-        and not found continues what is around it, and does not count as measured; where objects are new the render is all that there is,
-        and counts like a photograph, as it does where it knows what something hid."""
+        """These surfaces, colours, classes and `found` bool[H,W] of a view after images were warped in to these pixels:
+        what was vacated and not found continues what is around it, and does not count as measured; where objects are
+        new the render is all that there is, and counts like a photograph, as it does where it knows what something
+        hid."""
         if self.vacated is None:
             return self, color, ids, found
         if self.render is not None:
@@ -300,7 +321,8 @@ class Surfaces:
             color, ids = torch.where(shown, self.render.color, color), torch.where(shown, self.render.semantics[0], ids)
             found = found | shown
         ground = self.measured & torch.isin(self.ids, GROUND_IDS) & torch.isfinite(self.vacated.ground)
-        hole = self.vacated.mask & ~found  # what stood there, or its shadow, may have coloured points: of ground, only their place counts
+        # what stood there, or its shadow, may have coloured points: of ground, only their place counts
+        hole = self.vacated.mask & ~found
         color, ids = continued(color, ids, self.vacated, hole)
         render = None if self.render is None else uncertain_there(self.render, self.vacated, hole, color)
         return replace(self, measured=self.measured & ~(hole & ~ground), render=render), color, ids, found
@@ -316,7 +338,8 @@ def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[n
 
 
 def filled_depth(measured: SparseDepth, far_m: float = 100.0) -> Tensor:
-    """Depth f32[T,1,H,W] with the nearest measured pixel's where nothing was measured; `far_m` in a frame without any."""
+    """Depth f32[T,1,H,W] with the nearest measured pixel's where nothing was measured; `far_m` in a frame without
+    any."""
     filled = []
     for image, valid in zip(measured.depth[:, 0].numpy(), measured.valid[:, 0].numpy(), strict=True):
         filled.append(torch.from_numpy(image[nearest_valid(valid)] if valid.any() else np.full_like(image, far_m)))
@@ -378,8 +401,8 @@ def warp(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Colours and classes that the pixels of `view`, at `depth` f32[H,W], have in a recorded image.
 
-    `surface` f32[h,w]: depth of the nearest surface at the pixels of the recorded image.
-    Returns rgb f32[3,H,W] (bilinear), semantics u8[H,W] (nearest) and found bool[H,W]: inside the image, usable and not hidden in it.
+    `surface` f32[h,w]: depth of the nearest surface at the pixels of the recorded image. Returns rgb f32[3,H,W]
+    (bilinear), semantics u8[H,W] (nearest) and found bool[H,W]: inside the image, usable and not hidden in it.
     """
     x, y, z = carry(view, depth[None], source.view)
     in_front = look_up(surface[None], x, y, "nearest")[0, 0]
@@ -391,9 +414,8 @@ def warp(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WarpSource:
-    """A recorded image made ready for warping: rgb f32[3,h,w] in common colours (of 0..1 or a little beyond), depth f32[h,w] m (filled),
-    moving bool[h,w],
-    semantics u8[h,w] (255 = unknown), usable bool[h,w] or None (all)."""
+    """A recorded image made ready for warping: rgb f32[3,h,w] in common colours (of 0..1 or a little beyond), depth
+    f32[h,w] m (filled), moving bool[h,w], semantics u8[h,w] (255 = unknown), usable bool[h,w] or None (all)."""
 
     view: View
     rgb: Tensor
@@ -415,22 +437,25 @@ def build_conditions(
     *,
     recolor: Recolor | None = None,
 ) -> tuple[Condition, Condition]:
-    """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine grid.
+    """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine
+    grid.
 
     Args:
         cloud: fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time.
         recorded: images of any cameras; the ones nearest in time to a view are warped into it; may be empty.
-        sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further views. Of
-            `KeptImages` with a folder, fine conditions of large views lie in files.
-        render_at: renders of a fitted scene. They are part of the condition, and tell how far away is what no point was measured on
-            (not with `published`). Recorded images that `sources` holds must have been prepared with the same renders.
+        sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further
+            views. Of `KeptImages` with a folder, fine conditions of large views lie in files.
+        render_at: renders of a fitted scene. They are part of the condition, and tell how far away is what no point was
+            measured on (not with `published`). Recorded images that `sources` holds must have been prepared with the
+            same renders.
         vacated_at: of an edited drive: where something stood that is not there any more (not with `published`).
         recolor: with `published`: changes the colours of the points, at the camera's size, and of the reference.
 
     Returns:
-        Two conditions (the same object if there is no finer grid): colour and depth filled everywhere (zeros with `published`), `valid`
-        where a point was seen and kept, `warped` where the colour comes from a recorded image, the `backdrop` of step 5, and as
-        reference the recorded image of the first view's camera that is nearest in time (black if there is none).
+        Two conditions (the same object if there is no finer grid): colour and depth filled everywhere (zeros with
+        `published`), `valid` where a point was seen and kept, `warped` where the colour comes from a recorded image,
+        the `backdrop` of step 5, and as reference the recorded image of the first view's camera that is nearest in time
+        (black if there is none).
 
     Raises:
         InputError: no views.
@@ -451,8 +476,18 @@ def build_conditions(
     rows = ((*part, *(() if render_at is None else _planes(shown))) for part, shown in made)
     color, depth, valid, warped, backdrop, ids, far_ids, *planes = stacked(rows, len(fine_views), folder)
     renders = RenderPlanes(*planes) if planes else None
-    fine = Condition(fine_views, color, depth, valid, reference if size == (rules.width, rules.height) else backdrop[0],
-                     warped, backdrop, ids, far_ids, renders)  # fmt: skip
+    fine = Condition(
+        fine_views,
+        color,
+        depth,
+        valid,
+        reference if size == (rules.width, rules.height) else backdrop[0],
+        warped,
+        backdrop,
+        ids,
+        far_ids,
+        renders,
+    )
     if size == (rules.width, rules.height):
         return fine, fine
 
@@ -464,15 +499,29 @@ def build_conditions(
     small_renders = None
     if renders is not None:
         small_renders = RenderPlanes(
-            reduced(renders.color), picked(renders.depth), reduced(renders.alpha), reduced(renders.certainty), picked(renders.semantics)
+            reduced(renders.color),
+            picked(renders.depth),
+            reduced(renders.alpha),
+            reduced(renders.certainty),
+            picked(renders.semantics),
         )
     small_points = DrawnCloud(cloud, tracks, rules, _in_order(small_renders), vacated_at)
     own = [small_points.look(view, there[0]) for view, there in zip(small, picked(far_ids))]
     own = [o.with_hole(o.color, o.ids, there[0] > 0.5)[0] for o, there in zip(own, reduced(warped))]
     scratch.rest_mapped()
     own_depth, own_valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
-    condition = Condition(tuple(small), reduced(color), own_depth, own_valid, reference, reduced(warped) > 0.5,
-                          reduced(backdrop), picked(ids), picked(far_ids), small_renders)  # fmt: skip
+    condition = Condition(
+        tuple(small),
+        reduced(color),
+        own_depth,
+        own_valid,
+        reference,
+        reduced(warped) > 0.5,
+        reduced(backdrop),
+        picked(ids),
+        picked(far_ids),
+        small_renders,
+    )
     return condition, fine
 
 
@@ -497,8 +546,8 @@ def _in_order(renders: RenderPlanes | None) -> RenderAt | None:
 def _condition_of_view(
     points: DrawnCloud, view: View, recorded: Sequence[Photo], rules: ConditionRules, sources: dict[int, WarpSource]
 ) -> tuple[tuple[Tensor, ...], RenderPlanes | None]:
-    """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and of
-    the backdrop u8[1,H,W] of one view, at its size; and its render."""
+    """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and
+    of the backdrop u8[1,H,W] of one view, at its size; and its render."""
 
     def source(number: int) -> WarpSource:
         if number not in sources:
@@ -546,7 +595,8 @@ def _nearest_measured(sparse: ProjectedPoints) -> tuple[Tensor, Tensor]:
 def _filled(
     sparse: ProjectedPoints, nearest: tuple[Tensor, Tensor], rules: ConditionRules
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest measured pixel, for every pixel."""
+    """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest measured pixel, for every
+    pixel."""
     if not bool(sparse.valid.any()):
         return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
     here = (..., *nearest)
@@ -554,16 +604,19 @@ def _filled(
 
 
 def _another_surface(depth: Tensor, render: RenderPlanes, rules: ConditionRules) -> Tensor:
-    """Where a render shows another surface than the one at `depth` f32[H,W], and photographs determined it, bool[H,W]."""
+    """Where a render shows another surface than the one at `depth` f32[H,W], and photographs determined it,
+    bool[H,W]."""
     sure = (render.alpha[0] > rules.sure_alpha) & determined(render, torch.ones_like(depth, dtype=torch.bool))
     return sure & ((render.depth[0] - depth).abs() > rules.another_surface * depth)
 
 
 def _among_measured(sparse: ProjectedPoints, depth: Tensor, rules: ConditionRules) -> Tensor:
-    """Which pixels are measured, or have measured ones of their filled depth f32[H,W] to both sides in some direction, at most twice
-    `measured_reach_px` away, bool[H,W]: the surface goes on there, whatever a render with holes shows."""
+    """Which pixels are measured, or have measured ones of their filled depth f32[H,W] to both sides in some direction,
+    at most twice `measured_reach_px` away, bool[H,W]: the surface goes on there, whatever a render with holes shows."""
     reach = 2 * rules.measured_reach_px
-    own = functional.pad(torch.where(sparse.valid, sparse.depth, torch.inf)[None, None], (reach,) * 4, value=torch.inf)[0, 0]
+    own = functional.pad(torch.where(sparse.valid, sparse.depth, torch.inf)[None, None], (reach,) * 4, value=torch.inf)[
+        0, 0
+    ]
     height, width = depth.shape
 
     def on_side(down: int, right: int) -> Tensor:
@@ -581,8 +634,8 @@ def _among_measured(sparse: ProjectedPoints, depth: Tensor, rules: ConditionRule
 
 
 def _levelled(view: View, depth: Tensor, ids: Tensor, nearest: tuple[Tensor, Tensor]) -> Tensor:
-    """Filled depth f32[H,W] in which ground goes on at the height, not at the depth, of the nearest measured pixel; `ids` u8[H,W] are
-    that pixel's classes."""
+    """Filled depth f32[H,W] in which ground goes on at the height, not at the depth, of the nearest measured pixel;
+    `ids` u8[H,W] are that pixel's classes."""
     falls = -ray_directions(view)[2]
     there = falls[nearest]
     level = torch.isin(ids, GROUND_IDS) & (falls > LEAST_FALL) & (there > LEAST_FALL)
@@ -590,9 +643,13 @@ def _levelled(view: View, depth: Tensor, ids: Tensor, nearest: tuple[Tensor, Ten
 
 
 def _published_condition(
-    cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], reference: Tensor, rules: ConditionRules,
+    cloud: FusedCloud,
+    tracks: Sequence[Track],
+    views: Sequence[View],
+    reference: Tensor,
+    rules: ConditionRules,
     recolor: Recolor | None,
-) -> Condition:  # fmt: skip
+) -> Condition:
     own = (rules.width, rules.height)
     native = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     seen = views if native == own else [view.resized(*native) for view in views]
@@ -611,8 +668,9 @@ def _published_condition(
 def _measured(cloud: FusedCloud, tracks: Sequence[Track], views: Sequence[View], rules: ConditionRules) -> SparseDepth:
     """What visible points measure at views of the condition's size.
 
-    Points are drawn on a grid at least as fine as the camera's and the condition's, without those that others hide, and each pixel
-    takes the cell in its middle: depth is never mixed, and the nearest of many points in a coarse pixel is not preferred.
+    Points are drawn on a grid at least as fine as the camera's and the condition's, without those that others hide, and
+    each pixel takes the cell in its middle: depth is never mixed, and the nearest of many points in a coarse pixel is
+    not preferred.
     """
     own, seen = (rules.width, rules.height), replace(rules, published=False)
     grid = max(own[0], rules.fine_width), max(own[1], rules.fine_height)
@@ -657,8 +715,8 @@ def _rank_of_images(
 
 
 def _order_of_images(view: View, depth: Tensor, recorded: Sequence[Photo], rules: ConditionRules) -> list[int]:
-    """The images to try for a view of depth f32[H,W]: nearest in time first (steps of 20 ms; see `other_camera_s`), the same camera
-    before others, then by distance. Images that hardly overlap the view are left out, but for the first."""
+    """The images to try for a view of depth f32[H,W]: nearest in time first (steps of 20 ms; see `other_camera_s`), the
+    same camera before others, then by distance. Images that hardly overlap the view are left out, but for the first."""
 
     columns, rows = min(view.camera.width, OVERLAP_GRID[0]), min(view.camera.height, OVERLAP_GRID[1])
     coarse = view.resized(columns, rows)

@@ -1,13 +1,14 @@
 """Training clips from generated cities: pure functions of (seed, city number).
 
-One city is a short log (12 frames) recorded by the front camera and, sometimes, the two beside it. Its sweeps are fused as
-the `fuse` verb does, the condition is built as `synthesize` does, and the truth comes from the generator at exactly the
-views of the clip. Most clips lie beside the recorded path; one per city follows it, with only some of its recorded images
-given, as for frames that a log lacks.
+One city is a short log (12 frames) recorded by the front camera and, sometimes, the two beside it. Its sweeps are fused
+as the `fuse` verb does, the condition is built as `synthesize` does, and the truth comes from the generator at exactly
+the views of the clip. Most clips lie beside the recorded path; one per city follows it, with only some of its recorded
+images given, as for frames that a log lacks.
 
-What varies from city to city besides the city itself: field of view, mounting height and pitch, number and elevation range
-of the LiDAR's beams, drop-out, frame rate, number of sweeps fused, errors of the LiDAR poses. With ``realism="varied"`` much more does: see
-`varied.py` for the distribution and `from_city.py` for how faulty sensors and exact truth go together.
+What varies from city to city besides the city itself: field of view, mounting height and pitch, number and elevation
+range of the LiDAR's beams, drop-out, frame rate, number of sweeps fused, errors of the LiDAR poses. With
+``realism="varied"`` much more does: see `varied.py` for the distribution and `from_city.py` for how faulty sensors and
+exact truth go together.
 """
 
 from __future__ import annotations
@@ -46,24 +47,23 @@ from mudg.diffusion.clips.condition import ConditionRules, RenderAt, WarpSource,
 from mudg.diffusion.clips.inputs import NearSweeps, near_condition, simulated_lateness_s
 from mudg.diffusion.clips.shards import FAR_M, pack_clips, shard_path, write_shard
 
-# city log -------------------------------------------------------------------------------------------------------------
+# city log -----------------------------------------------------------------------------------------
 #
 # A generated log as its training clips need it, and its recording with the faults of real sensors.
 #
-# With faults, the cameras are the reference: the view of a clip is where the camera truly was (moved sideways), and its truth is exact.
-# What
-# the condition knows may be wrong. Its views carry the recorded poses, which have errors; an image recorded at the time of a view has
-# the same error and so still fits it; points and images of other times, and points of a LiDAR that is not where the calibration says,
-# do not. The truth has the look of the camera at that time (exposure, white balance, vignetting, contrast) but none of its noise and
-# blur.
+# With faults, the cameras are the reference: the view of a clip is where the camera truly was (moved sideways), and its
+# truth is exact. What the condition knows may be wrong. Its views carry the recorded poses, which have errors; an image
+# recorded at the time of a view has the same error and so still fits it; points and images of other times, and points
+# of a LiDAR that is not where the calibration says, do not. The truth has the look of the camera at that time
+# (exposure, white balance, vignetting, contrast) but none of its noise and blur.
 
 
 @dataclass(frozen=True)
 class CityLog:
     """A generated log as its training clips need it: world, fused cloud, recorded images of all frames and cameras.
 
-    ``sweeps``: what was fused.
-    ``boxes``: the annotated tracks (None = the exact ones); ``errors`` f64[frames, 4, 4]: recorded pose = true pose @ error.
+    ``sweeps``: what was fused. ``boxes``: the annotated tracks (None = the exact ones); ``errors`` f64[frames, 4, 4]:
+    recorded pose = true pose @ error.
     """
 
     world: CityWorld
@@ -97,7 +97,8 @@ def claimed_view(world: CityWorld, errors: NDArray[np.float64], view: View) -> V
 
 
 def record_with_faults(config: CityConfig, sensors: SensorFaults, used: Sequence[int], key: int) -> CityLog:
-    """Record and fuse a city with faulty sensors; ``used``: the frames that have a sweep. Everything follows from ``key``."""
+    """Record and fuse a city with faulty sensors; ``used``: the frames that have a sweep. Everything follows from
+    ``key``."""
     world = CityWorld(config)
     errors = pose_errors(sensors.poses, config.n_frames, key)
     photos = {name: _photos(world, sensors, errors, name, key) for name in config.cameras}
@@ -138,12 +139,12 @@ def _photos(world: CityWorld, sensors: SensorFaults, errors: NDArray[np.float64]
     return photos
 
 
-# from city ------------------------------------------------------------------------------------------------------------
+# from city ----------------------------------------------------------------------------------------
 
 
 HELD_OUT = 1_000_000
-"""Numbers of cities, and of clips of logs, from here on are for scoring, never for training. Such cities have the standard
-rig, all cameras, and shifts of exactly 2, 3 and 4 m, whatever the seed."""
+"""Numbers of cities, and of clips of logs, from here on are for scoring, never for training. Such cities have the
+standard rig, all cameras, and shifts of exactly 2, 3 and 4 m, whatever the seed."""
 
 DEVELOPMENT = tuple(range(HELD_OUT, HELD_OUT + 6))
 """Cities for choosing between variants; also what `learn` watches."""
@@ -177,22 +178,23 @@ class CityClipRules:
     point_colors: bool = False
     """Also keep the colours of the nearest points, without images, in training clips (clips for scoring always do)."""
     published: bool = False
-    """The published system's condition: points alone, 0 where nothing was seen; the reference is the image recorded at the time of
-    the first view, from where it was recorded."""
+    """The published system's condition: points alone, 0 where nothing was seen; the reference is the image recorded at
+    the time of the first view, from where it was recorded."""
     near_points: bool = False
     """FreeVS' condition (`inputs.py`): points of a few frames alone."""
     realism: Realism = "plain"
-    """varied: training cities and their sensors are drawn from `varied.draw_city`; clips then have the size of `size_of`. mixed: so are
-    half of them; the others are plain, of these sizes."""
+    """varied: training cities and their sensors are drawn from `varied.draw_city`; clips then have the size of
+    `size_of`. mixed: so are half of them; the others are plain, of these sizes."""
     log_frames: int = FRAMES
     """Length of the logs at least. In longer ones than `FRAMES` each clip begins at a frame of its own."""
     side_cameras: float | None = None
-    """Share of the training cities with two cameras beside the front one (None: 0.4 of plain cities, 0.35 of varied ones)."""
+    """Share of the training cities with two cameras beside the front one (None: 0.4 of plain cities, 0.35 of varied
+    ones)."""
     fit_steps: tuple[int, int] = (100, 300)
     """Fewest and most steps of the fit to a training city; cities for scoring have the middle of them."""
     fitted: bool = False
-    """Clips have renders of a scene fitted to the recorded images (which the maker of the clips supplies), and a patch at a higher
-    resolution; recorded images are 2 to 4 times larger than the clips."""
+    """Clips have renders of a scene fitted to the recorded images (which the maker of the clips supplies), and a patch
+    at a higher resolution; recorded images are 2 to 4 times larger than the clips."""
     textures: str = ""
     """Varied cities: folder of photographic textures and skies, used by most cities (empty = none)."""
 
@@ -203,13 +205,14 @@ class CityClipRules:
 
 
 def is_varied(rules: CityClipRules, city: int) -> bool:
-    """Whether a city is drawn from the varied distribution; cities for scoring never are. Of mixed ones, `SIZES` neighbours are (one of
-    each size) and the next are not."""
+    """Whether a city is drawn from the varied distribution; cities for scoring never are. Of mixed ones, `SIZES`
+    neighbours are (one of each size) and the next are not."""
     return city < HELD_OUT and (rules.realism == "varied" or (rules.realism == "mixed" and city // SIZES % 2 == 0))
 
 
 def size_of(rules: CityClipRules, city: int) -> tuple[int, int]:
-    """Width and height of a city's clips. Varied and mixed cities differ in aspect, except for the published system's fixed size."""
+    """Width and height of a city's clips. Varied and mixed cities differ in aspect, except for the published system's
+    fixed size."""
     if rules.realism != "plain" and city < HELD_OUT and not rules.published:
         return varied.sized(rules.width, rules.height, city)
     return rules.width, rules.height
@@ -256,7 +259,8 @@ def city_config(rules: CityClipRules, city: int) -> CityConfig:
 
 
 def shifts_of(rules: CityClipRules, city: int) -> tuple[float, ...]:
-    """Lateral shift of each clip of a city, metres; 0 = the recorded path. Held-out cities: 2, 3, 4 m, sides alternating."""
+    """Lateral shift of each clip of a city, metres; 0 = the recorded path. Held-out cities: 2, 3, 4 m, sides
+    alternating."""
     if city >= HELD_OUT:
         side = 1.0 if city % 2 == 0 else -1.0
         return (2.0 * side, -3.0 * side, 4.0 * side, 0.0)[: rules.clips]
@@ -269,9 +273,14 @@ def shifts_of(rules: CityClipRules, city: int) -> tuple[float, ...]:
 
 
 def start_of(rules: CityClipRules, city: int, number: int) -> int:
-    """First frame of clip `number` of a city: where the log reaches `FIRST` frames beyond the clip at both ends, if it is so long."""
+    """First frame of clip `number` of a city: where the log reaches `FIRST` frames beyond the clip at both ends, if it
+    is so long."""
     last = rules.frames - FIRST - rules.window
-    return FIRST if last <= FIRST else int(seeds.numpy_rng(rules.seed, city * 64 + number, "start").integers(FIRST, last + 1))
+    return (
+        FIRST
+        if last <= FIRST
+        else int(seeds.numpy_rng(rules.seed, city * 64 + number, "start").integers(FIRST, last + 1))
+    )
 
 
 def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
@@ -279,7 +288,9 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
     config = replace(city_config(rules, city), n_frames=frames)
     rng = seeds.numpy_rng(rules.seed, city, "log")
     if is_varied(rules, city):
-        used = range(frames) if rng.random() < 0.6 else np.flatnonzero(rng.random(frames) < rng.uniform(0.3, 0.9)).tolist()
+        used = (
+            range(frames) if rng.random() < 0.6 else np.flatnonzero(rng.random(frames) < rng.uniform(0.3, 0.9)).tolist()
+        )
         key = seeds.key(rules.seed, city, "log with faults")
         return record_with_faults(config, sensors_of(rules, city), used or [frames // 2], key)
     world = CityWorld(config)
@@ -305,7 +316,8 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
 
 
 def given_images(rules: CityClipRules, city: int, log: CityLog) -> tuple[Photo, ...]:
-    """The recorded images that the clips of a city may know: all, or as in a log whose every fourth moment is held out."""
+    """The recorded images that the clips of a city may know: all, or as in a log whose every fourth moment is held
+    out."""
     return _known(rules, city, log, seeds.numpy_rng(rules.seed, city, "clips"))
 
 
@@ -375,7 +387,8 @@ def _split_moments(
 
 
 def patch_side(size: tuple[int, int]) -> int:
-    """Side of the patches of clips of a size, in pixels of the patch: the same at all scales, so that a step can mix them."""
+    """Side of the patches of clips of a size, in pixels of the patch: the same at all scales, so that a step can mix
+    them."""
     return min(PATCH_PX, 2 * min(size)) // 12 * 12
 
 
@@ -419,7 +432,8 @@ def clip_from_truth(condition: Condition, truths: Sequence[CityTruth]) -> Clip:
 
 
 def write_missing(rules: CityClipRules, cities: Sequence[int], folder: Path, fit: FitCity | None = None) -> None:
-    """Make the shards of those cities that have none in `folder` yet, one after another (`fit`: with `rules.fitted`)."""
+    """Make the shards of those cities that have none in `folder` yet, one after another (`fit`: with
+    `rules.fitted`)."""
     missing = [city for city in cities if not shard_path(folder, city).is_file()]
     for city in progress(missing, len(missing), "generating cities"):
         write_city(rules, city, folder, fit)

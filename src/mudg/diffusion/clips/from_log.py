@@ -2,17 +2,17 @@
 
 A clip is a window of consecutive frames of one camera, seen from where they were recorded:
 
-* **truth**: the recorded images; depth of the LiDAR sweep taken with each image, where it measured, and elsewhere the depth labels of
-  the scene, where there are such, with their confidence; classes where labels exist and are trusted;
-* **condition**: what `synthesize` would build for these views without their own images. Every view gets only images that
-  are at least some moments away, so that the model has to complete something: between one and `farthest` moments, drawn per
-  window. A random share of the cloud's points is left out, so that depth is more than copying.
+* **truth**: the recorded images; depth of the LiDAR sweep taken with each image, where it measured, and elsewhere the
+  depth labels of the scene, where there are such, with their confidence; classes where labels exist and are trusted;
+* **condition**: what `synthesize` would build for these views without their own images. Every view gets only images
+  that are at least some moments away, so that the model has to complete something: between one and `farthest` moments,
+  drawn per window. A random share of the cloud's points is left out, so that depth is more than copying.
 
-The points of the cloud keep the colours that fusing gave them, also where those came from the very image that is the truth;
-so it is in the published system.
+The points of the cloud keep the colours that fusing gave them, also where those came from the very image that is the
+truth; so it is in the published system.
 
-Held-out frames of the scene are never read. Every n-th window is for scoring, and training windows that show a moment of
-one of these are left out.
+Held-out frames of the scene are never read. Every n-th window is for scoring, and training windows that show a moment
+of one of these are left out.
 """
 
 from __future__ import annotations
@@ -72,8 +72,8 @@ class LogClipRules:
     """Colours are gathered at so many times the clip's size."""
     seed: int = 0
     published: bool = False
-    """The published system's condition: points alone, 0 where nothing was seen, projected at the camera's size; the reference is
-    the window's first image."""
+    """The published system's condition: points alone, 0 where nothing was seen, projected at the camera's size; the
+    reference is the window's first image."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,8 @@ class LogSource:
 
 
 def log_source(text: str) -> LogSource:
-    """The log that SCENE=FUSED names, or the output folder of `mudg run` (labels of annotate are taken if there are some).
+    """The log that SCENE=FUSED names, or the output folder of `mudg run` (labels of annotate are taken if there are
+    some).
 
     Raises:
         InputError: no scene or no cloud there.
@@ -107,14 +108,18 @@ def log_source(text: str) -> LogSource:
         labelled = run / "annotate"
         found = LogSource(labelled if (labelled / "scene.json").is_file() else run / "scene", run / "fuse")
     if not (found.fused / "fuse.json").is_file() or not found.scene.exists():
-        raise InputError("no scene with a fused cloud here", where=text,
-            expected="SCENE=FUSED, or an output folder of mudg run", remedy="make the cloud with `mudg fuse`")  # fmt: skip
+        raise InputError(
+            "no scene with a fused cloud here",
+            where=text,
+            expected="SCENE=FUSED, or an output folder of mudg run",
+            remedy="make the cloud with `mudg fuse`",
+        )
     return found
 
 
 def log_windows(scene: Scene, rules: LogClipRules) -> list[LogWindow]:
-    """All windows of a scene, camera by camera in time order. Frames held out for scoring the scene, and images that are rendered in part
-    (of an edited drive), are passed over.
+    """All windows of a scene, camera by camera in time order. Frames held out for scoring the scene, and images that
+    are rendered in part (of an edited drive), are passed over.
 
     Raises:
         InputError: unknown camera, or no camera has enough frames.
@@ -130,8 +135,12 @@ def log_windows(scene: Scene, rules: LogClipRules) -> list[LogWindow]:
             chosen = frames[start : start + reach : rules.frame_step]
             found.append(LogWindow(camera, tuple(f.id for f in chosen), kept))
     if not found:
-        raise InputError("a log is too short for a training clip", where=scene.root, expected=f"{reach} frames of a camera",
-                         remedy="give a shorter --data.window, or ingest with --test-every 0")  # fmt: skip
+        raise InputError(
+            "a log is too short for a training clip",
+            where=scene.root,
+            expected=f"{reach} frames of a camera",
+            remedy="give a shorter --data.window, or ingest with --test-every 0",
+        )
     time_of = {frame.id: frame.view.time_s for frame in scene.frames}
     scored = {time_of[name] for window in found if window.held_out for name in window.frames}
     return [w for w in found if w.held_out or not scored & {time_of[name] for name in w.frames}]
@@ -183,7 +192,9 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
     known = confidence > 0
     given = condition.depth if condition.measured is None else filled_depth(condition.measured)
     depth = torch.where(known, depth, given)  # a plausible filling: the noisy input shows it
-    return Clip(condition, rgb, depth, known, ids, depth_confidence=None if bool((confidence[known] == 1).all()) else confidence)
+    return Clip(
+        condition, rgb, depth, known, ids, depth_confidence=None if bool((confidence[known] == 1).all()) else confidence
+    )
 
 
 def _condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int) -> tuple[Condition, dict[int, Photo]]:
@@ -241,8 +252,8 @@ def _stacked(parts: Sequence[Condition]) -> Condition:
 
 
 def _truth(log: OpenLog, frame: Frame, recorded: Photo, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """rgb f32[3,H,W], depth f32[1,H,W] metres, its confidence f32[1,H,W] (1 = measured, 0 = unknown) and classes i64[H,W], all at the
-    size of `view`. Where classes or labels say sky, depth is far away."""
+    """rgb f32[3,H,W], depth f32[1,H,W] metres, its confidence f32[1,H,W] (1 = measured, 0 = unknown) and classes
+    i64[H,W], all at the size of `view`. Where classes or labels say sky, depth is far away."""
     scene, (width, height) = log.scene, (view.camera.width, view.camera.height)
     rgb = image_tensor(resize_area(recorded.rgb, width, height))
     ids = np.full((height, width), palette.UNLABELLED, np.uint8)
@@ -252,7 +263,10 @@ def _truth(log: OpenLog, frame: Frame, recorded: Photo, view: View) -> tuple[Ten
     confidence, sky = known.astype(np.float32), (ids == SKY) & ~known
     if log.rules.depth == "annotated" and "depth" in frame.labels:
         label = lambda name: resize_nearest(read_label(scene, frame, name), height, width)  # noqa: E731
-        labelled, sure = label("depth"), label("depth_confidence") if "depth_confidence" in frame.labels else np.float32(1)
+        labelled, sure = (
+            label("depth"),
+            (label("depth_confidence") if "depth_confidence" in frame.labels else np.float32(1)),
+        )
         more = ~known & ~sky & np.isfinite(labelled) & ~(label("ego") if "ego" in frame.labels else np.False_)
         depth, confidence = np.where(more, labelled, depth), np.where(more, sure, confidence)
         if "sky" in frame.labels:  # made labels have a depth there, too
@@ -280,13 +294,14 @@ def measured_depth(scene: Scene, view: View) -> tuple[NDArray[np.float32], NDArr
     return depth, seen_pixels(depth, seen.valid[0].numpy(), HIDING_RULES["condition"])
 
 
-# files ----------------------------------------------------------------------------------------------------------------
+# files --------------------------------------------------------------------------------------------
 
 
 def plan_shards(
     sources: Sequence[LogSource], rules: LogClipRules, first_held_out: int
 ) -> list[tuple[int, LogSource, LogWindow]]:
-    """What shards there will be, one clip each: (number, log, window); numbers from 0 to train on, from `first_held_out` to score.
+    """What shards there will be, one clip each: (number, log, window); numbers from 0 to train on, from
+    `first_held_out` to score.
 
     Raises:
         InputError: a log is too short, or holding out leaves nothing to train on.
@@ -299,10 +314,14 @@ def plan_shards(
             counts[window.held_out] += 1
     if not counts[False] or (rules.held_out_every and not counts[True]):
         raise InputError(
-            "the logs are too short to hold out windows", where=", ".join(str(s.scene) for s in sources),
+            "the logs are too short to hold out windows",
+            where=", ".join(str(s.scene) for s in sources),
             got=f"{counts[False]} windows to train on, {counts[True]} to score",
-            remedy="smaller --data.stride or --data.window, or --data.held-out-every 0 (scores are then of clips trained on)",
-        )  # fmt: skip
+            remedy=(
+                "smaller --data.stride or --data.window, or --data.held-out-every 0 (scores are then of clips"
+                " trained on)"
+            ),
+        )
     return rows
 
 
@@ -326,8 +345,12 @@ def claim_folder(folder: Path, rules: LogClipRules, sources: Sequence[LogSource]
     if path.is_file():
         found = store.read_json(path)
         if found != wanted:
-            raise UsageError("the folder holds training clips of other logs or settings", where=str(folder),
-                got="; ".join(differences(found, wanted)[:4]), remedy="give another --data.clips")  # fmt: skip
+            raise UsageError(
+                "the folder holds training clips of other logs or settings",
+                where=str(folder),
+                got="; ".join(differences(found, wanted)[:4]),
+                remedy="give another --data.clips",
+            )
         return
     if folder.is_dir() and any(folder.glob("*.safetensors")):
         raise UsageError("the folder holds other training clips", where=str(folder), remedy="give another --data.clips")

@@ -1,8 +1,8 @@
 """Conditions of which parts are switched off, for measuring what each part brings.
 
-The small diffusion model was trained on whole conditions (at times without classes or renders). A condition without points or without
-recorded images is therefore outside of what it has seen: such a measurement says what the trained model makes of the rest, not what
-a model trained without that part would make.
+The small diffusion model was trained on whole conditions (at times without classes or renders). A condition without
+points or without recorded images is therefore outside of what it has seen: such a measurement says what the trained
+model makes of the rest, not what a model trained without that part would make.
 """
 
 from __future__ import annotations
@@ -26,15 +26,17 @@ from mudg.core.project import ProjectedPoints
 from mudg.core.weather import DriveFacts, ShownView
 from mudg.diffusion.clips.condition import ConditionRules, RenderAt, VacatedAt, WarpSource, build_conditions
 
-# near points ----------------------------------------------------------------------------------------------------------
+# near points --------------------------------------------------------------------------------------
 #
 # The condition of FreeVS: coloured LiDAR points of a few frames around each view, and nothing else.
 #
-# Points of the sweeps within two frames of a view's time; those of moving objects are gathered in their boxes and put where the boxes are
-# at the view's time. One pixel per point, the nearest wins, black elsewhere. No depth, no recorded image, no classes, no renders. Unlike
-# FreeVS we do not reserve a margin around objects, and do not crop rows that LiDAR never covers.
+# Points of the sweeps within two frames of a view's time; those of moving objects are gathered in their boxes and put
+# where the boxes are at the view's time. One pixel per point, the nearest wins, black elsewhere. No depth, no recorded
+# image, no classes, no renders. Unlike FreeVS we do not reserve a margin around objects, and do not crop rows that
+# LiDAR never covers.
 #
-# Its training simulates another view on the recorded path: half of the clips there are made of points that are four frames off.
+# Its training simulates another view on the recorded path: half of the clips there are made of points that are four
+# frames off.
 
 
 NEAR_FRAMES: Final = 2
@@ -82,17 +84,23 @@ def near_condition(sweeps: NearSweeps, views: Sequence[View], rules: ConditionRu
     """The model's condition for ``views``, resized to the rules' size.
 
     Args:
-        rules: size and distance limits; nothing else counts. late_s: how much later than its view the points of a view were measured.
+        rules: size and distance limits; nothing else counts. late_s: how much later than its view the points of a view
+            were measured.
     """
     small = tuple(view.resized(rules.width, rules.height) for view in views)
     bare = replace(rules, published=True, point_px=1.0)
     seen = [bare.project(sweeps.cloud_at(view.time_s + late_s), sweeps.tracks, view) for view in small]
     valid = torch.stack([s.valid for s in seen])[:, None]
-    shown = [sweeps.colors.image_of(v.camera.name, s.rgb).clamp(0, 1) if sweeps.colors.to_common else s.rgb for v, s in zip(small, seen)]
+    shown = [
+        sweeps.colors.image_of(v.camera.name, s.rgb).clamp(0, 1) if sweeps.colors.to_common else s.rgb
+        for v, s in zip(small, seen)
+    ]
     color = torch.stack(shown) * valid
     unknown = torch.full_like(valid, palette.UNLABELLED, dtype=torch.uint8)
     depth = torch.full(valid.shape, float(rules.far_m))
-    return Condition(small, color, depth, valid, torch.zeros_like(color[0]), torch.zeros_like(valid), color, unknown, unknown)
+    return Condition(
+        small, color, depth, valid, torch.zeros_like(color[0]), torch.zeros_like(valid), color, unknown, unknown
+    )
 
 
 def simulated_lateness_s(sweeps: NearSweeps, rng: np.random.Generator) -> float:
@@ -100,10 +108,10 @@ def simulated_lateness_s(sweeps: NearSweeps, rng: np.random.Generator) -> float:
     return 0.0 if rng.random() >= OTHER_SHARE else float(rng.choice([-1.0, 1.0])) * OTHER_FRAMES * sweeps.period_s
 
 
-# weathered ------------------------------------------------------------------------------------------------------------
+# weathered ----------------------------------------------------------------------------------------
 #
-# Views in other weather or light, and what the published system is given of them: points and a reference image, edited before they are
-# brought to the network's size. Geometry and classes stay.
+# Views in other weather or light, and what the published system is given of them: points and a reference image, edited
+# before they are brought to the network's size. Geometry and classes stay.
 
 
 SKY: Final = palette.ID["sky"]
@@ -111,8 +119,8 @@ SKY: Final = palette.ID["sky"]
 
 @dataclass(frozen=True, eq=False)
 class InWeather:
-    """Weather for the views of a drive: settings, light and ground of the drive, seed of drops and patches, and the velocity of the
-    cameras at a time."""
+    """Weather for the views of a drive: settings, light and ground of the drive, seed of drops and patches, and the
+    velocity of the cameras at a time."""
 
     settings: Conditions
     drive: DriveFacts
@@ -129,13 +137,15 @@ class InWeather:
 
 @dataclass(frozen=True, eq=False)
 class WeatheredPoints:
-    """Points and recorded images of a drive in weather, with the surfaces of a fitted scene between the points and behind the images."""
+    """Points and recorded images of a drive in weather, with the surfaces of a fitted scene between the points and
+    behind the images."""
 
     how: InWeather
     render_at: RenderAt
 
     def points(self, view: View, seen: ProjectedPoints) -> Tensor:
-        """Colours f32[3,H,W] of projected points in this weather, each at its own distance; meaningless where there are none."""
+        """Colours f32[3,H,W] of projected points in this weather, each at its own distance; meaningless where there are
+        none."""
         shown = self.render_at(view)
         ids = torch.where(seen.valid & (shown.semantics == SKY), palette.UNLABELLED, shown.semantics)
         depth = torch.where(seen.valid, seen.depth, shown.depth)
@@ -147,14 +157,15 @@ class WeatheredPoints:
         return self.how.image(view, rgb, shown.depth, shown.semantics)
 
 
-# ablated --------------------------------------------------------------------------------------------------------------
+# ablated ------------------------------------------------------------------------------------------
 
 
 ConditionParts = Literal["full", "reference", "points", "concat", "freevs", "repair"]
-"""full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of the points alone,
-without recorded images and renders. concat: points and that image, without anything warped by depth, and without renders. repair:
-renders of a fit and that image, without anything measured. Of published-type models reference and points leave out the other; concat
-shows the image in frame 0, beside the points, and not in the image tokens."""
+"""full: the whole condition. reference: the nearest recorded image alone, put up far away. points: colour and depth of
+the points alone, without recorded images and renders. concat: points and that image, without anything warped by depth,
+and without renders. repair: renders of a fit and that image, without anything measured. Of published-type models
+reference and points leave out the other; concat shows the image in frame 0, beside the points, and not in the image
+tokens."""
 
 
 COVERED = 0.5
@@ -163,8 +174,8 @@ COVERED = 0.5
 
 @dataclass(frozen=True, slots=True)
 class ConditionSources:
-    """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, renders of a fit, and the log's
-    sweeps, where they are needed; of an edited drive also where something stood that is not there any more, and,
+    """What conditions of a scene are made of: its clouds and tracks, recorded images, rules, renders of a fit, and the
+    log's sweeps, where they are needed; of an edited drive also where something stood that is not there any more, and,
     for published-type models, its weather."""
 
     cloud: FusedCloud
@@ -194,8 +205,12 @@ def conditions_of(
         return condition, condition
     if parts == "full":
         how, render_at = sources.weather, sources.render_at
-        recolor = WeatheredPoints(how, render_at) if rules.published and how is not None and render_at is not None else None
-        return build_conditions(cloud, tracks, views, recorded, rules, kept, render_at, sources.vacated_at, recolor=recolor)
+        recolor = (
+            WeatheredPoints(how, render_at) if rules.published and how is not None and render_at is not None else None
+        )
+        return build_conditions(
+            cloud, tracks, views, recorded, rules, kept, render_at, sources.vacated_at, recolor=recolor
+        )
     if parts == "repair":
         return _of_renders(sources, views, kept)
     if rules.published:
@@ -216,13 +231,15 @@ def conditions_of(
 def _of_renders(
     sources: ConditionSources, views: Sequence[View], kept: dict[int, WarpSource]
 ) -> tuple[Condition, Condition]:
-    """Renders in the place of points, none of them measured, and the nearest recorded image. Where a render covers a pixel it counts as a
-    recorded image that was warped there: it is the picture that is repaired."""
+    """Renders in the place of points, none of them measured, and the nearest recorded image. Where a render covers a
+    pixel it counts as a recorded image that was warped there: it is the picture that is repaired."""
     if sources.render_at is None:
         raise UsageError("this condition needs renders of a fitted scene", got="repair")
     rules, static = replace(sources.rules, images_per_view=1), sources.cloud.static
     labels = None if static.semantics is None else static.semantics[:0]
-    empty = FusedCloud(replace(static, xyz=static.xyz[:0], rgb=static.rgb[:0], semantics=labels), {}, sources.cloud.colors)
+    empty = FusedCloud(
+        replace(static, xyz=static.xyz[:0], rgb=static.rgb[:0], semantics=labels), {}, sources.cloud.colors
+    )
     made = build_conditions(empty, (), views, sources.recorded, rules, kept, sources.render_at)
 
     def bare(given: Condition) -> Condition:
@@ -230,9 +247,13 @@ def _of_renders(
         if shown is None:
             raise UsageError("this condition needs renders of a fitted scene", got="repair")
         return replace(
-            given, color=shown.color, depth=shown.depth, semantics=shown.semantics, valid=torch.zeros_like(given.valid),
+            given,
+            color=shown.color,
+            depth=shown.depth,
+            semantics=shown.semantics,
+            valid=torch.zeros_like(given.valid),
             warped=shown.alpha > COVERED,
-        )  # fmt: skip
+        )
 
     small, fine = (bare(given) for given in made)
     return small, fine
@@ -244,6 +265,9 @@ def _with_backdrop(points: Condition, images: Condition, rules: ConditionRules, 
     if parts == "concat" or images.backdrop is None:
         return given
     return replace(
-        given, color=images.backdrop, semantics=images.backdrop_semantics, valid=torch.zeros_like(points.valid),
+        given,
+        color=images.backdrop,
+        semantics=images.backdrop_semantics,
+        valid=torch.zeros_like(points.valid),
         depth=torch.full_like(points.depth, rules.far_m),
-    )  # fmt: skip
+    )

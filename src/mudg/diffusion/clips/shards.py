@@ -3,7 +3,8 @@
 A shard is a safetensors file with, for K clips of T frames,
 
     rgb u8[K,T,3,H,W]  depth f16[K,T,H,W] metres (codes beyond 1000 m and sky as 1000)  semantics u8[K,T,H,W]
-    color u8[K,T,3,H,W]  sparse_depth f16[K,T,H,W]  flags u8[K,T,H,W] (1 = a point was seen, 2 = colour warped, 4 = depth
+    color u8[K,T,3,H,W]  sparse_depth f16[K,T,H,W]
+    flags u8[K,T,H,W] (1 = a point was seen, 2 = colour warped, 4 = depth
         is not true, it only fills a gap; clips of recorded logs)
     backdrop u8[K,T,3,H,W]  reference u8[K,3,H,W]  shift_m f32[K]
     ids, backdrop_ids u8[K,T,H,W]: classes that came with color and backdrop, 255 = unknown
@@ -17,9 +18,11 @@ and, where a fitted scene was rendered,
 
 and, of recorded logs with annotated depth, depth_confidence u8[K,T,H,W] (of 255)
 
-and, of the published system's conditions, measured f16[K,T,H,W] metres: what points measured (`Condition.measured`), 0 = nothing
+and, of the published system's conditions, measured f16[K,T,H,W] metres: what points measured (`Condition.measured`), 0
+= nothing
 
-and, for patches at a higher resolution, all of these once more as fine_NAME, with fine_place i32[K,3] (row, column, scale).
+and, for patches at a higher resolution, all of these once more as fine_NAME, with fine_place i32[K,3] (row, column,
+scale).
 """
 
 from __future__ import annotations
@@ -55,8 +58,8 @@ def shard_path(folder: Path, city: int) -> Path:
 def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArray[np.generic]]:
     """Arrays of a shard from clips of one size.
 
-    Depth that is not valid is stored as far away, as is right for a generated sky. With `gaps` it is stored as it is, and
-    marked as unknown. A condition's depth of 0 (nothing seen; points alone) stays 0.
+    Depth that is not valid is stored as far away, as is right for a generated sky. With `gaps` it is stored as it is,
+    and marked as unknown. A condition's depth of 0 (nothing seen; points alone) stays 0.
     """
 
     def u8(image: Tensor) -> NDArray[np.uint8]:
@@ -102,11 +105,13 @@ def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArra
     if any(c.renders is not None for c in conditions):
         shown = [_empty_renders(c) if c.renders is None else c.renders for c in conditions]
         arrays |= {
-            "render": np.stack([u8(r.color) for r in shown]), "render_depth": np.stack([f16(r.depth) for r in shown]),
-            "alpha": np.stack([u8(r.alpha)[:, 0] for r in shown]), "certainty": np.stack([u8(r.certainty)[:, 0] for r in shown]),
+            "render": np.stack([u8(r.color) for r in shown]),
+            "render_depth": np.stack([f16(r.depth) for r in shown]),
+            "alpha": np.stack([u8(r.alpha)[:, 0] for r in shown]),
+            "certainty": np.stack([u8(r.certainty)[:, 0] for r in shown]),
             "render_ids": np.stack([r.semantics[:, 0].numpy() for r in shown]),
             "rendered": np.array([c.renders is not None for c in conditions]),
-        }  # fmt: skip
+        }
     measured = [c.measured for c in conditions if c.measured is not None]
     if measured and len(measured) == len(clips):
         arrays["measured"] = np.stack([f16(m.depth) * m.valid[:, 0].numpy() for m in measured])
@@ -166,28 +171,48 @@ def _frames_at(path: Path) -> int:
         return int(shard.get_slice("rgb").get_shape()[1])
 
 
-def _open(path: Path) -> safe_open:  # type: ignore[valid-type]
+def _open(path: Path) -> safe_open:
     try:
         return safe_open(str(store.regular(path)), "numpy")
     except (SafetensorError, OSError) as error:
-        raise InputError("a shard of training clips is missing or damaged", where=str(path), got=str(error),
-            remedy="delete it; it is made again") from error  # fmt: skip
+        raise InputError(
+            "a shard of training clips is missing or damaged",
+            where=str(path),
+            got=str(error),
+            remedy="delete it; it is made again",
+        ) from error
 
 
-_PER_FRAME = ("rgb", "depth", "semantics", "color", "sparse_depth", "flags", "backdrop", "ids", "backdrop_ids", "world_from_cam",
-              "intrinsics")  # fmt: skip
+_PER_FRAME = (
+    "rgb",
+    "depth",
+    "semantics",
+    "color",
+    "sparse_depth",
+    "flags",
+    "backdrop",
+    "ids",
+    "backdrop_ids",
+    "world_from_cam",
+    "intrinsics",
+)
 
 
 _RENDERS = ("render", "render_depth", "alpha", "certainty", "render_ids")
 _ARRAYS = {
-    **dict.fromkeys(("rgb", "color", "backdrop", "point_color", "render"), ("U8", "KT3HW")), "reference": ("U8", "K3HW"),
+    **dict.fromkeys(("rgb", "color", "backdrop", "point_color", "render"), ("U8", "KT3HW")),
+    "reference": ("U8", "K3HW"),
     **dict.fromkeys(("depth", "sparse_depth", "measured", "render_depth"), ("F16", "KTHW")),
     **dict.fromkeys(
-        ("semantics", "flags", "ids", "backdrop_ids", "alpha", "certainty", "render_ids", "depth_confidence"), ("U8", "KTHW")
+        ("semantics", "flags", "ids", "backdrop_ids", "alpha", "certainty", "render_ids", "depth_confidence"),
+        ("U8", "KTHW"),
     ),
-    "world_from_cam": ("F64", "KT44"), "intrinsics": ("F64", "KT4"), "shift_m": ("F32", "K"), "rendered": ("BOOL", "K"),
+    "world_from_cam": ("F64", "KT44"),
+    "intrinsics": ("F64", "KT4"),
+    "shift_m": ("F32", "K"),
+    "rendered": ("BOOL", "K"),
     "place": ("I32", "K3"),
-}  # fmt: skip
+}
 """Types and axes of a shard's arrays: clips, frames, rows, columns, and sizes that are always the same."""
 
 
@@ -195,7 +220,10 @@ def _check_arrays(shard: Any, path: Path) -> None:
     """InputError where an array is missing, or of another type or size than the others say; only the header is read."""
     names = set(shard.keys())
     for prefix in ("", FINE) if f"{FINE}place" in names else ("",):
-        required = {prefix + name for name in (*_PER_FRAME, "reference", "shift_m", *(_RENDERS if f"{prefix}rendered" in names else ()))}
+        required = {
+            prefix + name
+            for name in (*_PER_FRAME, "reference", "shift_m", *(_RENDERS if f"{prefix}rendered" in names else ()))
+        }
         if required - names:
             raise _damaged(path, "every array of a shard", f"no {', '.join(sorted(required - names))}")
         shape = shard.get_slice(f"{prefix}rgb").get_shape()
@@ -214,13 +242,24 @@ def _check_values(found: Mapping[str, Tensor], path: Path) -> None:
     for name, value in found.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             raise _damaged(path, "finite numbers", name)
-        if name in ("semantics", "ids", "backdrop_ids", "render_ids") and bool(((value >= len(CLASSES)) & (value != UNLABELLED)).any()):
-            raise _damaged(path, f"classes below {len(CLASSES)}, or {UNLABELLED}", f"{name}: {int(value[value != UNLABELLED].max())}")
+        if name in ("semantics", "ids", "backdrop_ids", "render_ids") and bool(
+            ((value >= len(CLASSES)) & (value != UNLABELLED)).any()
+        ):
+            raise _damaged(
+                path,
+                f"classes below {len(CLASSES)}, or {UNLABELLED}",
+                f"{name}: {int(value[value != UNLABELLED].max())}",
+            )
 
 
 def _damaged(path: Path, expected: str, got: str) -> InputError:
-    return InputError("a shard of training clips is damaged", where=str(path), expected=expected, got=got,
-        remedy="delete it; it is made again")  # fmt: skip
+    return InputError(
+        "a shard of training clips is damaged",
+        where=str(path),
+        expected=expected,
+        got=got,
+        remedy="delete it; it is made again",
+    )
 
 
 def read_clip(folder: Path | ShardSource, city: int, clip: int, frames: Sequence[int]) -> Clip:
@@ -236,8 +275,13 @@ def clip_at(path: Path, clip: int, frames: Sequence[int]) -> Clip:
         _check_arrays(shard, path)
         clips, most = shard.get_slice("rgb").get_shape()[:2]
         if not (0 <= clip < clips and 0 <= min(frames) and max(frames) < most):
-            raise InputError("a shard has fewer clips or frames", where=str(path), got=f"{clips} clips of {most} frames",
-                expected=f"clip {clip}, frame {max(frames)}", remedy="choose another --data.clips, or a smaller --data.window")  # fmt: skip
+            raise InputError(
+                "a shard has fewer clips or frames",
+                where=str(path),
+                got=f"{clips} clips of {most} frames",
+                expected=f"clip {clip}, frame {max(frames)}",
+                remedy="choose another --data.clips, or a smaller --data.window",
+            )
         made = _read_part(shard, "", clip, frames, path)
         if f"{FINE}place" not in shard.keys():
             return made
@@ -249,8 +293,11 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int], path: 
     """A clip, or its patch, from the arrays whose names begin with `prefix`."""
     there = set(shard.keys())
     if f"{prefix}effect" in there:
-        raise InputError("the clips are of generated cities in other weather, which are no longer learned from", got="an array effect",
-                         remedy="choose another folder of clips: it is filled anew")  # fmt: skip
+        raise InputError(
+            "the clips are of generated cities in other weather, which are no longer learned from",
+            got="an array effect",
+            remedy="choose another folder of clips: it is filled anew",
+        )
     rendered = f"{prefix}rendered" in there and bool(shard.get_slice(f"{prefix}rendered")[clip])
     names = [
         *_PER_FRAME,
@@ -271,29 +318,44 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int], path: 
     renders = None
     if rendered:
         renders = RenderPlanes(
-            image(found["render"]), plane(found["render_depth"]), plane(found["alpha"]) / 255, plane(found["certainty"]) / 255,
+            image(found["render"]),
+            plane(found["render_depth"]),
+            plane(found["alpha"]) / 255,
+            plane(found["certainty"]) / 255,
             found["render_ids"].unsqueeze(1),
-        )  # fmt: skip
+        )
     measured = plane(found["measured"]) if "measured" in found else None
     condition = Condition(
-        views, image(found["color"]), plane(found["sparse_depth"]), (flags & FLAG_VALID) > 0, image(reference),
-        warped=(flags & FLAG_WARPED) > 0, backdrop=image(found["backdrop"]), semantics=found["ids"].unsqueeze(1),
-        backdrop_semantics=found["backdrop_ids"].unsqueeze(1), renders=renders,
+        views,
+        image(found["color"]),
+        plane(found["sparse_depth"]),
+        (flags & FLAG_VALID) > 0,
+        image(reference),
+        warped=(flags & FLAG_WARPED) > 0,
+        backdrop=image(found["backdrop"]),
+        semantics=found["ids"].unsqueeze(1),
+        backdrop_semantics=found["backdrop_ids"].unsqueeze(1),
+        renders=renders,
         measured=None if measured is None else SparseDepth(measured, measured > 0),
-    )  # fmt: skip
+    )
     return Clip(
-        condition, image(found["rgb"]), plane(found["depth"]), (flags & FLAG_DEPTH_UNKNOWN) == 0, found["semantics"].long(), shift_m,
+        condition,
+        image(found["rgb"]),
+        plane(found["depth"]),
+        (flags & FLAG_DEPTH_UNKNOWN) == 0,
+        found["semantics"].long(),
+        shift_m,
         image(found["point_color"]) if "point_color" in found else None,
         depth_confidence=plane(found["depth_confidence"]) / 255 if "depth_confidence" in found else None,
-    )  # fmt: skip
+    )
 
 
 def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     """Random mirror image, one random colour curve for truth and condition alike, and worse or no given classes.
 
     Curves: gain 0.7-1.4, gamma 0.75-1.35, contrast 0.75-1.35 about the clip's mean, saturation 0.5-1.4, white balance
-    +-8 %; the condition gets a further exposure error of +-3 %.
-    Given classes: see `ClassMistakes`. A mirrored clip keeps its poses and intrinsics: they then describe the mirror image of the place.
+    +-8 %; the condition gets a further exposure error of +-3 %. Given classes: see `ClassMistakes`. A mirrored clip
+    keeps its poses and intrinsics: they then describe the mirror image of the place.
 
     Args:
         clip: as read from a shard, with warped colours, backdrop and classes. Its patch is varied in the same way.
@@ -345,7 +407,9 @@ def _mirrored(clip: Clip) -> Clip:
     own = {name: flip(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
     if clip.depth_confidence is not None:
         own["depth_confidence"] = flip(clip.depth_confidence)
-    return replace(clip, condition=replace(given, **turned, renders=renders, measured=measured), **own, shift_m=-clip.shift_m)
+    return replace(
+        clip, condition=replace(given, **turned, renders=renders, measured=measured), **own, shift_m=-clip.shift_m
+    )
 
 
 NO_IDS, WORSE_IDS = 0.35, 0.25
@@ -358,8 +422,8 @@ NO_RENDERS = 0.1
 class ClassMistakes:
     """Given classes as a labeller might have made them: exact, none at all, or with mistakes.
 
-    Mistakes: a class is unknown (15 %) or taken for another one (8 %) throughout (`table` u8[256], None = none are given), and blocks
-    of 8x8 pixels are unknown (`holes`: the share of the blocks, and the seed of the draw).
+    Mistakes: a class is unknown (15 %) or taken for another one (8 %) throughout (`table` u8[256], None = none are
+    given), and blocks of 8x8 pixels are unknown (`holes`: the share of the blocks, and the seed of the draw).
     """
 
     table: NDArray[np.uint8] | None

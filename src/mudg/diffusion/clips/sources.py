@@ -1,7 +1,8 @@
-"""Where training clips come from when they are not in one folder of this machine: an object store, through a bounded cache.
+"""Where training clips come from when they are not in one folder of this machine: an object store, through a bounded
+cache.
 
-What is in the cache is a copy, or can be made again. Several processes may share it: files appear under their names complete, and one
-that another process removed meanwhile is brought once more.
+What is in the cache is a copy, or can be made again. Several processes may share it: files appear under their names
+complete, and one that another process removed meanwhile is brought once more.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ _TRIES = 3
 
 
 class ShardCache:
-    """A folder of shards of at most `limit` bytes. Those used longest ago are removed first; the newest one always stays.
+    """A folder of shards of at most `limit` bytes. Those used longest ago are removed first; the newest one always
+    stays.
 
     The time of a file's last change says when it was last used.
     """
@@ -83,7 +85,10 @@ class FolderOfShards:
         for above, prefix in ((place, ""), (_parent(place), f"{place.name}/")):
             found = above.uploaded() if above is not None else None
             if found is not None:
-                return cls(place, {name[len(prefix) :]: one.sha256 for name, one in found.files.items() if name.startswith(prefix)})
+                return cls(
+                    place,
+                    {name[len(prefix) :]: one.sha256 for name, one in found.files.items() if name.startswith(prefix)},
+                )
         return cls(place, {})
 
     @property
@@ -102,7 +107,8 @@ class FolderOfShards:
         """Write a shard to `path`, verified.
 
         Raises:
-            InputError: it is not there. IntegrityError: it is not what was uploaded, twice. ResourceError: no connection.
+            InputError: it is not there. IntegrityError: it is not what was uploaded, twice. ResourceError: no
+                connection.
         """
         name = clip_shards.shard_path(Path(), number).name
         wanted = self.sums.get(name, "")
@@ -113,8 +119,13 @@ class FolderOfShards:
                 store.atomic_write(path, content)
                 return
             if last:
-                raise IntegrityError("what came is not what was uploaded", where=f"{self.place}/{name}",
-                    expected=f"sha256 {wanted[:16]}...", got=f"sha256 {got[:16]}...", remedy="upload the clips again")  # fmt: skip
+                raise IntegrityError(
+                    "what came is not what was uploaded",
+                    where=f"{self.place}/{name}",
+                    expected=f"sha256 {wanted[:16]}...",
+                    got=f"sha256 {got[:16]}...",
+                    remedy="upload the clips again",
+                )
 
 
 def _parent(place: Location) -> Location | None:
@@ -146,8 +157,13 @@ class StreamedShards:
         found = clip_shards.clips_at(path)
         if number < HELD_OUT and found != self._clips:
             store.remove(path)
-            raise InputError("the training clips have another number of clips in each shard", where=str(self._folder.place),
-                expected=str(self._clips), got=str(found), remedy=f"--data.clips-per-city {found}")  # fmt: skip
+            raise InputError(
+                "the training clips have another number of clips in each shard",
+                where=str(self._folder.place),
+                expected=str(self._clips),
+                got=str(found),
+                remedy=f"--data.clips-per-city {found}",
+            )
 
     def clips_in(self, number: int) -> int:
         """Clips in a shard; of those to train on without fetching it."""

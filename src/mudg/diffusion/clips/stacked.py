@@ -34,7 +34,8 @@ def stacked(rows: Iterable[Sequence[Tensor]], count: int, folder: Path | None) -
     """``torch.stack`` of every column of ``count`` rows, of which only one is in memory besides.
 
     Args:
-        rows: planes ``[..., H, W]`` of one view each. folder: where large ones are put into files; None: all stay in memory.
+        rows: planes ``[..., H, W]`` of one view each. folder: where large ones are put into files; None: all stay in
+            memory.
     """
     stacks: list[Tensor] = []
     for number, row in enumerate(rows):

@@ -1,8 +1,9 @@
 """convert: a published checkpoint -> a model folder that `synthesize` and training read.
 
-The checkpoint is a pickle from elsewhere. It is opened in a process of its own, under a memory limit, by torch's restricted
-unpickler; its names and shapes are compared with the network's, strictly; its caption is embedded once, so that the
-text tower need not be kept. Checkpoints of DynamiCrafter (8 input channels, no modality label) are widened as the paper says.
+The checkpoint is a pickle from elsewhere. It is opened in a process of its own, under a memory limit, by torch's
+restricted unpickler; its names and shapes are compared with the network's, strictly; its caption is embedded once, so
+that the text tower need not be kept. Checkpoints of DynamiCrafter (8 input channels, no modality label) are widened as
+the paper says.
 """
 
 from __future__ import annotations
@@ -33,9 +34,9 @@ DTYPES = {"keep": None, "float32": torch.float32, "float16": torch.float16, "bfl
 SHARD_BYTES = 2**30
 """Largest size of one weight file."""
 LICENCE = (
-    "Weights keep the terms of those who published them; read the page they came from before any use. The code of MuDG and of "
-    "DynamiCrafter is Apache-2.0; the data they were trained on have licences of their own (the Waymo Open Dataset is for "
-    "non-commercial use)."
+    "Weights keep the terms of those who published them; read the page they came from before any use. The code of MuDG"
+    " and of DynamiCrafter is Apache-2.0; the data they were trained on have licences of their own (the Waymo Open"
+    " Dataset is for non-commercial use)."
 )
 
 
@@ -48,12 +49,14 @@ def run(config: ConvertConfig, checkpoint: Path, to: Path, conversion: Conversio
     """Convert one checkpoint; returns `to`, which is complete or not there.
 
     Args:
-        config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file; or the folder around DepthLab's files.
+        config: see `ConvertConfig`. checkpoint: a .ckpt, .pt or .safetensors file; or the folder around DepthLab's
+            files.
         to: folder of the model; replaced only with `overwrite`.
         conversion: of this kind of checkpoint.
 
     Raises:
-        UsageError: the folder exists, or the resolution is not known. InputError: not such a checkpoint; nothing is written.
+        UsageError: the folder exists, or the resolution is not known. InputError: not such a checkpoint; nothing is
+            written.
         ResourceError: memory limit or disk.
     """
     checkpoint, to = Path(checkpoint), Path(to)
@@ -64,7 +67,9 @@ def run(config: ConvertConfig, checkpoint: Path, to: Path, conversion: Conversio
     if replaces and not overwrite:
         raise UsageError("the folder exists", where=str(to), remedy="choose another --to, or add --overwrite")
     if replaces and not _holds_model(to):
-        raise UsageError("the folder holds files that do not belong to a model", where=str(to), remedy="choose another --to")
+        raise UsageError(
+            "the folder holds files that do not belong to a model", where=str(to), remedy="choose another --to"
+        )
     place = replacement.staging if replaces else to  # until it is whole, the old model stays as it is
     work, limit = conversion(place)
     if replaces:
@@ -89,7 +94,8 @@ def _holds_model(folder: Path) -> bool:
 
 
 def own_names(folder: Path) -> list[str]:
-    """Names of the files that a model folder's description lists, and its own last; none if there is no such description."""
+    """Names of the files that a model folder's description lists, and its own last; none if there is no such
+    description."""
     try:
         content = store.read_json(folder / "model.json")
         files = list(content["files"]) if "files" in content else []
@@ -100,7 +106,9 @@ def own_names(folder: Path) -> list[str]:
         return []
 
 
-def of_diffusion(config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None = None) -> tuple[Work, int]:
+def of_diffusion(
+    config: ConvertConfig, checkpoint: Path, to: Path, network: PublishedConfig | None = None
+) -> tuple[Work, int]:
     """The conversion of a diffusion model, and the address space it may take.
 
     Args:
@@ -124,16 +132,18 @@ def resolution(config: ConvertConfig, checkpoint: Path) -> tuple[int, int]:
             if mark in part:
                 return size
     raise UsageError(
-        "the training resolution is not in the file's name", where=str(checkpoint), expected="512 or 1024 in the name",
+        "the training resolution is not in the file's name",
+        where=str(checkpoint),
+        expected="512 or 1024 in the name",
         remedy="add --resolution 320x512 or --resolution 576x1024",
-    )  # fmt: skip
+    )
 
 
 def memory_limit(config: ConvertConfig, *files: Path) -> int:
     """Address space in bytes that conversion may add to what a process with torch has.
 
-    The files, mapped (or read, and then copied once, where their format cannot be mapped), twice the largest weight file
-    written, 3 GiB for working.
+    The files, mapped (or read, and then copied once, where their format cannot be mapped), twice the largest weight
+    file written, 3 GiB for working.
     """
     if config.memory_gb:
         return int(config.memory_gb * 1e9)
@@ -155,9 +165,16 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
     text = {name.removeprefix("text."): tensors.pop(name) for name in list(tensors) if name.startswith("text.")}
     tensors["text"] = embed_captions(network, text)
     facts = {
-        "source": {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": store.sha256_file(checkpoint)},
-        "adapted": adapted, "base_scale": base_scale, "caption": clip.CAPTION, "licence": LICENCE,
-    }  # fmt: skip
+        "source": {
+            "file": checkpoint.name,
+            "bytes": checkpoint.stat().st_size,
+            "sha256": store.sha256_file(checkpoint),
+        },
+        "adapted": adapted,
+        "base_scale": base_scale,
+        "caption": clip.CAPTION,
+        "licence": LICENCE,
+    }
     dtype = DTYPES[config.dtype]
     published_files.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=SHARD_BYTES)
 
@@ -166,19 +183,26 @@ def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:
     """InputError for DynamiCrafter-256, which looks alike and is another model."""
     marks = [name for name in found if ".framestride_embed." in name or name.endswith(".attn2.alpha")]
     if marks:
-        raise InputError("this is the 256-pixel DynamiCrafter, which cannot be converted", where=str(where),
+        raise InputError(
+            "this is the 256-pixel DynamiCrafter, which cannot be converted",
+            where=str(where),
             got=", ".join(marks[:3]),
-            expected="MuDG, or DynamiCrafter-512 or -1024: the small one predicts noise instead of velocity, has a schedule that never "
-            "reaches pure noise and no dynamic rescale, and weights its image attention with learned factors",
+            expected=(
+                "MuDG, or DynamiCrafter-512 or -1024: the small one predicts noise instead of velocity, has a schedule"
+                " that never reaches pure noise and no dynamic rescale, and weights its image attention with learned"
+                " factors"
+            ),
             remedy="take the 512 or 1024 checkpoint",
-        )  # fmt: skip
+        )
 
 
 def widen(found: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
-    """A checkpoint with 8 input channels made one with 12 and a modality label; others unchanged. Also says what was done.
+    """A checkpoint with 8 input channels made one with 12 and a modality label; others unchanged. Also says what was
+    done.
 
     The condition's four input channels are used twice, for colour and for depth, and the whole kernel, noise channels
-    included, is halved; the label's embedding starts as a copy of that of the noise step. Both as in the published training.
+    included, is halved; the label's embedding starts as a copy of that of the noise step. Both as in the published
+    training.
     """
     tensors = dict(found)
     kernel = tensors.get(_ENTER)
@@ -194,7 +218,8 @@ def widen(found: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
 
 
 def wanted_shapes(network: PublishedConfig) -> dict[str, tuple[int, ...]]:
-    """Our name -> shape of everything that a checkpoint must hold: the model, the text tower, the table of the dynamic rescale."""
+    """Our name -> shape of everything that a checkpoint must hold: the model, the text tower, the table of the dynamic
+    rescale."""
     with torch.device("meta"):
         model, tower = PublishedMDM(network), TextTower(network.text, network.vocabulary)
     shapes = {name: tuple(value.shape) for name, value in model.state_dict().items() if name != "text"}
@@ -203,19 +228,25 @@ def wanted_shapes(network: PublishedConfig) -> dict[str, tuple[int, ...]]:
 
 
 def _check_values(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: Path) -> None:
-    """InputError for values that no such model has: not finite, a schedule that keeps signal, a rescale outside (0, 1]."""
+    """InputError for values that no such model has: not finite, a schedule that keeps signal, a rescale outside (0,
+    1]."""
     weights.refuse_bad_values(tensors, str(where))
     scale, alpha_bar = tensors["scale"].float(), found.get("alphas_cumprod")
     if float(scale.min()) <= 0 or float(scale.max()) > 1 + 1e-6:
         raise InputError(
-            "the dynamic rescale table is out of range", where=f"{where}: scale_arr", expected="0 < value <= 1",
+            "the dynamic rescale table is out of range",
+            where=f"{where}: scale_arr",
+            expected="0 < value <= 1",
             got=f"{float(scale.min())} .. {float(scale.max())}",
-        )  # fmt: skip
+        )
     if alpha_bar is not None and abs(float(alpha_bar.flatten()[-1])) > 1e-6:
         raise InputError(
-            "the checkpoint's noise schedule keeps signal at its last step", where=f"{where}: alphas_cumprod[-1]", expected="0",
-            got=str(float(alpha_bar.flatten()[-1])), remedy="take a MuDG or DynamiCrafter checkpoint; this is another model",
-        )  # fmt: skip
+            "the checkpoint's noise schedule keeps signal at its last step",
+            where=f"{where}: alphas_cumprod[-1]",
+            expected="0",
+            got=str(float(alpha_bar.flatten()[-1])),
+            remedy="take a MuDG or DynamiCrafter checkpoint; this is another model",
+        )
 
 
 @torch.no_grad()
@@ -232,8 +263,7 @@ def embed_captions(network: PublishedConfig, tower_weights: Mapping[str, Tensor]
 def _card(network: PublishedConfig, facts: Mapping[str, Any]) -> str:
     adapted = facts["adapted"] or "nothing"
     return (
-        f"# Diffusion model converted from {facts['source']['file']}\n\n"
-        f"Trained at {network.width}x{network.height}, {network.window} frames. SHA-256 of the source: {facts['source']['sha256']}.\n"
-        f"Adapted: {adapted}. Dynamic rescale down to {facts['base_scale']:g}, as the checkpoint says.\n\n"
-        f"## Licence\n\n{facts['licence']}\n"
+        f"# Diffusion model converted from {facts['source']['file']}\n\nTrained at {network.width}x{network.height},"
+        f" {network.window} frames. SHA-256 of the source: {facts['source']['sha256']}.\nAdapted: {adapted}. Dynamic"
+        f" rescale down to {facts['base_scale']:g}, as the checkpoint says.\n\n## Licence\n\n{facts['licence']}\n"
     )

@@ -1,8 +1,9 @@
 """The KL autoencoder of the published model: images to latents of 1/8 the size and back.
 
-A convolutional encoder gives mean and log-variance of a Gaussian over 4 latent channels; a decoder inverts it (Rombach et al.,
-"High-resolution image synthesis with latent diffusion models"). Colour, depth and semantics all pass as three-channel images
-in [-1, 1]: depth as its linear code repeated three times, classes as colours of the published palette. No 8-bit step.
+A convolutional encoder gives mean and log-variance of a Gaussian over 4 latent channels; a decoder inverts it (Rombach
+et al., "High-resolution image synthesis with latent diffusion models"). Colour, depth and semantics all pass as
+three-channel images in [-1, 1]: depth as its linear code repeated three times, classes as colours of the published
+palette. No 8-bit step.
 
 As a codec it has the members that `networks/codec.py` asks for; frames go through a few at a time.
 """
@@ -115,10 +116,10 @@ class Encoder(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         h = self.enter(x)
         for level in self.down:
-            for block in level.blocks:  # type: ignore[union-attr]
+            for block in level.blocks:
                 h = block(h)
             if level.scale is not None:
-                h = level.scale(functional.pad(h, (0, 1, 0, 1)))  # type: ignore[operator]
+                h = level.scale(functional.pad(h, (0, 1, 0, 1)))
         return self.leave(functional.silu(self.norm(self.middle(h))))
 
 
@@ -142,8 +143,8 @@ class Decoder(nn.Module):
 
     def forward(self, z: Tensor) -> Tensor:
         h = self.middle(self.enter(z))
-        for level in reversed(self.up):  # type: ignore[call-overload]
-            for block in level.blocks:  # type: ignore[union-attr]
+        for level in reversed(self.up):
+            for block in level.blocks:
                 h = block(h)
             if level.scale is not None:
                 h = level.scale(functional.interpolate(h, scale_factor=2.0, mode="nearest"))
@@ -166,7 +167,7 @@ class Autoencoder(nn.Module):
         """Number format of the weights."""
         return self.to_moments.weight.dtype
 
-    # images and latents -----------------------------------------------------------------------------------------------
+    # images and latents ---------------------------------------------------------------------------
 
     def moments(self, image: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log-variance, each [N,4,H/8,W/8], of images [N,3,H,W] in [-1,1]; not scaled."""
@@ -196,7 +197,7 @@ class Autoencoder(nn.Module):
         image = torch.cat([self.decoder(self.from_latent(part)).float() for part in flat.split(frames_at_once)])
         return image.reshape(*lead, *image.shape[1:])
 
-    # modalities -------------------------------------------------------------------------------------------------------
+    # modalities -----------------------------------------------------------------------------------
 
     def depth_image(self, depth_m: Tensor) -> Tensor:
         """Depth [..,1,H,W] metres -> image [..,3,H,W]: 0..100 m to [-1,1], three times."""

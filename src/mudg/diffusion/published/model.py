@@ -5,8 +5,8 @@
     one pass per modality          v-prediction with classifier-free guidance, told apart by the modality label
     latents    -> pixels           autoencoder
 
-`encode_condition`, `loss` and `sample` mean what they mean in `diffusion/model.py`. Where model and paper differ from each other
-the defaults follow the released weights; docs/published.md lists the differences.
+`encode_condition`, `loss` and `sample` mean what they mean in `diffusion/model.py`. Where model and paper differ from
+each other the defaults follow the released weights; docs/published.md lists the differences.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from mudg.diffusion.published.video_unet import (
     VideoUNet,
     VideoUNetConfig,
 )
-from mudg.diffusion.requests import (  # fmt: skip
+from mudg.diffusion.requests import (
     GeneratedClip,
     SampleRequest,
     check_image_size,
@@ -58,7 +58,8 @@ LABELS: dict[Modality, int] = {"rgb": 0, "semantics": 1, "depth": 500}
 """Modality labels of the published checkpoints; fed through a sinusoid like a time step."""
 
 GUIDANCE = 7.5
-"""Weight of the guided over the unguided velocity, where a request has none; 1 switches guidance off and halves the work."""
+"""Weight of the guided over the unguided velocity, where a request has none; 1 switches guidance off and halves the
+work."""
 GUIDANCE_RESCALE = 0.7
 """Share of the guided velocity whose spread is pulled back to that of the conditional one."""
 
@@ -71,7 +72,8 @@ SCALE_ENTRIES = 1400
 
 @dataclass(frozen=True)
 class PublishedConfig:
-    """Everything that fixes the model's function except its weights. The defaults are the published model at 576x1024."""
+    """Everything that fixes the model's function except its weights. The defaults are the published model at
+    576x1024."""
 
     net: VideoUNetConfig = VideoUNetConfig()
     codec: AutoencoderConfig = AutoencoderConfig()
@@ -88,22 +90,29 @@ class PublishedConfig:
     fps: int = 10
     """Frame rate given to the network; the published one never saw another."""
     missing_is_zero: bool = True
-    """Give the network black and 0 m where nothing was seen, as in the published training, whatever the condition holds there."""
+    """Give the network black and 0 m where nothing was seen, as in the published training, whatever the condition holds
+    there."""
 
     def __post_init__(self) -> None:
         if self.text.width != self.net.context_width or self.image_tokens.context_width != self.net.context_width:
-            raise UsageError("caption and image tokens must have the width of the network's context",
-                expected=str(self.net.context_width), got=f"{self.text.width}, {self.image_tokens.context_width}")  # fmt: skip
+            raise UsageError(
+                "caption and image tokens must have the width of the network's context",
+                expected=str(self.net.context_width),
+                got=f"{self.text.width}, {self.image_tokens.context_width}",
+            )
         if self.image.width != self.image_tokens.image_width:
-            raise UsageError("image tower and resampler differ in width",
-                got=f"{self.image.width}, {self.image_tokens.image_width}")  # fmt: skip
+            raise UsageError(
+                "image tower and resampler differ in width", got=f"{self.image.width}, {self.image_tokens.image_width}"
+            )
         if (
             self.net.channels_in != 3 * self.codec.latent_channels
             or self.net.channels_out != self.codec.latent_channels
         ):
-            raise UsageError("the network must take three latents (noisy, colour, depth) and give one",
+            raise UsageError(
+                "the network must take three latents (noisy, colour, depth) and give one",
                 expected=f"{3 * self.codec.latent_channels} -> {self.codec.latent_channels}",
-                got=f"{self.net.channels_in} -> {self.net.channels_out}")  # fmt: skip
+                got=f"{self.net.channels_in} -> {self.net.channels_out}",
+            )
 
     @property
     def window(self) -> int:
@@ -120,8 +129,9 @@ class PublishedConfig:
 class PublishedLatents:
     """A batch of conditions as the network wants them.
 
-    planes f32[B,T,8,h,w]: latents of the colour and the depth condition; features [B,257,D] image tower's output for the reference and
-    grey [1,257,D] for a mid-grey image (the absent reference); seen f32[B,T,1,h,w] share of the cell that was seen.
+    planes f32[B,T,8,h,w]: latents of the colour and the depth condition; features [B,257,D] image tower's output for
+    the reference and grey [1,257,D] for a mid-grey image (the absent reference); seen f32[B,T,1,h,w] share of the cell
+    that was seen.
     """
 
     planes: Tensor
@@ -144,8 +154,8 @@ class WorkSplit:
 
 @dataclass(frozen=True)
 class _Told:
-    """What the network is told beside the latents: modality labels i64[N], caption tokens [N,77,D], image tokens [N,T,16,D], and keys
-    and values of both in every layer if they are needed more than once."""
+    """What the network is told beside the latents: modality labels i64[N], caption tokens [N,77,D], image tokens
+    [N,T,16,D], and keys and values of both in every layer if they are needed more than once."""
 
     label: Tensor
     text: Tensor
@@ -169,7 +179,8 @@ class ContextDropout:
 
 
 PAPER_DROPOUT = ContextDropout()
-"""The reference is missing in 20 % of the clips, as the paper says; the released training code does each of the three in 5 %."""
+"""The reference is missing in 20 % of the clips, as the paper says; the released training code does each of the three
+in 5 %."""
 
 MODALITY_SHARES: dict[Modality, float] = {"rgb": 0.5, "semantics": 0.25, "depth": 0.25}
 """How often a training clip shows which modality."""
@@ -211,9 +222,9 @@ class PublishedMDM(nn.Module):
     @property
     def dtype(self) -> torch.dtype:
         """Number format of the denoising network."""
-        return self.net.leave.weight.dtype  # type: ignore[return-value]
+        return self.net.leave.weight.dtype
 
-    # inputs -----------------------------------------------------------------------------------------------------------
+    # inputs ---------------------------------------------------------------------------------------
 
     def check_size(self, height: int, width: int) -> None:
         """UsageError unless an image of this size fits the network's strides."""
@@ -229,8 +240,13 @@ class PublishedMDM(nn.Module):
         if frames != self.config.window:
             raise UsageError(
                 "a clip of the published model has a fixed number of frames: its image tokens belong to one frame each",
-                where="PublishedMDM", expected=f"{self.config.window} frames", got=f"{frames}",
-                remedy=f"use trajectories of at least {self.config.window} frames; they are made in windows of that length")  # fmt: skip
+                where="PublishedMDM",
+                expected=f"{self.config.window} frames",
+                got=f"{frames}",
+                remedy=(
+                    f"use trajectories of at least {self.config.window} frames; they are made in windows of that length"
+                ),
+            )
 
     def encode_condition(
         self,
@@ -238,16 +254,18 @@ class PublishedMDM(nn.Module):
         generator: torch.Generator | None = None,
         known: Tensor | None = None,
     ) -> PublishedLatents:
-        """Latents of the conditions of clips of one shape, and image features of their references (see `PublishedLatents`).
+        """Latents of the conditions of clips of one shape, and image features of their references (see
+        `PublishedLatents`).
 
         Args:
             generator: noise of the autoencoder's posterior; needed unless the configuration names its mean.
-            known: colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the sparse
-                colour there (of every clip), frame 0 excepted.
+            known: colour f32[k,3,H,W] in [0,1] generated for the first k frames by the window before: they replace the
+                sparse colour there (of every clip), frame 0 excepted.
         """
         batch = [condition] if isinstance(condition, Condition) else list(condition)
         color, depth, valid, reference = (
-            torch.stack([getattr(c, name) for c in batch]).to(self.device) for name in ("color", "depth", "valid", "reference")
+            torch.stack([getattr(c, name) for c in batch]).to(self.device)
+            for name in ("color", "depth", "valid", "reference")
         )
         valid = valid.float()
         self.check_size(*color.shape[-2:])
@@ -286,11 +304,14 @@ class PublishedMDM(nn.Module):
     def encode_truth(
         self, rgb: Tensor, depth: Tensor, semantics: Tensor, generator: torch.Generator | None = None
     ) -> dict[Modality, Tensor]:
-        """Latents of a clip's truth: rgb [B,T,3,H,W] in [0,1], depth [B,T,1,H,W] m (sky = far), semantics i64[B,T,H,W]."""
+        """Latents of a clip's truth: rgb [B,T,3,H,W] in [0,1], depth [B,T,1,H,W] m (sky = far), semantics
+        i64[B,T,H,W]."""
         generator = self._posterior(generator)
         images: dict[Modality, Tensor] = {
-            "rgb": rgb * 2 - 1, "depth": self.codec.depth_image(depth), "semantics": self.codec.semantic_image(semantics)
-        }  # fmt: skip
+            "rgb": rgb * 2 - 1,
+            "depth": self.codec.depth_image(depth),
+            "semantics": self.codec.semantic_image(semantics),
+        }
         return {m: self._encode(image, generator) for m, image in images.items()}
 
     def _encode(self, image: Tensor, generator: torch.Generator | None) -> Tensor:
@@ -301,23 +322,28 @@ class PublishedMDM(nn.Module):
         if self.config.codec.posterior == "mean":
             return None
         if generator is None:
-            raise UsageError("encoding draws from the posterior and needs a generator", where="PublishedMDM",
-                remedy='or use posterior = "mean"')  # fmt: skip
+            raise UsageError(
+                "encoding draws from the posterior and needs a generator",
+                where="PublishedMDM",
+                remedy='or use posterior = "mean"',
+            )
         return generator
 
-    # network ----------------------------------------------------------------------------------------------------------
+    # network --------------------------------------------------------------------------------------
 
     def predict(
         self, x: Tensor, planes: Tensor, t: Tensor, names: Sequence[Modality], text: Tensor, tokens: Tensor
     ) -> Tensor:
-        """Velocity f32[N,T,4,h,w] of noisy latents `x` of the same shape, modality `names[n]` each, at steps `t` i64[N].
+        """Velocity f32[N,T,4,h,w] of noisy latents `x` of the same shape, modality `names[n]` each, at steps `t`
+        i64[N].
 
         planes [N,T,8,h,w]; text [N,77,D]; tokens [N,T,16,D].
         """
         return self._velocity(x, planes, t, self._told(names, text, tokens))
 
     def _told(self, names: Sequence[Modality], text: Tensor, tokens: Tensor, *, ahead: bool = False) -> _Told:
-        """What the network is told beside the latents; `ahead`: with keys and values of caption and image tokens, for many steps."""
+        """What the network is told beside the latents; `ahead`: with keys and values of caption and image tokens, for
+        many steps."""
         text, tokens = text.to(self.dtype), tokens.to(self.dtype)
         label = torch.tensor([LABELS[m] for m in names], device=text.device)
         return _Told(label, text, tokens, self.net.context_keys(text, tokens) if ahead else None)
@@ -328,10 +354,11 @@ class PublishedMDM(nn.Module):
         fps = torch.full_like(t, self.config.fps)
         return self.net(inputs, t, told.label, fps, told.text, told.tokens, told.keys).float()
 
-    # training ---------------------------------------------------------------------------------------------------------
+    # training -------------------------------------------------------------------------------------
 
     def loss(self, clips: Sequence[Clip], part: BatchPart, settings: LossSettings) -> Losses:
-        """`velocity_loss` of clips of one size; all that is drawn comes from `part`, the autoencoder's posterior clip by clip.
+        """`velocity_loss` of clips of one size; all that is drawn comes from `part`, the autoencoder's posterior clip
+        by clip.
 
         Raises:
             InputError: the clips' condition is not the published one.
@@ -341,12 +368,19 @@ class PublishedMDM(nn.Module):
         with torch.no_grad():
             for number, clip in enumerate(clips, part.first):
                 if clip.condition.warped is not None and bool(clip.condition.warped.any()):
-                    raise InputError("the training clips show warped images in their condition",
-                        where=f"step {part.step}", expected="points alone, as the published-type model is given",
-                        remedy="give another folder of clips; they are made anew")  # fmt: skip
+                    raise InputError(
+                        "the training clips show warped images in their condition",
+                        where=f"step {part.step}",
+                        expected="points alone, as the published-type model is given",
+                        remedy="give another folder of clips; they are made anew",
+                    )
                 draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
                 bare = settings.frame_dropout and bool(no_reference[number])
-                encoded.append(self.encode_condition(replace(clip.condition, reference_in="nowhere") if bare else clip.condition, draws))
+                encoded.append(
+                    self.encode_condition(
+                        replace(clip.condition, reference_in="nowhere") if bare else clip.condition, draws
+                    )
+                )
                 truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
             truth: dict[Modality, Tensor] = {m: torch.cat([one[m] for one in truths]) for m in MODALITIES}
             classes = torch.stack([clip.semantics != palette.UNLABELLED for clip in clips]).unsqueeze(2)
@@ -354,11 +388,18 @@ class PublishedMDM(nn.Module):
                 "depth": self._share_of_cells(torch.stack([clip.depth_weight for clip in clips])),
                 "semantics": self._share_of_cells(classes),
             }
-        planes, features, seen = (torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen"))
+        planes, features, seen = (
+            torch.cat([getattr(e, name) for e in encoded]) for name in ("planes", "features", "seen")
+        )
         return self.velocity_loss(
-            truth, PublishedLatents(planes, features, encoded[0].grey, seen), seeds.torch_generator(part.seed, part.step, "noise"),
-            dropout=dropout, known=known, first=part.first, batch_clips=part.count,
-        )  # fmt: skip
+            truth,
+            PublishedLatents(planes, features, encoded[0].grey, seen),
+            seeds.torch_generator(part.seed, part.step, "noise"),
+            dropout=dropout,
+            known=known,
+            first=part.first,
+            batch_clips=part.count,
+        )
 
     forward = loss
     """What `DistributedDataParallel` calls, to exchange gradients behind it."""
@@ -382,15 +423,18 @@ class PublishedMDM(nn.Module):
 
         Args:
             truth: latents of `encode_truth`, each [B,T,4,h,w].
-            encoded: where the reference is left out the image tokens go grey, as in the released code; frame 0 is as it was encoded.
+            encoded: where the reference is left out the image tokens go grey, as in the released code; frame 0 is as it
+                was encoded.
             generator: of all draws: modality, noise step, noise, which context is left out, dropout inside the network.
-            known: f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known everywhere.
+            known: f32[B,T,1,h,w] share of the cell whose truth is known, of any modality; one not named is known
+                everywhere.
             first: number of the first of these clips in the batch of a training step.
-            batch_clips: clips of that batch (0 = just these); what is drawn for a clip does not depend on how the batch is divided.
+            batch_clips: clips of that batch (0 = just these); what is drawn for a clip does not depend on how the batch
+                is divided.
 
         Returns:
-            A term for each modality that any clip of the batch shows, so that all parts have the same terms; scaled so that the
-            mean over equal parts is the mean over the clips that show it.
+            A term for each modality that any clip of the batch shows, so that all parts have the same terms; scaled so
+            that the mean over equal parts is the mean over the clips that show it.
         """
         count = encoded.planes.shape[0]
         batch_clips, own = batch_clips or count, slice(first, first + count)
@@ -412,13 +456,16 @@ class PublishedMDM(nn.Module):
             everywhere = torch.ones_like(x0[0, :, :1])
             squares = squares * torch.stack([known[m][n] if m in known else everywhere for n, m in enumerate(names)])
         errors = squares.flatten(1).mean(1)
-        sums = {m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in drawn}
+        sums = {
+            m: sum(float(e) for e, name in zip(errors.detach(), names) if name == m) for m in MODALITIES if m in drawn
+        }
         return Losses(errors.mean(), {m: total * batch_clips / (count * drawn.count(m)) for m, total in sums.items()})
 
     def _batch_draws(
         self, count: int, generator: torch.Generator, dropout: ContextDropout
     ) -> tuple[Tensor, list[Modality], Tensor, Tensor]:
-        """Of the clips of a batch: noise steps i64[N], modalities, and bool[N] each: without the caption, without the reference."""
+        """Of the clips of a batch: noise steps i64[N], modalities, and bool[N] each: without the caption, without the
+        reference."""
         steps, names = noise.stratified_steps(count, len(self.schedule), generator), _draw_modalities(count, generator)
         u = torch.rand(count, generator=generator)
         no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
@@ -436,36 +483,45 @@ class PublishedMDM(nn.Module):
     def temporal_parameters(self, which: Literal["transformers", "all"]) -> set[str]:
         """Names in `trained_part` of the parameters that mix frames.
 
-        Those of the temporal transformers inside the blocks, which is what the published second stage froze; or of `all` temporal
-        layers, that after the input convolution and the temporal convolutions included, which is what its text says.
+        Those of the temporal transformers inside the blocks, which is what the published second stage froze; or of
+        `all` temporal layers, that after the input convolution and the temporal convolutions included, which is what
+        its text says.
         """
         kinds = (TemporalTransformer, TemporalConv) if which == "all" else TemporalTransformer
         layers = [m for m in self.net.modules() if isinstance(m, kinds) and (which == "all" or m is not self.net.first)]
         ids = {id(parameter) for layer in layers for parameter in layer.parameters()}
         return {name for name, parameter in self.trained_part().named_parameters() if id(parameter) in ids}
 
-    # sampling ---------------------------------------------------------------------------------------------------------
+    # sampling -------------------------------------------------------------------------------------
 
     @staticmethod
     def check_request(request: SampleRequest) -> None:
         """UsageError for a setting that does not apply to this kind of model, or to the sampler."""
         request.sampler_settings()
         if request.start is not None:
-            raise UsageError("only small models can begin from a given clip", where="start", remedy="choose another model")
+            raise UsageError(
+                "only small models can begin from a given clip", where="start", remedy="choose another model"
+            )
 
     def image_size(self, width: int, height: int, width_px: int = 0) -> tuple[int, int]:
-        """Width and height the model works at: its own whatever the camera's are, or about `width_px` wide in the same aspect."""
+        """Width and height the model works at: its own whatever the camera's are, or about `width_px` wide in the same
+        aspect."""
         del width, height
         own = self.config
-        return sized_to_width(width_px, own.width / own.height, own.pixel_multiple) if width_px else (own.width, own.height)
+        return (
+            sized_to_width(width_px, own.width / own.height, own.pixel_multiple)
+            if width_px
+            else (own.width, own.height)
+        )
 
     @torch.no_grad()
     def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
-        """Generate one clip of exactly `config.window` frames (see `SampleRequest`). Condition and clip are on the model's device.
+        """Generate one clip of exactly `config.window` frames (see `SampleRequest`). Condition and clip are on the
+        model's device.
 
-        Steps run from the noisiest one down. Of frames whose latents are known, the decoded colour takes the place of the sparse
-        colour: the published way to continue a video. Depth and semantics are not continued. Without `align`, depth is
-        what the model says.
+        Steps run from the noisiest one down. Of frames whose latents are known, the decoded colour takes the place of
+        the sparse colour: the published way to continue a video. Depth and semantics are not continued. Without
+        `align`, depth is what the model says.
         """
         self.check_request(request)
         self.check_frames(len(condition.views))
@@ -474,7 +530,9 @@ class PublishedMDM(nn.Module):
         with torch.autocast(self.device.type, torch.bfloat16) if half else contextlib.nullcontext():
             before = None if request.known is None else request.known["rgb"].to(self.device)
             before = None if before is None else self.codec.decode_rgb(before, frames_at_once)
-            encoded = self.encode_condition(condition, seeds.torch_generator(request.seed, request.index, "posterior"), before)
+            encoded = self.encode_condition(
+                condition, seeds.torch_generator(request.seed, request.index, "posterior"), before
+            )
             tokens = self.image_tokens(torch.cat([encoded.features, encoded.grey]).to(self.image_tokens.queries.dtype))
             groups = [MODALITIES] if self.split.modalities_together else [(m,) for m in MODALITIES]
             latents: dict[Modality, Tensor] = {}
@@ -514,17 +572,22 @@ class PublishedMDM(nn.Module):
     ) -> noise.Denoise:
         """The denoiser for `names` in one batch: velocity with classifier-free guidance.
 
-        What is the same at every step is computed here, once: the condition's planes, and keys and values of caption and image.
+        What is the same at every step is computed here, once: the condition's planes, and keys and values of caption
+        and image.
         """
         guidance = GUIDANCE if request.guidance is None else request.guidance
         rescale = GUIDANCE_RESCALE if request.guidance_rescale is None else request.guidance_rescale
         count, both = len(names), slice(0, 1 if guidance == 1 else 2)  # 0: with caption and reference, 1: without
         halves = [both] if self.split.guidance_together or guidance == 1 else [slice(0, 1), slice(1, 2)]
         told = [
-            self._told(names * len(self.text[half]), self.text[half].repeat_interleave(count, 0),
-                       tokens[half].repeat_interleave(count, 0), ahead=True)
+            self._told(
+                names * len(self.text[half]),
+                self.text[half].repeat_interleave(count, 0),
+                tokens[half].repeat_interleave(count, 0),
+                ahead=True,
+            )
             for half in halves
-        ]  # fmt: skip
+        ]
 
         def passed(x: Tensor, t: int, about: _Told) -> Tensor:
             n = len(about.label)
@@ -545,7 +608,7 @@ def _draw_modalities(count: int, generator: torch.Generator) -> list[Modality]:
     return [names[int(place)] for place in torch.bucketize(u, limits, right=True)]
 
 
-# files ----------------------------------------------------------------------------------------------------------------
+# files --------------------------------------------------------------------------------------------
 #
 # Folders that hold a published-type diffusion model (see `diffusion/files.py` for what is in such a folder).
 
@@ -592,7 +655,13 @@ def save(
         store.write_safetensors(partial / "scale.safetensors", small)
         files["scale.safetensors"] = store.sha256_file(partial / "scale.safetensors")
         store.write_text(partial / "MODEL_CARD.md", card)
-        description = {"schema": 1, "kind": KIND, "config": dataclasses.asdict(config), "files": files, "facts": dict(facts)}
+        description = {
+            "schema": 1,
+            "kind": KIND,
+            "config": dataclasses.asdict(config),
+            "files": files,
+            "facts": dict(facts),
+        }
         store.write_json(partial / MODEL_FILE, description)
         store.sync_tree(partial)
 

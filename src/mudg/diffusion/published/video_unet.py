@@ -1,14 +1,15 @@
 """The denoising network of the published model: a latent-video UNet with spatial and temporal transformers.
 
 Everything except the temporal layers works on frames, [B*T,C,h,w]. A frame sees the others in three places: in the four
-1-D convolutions over time inside each residual block, in the temporal transformers (self-attention over the T frames at one
-cell; order is known only through the convolutions and the image tokens), and in `first`, one more temporal transformer right
-after the input convolution. Cross-attention looks at the caption's tokens and, with keys and values of its own, at the 16
-image tokens that belong to the frame.
+1-D convolutions over time inside each residual block, in the temporal transformers (self-attention over the T frames at
+one cell; order is known only through the convolutions and the image tokens), and in `first`, one more temporal
+transformer right after the input convolution. Cross-attention looks at the caption's tokens and, with keys and values
+of its own, at the 16 image tokens that belong to the frame.
 
 The vector that modulates the residual blocks is time(t) + label(modality) + fps(rate), all through sinusoids.
 
-Source: paper of MuDG, section on the multi-modal diffusion model; architecture of DynamiCrafter (Xing et al.) with a modality label added.
+Source: paper of MuDG, section on the multi-modal diffusion model; architecture of DynamiCrafter (Xing et al.) with a
+modality label added.
 """
 
 from __future__ import annotations
@@ -26,12 +27,12 @@ from mudg.base.errors import UsageError
 from mudg.diffusion.network import sinusoid
 from mudg.networks.clip import attend
 
-# resampler ------------------------------------------------------------------------------------------------------------
+# resampler ----------------------------------------------------------------------------------------
 #
 # The image-token resampler: from all tokens of the image tower to 16 tokens for each of 16 frames.
 #
-# Learned queries read from the image's tokens and from each other, layer by layer (Perceiver: Jaegle et al.; its use in video:
-# Alayrac et al., "Flamingo"). Queries belong to frames, so the number of frames is part of the weights.
+# Learned queries read from the image's tokens and from each other, layer by layer (Perceiver: Jaegle et al.; its use in
+# video: Alayrac et al., "Flamingo"). Queries belong to frames, so the number of frames is part of the weights.
 
 
 @dataclass(frozen=True)
@@ -77,9 +78,11 @@ class ResamplerLayer(nn.Module):
         hidden = config.feed_factor * config.width
         self.attention = ReadingAttention(config)
         self.feed = nn.Sequential(
-            nn.LayerNorm(config.width), nn.Linear(config.width, hidden, bias=False), nn.GELU(),
+            nn.LayerNorm(config.width),
+            nn.Linear(config.width, hidden, bias=False),
+            nn.GELU(),
             nn.Linear(hidden, config.width, bias=False),
-        )  # fmt: skip
+        )
 
     def forward(self, image: Tensor, queries: Tensor) -> Tensor:
         queries = queries + self.attention(image, queries)
@@ -107,7 +110,7 @@ class Resampler(nn.Module):
         return self.norm(self.leave(queries)).unflatten(1, (self.config.frames, self.config.tokens))
 
 
-# video unet -----------------------------------------------------------------------------------------------------------
+# video unet ---------------------------------------------------------------------------------------
 
 
 GROUPS = 32
@@ -132,18 +135,23 @@ class VideoUNetConfig:
 
     def __post_init__(self) -> None:
         if len(self.multipliers) != len(self.attention):
-            raise UsageError("multipliers and attention need one entry per level",
-                got=f"{self.multipliers}, {self.attention}")  # fmt: skip
+            raise UsageError(
+                "multipliers and attention need one entry per level", got=f"{self.multipliers}, {self.attention}"
+            )
         if self.width % GROUPS:
-            raise UsageError("the width is no multiple of the normalisation groups", expected=f"multiple of {GROUPS}",
-                got=str(self.width))  # fmt: skip
+            raise UsageError(
+                "the width is no multiple of the normalisation groups",
+                expected=f"multiple of {GROUPS}",
+                got=str(self.width),
+            )
 
 
 class SeededDropout(nn.Module):
-    """Dropout that draws for each clip from a seed of its own; the caller sets `seeds`, one per clip, before a training step.
+    """Dropout that draws for each clip from a seed of its own; the caller sets `seeds`, one per clip, before a training
+    step.
 
-    What is drawn depends on the layer's seeds alone: neither on the other clips of the batch nor on when the layer is run, so
-    that a second computation in the backward pass draws the same.
+    What is drawn depends on the layer's seeds alone: neither on the other clips of the batch nor on when the layer is
+    run, so that a second computation in the backward pass draws the same.
     """
 
     seeds: tuple[int, ...] = ()
@@ -157,9 +165,13 @@ class SeededDropout(nn.Module):
         if not self.training or self.share == 0:
             return x
         if not self.seeds or len(x) % len(self.seeds):
-            raise UsageError("dropout needs a seed for every clip", where="SeededDropout",
-                expected=f"a divisor of {len(x)} seeds", got=str(len(self.seeds)),
-                remedy="call PublishedMDM.loss, or eval()")  # fmt: skip
+            raise UsageError(
+                "dropout needs a seed for every clip",
+                where="SeededDropout",
+                expected=f"a divisor of {len(x)} seeds",
+                got=str(len(self.seeds)),
+                remedy="call PublishedMDM.loss, or eval()",
+            )
         shape = (len(x) // len(self.seeds), *x.shape[1:])
         draws = [
             torch.rand(shape, generator=torch.Generator(x.device).manual_seed(s), device=x.device) for s in self.seeds
@@ -184,7 +196,8 @@ class ContextKeys(NamedTuple):
 
 
 class Attention(nn.Module):
-    """Multi-head attention; with `image`, a second attention over image tokens is added before the output projection."""
+    """Multi-head attention; with `image`, a second attention over image tokens is added before the output
+    projection."""
 
     def __init__(self, width: int, context_width: int, heads: int, image: bool, dropout: float) -> None:
         super().__init__()
@@ -211,7 +224,7 @@ class Attention(nn.Module):
     def keys(self, context: Context) -> ContextKeys:
         """Keys and values of a context; of layers that have those of an image."""
         text, image = context
-        return ContextKeys(self.key(text), self.value(text), self.image_key(image), self.image_value(image))  # type: ignore[misc]
+        return ContextKeys(self.key(text), self.value(text), self.image_key(image), self.image_value(image))
 
 
 class GatedFeedForward(nn.Module):
@@ -286,7 +299,7 @@ class TemporalTransformer(nn.Module):
         tokens = self.norm(video).permute(0, 3, 4, 2, 1).reshape(-1, frames, c)
         tokens = functional.linear(tokens, self.enter.weight.flatten(1), self.enter.bias)
         tokens = self.block(tokens)
-        tokens = functional.linear(tokens, self.out.weight.flatten(1), self.out.bias)  # type: ignore[arg-type, operator, union-attr]
+        tokens = functional.linear(tokens, self.out.weight.flatten(1), self.out.bias)
         return x + tokens.reshape(n // frames, h, w, frames, c).permute(0, 3, 4, 1, 2).reshape(n, c, h, w)
 
 
@@ -305,7 +318,8 @@ class TemporalConv(nn.Module):
 
 
 class ResBlock(nn.Module):
-    """norm - SiLU - conv, the embedding added, norm - SiLU - conv, around a residual; then four temporal convolutions around another."""
+    """norm - SiLU - conv, the embedding added, norm - SiLU - conv, around a residual; then four temporal convolutions
+    around another."""
 
     def __init__(self, inside: int, outside: int, embed: int, dropout: float) -> None:
         super().__init__()
@@ -317,7 +331,7 @@ class ResBlock(nn.Module):
         self.conv2 = _zero(nn.Conv2d(outside, outside, 3, padding=1))
         self.skip = nn.Conv2d(inside, outside, 1) if inside != outside else nn.Identity()
         self.temporal = nn.ModuleList(TemporalConv(outside, dropout if n else 0.0) for n in range(4))
-        _zero(self.temporal[-1].conv)  # type: ignore[arg-type]
+        _zero(self.temporal[-1].conv)
 
     def forward(self, x: Tensor, embedding: Tensor, frames: int) -> Tensor:
         """`x` [B*T,inside,h,w], `embedding` [B*T,embed] -> [B*T,outside,h,w]."""
@@ -332,12 +346,19 @@ class ResBlock(nn.Module):
 
 
 class Stage(nn.Module):
-    """One step down or up the U: a plain convolution (`conv`), or a residual block with its transformers, and what enlarges after it."""
+    """One step down or up the U: a plain convolution (`conv`), or a residual block with its transformers, and what
+    enlarges after it."""
 
     def __init__(
-        self, inside: int, outside: int, config: VideoUNetConfig, *, conv_stride: int = 0, attention: bool = False,
+        self,
+        inside: int,
+        outside: int,
+        config: VideoUNetConfig,
+        *,
+        conv_stride: int = 0,
+        attention: bool = False,
         grow: bool = False,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
         self.conv = nn.Conv2d(inside, outside, 3, stride=conv_stride, padding=1) if conv_stride else None
         self.res = None if conv_stride else ResBlock(inside, outside, 4 * config.width, config.dropout)
@@ -416,14 +437,21 @@ class VideoUNet(nn.Module):
         self.leave = _zero(nn.Conv2d(inside, config.channels_out, 3, padding=1))
 
     def context_keys(self, text: Tensor, image: Tensor) -> list[ContextKeys]:
-        """Keys and values of caption tokens [B,77,D] and image tokens [B,T,16,D] in every layer that looks at them, in the order of
-        `forward`. They are the same at every noise step."""
+        """Keys and values of caption tokens [B,77,D] and image tokens [B,T,16,D] in every layer that looks at them, in
+        the order of `forward`. They are the same at every noise step."""
         spatial = [stage.spatial for stage in (*self.down, self.middle, *self.up) if stage.spatial is not None]
         context = Context(text, image.flatten(0, 1))
-        return [layer.block.attention2.keys(context) for layer in spatial]  # type: ignore[union-attr, operator]
+        return [layer.block.attention2.keys(context) for layer in spatial]
 
     def forward(
-        self, x: Tensor, t: Tensor, label: Tensor, fps: Tensor, text: Tensor, image: Tensor, keys: Sequence[ContextKeys] | None = None
+        self,
+        x: Tensor,
+        t: Tensor,
+        label: Tensor,
+        fps: Tensor,
+        text: Tensor,
+        image: Tensor,
+        keys: Sequence[ContextKeys] | None = None,
     ) -> Tensor:
         """One denoiser pass.
 
@@ -459,4 +487,4 @@ class VideoUNet(nn.Module):
         """A stage, kept for the backward pass or not. Dropout draws the same numbers when it is computed again."""
         if not (self.checkpointing and self.training and torch.is_grad_enabled()):
             return stage(*inputs)
-        return checkpoint(stage, *inputs, use_reentrant=False, preserve_rng_state=False)  # type: ignore[return-value]
+        return checkpoint(stage, *inputs, use_reentrant=False, preserve_rng_state=False)

@@ -11,21 +11,26 @@ from mudg.base.devices import DeviceName
 
 @settings
 class AdaptConfig:
-    """Adapt the diffusion model to a recorded log: train it for a few steps on the log's own photographs, seen from where other
-    photographs of the log were taken or might have been taken."""
+    """Adapt the diffusion model to a recorded log: train it for a few steps on the log's own photographs, seen from
+    where other photographs of the log were taken or might have been taken."""
 
     RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "cameras_left_out": ("block", []), "augment": ("precision", True), "label_confidence": ("precision", 0.5),
-    }  # fmt: skip
+        "cameras_left_out": ("block", []),
+        "augment": ("precision", True),
+        "label_confidence": ("precision", 0.5),
+    }
 
     model: str = "embedded"
-    """Diffusion model to start from: "embedded", shipped with the package, or a model folder written by learn. It must use renders."""
+    """Diffusion model to start from: "embedded", shipped with the package, or a model folder written by learn. It must
+    use renders."""
     cameras: tuple[str, ...] = ("front",)
     """Cameras whose photographs are learned (empty = the first camera)."""
     shifts_m: tuple[float, ...] = (2.5, -2.5)
-    """Lateral shifts in metres of the made-up drives beside the recorded path, from which the model learns to generate the photographs."""
+    """Lateral shifts in metres of the made-up drives beside the recorded path, from which the model learns to generate
+    the photographs."""
     gaps: bool = True
-    """Also learn to generate photographs from those of other times: half of the log is left out of a fit, then the other half."""
+    """Also learn to generate photographs from those of other times: half of the log is left out of a fit, then the
+    other half."""
     block: int = setting(default=4, ge=1)
     """Frames per training clip, and consecutive frames left out together."""
     held_out_every: int = setting(default=4, ge=2)
@@ -41,12 +46,13 @@ class AdaptConfig:
     trained: Literal["all", "refiner"] = "all"
     """Parts that are trained. refiner: refiner and finisher only."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
+    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
+    elsewhere."""
     device: DeviceName = "auto"
     """Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
     processes: int = setting(default=0, ge=0)
-    """Number of fits made at the same time, with one thread each (0 = one per core; at most four where the diffusion model is not on the
-    CPU). The result does not depend on it."""
+    """Number of fits made at the same time, with one thread each (0 = one per core; at most four where the diffusion
+    model is not on the CPU). The result does not depend on it."""
     threads: int = setting(default=0, ge=0)
     """Threads of the training (0 = one per core). Results are repeatable for the same number of threads."""
     seed: int = 0

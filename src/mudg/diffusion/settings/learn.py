@@ -18,31 +18,37 @@ class LearnData:
     STREAMED: ClassVar[tuple[str, ...]] = ("clips",)
     """Settings that may be addresses of an object store."""
     RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "weathers": ("textures", 0), "effect_dropout": ("textures", 0.1), "frame_step": ("held_out_every", 1),
+        "weathers": ("textures", 0),
+        "effect_dropout": ("textures", 0.1),
+        "frame_step": ("held_out_every", 1),
         "label_confidence": ("depth", 0.5),
-    }  # fmt: skip
+    }
 
     width: int = setting(default=192, ge=32)
     """Width of the training images in pixels."""
     height: int = setting(default=128, ge=32)
-    """Height of the training images in pixels. For logs only the area width x height counts; the aspect ratio is the camera's."""
+    """Height of the training images in pixels. For logs only the area width x height counts; the aspect ratio is the
+    camera's."""
     window: int = setting(default=8, ge=1)
     """Frames per clip."""
     clips: str = ""
-    """Folder of training clips to read; missing clips are added to it (empty = a folder inside the output). Give an earlier run's
-    folder to reuse its clips. At an address such as s3://bucket/clips all clips must be there; they are fetched when needed."""
+    """Folder of training clips to read; missing clips are added to it (empty = a folder inside the output). Give an
+    earlier run's folder to reuse its clips. At an address such as s3://bucket/clips all clips must be there; they are
+    fetched when needed."""
     augment: bool = True
     """Vary the training clips: change colours, mirror, and corrupt the classes in the condition."""
     reference_dropout: float = setting(default=0.2, ge=0, le=1)
-    """Published-type models: share of the clips that are trained without their reference image (paper: 0.2, released code:
-    0.1)."""
+    """Published-type models: share of the clips that are trained without their reference image (paper: 0.2, released
+    code: 0.1)."""
     reference_dropout_scope: Literal["tokens", "tokens_and_frame"] = "tokens"
-    """Published-type models: what such a clip lacks. tokens: the image tokens, as in the released code; frame 0 of the colour condition
-    still shows the reference. tokens_and_frame: frame 0 shows points like all others, too, which the paper's sentence may mean."""
+    """Published-type models: what such a clip lacks. tokens: the image tokens, as in the released code; frame 0 of the
+    colour condition still shows the reference. tokens_and_frame: frame 0 shows points like all others, too, which the
+    paper's sentence may mean."""
     cities: int = setting(default=240, ge=1)
     """Number of generated cities to train on."""
     skip_cities: int = setting(default=0, ge=0)
-    """Generated cities to leave out before the first one, for example those of an earlier run whose `clips` this run uses and adds to."""
+    """Generated cities to leave out before the first one, for example those of an earlier run whose `clips` this run
+    uses and adds to."""
     first_cities: int = setting(default=40, ge=1)
     """Number of cities in use from the first step. The others are generated and join while training runs."""
     all_cities_at: float = setting(default=0.6, ge=0, le=1)
@@ -50,29 +56,32 @@ class LearnData:
     clips_per_city: int = setting(default=4, ge=1)
     """Clips taken from each generated city."""
     realism: Literal["plain", "varied", "mixed"] = "plain"
-    """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). mixed = half of them
-    are. The small model then also learns five aspect ratios, all of about the area width x height. Cities for scoring stay plain."""
+    """Generated cities: varied = cities, cameras, LiDARs and their faults as in recorded logs (docs/training.md). mixed
+    = half of them are. The small model then also learns five aspect ratios, all of about the area width x height.
+    Cities for scoring stay plain."""
     log_frames: int = setting(default=12, ge=12)
     """Generated cities: frames of each log. Longer logs, with fits of more steps, give better renders."""
     side_cameras: float | None = setting(default=None, ge=0, le=1)
-    """Generated cities: share with two cameras beside the front one (not given: 0.4 of plain cities, 0.35 of varied ones)."""
+    """Generated cities: share with two cameras beside the front one (not given: 0.4 of plain cities, 0.35 of varied
+    ones)."""
     fit_steps: tuple[Annotated[int, Limits(ge=1)], Annotated[int, Limits(ge=1)]] = (100, 300)
     """Generated cities: fewest and most steps of the fit to each city; cities for scoring have the middle of them."""
     renders: bool = True
-    """Generated cities: fit a scene to each city's images for a few hundred steps and give its renders in the condition, with patches
-    at the camera's resolution. Takes about half a minute per city. Not done for models that use no renders. Without it, or on recorded
-    logs, no model learns to use renders or gets a finisher."""
+    """Generated cities: fit a scene to each city's images for a few hundred steps and give its renders in the
+    condition, with patches at the camera's resolution. Takes about half a minute per city. Not done for models that use
+    no renders. Without it, or on recorded logs, no model learns to use renders or gets a finisher."""
     condition: Literal["full", "freevs"] = "full"
-    """Generated cities: what the model is given. freevs: as FreeVS, coloured LiDAR points of two frames before and after each view, without
-    depth, recorded images, classes and renders; use the model with `mudg synthesize --condition freevs`."""
+    """Generated cities: what the model is given. freevs: as FreeVS, coloured LiDAR points of two frames before and
+    after each view, without depth, recorded images, classes and renders; use the model with `mudg synthesize
+    --condition freevs`."""
     textures: str = ""
-    """Varied cities: folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to use (empty =
-    none)."""
+    """Varied cities: folder with photographs of surfaces (textures/*.jpg, *.png) and panoramas of skies (sky/*.hdr) to
+    use (empty = none)."""
     held_out: int = setting(default=6, ge=1)
     """Number of additional cities that are used for scoring only."""
     scenes: tuple[str, ...] = ()
-    """Recorded logs to train on instead of cities: output folders of mudg run, or SCENE=FUSED for each. Or one list of many
-    scenes, a file that ends in .yaml, .json or .txt (docs/training.md)."""
+    """Recorded logs to train on instead of cities: output folders of mudg run, or SCENE=FUSED for each. Or one list of
+    many scenes, a file that ends in .yaml, .json or .txt (docs/training.md)."""
     bad_scenes: float = setting(default=0.02, ge=0, le=1)
     """Scenes of a list: share that may be missing or damaged. These are named and left out; more end the training."""
     cameras: tuple[str, ...] = ()
@@ -82,11 +91,11 @@ class LearnData:
     held_out_every: int = setting(default=5, ge=0)
     """Logs: every n-th clip is used for scoring only (0 = none)."""
     depth: Literal["annotated", "sweep"] = "annotated"
-    """Logs: what is learned as depth. annotated: the sweep taken with an image where it measured, elsewhere the scene's depth labels,
-    weighted with their confidence. sweep: the sweep alone, which covers a few percent of the pixels."""
+    """Logs: what is learned as depth. annotated: the sweep taken with an image where it measured, elsewhere the scene's
+    depth labels, weighted with their confidence. sweep: the sweep alone, which covers a few percent of the pixels."""
     least_points: float | None = setting(default=None, gt=0, le=1)
-    """Logs: smallest share of the cloud's points in the condition of a training clip; the share is drawn between this and 1 (not given:
-    0.3; published-type models: 1, all points, as in the paper)."""
+    """Logs: smallest share of the cloud's points in the condition of a training clip; the share is drawn between this
+    and 1 (not given: 0.3; published-type models: 1, all points, as in the paper)."""
 
 
 @settings
@@ -110,7 +119,8 @@ class LearnNetwork:
     renders: bool = True
     """Let the condition hold renders of a fitted scene."""
     finish_widths: tuple[int, ...] = (32, 64)
-    """Channels of the finisher, which brings clips to the camera's size, at half and at a quarter of that size (empty = no finisher)."""
+    """Channels of the finisher, which brings clips to the camera's size, at half and at a quarter of that size (empty =
+    no finisher)."""
     finish_blocks: tuple[int, ...] = (2, 2)
     """Residual blocks of the finisher at each level."""
 
@@ -158,8 +168,8 @@ class LearnLoss:
     """Terms of the training loss."""
 
     class_balance: float = setting(default=0.0, ge=0, le=1)
-    """Balance of rare classes in the semantic loss: 0 = as frequent as they are, 1 = all classes count the same. The bias this
-    gives the refiner's class scores is removed after training."""
+    """Balance of rare classes in the semantic loss: 0 = as frequent as they are, 1 = all classes count the same. The
+    bias this gives the refiner's class scores is removed after training."""
     refined_share: float = setting(default=0.5, gt=0, le=1)
     """The refiner is trained on a crop whose sides are this share of the image's."""
 
@@ -182,29 +192,29 @@ class LearnCompute:
     values."""
 
     device: DeviceName = "auto"
-    """Device on which the networks are trained and scored: auto (CUDA if there is one), cpu, cuda, cuda:N, mps. Under torchrun cuda is
-    one device for each process. Clips are made on the CPU."""
+    """Device on which the networks are trained and scored: auto (CUDA if there is one), cpu, cuda, cuda:N, mps. Under
+    torchrun cuda is one device for each process. Clips are made on the CPU."""
     parallel: Literal["ddp", "fsdp", "hsdp"] = "ddp"
-    """Under torchrun: ddp keeps the whole network in every process; fsdp shards parameters and optimizer state over all processes; hsdp
-    shards them within each node and keeps a replica on every node."""
+    """Under torchrun: ddp keeps the whole network in every process; fsdp shards parameters and optimizer state over all
+    processes; hsdp shards them within each node and keeps a replica on every node."""
     processes_per_replica: int = setting(default=0, ge=0)
     """hsdp: processes over which one replica is sharded (0 = the processes of a node)."""
     accumulate: int = setting(default=1, ge=1)
-    """Gradient accumulation: each process computes its share of a step in this many portions. Larger needs less memory and gives
-    the same result."""
+    """Gradient accumulation: each process computes its share of a step in this many portions. Larger needs less memory
+    and gives the same result."""
     recompute: bool = False
-    """Activation checkpointing: recompute the activations of the network's blocks in the backward pass. Needs less memory, takes
-    longer."""
+    """Activation checkpointing: recompute the activations of the network's blocks in the backward pass. Needs less
+    memory, takes longer."""
     workers: int = setting(default=1, ge=0)
-    """Processes that generate clips of cities while training runs (0 = wait until another process has written them). Clips of
-    logs are made before training starts, by this process if 0."""
+    """Processes that generate clips of cities while training runs (0 = wait until another process has written them).
+    Clips of logs are made before training starts, by this process if 0."""
     checkpoint_every: int = setting(default=100, ge=1)
     """Steps between checkpoints; an interrupted training resumes at the last one."""
     checkpoints_kept: int = setting(default=2, ge=2)
     """Newest checkpoints to keep; older ones are removed."""
     cache: str = ""
-    """Folder for training clips that are fetched or made when they are needed; several runs and processes may share it (empty = a folder
-    inside the output)."""
+    """Folder for training clips that are fetched or made when they are needed; several runs and processes may share it
+    (empty = a folder inside the output)."""
     cache_gb: float = setting(default=50.0, gt=0)
     """Largest size of that folder in GB. The clips that were not used for the longest time are removed first."""
     read_ahead: int = setting(default=4, ge=0)
@@ -222,15 +232,16 @@ class LearnConfig:
     seed: int = 0
     """Seed of the cities, the initial weights and all other random numbers."""
     start: str = ""
-    """Model to continue from: a folder written by learn or convert, or "embedded" for the shipped model (empty = train from
-    scratch)."""
+    """Model to continue from: a folder written by learn or convert, or "embedded" for the shipped model (empty = train
+    from scratch)."""
     steps: int = setting(default=2800, ge=1)
     """Training steps of the network."""
     frozen: Literal["nothing", "temporal_transformers", "temporal_layers", "denoiser"] = "nothing"
-    """Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all layers that
-    mix frames. denoiser: train the refiner only."""
+    """Layers that keep their weights. temporal_transformers: as in the published second stage. temporal_layers: all
+    layers that mix frames. denoiser: train the refiner only."""
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
-    """Number format of the computation. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere."""
+    """Number format of the computation. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
+    elsewhere."""
     threads: int = setting(default=1, ge=1)
     """Threads of the training process. Results are repeatable for the same number of threads."""
     data: LearnData = setting(default_factory=LearnData)

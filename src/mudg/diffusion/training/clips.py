@@ -1,4 +1,5 @@
-"""The clips that `learn` trains on: made if they are missing, and drawn for a step as a pure function of (seed, step)."""
+"""The clips that `learn` trains on: made if they are missing, and drawn for a step as a pure function of (seed,
+step)."""
 
 from __future__ import annotations
 
@@ -40,13 +41,14 @@ from mudg.scene.clouds import write_fused
 from mudg.scene.part import PlacedSweep, write_photos
 from mudg.scene.read import read_scene
 
-# city fits ------------------------------------------------------------------------------------------------------------
+# city fits ----------------------------------------------------------------------------------------
 #
 # Short fits to generated cities, whose renders become part of the conditions that the diffusion model is trained on.
 
 
 def write_fitted_city(rules: CityClipRules, city: int, folder: Path) -> int:
-    """Make one city's clips with renders of a fit and write its shard; returns the number of clips. For a process of its own."""
+    """Make one city's clips with renders of a fit and write its shard; returns the number of clips. For a process of
+    its own."""
     return from_city.write_city(rules, city, folder, fit_city)
 
 
@@ -58,7 +60,9 @@ def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
     config = short_fit(steps, width, images[0].view.camera.width, seed=city)
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
-        write_photos(folder / "scene", log.world.source(), log.world.ego_path(), log.tracks(), images, placed_sweeps(log))
+        write_photos(
+            folder / "scene", log.world.source(), log.world.ego_path(), log.tracks(), images, placed_sweeps(log)
+        )
         write_fused(folder / "fused", log.cloud, {})
         work = RunDir.open(folder / "fit", fit.OUTPUT, result_settings(config), {})
         fit.write_fit(config, fit.FitInputs(folder / "scene", folder / "fused"), work)
@@ -86,7 +90,7 @@ def placed_sweeps(log: CityLog) -> Iterator[PlacedSweep]:
         last_s = sweep.time_s
 
 
-# clips ----------------------------------------------------------------------------------------------------------------
+# clips --------------------------------------------------------------------------------------------
 
 
 CACHE = "cache"
@@ -99,7 +103,8 @@ def held_out_cities(config: LearnConfig) -> list[int]:
 
 
 def cities_in_use(config: LearnConfig, step: int) -> range:
-    """Cities that training may draw from at `step`: `first_cities`, then linearly up to `cities` at `all_cities_at`, after those skipped.
+    """Cities that training may draw from at `step`: `first_cities`, then linearly up to `cities` at `all_cities_at`,
+    after those skipped.
 
     A function of the step alone, so that clips can still be in the making while training runs and the draw stays the
     same in every run.
@@ -110,17 +115,26 @@ def cities_in_use(config: LearnConfig, step: int) -> range:
     return range(data.skip_cities, data.skip_cities + count)
 
 
-# cities ---------------------------------------------------------------------------------------------------------------
+# cities -------------------------------------------------------------------------------------------
 
 
 def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.CityClipRules:
     """Rules for the generator; `points_alone`: the published system's condition."""
     data = config.data
     return from_city.CityClipRules(
-        data.width, data.height, data.window, config.seed, data.clips_per_city, published=points_alone,
-        realism=data.realism, textures=data.textures,
-        fitted=data.renders and not points_alone, near_points=data.condition == "freevs",
-        log_frames=data.log_frames, side_cameras=data.side_cameras, fit_steps=data.fit_steps,
+        data.width,
+        data.height,
+        data.window,
+        config.seed,
+        data.clips_per_city,
+        published=points_alone,
+        realism=data.realism,
+        textures=data.textures,
+        fitted=data.renders and not points_alone,
+        near_points=data.condition == "freevs",
+        log_frames=data.log_frames,
+        side_cameras=data.side_cameras,
+        fit_steps=data.fit_steps,
     )
 
 
@@ -129,37 +143,47 @@ def without_renders(config: LearnConfig) -> LearnConfig:
     return replace(config, data=replace(config.data, renders=False))
 
 
-def making_clips(config: LearnConfig, folder: Path, points_alone: bool = False) -> contextlib.AbstractContextManager[None]:
+def making_clips(
+    config: LearnConfig, folder: Path, points_alone: bool = False
+) -> contextlib.AbstractContextManager[None]:
     """A block while which processes make the missing clips of cities, held-out ones first (see ``calls_beside``)."""
     rules = clip_rules(config, points_alone)
     wanted = [*held_out_cities(config), *(config.data.skip_cities + n for n in range(config.data.cities))]
     missing = [n for n in wanted if not clip_shards.shard_path(folder, n).is_file()]
     for number in set(wanted).difference(missing):
-        clip_shards.clips_at(clip_shards.shard_path(folder, number))  # a damaged one is found before the training begins
+        # a damaged one is found before the training begins
+        clip_shards.clips_at(clip_shards.shard_path(folder, number))
     if not missing or config.compute.workers == 0:
         return contextlib.nullcontext()
     store.make_folder(folder)
     if not os.access(folder, os.W_OK):
-        raise ResourceError("training clips cannot be written here", where=str(folder), remedy="choose another --data.clips")
+        raise ResourceError(
+            "training clips cannot be written here", where=str(folder), remedy="choose another --data.clips"
+        )
     log.info(f"learn: {len(missing)} cities to generate into {folder}, {config.compute.workers} processes")
     make = write_fitted_city if rules.fitted else from_city.write_city
     return calls_beside(make, [(rules, n, folder) for n in missing], config.compute.workers)
 
 
 def await_shard(folder: Path | ShardSource, city: int, patience_s: float = 900.0) -> None:
-    """Wait until a shard is there (it is being made by another process). One of another source is brought when it is read."""
+    """Wait until a shard is there (it is being made by another process). One of another source is brought when it is
+    read."""
     if not isinstance(folder, Path):
         return
     path = clip_shards.shard_path(folder, city)
     started = time.monotonic()
     while not path.is_file():
         if time.monotonic() - started > patience_s:
-            raise ResourceError("no training clips arrived", where=str(path), expected=f"within {patience_s:.0f} s",
-                                remedy="see the errors of the generating processes above")  # fmt: skip
+            raise ResourceError(
+                "no training clips arrived",
+                where=str(path),
+                expected=f"within {patience_s:.0f} s",
+                remedy="see the errors of the generating processes above",
+            )
         time.sleep(0.5)
 
 
-# logs -----------------------------------------------------------------------------------------------------------------
+# logs ---------------------------------------------------------------------------------------------
 
 
 def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, points_alone: bool = False) -> LogClipRules:
@@ -170,8 +194,12 @@ def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, poin
     scene = read_scene(sources[0].scene)
     names = config.data.cameras or tuple(scene.cameras)
     if names[0] not in scene.cameras:
-        raise InputError("the scene has no such camera", where=f"--data.cameras, {scene.root}",
-            expected=", ".join(scene.cameras), got=names[0])  # fmt: skip
+        raise InputError(
+            "the scene has no such camera",
+            where=f"--data.cameras, {scene.root}",
+            expected=", ".join(scene.cameras),
+            got=names[0],
+        )
     camera = scene.cameras[names[0]]
     width, height = sized_to_area(config.data.width * config.data.height, camera.width / camera.height, multiple)
     if points_alone:
@@ -181,11 +209,20 @@ def log_rules(config: LearnConfig, sources: list[LogSource], multiple: int, poin
 
 def _log_rules(config: LearnConfig, size: tuple[int, int], held_out_every: int, points_alone: bool) -> LogClipRules:
     data = config.data
-    least_points = (1.0 if points_alone else LogClipRules.least_points) if data.least_points is None else data.least_points
+    least_points = (
+        (1.0 if points_alone else LogClipRules.least_points) if data.least_points is None else data.least_points
+    )
     return LogClipRules(
-        *size, window=data.window, stride=data.stride, cameras=data.cameras, held_out_every=held_out_every,
-        seed=config.seed, published=points_alone, depth=data.depth, least_points=least_points,
-    )  # fmt: skip
+        *size,
+        window=data.window,
+        stride=data.stride,
+        cameras=data.cameras,
+        held_out_every=held_out_every,
+        seed=config.seed,
+        published=points_alone,
+        depth=data.depth,
+        least_points=least_points,
+    )
 
 
 def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tuple[int, int]:
@@ -214,9 +251,15 @@ def for_logs(config: LearnConfig, rules: LogClipRules, train: int, scored: int) 
     if not scored:
         log.warn("learn: no clip is held out; the scored clip was also trained on")
     data = replace(
-        config.data, cities=train, first_cities=train, clips_per_city=1, width=rules.width, height=rules.height,
-        held_out=max(1, scored), skip_cities=0,
-    )  # fmt: skip
+        config.data,
+        cities=train,
+        first_cities=train,
+        clips_per_city=1,
+        width=rules.width,
+        height=rules.height,
+        held_out=max(1, scored),
+        skip_cities=0,
+    )
     return replace(config, data=data, score=replace(config.score, watched=min(config.score.watched, max(1, scored))))
 
 
@@ -232,14 +275,15 @@ def describe_logs(config: LearnConfig, rules: LogClipRules) -> str:
     given = "the projected points and the first image" if rules.published else "images taken at other times"
     elsewhere = ", and from labels elsewhere" if rules.depth == "annotated" else ""
     return (
-        f"{config.data.cities} clips of {config.data.window} frames of {len(config.data.scenes)} recorded "
-        f"{'log' if len(config.data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, seen from where they were\n"
-        f"recorded, with {given} as condition. Depth was learned where a sweep measured it{elsewhere}. The model this\n"
-        f"one continues from has training data of its own. `held-out` below means every {config.data.held_out_every}. window of these logs."
+        f"{config.data.cities} clips of {config.data.window} frames of {len(config.data.scenes)} recorded"
+        f" {'log' if len(config.data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, seen from where"
+        f" they were\nrecorded, with {given} as condition. Depth was learned where a sweep measured it{elsewhere}. The"
+        " model this\none continues from has training data of its own. `held-out` below means every"
+        f" {config.data.held_out_every}. window of these logs."
     )
 
 
-# clips that are fetched or made when they are needed ------------------------------------------------------------------
+# clips that are fetched or made when they are needed ----------------------------------------------
 
 
 def clips_at_address(config: LearnConfig) -> bool:
@@ -255,24 +299,37 @@ def is_streamed(config: LearnConfig) -> bool:
     """
     listed, remote = is_list(config.data.scenes), clips_at_address(config)
     if remote and config.data.scenes:
-        raise UsageError("logs and clips at an address are given", where="--data.scenes, --data.clips", got=config.data.clips,
-                         remedy="leave one out; a list of scenes may name folders of clips at addresses")  # fmt: skip
+        raise UsageError(
+            "logs and clips at an address are given",
+            where="--data.scenes, --data.clips",
+            got=config.data.clips,
+            remedy="leave one out; a list of scenes may name folders of clips at addresses",
+        )
     if listed and config.data.clips:
-        raise UsageError("a list of scenes says where the clips are", where="--data.clips", got=config.data.clips,
-                         remedy="leave it out; --compute.cache chooses where clips that were made or fetched are kept")  # fmt: skip
+        raise UsageError(
+            "a list of scenes says where the clips are",
+            where="--data.clips",
+            got=config.data.clips,
+            remedy="leave it out; --compute.cache chooses where clips that were made or fetched are kept",
+        )
     return listed or remote
 
 
 def open_streamed(
     config: LearnConfig, out: Path, multiple: int, points_alone: bool
 ) -> tuple[LearnConfig, StreamedShards | ListedShards]:
-    """The clips at the address of `clips` or of the listed scenes, and the configuration with the size that they have."""
-    cache = ShardCache(Path(config.compute.cache) if config.compute.cache else out / CACHE, int(config.compute.cache_gb * 1e9))
+    """The clips at the address of `clips` or of the listed scenes, and the configuration with the size that they
+    have."""
+    cache = ShardCache(
+        Path(config.compute.cache) if config.compute.cache else out / CACHE, int(config.compute.cache_gb * 1e9)
+    )
     if not config.data.scenes:
         return config, StreamedShards(Location.of(config.data.clips), cache, config.data.clips_per_city)
     data = config.data
     if not points_alone:
-        data = replace(data, width=round(data.width / multiple) * multiple, height=round(data.height / multiple) * multiple)
+        data = replace(
+            data, width=round(data.width / multiple) * multiple, height=round(data.height / multiple) * multiple
+        )
     rules = _log_rules(config, (data.width, data.height), 0, points_alone)
     scenes = read_list(data.scenes[0], data.held_out)
     log.info(*f"learn: {data.scenes[0]}: {scenes.summary()}".splitlines())
@@ -280,7 +337,8 @@ def open_streamed(
 
 
 def weighed_shards(config: LearnConfig, folder: Path | ShardSource) -> Sequence[int]:
-    """Shards over which classes are counted: the first cities, or some that are drawn from a list, where classes are balanced."""
+    """Shards over which classes are counted: the first cities, or some that are drawn from a list, where classes are
+    balanced."""
     if not isinstance(folder, ListedShards):
         return cities_in_use(config, 0)[:20]
     count = 20 if config.loss.class_balance else 0
@@ -305,11 +363,12 @@ def describe_list(config: LearnConfig, shards: ListedShards) -> str:
     )
 
 
-# a step's clips -------------------------------------------------------------------------------------------------------
+# a step's clips -----------------------------------------------------------------------------------
 
 
 def of_one_size(config: LearnConfig) -> LearnConfig:
-    """The configuration for clips that were made of one size, as the published system needs them, however varied the cities are."""
+    """The configuration for clips that were made of one size, as the published system needs them, however varied the
+    cities are."""
     return replace(config, data=replace(config.data, realism="plain"))
 
 
@@ -328,16 +387,26 @@ def _of_same_size(city: int, first: int, sizes: list[tuple[int, int]], cities: r
 
 
 def draw_clips(
-    config: LearnConfig, folder: Path | ShardSource, step: int, count: int, frames: int, purpose: str, part: slice | None = None
+    config: LearnConfig,
+    folder: Path | ShardSource,
+    step: int,
+    count: int,
+    frames: int,
+    purpose: str,
+    part: slice | None = None,
 ) -> list[Clip]:
     """The clips of a step: random shards, clips and runs of consecutive frames, varied (see `clip_shards.vary`).
 
-    What is drawn for a clip depends on (seed, step, purpose) and the clip's place in the batch of `count`, and not on which
-    `part` of that batch is drawn here, nor on where the shards come from. All clips of a step have one size: that of its first clip.
+    What is drawn for a clip depends on (seed, step, purpose) and the clip's place in the batch of `count`, and not on
+    which `part` of that batch is drawn here, nor on where the shards come from. All clips of a step have one size: that
+    of its first clip.
     """
     places = range(count)[part or slice(None)]
     if isinstance(folder, ListedShards):
-        return [_varied(config, _listed_clip(config, folder, (step, place, purpose), frames), step, place, purpose) for place in places]
+        return [
+            _varied(config, _listed_clip(config, folder, (step, place, purpose), frames), step, place, purpose)
+            for place in places
+        ]
     picks, sizes = _picks(config, folder, step, count, frames, purpose), sizes_of_cities(config)
     clips = []
     for place in places:
@@ -385,8 +454,10 @@ def _refuse_size(clip: Clip, size: tuple[int, int], folder: Path | ShardSource, 
         raise InputError(
             "the training clips have another size",
             where=str(clip_shards.shard_path(folder, shard)) if isinstance(folder, Path) else f"shard {shard}",
-            expected=f"{width}x{height}", got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}", remedy="choose another --data.clips",
-        )  # fmt: skip
+            expected=f"{width}x{height}",
+            got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
+            remedy="choose another --data.clips",
+        )
 
 
 def _varied(config: LearnConfig, clip: Clip, step: int, place: int, purpose: str) -> Clip:
@@ -412,7 +483,8 @@ def bring_shards(
 
 
 class ReadingAhead:
-    """Threads that bring the shards of the next steps while a step is computed. What fails there fails again when it is drawn.
+    """Threads that bring the shards of the next steps while a step is computed. What fails there fails again when it is
+    drawn.
 
     Args:
         bring: brings the shards of a step.

@@ -1,9 +1,9 @@
 """How much memory the published-type model needs, and how to cut its work to fit.
 
-Nothing is allocated: the networks are built on torch's meta device and run there, while every tensor's birth and death is
-counted. What is counted is what an eager pass holds at its worst moment; attention counts as a fused kernel, which stores no scores,
-except where its heads are too wide for one. Not counted: the device's own context and the workspace of convolutions, for
-which `RESERVE_BYTES` stands.
+Nothing is allocated: the networks are built on torch's meta device and run there, while every tensor's birth and death
+is counted. What is counted is what an eager pass holds at its worst moment; attention counts as a fused kernel, which
+stores no scores, except where its heads are too wide for one. Not counted: the device's own context and the workspace
+of convolutions, for which `RESERVE_BYTES` stands.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from mudg.diffusion.published.model import PublishedConfig, PublishedMDM, WorkSp
 from mudg.diffusion.requests import SampleRequest
 from mudg.networks.clip import TEXT_TOKENS
 
-# which number format the networks run in, and saying so ---------------------------------------------------------------
+# which number format the networks run in, and saying so -------------------------------------------
 
 
 Precision = Literal["auto", "float32", "bfloat16", "float16"]
@@ -40,21 +40,30 @@ CPU = torch.device("cpu")
 def half_format(precision: Precision, device: torch.device = CPU, *, float16: bool = False) -> torch.dtype | None:
     """The half precision that convolutions and matrix products run in, None for float32. The choice is announced once.
 
-    "auto" gives bfloat16 on CPUs that multiply in it: with AMX, or with AVX-512 (measured on Zen 4: a training step takes 0.55 of
-    the time of float32, a sample 0.7); and on CUDA devices that have it (compute capability 8 and above). On other CUDA devices it
-    gives float16 where `float16` says that the network bears its range, else float32; on MPS float32. An explicit choice is obeyed.
+    "auto" gives bfloat16 on CPUs that multiply in it: with AMX, or with AVX-512 (measured on Zen 4: a training step
+    takes 0.55 of the time of float32, a sample 0.7); and on CUDA devices that have it (compute capability 8 and above).
+    On other CUDA devices it gives float16 where `float16` says that the network bears its range, else float32; on MPS
+    float32. An explicit choice is obeyed.
 
     Raises:
         UsageError: float16 on another device than CUDA, or for a network that does not bear its range.
     """
     if precision == "float16" and not (float16 and SAME_CODE.get(device.type, device.type) == "cuda"):
-        raise UsageError("float16 is for published-type models on CUDA devices", where="--precision",
-            got=f"{'a published-type' if float16 else 'another'} model on {device}", remedy="bfloat16, or auto")  # fmt: skip
+        raise UsageError(
+            "float16 is for published-type models on CUDA devices",
+            where="--precision",
+            got=f"{'a published-type' if float16 else 'another'} model on {device}",
+            remedy="bfloat16, or auto",
+        )
     if precision != "auto":
         chosen, reason = {"bfloat16": torch.bfloat16, "float16": torch.float16}.get(precision), f"asked for {precision}"
     elif device.type == "cpu":
         capabilities = getattr(torch.cpu, "get_capabilities", dict)()
-        able = [title for name, title in (("amx_bf16", "AMX"), ("avx512_bf16", "AVX-512 BF16")) if capabilities.get(name, False)]
+        able = [
+            title
+            for name, title in (("amx_bf16", "AMX"), ("avx512_bf16", "AVX-512 BF16"))
+            if capabilities.get(name, False)
+        ]
         chosen = torch.bfloat16 if able else None
         reason = f"the CPU has {able[0]}" if able else "the CPU has no bfloat16"
     elif device.type == "cuda":
@@ -73,7 +82,7 @@ def choose_bf16(precision: Precision, device: torch.device = CPU) -> bool:
     return half_format(precision, device) is not None
 
 
-# memory plan ----------------------------------------------------------------------------------------------------------
+# memory plan --------------------------------------------------------------------------------------
 
 
 RESERVE_BYTES = 1_000_000_000
@@ -146,8 +155,8 @@ def meta_model(config: PublishedConfig, dtype: torch.dtype) -> PublishedMDM:
 
 
 def denoise_bytes(model: PublishedMDM, height: int, width: int, batch: int) -> int:
-    """Activations of one pass of the denoising network over `batch` latent videos, with the keys and values of their contexts, which are
-    kept from step to step."""
+    """Activations of one pass of the denoising network over `batch` latent videos, with the keys and values of their
+    contexts, which are kept from step to step."""
     config, net = model.config, model.net
     dtype, factor = model.dtype, model.codec.factor
     with torch.device("meta"):
@@ -172,8 +181,8 @@ def autoencoder_bytes(model: PublishedMDM, height: int, width: int, frames: int)
 
 
 def sampling_bytes(model: PublishedMDM, split: WorkSplit, *, guidance: bool = True) -> int:
-    """What sampling one clip takes beside the weights, from its condition to its pixels, under a cut. Steps do not matter; the fit of
-    depth is left out (it needs values, and a few megabytes)."""
+    """What sampling one clip takes beside the weights, from its condition to its pixels, under a cut. Steps do not
+    matter; the fit of depth is left out (it needs values, and a few megabytes)."""
     config, before = model.config, model.split
     frames, height, width = config.window, config.height, config.width
     camera = Camera("counted", width, height, 1.0, 1.0, 0.0, 0.0)
@@ -200,7 +209,8 @@ def parameter_bytes(model: nn.Module) -> int:
 
 @dataclass(frozen=True)
 class Needs:
-    """What the parts of the work take at the model's own size, in bytes; videos and frames take in proportion to their number."""
+    """What the parts of the work take at the model's own size, in bytes; videos and frames take in proportion to their
+    number."""
 
     parameters: int
     tower: int
@@ -226,13 +236,14 @@ def needs_of(config: PublishedConfig, bytes_per_value: int) -> Needs:
 def choose(
     needs: Needs, budget_bytes: int, *, guidance: bool = True, offload: tuple[bool, ...] = (False, True)
 ) -> tuple[WorkSplit, int]:
-    """The fastest way to cut the work of one clip that fits the budget, or the thriftiest if none does, and its peak in bytes.
+    """The fastest way to cut the work of one clip that fits the budget, or the thriftiest if none does, and its peak in
+    bytes.
 
     The peak is what stays, the worst moment of all, and the reserve.
 
     Args:
-        offload: whether the image tower is on the CPU, in the order in which it is tried with each cut. Moving it costs a fraction of a
-            second per clip, smaller batches cost more.
+        offload: whether the image tower is on the CPU, in the order in which it is tried with each cut. Moving it costs
+            a fraction of a second per clip, smaller batches cost more.
     """
     found = [_cut(needs, budget_bytes, cut, away, guidance) for cut in CUTS for away in offload]
     return next((way for way in found if way[1] <= budget_bytes), found[-1])

@@ -1,8 +1,8 @@
 """The models that `learn` can train, what is particular to each, and with which weights a training starts.
 
-The loop (draws, layouts, checkpoints, averages) uses three methods that both models have: `loss(clips, part, settings)`,
-also as `forward`; `trained_part()`, the modules that change; `temporal_parameters(which)`, those that a later stage may freeze.
-All else is a row of `KINDS`. A new kind of model is a class with these methods and a row here.
+The loop (draws, layouts, checkpoints, averages) uses three methods that both models have: `loss(clips, part,
+settings)`, also as `forward`; `trained_part()`, the modules that change; `temporal_parameters(which)`, those that a
+later stage may freeze. All else is a row of `KINDS`. A new kind of model is a class with these methods and a row here.
 """
 
 from __future__ import annotations
@@ -71,21 +71,24 @@ KINDS: dict[type[nn.Module], ModelKind] = {
 def kind_of(model: nn.Module) -> ModelKind:
     """The row of a model; UsageError if it cannot be trained."""
     if type(model) not in KINDS:
-        raise UsageError("this kind of model cannot be trained here", got=type(model).__name__,
-            expected=", ".join(kind.__name__ for kind in KINDS))  # fmt: skip
+        raise UsageError(
+            "this kind of model cannot be trained here",
+            got=type(model).__name__,
+            expected=", ".join(kind.__name__ for kind in KINDS),
+        )
     return KINDS[type(model)]
 
 
-# start ----------------------------------------------------------------------------------------------------------------
+# start --------------------------------------------------------------------------------------------
 
 
 def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
     """The model to train, and which of its parts ("codec", "refiner", "finisher") have no weights yet.
 
-    With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders where the settings
-    ask for them. If the settings do not describe that network but are the defaults, it is taken as it is. Clips may be of another
-    size and length than before. Inputs for renders and a finisher are learned from generated cities with renders; from other clips
-    no model gets any that it does not have.
+    With `start` the network is that of the earlier model, extended by a refiner, a finisher and inputs for renders
+    where the settings ask for them. If the settings do not describe that network but are the defaults, it is taken as
+    it is. Clips may be of another size and length than before. Inputs for renders and a finisher are learned from
+    generated cities with renders; from other clips no model gets any that it does not have.
 
     Raises:
         UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take.
@@ -96,12 +99,18 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
         return MDM(wanted if can_grow else _with_renders_of(wanted, None)), {"codec", "refiner", "finisher"}
     if is_published(config.start):
         if not _network_is_default(config):
-            raise UsageError("the shape of a published-type network cannot be changed", where="--start",
-                             remedy="leave out the settings of the group network")  # fmt: skip
+            raise UsageError(
+                "the shape of a published-type network cannot be changed",
+                where="--start",
+                remedy="leave out the settings of the group network",
+            )
         return learn_published.starting_model(config), set()
     before = mdm_files.load(config.start)
     if before.config.window != config.data.window:
-        log.info(f"learn: training on clips of {config.data.window} frames; --start was trained on clips of {before.config.window}")
+        log.info(
+            f"learn: training on clips of {config.data.window} frames; --start was trained on clips of"
+            f" {before.config.window}"
+        )
     wanted = wanted if can_grow else _with_renders_of(wanted, before.config)
     resized = model_of_window(before, wanted.window, wanted.area_px)
     if wanted != resized.config and not same_denoiser(resized.config, wanted) and _network_is_default(config):
@@ -124,7 +133,9 @@ def _with_renders_of(wanted: MDMConfig, before: MDMConfig | None) -> MDMConfig:
     """A network that uses renders, and has a finisher, as `before` does (None: neither)."""
     if before is None:
         return replace(wanted, renders=False, finish_widths=(), finish_blocks=())
-    return replace(wanted, renders=before.renders, finish_widths=before.finish_widths, finish_blocks=before.finish_blocks)
+    return replace(
+        wanted, renders=before.renders, finish_widths=before.finish_widths, finish_blocks=before.finish_blocks
+    )
 
 
 def hold_finisher(model: Model, fresh: set[str], patches: bool) -> None:
@@ -138,8 +149,9 @@ def hold_finisher(model: Model, fresh: set[str], patches: bool) -> None:
     if "finisher" in fresh:
         raise UsageError(
             "the training clips have no patches at a higher resolution, from which the finisher is learned",
-            where="--data.clips", remedy="choose another folder, or give --data.no-renders",
-        )  # fmt: skip
+            where="--data.clips",
+            remedy="choose another folder, or give --data.no-renders",
+        )
     model.finisher.requires_grad_(False)
     log.info("learn: the clips have no patches at a higher resolution; the finisher keeps its weights")
 
@@ -208,9 +220,15 @@ FIT_IMAGES = 8
 
 
 def train_codec(
-    codec: PatchCodec, config: LearnConfig, run_dir: RunDir, folder: Path | ShardSource, bf16: bool, device: torch.device = CPU
+    codec: PatchCodec,
+    config: LearnConfig,
+    run_dir: RunDir,
+    folder: Path | ShardSource,
+    bf16: bool,
+    device: torch.device = CPU,
 ) -> None:
-    """Fit the linear parts on the first cities of `folder`, on the CPU, then train the decoder on noisy latents, on a device."""
+    """Fit the linear parts on the first cities of `folder`, on the CPU, then train the decoder on noisy latents, on a
+    device."""
     steps, out, alone = config.codec.steps, run_dir.path / "codec", Ranks(0, 1, device)
     codec.to(device)
     optimizer = torch.optim.AdamW(codec.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.99), weight_decay=1e-3)
@@ -257,13 +275,17 @@ def load_trained_codec(codec: PatchCodec, out: Path, ranks: Ranks) -> None:
     """The codec that the leader trained, in every process."""
     saved = newest_checkpoint(out / "codec", ranks)
     if saved is None:
-        raise ResourceError("the trained codec that rank 0 wrote is not visible here", where=str(out / "codec"),
-                            remedy="choose an --out on a file system that all processes share")  # fmt: skip
+        raise ResourceError(
+            "the trained codec that rank 0 wrote is not visible here",
+            where=str(out / "codec"),
+            remedy="choose an --out on a file system that all processes share",
+        )
     read_rows(saved.path, "net", nn.ModuleDict({"codec": codec}).state_dict())
 
 
 def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Generator) -> tuple[Tensor, dict[str, float]]:
-    """Reconstruction loss of the decoder on latents with a little noise, drawn on the CPU; modalities are left out at random.
+    """Reconstruction loss of the decoder on latents with a little noise, drawn on the CPU; modalities are left out at
+    random.
 
     L1 + half squared error and L1 of gradients for colour, L1 for the depth code, cross-entropy for classes.
     """
@@ -272,12 +294,15 @@ def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Genera
     )
     with torch.no_grad():
         latents: dict[Modality, Tensor] = {
-            "rgb": codec.encode_rgb(rgb), "depth": codec.encode_depth(depth), "semantics": codec.encode_semantics(ids)
-        }  # fmt: skip
+            "rgb": codec.encode_rgb(rgb),
+            "depth": codec.encode_depth(depth),
+            "semantics": codec.encode_semantics(ids),
+        }
         amount = 0.15 * torch.rand(len(rgb), 1, 1, 1, generator=generator).to(rgb.device)
         keep = (torch.rand(3, len(rgb), 1, 1, 1, generator=generator) > 0.15).float().to(rgb.device)
         noisy: dict[Modality, Tensor] = {
-            m: (z + amount * torch.randn(z.shape, generator=generator).to(z.device)) * k for (m, z), k in zip(latents.items(), keep)
+            m: (z + amount * torch.randn(z.shape, generator=generator).to(z.device)) * k
+            for (m, z), k in zip(latents.items(), keep)
         }
         target = codec.linear_depth_code(depth)
     made_rgb, made_depth, scores = codec.decode_raw(noisy)
@@ -286,9 +311,9 @@ def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Genera
     parts = {
         "rgb": losses.image_error((made_rgb - (rgb * 2 - 1)) * keep[0], square=0.5, gradient=0.25),
         "depth": ((made_depth - target) * keep[1] * known).abs().mean(),
-        "semantics": functional.cross_entropy(scores, ids, ignore_index=palette.UNLABELLED)
-        if labelled
-        else scores.sum() * 0,
+        "semantics": (
+            functional.cross_entropy(scores, ids, ignore_index=palette.UNLABELLED) if labelled else scores.sum() * 0
+        ),
     }
     loss = parts["rgb"] + parts["depth"] + 0.1 * parts["semantics"]
     return loss, {name: float(part.detach()) for name, part in parts.items()}

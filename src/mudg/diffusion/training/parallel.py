@@ -1,11 +1,12 @@
 """Training on several processes: who they are, what they agree on, and how the network is spread over them.
 
 Started by `torchrun`, every process runs the same program. They meet in a process group (gloo on CPUs, nccl on CUDA
-devices) and differ only in their number, the rank. Rank 0 leads: it alone makes clips, writes logs and pictures, and scores.
+devices) and differ only in their number, the rank. Rank 0 leads: it alone makes clips, writes logs and pictures, and
+scores.
 
 Four layouts give the same losses up to rounding: one process; `ddp`, a whole copy of the network per process; `fsdp`,
-parameters, moments and average cut into pieces along their first axis (`torch.distributed.fsdp.fully_shard`); `hsdp`, the same
-pieces within each group of processes, usually a node, and whole replicas of the network in all groups.
+parameters, moments and average cut into pieces along their first axis (`torch.distributed.fsdp.fully_shard`); `hsdp`,
+the same pieces within each group of processes, usually a node, and whole replicas of the network in all groups.
 
 What processes tell each other is numbers and JSON text. Nothing is pickled.
 """
@@ -37,10 +38,12 @@ from mudg.base.processes import error_from_record, error_record
 PATIENCE = datetime.timedelta(hours=6)
 """How long processes wait for each other: as long as the leader may need to make clips or to score."""
 SAME_SIGNAL_S = 2.0
-"""The terminal sends Ctrl-C to all processes, and launchers pass it on: within this time a second one is the same one."""
+"""The terminal sends Ctrl-C to all processes, and launchers pass it on: within this time a second one is the same
+one."""
 PARTING_S = 0.5
-"""Rest after the last message. Threads of gloo let go of its tensors a moment later, and need the interpreter for that; one that comes
-when the interpreter is already shutting down aborts the process, after all the work is done and saved."""
+"""Rest after the last message. Threads of gloo let go of its tensors a moment later, and need the interpreter for that;
+one that comes when the interpreter is already shutting down aborts the process, after all the work is done and
+saved."""
 Layout = Literal["ddp", "fsdp", "hsdp"]
 
 
@@ -85,7 +88,8 @@ class Ranks:
     def leader_does(self, work: Callable[[], Any]) -> Any:
         """Run `work` in the leader alone; all get its JSON result, or raise its error.
 
-        An error that is not one of ours, or an interruption, ends the leader at once; the launcher then ends the others.
+        An error that is not one of ours, or an interruption, ends the leader at once; the launcher then ends the
+        others.
         """
         if self.size == 1:
             return work()
@@ -116,8 +120,11 @@ class Ranks:
         if failure is not None:
             raise failure
         if failed:
-            raise ResourceError("another process of this training failed", got=f"{failed:.0f} of {self.size}",
-                                remedy="see its message above or in the launcher's logs")  # fmt: skip
+            raise ResourceError(
+                "another process of this training failed",
+                got=f"{failed:.0f} of {self.size}",
+                remedy="see its message above or in the launcher's logs",
+            )
 
     def share(self, clips: int, parts: int) -> list[slice]:
         """Which clips of a batch of `clips` this process takes, in `parts` portions one after another.
@@ -127,10 +134,13 @@ class Ranks:
         """
         size, rest = divmod(clips, self.size * parts)
         if rest or not size:
-            raise UsageError("a step's clips cannot be divided evenly",
+            raise UsageError(
+                "a step's clips cannot be divided evenly",
                 where="--optimizer.batch-frames, --compute.accumulate",
-                expected=f"a multiple of {self.size} processes x {parts} portions", got=f"{clips} clips",
-                remedy="make --optimizer.batch-frames a multiple of window x processes x accumulate")  # fmt: skip
+                expected=f"a multiple of {self.size} processes x {parts} portions",
+                got=f"{clips} clips",
+                remedy="make --optimizer.batch-frames a multiple of window x processes x accumulate",
+            )
         first = self.rank * parts * size
         return [slice(first + n * size, first + (n + 1) * size) for n in range(parts)]
 
@@ -145,8 +155,8 @@ def join_processes(wanted: str) -> Iterator[Ranks]:
         wanted: a `DeviceName`. Several processes compute on the CPU, or on one CUDA device each.
 
     Raises:
-        ResourceError: there is no such device. UsageError: it has no implementation, or is one for several processes; the launcher's
-            variables are not numbers.
+        ResourceError: there is no such device. UsageError: it has no implementation, or is one for several processes;
+            the launcher's variables are not numbers.
     """
     if dist.is_available() and dist.is_initialized():
         yield _ranks_on_device(dist.get_rank(), dist.get_world_size(), wanted)
@@ -154,15 +164,22 @@ def join_processes(wanted: str) -> Iterator[Ranks]:
     try:
         size, rank = int(os.environ.get("WORLD_SIZE", "1")), int(os.environ.get("RANK", "0"))
     except ValueError as error:
-        raise UsageError("the launcher's variables are not numbers", where="WORLD_SIZE, RANK",
-            got=str(error)) from error  # fmt: skip
+        raise UsageError(
+            "the launcher's variables are not numbers", where="WORLD_SIZE, RANK", got=str(error)
+        ) from error
     if size == 1:
         yield _ranks_on_device(0, 1, wanted)
         return
     place = _ranks_on_device(rank, size, wanted)
-    if place.leads and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True" and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0":
-        log.warn("learn: restarted processes may find each other's old addresses in the launcher's store and fail; "
-                 "start torchrun with TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1")  # fmt: skip
+    if (
+        place.leads
+        and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
+        and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
+    ):
+        log.warn(
+            "learn: restarted processes may find each other's old addresses in the launcher's store and fail; "
+            "start torchrun with TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1"
+        )
     dist.init_process_group("nccl" if place.device.type == "cuda" else "gloo", timeout=PATIENCE)
     was_quiet = log.is_quiet()
     log.set_quiet(was_quiet or rank > 0)
@@ -180,8 +197,12 @@ def _ranks_on_device(rank: int, size: int, wanted: str) -> Ranks:
         chosen = choose_device(wanted, purpose, NETWORK_KINDS)
     else:
         if ":" in wanted:
-            raise UsageError("several processes cannot share a device", where="--compute.device",
-                             expected="auto, cpu or cuda: one for each", got=wanted)  # fmt: skip
+            raise UsageError(
+                "several processes cannot share a device",
+                where="--compute.device",
+                expected="auto, cpu or cuda: one for each",
+                got=wanted,
+            )
         chosen = choose_device(wanted, purpose)
         if chosen.type != "cpu":
             chosen = choose_device(f"{chosen.type}:{os.environ.get('LOCAL_RANK', '0')}", purpose)
@@ -190,20 +211,23 @@ def _ranks_on_device(rank: int, size: int, wanted: str) -> Ranks:
     return Ranks(rank, size, chosen)
 
 
-# the network over the processes ---------------------------------------------------------------------------------------
+# the network over the processes -------------------------------------------------------------------
 
 
 class Spread:
     """A model in one of the layouts: call `network` as the model itself, in `portion` for each portion of a step."""
 
-    def __init__(self, model: nn.Module, trained: nn.ModuleDict, ranks: Ranks, layout: Layout, per_replica: int = 0) -> None:
+    def __init__(
+        self, model: nn.Module, trained: nn.ModuleDict, ranks: Ranks, layout: Layout, per_replica: int = 0
+    ) -> None:
         self.network = model
         self._sharded: list[nn.Module] = []
         if ranks.size == 1:
             return
         if layout == "ddp":
             known = inspect.signature(nn.parallel.DistributedDataParallel).parameters
-            buffers = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"  # since torch 2.13
+            # since torch 2.13
+            buffers = "forward_sync_buffers" if "forward_sync_buffers" in known else "broadcast_buffers"
             self.network = nn.parallel.DistributedDataParallel(model, **{buffers: False})
             return
         from torch.distributed.device_mesh import init_device_mesh
@@ -225,14 +249,15 @@ class Spread:
     def portion(self, last: bool) -> Iterator[None]:
         """Around loss and backward of one portion: gradients are exchanged after the last one only."""
         for part in self._sharded:
-            part.set_requires_gradient_sync(last)  # type: ignore[operator]
+            part.set_requires_gradient_sync(last)
         holds = isinstance(self.network, nn.parallel.DistributedDataParallel) and not last
-        with self.network.no_sync() if holds else contextlib.nullcontext():  # type: ignore[operator]
+        with self.network.no_sync() if holds else contextlib.nullcontext():
             yield
 
 
 def mesh_shape(ranks: Ranks, per_replica: int) -> tuple[int, int]:
-    """Replicas of the network, and the processes over which each is sharded; 0: those that the launcher started on this node.
+    """Replicas of the network, and the processes over which each is sharded; 0: those that the launcher started on this
+    node.
 
     Raises:
         UsageError: the processes cannot be divided so.
@@ -240,14 +265,19 @@ def mesh_shape(ranks: Ranks, per_replica: int) -> tuple[int, int]:
     text = os.environ.get("LOCAL_WORLD_SIZE", "")
     size = per_replica or (int(text) if text.isdecimal() else 0) or ranks.size
     if ranks.size % size:
-        raise UsageError("the processes cannot be divided into replicas", where="--compute.processes-per-replica",
-            expected=f"a divisor of {ranks.size} processes", got=str(size),
-            remedy="give the number of processes of a node, the same on all")  # fmt: skip
+        raise UsageError(
+            "the processes cannot be divided into replicas",
+            where="--compute.processes-per-replica",
+            expected=f"a divisor of {ranks.size} processes",
+            got=str(size),
+            remedy="give the number of processes of a node, the same on all",
+        )
     return ranks.size // size, size
 
 
 def blocks(part: nn.Module) -> list[nn.Module]:
-    """The repeated blocks of a network: the modules in its outermost lists, lists of lists taken apart, plain layers left out.
+    """The repeated blocks of a network: the modules in its outermost lists, lists of lists taken apart, plain layers
+    left out.
 
     These are what is sharded, and recomputed, as a unit.
     """
@@ -265,10 +295,11 @@ def _members(modules: nn.ModuleList) -> list[nn.Module]:
 
 
 def recompute(part: nn.Module) -> int:
-    """Keep no activations inside the blocks of `part`: the backward pass computes them again. Returns how many there are."""
+    """Keep no activations inside the blocks of `part`: the backward pass computes them again. Returns how many there
+    are."""
     found = blocks(part)
     for block in found:
-        block.forward = functools.partial(recomputed, block.forward, use_reentrant=False)  # type: ignore[method-assign]
+        block.forward = functools.partial(recomputed, block.forward, use_reentrant=False)
     return len(found)
 
 
@@ -290,12 +321,12 @@ def is_sharded(value: Tensor) -> bool:
 
 def local(value: Tensor) -> Tensor:
     """This process's piece of a sharded tensor; any other tensor as it is. Shares memory."""
-    return value.to_local() if is_sharded(value) else value  # type: ignore[attr-defined]
+    return value.to_local() if is_sharded(value) else value
 
 
 def gathered(value: Tensor) -> Tensor:
     """The whole of a tensor, sharded or not, on the CPU of every process. All processes must call this together."""
-    return (value.full_tensor() if is_sharded(value) else value).detach().cpu()  # type: ignore[attr-defined]
+    return (value.full_tensor() if is_sharded(value) else value).detach().cpu()
 
 
 def first_row(value: Tensor) -> int:
@@ -303,7 +334,7 @@ def first_row(value: Tensor) -> int:
     if not is_sharded(value):
         return 0
     axis = _shard_axis(value)
-    mesh = value.device_mesh  # type: ignore[attr-defined]
+    mesh = value.device_mesh
     per_rank = -(-value.shape[0] // mesh.size(axis))
     return min(value.shape[0], per_rank * mesh.get_local_rank(axis))
 
@@ -312,7 +343,7 @@ def is_copy(value: Tensor) -> bool:
     """Whether another process, of a replica before this one, holds the same piece of a sharded tensor."""
     if not is_sharded(value):
         return False
-    axis, mesh = _shard_axis(value), value.device_mesh  # type: ignore[attr-defined]
+    axis, mesh = _shard_axis(value), value.device_mesh
     return any(mesh.get_local_rank(n) > 0 for n in range(mesh.ndim) if n != axis)
 
 
@@ -320,10 +351,13 @@ def _shard_axis(value: Tensor) -> int:
     """The axis of the mesh over which a tensor's rows are divided; over all others it is replicated."""
     from torch.distributed.tensor.placement_types import Replicate, Shard
 
-    placements = list(value.placements)  # type: ignore[attr-defined]
+    placements = list(value.placements)
     if placements.count(Shard(0)) != 1 or any(p not in (Shard(0), Replicate()) for p in placements):
-        raise ResourceError("a tensor is sharded in a way that checkpoints do not support", expected="Shard(0), or replicas of it",
-                            got=str(placements))  # fmt: skip
+        raise ResourceError(
+            "a tensor is sharded in a way that checkpoints do not support",
+            expected="Shard(0), or replicas of it",
+            got=str(placements),
+        )
     return placements.index(Shard(0))
 
 
@@ -333,7 +367,7 @@ def clip_gradients(part: nn.Module, limit: float) -> float:
     return float(gathered(norm))
 
 
-# a step's end ---------------------------------------------------------------------------------------------------------
+# a step's end -------------------------------------------------------------------------------------
 
 
 def agreed_terms(
@@ -344,7 +378,9 @@ def agreed_terms(
     Raises:
         NumericsError: in every process, if a term is not finite in any; names the terms, the step and the processes.
     """
-    bad = [float(not all(map(math.isfinite, terms.values()))) if rank == ranks.rank else 0.0 for rank in range(ranks.size)]
+    bad = [
+        float(not all(map(math.isfinite, terms.values()))) if rank == ranks.rank else 0.0 for rank in range(ranks.size)
+    ]
     sums = ranks.total([*terms.values(), float(stop), *bad])
     mean = {name: value / (ranks.size * portions) for name, value in zip(terms, sums)}
     flags = sums[len(terms) + 1 :]
@@ -353,7 +389,10 @@ def agreed_terms(
         where = f"learn, step {step}"
         if ranks.size > 1:
             where += f", process {', '.join(str(n) for n, flag in enumerate(flags) if flag)} of {ranks.size}"
-        raise NumericsError(f"the {', '.join(names)} term of the {what} is not finite", where=where,
+        raise NumericsError(
+            f"the {', '.join(names)} term of the {what} is not finite",
+            where=where,
             got=", ".join(str(mean[n]) for n in names),
-            remedy="continue from the last checkpoint with a lower learning rate")  # fmt: skip
+            remedy="continue from the last checkpoint with a lower learning rate",
+        )
     return mean, sums[len(terms)] > 0

@@ -27,17 +27,19 @@ def starting_model(config: LearnConfig) -> PublishedMDM:
     """The model of `config.start` in float32, to be trained at the configured size; nothing of it is drawn anew.
 
     Raises:
-        UsageError: clips of another length than the image tokens are made for, or of a size that does not fit the strides; a
-            setting that does not apply to this model.
+        UsageError: clips of another length than the image tokens are made for, or of a size that does not fit the
+            strides; a setting that does not apply to this model.
     """
     model = published_files.load(Path(config.start), dtype=torch.float32)
     frames = model.config.window
     if config.data.window != frames or config.optimizer.full_window_share < 1:
         raise UsageError(
             "a published-type model needs clips of exactly the length of its image tokens",
-            where="--data.window, --optimizer.full-window-share", expected=f"{frames} frames in all steps",
+            where="--data.window, --optimizer.full-window-share",
+            expected=f"{frames} frames in all steps",
             got=f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps",
-            remedy=f"--data.window {frames} --optimizer.full-window-share 1")  # fmt: skip
+            remedy=f"--data.window {frames} --optimizer.full-window-share 1",
+        )
     model.check_size(config.data.height, config.data.width)
     with torch.no_grad():  # out of the mapped files: training writes in place
         for value in (*model.parameters(), *model.buffers()):
@@ -48,8 +50,8 @@ def starting_model(config: LearnConfig) -> PublishedMDM:
 
 
 def rebuilt(model: PublishedMDM, weights: Mapping[str, Tensor]) -> PublishedMDM:
-    """The model where it was trained, ready for use, with these weights in its trained part. Shares memory with what it is
-    made of: it is large, and scoring it on a CPU would take longer than training it on a GPU."""
+    """The model where it was trained, ready for use, with these weights in its trained part. Shares memory with what it
+    is made of: it is large, and scoring it on a CPU would take longer than training it on a GPU."""
     with torch.device("meta"):
         made = PublishedMDM(model.config)
     fixed = {name: value for name, value in model.state_dict().items() if name not in weights}
@@ -75,5 +77,13 @@ def save(model: PublishedMDM, folder: Path, text: str, facts: Mapping[str, Any])
 
 def card(model: PublishedMDM, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
     """Text of the model card; `data` says what it was trained on (empty = generated cities)."""
-    return html.render_text("published_card.md.j2", data=data, window=model.config.window, config=config, clips=config.data,
-                            rules=config.optimizer, scores=scores, table=learn_score.table(scores))  # fmt: skip
+    return html.render_text(
+        "published_card.md.j2",
+        data=data,
+        window=model.config.window,
+        config=config,
+        clips=config.data,
+        rules=config.optimizer,
+        scores=scores,
+        table=learn_score.table(scores),
+    )

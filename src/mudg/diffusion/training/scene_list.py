@@ -7,7 +7,8 @@ A list is a file in YAML or JSON,
       - s3://bucket/clips/0001                          a folder of clips, or
       - {path: runs/0002, data_set: kitti, weight: 2, held_out: true}
 
-or plain text: a scene in each line, `PATH`, or `PATH<tab>DATA_SET<tab>WEIGHT`. Nothing of a scene is read before it is drawn.
+or plain text: a scene in each line, `PATH`, or `PATH<tab>DATA_SET<tab>WEIGHT`. Nothing of a scene is read before it is
+drawn.
 """
 
 from __future__ import annotations
@@ -89,8 +90,12 @@ class SceneList:
                 self.members.setdefault(scene.data_set, []).append(n)
         unknown = sorted(set(weights) - {scene.data_set for scene in scenes})
         if unknown:
-            raise InputError("a weight is given for a data set without scenes", where=where, got=", ".join(unknown[:8]),
-                             expected=f"one of {', '.join(list(self.members)[:20])}")  # fmt: skip
+            raise InputError(
+                "a weight is given for a data set without scenes",
+                where=where,
+                got=", ".join(unknown[:8]),
+                expected=f"one of {', '.join(list(self.members)[:20])}",
+            )
         self._sums = {name: np.cumsum([scenes[n].weight for n in of]) for name, of in self.members.items()}
         shares = np.array([weights.get(name, float(self._sums[name][-1])) for name in self.members], np.float64)
         if not len(shares) or shares.sum() <= 0:
@@ -109,7 +114,10 @@ class SceneList:
     def summary(self) -> str:
         """Data sets with their scenes and shares, a line each."""
         lines = [f"{len(self.scenes)} scenes, {len(self.scored)} of them held out"]
-        lines += [f"  {name}: {len(of)} scenes, {100 * self.shares[name]:.3g} % of the clips" for name, of in self.members.items()]
+        lines += [
+            f"  {name}: {len(of)} scenes, {100 * self.shares[name]:.3g} % of the clips"
+            for name, of in self.members.items()
+        ]
         return "\n".join(lines)
 
 
@@ -148,15 +156,19 @@ def _plain_lines(content: bytes, where: str) -> list[ListedScene]:
         except ValueError:
             weight = -1.0
         if len(rest) > 2 or not 0 <= weight < float("inf"):
-            raise InputError("not a line of a list of scenes", where=f"{where}, line {number}", got=line[:200],
-                             expected="PATH, or PATH<tab>DATA_SET<tab>WEIGHT")  # fmt: skip
+            raise InputError(
+                "not a line of a list of scenes",
+                where=f"{where}, line {number}",
+                got=line[:200],
+                expected="PATH, or PATH<tab>DATA_SET<tab>WEIGHT",
+            )
         found.append(ListedScene(path=path, data_set=rest[0] if rest else "scenes", weight=weight))
     if not found:
         raise InputError("a list names no scene", where=where)
     return found
 
 
-# shards of listed scenes ----------------------------------------------------------------------------------------------
+# shards of listed scenes --------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -211,8 +223,8 @@ class ListedShards:
                 self._leave_out(number, error)
 
     def _leave_out(self, number: int, error: InputError | IntegrityError) -> None:
-        """A scene that cannot be opened, or one of its shards. Others of a scene are drawn on: what is left out must not depend on
-        what this process happened to read before."""
+        """A scene that cannot be opened, or one of its shards. Others of a scene are drawn on: what is left out must
+        not depend on what this process happened to read before."""
         scenes = self.scenes.scenes
         with self._lock:
             if number not in self.bad:
@@ -222,12 +234,17 @@ class ListedShards:
             count = len({bad // SPAN for bad in self.bad})
         most = int(self._limit * len(scenes))
         if count > most or count == len(scenes):
-            raise UsageError("too many scenes of the list are missing or damaged", where=f"{self.scenes.where}, --data.bad-scenes",
-                expected=f"at most {most} of {len(scenes)}", got=f"{count}, the last: {str(error).splitlines()[0]}",
-                remedy="repair the scenes named above or take them off the list") from error  # fmt: skip
+            raise UsageError(
+                "too many scenes of the list are missing or damaged",
+                where=f"{self.scenes.where}, --data.bad-scenes",
+                expected=f"at most {most} of {len(scenes)}",
+                got=f"{count}, the last: {str(error).splitlines()[0]}",
+                remedy="repair the scenes named above or take them off the list",
+            ) from error
 
     def scored(self) -> list[int]:
-        """The first shard of every held-out scene, or of one trained on where none is. Those that cannot be used are left out.
+        """The first shard of every held-out scene, or of one trained on where none is. Those that cannot be used are
+        left out.
 
         Raises:
             InputError: none can be used.
@@ -287,16 +304,24 @@ class ListedShards:
                 chosen = tuple(n for n in numbers if n < HELD_OUT) or numbers
                 if place.local is not None:
                     return _OpenScene(chosen, lambda n: clip_shards.shard_path(Path(place.text), n))
-                return _OpenScene(chosen, lambda n: self._cache.get(f"{folder.key}/{n:07d}.safetensors", lambda at: folder.bring(n, at)))
+                return _OpenScene(
+                    chosen,
+                    lambda n: self._cache.get(f"{folder.key}/{n:07d}.safetensors", lambda at: folder.bring(n, at)),
+                )
         places = [Location.of(given), Location.of(fused)] if separator else [Location.of(given)]
         if all(place.local is not None for place in places):
             return self._of_log(from_log.log_source(text), scored, lambda make: make(from_log.log_source(text)))
         return self._of_remote_log(places, scored)
 
     def _of_log(
-        self, source: LogSource | None, scored: bool, with_log: Callable[[Callable[[LogSource], None]], None], key: str = ""
+        self,
+        source: LogSource | None,
+        scored: bool,
+        with_log: Callable[[Callable[[LogSource], None]], None],
+        key: str = "",
     ) -> _OpenScene:
-        """A log's clips, all made when the first one is wanted. How many there are is kept in the cache, by the log's content."""
+        """A log's clips, all made when the first one is wanted. How many there are is kept in the cache, by the log's
+        content."""
         rules = self._rules
         if source is not None:
             key = f"{store.digest(source.scene)} {store.digest(source.fused)}"
@@ -342,9 +367,14 @@ class ListedShards:
 
         facts = []
         for place in places:
-            record = next((place / n for n in ("_contents.json", store.MANIFEST, "scene.json") if (place / n).exists()), None)
+            record = next(
+                (place / n for n in ("_contents.json", store.MANIFEST, "scene.json") if (place / n).exists()), None
+            )
             if record is None:
-                raise InputError("no clips and no log here", where=place.text,
-                    remedy="check the address, and whether its upload was finished")  # fmt: skip
+                raise InputError(
+                    "no clips and no log here",
+                    where=place.text,
+                    remedy="check the address, and whether its upload was finished",
+                )
             facts.append(hashlib.sha256(record.load()).hexdigest())
         return self._of_log(None, scored, with_log, " ".join(facts))

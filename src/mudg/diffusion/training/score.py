@@ -28,13 +28,25 @@ from mudg.diffusion.settings.learn import LearnConfig
 
 SKY = palette.ID["sky"]
 SCORES = (
-    ("psnr", "RGB PSNR dB"), ("psnr_seen", "- where seen"), ("psnr_unseen", "- unseen"), ("psnr_condition", "- of the condition"),
-    ("psnr_points", "- nearest point"), ("psnr_reference", "- points + one image"),
-    ("ssim", "SSIM"), ("sharpness", "sharpness (1 = truth)"), ("abs_rel", "depth AbsRel"), ("delta1", "delta1"),
-    ("abs_rel_nearest", "AbsRel nearest fill"), ("delta1_nearest", "delta1 nearest fill"), ("miou", "mIoU"), ("accuracy", "accuracy"),
+    ("psnr", "RGB PSNR dB"),
+    ("psnr_seen", "- where seen"),
+    ("psnr_unseen", "- unseen"),
+    ("psnr_condition", "- of the condition"),
+    ("psnr_points", "- nearest point"),
+    ("psnr_reference", "- points + one image"),
+    ("ssim", "SSIM"),
+    ("sharpness", "sharpness (1 = truth)"),
+    ("abs_rel", "depth AbsRel"),
+    ("delta1", "delta1"),
+    ("abs_rel_nearest", "AbsRel nearest fill"),
+    ("delta1_nearest", "delta1 nearest fill"),
+    ("miou", "mIoU"),
+    ("accuracy", "accuracy"),
     ("flicker", "flicker (1 = truth)"),
-    ("sky_near", "sky nearer 80 m"), ("edges_agree", "depth edges on class edges"), ("confidence_gap", "confidence AUC"),
-)  # fmt: skip
+    ("sky_near", "sky nearer 80 m"),
+    ("edges_agree", "depth edges on class edges"),
+    ("confidence_gap", "confidence AUC"),
+)
 
 
 def score(
@@ -52,8 +64,8 @@ def score(
         request: how clips are sampled; the index is put in for each.
         prepare: changes each clip before it is used, for example `without_classes`.
 
-    Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}. Keys as in
-    `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
+    Returns {"average": scores over the shifted clips, "by_shift": {shift: scores}, "clips": n, "steps": request.steps}.
+    Keys as in `SCORES`; classes are pooled over all clips before the IoU. Draws a grid of up to 6 clips into `picture`.
     """
     rows: dict[str, list[dict[str, float]]] = {}
     counts: dict[str, Tensor] = {}
@@ -74,7 +86,7 @@ def score(
         save_grid(picture, pairs)
     by_shift = {name: _average(rows[name], counts[name]) for name in sorted(rows)}
     shifted = [n for n in rows if n != "recorded"] or list(rows)
-    pooled = _average([r for n in shifted for r in rows[n]], sum(counts[n] for n in shifted))  # type: ignore[arg-type]
+    pooled = _average([r for n in shifted for r in rows[n]], sum(counts[n] for n in shifted))
     return {"average": pooled, "by_shift": by_shift, "clips": sum(map(len, rows.values())), "steps": request.steps}
 
 
@@ -86,7 +98,8 @@ def without_classes(clip: Clip) -> Clip:
 def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Tensor]:
     """Scores of one clip and its class confusion i64[19,20]."""
     rgb, ids, given, points = clip.rgb, clip.semantics, clip.condition, clip.point_color
-    depth = torch.where(clip.depth_weight == 1, clip.depth, clip_shards.FAR_M)  # far depth does not count, nor does guessed depth
+    # far depth does not count, nor does guessed depth
+    depth = torch.where(clip.depth_weight == 1, clip.depth, clip_shards.FAR_M)
     seen = given.valid if given.warped is None else given.valid | given.warped
     backdrop = given.color if given.backdrop is None else given.backdrop
     frames = [TrueFrame.of(*one) for one in zip(given.views, depth, ids, strict=True)]
@@ -171,11 +184,12 @@ def table(scores: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-# pictures -------------------------------------------------------------------------------------------------------------
+# pictures -----------------------------------------------------------------------------------------
 
 
 def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: int = 4) -> None:
-    """One row per clip: condition, made and true colour; condition, made and true depth; made and true classes; confidence."""
+    """One row per clip: condition, made and true colour; condition, made and true depth; made and true classes;
+    confidence."""
     rows = []
     for clip, sample in pairs:
         t = min(frame, len(sample.confidence) - 1)
@@ -186,7 +200,7 @@ def save_grid(path: Path, pairs: Sequence[tuple[Clip, GeneratedClip]], frame: in
             *(depth_colors(depth[0].numpy()) for depth in (measured, sample.depth[t], clip.depth[t])),
             *(class_colors(ids.numpy()) for ids in (sample.semantics[t], clip.semantics[t])),
             gray(sample.confidence[t, 0].numpy()),
-        ]  # fmt: skip
+        ]
         rows.append(np.concatenate(cells, 1))
     store.write_image(path, np.concatenate(rows, 0))
 
@@ -228,7 +242,7 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
     store.write_image(path, image)
 
 
-# model card -----------------------------------------------------------------------------------------------------------
+# model card ---------------------------------------------------------------------------------------
 
 
 def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
@@ -237,5 +251,14 @@ def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data:
     `data` says what it was trained on; empty = generated cities.
     """
     parameters = sum(p.numel() for p in model.parameters())
-    return html.render_text("mdm_card.md.j2", data=data, refines=model.refiner is not None, parameters=parameters, config=config,
-                            clips=config.data, rules=config.optimizer, scores=scores, table=table(scores))  # fmt: skip
+    return html.render_text(
+        "mdm_card.md.j2",
+        data=data,
+        refines=model.refiner is not None,
+        parameters=parameters,
+        config=config,
+        clips=config.data,
+        rules=config.optimizer,
+        scores=scores,
+        table=table(scores),
+    )

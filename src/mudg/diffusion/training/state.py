@@ -1,16 +1,18 @@
 """What a training run must remember between steps, and its checkpoints: readable under another number of processes.
 
-Every process writes the rows of each tensor that it holds to a safetensors file of its own, with a JSON index beside it:
+Every process writes the rows of each tensor that it holds to a safetensors file of its own, with a JSON index beside
+it:
 
     steps/step_00000100/
         net.0000.safetensors  net.0000.json     weights: rank 0's rows; name -> shape of the whole tensor, first row
-        net.0001.safetensors  net.0001.json     rank 1's, only if parameters were sharded; of several replicas the first one's
+        net.0001.safetensors  net.0001.json     rank 1's, only if parameters were sharded; of several replicas the first
+                              one's
         average.*  exp_avg.*  exp_avg_sq.*      moving average and AdamW's moments, in the same way
         state.json  manifest.json               step, seed, layout; SHA-256 of every file
 
-A reader takes the rows it needs from whatever files hold them. `torch.distributed.checkpoint` does this too, but the index
-it writes is a pickle, its files are `torch.save` archives with a pickle inside, and with its safetensors writer the plans
-that processes exchange are pickled still. Nothing that is read back here may execute data.
+A reader takes the rows it needs from whatever files hold them. `torch.distributed.checkpoint` does this too, but the
+index it writes is a pickle, its files are `torch.save` archives with a pickle inside, and with its safetensors writer
+the plans that processes exchange are pickled still. Nothing that is read back here may execute data.
 """
 
 from __future__ import annotations
@@ -57,7 +59,8 @@ class TrainingState:
             )
 
     def export_weights(self, ranks: Ranks) -> dict[str, Tensor]:
-        """The weights to use: the average, or the weights themselves; whole, on the CPU, in the leader (others get none).
+        """The weights to use: the average, or the weights themselves; whole, on the CPU, in the leader (others get
+        none).
 
         All processes must call this together.
         """
@@ -74,7 +77,8 @@ class TrainingState:
         return {kind: {name: held[kind] for name, held in state.items()} for kind in MOMENTS}
 
     def save(self, folder: Path, ranks: Ranks, facts: Mapping[str, Any], keep: int = 2) -> float:
-        """Write a checkpoint of the present step; all processes take part, on a file system that all see. Returns the seconds it took."""
+        """Write a checkpoint of the present step; all processes take part, on a file system that all see. Returns the
+        seconds it took."""
         began = time.monotonic()
         weights = self.trained.state_dict()
         groups = {"net": weights, **self._moments()}
@@ -101,7 +105,8 @@ class TrainingState:
         return time.monotonic() - began
 
     def resume(self, folder: Path, ranks: Ranks) -> bool:
-        """Take up the newest checkpoint in `folder` that verifies; whether there is one. All processes must call this together."""
+        """Take up the newest checkpoint in `folder` that verifies; whether there is one. All processes must call this
+        together."""
         saved = newest_checkpoint(folder, ranks)
         if saved is None:
             return False
@@ -170,8 +175,12 @@ class RowFiles:
         """
         piece, shape, start = local(value), tuple(value.shape), first_row(value)
         if self._shapes.get(name) != shape:
-            raise IntegrityError("a checkpoint does not fit the model", where=f"{self._where}.{name}",
-                expected=str(shape), got=str(self._shapes.get(name, "no such tensor")))  # fmt: skip
+            raise IntegrityError(
+                "a checkpoint does not fit the model",
+                where=f"{self._where}.{name}",
+                expected=str(shape),
+                got=str(self._shapes.get(name, "no such tensor")),
+            )
         if not shape:
             return self._open(self._index[name][0][1]).get_tensor(name)
         stop = start + len(piece)
@@ -182,8 +191,12 @@ class RowFiles:
             if a < b:
                 rows.append((a, part[a - first : b - first]))
         if sum(len(r) for _, r in rows) != len(piece):
-            raise IntegrityError("rows of a tensor are missing from a checkpoint", where=f"{self._where}.{name}",
-                                 expected=f"{start} to {stop}", got=str([(a, len(r)) for a, r in rows]))  # fmt: skip
+            raise IntegrityError(
+                "rows of a tensor are missing from a checkpoint",
+                where=f"{self._where}.{name}",
+                expected=f"{start} to {stop}",
+                got=str([(a, len(r)) for a, r in rows]),
+            )
         return torch.cat([r for _, r in rows]) if rows else torch.empty_like(piece)
 
     def _open(self, path: Path) -> Any:

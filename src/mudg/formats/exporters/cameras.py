@@ -1,7 +1,8 @@
 """Cameras and images of a log as a COLMAP model, binary or text, with one rig of all cameras.
 
-Poses are camera from world, axes x right, y down, z forward, pixel centres at 0.5: those of this program. Images that the rig took at one
-time and whose poses agree with it are one frame; any other image is a frame by itself, so that every image has exactly its own pose.
+Poses are camera from world, axes x right, y down, z forward, pixel centres at 0.5: those of this program. Images that
+the rig took at one time and whose poses agree with it are one frame; any other image is a frame by itself, so that
+every image has exactly its own pose.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from mudg.base.types import Frame, PointCloud, Scene
 from mudg.formats.splats import ply
 from mudg.scene.files import open_files
 
-# names and bytes of a log's pictures for data sets of cameras ---------------------------------------------------------
+# names and bytes of a log's pictures for data sets of cameras -------------------------------------
 
 
 def picture_names(scene: Scene) -> dict[str, str]:
@@ -35,7 +36,7 @@ def pictures(scene: Scene) -> Iterator[tuple[str, bytes]]:
         yield names[frame.id], files.read(frame.image.path)
 
 
-# nerfstudio -----------------------------------------------------------------------------------------------------------
+# nerfstudio ---------------------------------------------------------------------------------------
 #
 # Cameras and images of a log as a nerfstudio data set: ``transforms.json``, pictures, starting points.
 #
@@ -51,11 +52,23 @@ def nerfstudio_files(scene: Scene, points: PointCloud | None = None) -> dict[str
     names, frames = picture_names(scene), []
     for frame in scene.frames:
         view, camera = frame.view, frame.view.camera
-        frames.append({
-            "file_path": names[frame.id], "transform_matrix": (view.world_from_cam @ FLIP).tolist(), "time": view.time_s,
-            "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy, "w": camera.width, "h": camera.height,
-            "k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0,
-        })  # fmt: skip
+        frames.append(
+            {
+                "file_path": names[frame.id],
+                "transform_matrix": (view.world_from_cam @ FLIP).tolist(),
+                "time": view.time_s,
+                "fl_x": camera.fx,
+                "fl_y": camera.fy,
+                "cx": camera.cx,
+                "cy": camera.cy,
+                "w": camera.width,
+                "h": camera.height,
+                "k1": 0.0,
+                "k2": 0.0,
+                "p1": 0.0,
+                "p2": 0.0,
+            }
+        )
     test = [names[frame.id] for frame in scene.frames if scene.split.get(frame.id) == "test"]
     value = {"camera_model": "OPENCV", "applied_transform": np.eye(4)[:3].tolist(), "frames": frames}
     if test:
@@ -76,7 +89,7 @@ def points_ply(points: PointCloud) -> bytes:
     return ply.header([("vertex", len(points), columns)]) + rows.tobytes()
 
 
-# colmap ---------------------------------------------------------------------------------------------------------------
+# colmap -------------------------------------------------------------------------------------------
 
 
 PINHOLE: Final = 1
@@ -97,7 +110,8 @@ class RigFrame:
 
 
 def sensors_from_rig(scene: Scene) -> dict[str, Matrix]:
-    """Pose of every camera in the rig, whose frame is that of the first camera: from the first image of each and the vehicle's path."""
+    """Pose of every camera in the rig, whose frame is that of the first camera: from the first image of each and the
+    vehicle's path."""
     cam_from_ego = {}
     for frame in scene.frames:
         name = frame.view.camera.name
@@ -162,9 +176,11 @@ def _binary(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict
     ]
     taken = [
         struct.pack("<I7dI", images[frame.id], *_pose(frame.view.cam_from_world), cameras[frame.view.camera.name])
-        + _name(names, frame).encode() + b"\0" + struct.pack("<Q", 0)
+        + _name(names, frame).encode()
+        + b"\0"
+        + struct.pack("<Q", 0)
         for frame in scene.frames
-    ]  # fmt: skip
+    ]
     others = list(sensors)[1:]
     first = next(iter(sensors), None)
     rig = b"" if first is None else struct.pack("<IIiI", 1, len(sensors), CAMERA, cameras[first])
@@ -173,9 +189,11 @@ def _binary(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict
         struct.pack("<II7dI", index + 1, 1, *_pose(one.rig_from_world), len(one.frames))
         + b"".join(struct.pack("<iIQ", CAMERA, cameras[f.view.camera.name], images[f.id]) for f in one.frames)
         for index, one in enumerate(frames)
-    ]  # fmt: skip
-    cloud = np.zeros(0 if points is None else len(points), [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"),
-                                                            ("track", "<u8")])  # fmt: skip
+    ]
+    cloud = np.zeros(
+        0 if points is None else len(points),
+        [("id", "<u8"), ("xyz", "<f8", 3), ("rgb", "u1", 3), ("error", "<f8"), ("track", "<u8")],
+    )
     if points is not None:
         cloud["id"], cloud["xyz"], cloud["rgb"] = np.arange(1, len(points) + 1), points.xyz, points.rgb
     parts = {"cameras.bin": lens, "images.bin": taken, "rigs.bin": [rig] if rig else [], "frames.bin": moments}
@@ -203,10 +221,15 @@ def _text(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict[s
         rest = [word for name in others for word in ("CAMERA", cameras[name], 1, *_pose(sensors[name]))]
         rig.append(words(1, len(sensors), "CAMERA", cameras[first], *rest))
     moments = [
-        words(index + 1, 1, *_pose(one.rig_from_world), len(one.frames),
-              *(word for f in one.frames for word in ("CAMERA", cameras[f.view.camera.name], images[f.id])))
+        words(
+            index + 1,
+            1,
+            *_pose(one.rig_from_world),
+            len(one.frames),
+            *(word for f in one.frames for word in ("CAMERA", cameras[f.view.camera.name], images[f.id])),
+        )
         for index, one in enumerate(frames)
-    ]  # fmt: skip
+    ]
     rows = [] if points is None else zip(points.xyz.astype(np.float64).tolist(), points.rgb.tolist())
     cloud = [words(index + 1, *xyz, *rgb, 0) for index, (xyz, rgb) in enumerate(rows)]
     parts = {"cameras.txt": lens, "images.txt": taken, "rigs.txt": rig, "frames.txt": moments, "points3D.txt": cloud}

@@ -45,22 +45,51 @@ _POSE: Final = _record(position=_VECTOR, orientation=_TURN)
 _COLOR: Final = _record(r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
 _STAMPED: Final = {"timestamp": _TIME, "frame_id": _TEXT}
 _CUBE: Final = _record(pose=_POSE, size=_VECTOR, color=_COLOR)
-_LABEL: Final = _record(pose=_POSE, billboard={"type": "boolean"}, font_size=_NUMBER, scale_invariant={"type": "boolean"},
-                        color=_COLOR, text=_TEXT)  # fmt: skip
-_ENTITY: Final = _record(**_STAMPED, id=_TEXT, lifetime=_TIME, frame_locked={"type": "boolean"},
-                         metadata=_list(_record(key=_TEXT, value=_TEXT)), cubes=_list(_CUBE), texts=_list(_LABEL))  # fmt: skip
+_LABEL: Final = _record(
+    pose=_POSE,
+    billboard={"type": "boolean"},
+    font_size=_NUMBER,
+    scale_invariant={"type": "boolean"},
+    color=_COLOR,
+    text=_TEXT,
+)
+_ENTITY: Final = _record(
+    **_STAMPED,
+    id=_TEXT,
+    lifetime=_TIME,
+    frame_locked={"type": "boolean"},
+    metadata=_list(_record(key=_TEXT, value=_TEXT)),
+    cubes=_list(_CUBE),
+    texts=_list(_LABEL),
+)
 
 SCHEMAS: Final[Mapping[str, dict[str, Any]]] = {
-    "foxglove.FrameTransforms": _record(transforms=_list(_record(
-        timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_TURN))),
+    "foxglove.FrameTransforms": _record(
+        transforms=_list(
+            _record(timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_TURN)
+        )
+    ),
     "foxglove.PoseInFrame": _record(**_STAMPED, pose=_POSE),
     "foxglove.CompressedImage": _record(**_STAMPED, data=_BYTES, format=_TEXT),
-    "foxglove.CameraCalibration": _record(**_STAMPED, width={"type": "integer"}, height={"type": "integer"}, distortion_model=_TEXT,
-                                          D=_list(_NUMBER), K=_list(_NUMBER), R=_list(_NUMBER), P=_list(_NUMBER)),
-    "foxglove.PointCloud": _record(**_STAMPED, pose=_POSE, point_stride={"type": "integer"},
-                                   fields=_list(_record(name=_TEXT, offset={"type": "integer"}, type={"type": "integer"})), data=_BYTES),
+    "foxglove.CameraCalibration": _record(
+        **_STAMPED,
+        width={"type": "integer"},
+        height={"type": "integer"},
+        distortion_model=_TEXT,
+        D=_list(_NUMBER),
+        K=_list(_NUMBER),
+        R=_list(_NUMBER),
+        P=_list(_NUMBER),
+    ),
+    "foxglove.PointCloud": _record(
+        **_STAMPED,
+        pose=_POSE,
+        point_stride={"type": "integer"},
+        fields=_list(_record(name=_TEXT, offset={"type": "integer"}, type={"type": "integer"})),
+        data=_BYTES,
+    ),
     "foxglove.SceneUpdate": _record(deletions=_list(_record(timestamp=_TIME, id=_TEXT)), entities=_list(_ENTITY)),
-}  # fmt: skip
+}
 
 DIALECT: Final = McapDialect(
     "", "jsonschema", "json", {name: json.dumps({"title": name, **schema}) for name, schema in SCHEMAS.items()}
@@ -68,12 +97,13 @@ DIALECT: Final = McapDialect(
 """How these messages stand in a file."""
 
 
-# -- messages ------------------------------------------------------------------------------------------------------------
+# -- messages --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class _JsonMessage:
-    """One message before it is made: its topic, the name of its schema, seconds on the log's clock, and what makes its value."""
+    """One message before it is made: its topic, the name of its schema, seconds on the log's clock, and what makes its
+    value."""
 
     topic: str
     schema: str
@@ -105,8 +135,12 @@ class FoxgloveMessages:
     def _of_cameras(self) -> Iterator[_JsonMessage]:
         for frame in self._scene.frames:
             name, view = frame.view.camera.name, frame.view
-            yield _JsonMessage("/tf", "foxglove.FrameTransforms", view.time_s, lambda v=view: self._transforms(v.time_s, [
-                (f"camera/{v.camera.name}", v.world_from_cam)]))  # fmt: skip
+            yield _JsonMessage(
+                "/tf",
+                "foxglove.FrameTransforms",
+                view.time_s,
+                lambda v=view: self._transforms(v.time_s, [(f"camera/{v.camera.name}", v.world_from_cam)]),
+            )
             yield _JsonMessage(
                 f"/camera/{name}/calibration",
                 "foxglove.CameraCalibration",
@@ -132,8 +166,12 @@ class FoxgloveMessages:
             yield _JsonMessage("/objects", "foxglove.SceneUpdate", moment, lambda t=moment: self._boxes(t))
             pose = self._scene.ego.pose_at(moment)
             if pose is not None:
-                yield _JsonMessage("/ego", "foxglove.PoseInFrame", moment, lambda t=moment, p=pose: {
-                    "timestamp": self._stamp(t), "frame_id": "world", "pose": _pose(p)})  # fmt: skip
+                yield _JsonMessage(
+                    "/ego",
+                    "foxglove.PoseInFrame",
+                    moment,
+                    lambda t=moment, p=pose: {"timestamp": self._stamp(t), "frame_id": "world", "pose": _pose(p)},
+                )
                 yield _JsonMessage(
                     "/tf",
                     "foxglove.FrameTransforms",
@@ -142,23 +180,41 @@ class FoxgloveMessages:
                 )
 
     def _transforms(self, time_s: float, frames: Sequence[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:
-        return {"transforms": [
-            {"timestamp": self._stamp(time_s), "parent_frame_id": "world", "child_frame_id": name, "translation": _pose(pose)["position"],
-             "rotation": _pose(pose)["orientation"]} for name, pose in frames
-        ]}  # fmt: skip
+        return {
+            "transforms": [
+                {
+                    "timestamp": self._stamp(time_s),
+                    "parent_frame_id": "world",
+                    "child_frame_id": name,
+                    "translation": _pose(pose)["position"],
+                    "rotation": _pose(pose)["orientation"],
+                }
+                for name, pose in frames
+            ]
+        }
 
     def _calibration(self, view: View) -> dict[str, Any]:
         camera = view.camera
         k = camera.matrix
         return {
-            "timestamp": self._stamp(view.time_s), "frame_id": f"camera/{camera.name}", "width": camera.width, "height": camera.height,
-            "distortion_model": "", "D": [], "K": k.reshape(-1).tolist(), "R": np.eye(3).reshape(-1).tolist(),
+            "timestamp": self._stamp(view.time_s),
+            "frame_id": f"camera/{camera.name}",
+            "width": camera.width,
+            "height": camera.height,
+            "distortion_model": "",
+            "D": [],
+            "K": k.reshape(-1).tolist(),
+            "R": np.eye(3).reshape(-1).tolist(),
             "P": np.column_stack([k, np.zeros(3)]).reshape(-1).tolist(),
-        }  # fmt: skip
+        }
 
     def _image(self, frame: Frame) -> dict[str, Any]:
-        return {"timestamp": self._stamp(frame.view.time_s), "frame_id": f"camera/{frame.view.camera.name}",
-                "format": picture_format(frame), "data": _base64(self._log.picture(frame))}  # fmt: skip
+        return {
+            "timestamp": self._stamp(frame.view.time_s),
+            "frame_id": f"camera/{frame.view.camera.name}",
+            "format": picture_format(frame),
+            "data": _base64(self._log.picture(frame)),
+        }
 
     def _sweep(self, sweep: Sweep) -> dict[str, Any]:
         points = self._log.points(sweep)
@@ -178,21 +234,45 @@ class FoxgloveMessages:
     def _cloud(self, time_s: float, frame: str, rows: NDArray[Any], more: list[tuple[str, int, int]]) -> dict[str, Any]:
         fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), *more]
         return {
-            "timestamp": self._stamp(time_s), "frame_id": frame, "pose": _pose(np.eye(4)), "point_stride": rows.dtype.itemsize,
-            "fields": [{"name": name, "offset": offset, "type": kind} for name, offset, kind in fields], "data": _base64(rows.tobytes()),
-        }  # fmt: skip
+            "timestamp": self._stamp(time_s),
+            "frame_id": frame,
+            "pose": _pose(np.eye(4)),
+            "point_stride": rows.dtype.itemsize,
+            "fields": [{"name": name, "offset": offset, "type": kind} for name, offset, kind in fields],
+            "data": _base64(rows.tobytes()),
+        }
 
     def _boxes(self, time_s: float) -> dict[str, Any]:
         entities = []
         for track, pose in self._log.boxes(time_s):
             red, green, blue = box_color(track.label)
-            entities.append({
-                "timestamp": self._stamp(time_s), "frame_id": "world", "id": track.id, "frame_locked": False,
-                "lifetime": {"sec": 0, "nsec": round(BOX_LIFE_S * NANO)}, "metadata": [{"key": "class", "value": track.label}],
-                "cubes": [{"pose": _pose(pose), "size": _vector(track.size_m), "color": {"r": red, "g": green, "b": blue, "a": 0.4}}],
-                "texts": [{"pose": _pose(above(pose, track)), "billboard": True, "font_size": 0.5, "scale_invariant": False,
-                           "color": {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0}, "text": f"{track.id} ({track.label})"}],
-            })  # fmt: skip
+            entities.append(
+                {
+                    "timestamp": self._stamp(time_s),
+                    "frame_id": "world",
+                    "id": track.id,
+                    "frame_locked": False,
+                    "lifetime": {"sec": 0, "nsec": round(BOX_LIFE_S * NANO)},
+                    "metadata": [{"key": "class", "value": track.label}],
+                    "cubes": [
+                        {
+                            "pose": _pose(pose),
+                            "size": _vector(track.size_m),
+                            "color": {"r": red, "g": green, "b": blue, "a": 0.4},
+                        }
+                    ],
+                    "texts": [
+                        {
+                            "pose": _pose(above(pose, track)),
+                            "billboard": True,
+                            "font_size": 0.5,
+                            "scale_invariant": False,
+                            "color": {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0},
+                            "text": f"{track.id} ({track.label})",
+                        }
+                    ],
+                }
+            )
         return {"deletions": [], "entities": entities}
 
 

@@ -1,4 +1,5 @@
-"""Messages over time as an MCAP file (https://mcap.dev/spec): a header, chunks of messages in order of time, each with an index, a summary.
+"""Messages over time as an MCAP file (https://mcap.dev/spec): a header, chunks of messages in order of time, each with
+an index, a summary.
 
 What the messages hold is not known here: their bytes are made one after the other, when they are written.
 """
@@ -14,8 +15,18 @@ from typing import Final
 MAGIC: Final = b"\x89MCAP0\r\n"
 CHUNK_BYTES: Final = 4 << 20
 _HEADER, _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _INDEX, _CHUNK_INDEX, _STATISTICS, _OFFSET, _END = (
-    1, 2, 3, 4, 5, 6, 7, 8, 0x0B, 0x0E, 0x0F,
-)  # fmt: skip
+    1,
+    2,
+    3,
+    4,
+    5,
+    6,
+    7,
+    8,
+    0x0B,
+    0x0E,
+    0x0F,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +44,8 @@ class McapDialect:
     """How messages are encoded.
 
     Args:
-        profile: of the file. schema_encoding, message_encoding: names of the specification. schemas: text of every schema by its name.
+        profile: of the file. schema_encoding, message_encoding: names of the specification. schemas: text of every
+            schema by its name.
         beside: what the channel of a topic carries beside.
     """
 
@@ -122,13 +134,27 @@ class McapBlocks:
         """Schema and channel records of all that occurred so far."""
         names = list(self._dialect.schemas)
         used = {schema for _, schema in self._channels.values()}
-        schemas = b"".join(_op(_SCHEMA, struct.pack("<H", names.index(name) + 1) + _text(name) + _text(self._dialect.schema_encoding)
-                               + _text(self._dialect.schemas[name])) for name in names if name in used)  # fmt: skip
+        schemas = b"".join(
+            _op(
+                _SCHEMA,
+                struct.pack("<H", names.index(name) + 1)
+                + _text(name)
+                + _text(self._dialect.schema_encoding)
+                + _text(self._dialect.schemas[name]),
+            )
+            for name in names
+            if name in used
+        )
         channels = b"".join(
-            _op(_CHANNEL, struct.pack("<HH", number, names.index(schema) + 1) + _text(topic)
-                + _text(self._dialect.message_encoding) + self._beside(topic))
+            _op(
+                _CHANNEL,
+                struct.pack("<HH", number, names.index(schema) + 1)
+                + _text(topic)
+                + _text(self._dialect.message_encoding)
+                + self._beside(topic),
+            )
             for topic, (number, schema) in self._channels.items()
-        )  # fmt: skip
+        )
         return schemas, channels
 
     def _beside(self, topic: str) -> bytes:
@@ -144,23 +170,49 @@ class McapBlocks:
         first, last = min(moments), max(moments)
         start = self._place
         self._span = (first if not self._indexes else min(self._span[0], first), max(self._span[1], last))
-        body = _op(_CHUNK, struct.pack("<QQQI", first, last, len(records), zlib.crc32(records)) + _text("")
-                   + struct.pack("<Q", len(records)) + records)  # fmt: skip
+        body = _op(
+            _CHUNK,
+            struct.pack("<QQQI", first, last, len(records), zlib.crc32(records))
+            + _text("")
+            + struct.pack("<Q", len(records))
+            + records,
+        )
         offsets, index = b"", b""
         for channel, entries in chunk.index.items():
             offsets += struct.pack("<HQ", channel, start + len(body) + len(index))
             rows = b"".join(struct.pack("<QQ", moment, len(head) + offset) for moment, offset in entries)
             index += _op(_INDEX, struct.pack("<HI", channel, len(rows)) + rows)
-        self._indexes.append(_op(_CHUNK_INDEX, struct.pack("<QQQQI", first, last, start, len(body), len(offsets)) + offsets
-                                 + struct.pack("<Q", len(index)) + _text("") + struct.pack("<QQ", len(records), len(records))))  # fmt: skip
+        self._indexes.append(
+            _op(
+                _CHUNK_INDEX,
+                struct.pack("<QQQQI", first, last, start, len(body), len(offsets))
+                + offsets
+                + struct.pack("<Q", len(index))
+                + _text("")
+                + struct.pack("<QQ", len(records), len(records)),
+            )
+        )
         return self._at(body + index)
 
     def _summary(self) -> bytes:
         schemas, channels = self._definitions()
         counts = b"".join(struct.pack("<HQ", channel, count) for channel, count in sorted(self._counts.items()))
         used = len({schema for _, schema in self._channels.values()})
-        statistics = _op(_STATISTICS, struct.pack("<QHIIIIQQI", sum(self._counts.values()), used, len(self._channels), 0, 0,
-                                                  len(self._indexes), *self._span, len(counts)) + counts)  # fmt: skip
+        statistics = _op(
+            _STATISTICS,
+            struct.pack(
+                "<QHIIIIQQI",
+                sum(self._counts.values()),
+                used,
+                len(self._channels),
+                0,
+                0,
+                len(self._indexes),
+                *self._span,
+                len(counts),
+            )
+            + counts,
+        )
         parts = (
             (_SCHEMA, schemas),
             (_CHANNEL, channels),

@@ -1,8 +1,10 @@
-"""A driving log as an NCore recording (version 4), written with NVIDIA's package: NAME.ncore4.zarr.itar and NAME.ncore4.json.
+"""A driving log as an NCore recording (version 4), written with NVIDIA's package: NAME.ncore4.zarr.itar and
+NAME.ncore4.json.
 
-Frames: ``world``, ``rig`` (the vehicle) and one per sensor. A sensor whose place on the vehicle is fixed hangs on ``rig`` by one pose, any
-other on ``world`` by its own path. Times are whole microseconds; the first record of the log is at 1 s. Sweeps, which the scene holds as
-seen at one moment, are taken apart again into rays in the sensor's frame at their own times. Boxes stand in ``world``.
+Frames: ``world``, ``rig`` (the vehicle) and one per sensor. A sensor whose place on the vehicle is fixed hangs on
+``rig`` by one pose, any other on ``world`` by its own path. Times are whole microseconds; the first record of the log
+is at 1 s. Sweeps, which the scene holds as seen at one moment, are taken apart again into rays in the sensor's frame at
+their own times. Boxes stand in ``world``.
 """
 
 from __future__ import annotations
@@ -54,7 +56,8 @@ def write_ncore(folder: Path, records: LogRecords) -> list[Path]:
     """Write a log into a folder, in a hidden folder there until it is complete; returns the files.
 
     Raises:
-        ResourceError: the package is not installed. InputError: two sweeps or pictures of one sensor begin or end at one microsecond.
+        ResourceError: the package is not installed. InputError: two sweeps or pictures of one sensor begin or end at
+            one microsecond.
     """
     made = _WrittenLog(records)
     name = file_names([records.scene.id])[0]
@@ -202,9 +205,15 @@ class _WrittenLog:
         ray = np.where(distance[:, None] > 0, raw / np.maximum(distance, 1e-12)[:, None], [1.0, 0.0, 0.0])
         classes = {} if points.classes is None else {POINT_CLASSES: points.classes}
         component.store_frame(
-            ray.astype(np.float32), times.astype(np.uint64), None, distance.astype(np.float32)[None],
-            points.intensity.clip(0, 1)[None], _unsigned(self._spans[sweep.id]), classes, {SWEEP_TIME: at},
-        )  # fmt: skip
+            ray.astype(np.float32),
+            times.astype(np.uint64),
+            None,
+            distance.astype(np.float32)[None],
+            points.intensity.clip(0, 1)[None],
+            _unsigned(self._spans[sweep.id]),
+            classes,
+            {SWEEP_TIME: at},
+        )
 
     def _as_measured(self, sweep: Sweep, xyz: NDArray[np.float32], times: Times, at: int) -> NDArray[np.float64]:
         """Points f64[N, 3] in the sensor's frame at their own times."""
@@ -229,7 +238,8 @@ class _WrittenLog:
         return data.CuboidTrackObservation(track.id, track.label, at, WORLD, at, box, source)
 
     def _keys_of(self, track: Track) -> Iterator[tuple[int, Matrix]]:
-        """Poses of an object at its keys within the recording, at its ends where it reaches beyond, and where keys lie far apart."""
+        """Poses of an object at its keys within the recording, at its ends where it reaches beyond, and where keys lie
+        far apart."""
         own = self._keys(track.times_s, track.pose_at)
         first, last = max(int(own.times_us[0]), self._start_us), min(int(own.times_us[-1]), self._end_us)
         if first > last:
@@ -256,7 +266,8 @@ class _WrittenLog:
 
 
 def sensor_ids(cameras: Iterable[str], lidars: Iterable[str]) -> dict[str, str]:
-    """``camera/NAME`` and ``lidar/NAME`` -> the name of the sensor's frame, each once and apart from ``rig`` and ``world``."""
+    """``camera/NAME`` and ``lidar/NAME`` -> the name of the sensor's frame, each once and apart from ``rig`` and
+    ``world``."""
     made: dict[str, str] = {}
     for kind, names in (("camera", cameras), ("lidar", lidars)):
         for name in names:
@@ -268,13 +279,19 @@ def sensor_ids(cameras: Iterable[str], lidars: Iterable[str]) -> dict[str, str]:
 
 
 def camera_model(data: Any, camera: Camera) -> Any:
-    """The intrinsics of a pinhole camera, f32. A scene does not know which way a shutter rolls: downwards is written."""
+    """The intrinsics of a pinhole camera, f32. A scene does not know which way a shutter rolls: downwards is
+    written."""
     shutter = data.ShutterType.ROLLING_TOP_TO_BOTTOM if camera.readout_s > 0 else data.ShutterType.GLOBAL
     return data.OpenCVPinholeCameraModelParameters(
-        resolution=np.array([camera.width, camera.height], np.uint64), shutter_type=shutter, external_distortion_parameters=None,
-        principal_point=np.array([camera.cx, camera.cy], np.float32), focal_length=np.array([camera.fx, camera.fy], np.float32),
-        radial_coeffs=np.zeros(6, np.float32), tangential_coeffs=np.zeros(2, np.float32), thin_prism_coeffs=np.zeros(4, np.float32),
-    )  # fmt: skip
+        resolution=np.array([camera.width, camera.height], np.uint64),
+        shutter_type=shutter,
+        external_distortion_parameters=None,
+        principal_point=np.array([camera.cx, camera.cy], np.float32),
+        focal_length=np.array([camera.fx, camera.fy], np.float32),
+        radial_coeffs=np.zeros(6, np.float32),
+        tangential_coeffs=np.zeros(2, np.float32),
+        thin_prism_coeffs=np.zeros(4, np.float32),
+    )
 
 
 def _masks(scene: Scene, frames: list[Frame]) -> dict[str, Any]:
@@ -294,9 +311,13 @@ def _in_order(records: list[Any], span: Any, sensor: str) -> list[Any]:
     spans = np.array([span(record) for record in ordered], np.int64).reshape(-1, 2)
     if (np.diff(spans, axis=0) <= 0).any():
         at = int(np.flatnonzero((np.diff(spans, axis=0) <= 0).any(1))[0])
-        raise InputError("two records of a sensor overlap so that neither is the earlier one", where=ordered[at + 1].id,
-            expected=f"one that begins and ends after {ordered[at].id}", got=f"{spans[at].tolist()} and {spans[at + 1].tolist()} us",
-            remedy=f"leave sensor {sensor} out of the scene")  # fmt: skip
+        raise InputError(
+            "two records of a sensor overlap so that neither is the earlier one",
+            where=ordered[at + 1].id,
+            expected=f"one that begins and ends after {ordered[at].id}",
+            got=f"{spans[at].tolist()} and {spans[at + 1].tolist()} us",
+            remedy=f"leave sensor {sensor} out of the scene",
+        )
     return ordered
 
 

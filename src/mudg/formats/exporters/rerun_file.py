@@ -1,10 +1,12 @@
 """A driving log, and a fitted scene over it, as a recording of rerun (.rrd), written with its package.
 
-    /world/ego  /world/ego_path  /world/camera/NAME (pinhole, pictures)  /world/lidar/NAME  /world/objects/ID  /world/points
+    /world/ego  /world/ego_path  /world/camera/NAME (pinhole, pictures)  /world/lidar/NAME  /world/objects/ID
+    /world/points
     /world/gaussians/NAME (centres, colours, sizes)
 
-The time line ``time`` counts from the first record. rerun shows the latest value and draws no lines between keys, so poses of objects are
-written at every moment of the log. The content is the same for the same input; the package puts fresh ids and the hour into every file.
+The time line ``time`` counts from the first record. rerun shows the latest value and draws no lines between keys, so
+poses of objects are written at every moment of the log. The content is the same for the same input; the package puts
+fresh ids and the hour into every file.
 """
 
 from __future__ import annotations
@@ -41,8 +43,10 @@ def package() -> Any:
     try:
         return importlib.import_module("rerun")
     except ImportError as error:
-        raise ResourceError("rerun files are written with the package rerun-sdk, which is not installed",
-            remedy="pip install 'mudg[rerun]', or export mcap, which needs no package") from error  # fmt: skip
+        raise ResourceError(
+            "rerun files are written with the package rerun-sdk, which is not installed",
+            remedy="pip install 'mudg[rerun]', or export mcap, which needs no package",
+        ) from error
 
 
 class RerunWriter:
@@ -174,9 +178,13 @@ class RerunWriter:
         )
 
     def _points(
-        self, path: str, xyz: NDArray[np.float32], colors: NDArray[np.uint8], radii: NDArray[np.floating],
+        self,
+        path: str,
+        xyz: NDArray[np.float32],
+        colors: NDArray[np.uint8],
+        radii: NDArray[np.floating],
         times_s: Sequence[float] = _ALWAYS,
-    ) -> None:  # fmt: skip
+    ) -> None:
         columns = self._rr.Points3D.columns(positions=xyz, colors=colors, radii=radii)
         self._put(path, columns.partition([len(xyz)]), times_s)
 

@@ -1,11 +1,13 @@
 """A driving log as a bag of ROS 2 (rosbag2 with MCAP storage), written without ROS.
 
-    /tf  /tf_static  /ego/path (once)  /ego/pose  /camera/NAME/image/compressed  /camera/NAME/camera_info  /lidar/NAME/points
+    /tf  /tf_static  /ego/path (once)  /ego/pose  /camera/NAME/image/compressed  /camera/NAME/camera_info
+    /lidar/NAME/points
     /objects/markers  /objects/detections  /points (fused, once)
 
-Frames (REP 103, REP 105): ``map``, ``base_link`` (the vehicle), ``camera_NAME_optical`` (x right, y down, z forward), ``lidar_NAME``.
-A sensor whose place on the vehicle is fixed hangs on ``base_link`` by /tf_static, any other on ``map`` by /tf. Principal points count
-from the centre of the first pixel, as OpenCV's do: half a pixel less than in this program.
+Frames (REP 103, REP 105): ``map``, ``base_link`` (the vehicle), ``camera_NAME_optical`` (x right, y down, z forward),
+``lidar_NAME``. A sensor whose place on the vehicle is fixed hangs on ``base_link`` by /tf_static, any other on ``map``
+by /tf. Principal points count from the centre of the first pixel, as OpenCV's do: half a pixel less than in this
+program.
 """
 
 from __future__ import annotations
@@ -26,26 +28,39 @@ from mudg.base.types import Frame, Sweep, View
 from mudg.formats.exporters.log_records import BOX_LIFE_S, NANO, LogRecords, above, box_color, picture_format
 from mudg.formats.exporters.mcap import McapDialect, McapMessage
 
-# cdr ------------------------------------------------------------------------------------------------------------------
+# cdr ----------------------------------------------------------------------------------------------
 #
-# Messages of ROS 2 as bytes: definitions as ``.msg`` files state them, and values as CDR (OMG's XCDR version 1, little endian).
+# Messages of ROS 2 as bytes: definitions as ``.msg`` files state them, and values as CDR (OMG's XCDR version 1, little
+# endian).
 #
-# A definition is lines of ``type name``. Every value is aligned to its size, counted after the four bytes of the header; texts and lists
-# begin with their length.
+# A definition is lines of ``type name``. Every value is aligned to its size, counted after the four bytes of the
+# header; texts and lists begin with their length.
 
 
 HEADER: Final = b"\0\1\0\0"
 LINE: Final = "=" * 80
 PRIMITIVES: Final = {
-    "bool": "?", "byte": "B", "char": "B", "int8": "b", "uint8": "B", "int16": "h", "uint16": "H", "int32": "i", "uint32": "I",
-    "int64": "q", "uint64": "Q", "float32": "f", "float64": "d",
-}  # fmt: skip
+    "bool": "?",
+    "byte": "B",
+    "char": "B",
+    "int8": "b",
+    "uint8": "B",
+    "int16": "h",
+    "uint16": "H",
+    "int32": "i",
+    "uint32": "I",
+    "int64": "q",
+    "uint64": "Q",
+    "float32": "f",
+    "float64": "d",
+}
 _FIELD: Final = re.compile(r"([A-Za-z][\w/]*)(\[(\d*)\])? ([a-z]\w*)")
 
 
 @dataclass(frozen=True, slots=True)
 class CdrField:
-    """One field: its type, its name, and how often it stands there (None: once; -1: any number, stated before; else fixed)."""
+    """One field: its type, its name, and how often it stands there (None: once; -1: any number, stated before; else
+    fixed)."""
 
     kind: str
     name: str
@@ -137,7 +152,7 @@ def _number(out: bytearray, code: str, value: float) -> None:
     out += struct.pack(f"<{code}", value)
 
 
-# ros2 -----------------------------------------------------------------------------------------------------------------
+# ros2 ---------------------------------------------------------------------------------------------
 
 
 START_S: Final = 1
@@ -150,48 +165,71 @@ FLOAT32: Final = 7
 CUBE: Final = 1
 WORDS: Final = 9
 
-DEFINITIONS: Final = Definitions({
-    "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
-    "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
-    "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
-    "std_msgs/ColorRGBA": "float32 r\nfloat32 g\nfloat32 b\nfloat32 a",
-    "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
-    "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
-    "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
-    "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
-    "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
-    "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
-    "geometry_msgs/TransformStamped": "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform",
-    "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
-    "nav_msgs/Path": "std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses",
-    "sensor_msgs/CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data",
-    "sensor_msgs/RegionOfInterest": "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify",
-    "sensor_msgs/CameraInfo": "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n"
-    "float64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi",
-    "sensor_msgs/PointField": "string name\nuint32 offset\nuint8 datatype\nuint32 count",
-    "sensor_msgs/PointCloud2": "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\nbool is_bigendian\n"
-    "uint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense",
-    "visualization_msgs/UVCoordinate": "float32 u\nfloat32 v",
-    "visualization_msgs/MeshFile": "string filename\nuint8[] data",
-    "visualization_msgs/Marker": "std_msgs/Header header\nstring ns\nint32 id\nint32 type\nint32 action\ngeometry_msgs/Pose pose\n"
-    "geometry_msgs/Vector3 scale\nstd_msgs/ColorRGBA color\nbuiltin_interfaces/Duration lifetime\nbool frame_locked\n"
-    "geometry_msgs/Point[] points\nstd_msgs/ColorRGBA[] colors\nstring texture_resource\nsensor_msgs/CompressedImage texture\n"
-    "visualization_msgs/UVCoordinate[] uv_coordinates\nstring text\nstring mesh_resource\nvisualization_msgs/MeshFile mesh_file\n"
-    "bool mesh_use_embedded_materials",
-    "visualization_msgs/MarkerArray": "visualization_msgs/Marker[] markers",
-    "vision_msgs/ObjectHypothesis": "string class_id\nfloat64 score",
-    "vision_msgs/ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
-    "vision_msgs/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
-    "vision_msgs/Detection3D": "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox3D bbox\n"
-    "string id",
-    "vision_msgs/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
-})  # fmt: skip
+DEFINITIONS: Final = Definitions(
+    {
+        "builtin_interfaces/Time": "int32 sec\nuint32 nanosec",
+        "builtin_interfaces/Duration": "int32 sec\nuint32 nanosec",
+        "std_msgs/Header": "builtin_interfaces/Time stamp\nstring frame_id",
+        "std_msgs/ColorRGBA": "float32 r\nfloat32 g\nfloat32 b\nfloat32 a",
+        "geometry_msgs/Point": "float64 x\nfloat64 y\nfloat64 z",
+        "geometry_msgs/Vector3": "float64 x\nfloat64 y\nfloat64 z",
+        "geometry_msgs/Quaternion": "float64 x\nfloat64 y\nfloat64 z\nfloat64 w",
+        "geometry_msgs/Pose": "geometry_msgs/Point position\ngeometry_msgs/Quaternion orientation",
+        "geometry_msgs/PoseStamped": "std_msgs/Header header\ngeometry_msgs/Pose pose",
+        "geometry_msgs/PoseWithCovariance": "geometry_msgs/Pose pose\nfloat64[36] covariance",
+        "geometry_msgs/Transform": "geometry_msgs/Vector3 translation\ngeometry_msgs/Quaternion rotation",
+        "geometry_msgs/TransformStamped": (
+            "std_msgs/Header header\nstring child_frame_id\ngeometry_msgs/Transform transform"
+        ),
+        "tf2_msgs/TFMessage": "geometry_msgs/TransformStamped[] transforms",
+        "nav_msgs/Path": "std_msgs/Header header\ngeometry_msgs/PoseStamped[] poses",
+        "sensor_msgs/CompressedImage": "std_msgs/Header header\nstring format\nuint8[] data",
+        "sensor_msgs/RegionOfInterest": (
+            "uint32 x_offset\nuint32 y_offset\nuint32 height\nuint32 width\nbool do_rectify"
+        ),
+        "sensor_msgs/CameraInfo": (
+            "std_msgs/Header header\nuint32 height\nuint32 width\nstring distortion_model\nfloat64[] d\nfloat64[9] k\n"
+            "float64[9] r\nfloat64[12] p\nuint32 binning_x\nuint32 binning_y\nsensor_msgs/RegionOfInterest roi"
+        ),
+        "sensor_msgs/PointField": "string name\nuint32 offset\nuint8 datatype\nuint32 count",
+        "sensor_msgs/PointCloud2": (
+            "std_msgs/Header header\nuint32 height\nuint32 width\nsensor_msgs/PointField[] fields\nbool is_bigendian\n"
+            "uint32 point_step\nuint32 row_step\nuint8[] data\nbool is_dense"
+        ),
+        "visualization_msgs/UVCoordinate": "float32 u\nfloat32 v",
+        "visualization_msgs/MeshFile": "string filename\nuint8[] data",
+        "visualization_msgs/Marker": (
+            "std_msgs/Header header\nstring ns\nint32 id\nint32 type\nint32 action\ngeometry_msgs/Pose"
+            " pose\ngeometry_msgs/Vector3 scale\nstd_msgs/ColorRGBA color\nbuiltin_interfaces/Duration lifetime\nbool"
+            " frame_locked\ngeometry_msgs/Point[] points\nstd_msgs/ColorRGBA[] colors\nstring"
+            " texture_resource\nsensor_msgs/CompressedImage texture\nvisualization_msgs/UVCoordinate[]"
+            " uv_coordinates\nstring text\nstring mesh_resource\nvisualization_msgs/MeshFile mesh_file\nbool"
+            " mesh_use_embedded_materials"
+        ),
+        "visualization_msgs/MarkerArray": "visualization_msgs/Marker[] markers",
+        "vision_msgs/ObjectHypothesis": "string class_id\nfloat64 score",
+        "vision_msgs/ObjectHypothesisWithPose": (
+            "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose"
+        ),
+        "vision_msgs/BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+        "vision_msgs/Detection3D": (
+            "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox3D bbox\n"
+            "string id"
+        ),
+        "vision_msgs/Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+    }
+)
 """Messages of Humble and later."""
 SENT: Final = (
-    "tf2_msgs/TFMessage", "nav_msgs/Path", "geometry_msgs/PoseStamped", "sensor_msgs/CompressedImage", "sensor_msgs/CameraInfo",
-    "sensor_msgs/PointCloud2", "visualization_msgs/MarkerArray", "vision_msgs/Detection3DArray",
-)  # fmt: skip
+    "tf2_msgs/TFMessage",
+    "nav_msgs/Path",
+    "geometry_msgs/PoseStamped",
+    "sensor_msgs/CompressedImage",
+    "sensor_msgs/CameraInfo",
+    "sensor_msgs/PointCloud2",
+    "visualization_msgs/MarkerArray",
+    "vision_msgs/Detection3DArray",
+)
 ONCE: Final = frozenset({"/tf_static", "/ego/path", "/points"})
 """Topics whose one message is kept for those who join later."""
 
@@ -211,15 +249,29 @@ def metadata(topics: Mapping[str, tuple[str, int]], span: tuple[int, int]) -> by
     start, length = {"nanoseconds_since_epoch": span[0]}, {"nanoseconds": span[1] - span[0]}
     total = sum(count for _, count in topics.values())
     listed = [
-        {"topic_metadata": {"name": topic, "type": kind, "serialization_format": "cdr", "offered_qos_profiles": _qos(topic)},
-         "message_count": count}
+        {
+            "topic_metadata": {
+                "name": topic,
+                "type": kind,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": _qos(topic),
+            },
+            "message_count": count,
+        }
         for topic, (kind, count) in topics.items()
-    ]  # fmt: skip
+    ]
     about = {
-        "version": 5, "storage_identifier": "mcap", "duration": length, "starting_time": start, "message_count": total,
-        "topics_with_message_count": listed, "compression_format": "", "compression_mode": "", "relative_file_paths": [FILE],
+        "version": 5,
+        "storage_identifier": "mcap",
+        "duration": length,
+        "starting_time": start,
+        "message_count": total,
+        "topics_with_message_count": listed,
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [FILE],
         "files": [{"path": FILE, "starting_time": dict(start), "duration": dict(length), "message_count": total}],
-    }  # fmt: skip
+    }
     return yaml.safe_dump({"rosbag2_bagfile_information": about}, sort_keys=False).encode()
 
 
@@ -233,9 +285,16 @@ def _qos(topic: str) -> str:
     never = {"sec": 9223372036, "nsec": 854775807}
     once = topic in ONCE
     profile = {
-        "history": 1, "depth": 1 if once else 10, "reliability": 1, "durability": 1 if once else 2, "deadline": dict(never),
-        "lifespan": dict(never), "liveliness": 1, "liveliness_lease_duration": dict(never), "avoid_ros_namespace_conventions": False,
-    }  # fmt: skip
+        "history": 1,
+        "depth": 1 if once else 10,
+        "reliability": 1,
+        "durability": 1 if once else 2,
+        "deadline": dict(never),
+        "lifespan": dict(never),
+        "liveliness": 1,
+        "liveliness_lease_duration": dict(never),
+        "avoid_ros_namespace_conventions": False,
+    }
     return yaml.safe_dump([profile], sort_keys=False)
 
 
@@ -253,7 +312,7 @@ def ros_names(names: Iterable[str]) -> dict[str, str]:
     return made
 
 
-# -- messages ------------------------------------------------------------------------------------------------------------
+# -- messages --------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -302,11 +361,30 @@ class Ros2Messages:
     def _once(self) -> Iterator[_CdrMessage]:
         start = self._log.start_s
         if self._mounts:
-            yield _CdrMessage("/tf_static", "tf2_msgs/TFMessage", start, lambda: {"transforms": [
-                self._transform(start, VEHICLE, self._frame(name), mount) for name, mount in self._mounts.items()]})  # fmt: skip
+            yield _CdrMessage(
+                "/tf_static",
+                "tf2_msgs/TFMessage",
+                start,
+                lambda: {
+                    "transforms": [
+                        self._transform(start, VEHICLE, self._frame(name), mount)
+                        for name, mount in self._mounts.items()
+                    ]
+                },
+            )
         ego = self._scene.ego
-        yield _CdrMessage("/ego/path", "nav_msgs/Path", start, lambda: {"header": self._header(start, MAP), "poses": [
-            {"header": self._header(float(t), MAP), "pose": _pose(pose)} for t, pose in zip(ego.times_s, ego.world_from_ego)]})  # fmt: skip
+        yield _CdrMessage(
+            "/ego/path",
+            "nav_msgs/Path",
+            start,
+            lambda: {
+                "header": self._header(start, MAP),
+                "poses": [
+                    {"header": self._header(float(t), MAP), "pose": _pose(pose)}
+                    for t, pose in zip(ego.times_s, ego.world_from_ego)
+                ],
+            },
+        )
         if self._log.fused is not None:
             yield _CdrMessage("/points", "sensor_msgs/PointCloud2", start, self._fused)
 
@@ -316,8 +394,12 @@ class Ros2Messages:
             pose = self._scene.ego.pose_at(moment)
             if pose is not None:
                 yield self._tf(moment, VEHICLE, pose)
-                yield _CdrMessage("/ego/pose", "geometry_msgs/PoseStamped", moment, lambda t=moment, p=pose: {
-                    "header": self._header(t, MAP), "pose": _pose(p)})  # fmt: skip
+                yield _CdrMessage(
+                    "/ego/pose",
+                    "geometry_msgs/PoseStamped",
+                    moment,
+                    lambda t=moment, p=pose: {"header": self._header(t, MAP), "pose": _pose(p)},
+                )
         for sensor, time_s, pose in self._log.sensor_poses():
             if sensor not in self._mounts:
                 yield self._tf(time_s, self._frame(sensor), pose)
@@ -329,8 +411,11 @@ class Ros2Messages:
 
     def _transform(self, time_s: float, parent: str, child: str, pose: NDArray[np.float64]) -> dict[str, Any]:
         told = _pose(pose)
-        return {"header": self._header(time_s, parent), "child_frame_id": child,
-                "transform": {"translation": told["position"], "rotation": told["orientation"]}}  # fmt: skip
+        return {
+            "header": self._header(time_s, parent),
+            "child_frame_id": child,
+            "transform": {"translation": told["position"], "rotation": told["orientation"]},
+        }
 
     def _of_sensors(self) -> Iterator[_CdrMessage]:
         for frame in self._scene.frames:
@@ -350,10 +435,15 @@ class Ros2Messages:
         k = camera.matrix
         k[:2, 2] -= 0.5
         return {
-            "header": self._header(view.time_s, self._frame(f"camera/{camera.name}")), "height": camera.height, "width": camera.width,
-            "distortion_model": "plumb_bob", "d": [0.0] * 5, "k": k.reshape(-1).tolist(), "r": np.eye(3).reshape(-1).tolist(),
+            "header": self._header(view.time_s, self._frame(f"camera/{camera.name}")),
+            "height": camera.height,
+            "width": camera.width,
+            "distortion_model": "plumb_bob",
+            "d": [0.0] * 5,
+            "k": k.reshape(-1).tolist(),
+            "r": np.eye(3).reshape(-1).tolist(),
             "p": np.column_stack([k, np.zeros(3)]).reshape(-1).tolist(),
-        }  # fmt: skip
+        }
 
     def _image(self, frame: Frame) -> dict[str, Any]:
         header = self._header(frame.view.time_s, self._frame(f"camera/{frame.view.camera.name}"))
@@ -381,8 +471,16 @@ class Ros2Messages:
             for index, name in enumerate(rows.dtype.names or ())
         ]
         content = rows.tobytes()
-        return {"header": self._header(time_s, frame), "height": 1, "width": len(rows), "fields": fields, "point_step": rows.dtype.itemsize,
-                "row_step": len(content), "data": content, "is_dense": True}  # fmt: skip
+        return {
+            "header": self._header(time_s, frame),
+            "height": 1,
+            "width": len(rows),
+            "fields": fields,
+            "point_step": rows.dtype.itemsize,
+            "row_step": len(content),
+            "data": content,
+            "is_dense": True,
+        }
 
     def _of_objects(self) -> Iterator[_CdrMessage]:
         for moment in self._log.moments():
@@ -398,21 +496,48 @@ class Ros2Messages:
         markers = []
         for track, pose in self._log.boxes(time_s):
             red, green, blue = box_color(track.label)
-            shared = {"header": self._header(time_s, MAP), "id": numbers[track.id],
-                      "lifetime": {"nanosec": round(BOX_LIFE_S * NANO)}}  # fmt: skip
-            markers.append({**shared, "ns": "boxes", "type": CUBE, "pose": _pose(pose), "scale": _vector(track.size_m),
-                            "color": {"r": red, "g": green, "b": blue, "a": 0.4}})  # fmt: skip
-            markers.append({**shared, "ns": "names", "type": WORDS, "pose": _pose(above(pose, track)), "scale": {"z": 0.5},
-                            "color": {"r": 1, "g": 1, "b": 1, "a": 1}, "text": f"{track.id} ({track.label})"})  # fmt: skip
+            shared = {
+                "header": self._header(time_s, MAP),
+                "id": numbers[track.id],
+                "lifetime": {"nanosec": round(BOX_LIFE_S * NANO)},
+            }
+            markers.append(
+                {
+                    **shared,
+                    "ns": "boxes",
+                    "type": CUBE,
+                    "pose": _pose(pose),
+                    "scale": _vector(track.size_m),
+                    "color": {"r": red, "g": green, "b": blue, "a": 0.4},
+                }
+            )
+            markers.append(
+                {
+                    **shared,
+                    "ns": "names",
+                    "type": WORDS,
+                    "pose": _pose(above(pose, track)),
+                    "scale": {"z": 0.5},
+                    "color": {"r": 1, "g": 1, "b": 1, "a": 1},
+                    "text": f"{track.id} ({track.label})",
+                }
+            )
         return {"markers": markers}
 
     def _detections(self, time_s: float) -> dict[str, Any]:
         header = self._header(time_s, MAP)
-        return {"header": header, "detections": [
-            {"header": header, "id": track.id, "bbox": {"center": _pose(pose), "size": _vector(track.size_m)},
-             "results": [{"hypothesis": {"class_id": track.label, "score": 1.0}, "pose": {"pose": _pose(pose)}}]}
-            for track, pose in self._log.boxes(time_s)
-        ]}  # fmt: skip
+        return {
+            "header": header,
+            "detections": [
+                {
+                    "header": header,
+                    "id": track.id,
+                    "bbox": {"center": _pose(pose), "size": _vector(track.size_m)},
+                    "results": [{"hypothesis": {"class_id": track.label, "score": 1.0}, "pose": {"pose": _pose(pose)}}],
+                }
+                for track, pose in self._log.boxes(time_s)
+            ],
+        }
 
 
 def _vector(values: NDArray[np.floating]) -> dict[str, float]:

@@ -43,7 +43,8 @@ def mp4_bytes(frames: Iterable[NDArray[np.uint8]], fps: float = 10.0, crf: int =
 
 @dataclass(frozen=True)
 class Encoding:
-    """How a video is coded: pictures per second, the best and the worst quality (x264's CRF, lower is better), x264's preset."""
+    """How a video is coded: pictures per second, the best and the worst quality (x264's CRF, lower is better), x264's
+    preset."""
 
     fps: float
     first_crf: int
@@ -75,7 +76,9 @@ def _encode(target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: i
     try:
         for index, frame in enumerate(frames):
             if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
-                raise InputError("a video frame must be u8[H, W, 3]", where=f"frame {index}", got=f"{frame.dtype} {frame.shape}")
+                raise InputError(
+                    "a video frame must be u8[H, W, 3]", where=f"frame {index}", got=f"{frame.dtype} {frame.shape}"
+                )
             if container is None:
                 size = frame.shape
                 # The index first, so that players start at once; only a file can be rewritten that way.
@@ -83,8 +86,10 @@ def _encode(target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: i
                 container = av.open(target, "w", format="mp4", options=options)
                 stream = _stream(container, frame.shape, fps, crf, preset)
             if frame.shape != size:
-                raise InputError("video frames differ in size", where=f"frame {index}", expected=str(size), got=str(frame.shape))
-            for packet in stream.encode(av.VideoFrame.from_ndarray(_even(frame), format="rgb24")):  # type: ignore[union-attr]
+                raise InputError(
+                    "video frames differ in size", where=f"frame {index}", expected=str(size), got=str(frame.shape)
+                )
+            for packet in stream.encode(av.VideoFrame.from_ndarray(_even(frame), format="rgb24")):
                 container.mux(packet)
         if container is None or stream is None:
             raise InputError("a video needs at least one frame")
@@ -105,8 +110,8 @@ def _stream(container: Any, shape: tuple[int, ...], fps: float, crf: int, preset
     stream.width, stream.height = shape[1] + shape[1] % 2, shape[0] + shape[0] % 2
     stream.pix_fmt = "yuv420p"
     stream.thread_count = 1  # the same bytes on every machine with this encoder
-    # Without the tree of macroblocks: with B-frames x264's vector code for it reads memory that was never written, and the bytes of a
-    # video then depend on what lay there before.
+    # Without the tree of macroblocks: with B-frames x264's vector code for it reads memory that was never written, and
+    # the bytes of a video then depend on what lay there before.
     stream.options = {"crf": str(crf), "preset": preset, "mbtree": "0"} if codec == "libx264" else {}
     return stream
 

@@ -1,8 +1,9 @@
 """Importers: dataset logs in their own formats -> scene directories. This is the only place that lists them.
 
 A format is one module, or a folder with ``importer.py``. It has ``import_<format>(source, out, options) -> Scene``,
-``looks_like_<format>(source) -> bool`` and, where folders hold many logs, ``files_of_<format>(source, options) -> LogFiles``; its name
-in ``FORMATS`` and a case in ``_functions``. Modules are loaded when their format is first asked for.
+``looks_like_<format>(source) -> bool`` and, where folders hold many logs, ``files_of_<format>(source, options) ->
+LogFiles``; its name in ``FORMATS`` and a case in ``_functions``. Modules are loaded when their format is first asked
+for.
 """
 
 from __future__ import annotations
@@ -22,8 +23,16 @@ Finder = Callable[[Path, ImportOptions], LogFiles]
 
 FORMATS = (
     "kitti360",  # before kitti: a drive's folder has image_00 in both
-    "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom", "kitti",
-)  # fmt: skip
+    "waymo",
+    "nuscenes",
+    "argoverse2",
+    "pandaset",
+    "nuplan",
+    "dgp",
+    "ncore",
+    "custom",
+    "kitti",
+)
 """Names of the formats, in the order in which a folder is asked whether it looks like one."""
 
 
@@ -102,4 +111,5 @@ IMPORTERS: Mapping[str, Importer] = {name: partial(_import, name) for name in FO
 """Format name -> importer ``(source, out, options) -> Scene``."""
 
 RECOGNISERS: Mapping[str, Recogniser] = {name: partial(_looks_like, name) for name in FORMATS}
-"""Format name -> whether a folder or file looks like it (by names of files, a few bytes at most). The first that says yes wins."""
+"""Format name -> whether a folder or file looks like it (by names of files, a few bytes at most). The first that says
+yes wins."""

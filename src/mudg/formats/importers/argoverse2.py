@@ -8,10 +8,10 @@
 ``annotations.feather``                     boxes in the vehicle's frame at the sweeps' times (not in the test split)
 =========================================== =====================================================================
 
-Images are rectified by the publisher: the coefficients k1 to k3 describe the original lens and are kept for the record only.
-Sweeps are the returns of two sensors, compensated for the vehicle's motion to the time in their name; ``dt_s`` is the file's
-``offset_ns``. They are stored in the frame of the upper sensor, so that a sweep has the origin its rays came from (the lower
-one sits about 0.1 m below it).
+Images are rectified by the publisher: the coefficients k1 to k3 describe the original lens and are kept for the record
+only. Sweeps are the returns of two sensors, compensated for the vehicle's motion to the time in their name; ``dt_s`` is
+the file's ``offset_ns``. They are stored in the frame of the upper sensor, so that a sweep has the origin its rays came
+from (the lower one sits about 0.1 m below it).
 """
 
 from __future__ import annotations
@@ -54,14 +54,25 @@ Matrix = NDArray[np.float64]
 
 LICENCE: Final = "CC BY-NC-SA 4.0 (Argoverse 2: Wilson et al.; attribution, non-commercial, share-alike)"
 RING_CAMERAS: Final = (
-    "ring_front_center", "ring_front_left", "ring_front_right", "ring_side_left", "ring_side_right",
-    "ring_rear_left", "ring_rear_right",
-)  # fmt: skip
+    "ring_front_center",
+    "ring_front_left",
+    "ring_front_right",
+    "ring_side_left",
+    "ring_side_right",
+    "ring_rear_left",
+    "ring_rear_right",
+)
 CAMERAS: Final[Mapping[str, str]] = {
-    "ring_front_center": "front", "ring_front_left": "front_left", "ring_front_right": "front_right",
-    "ring_side_left": "side_left", "ring_side_right": "side_right", "ring_rear_left": "rear_left",
-    "ring_rear_right": "rear_right", "stereo_front_left": "stereo_left", "stereo_front_right": "stereo_right",
-}  # fmt: skip
+    "ring_front_center": "front",
+    "ring_front_left": "front_left",
+    "ring_front_right": "front_right",
+    "ring_side_left": "side_left",
+    "ring_side_right": "side_right",
+    "ring_rear_left": "rear_left",
+    "ring_rear_right": "rear_right",
+    "stereo_front_left": "stereo_left",
+    "stereo_front_right": "stereo_right",
+}
 SENSOR: Final = "lidar"
 _UPPER: Final = "up_lidar"
 _LOWER: Final = "down_lidar"
@@ -73,27 +84,59 @@ SWEEPS: Final = "sensors/lidar/*.feather"
 OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     "city_SE3_egovehicle.feather": frozenset({"timestamp_ns", *_POSE}),
     "egovehicle_SE3_sensor.feather": frozenset({"sensor_name", *_POSE}),
-    "intrinsics.feather": frozenset({
-        "sensor_name", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px",
-    }),
-    "annotations.feather": frozenset({
-        "timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *_POSE, "num_interior_pts", "log_id",
-    }),
+    "intrinsics.feather": frozenset(
+        {"sensor_name", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px"}
+    ),
+    "annotations.feather": frozenset(
+        {
+            "timestamp_ns",
+            "track_uuid",
+            "category",
+            "length_m",
+            "width_m",
+            "height_m",
+            *_POSE,
+            "num_interior_pts",
+            "log_id",
+        }
+    ),
     SWEEPS: frozenset({"x", "y", "z", "intensity", "laser_number", "offset_ns"}),
-}  # fmt: skip
+}
 """Tables -> their columns."""
 
 LABELS: Final[Mapping[str, str]] = {
-    "REGULAR_VEHICLE": "car", "PEDESTRIAN": "pedestrian", "OFFICIAL_SIGNALER": "pedestrian", "BICYCLE": "bicycle",
-    "BICYCLIST": "rider", "MOTORCYCLE": "motorcycle", "MOTORCYCLIST": "rider", "WHEELED_RIDER": "rider",
-    "WHEELED_DEVICE": "wheeled_device", "BUS": "bus", "SCHOOL_BUS": "bus", "ARTICULATED_BUS": "bus",
-    "LARGE_VEHICLE": "truck", "BOX_TRUCK": "truck", "TRUCK": "truck", "TRUCK_CAB": "truck",
-    "VEHICULAR_TRAILER": "trailer", "RAILED_VEHICLE": "tram", "STROLLER": "stroller", "WHEELCHAIR": "wheelchair",
-    "DOG": "animal", "ANIMAL": "animal", "BOLLARD": "bollard", "CONSTRUCTION_CONE": "traffic_cone",
-    "CONSTRUCTION_BARREL": "construction_barrel", "STOP_SIGN": "traffic_sign", "SIGN": "traffic_sign",
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "traffic_sign", "MOBILE_PEDESTRIAN_SIGN": "traffic_sign",
-    "MESSAGE_BOARD_TRAILER": "message_board_trailer", "TRAFFIC_LIGHT_TRAILER": "traffic_light_trailer",
-}  # fmt: skip
+    "REGULAR_VEHICLE": "car",
+    "PEDESTRIAN": "pedestrian",
+    "OFFICIAL_SIGNALER": "pedestrian",
+    "BICYCLE": "bicycle",
+    "BICYCLIST": "rider",
+    "MOTORCYCLE": "motorcycle",
+    "MOTORCYCLIST": "rider",
+    "WHEELED_RIDER": "rider",
+    "WHEELED_DEVICE": "wheeled_device",
+    "BUS": "bus",
+    "SCHOOL_BUS": "bus",
+    "ARTICULATED_BUS": "bus",
+    "LARGE_VEHICLE": "truck",
+    "BOX_TRUCK": "truck",
+    "TRUCK": "truck",
+    "TRUCK_CAB": "truck",
+    "VEHICULAR_TRAILER": "trailer",
+    "RAILED_VEHICLE": "tram",
+    "STROLLER": "stroller",
+    "WHEELCHAIR": "wheelchair",
+    "DOG": "animal",
+    "ANIMAL": "animal",
+    "BOLLARD": "bollard",
+    "CONSTRUCTION_CONE": "traffic_cone",
+    "CONSTRUCTION_BARREL": "construction_barrel",
+    "STOP_SIGN": "traffic_sign",
+    "SIGN": "traffic_sign",
+    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "traffic_sign",
+    "MOBILE_PEDESTRIAN_SIGN": "traffic_sign",
+    "MESSAGE_BOARD_TRAILER": "message_board_trailer",
+    "TRAFFIC_LIGHT_TRAILER": "traffic_light_trailer",
+}
 """The data set's categories -> labels."""
 
 
@@ -107,8 +150,8 @@ def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     Args:
         source: a log's folder, or a folder of logs.
-        options: ``sequence`` names the log (its beginning is enough) where there are several; ``frames`` counts images of
-            the first chosen camera; ``cameras`` by either name, the seven ring cameras by default.
+        options: ``sequence`` names the log (its beginning is enough) where there are several; ``frames`` counts images
+            of the first chosen camera; ``cameras`` by either name, the seven ring cameras by default.
 
     Raises:
         UsageError: there are several logs and none was chosen, or there is no such log or camera.
@@ -133,9 +176,13 @@ def _logs(source: Path) -> list[Path]:
 def _choose_log(source: Path, options: ImportOptions) -> Path:
     logs = _logs(source)
     if not logs:
-        raise InputError("no Argoverse 2 log found", where=str(source), got=folder_contents(source),
+        raise InputError(
+            "no Argoverse 2 log found",
+            where=str(source),
+            got=folder_contents(source),
             expected="city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders",
-            remedy="give the folder of one log of the sensor data set")  # fmt: skip
+            remedy="give the folder of one log of the sensor data set",
+        )
     matching = [path for path in logs if path.resolve().name.startswith(options.sequence)]
     return the_only(matching, [path.name for path in logs], options, source, "log")
 
@@ -152,9 +199,12 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
     image_folder, sweep_folder = folder / "sensors" / "cameras", folder / "sensors" / "lidar"
     there = {raw: name for raw, name in CAMERAS.items() if (image_folder / raw).is_dir()}
     if not there:
-        raise InputError("the log has no images", where=str(image_folder),
+        raise InputError(
+            "the log has no images",
+            where=str(image_folder),
             expected="folders ring_front_center, ring_front_left, ... with images named by nanoseconds",
-            remedy="download the sensor data set's camera archives, too; a scene is made of images")  # fmt: skip
+            remedy="download the sensor data set's camera archives, too; a scene is made of images",
+        )
     refuse_missing_cameras(there.values(), (CAMERAS[raw] for raw in RING_CAMERAS), options, image_folder)
     chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, RING_CAMERAS)}
     files = {name: _files_by_time(image_folder / raw, (".jpg", ".jpeg", ".png")) for name, raw in chosen.items()}
@@ -215,7 +265,7 @@ def _with_poses(files: Mapping[int, Path], ego: EgoPath, zero_ns: int, sensor: s
     return placed
 
 
-# --- tables ---------------------------------------------------------------------------------------------------------
+# --- tables ---------------------------------------------------------------------------------------
 
 
 def read_feather(path: Path, columns: Sequence[str]) -> Columns:
@@ -293,7 +343,8 @@ def read_cameras(path: Path, chosen: Mapping[str, str]) -> dict[str, Camera]:
 
 
 def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = False) -> tuple[list[Track], list[str]]:
-    """Tracks in the city's frame, and notes; no file is no tracks. ``skip_missing`` leaves out boxes without a vehicle pose."""
+    """Tracks in the city's frame, and notes; no file is no tracks. ``skip_missing`` leaves out boxes without a vehicle
+    pose."""
     where = str(path)
     if not path.is_file():
         return [], ["no annotations in this log: everything counts as static"]
@@ -322,7 +373,8 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = 
 def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()) -> SweepPoints:
     """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time.
 
-    Beams without a return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it, f64[3] each.
+    Beams without a return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it,
+    f64[3] each.
 
     Raises:
         InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn.
@@ -337,9 +389,12 @@ def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()
     if offset_ns.dtype.kind not in "iu" or (
         len(offset_ns) and int(np.abs(offset_ns.astype(np.int64)).max()) > _MAX_OFFSET_NS
     ):
-        raise InputError("point times are no nanoseconds of one turn", where=f"{where}: offset_ns",
+        raise InputError(
+            "point times are no nanoseconds of one turn",
+            where=f"{where}: offset_ns",
             expected="whole nanoseconds since the sweep's time, under half a second",
-            got=f"{offset_ns.dtype}, up to {offset_ns.max():g}")  # fmt: skip
+            got=f"{offset_ns.dtype}, up to {offset_ns.max():g}",
+        )
     xyz = transform_points(invert(ego_from_lidar), xyz_ego).astype(np.float32)
     dt_s = (offset_ns.astype(np.float64) / NANOSECONDS).astype(np.float32)
     return SweepPoints(xyz, intensity, dt_s, no_returns=int((~returns).sum()))

@@ -22,16 +22,18 @@ from mudg.base.geometry import (
 from mudg.base.types import SweepPoints, Track, foreign_name
 from mudg.scene import motion
 
-# box times ------------------------------------------------------------------------------------------------------------
+# box times ----------------------------------------------------------------------------------------
 #
 # When a box was seen: annotated boxes of moving objects are brought to their sweep's time.
 #
 # A turning sensor meets an object some time before or after the sweep's time stamp. Sweeps that are compensated for the
-# vehicle's motion still show a moving object where it was when the beams met it, and people draw its box around these points: the box
-# belongs to the mean time of the points inside it, not to the stamp it is filed under. At 10 m/s and 0.08 s that is 0.8 m.
-# Each such box is moved by the track's velocity to the stamp, where points, too, are brought by their ``dt_s``.
+# vehicle's motion still show a moving object where it was when the beams met it, and people draw its box around these
+# points: the box belongs to the mean time of the points inside it, not to the stamp it is filed under. At 10 m/s and
+# 0.08 s that is 0.8 m. Each such box is moved by the track's velocity to the stamp, where points, too, are brought by
+# their ``dt_s``.
 #
-# Images are taken a little before or after the sweep they belong to; ``reach_images`` lets a track cover those at its ends.
+# Images are taken a little before or after the sweep they belong to; ``reach_images`` lets a track cover those at its
+# ends.
 
 
 MOVES_M: Final = 1.0
@@ -99,7 +101,8 @@ class BoxTimes:
 def _velocity_box_times(times_s: NDArray[np.float64], late_s: NDArray[np.float64], places: Matrix) -> Matrix:
     """Velocity at each key, f64[T, 3] m/s: a place filed under t was taken at t + late.
 
-    Steps that these delays nearly cancel (an object crosses the seam where the turn begins) tell no velocity and are left out.
+    Steps that these delays nearly cancel (an object crosses the seam where the turn begins) tell no velocity and are
+    left out.
     """
     steps_s = np.diff(times_s + late_s)
     telling = steps_s > 0.5 * np.diff(times_s)
@@ -117,7 +120,8 @@ def _extent_m(track: Track) -> float:
 
 
 def reach_images(track: Track) -> Track:
-    """The track with a key ``REACH_S`` before its first and one after its last box, made with the velocity of the nearest two.
+    """The track with a key ``REACH_S`` before its first and one after its last box, made with the velocity of the
+    nearest two.
 
     Without these, objects would be missing in images taken just before the first sweep that shows them.
     """
@@ -131,7 +135,8 @@ def reach_images(track: Track) -> Track:
 
 
 def clip_track(track: Track, start_s: float, end_s: float) -> Track | None:
-    """The keys of a track that matter from ``start_s`` to ``end_s``: those inside and one beyond each end; None if it is not there then."""
+    """The keys of a track that matter from ``start_s`` to ``end_s``: those inside and one beyond each end; None if it
+    is not there then."""
     if track.times_s[-1] < start_s - 1e-6 or track.times_s[0] > end_s + 1e-6:
         return None
     first = max(0, int(np.searchsorted(track.times_s, start_s + 1e-6)) - 1)
@@ -139,7 +144,7 @@ def clip_track(track: Track, start_s: float, end_s: float) -> Track | None:
     return Track(track.id, track.label, track.size_m, track.times_s[first:last], track.world_from_object[first:last])
 
 
-# box tracks -----------------------------------------------------------------------------------------------------------
+# box tracks ---------------------------------------------------------------------------------------
 
 
 Matrix = NDArray[np.float64]
@@ -153,7 +158,8 @@ _MIN_STEP_S: Final = 0.05
 _SAME_TIME_S: Final = 1e-4
 _NAMED: Final = 5
 Speeds = Callable[[NDArray[np.float64], Matrix, Sequence[NDArray[np.intp]]], Matrix]
-"""Times f64[n] at which an object was measured, its places f64[n, 3], the pieces of its track (indices) -> velocities f64[n, 3] m/s."""
+"""Times f64[n] at which an object was measured, its places f64[n, 3], the pieces of its track (indices) -> velocities
+f64[n, 3] m/s."""
 
 
 def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, float, float]:
@@ -163,9 +169,12 @@ def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, f
     except (TypeError, ValueError) as error:
         raise InputError("box size is not made of numbers", where=where, got=str(error)) from error
     if not all(np.isfinite(side) and 0 < side <= MAX_SIDE_M for side in size):
-        raise InputError("box size makes no sense", where=where,
+        raise InputError(
+            "box size makes no sense",
+            where=where,
             expected=f"length, width and height in metres, above 0 and at most {MAX_SIDE_M:g}",
-            got=f"length {length}, width {width}, height {height}")  # fmt: skip
+            got=f"length {length}, width {width}, height {height}",
+        )
     return size
 
 
@@ -181,8 +190,8 @@ class BoxTracks:
 
     Args:
         where: the file or folder the boxes come from, for messages.
-        labels: the data set's class -> the label here (``car``, ``pedestrian``, ...). Other classes keep the last part (after
-            a dot) of their name in lower case, and are named once in the notes.
+        labels: the data set's class -> the label here (``car``, ``pedestrian``, ...). Other classes keep the last part
+            (after a dot) of their name in lower case, and are named once in the notes.
         max_gap_s: an object that is not seen for longer than this is split.
     """
 
@@ -195,7 +204,8 @@ class BoxTracks:
         return len(self._members)
 
     def label_of(self, category: str) -> str:
-        """The label of a class of the data set; classes that are not known are counted. InputError for a name above 200 bytes."""
+        """The label of a class of the data set; classes that are not known are counted. InputError for a name above 200
+        bytes."""
         if category in self._labels:
             return self._labels[category]
         foreign_name(category, f"{self._where}: class of a box")
@@ -221,9 +231,10 @@ class BoxTracks:
             time_s: when, seconds of the scene's clock.
             size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
-            standing: the data set says that the object does not move in the whole log. It must say so with every box of the object.
-            late_s: how long after ``time_s`` the box was measured (a turning LiDAR reaches it at its own time). The track's key
-                stands at ``time_s``, moved there with the object's velocity.
+            standing: the data set says that the object does not move in the whole log. It must say so with every box of
+                the object.
+            late_s: how long after ``time_s`` the box was measured (a turning LiDAR reaches it at its own time). The
+                track's key stands at ``time_s``, moved there with the object's velocity.
             where: file and record, for messages.
 
         Raises:
@@ -241,13 +252,13 @@ class BoxTracks:
     ) -> tuple[list[Track], list[str]]:
         """All tracks in the order of their first boxes, and notes for people.
 
-        The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to its last
-        moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
+        The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
+        its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
 
         Args:
             speeds: how velocities are found; None = from the neighbouring boxes of a piece.
-            images_s: time of a box -> times of the first and last image that show the object; a track reaches from the first
-                image of its first box to the last one of its last. None = from box to box.
+            images_s: time of a box -> times of the first and last image that show the object; a track reaches from the
+                first image of its first box to the last one of its last. None = from box to box.
 
         Raises:
             InputError: an object has two boxes at one moment; length and width are swapped.
@@ -260,8 +271,12 @@ class BoxTracks:
             times = rows[:, 0]
             if (np.diff(times) <= 0).any():
                 at = float(times[int(np.flatnonzero(np.diff(times) <= 0)[0])])
-                raise InputError("an object has two boxes at one moment", where=f"{self._where}: object {name}",
-                    got=f"time {at:.3f} s of the log", remedy="are two logs mixed?")  # fmt: skip
+                raise InputError(
+                    "an object has two boxes at one moment",
+                    where=f"{self._where}: object {name}",
+                    got=f"time {at:.3f} s of the log",
+                    remedy="are two logs mixed?",
+                )
             size = np.median(rows[:, 2:5], axis=0)
             label = max(member.labels, key=lambda name: member.labels[name])
             poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -295,7 +310,8 @@ class BoxTracks:
 
 
 def turned_back(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
-    """The tracks with headings that flip by 180 degrees turned back, and a note about those that were; see ``motion.unflipped``."""
+    """The tracks with headings that flip by 180 degrees turned back, and a note about those that were; see
+    ``motion.unflipped``."""
     mended, names = [], []
     for track in tracks:
         poses, turned = motion.unflipped(track.times_s, track.world_from_object, motion.most_turn_rad_s(track.label))
@@ -318,9 +334,16 @@ def check_sides(tracks: Sequence[Track], where: str) -> None:
     wide = [track for track in vehicles if track.size_m[1] > track.size_m[0]]
     if vehicles and 2 * len(wide) > len(vehicles):
         length, width, _ = wide[0].size_m
-        raise InputError("length and width of boxes are swapped", where=where, expected="vehicles longer than wide",
-            got=f"{len(wide)} of {len(vehicles)} are wider than long, e.g. {wide[0].label} {wide[0].id}: "
-            f"{length:.2f} m long, {width:.2f} m wide", remedy="check the order in which the sizes were written")  # fmt: skip
+        raise InputError(
+            "length and width of boxes are swapped",
+            where=where,
+            expected="vehicles longer than wide",
+            got=(
+                f"{len(wide)} of {len(vehicles)} are wider than long, e.g. {wide[0].label} {wide[0].id}: "
+                f"{length:.2f} m long, {width:.2f} m wide"
+            ),
+            remedy="check the order in which the sizes were written",
+        )
 
 
 def neighbour_speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:

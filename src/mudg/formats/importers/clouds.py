@@ -29,13 +29,66 @@ _MAX_HEADER_BYTES: Final = 1 << 16
 _LZF_MAX_GROWTH: Final = 90
 """A token of 3 bytes makes at most 264."""
 
-USUAL: Final = frozenset({
-    "x", "y", "z", "intensity", "reflectivity", "reflectance", "remission", "i", "ring", "channel", "laser_id", "lidar_info", "line", "tag",
-    "t", "time", "timestamp", "time_stamp", "offset_time", "offset_ns", "range", "distance", "azimuth", "elevation", "ambient", "noise",
-    "near_ir", "signal", "return_type", "return_number", "number_of_returns", "confidence", "rgb", "rgba", "r", "g", "b", "a", "red",
-    "green", "blue", "alpha", "nx", "ny", "nz", "normal_x", "normal_y", "normal_z", "curvature", "label", "class", "classification",
-    "instance", "object", "velocity", "doppler",
-})  # fmt: skip
+USUAL: Final = frozenset(
+    {
+        "x",
+        "y",
+        "z",
+        "intensity",
+        "reflectivity",
+        "reflectance",
+        "remission",
+        "i",
+        "ring",
+        "channel",
+        "laser_id",
+        "lidar_info",
+        "line",
+        "tag",
+        "t",
+        "time",
+        "timestamp",
+        "time_stamp",
+        "offset_time",
+        "offset_ns",
+        "range",
+        "distance",
+        "azimuth",
+        "elevation",
+        "ambient",
+        "noise",
+        "near_ir",
+        "signal",
+        "return_type",
+        "return_number",
+        "number_of_returns",
+        "confidence",
+        "rgb",
+        "rgba",
+        "r",
+        "g",
+        "b",
+        "a",
+        "red",
+        "green",
+        "blue",
+        "alpha",
+        "nx",
+        "ny",
+        "nz",
+        "normal_x",
+        "normal_y",
+        "normal_z",
+        "curvature",
+        "label",
+        "class",
+        "classification",
+        "instance",
+        "object",
+        "velocity",
+        "doppler",
+    }
+)
 """Fields that clouds of LiDARs usually have, whatever their case: no format of clouds closes its list."""
 
 Fields = Mapping[str, NDArray]
@@ -43,7 +96,8 @@ Fields = Mapping[str, NDArray]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
-    """Points as a file has them: ``xyz`` f64[N, 3], and every other named field of one number a point, ``fields`` [N] each.
+    """Points as a file has them: ``xyz`` f64[N, 3], and every other named field of one number a point, ``fields`` [N]
+    each.
 
     Beams without a return (``scene.returns.is_return``) are left out; ``missing`` counts them.
     """
@@ -64,32 +118,51 @@ def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
     """
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        raise InputError("point cloud format is not known", where=str(path), expected=", ".join(READERS),
-            got=path.suffix or "no suffix")  # fmt: skip
+        raise InputError(
+            "point cloud format is not known",
+            where=str(path),
+            expected=", ".join(READERS),
+            got=path.suffix or "no suffix",
+        )
     columns = reader(store.read_bytes(path), str(path))
     absent = [name for name in "xyz" if name not in columns]
     if absent:
-        raise InputError("cloud has no coordinates", where=str(path), expected="fields x, y, z",
-            got=", ".join(columns) or "no fields")  # fmt: skip
+        raise InputError(
+            "cloud has no coordinates",
+            where=str(path),
+            expected="fields x, y, z",
+            got=", ".join(columns) or "no fields",
+        )
     note_unknown(f"*{path.suffix}", [name for name in columns if name.lower() not in USUAL], frozenset(known))
     xyz = np.stack([columns[name].astype(np.float64) for name in "xyz"], 1)
     nowhere = ~is_return(xyz)
     xyz = xyz[~nowhere]
     if not np.isfinite(xyz).all():
         bad = int((~np.isfinite(xyz).all(1)).sum())
-        raise InputError("cloud holds coordinates that are not finite", where=str(path),
+        raise InputError(
+            "cloud holds coordinates that are not finite",
+            where=str(path),
             got=f"{bad} of {len(xyz)} points",
-            remedy="leave missing returns out, or write all three coordinates as NaN")  # fmt: skip
+            remedy="leave missing returns out, or write all three coordinates as NaN",
+        )
     rest = {name: values[~nowhere] for name, values in columns.items() if name not in "xyz"}
     return Cloud(xyz, rest, int(nowhere.sum()))
 
 
-# --- PCD --------------------------------------------------------------------------------------------------------------
+# --- PCD ------------------------------------------------------------------------------------------
 
 _PCD_TYPES: Final = {
-    ("F", 4): "<f4", ("F", 8): "<f8", ("I", 1): "<i1", ("I", 2): "<i2", ("I", 4): "<i4", ("I", 8): "<i8",
-    ("U", 1): "<u1", ("U", 2): "<u2", ("U", 4): "<u4", ("U", 8): "<u8",
-}  # fmt: skip
+    ("F", 4): "<f4",
+    ("F", 8): "<f8",
+    ("I", 1): "<i1",
+    ("I", 2): "<i2",
+    ("I", 4): "<i4",
+    ("I", 8): "<i8",
+    ("U", 1): "<u1",
+    ("U", 2): "<u2",
+    ("U", 4): "<u4",
+    ("U", 8): "<u8",
+}
 _PCD_KEYS: Final = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 
 
@@ -110,8 +183,12 @@ def read_pcd(content: bytes, where: str) -> dict[str, NDArray]:
     points = _count(header["POINTS"][0], f"{where}: POINTS")
     width, height = (_count(header[key][0], f"{where}: {key}") for key in ("WIDTH", "HEIGHT"))
     if width * height != points:
-        raise InputError("cloud contradicts itself", where=where, expected=f"WIDTH x HEIGHT = {width * height} points",
-            got=f"POINTS {points}")  # fmt: skip
+        raise InputError(
+            "cloud contradicts itself",
+            where=where,
+            expected=f"WIDTH x HEIGHT = {width * height} points",
+            got=f"POINTS {points}",
+        )
     body = content[start:]
     kind = header["DATA"][0].lower()
     if kind == "ascii":
@@ -126,8 +203,9 @@ def read_pcd(content: bytes, where: str) -> dict[str, NDArray]:
     if kind == "binary_compressed":  # field after field, all points of one together
         flat = _pcd_unpacked(body, points, size, where)
         return {field.name: np.frombuffer(flat, field.kind, points, field.byte * points).copy() for field in fields}
-    raise InputError("cloud's DATA is of no known kind", where=where, expected="ascii, binary or binary_compressed",
-        got=kind[:40])  # fmt: skip
+    raise InputError(
+        "cloud's DATA is of no known kind", where=where, expected="ascii, binary or binary_compressed", got=kind[:40]
+    )
 
 
 def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
@@ -136,8 +214,13 @@ def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
     while "DATA" not in header:
         end = content.find(b"\n", start, _MAX_HEADER_BYTES)
         if end < 0:
-            raise InputError("not a PCD file", where=where, expected=f"a header with {', '.join(_PCD_KEYS)}",
-                got=f"{len(content)} bytes without the line DATA", remedy="is the file cut off?")  # fmt: skip
+            raise InputError(
+                "not a PCD file",
+                where=where,
+                expected=f"a header with {', '.join(_PCD_KEYS)}",
+                got=f"{len(content)} bytes without the line DATA",
+                remedy="is the file cut off?",
+            )
         words = content[start:end].decode("ascii", "replace").split()
         start = end + 1
         if words and not words[0].startswith("#"):
@@ -146,18 +229,26 @@ def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
     header.setdefault("HEIGHT", ["1"])
     absent = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA") if not header.get(key)]
     if absent:
-        raise InputError("PCD header is incomplete", where=where, expected=", ".join(absent),
-            got=", ".join(f"{key} {' '.join(values)}" for key, values in header.items())[:200])  # fmt: skip
+        raise InputError(
+            "PCD header is incomplete",
+            where=where,
+            expected=", ".join(absent),
+            got=", ".join(f"{key} {' '.join(values)}" for key, values in header.items())[:200],
+        )
     return header, start
 
 
 def _pcd_fields(header: dict[str, list[str]], where: str) -> tuple[list[_PcdField], int, int]:
-    """Fields of one number a point, each name once (padding, called ``_``, and descriptors are passed over); bytes and numbers a row."""
+    """Fields of one number a point, each name once (padding, called ``_``, and descriptors are passed over); bytes and
+    numbers a row."""
     names, sizes, types, counts = (header[key] for key in ("FIELDS", "SIZE", "TYPE", "COUNT"))
     if not len(names) == len(sizes) == len(types) == len(counts):
-        raise InputError("PCD header contradicts itself", where=where,
+        raise InputError(
+            "PCD header contradicts itself",
+            where=where,
             expected="as many SIZE, TYPE and COUNT as FIELDS",
-            got=f"{len(names)}, {len(sizes)}, {len(types)}, {len(counts)}")  # fmt: skip
+            got=f"{len(names)}, {len(sizes)}, {len(types)}, {len(counts)}",
+        )
     fields: dict[str, _PcdField] = {}
     byte = column = 0
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
@@ -179,8 +270,12 @@ def _number_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[n
     except ValueError as error:
         raise InputError("cloud holds a value that is no number", where=where, got=str(error)[:120]) from error
     if len(table) != rows * columns:
-        raise InputError("cloud is cut off or has rows of another length", where=where, got=f"{len(table)} numbers",
-            expected=f"{rows} rows of {columns}")  # fmt: skip
+        raise InputError(
+            "cloud is cut off or has rows of another length",
+            where=where,
+            got=f"{len(table)} numbers",
+            expected=f"{rows} rows of {columns}",
+        )
     return table.reshape(rows, columns)
 
 
@@ -189,16 +284,20 @@ def _pcd_unpacked(body: bytes, points: int, size: int, where: str) -> bytes:
     packed, unpacked = (int(n) for n in np.frombuffer(body, "<u4", 2))
     _enough(body, 8 + packed, where)
     if unpacked != points * size or unpacked > packed * _LZF_MAX_GROWTH + 1:
-        raise InputError("compressed cloud contradicts itself", where=where,
-            expected=f"{points} points of {size} bytes", got=f"{packed} bytes said to unpack to {unpacked}")  # fmt: skip
+        raise InputError(
+            "compressed cloud contradicts itself",
+            where=where,
+            expected=f"{points} points of {size} bytes",
+            got=f"{packed} bytes said to unpack to {unpacked}",
+        )
     return lzf_decompress(body[8 : 8 + packed], unpacked, where)
 
 
 def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
     """Unpack LibLZF data to exactly ``length`` bytes.
 
-    A token below 32 is that many + 1 literal bytes. Any other copies from what was unpacked: its upper 3 bits + 2 are the
-    length (7: one more byte to add), its lower 5 bits and the next byte are how far back, less 1.
+    A token below 32 is that many + 1 literal bytes. Any other copies from what was unpacked: its upper 3 bits + 2 are
+    the length (7: one more byte to add), its lower 5 bits and the next byte are how far back, less 1.
 
     Raises:
         InputError: reads or writes beyond an end, or another length comes out.
@@ -239,8 +338,13 @@ def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
 
 def _enough(body: bytes, needed: int, where: str) -> None:
     if len(body) < needed:
-        raise InputError("cloud is cut off", where=where, expected=f"at least {needed} bytes after the header",
-            got=str(len(body)), remedy="copy the file again")  # fmt: skip
+        raise InputError(
+            "cloud is cut off",
+            where=where,
+            expected=f"at least {needed} bytes after the header",
+            got=str(len(body)),
+            remedy="copy the file again",
+        )
 
 
 def _count(word: str, where: str, largest: int = MAX_POINTS) -> int:
@@ -249,22 +353,38 @@ def _count(word: str, where: str, largest: int = MAX_POINTS) -> int:
     return int(word)
 
 
-# --- PLY --------------------------------------------------------------------------------------------------------------
+# --- PLY ------------------------------------------------------------------------------------------
 
 _PLY_TYPES: Final = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 _PLY_ORDER: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
 
 def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
-    """Vertices of a polygon file; they must come first and have plain properties. What follows (faces) is passed over."""
+    """Vertices of a polygon file; they must come first and have plain properties. What follows (faces) is passed
+    over."""
     end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
     start = content.find(b"\n", end) + 1
     if not content.startswith(b"ply") or end < 0 or start == 0:
-        raise InputError("not a PLY file", where=where, expected="a header from 'ply' to 'end_header'",
-            got=f"{len(content)} bytes")  # fmt: skip
+        raise InputError(
+            "not a PLY file", where=where, expected="a header from 'ply' to 'end_header'", got=f"{len(content)} bytes"
+        )
     order, points, properties, element = "?", -1, [], ""
     for line in content[:end].decode("ascii", "replace").splitlines():
         words = line.split()
@@ -281,8 +401,9 @@ def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
                 raise InputError("vertex property is of no known type", where=where, got=line.strip()[:80])
             properties.append((words[2], _PLY_TYPES[words[1]]))
     if order not in _PLY_ORDER or points < 0 or not properties or len({n for n, _ in properties}) != len(properties):
-        raise InputError("PLY header is incomplete", where=where, expected="format, element vertex, properties",
-            got=order)  # fmt: skip
+        raise InputError(
+            "PLY header is incomplete", where=where, expected="format, element vertex, properties", got=order
+        )
     body = content[start:]
     if order == "ascii":
         lines = body.split(b"\n", points)  # faces may follow
@@ -294,11 +415,14 @@ def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
     return {name: rows[name].astype(rows[name].dtype.newbyteorder("=")) for name, _ in properties}
 
 
-# --- BIN and NPZ ------------------------------------------------------------------------------------------------------
+# --- BIN and NPZ ----------------------------------------------------------------------------------
 
 
-def read_float_rows(path: Path, columns: int, what: str = "scan", axes: int = 3) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], and which of them are returns bool[N].
+def read_float_rows(
+    path: Path, columns: int, what: str = "scan", axes: int = 3
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], and which of them are
+    returns bool[N].
 
     Args:
         what: what one file holds, for messages.
@@ -309,22 +433,35 @@ def read_float_rows(path: Path, columns: int, what: str = "scan", axes: int = 3)
     """
     content = store.read_bytes(path)
     if len(content) % (4 * columns):
-        raise InputError(f"{what} is cut off", where=str(path), got=f"{len(content)} bytes",
-            expected=f"a multiple of {4 * columns} bytes ({columns} float32 a row)", remedy="copy the file again")  # fmt: skip
+        raise InputError(
+            f"{what} is cut off",
+            where=str(path),
+            got=f"{len(content)} bytes",
+            expected=f"a multiple of {4 * columns} bytes ({columns} float32 a row)",
+            remedy="copy the file again",
+        )
     rows = np.frombuffer(content, "<f4").reshape(-1, columns).astype(np.float32)
     returns = is_return(rows[:, :axes])
     bad = ~np.isfinite(rows[returns]).all(1)
     if bad.any():
-        raise InputError(f"{what} holds values that are not finite", where=str(path),
-            got=f"{int(bad.sum())} of {len(rows)} rows", remedy="copy the file again")  # fmt: skip
+        raise InputError(
+            f"{what} holds values that are not finite",
+            where=str(path),
+            got=f"{int(bad.sum())} of {len(rows)} rows",
+            remedy="copy the file again",
+        )
     return rows, returns
 
 
 def read_bin(content: bytes, where: str) -> dict[str, NDArray]:
     """KITTI's form: little-endian float32 rows x, y, z, intensity, nothing else."""
     if len(content) % 16:
-        raise InputError("cloud is cut off, or is not of this form", where=where, got=f"{len(content)} bytes",
-            expected="a multiple of 16 bytes: float32 x, y, z, intensity a point")  # fmt: skip
+        raise InputError(
+            "cloud is cut off, or is not of this form",
+            where=where,
+            got=f"{len(content)} bytes",
+            expected="a multiple of 16 bytes: float32 x, y, z, intensity a point",
+        )
     rows = np.frombuffer(content, "<f4").reshape(-1, 4)
     return {name: rows[:, index].copy() for index, name in enumerate(("x", "y", "z", "intensity"))}
 
@@ -343,8 +480,9 @@ def npz_arrays(content: bytes, where: str) -> dict[str, NDArray]:
                     member = f"{where}: {entry.filename}"
                     arrays[entry.filename.removesuffix(".npy")] = read_npy(handle, entry.file_size, member)
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error) as error:
-        raise InputError("not a readable NPZ file, or cut off", where=where, got=str(error)[:120],
-            remedy="copy the file again") from error  # fmt: skip
+        raise InputError(
+            "not a readable NPZ file, or cut off", where=where, got=str(error)[:120], remedy="copy the file again"
+        ) from error
     return arrays
 
 
@@ -353,12 +491,20 @@ def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
     columns = npz_arrays(content, where)
     xyz = columns.pop("xyz", None)
     if xyz is None or xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
-        raise InputError("NPZ cloud has no coordinates", where=where, expected="an array xyz [N, 3] of numbers",
-            got=", ".join(columns) or ("nothing" if xyz is None else f"{xyz.dtype} {xyz.shape}"))  # fmt: skip
+        raise InputError(
+            "NPZ cloud has no coordinates",
+            where=where,
+            expected="an array xyz [N, 3] of numbers",
+            got=", ".join(columns) or ("nothing" if xyz is None else f"{xyz.dtype} {xyz.shape}"),
+        )
     for name, values in columns.items():
         if values.shape != (len(xyz),) or values.dtype.kind not in "fiub":
-            raise InputError("NPZ array does not fit the points", where=f"{where}: {name}",
-                expected=f"numbers [{len(xyz)}]", got=f"{values.dtype} {values.shape}")  # fmt: skip
+            raise InputError(
+                "NPZ array does not fit the points",
+                where=f"{where}: {name}",
+                expected=f"numbers [{len(xyz)}]",
+                got=f"{values.dtype} {values.shape}",
+            )
     return {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], **columns}
 
 
@@ -368,7 +514,8 @@ def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
     Its header is compared with this size before anything is allocated; arrays of objects (pickles) are refused.
 
     Raises:
-        InputError: not numbers, or of another size than declared. ValueError, zipfile.BadZipFile, zlib.error: no array, or damaged.
+        InputError: not numbers, or of another size than declared. ValueError, zipfile.BadZipFile, zlib.error: no array,
+            or damaged.
     """
     version = np.lib.format.read_magic(handle)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
@@ -376,8 +523,15 @@ def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
         raise InputError("array is of a version that is not read", where=where, got=str(version))
     try:
         shape, fortran, dtype = readers[version](handle)
-    except (tokenize.TokenError, SyntaxError, RecursionError, MemoryError) as error:  # of the parser that numpy hands the header to
-        raise InputError("array's header makes no sense", where=where, got=str(error)[:120], remedy="copy the file again") from error
+    except (
+        tokenize.TokenError,
+        SyntaxError,
+        RecursionError,
+        MemoryError,
+    ) as error:  # of the parser that numpy hands the header to
+        raise InputError(
+            "array's header makes no sense", where=where, got=str(error)[:120], remedy="copy the file again"
+        ) from error
     length = math.prod(shape) * dtype.itemsize
     if (
         dtype.hasobject
@@ -385,14 +539,21 @@ def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
         or length > min(size, MAX_POINTS * 24)
         or handle.tell() + length != size
     ):
-        raise InputError("array is not plain numbers of the declared size", where=where,
-            got=f"{dtype} {shape} in {size} bytes", remedy="save it with numpy.savez from an array of numbers")  # fmt: skip
+        raise InputError(
+            "array is not plain numbers of the declared size",
+            where=where,
+            got=f"{dtype} {shape} in {size} bytes",
+            remedy="save it with numpy.savez from an array of numbers",
+        )
     content = handle.read(length)
     handle.read(1)  # at its end an archive's member compares its checksum
     return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
 
 
 READERS: Final[dict[str, Callable[[bytes, str], dict[str, NDArray]]]] = {
-    ".pcd": read_pcd, ".ply": read_ply, ".bin": read_bin, ".npz": read_npz,
-}  # fmt: skip
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+    ".bin": read_bin,
+    ".npz": read_npz,
+}
 """Suffix -> reader of its bytes; fields by name."""

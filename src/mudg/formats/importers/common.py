@@ -40,9 +40,10 @@ from mudg.base.types import EgoPath
 from mudg.scene import motion
 from mudg.scene.clouds import is_return, near_places
 
-# columns --------------------------------------------------------------------------------------------------------------
+# columns ------------------------------------------------------------------------------------------
 #
-# Foreign tables and records: columns that must be there, numbers that must be finite, and the pyarrow package behind some files.
+# Foreign tables and records: columns that must be there, numbers that must be finite, and the pyarrow package behind
+# some files.
 
 
 Columns = Mapping[str, NDArray[Any]]
@@ -53,8 +54,13 @@ def require_columns(names: Iterable[str], there: Iterable[str], where: object) -
     """Refuse a table that lacks one of ``names``."""
     there, names = list(there), list(names)
     if not set(names) <= set(there):
-        raise InputError("table lacks columns", where=str(where), got=", ".join(sorted(there)[:40]) or "no columns",
-            expected=", ".join(names), remedy="is this a file of another data set, version or kind?")  # fmt: skip
+        raise InputError(
+            "table lacks columns",
+            where=str(where),
+            got=", ".join(sorted(there)[:40]) or "no columns",
+            expected=", ".join(names),
+            remedy="is this a file of another data set, version or kind?",
+        )
 
 
 def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDArray[np.float64]:
@@ -70,26 +76,36 @@ def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDA
         raise InputError("column does not hold numbers", where=where, got=str(error)[:120]) from error
     bad = ~np.isfinite(table).all(1)
     if bad.any():
-        raise InputError("column holds values that are not finite", where=where,
-            got=f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}")  # fmt: skip
+        raise InputError(
+            "column holds values that are not finite",
+            where=where,
+            got=f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}",
+        )
     return table
 
 
 def unit_intensity(values: NDArray[Any], largest: float, where: object, remedy: str = "") -> NDArray[np.float32]:
-    """Intensities of a cloud, from 0 to the ``largest`` that its format has, as f32 from 0 to 1; rounding beyond that is taken off.
+    """Intensities of a cloud, from 0 to the ``largest`` that its format has, as f32 from 0 to 1; rounding beyond that
+    is taken off.
 
     Raises:
         InputError: other values, which would all become 0 or 1, or some that are not finite.
     """
     scaled = values.astype(np.float64) / largest
     if not ((scaled > -_ROUNDING) & (scaled < 1 + _ROUNDING)).all():
-        raise InputError("intensity is out of range", where=str(where), expected=f"0 to {largest:g}",
-            got=f"{values.min():g} to {values.max():g}", remedy=remedy or "scale the values as the data set does")  # fmt: skip
+        raise InputError(
+            "intensity is out of range",
+            where=str(where),
+            expected=f"0 to {largest:g}",
+            got=f"{values.min():g} to {values.max():g}",
+            remedy=remedy or "scale the values as the data set does",
+        )
     return scaled.clip(0, 1).astype(np.float32)
 
 
 def returns_of(columns: Columns, where: object, places: Iterable[NDArray[np.float64]] = ()) -> NDArray[np.bool_]:
-    """Rows of a cloud's columns x, y, z that are returns of a beam: by their numbers, and not at one of the sensors' ``places``."""
+    """Rows of a cloud's columns x, y, z that are returns of a beam: by their numbers, and not at one of the sensors'
+    ``places``."""
     try:
         xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
     except (TypeError, ValueError) as error:
@@ -117,16 +133,23 @@ def arrow_files(path: Path) -> Iterator[None]:
     try:
         import pyarrow
     except ImportError as error:
-        raise ResourceError("Feather and Parquet files need pyarrow, which is not installed", where=str(path),
-            remedy="pip install 'mudg[data]'") from error  # fmt: skip
+        raise ResourceError(
+            "Feather and Parquet files need pyarrow, which is not installed",
+            where=str(path),
+            remedy="pip install 'mudg[data]'",
+        ) from error
     try:
         yield
     except (pyarrow.ArrowException, OSError, MemoryError, StopIteration, UnicodeDecodeError) as error:
-        raise InputError("table cannot be read, or is cut off", where=str(path), remedy="copy the file again",
-            got=str(error)[:200] or "it ends early") from error  # fmt: skip
+        raise InputError(
+            "table cannot be read, or is cut off",
+            where=str(path),
+            remedy="copy the file again",
+            got=str(error)[:200] or "it ends early",
+        ) from error
 
 
-# options --------------------------------------------------------------------------------------------------------------
+# options ------------------------------------------------------------------------------------------
 #
 # What a user may choose when importing a log; every importer reads the same options and says which it cannot honour.
 
@@ -175,8 +198,9 @@ def parse_frame_range(text: str) -> tuple[int, int] | None:
         return None
     match = re.fullmatch(r"(\d{1,9}):(\d{1,9})", text.strip())
     if match is None or int(match[1]) >= int(match[2]):
-        raise UsageError("frame range makes no sense", where="--frames",
-            expected="FIRST:END with FIRST < END, e.g. 0:16", got=text)  # fmt: skip
+        raise UsageError(
+            "frame range makes no sense", where="--frames", expected="FIRST:END with FIRST < END, e.g. 0:16", got=text
+        )
     return int(match[1]), int(match[2])
 
 
@@ -191,8 +215,12 @@ def parse_resolution(text: str) -> Resolution | None:
     match = re.fullmatch(r"(\d{2,5})(?:x(\d{2,5}))?", text.strip().lower())
     sides = [int(side) for side in match.groups() if side] if match is not None else []
     if not sides or min(sides) < 16:
-        raise UsageError("image size makes no sense", where="--resolution",
-            expected="the longest side, e.g. 960, or WIDTHxHEIGHT, e.g. 960x640; at least 16 pixels", got=text)  # fmt: skip
+        raise UsageError(
+            "image size makes no sense",
+            where="--resolution",
+            expected="the longest side, e.g. 960, or WIDTHxHEIGHT, e.g. 960x640; at least 16 pixels",
+            got=text,
+        )
     return sides[0] if len(sides) == 1 else (sides[0], sides[1])
 
 
@@ -210,7 +238,7 @@ def holdout_split(frame_ids_by_time: list[list[str]], test_every: int) -> dict[s
     }
 
 
-# common ---------------------------------------------------------------------------------------------------------------
+# common -------------------------------------------------------------------------------------------
 
 
 Item = TypeVar("Item")
@@ -235,7 +263,7 @@ _EPOCH_S: Final = (1e8, 4.1e9)
 _MAX_LOG_S: Final = 4 * 3600.0
 
 
-# --- work over frames -------------------------------------------------------------------------------------------------
+# --- work over frames -----------------------------------------------------------------------------
 
 
 def processors() -> int:
@@ -304,8 +332,8 @@ def for_each(
 
 
 def foreign_numbers() -> np.errstate:
-    """Code that reads numbers of others: values that overflow or are none stay silent, because what comes out is checked. Holds in the
-    thread that enters it."""
+    """Code that reads numbers of others: values that overflow or are none stay silent, because what comes out is
+    checked. Holds in the thread that enters it."""
     return np.errstate(over="ignore", invalid="ignore")
 
 
@@ -318,12 +346,15 @@ def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]
         if called in error.where:
             raise
         raise type(error)(
-            error.what, where=f"{called}: {error.where}" if error.where else called,
-            expected=error.expected, got=error.got, remedy=error.remedy,
-        ) from error  # fmt: skip
+            error.what,
+            where=f"{called}: {error.where}" if error.where else called,
+            expected=error.expected,
+            got=error.got,
+            remedy=error.remedy,
+        ) from error
 
 
-# --- time -------------------------------------------------------------------------------------------------------------
+# --- time -----------------------------------------------------------------------------------------
 
 
 def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, where: str, start: float = 0) -> Matrix:
@@ -344,16 +375,24 @@ def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, wh
     steps = np.diff(since_start)
     if (steps <= 0).any():
         at = int(np.flatnonzero(steps <= 0)[0])
-        raise InputError("timestamps do not increase", where=f"{where}: record {at + 1}",
-            expected=f"later than {numbers[at]} {unit}", got=str(numbers[at + 1]),
-            remedy="sort the records by time, and remove doubled ones")  # fmt: skip
+        raise InputError(
+            "timestamps do not increase",
+            where=f"{where}: record {at + 1}",
+            expected=f"later than {numbers[at]} {unit}",
+            got=str(numbers[at + 1]),
+            remedy="sort the records by time, and remove doubled ones",
+        )
     low, high = PLAUSIBLE_PERIOD_S
     if len(steps) and not low <= (period := float(np.median(steps))) <= high:
         raw = period * UNITS_PER_SECOND[unit]
         fitting = [u for u, scale in UNITS_PER_SECOND.items() if low <= raw / scale <= high]
-        raise InputError("timestamps are in another unit than expected", where=where,
-            expected=f"{unit}; records {low:g} to {high:g} s apart", got=f"records {period:.3g} s apart",
-            remedy=f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording")  # fmt: skip
+        raise InputError(
+            "timestamps are in another unit than expected",
+            where=where,
+            expected=f"{unit}; records {low:g} to {high:g} s apart",
+            got=f"records {period:.3g} s apart",
+            remedy=f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording",
+        )
     return since_start
 
 
@@ -362,20 +401,30 @@ def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> Non
     unit = {10**6: "microseconds", 10**9: "nanoseconds"}[per_second]
     outside = (stamps < _EPOCH_S[0] * per_second) | (stamps > _EPOCH_S[1] * per_second)
     if outside.any():
-        raise InputError("time stamp is in another unit", where=where, expected=f"{unit} since 1970",
-            got=f"{int(stamps[outside][0])}", remedy=f"convert the stamps to {unit}")  # fmt: skip
+        raise InputError(
+            "time stamp is in another unit",
+            where=where,
+            expected=f"{unit} since 1970",
+            got=f"{int(stamps[outside][0])}",
+            remedy=f"convert the stamps to {unit}",
+        )
     if len(stamps) and int(stamps.max()) - int(stamps.min()) > _MAX_LOG_S * per_second:
-        raise InputError("time stamps of one log span more than hours", where=where,
-            got=f"{int(stamps.min())} to {int(stamps.max())}", expected=f"{unit}, all of one recording",
-            remedy="are records of another log, or of another unit, mixed in?")  # fmt: skip
+        raise InputError(
+            "time stamps of one log span more than hours",
+            where=where,
+            got=f"{int(stamps.min())} to {int(stamps.max())}",
+            expected=f"{unit}, all of one recording",
+            remedy="are records of another log, or of another unit, mixed in?",
+        )
 
 
 def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArray[np.intp]:
-    """Index into increasing ``sorted_times_s`` f64[n] of the nearest for each of ``times_s`` f64[m]; halfway goes to the earlier."""
+    """Index into increasing ``sorted_times_s`` f64[n] of the nearest for each of ``times_s`` f64[m]; halfway goes to
+    the earlier."""
     return np.searchsorted((sorted_times_s[1:] + sorted_times_s[:-1]) / 2, times_s)
 
 
-# --- poses ------------------------------------------------------------------------------------------------------------
+# --- poses ----------------------------------------------------------------------------------------
 
 
 def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
@@ -392,8 +441,12 @@ def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
     if len(numbers) == 4 and np.abs(numbers[3] - [0, 0, 0, 1]).max() > POSE_TOLERANCE:
         got = numbers[3].tolist()
         transposed = np.abs(numbers[:3, 3]).max() < POSE_TOLERANCE
-        raise InputError("pose does not end in the row 0 0 0 1", where=where, got=str(got),
-            remedy="it looks transposed: write it row by row" if transposed else "write it row by row")  # fmt: skip
+        raise InputError(
+            "pose does not end in the row 0 0 0 1",
+            where=where,
+            got=str(got),
+            remedy="it looks transposed: write it row by row" if transposed else "write it row by row",
+        )
     return from_rotation_translation(rigid_rotation(numbers[:3, :3], where), numbers[:3, 3])
 
 
@@ -402,16 +455,29 @@ def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
     u, stretch, vt = np.linalg.svd(matrix)
     handed = float(np.linalg.det(u @ vt))
     if stretch[0] - stretch[2] <= POSE_TOLERANCE * stretch[0] and abs(stretch[1] - 1) > POSE_TOLERANCE:
-        raise InputError("pose is scaled", where=where, expected="a rotation (scale 1)", got=f"scale {stretch[1]:.6g}",
-            remedy="divide the rotation part by its scale; are the translations in metres?")  # fmt: skip
+        raise InputError(
+            "pose is scaled",
+            where=where,
+            expected="a rotation (scale 1)",
+            got=f"scale {stretch[1]:.6g}",
+            remedy="divide the rotation part by its scale; are the translations in metres?",
+        )
     if np.abs(stretch - 1).max() > POSE_TOLERANCE:
-        raise InputError("pose is not a rigid motion", where=where, expected="an orthonormal rotation part",
+        raise InputError(
+            "pose is not a rigid motion",
+            where=where,
+            expected="an orthonormal rotation part",
             got=f"stretches {', '.join(f'{s:.4g}' for s in stretch)}",
-            remedy="is it row-major, without shear or scale?")  # fmt: skip
+            remedy="is it row-major, without shear or scale?",
+        )
     if handed < 0:
-        raise InputError("pose is left-handed", where=where, expected="determinant +1",
+        raise InputError(
+            "pose is left-handed",
+            where=where,
+            expected="determinant +1",
             got="a reflection (determinant -1)",
-            remedy="one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras")  # fmt: skip
+            remedy="one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras",
+        )
     return u @ vt
 
 
@@ -423,12 +489,20 @@ def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matri
     """
     q, t = np.asarray(wxyz, np.float64).reshape(-1), np.asarray(xyz_m, np.float64).reshape(-1)
     if q.shape != (4,) or t.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(t).all():
-        raise InputError("pose is not a quaternion and a translation", where=where, expected="4 and 3 finite numbers",
-            got=f"{q.tolist()} and {t.tolist()}")  # fmt: skip
+        raise InputError(
+            "pose is not a quaternion and a translation",
+            where=where,
+            expected="4 and 3 finite numbers",
+            got=f"{q.tolist()} and {t.tolist()}",
+        )
     length = float(np.linalg.norm(q))
     if abs(length - 1) > QUATERNION_TOLERANCE:
-        raise InputError("quaternion does not have length 1", where=where, expected="w, x, y, z of a rotation",
-            got=f"length {length:.6g}")  # fmt: skip
+        raise InputError(
+            "quaternion does not have length 1",
+            where=where,
+            expected="w, x, y, z of a rotation",
+            got=f"length {length:.6g}",
+        )
     return from_rotation_translation(matrix_from_quaternion(q), t)
 
 
@@ -438,7 +512,8 @@ def pose_near(
     """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys.
 
     Raises:
-        InputError: more than ``max_beyond_s`` outside, or in a gap of the path where the pose would be a guess (``motion.gap_at``).
+        InputError: more than ``max_beyond_s`` outside, or in a gap of the path where the pose would be a guess
+            (``motion.gap_at``).
     """
     inside = pose_at(ego.times_s, ego.world_from_ego, time_s)
     if inside is not None:
@@ -449,9 +524,16 @@ def pose_near(
     first = time_s < ego.times_s[0]
     beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
     if beyond > max_beyond_s:
-        raise InputError("vehicle poses do not cover the images and scans", where=where, got=f"{beyond:.2f} s outside",
+        raise InputError(
+            "vehicle poses do not cover the images and scans",
+            where=where,
+            got=f"{beyond:.2f} s outside",
             expected="poses from the first to the last frame",
-            remedy="are the clocks the same? is the file cut off, or of another log? --skip-missing leaves such records out")  # fmt: skip
+            remedy=(
+                "are the clocks the same? is the file cut off, or of another log? --skip-missing leaves such"
+                " records out"
+            ),
+        )
     if len(ego.times_s) == 1:
         return ego.world_from_ego[0]
     near, far = (0, 1) if first else (-1, -2)
@@ -466,9 +548,13 @@ def pose_near(
 
 def gap_problem(gap: motion.Gap, time_s: float, where: str) -> InputError:
     """The error about an image or scan in a gap of the vehicle's path."""
-    return InputError("vehicle poses have a gap here", where=where, got=f"at {time_s:.3f} s: {gap}",
+    return InputError(
+        "vehicle poses have a gap here",
+        where=where,
+        got=f"at {time_s:.3f} s: {gap}",
         expected="poses around every image and scan",
-        remedy="leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps")  # fmt: skip
+        remedy="leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps",
+    )
 
 
 def has_pose(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S) -> bool:
@@ -481,7 +567,8 @@ def has_pose(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATIO
 
 
 def mended_path(ego: EgoPath, options: ImportOptions, notes: list[str]) -> EgoPath:
-    """The vehicle's path with headings that flip by 180 degrees turned back and, if that is asked for, its gaps bridged.
+    """The vehicle's path with headings that flip by 180 degrees turned back and, if that is asked for, its gaps
+    bridged.
 
     Args:
         options: ``bridge_gaps`` is used.
@@ -491,8 +578,8 @@ def mended_path(ego: EgoPath, options: ImportOptions, notes: list[str]) -> EgoPa
     if len(turned):
         ego = EgoPath(ego.times_s, poses)
         notes.append(
-            f"the vehicle's heading flips by 180 degrees at {ego.times_s[turned[0]]:.3f} s: {len(turned)} of {len(poses)} poses were "
-            "turned back"
+            f"the vehicle's heading flips by 180 degrees at {ego.times_s[turned[0]]:.3f} s: {len(turned)} of"
+            f" {len(poses)} poses were turned back"
         )
     found = motion.gaps(ego.times_s, ego.world_from_ego) if options.bridge_gaps else []
     if found:
@@ -503,10 +590,14 @@ def mended_path(ego: EgoPath, options: ImportOptions, notes: list[str]) -> EgoPa
 
 
 def origin_note(map_from_ego: Matrix) -> str:
-    """A note that says where the scene's world lies in the data set's: its origin is the first vehicle pose, subtracted in float64."""
+    """A note that says where the scene's world lies in the data set's: its origin is the first vehicle pose, subtracted
+    in float64."""
     x, y, z = (float(value) for value in map_from_ego[:3, 3])
     turn = yaw_of(map_from_ego)
-    return f"the world's origin is ({x:.3f}, {y:.3f}, {z:.3f}) m in the data set's world, its x axis turned by {turn:.6f} rad"
+    return (
+        f"the world's origin is ({x:.3f}, {y:.3f}, {z:.3f}) m in the data set's world, its x axis turned by"
+        f" {turn:.6f} rad"
+    )
 
 
 def world_from_first(map_from_ego: Matrix) -> Matrix:
@@ -523,12 +614,17 @@ def ego_path(stamps_s: Sequence[float], poses: Sequence[Matrix]) -> EgoPath:
 
 
 def check_motion(ego: EgoPath, where: str) -> None:
-    """Refuse a vehicle that drives impossibly fast or lies on its side or slides: units or the order of values are wrong then."""
+    """Refuse a vehicle that drives impossibly fast or lies on its side or slides: units or the order of values are
+    wrong then."""
     upright = float(np.median(ego.world_from_ego[:, 2, 2]))
     if upright < _LEAST_UPRIGHT:
-        raise InputError("the vehicle does not stand upright", where=where, expected="vehicle and map with z up",
+        raise InputError(
+            "the vehicle does not stand upright",
+            where=where,
+            expected="vehicle and map with z up",
             got=f"its z axis rises by {upright:.2f} per metre",
-            remedy="check the order of quaternions (w, x, y, z) and the axes")  # fmt: skip
+            remedy="check the order of quaternions (w, x, y, z) and the axes",
+        )
     if len(ego.times_s) < 2:
         return
     # over a twentieth of a second at least: pose noise over less is no speed
@@ -539,19 +635,26 @@ def check_motion(ego: EgoPath, where: str) -> None:
     speed = np.linalg.norm(steps, axis=1) / (ego.times_s[last] - ego.times_s[first])
     at = int(speed.argmax())
     if speed[at] > MAX_SPEED_M_S:
-        raise InputError("the vehicle moves impossibly fast", where=where,
+        raise InputError(
+            "the vehicle moves impossibly fast",
+            where=where,
             got=f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose",
             expected=f"under {MAX_SPEED_M_S:.0f} m/s",
-            remedy="check the units of times and translations, and that all poses are of one log")  # fmt: skip
-    drives = (speed > _DRIVES_M_S) & (ego.times_s[last] - ego.times_s[first] <= _COURSE_WITHIN_S)  # over a gap it may turn
+            remedy="check the units of times and translations, and that all poses are of one log",
+        )
+    # over a gap it may turn
+    drives = (speed > _DRIVES_M_S) & (ego.times_s[last] - ego.times_s[first] <= _COURSE_WITHIN_S)
     if drives.any():
         forward = np.einsum("ni,ni->n", ego.world_from_ego[first[drives], :3, 0], steps[drives])
         along = float(np.median(np.abs(forward) / np.linalg.norm(steps[drives], axis=1)))  # reversing is driving, too
         if along < _LEAST_ALONG:
-            raise InputError("the vehicle does not drive where it looks", where=where,
+            raise InputError(
+                "the vehicle does not drive where it looks",
+                where=where,
                 expected="vehicle axes x forward, y left, z up",
                 got=f"it moves {np.rad2deg(np.arccos(along)):.0f} degrees off its x axis",
-                remedy="check the order of quaternions (w, x, y, z) and the axes")  # fmt: skip
+                remedy="check the order of quaternions (w, x, y, z) and the axes",
+            )
 
 
 def deskew(
@@ -562,7 +665,8 @@ def deskew(
     Args:
         xyz: f32[N, 3] metres, each in the sensor's frame at its own time.
         dt_s: f32[N], that time less ``time_s``.
-        world_from_lidar: the sensor's pose f64[4, 4] at a time; asked at 33 moments, points in between are blended linearly.
+        world_from_lidar: the sensor's pose f64[4, 4] at a time; asked at 33 moments, points in between are blended
+            linearly.
         time_s: the moment wanted.
 
     Returns:

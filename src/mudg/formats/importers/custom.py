@@ -1,4 +1,5 @@
-"""Importer and checker of logs in the neutral layout (docs/custom_format.md), for recordings that no other importer reads."""
+"""Importer and checker of logs in the neutral layout (docs/custom_format.md), for recordings that no other importer
+reads."""
 
 from __future__ import annotations
 
@@ -39,11 +40,12 @@ from mudg.scene import schema
 from mudg.scene.check import Finding
 from mudg.scene.read import decode_image
 
-# schema ---------------------------------------------------------------------------------------------------------------
+# schema -------------------------------------------------------------------------------------------
 #
 # ``log.json``, the index of a log in the neutral layout, as checked records. The layout is docs/custom_format.md.
 #
-# As in ``scene/schema.py``, the parser takes ``complain``: the importer raises at the first problem, ``mudg doctor`` collects all.
+# As in ``scene/schema.py``, the parser takes ``complain``: the importer raises at the first problem, ``mudg doctor``
+# collects all.
 
 
 Matrix = NDArray[np.float64]
@@ -54,7 +56,7 @@ LENSES: Final = {"brown_conrady": (brown_conrady, (4, 5, 8)), "equidistant": (eq
 """Distortion models and how many coefficients they take."""
 
 
-# --- what log.json may hold ---------------------------------------------------------------------------------------------
+# --- what log.json may hold -----------------------------------------------------------------------
 
 
 class QuaternionEntry(StrictRecord):
@@ -188,7 +190,7 @@ class LogIndex(StrictRecord):
     tracks: list[Any] = []
 
 
-# --- what a log holds -------------------------------------------------------------------------------------------------
+# --- what a log holds -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -202,7 +204,8 @@ class LogCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogItem:
-    """One image or cloud: its sensor and where that sits, seconds since the start, file, its own pose if the log gives one."""
+    """One image or cloud: its sensor and where that sits, seconds since the start, file, its own pose if the log gives
+    one."""
 
     kind: Literal["image", "cloud"]
     sensor: str
@@ -240,7 +243,7 @@ class CustomLog:
     origin_m: NDArray[np.float64]
 
 
-# --- parsing ------------------------------------------------------------------------------------------------------------
+# --- parsing --------------------------------------------------------------------------------------
 
 
 def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> CustomLog:
@@ -404,7 +407,7 @@ class _LogReader:
         return tracks
 
 
-# importer -------------------------------------------------------------------------------------------------------------
+# importer -----------------------------------------------------------------------------------------
 
 
 MAX_ALIKE: Final = 5
@@ -475,7 +478,8 @@ def _moments(images: Sequence[LogItem]) -> dict[LogItem, int]:
 
 
 def _chosen(content: CustomLog, options: ImportOptions) -> CustomLog:
-    """The cameras, frames and files asked for. ``frames`` counts images of the first of them in the log's order; the rest goes by time."""
+    """The cameras, frames and files asked for. ``frames`` counts images of the first of them in the log's order; the
+    rest goes by time."""
     there = {name: name for name in content.cameras}
     names = chosen_cameras(there, options, str(content.root / INDEX), tuple(there))
     images = [image for image in content.images if image.sensor in names]
@@ -505,8 +509,8 @@ def _usable(content: CustomLog, records: list[LogItem]) -> list[LogItem]:
     if len(placed) < len(found):
         times = [r.time_s for r in found if r not in placed]
         log.warn(
-            f"custom: left out {len(times)} records of kind {records[0].kind} without a vehicle pose, from {min(times):.3f} to "
-            f"{max(times):.3f} s"
+            f"custom: left out {len(times)} records of kind {records[0].kind} without a vehicle pose, from"
+            f" {min(times):.3f} to {max(times):.3f} s"
         )
     return placed
 
@@ -520,7 +524,7 @@ def _numbered(records: Sequence[LogItem]) -> list[Numbered]:
     return numbered
 
 
-# --- one record -------------------------------------------------------------------------------------------------------
+# --- one record -----------------------------------------------------------------------------------
 
 
 def _file(content: CustomLog, record: LogItem) -> Path:
@@ -553,8 +557,8 @@ def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> Sw
     """The points of a sweep, motion-compensated to its time.
 
     Raises:
-        InputError: no points, a field that was declared is not there, intensities above the declared largest one, points
-            that need their times and have none.
+        InputError: no points, a field that was declared is not there, intensities above the declared largest one,
+            points that need their times and have none.
     """
     lidar, path = content.lidars[sweep.sensor], _file(content, sweep)
     cloud = read_cloud(path, known=(lidar.intensity_field, lidar.time_field))
@@ -569,9 +573,10 @@ def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> Sw
     if not lidar.time_field:
         raise InputError(
             "sweeps are not motion-compensated, and their points have no times",
-            where=f"{content.root / INDEX}: lidars.{sweep.sensor}", expected="time_field and time_unit",
+            where=f"{content.root / INDEX}: lidars.{sweep.sensor}",
+            expected="time_field and time_unit",
             remedy="name the field with the time of each point, or add --untwist no",
-        )  # fmt: skip
+        )
 
     def world_from_lidar(time_s: float) -> NDArray[np.float64]:
         return pose_near(content.ego, time_s) @ sweep.ego_from_sensor
@@ -621,7 +626,7 @@ def _delays(cloud: Cloud, sweep: LogItem, content: CustomLog, path: Path) -> NDA
     return dt_s.astype(np.float32)
 
 
-# --- checking -----------------------------------------------------------------------------------------------------------
+# --- checking -------------------------------------------------------------------------------------
 
 
 def check_log(source: Path) -> list[Finding]:
@@ -653,7 +658,9 @@ def check_log(source: Path) -> list[Finding]:
         if points.no_returns:
             rows = points.no_returns + len(points.xyz)
             yield Finding(
-                "note", f"sweep {sweep.id}", f"{points.no_returns} of {rows} points mark beams without a return; ingest leaves them out"
+                "note",
+                f"sweep {sweep.id}",
+                f"{points.no_returns} of {rows} points mark beams without a return; ingest leaves them out",
             )
         yield from scene_check.check_points(scene, sweep, points)
 
@@ -669,7 +676,8 @@ def check_log(source: Path) -> list[Finding]:
 
 
 def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple[Scene, list[LogItem], list[LogItem]]:
-    """The log as a scene whose references are files of the log: nothing is copied; and the records of its frames and sweeps.
+    """The log as a scene whose references are files of the log: nothing is copied; and the records of its frames and
+    sweeps.
 
     Records without a pose are complained about and left out. Cameras are as recorded.
     """
@@ -692,14 +700,22 @@ def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple
     split = holdout_split([groups[moment] for moment in sorted(groups)], ImportOptions().test_every)
     cameras = {name: camera.camera for name, camera in content.cameras.items()}
     scene = Scene(
-        content.name, str(content.root), cameras, tuple(frames.values()), tuple(sweeps.values()), content.tracks,
-        content.ego, split, content.source,
-    )  # fmt: skip
+        content.name,
+        str(content.root),
+        cameras,
+        tuple(frames.values()),
+        tuple(sweeps.values()),
+        content.tracks,
+        content.ego,
+        split,
+        content.source,
+    )
     return scene, list(frames), list(sweeps)
 
 
 def _collapsed(findings: Iterable[Finding]) -> list[Finding]:
-    """At most ``MAX_ALIKE`` findings of one kind (the same text before the first ``;``), and how many more there are."""
+    """At most ``MAX_ALIKE`` findings of one kind (the same text before the first ``;``), and how many more there
+    are."""
     counts: Counter[tuple[scene_check.Level, str]] = Counter()
     kept = []
     for finding in findings:

@@ -8,8 +8,8 @@
 ``bounding_box_3d/<lidar>/*``  boxes in the LiDAR's frame, with instance ids; classes in ``ontology/<hash>.json``
 ============================== =========================================================================================
 
-Poses are those of the sensors at their own times; nothing is interpolated. Images project without distortion. Clouds carry no point
-times, so ``dt_s`` is 0.
+Poses are those of the sensors at their own times; nothing is interpolated. Images project without distortion. Clouds
+carry no point times, so ``dt_s`` is 0.
 
 Some published scenes carry times in tenths of a microsecond that were written out as microseconds: dates in the 25th
 century, a clock that runs ten times too fast. Times after 2099 are read as such, and it is said.
@@ -57,24 +57,68 @@ _BOXES_3D: Final = "1"
 _POSE: Final[Known] = {"translation": dict.fromkeys("xyz"), "rotation": dict.fromkeys(("qw", "qx", "qy", "qz"))}
 _ID: Final[Known] = dict.fromkeys(("log", "name", "timestamp", "index"))
 _SCENE: Final[Known] = {
-    **dict.fromkeys(("name", "description", "log", "metadata", "creation_date", "ontologies", "agent_ontologies", "statistics")),
+    **dict.fromkeys(
+        ("name", "description", "log", "metadata", "creation_date", "ontologies", "agent_ontologies", "statistics")
+    ),
     "samples": {**dict.fromkeys(("datum_keys", "calibration_key", "metadata")), "id": _ID},
     "data": {
-        **dict.fromkeys(("key", "next_key", "prev_key")), "id": _ID,
+        **dict.fromkeys(("key", "next_key", "prev_key")),
+        "id": _ID,
         "datum": {
-            "file_datum": None, "radar_point_cloud": None,
-            "image": {**dict.fromkeys(("filename", "height", "width", "channels", "annotations", "metadata")), "pose": _POSE},
-            "point_cloud": {**dict.fromkeys(("filename", "annotations", "metadata", "point_format", "point_fields")), "pose": _POSE},
+            "file_datum": None,
+            "radar_point_cloud": None,
+            "image": {
+                **dict.fromkeys(("filename", "height", "width", "channels", "annotations", "metadata")),
+                "pose": _POSE,
+            },
+            "point_cloud": {
+                **dict.fromkeys(("filename", "annotations", "metadata", "point_format", "point_fields")),
+                "pose": _POSE,
+            },
         },
     },
-}  # fmt: skip
+}
 _LENS: Final = (
-    "fx", "fy", "cx", "cy", "skew", "fov", "fisheye", *(f"k{number}" for number in range(1, 7)), "p1", "p2", "s1", "s2", "s3", "s4",
-    "taux", "tauy", "alpha", "beta", "w", "xi", "equirectangular",
-)  # fmt: skip
-_CHANNELS: Final = frozenset({
-    "X", "Y", "Z", "INTENSITY", "R", "G", "B", "RING", "NORMAL_X", "NORMAL_Y", "NORMAL_Z", "CLASS_ID", "INSTANCE_ID", "TIMESTAMP",
-})  # fmt: skip
+    "fx",
+    "fy",
+    "cx",
+    "cy",
+    "skew",
+    "fov",
+    "fisheye",
+    *(f"k{number}" for number in range(1, 7)),
+    "p1",
+    "p2",
+    "s1",
+    "s2",
+    "s3",
+    "s4",
+    "taux",
+    "tauy",
+    "alpha",
+    "beta",
+    "w",
+    "xi",
+    "equirectangular",
+)
+_CHANNELS: Final = frozenset(
+    {
+        "X",
+        "Y",
+        "Z",
+        "INTENSITY",
+        "R",
+        "G",
+        "B",
+        "RING",
+        "NORMAL_X",
+        "NORMAL_Y",
+        "NORMAL_Z",
+        "CLASS_ID",
+        "INSTANCE_ID",
+        "TIMESTAMP",
+    }
+)
 OFFICIAL: Final[Mapping[str, Known]] = {
     "scene_*.json": _SCENE,
     "calibration/*.json": {"names": None, "intrinsics": dict.fromkeys(_LENS), "extrinsics": _POSE},
@@ -83,16 +127,27 @@ OFFICIAL: Final[Mapping[str, Known]] = {
         "annotations": {
             **dict.fromkeys(("class_id", "instance_id", "attributes", "num_points")),
             "box": {**dict.fromkeys(("width", "length", "height", "occlusion", "truncation")), "pose": _POSE},
-        },
+        }
     },
-}  # fmt: skip
-"""Kinds of files -> their fields, read or not; what is in metadata and attributes is free. Source: the format's published messages."""
+}
+"""Kinds of files -> their fields, read or not; what is in metadata and attributes is free. Source: the format's
+published messages."""
 LABELS: Final[Mapping[str, str]] = {
-    "Car": "car", "Truck": "truck", "Bus/RV/Caravan": "bus", "Bus": "bus", "Motorcycle": "motorcycle",
-    "Motorcyclist": "rider", "Bicycle": "bicycle", "Bicyclist": "rider", "Person": "pedestrian",
-    "Pedestrian": "pedestrian", "Train": "train", "Trailer": "trailer", "Towed Object": "towed_object",
+    "Car": "car",
+    "Truck": "truck",
+    "Bus/RV/Caravan": "bus",
+    "Bus": "bus",
+    "Motorcycle": "motorcycle",
+    "Motorcyclist": "rider",
+    "Bicycle": "bicycle",
+    "Bicyclist": "rider",
+    "Person": "pedestrian",
+    "Pedestrian": "pedestrian",
+    "Train": "train",
+    "Trailer": "trailer",
+    "Towed Object": "towed_object",
     "Wheeled Slow": "wheeled_slow",
-}  # fmt: skip
+}
 """Class names of common ontologies -> the labels of this package."""
 
 
@@ -106,8 +161,8 @@ def import_dgp(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     Args:
         source: a scene's folder, or a folder of scenes.
-        options: ``sequence`` names the scene's folder where there are several; ``frames`` counts images of the first chosen
-            camera; ``cameras`` by either name (``CAMERA_01`` or ``camera_01``), all by default.
+        options: ``sequence`` names the scene's folder where there are several; ``frames`` counts images of the first
+            chosen camera; ``cameras`` by either name (``CAMERA_01`` or ``camera_01``), all by default.
 
     Raises:
         UsageError: there are several scenes and none was chosen, or there is no such scene or camera.
@@ -130,8 +185,12 @@ def _scenes(source: Path) -> list[Path]:
 def _choose_scene(source: Path, options: ImportOptions) -> Path:
     scenes = _scenes(source)
     if not scenes:
-        raise InputError("no DGP scene found", where=str(source), got=folder_contents(source),
-            expected="scene_<hash>.json beside a calibration folder, here or in sub-folders")  # fmt: skip
+        raise InputError(
+            "no DGP scene found",
+            where=str(source),
+            got=folder_contents(source),
+            expected="scene_<hash>.json beside a calibration folder, here or in sub-folders",
+        )
     matching = [p for p in scenes if options.sequence in ("", p.parent.resolve().name, p.stem, p.name)]
     names = [f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes]
     return the_only(matching, names, options, source, "scene")
@@ -142,7 +201,7 @@ def files_of_dgp(source: Path, options: ImportOptions) -> LogFiles:
     return LogFiles((_choose_scene(source, options).parent,))
 
 
-# --- one scene ------------------------------------------------------------------------------------------------------
+# --- one scene ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -255,7 +314,7 @@ def _pose(value: Mapping[str, Any], where: str) -> Matrix:
     return common.pose_from_quaternion([q["qw"], q["qx"], q["qy"], q["qz"]], [t["x"], t["y"], t["z"]], f"{where}: pose")
 
 
-# --- calibration ----------------------------------------------------------------------------------------------------
+# --- calibration ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -268,8 +327,12 @@ class _DgpCalibration:
 
     def mount(self, sensor: str, where: str) -> Matrix:
         if sensor not in self.mounts:
-            raise InputError("calibration lacks a sensor", where=self.where, expected=f"{sensor} ({where})",
-                got=", ".join(self.mounts))  # fmt: skip
+            raise InputError(
+                "calibration lacks a sensor",
+                where=self.where,
+                expected=f"{sensor} ({where})",
+                got=", ".join(self.mounts),
+            )
         return self.mounts[sensor]
 
 
@@ -278,14 +341,16 @@ def _read_calibration(folder: Path, key: str) -> _DgpCalibration:
     record = _json(path, "calibration/*.json")
     names = [str(name) for name in record["names"]]
     if not len(names) == len(record["extrinsics"]) == len(record["intrinsics"]):
-        raise InputError("calibration lists differ in length", where=str(path),
-            expected="names, extrinsics, intrinsics")  # fmt: skip
+        raise InputError(
+            "calibration lists differ in length", where=str(path), expected="names, extrinsics, intrinsics"
+        )
     mounts = {n: _pose(value, f"{path}: {n}") for n, value in zip(names, record["extrinsics"], strict=True)}
     return _DgpCalibration(dict(zip(names, record["intrinsics"], strict=True)), mounts, str(path))
 
 
 def _add_camera(cameras: dict[str, Camera], calibration: _DgpCalibration, name: str, datum: _Datum) -> None:
-    """The datum's camera; all images of a scene must share it. Half a pixel is added: pixel centres are whole numbers here."""
+    """The datum's camera; all images of a scene must share it. Half a pixel is added: pixel centres are whole numbers
+    here."""
     calibration.mount(datum.sensor, datum.where)
     k = {key: float(calibration.intrinsics[datum.sensor].get(key, 0.0)) for key in ("fx", "fy", "cx", "cy", "skew")}
     where = f"{calibration.where}: {datum.sensor}"
@@ -294,11 +359,15 @@ def _add_camera(cameras: dict[str, Camera], calibration: _DgpCalibration, name: 
     width, height = int(datum.record["width"]), int(datum.record["height"])
     camera = Camera(name, width, height, k["fx"], k["fy"], k["cx"] + 0.5, k["cy"] + 0.5)
     if cameras.setdefault(name, camera) != camera:
-        raise InputError("images of one camera differ in size or calibration", where=datum.where,
-            expected=str(cameras[name]), got=str(camera))  # fmt: skip
+        raise InputError(
+            "images of one camera differ in size or calibration",
+            where=datum.where,
+            expected=str(cameras[name]),
+            got=str(camera),
+        )
 
 
-# --- boxes and clouds -------------------------------------------------------------------------------------------------
+# --- boxes and clouds -----------------------------------------------------------------------------
 
 
 def _read_tracks(
@@ -317,8 +386,12 @@ def _read_tracks(
         for index, item in enumerate(_json(path, "bounding_box_3d/*.json")["annotations"]):
             where = f"{path}: annotations[{index}]"
             if item["class_id"] not in names:
-                raise InputError("box has a class that the ontology lacks", where=where, got=str(item["class_id"]),
-                    expected=", ".join(str(number) for number in names))  # fmt: skip
+                raise InputError(
+                    "box has a class that the ontology lacks",
+                    where=where,
+                    got=str(item["class_id"]),
+                    expected=", ".join(str(number) for number in names),
+                )
             box = item["box"]
             size = box["length"], box["width"], box["height"]
             label = tracks.label_of(names[item["class_id"]])
@@ -347,15 +420,23 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
     note_unknown("point_format", columns, _CHANNELS)
     fits = data.ndim == 2 and data.shape[1] == len(columns) and data.dtype.kind in "fiu"
     if not fits or not {"X", "Y", "Z"} <= {*columns}:
-        raise InputError("cloud does not have its columns", where=f"{where}: data", got=f"{data.dtype} {data.shape}",
-            expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}")  # fmt: skip
+        raise InputError(
+            "cloud does not have its columns",
+            where=f"{where}: data",
+            got=f"{data.dtype} {data.shape}",
+            expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}",
+        )
     returns = is_return(data[:, [columns.index(axis) for axis in "XYZ"]])
     no_returns, data = int((~returns).sum()), data[returns].astype(np.float32)
     if not np.isfinite(data).all():
-        raise InputError("cloud holds values that are not finite", where=where,
-            got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points")  # fmt: skip
+        raise InputError(
+            "cloud holds values that are not finite",
+            where=where,
+            got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points",
+        )
     xyz = np.ascontiguousarray(data[:, [columns.index(axis) for axis in "XYZ"]])
     intensity = data[:, columns.index("INTENSITY")] if "INTENSITY" in columns else np.zeros(len(data), np.float32)
-    if len(intensity) and not (-1e-3 < float(intensity.min()) <= float(intensity.max()) < 1.001):  # the format states no range
+    # the format states no range
+    if len(intensity) and not (-1e-3 < float(intensity.min()) <= float(intensity.max()) < 1.001):
         log.info_once("dgp: intensities outside of 0 to 1 are taken as 0 and 1: divide them by their largest value")
     return SweepPoints(xyz, np.clip(intensity, 0, 1), np.zeros(len(data), np.float32), no_returns=no_returns)

@@ -1,12 +1,13 @@
 """The one writer of imported scenes, and logs whose sensors run on their own clocks.
 
-Every importer ends in ``write_scene``: it says in a ``SceneContent`` what is small (cameras, vehicle path, notes), and turns one item after
-another (a frame, an image, a sweep) into ``SceneImage`` and ``SceneSweep`` when they are written.
+Every importer ends in ``write_scene``: it says in a ``SceneContent`` what is small (cameras, vehicle path, notes), and
+turns one item after another (a frame, an image, a sweep) into ``SceneImage`` and ``SceneSweep`` when they are written.
 
-Formats whose sensors run on their own clocks fill a ``DriveLog`` instead: every image and sweep with its own time and pose in the
-map's frame, nothing decoded yet. ``write_log`` chooses frames, moves the world to the first vehicle pose, and writes the scene.
-Frames are counted by one camera, the reference: frame n is its n-th image in time order. Everything else that was
-recorded nearer to that image than to its neighbours belongs to frame n. ``--frames`` and the held-out split go by this number.
+Formats whose sensors run on their own clocks fill a ``DriveLog`` instead: every image and sweep with its own time and
+pose in the map's frame, nothing decoded yet. ``write_log`` chooses frames, moves the world to the first vehicle pose,
+and writes the scene. Frames are counted by one camera, the reference: frame n is its n-th image in time order.
+Everything else that was recorded nearer to that image than to its neighbours belongs to frame n. ``--frames`` and the
+held-out split go by this number.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ Tracks = tuple[Sequence[Track], Sequence[str]]
 _EGO_MARGIN_S: Final = 0.6
 
 
-# --- any scene --------------------------------------------------------------------------------------------------------
+# --- any scene ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -115,11 +116,11 @@ class SceneContent(Generic[Item]):
 def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) -> Scene:
     """Write a scene at ``out``.
 
-    Points at a sensor's own place (``scene.returns``) are left out, and headings of boxes that flip by 180 degrees are turned
-    back; both are counted in the scene's notes.
+    Points at a sensor's own place (``scene.returns``) are left out, and headings of boxes that flip by 180 degrees are
+    turned back; both are counted in the scene's notes.
 
-    Images whose size is kept are copied byte for byte, after a check that they are complete and of their camera's size. At most two
-    items per worker are in memory, beside the few that wait for the disk.
+    Images whose size is kept are copied byte for byte, after a check that they are complete and of their camera's size.
+    At most two items per worker are in memory, beside the few that wait for the disk.
 
     Raises:
         InputError: an item is missing or damaged, or what is written contradicts itself. Nothing is left at ``out``.
@@ -128,7 +129,8 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
     types.foreign_name(content.name, f"{dataset}: name of the log")
     moments: list[tuple[int, str]] = []
     rows: dict[str, list[tuple[int, int, float]]] = {}
-    """Sensor -> of each sweep, rows without a return, all rows, and how far apart float32 numbers are at its farthest point."""
+    """Sensor -> of each sweep, rows without a return, all rows, and how far apart float32 numbers are at its farthest
+    point."""
 
     def convert(item: Item) -> None:
         for part in content.convert(item):
@@ -186,7 +188,10 @@ def _row_notes(rows: Mapping[str, Sequence[tuple[int, int, float]]]) -> list[str
     for sensor, counts in sorted(rows.items()):
         without, total = sum(one[0] for one in counts), sum(one[1] for one in counts)
         if without:
-            notes.append(f"{sensor}: {without} of {total} points ({without / total:.1%}) mark beams without a return and were left out")
+            notes.append(
+                f"{sensor}: {without} of {total} points ({without / total:.1%}) mark beams without a return and were"
+                " left out"
+            )
         spacing_m = max(one[2] for one in counts)
         if spacing_m > FLOAT32_SPACING_M:
             log.warn(
@@ -201,13 +206,13 @@ def _log_notes(dataset: str, notes: Iterable[str]) -> None:
         log.info(f"{dataset}: {note}")
 
 
-# --- sensors on their own clocks --------------------------------------------------------------------------------------
+# --- sensors on their own clocks ------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageRecord:
-    """One recorded image: ``map_from_cam`` f64[4, 4] at its own time. ``read``: its bytes, where it is no file of its own; ``place``
-    names it then, for errors, and ``path`` is the file that holds it."""
+    """One recorded image: ``map_from_cam`` f64[4, 4] at its own time. ``read``: its bytes, where it is no file of its
+    own; ``place`` names it then, for errors, and ``path`` is the file that holds it."""
 
     camera: str
     time_s: float
@@ -219,7 +224,8 @@ class ImageRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepRecord:
-    """One LiDAR sweep: ``map_from_lidar`` f64[4, 4] at its time; ``read`` loads the points when they are wanted. ``place`` as above."""
+    """One LiDAR sweep: ``map_from_lidar`` f64[4, 4] at its time; ``read`` loads the points when they are wanted.
+    ``place`` as above."""
 
     sensor: str
     time_s: float
@@ -231,8 +237,8 @@ class SweepRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraOptics:
-    """What a camera's images need besides its intrinsics: ``lens``, if they are not rectified, and where they show the recording vehicle,
-    ``ego`` bool[H, W] of the recorded size."""
+    """What a camera's images need besides its intrinsics: ``lens``, if they are not rectified, and where they show the
+    recording vehicle, ``ego`` bool[H, W] of the recorded size."""
 
     recorded: Camera
     lens: Lens | None = None
@@ -253,7 +259,8 @@ class DriveLog:
         source: data set, licence and notes.
         where: folder, for messages.
         optics: by scene name; cameras that are not named are rectified.
-        box_times: ``sweeps``: keys of tracks are the times of the sweeps in which people saw the boxes; ``own``: the boxes' own.
+        box_times: ``sweeps``: keys of tracks are the times of the sweeps in which people saw the boxes; ``own``: the
+            boxes' own.
     """
 
     name: str
@@ -272,13 +279,14 @@ class DriveLog:
 def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     """Write the chosen frames of ``drive`` as a scene at ``out``.
 
-    Tracks reach 0.05 s beyond their boxes, so that images at their ends are covered. Boxes of moving objects are brought to
-    the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep
-    counts as one moment, without point times, and boxes stay as drawn.
+    Tracks reach 0.05 s beyond their boxes, so that images at their ends are covered. Boxes of moving objects are
+    brought to the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep counts as one moment,
+    without point times, and boxes stay as drawn.
 
     Raises:
         UsageError: no frame lies in the chosen range.
-        InputError: a file is missing or damaged; poses, times and units contradict each other. Nothing is left at ``out``.
+        InputError: a file is missing or damaged; poses, times and units contradict each other. Nothing is left at
+            ``out``.
     """
     check_motion(drive.ego, drive.where)
     chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
@@ -357,14 +365,22 @@ def _choose_frames(drive: DriveLog, options: ImportOptions) -> _Chosen:
     check_sensor_times(drive)
     lacking = [name for name in drive.cameras if not any(image.camera == name for image in drive.images)]
     if lacking:
-        raise InputError("a camera has no images in this log", where=drive.where, got=", ".join(lacking),
+        raise InputError(
+            "a camera has no images in this log",
+            where=drive.where,
+            got=", ".join(lacking),
             expected="images of every chosen camera",
-            remedy="unpack the archives with its images, or choose others with --cameras")  # fmt: skip
+            remedy="unpack the archives with its images, or choose others with --cameras",
+        )
     reference_s = np.sort([image.time_s for image in drive.images if image.camera == drive.reference])
     first, end = options.frames if options.frames is not None else (0, len(reference_s))
     if first >= len(reference_s):
-        raise UsageError("no frame lies in the chosen range", where="--frames", got=f"{first}:{end}",
-            expected=f"frames 0 to {len(reference_s) - 1} ({len(reference_s)} images of {drive.reference})")  # fmt: skip
+        raise UsageError(
+            "no frame lies in the chosen range",
+            where="--frames",
+            got=f"{first}:{end}",
+            expected=f"frames 0 to {len(reference_s) - 1} ({len(reference_s)} images of {drive.reference})",
+        )
 
     def numbered(records: Sequence[Any]) -> list[tuple[Any, int]]:
         nearest = nearest_index(reference_s, np.array([record.time_s for record in records])).tolist()
@@ -383,9 +399,13 @@ def _without_missing(chosen: _Chosen, options: ImportOptions) -> _Chosen:
         by_sensor.setdefault(_sensor_of(record), []).append(path)
     lacks = "; ".join(f"{sensor} lacks {len(paths)} (first: {paths[0].name})" for sensor, paths in by_sensor.items())
     if not options.skip_missing or not set(chosen.images) - set(absent):
-        raise InputError("files that the log names are missing", where=str(next(iter(absent.values()))), got=lacks,
+        raise InputError(
+            "files that the log names are missing",
+            where=str(next(iter(absent.values()))),
+            got=lacks,
             expected=f"all {len(chosen.images) + len(chosen.sweeps)} images and sweeps of the chosen frames",
-            remedy="unpack the missing archives, choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+            remedy="unpack the missing archives, choose frames with --frames FIRST:END, or add --skip-missing",
+        )
     log.warn(f"left out files that are missing: {lacks}")
     images = {image: number for image, number in chosen.images.items() if image not in absent}
     return _Chosen(images, [sweep for sweep in chosen.sweeps if sweep not in absent])
@@ -393,7 +413,9 @@ def _without_missing(chosen: _Chosen, options: ImportOptions) -> _Chosen:
 
 def _outside_gaps(chosen: _Chosen, drive: DriveLog, options: ImportOptions) -> _Chosen:
     """Refuse records in gaps of the vehicle's path, or leave them out and say so."""
-    guessed = {record: gap for record in (*chosen.images, *chosen.sweeps) if (gap := motion.gap_at(drive.ego, record.time_s))}
+    guessed = {
+        record: gap for record in (*chosen.images, *chosen.sweeps) if (gap := motion.gap_at(drive.ego, record.time_s))
+    }
     if not guessed:
         return chosen
     record, gap = next(iter(guessed.items()))
@@ -412,9 +434,12 @@ def check_sensor_times(drive: DriveLog) -> None:
     for sensor, values in times.items():
         steps = np.diff(np.sort(values))
         if len(steps) and steps.min() <= 0:
-            raise InputError("two records of one sensor have the same time", where=f"{drive.where}: {sensor}",
+            raise InputError(
+                "two records of one sensor have the same time",
+                where=f"{drive.where}: {sensor}",
                 got=f"{np.sort(values)[int(steps.argmin())]:.6f} s",
-                expected="a time of its own for every image and sweep")  # fmt: skip
+                expected="a time of its own for every image and sweep",
+            )
 
 
 def _ego_between(ego: EgoPath, start_s: float, end_s: float, where: str) -> EgoPath:

@@ -4,10 +4,10 @@ A scene's cameras are pinhole cameras: projection, fusion and rasteriser know no
 
 * Images that are rectified already, at the recorded size, are kept byte for byte.
 * Distorted images are rectified here. The pinhole camera keeps the optical centre and has the lens' focal length, made
-  longer just as far as needed for every pixel to show something: a scene holds no black borders and needs no mask of them.
-  What falls outside is lost; the coefficients stay in ``Camera.distortion`` for the record.
-* A lens for which this costs more than ``MAX_FOCAL_GAIN``, or whose polynomial turns back inside the image, is refused with
-  the way out: name a narrower pinhole camera (``target``).
+  longer just as far as needed for every pixel to show something: a scene holds no black borders and needs no mask of
+  them. What falls outside is lost; the coefficients stay in ``Camera.distortion`` for the record.
+* A lens for which this costs more than ``MAX_FOCAL_GAIN``, or whose polynomial turns back inside the image, is refused
+  with the way out: name a narrower pinhole camera (``target``).
 * ``resolution`` shrinks by averaging over the exact area of each new pixel; images are never enlarged.
 """
 
@@ -40,7 +40,7 @@ _STRIP_ROWS: Final = 64
 _BORDER_STEPS: Final = 64
 
 
-# --- lenses -----------------------------------------------------------------------------------------------------------
+# --- lenses ---------------------------------------------------------------------------------------
 
 
 def brown_conrady(
@@ -64,7 +64,8 @@ def brown_conrady(
 
 
 def equidistant(k1: float = 0, k2: float = 0, k3: float = 0, k4: float = 0) -> Lens:
-    """Fisheye: the image radius is a polynomial of the ray's angle. Source: Kannala and Brandt, 2006 (OpenCV's fisheye)."""
+    """Fisheye: the image radius is a polynomial of the ray's angle. Source: Kannala and Brandt, 2006 (OpenCV's
+    fisheye)."""
 
     def distort(xy: Floats) -> Floats:
         radius = np.linalg.norm(xy, axis=1)
@@ -76,7 +77,7 @@ def equidistant(k1: float = 0, k2: float = 0, k3: float = 0, k4: float = 0) -> L
     return distort
 
 
-# --- what is done to the images of one camera -----------------------------------------------------------------------------
+# --- what is done to the images of one camera -----------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -108,8 +109,8 @@ class ImageFit:
             where: names the image, for errors.
 
         Returns:
-            ``image`` itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95 for a
-            JPEG, PNG for a PNG, grey for grey) for a file.
+            ``image`` itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95
+            for a JPEG, PNG for a PNG, grey for grey) for a file.
 
         Raises:
             InputError: damaged, or not of the recorded size.
@@ -139,11 +140,16 @@ class ImageFit:
         return rgb if rgb.shape[:2] == size else shrink_exact(rgb, *size)
 
     def ids(self, ids: NDArray[Any]) -> NDArray[Any]:
-        """Labels [H, W] of the recorded size -> [h, w] of the scene's: each pixel takes the nearest recorded one, none are mixed."""
+        """Labels [H, W] of the recorded size -> [h, w] of the scene's: each pixel takes the nearest recorded one, none
+        are mixed."""
         height, width = self.recorded.height, self.recorded.width
         if ids.shape != (height, width):
-            raise InputError("label does not have its camera's size", where=f"camera {self.camera.name}",
-                expected=f"[{height}, {width}]", got=str(list(ids.shape)))  # fmt: skip
+            raise InputError(
+                "label does not have its camera's size",
+                where=f"camera {self.camera.name}",
+                expected=f"[{height}, {width}]",
+                got=str(list(ids.shape)),
+            )
         if self.table is not None:
             ids = self.table.nearest(ids)
         return resize_nearest(ids, self.camera.height, self.camera.width)
@@ -197,12 +203,16 @@ def resized(width: int, height: int, resolution: Resolution | None, where: str =
         scale = min(1.0, resolution / max(width, height))
         return max(1, round(width * scale)), max(1, round(height * scale))
     if resolution[0] > width or resolution[1] > height:
-        raise UsageError("images are never enlarged", where=where or "--resolution",
-            expected=f"at most {width}x{height}", got=f"{resolution[0]}x{resolution[1]}")  # fmt: skip
+        raise UsageError(
+            "images are never enlarged",
+            where=where or "--resolution",
+            expected=f"at most {width}x{height}",
+            got=f"{resolution[0]}x{resolution[1]}",
+        )
     return resolution
 
 
-# --- rectifying -------------------------------------------------------------------------------------------------------------
+# --- rectifying -----------------------------------------------------------------------------------
 
 
 def covering_camera(camera: Camera, lens: Lens) -> Camera:
@@ -220,9 +230,13 @@ def covering_camera(camera: Camera, lens: Lens) -> Camera:
         return camera
     problem = _border_problem(at(high), camera, lens)
     if problem is not None:
-        raise InputError("lens cannot be rectified to a pinhole camera of its own size", where=f"camera {camera.name}",
-            got=problem, expected=f"rays that cover the image with at most {MAX_FOCAL_GAIN:g} times the focal length",
-            remedy="check the order of the coefficients; for a very wide lens choose a narrower pinhole camera")  # fmt: skip
+        raise InputError(
+            "lens cannot be rectified to a pinhole camera of its own size",
+            where=f"camera {camera.name}",
+            got=problem,
+            expected=f"rays that cover the image with at most {MAX_FOCAL_GAIN:g} times the focal length",
+            remedy="check the order of the coefficients; for a very wide lens choose a narrower pinhole camera",
+        )
     while high - low > 1e-4:
         middle = (low + high) / 2
         low, high = (middle, high) if _border_problem(at(middle), camera, lens) else (low, middle)
@@ -230,7 +244,8 @@ def covering_camera(camera: Camera, lens: Lens) -> Camera:
 
 
 def _border_problem(target: Camera, camera: Camera, lens: Lens) -> str | None:
-    """Why ``target`` cannot be filled from ``camera``, or None: a border pixel outside, or a ray whose radius turns back."""
+    """Why ``target`` cannot be filled from ``camera``, or None: a border pixel outside, or a ray whose radius turns
+    back."""
     u = np.linspace(0.5, target.width - 0.5, _BORDER_STEPS)
     v = np.linspace(0.5, target.height - 0.5, _BORDER_STEPS)
     border = np.concatenate(
@@ -271,8 +286,12 @@ class _Table:
             place = lens(xy) * [camera.fx, camera.fy] + [camera.cx, camera.cy] - 0.5
             outside = (place < -0.51) | (place > np.array([camera.width, camera.height]) - 0.49)
             if not np.isfinite(place).all() or outside.any():
-                raise InputError("rectified camera looks beyond the recorded image", where=f"camera {camera.name}",
-                    got=f"row {rows.start} on", remedy="choose a narrower pinhole camera")  # fmt: skip
+                raise InputError(
+                    "rectified camera looks beyond the recorded image",
+                    where=f"camera {camera.name}",
+                    got=f"row {rows.start} on",
+                    remedy="choose a narrower pinhole camera",
+                )
             place = place.clip(0, np.array([camera.width, camera.height]) - 1.0)
             whole = np.minimum(place.astype(np.int64), [max(camera.width - 2, 0), max(camera.height - 2, 0)])
             part = np.minimum(np.round((place - whole) * 256), 255).astype(np.uint8)

@@ -9,18 +9,19 @@
 ``data_2d_semantics/``     ``train/<drive>/image_00|01/semantic`` and ``confidence``, where there are any
 ========================== =========================================================================================
 
-Frames. World: z up, origin and x axis at the vehicle of the first imported frame (the data set's own world lies kilometres
-away). The vehicle is the GPS/IMU. ``image_00`` is called ``front``.
+Frames. World: z up, origin and x axis at the vehicle of the first imported frame (the data set's own world lies
+kilometres away). The vehicle is the GPS/IMU. ``image_00`` is called ``front``.
 
-Time. All sensors of a frame share one moment, as the data set's own tools have it: the velodyne's time stamp. Poses are missing
-where the vehicle hardly moves; they are interpolated there. Frames before the first and after the last pose are left out.
+Time. All sensors of a frame share one moment, as the data set's own tools have it: the velodyne's time stamp. Poses are
+missing where the vehicle hardly moves; they are interpolated there. Frames before the first and after the last pose are
+left out.
 
-Scans are distorted by the vehicle's motion; they are untwisted here. The sensor turns clockwise seen from above in 0.1 s and
-looks forward at the frame's moment (as the data set's tools have it). Lines of the SICK scanners, about four a frame, become
-one sweep per frame.
+Scans are distorted by the vehicle's motion; they are untwisted here. The sensor turns clockwise seen from above in 0.1
+s and looks forward at the frame's moment (as the data set's tools have it). Lines of the SICK scanners, about four a
+frame, become one sweep per frame.
 
-Fisheye cameras are taken when they are asked for (``--cameras side_left side_right``): rectified to a pinhole camera that
-looks along the lens' axis and is 90 degrees wide and high, with the lens' own resolution in its centre.
+Fisheye cameras are taken when they are asked for (``--cameras side_left side_right``): rectified to a pinhole camera
+that looks along the lens' axis and is 90 degrees wide and high, with the lens' own resolution in its centre.
 """
 
 from __future__ import annotations
@@ -72,31 +73,71 @@ from mudg.formats.importers.layout import LogFiles
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.motion import GAP_M
 
-# boxes ----------------------------------------------------------------------------------------------------------------
+# boxes --------------------------------------------------------------------------------------------
 #
 # KITTI-360 bounding primitives: ``data_3d_bboxes/*/<drive>.xml``, OpenCV-style matrices in XML, boxes in the world.
 #
-# An object's ``transform`` maps its ``vertices`` (a unit cube for the classes read here) to the world and holds the size as scale.
-# Static objects have ``timestamp`` -1 and a window of frames; objects that move have one entry per frame.
+# An object's ``transform`` maps its ``vertices`` (a unit cube for the classes read here) to the world and holds the
+# size as scale. Static objects have ``timestamp`` -1 and a window of frames; objects that move have one entry per
+# frame.
 #
-# The files hold a hundred thousand objects of all classes; they are read in pieces and only the classes of ``LABEL_OF`` are kept.
+# The files hold a hundred thousand objects of all classes; they are read in pieces and only the classes of ``LABEL_OF``
+# are kept.
 
 
 LABEL_OF_ID: Final = {
-    13: "car", 14: "truck", 34: "bus", 16: "caravan", 15: "trailer", 33: "train", 17: "motorcycle", 18: "bicycle",
-    19: "person", 20: "rider", 36: "unknown vehicle",
-}  # fmt: skip
-"""The annotation tool's class numbers (``semanticId``) of what can move. Source: the data set's label table (kittiId)."""
+    13: "car",
+    14: "truck",
+    34: "bus",
+    16: "caravan",
+    15: "trailer",
+    33: "train",
+    17: "motorcycle",
+    18: "bicycle",
+    19: "person",
+    20: "rider",
+    36: "unknown vehicle",
+}
+"""The annotation tool's class numbers (``semanticId``) of what can move. Source: the data set's label table
+(kittiId)."""
 LABEL_OF: Final = {
-    "car": "car", "truck": "truck", "bus": "bus", "caravan": "caravan", "trailer": "trailer", "train": "train",
-    "motorcycle": "motorcycle", "bicycle": "bicycle", "person": "pedestrian", "pedestrian": "pedestrian",
-    "rider": "cyclist", "unknown vehicle": "vehicle",
-}  # fmt: skip
+    "car": "car",
+    "truck": "truck",
+    "bus": "bus",
+    "caravan": "caravan",
+    "trailer": "trailer",
+    "train": "train",
+    "motorcycle": "motorcycle",
+    "bicycle": "bicycle",
+    "person": "pedestrian",
+    "pedestrian": "pedestrian",
+    "rider": "cyclist",
+    "unknown vehicle": "vehicle",
+}
 """Classes that become tracks -> the labels of this package. Buildings, poles, vegetation and ground are no tracks."""
-_OFFICIAL: Final = frozenset({
-    "index", "label", "category", "semanticId", "semanticId_orig", "instanceId", "timestamp", "start_frame", "end_frame", "dynamic",
-    "dynamicSeq", "dynamicIdx", "dynamicIndex", "level_min", "level_max", "color", "transform", "vertices", "faces",
-})  # fmt: skip
+_OFFICIAL: Final = frozenset(
+    {
+        "index",
+        "label",
+        "category",
+        "semanticId",
+        "semanticId_orig",
+        "instanceId",
+        "timestamp",
+        "start_frame",
+        "end_frame",
+        "dynamic",
+        "dynamicSeq",
+        "dynamicIdx",
+        "dynamicIndex",
+        "level_min",
+        "level_max",
+        "color",
+        "transform",
+        "vertices",
+        "faces",
+    }
+)
 """Fields of the data set's objects, read or not."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
 MAX_FILE_BYTES: Final = 8 * 1024**3
@@ -200,7 +241,9 @@ def _refuse_entities(content: bytes, where: str, first: bool) -> None:
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content or b"\0" in content or other:
         raise InputError(
             "box file declares a document type, entities or another encoding, which the data set's files do not",
-            where=where, remedy="use the file from the data set")  # fmt: skip
+            where=where,
+            remedy="use the file from the data set",
+        )
 
 
 def _label(item: ElementTree.Element, where: str) -> str:
@@ -233,8 +276,12 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
     rows, columns = _integer(node, "rows", f"{where}.{key}"), _integer(node, "cols", f"{where}.{key}")
     texts = (node.findtext("data") or "").split()
     if rows * columns != len(texts) or not 0 < rows * columns <= _MAX_VALUES:
-        raise InputError("matrix does not have the size it declares", where=f"{where}.{key}",
-            expected=f"{rows} x {columns} numbers", got=f"{len(texts)} values")  # fmt: skip
+        raise InputError(
+            "matrix does not have the size it declares",
+            where=f"{where}.{key}",
+            expected=f"{rows} x {columns} numbers",
+            got=f"{len(texts)} values",
+        )
     try:
         values = np.array([float(text) for text in texts])
     except ValueError as error:
@@ -249,12 +296,15 @@ def _shape(
 ) -> tuple[tuple[float, float, float], Matrix] | None:
     """Size and pose of the box, or None if it is sheared.
 
-    The axis that stands upright becomes z. Of the others, the first becomes x, for vehicles the longer one: which of them
-    the annotation tool called x does not matter for the box.
+    The axis that stands upright becomes z. Of the others, the first becomes x, for vehicles the longer one: which of
+    them the annotation tool called x does not matter for the box.
     """
     if transform.shape != (4, 4) or vertices.shape[1] != 3 or np.abs(transform[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError("box is not a 4x4 transform of 3-D vertices", where=where,
-            got=f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}")  # fmt: skip
+        raise InputError(
+            "box is not a 4x4 transform of 3-D vertices",
+            where=where,
+            got=f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}",
+        )
     low, high = vertices.min(0), vertices.max(0)
     scale = np.linalg.norm(transform[:3, :3], axis=0)
     sizes = scale * (high - low)
@@ -275,23 +325,28 @@ def _shape(
     return (float(sizes[first]), float(sizes[second]), float(sizes[up])), from_rotation_translation(rotation, centre)
 
 
-# calib ----------------------------------------------------------------------------------------------------------------
+# calib --------------------------------------------------------------------------------------------
 #
 # KITTI-360 calibration: rectified perspective cameras, fisheye cameras (model of Mei), LiDARs, all on the vehicle.
 #
-# The data set's vehicle frame is that of the GPS/IMU: x forward, y right, z down. The ego frame here is the same point with y to
-# the left and z up.
+# The data set's vehicle frame is that of the GPS/IMU: x forward, y right, z down. The ego frame here is the same point
+# with y to the left and z up.
 
 
 IMU_FROM_EGO: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 FISHEYES: Final = ("image_02", "image_03")
 FISHEYE_VIEW_DEG: Final = 90.0
-_FISHEYE_VALUES: Final = (
-    "image_width", "image_height", "xi", "k1", "k2", "p1", "p2", "gamma1", "gamma2", "u0", "v0",
-)  # fmt: skip
-_FISHEYE: Final = frozenset({
-    *_FISHEYE_VALUES, "model_type", "camera_name", "mirror_parameters", "distortion_parameters", "projection_parameters",
-})  # fmt: skip
+_FISHEYE_VALUES: Final = ("image_width", "image_height", "xi", "k1", "k2", "p1", "p2", "gamma1", "gamma2", "u0", "v0")
+_FISHEYE: Final = frozenset(
+    {
+        *_FISHEYE_VALUES,
+        "model_type",
+        "camera_name",
+        "mirror_parameters",
+        "distortion_parameters",
+        "projection_parameters",
+    }
+)
 """Entries of the data set's fisheye calibrations."""
 
 
@@ -314,7 +369,8 @@ class Kitti360Calibration:
     imu_from_rect0: Matrix
 
     def fit(self, camera: str, name: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
-        """How images of ``camera`` (``image_02``), of ``size`` (width, height), become images of the scene's ``name``."""
+        """How images of ``camera`` (``image_02``), of ``size`` (width, height), become images of the scene's
+        ``name``."""
         if camera in FISHEYES:
             return self._fit_fisheye(camera, name, size, options)
         path = self.folder / "perspective.txt"
@@ -338,7 +394,7 @@ class Kitti360Calibration:
 
         recorded = Camera(
             name, *size, values["gamma1"], values["gamma2"], values["u0"] + 0.5, values["v0"] + 0.5, (xi, *bend)
-        )  # fmt: skip
+        )
         # the focal length at the lens' centre, so that nothing is lost or made up there
         focal = values["gamma1"] / (1 + xi)
         side = max(16, round(2 * focal * np.tan(np.deg2rad(FISHEYE_VIEW_DEG / 2))))
@@ -385,9 +441,13 @@ def _rigid_file(path: Path) -> Matrix:
 
 def _check_size(size: tuple[int, int], declared: tuple[int, int], where: str) -> None:
     if size != declared:
-        raise InputError("images do not have the size that the calibration is for", where=where,
-            expected=f"{declared[0]}x{declared[1]}", got=f"{size[0]}x{size[1]}",
-            remedy="use the images as the data set ships them")  # fmt: skip
+        raise InputError(
+            "images do not have the size that the calibration is for",
+            where=where,
+            expected=f"{declared[0]}x{declared[1]}",
+            got=f"{size[0]}x{size[1]}",
+            remedy="use the images as the data set ships them",
+        )
 
 
 def _read_fisheye(path: Path) -> dict[str, float]:
@@ -395,8 +455,12 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     text = store.read_bytes(path).decode("utf-8", "replace")
     model = re.search(r"^\s*model_type\s*:\s*\"?(\w+)", text, re.MULTILINE)
     if model is None or model[1] != "MEI":
-        raise InputError("fisheye calibration is of another camera model", where=str(path), expected="model_type: MEI",
-            got=model[1] if model else "no model_type")  # fmt: skip
+        raise InputError(
+            "fisheye calibration is of another camera model",
+            where=str(path),
+            expected="model_type: MEI",
+            got=model[1] if model else "no model_type",
+        )
     note_unknown(path.name, re.findall(r"^\s*(\w+)\s*:", text, re.MULTILINE), _FISHEYE)
     found: dict[str, float] = {}
     for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
@@ -406,15 +470,24 @@ def _read_fisheye(path: Path) -> dict[str, float]:
             raise InputError("fisheye calibration holds no number", where=f"{path}: {key}", got=value[:40]) from error
     missing = [key for key in _FISHEYE_VALUES if key not in found]
     if missing:
-        raise InputError("fisheye calibration is incomplete", where=str(path), expected=", ".join(_FISHEYE_VALUES),
-            got=f"no {', '.join(missing)}", remedy="is the file cut off?")  # fmt: skip
+        raise InputError(
+            "fisheye calibration is incomplete",
+            where=str(path),
+            expected=", ".join(_FISHEYE_VALUES),
+            got=f"no {', '.join(missing)}",
+            remedy="is the file cut off?",
+        )
     if found["xi"] < 0 or found["gamma1"] <= 0 or found["gamma2"] <= 0:
-        raise InputError("fisheye calibration makes no sense", where=str(path), expected="xi >= 0, gamma1 and gamma2 > 0",
-                         got=f"xi={found['xi']:g}, gamma1={found['gamma1']:g}, gamma2={found['gamma2']:g}")  # fmt: skip
+        raise InputError(
+            "fisheye calibration makes no sense",
+            where=str(path),
+            expected="xi >= 0, gamma1 and gamma2 > 0",
+            got=f"xi={found['xi']:g}, gamma1={found['gamma1']:g}, gamma2={found['gamma2']:g}",
+        )
     return found
 
 
-# importer -------------------------------------------------------------------------------------------------------------
+# importer -----------------------------------------------------------------------------------------
 
 
 Matrix = NDArray[np.float64]
@@ -425,10 +498,31 @@ SICK: Final = "sick"
 FRAME_PERIOD_S: Final = 0.1
 _SICK_REACH_S: Final = 0.055
 _TRAIN_IDS: Final = {
-    7: 0, 8: 1, 11: 2, 12: 3, 13: 4, 17: 5, 19: 6, 20: 7, 21: 8, 22: 9, 23: 10, 24: 11, 25: 12, 26: 13, 27: 14, 28: 15,
-    31: 16, 32: 17, 33: 18, 34: 2, 35: 4, 37: 5,
-}  # fmt: skip
-"""The data set's class ids -> Cityscapes train ids (garage = building, gate = fence, small pole = pole); others unlabelled."""
+    7: 0,
+    8: 1,
+    11: 2,
+    12: 3,
+    13: 4,
+    17: 5,
+    19: 6,
+    20: 7,
+    21: 8,
+    22: 9,
+    23: 10,
+    24: 11,
+    25: 12,
+    26: 13,
+    27: 14,
+    28: 15,
+    31: 16,
+    32: 17,
+    33: 18,
+    34: 2,
+    35: 4,
+    37: 5,
+}
+"""The data set's class ids -> Cityscapes train ids (garage = building, gate = fence, small pole = pole); others
+unlabelled."""
 _LAST_ID: Final = 44
 
 
@@ -455,7 +549,8 @@ class _Folders:
 
 
 def looks_like_kitti360(source: Path) -> bool:
-    """Whether ``source`` is the data set's folder (``data_2d_raw`` and ``calibration`` in it), or a drive's in ``data_2d_raw``."""
+    """Whether ``source`` is the data set's folder (``data_2d_raw`` and ``calibration`` in it), or a drive's in
+    ``data_2d_raw``."""
     if not source.is_dir():
         return False
     root = source.absolute().parent.parent if source.absolute().parent.name == "data_2d_raw" else source
@@ -468,8 +563,8 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     Args:
         source: the data set's folder, or ``data_2d_raw/<drive>`` in it.
         out: destination.
-        options: ``sequence`` is the drive (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the stereo
-            pair; all others are used too.
+        options: ``sequence`` is the drive (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the
+            stereo pair; all others are used too.
 
     Raises:
         UsageError: there are several drives and none was chosen, or an option does not apply.
@@ -526,9 +621,15 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     origin = Source("kitti360", LICENCE, None, tuple(notes))
     path = EgoPath(scene_s, np.stack([pose_near(ego, float(time_s)) for time_s in scene_s]))
     content = SceneContent(
-        folders.drive, origin, fits, range(len(frames)), convert, lambda index: f"frame {frames[index]}", path,
+        folders.drive,
+        origin,
+        fits,
+        range(len(frames)),
+        convert,
+        lambda index: f"frame {frames[index]}",
+        path,
         tracks=lambda: (tracks, ()),
-    )  # fmt: skip
+    )
     return write_scene(content, out, options)
 
 
@@ -539,8 +640,12 @@ def _find(source: Path, options: ImportOptions) -> _Folders:
         return _Folders(source.absolute().parent.parent, source.absolute().name)
     raw = source / "data_2d_raw"
     if not raw.is_dir():
-        raise InputError("no KITTI-360 recording found", where=str(source), got=layout.folder_contents(source),
-            expected="data_2d_raw, data_poses and calibration in it")  # fmt: skip
+        raise InputError(
+            "no KITTI-360 recording found",
+            where=str(source),
+            got=layout.folder_contents(source),
+            expected="data_2d_raw, data_poses and calibration in it",
+        )
     drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
     wanted = options.sequence
     matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
@@ -565,7 +670,7 @@ def _without_pose(
     return [f"frames without a pose or time stamp were left out: {layout.number_ranges(sorted(lost))}"] if lost else []
 
 
-# --- time and motion ------------------------------------------------------------------------------------------------
+# --- time and motion ------------------------------------------------------------------------------
 
 
 def _clock(folders: _Folders, streams: Mapping[str, Mapping[int, Path]], notes: list[str]) -> NDArray[np.float64]:
@@ -593,8 +698,12 @@ def _find_poses(folders: _Folders, options: ImportOptions) -> Path:
     here = folders.root / "data_poses" / folders.drive
     path = layout.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
     if path is None:
-        raise InputError("no vehicle poses found", where=str(options.poses or here),
-            expected="poses.txt or cam0_to_world.txt", remedy="download the data set's vehicle poses")  # fmt: skip
+        raise InputError(
+            "no vehicle poses found",
+            where=str(options.poses or here),
+            expected="poses.txt or cam0_to_world.txt",
+            remedy="download the data set's vehicle poses",
+        )
     return path
 
 
@@ -606,16 +715,21 @@ def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np
         row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
         number = int(row[0])
         if number != row[0] or number <= before:
-            raise InputError("first column is not a list of growing frame numbers", where=where, got=f"{row[0]:g}",
-                remedy="is the file of another kind?")  # fmt: skip
+            raise InputError(
+                "first column is not a list of growing frame numbers",
+                where=where,
+                got=f"{row[0]:g}",
+                remedy="is the file of another kind?",
+            )
         before = number
         if number < len(clock) and np.isfinite(clock[number]):
             pose = rigid_pose(row[1:].reshape(-1, 4), where)
             numbers.append(number)
             poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
     if not poses:
-        raise InputError("no pose belongs to a frame", where=str(path),
-            expected=f"frame numbers up to {len(clock) - 1}")  # fmt: skip
+        raise InputError(
+            "no pose belongs to a frame", where=str(path), expected=f"frame numbers up to {len(clock) - 1}"
+        )
     times = clock[numbers]
     if (np.diff(times) <= 0).any():
         frame = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
@@ -624,7 +738,8 @@ def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np
 
 
 def _has_pose(ego: EgoPath, time_s: float) -> bool:
-    """Whether there is a pose at a time, or the vehicle moved less than ``GAP_M`` between the poses around it. NaN: no."""
+    """Whether there is a pose at a time, or the vehicle moved less than ``GAP_M`` between the poses around it. NaN:
+    no."""
     if not np.isfinite(time_s):
         return False
     after = int(np.searchsorted(ego.times_s, time_s))
@@ -644,7 +759,7 @@ def _untwisted(points: SweepPoints, ego: EgoPath, calibration: Kitti360Calibrati
     return replace(points, xyz=xyz, dt_s=dt_s)
 
 
-# --- SICK lines -------------------------------------------------------------------------------------------------------
+# --- SICK lines -----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -690,13 +805,14 @@ class _SickLines:
 
 
 def _read_line(path: Path) -> tuple[NDArray[np.float32], int]:
-    """One SICK line f32[N, 3]: pairs of float32 in the scanner's plane (source: the data set's reader); and its beams without a return."""
+    """One SICK line f32[N, 3]: pairs of float32 in the scanner's plane (source: the data set's reader); and its beams
+    without a return."""
     pairs, returns = read_float_rows(path, 2, "SICK line", axes=2)
     pairs = pairs[returns]
     return np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1), int((~returns).sum())
 
 
-# --- labels and boxes -------------------------------------------------------------------------------------------------
+# --- labels and boxes -----------------------------------------------------------------------------
 
 
 def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[str, NDArray[Any]]:
@@ -706,8 +822,9 @@ def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[
         return {}
     ids = _grey(path)
     if ids.dtype != np.uint8 or (ids[ids != UNLABELLED] > _LAST_ID).any():
-        raise InputError("semantic image holds ids that do not exist", where=str(path),
-            expected=f"0..{_LAST_ID}, 8 bits")  # fmt: skip
+        raise InputError(
+            "semantic image holds ids that do not exist", where=str(path), expected=f"0..{_LAST_ID}, 8 bits"
+        )
     table = np.full(256, UNLABELLED, np.uint8)
     table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())
     labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
@@ -724,8 +841,9 @@ def _grey(path: Path) -> NDArray[Any]:
     try:
         with Image.open(io.BytesIO(store.read_bytes(path)), formats=("PNG",)) as image:
             if image.mode not in ("L", "P", "I;16", "I"):
-                raise InputError("label image is not grey", where=str(path), got=f"mode {image.mode}",
-                    expected="8 or 16 bits")  # fmt: skip
+                raise InputError(
+                    "label image is not grey", where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits"
+                )
             array = np.array(image)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error
@@ -733,13 +851,10 @@ def _grey(path: Path) -> NDArray[Any]:
 
 
 def _read_tracks(
-    folders: _Folders,
-    options: ImportOptions,
-    time_of: Mapping[int, float],
-    world_from_source: Matrix,
-    notes: list[str],
+    folders: _Folders, options: ImportOptions, time_of: Mapping[int, float], world_from_source: Matrix, notes: list[str]
 ) -> list[Track]:
-    """Tracks within the imported frames: moving boxes at their frames, standing ones over the window they were drawn in."""
+    """Tracks within the imported frames: moving boxes at their frames, standing ones over the window they were drawn
+    in."""
     path = options.boxes or layout.first_file(*folders.boxes())
     if path is None:
         notes.append("no boxes found: everything counts as static")

@@ -1,4 +1,5 @@
-"""Finding the files of a log: numbered files, frames that are whole, cameras that were asked for, options that do not apply."""
+"""Finding the files of a log: numbered files, frames that are whole, cameras that were asked for, options that do not
+apply."""
 
 from __future__ import annotations
 
@@ -21,7 +22,8 @@ class LogFiles:
 
     Args:
         files: files, and folders that count with everything in them.
-        entries: folders too large for that, of which only their own times count: these change when a file comes or goes.
+        entries: folders too large for that, of which only their own times count: these change when a file comes or
+            goes.
     """
 
     files: tuple[Path, ...]
@@ -29,7 +31,8 @@ class LogFiles:
 
 
 def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
-    """Files called by a frame number, in order: ``0000000012.png`` with suffix ``.png``, ``07.pkl.gz`` with ``.pkl.gz``.
+    """Files called by a frame number, in order: ``0000000012.png`` with suffix ``.png``, ``07.pkl.gz`` with
+    ``.pkl.gz``.
 
     A folder that does not exist holds none.
     """
@@ -65,17 +68,24 @@ def complete_frames(
     missing = {name: sorted(everything - found) for name, found in numbers.items() if everything - found}
     gaps = "; ".join(f"{name} lacks {number_ranges(lacks)}" for name, lacks in missing.items())
     if missing and not options.skip_missing:
-        raise InputError("images and sweeps do not pair up", where=where,
-            expected="every camera and LiDAR for every frame", got=gaps,
-            remedy="copy the missing files, choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+        raise InputError(
+            "images and sweeps do not pair up",
+            where=where,
+            expected="every camera and LiDAR for every frame",
+            got=gaps,
+            remedy="copy the missing files, choose frames with --frames FIRST:END, or add --skip-missing",
+        )
     if missing:
         log.warn(f"{title}: left out incomplete frames: {gaps}")
     for lacks in missing.values():
         everything -= set(lacks)
     if not everything:
-        raise InputError("no frames to import", where=where,
+        raise InputError(
+            "no frames to import",
+            where=where,
             expected="numbered images" + (f" in {options.frames[0]}:{options.frames[1]}" if options.frames else ""),
-            got=", ".join(f"{name}: {number_ranges(sorted(found))}" for name, found in numbers.items()) or "nothing")  # fmt: skip
+            got=", ".join(f"{name}: {number_ranges(sorted(found))}" for name, found in numbers.items()) or "nothing",
+        )
     return sorted(everything)
 
 
@@ -119,8 +129,12 @@ def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOpti
     if len(matching) == 1:
         return matching[0]
     listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
-    raise UsageError(f"the folder holds several {kind}s" if matching else f"there is no such {kind}", where=str(where),
-        expected=f"--sequence with one of {listed}", got=options.sequence or "none chosen")  # fmt: skip
+    raise UsageError(
+        f"the folder holds several {kind}s" if matching else f"there is no such {kind}",
+        where=str(where),
+        expected=f"--sequence with one of {listed}",
+        got=options.sequence or "none chosen",
+    )
 
 
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
@@ -140,8 +154,9 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
     if not options.cameras:
         chosen = [name for name in available if name in usual]
         if not chosen:
-            raise InputError("the log has no camera that can be imported", where=where, expected=", ".join(usual),
-                got=listed)  # fmt: skip
+            raise InputError(
+                "the log has no camera that can be imported", where=where, expected=", ".join(usual), got=listed
+            )
         return chosen
     unknown = [name for name in options.cameras if name not in available and name not in by_scene_name]
     if unknown:
@@ -161,9 +176,13 @@ def refuse_missing_cameras(there: Iterable[str], usual: Iterable[str], options: 
     there, usual = list(there), list(usual)
     absent = [name for name in usual if name not in there]
     if absent and not options.cameras and not options.skip_missing:
-        raise InputError("cameras are missing in the log", where=str(where), got=f"no images of {', '.join(absent)}",
+        raise InputError(
+            "cameras are missing in the log",
+            where=str(where),
+            got=f"no images of {', '.join(absent)}",
             expected=f"{len(usual)} cameras",
-            remedy=f"choose those that are there with --cameras {' '.join(there)}, or add --skip-missing")  # fmt: skip
+            remedy=f"choose those that are there with --cameras {' '.join(there)}, or add --skip-missing",
+        )
 
 
 def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
@@ -180,10 +199,15 @@ def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
 
 
 def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
-    """Refuse ``--untwist yes``, ``--poses`` and ``--boxes`` for a data set that brings its own and compensates its sweeps."""
+    """Refuse ``--untwist yes``, ``--poses`` and ``--boxes`` for a data set that brings its own and compensates its
+    sweeps."""
     if options.untwist == "yes":
-        raise UsageError(f"sweeps of {dataset} are already compensated for the vehicle's motion", where=where,
-            got="--untwist yes", remedy="leave --untwist out")  # fmt: skip
+        raise UsageError(
+            f"sweeps of {dataset} are already compensated for the vehicle's motion",
+            where=where,
+            got="--untwist yes",
+            remedy="leave --untwist out",
+        )
     refuse_options(options, dataset, "poses", "boxes")
 
 
@@ -191,6 +215,7 @@ def path_inside(root: Path, name: Any, where: str) -> Path:
     """A file below ``root`` from a name in a foreign table; absolute names and ``..`` are refused."""
     problem = ref_problem(name)
     if problem is not None:
-        raise InputError(f"file name {problem}", where=where, got=repr(name)[:120],
-            expected="a relative path inside the log")  # fmt: skip
+        raise InputError(
+            f"file name {problem}", where=where, got=repr(name)[:120], expected="a relative path inside the log"
+        )
     return root / name

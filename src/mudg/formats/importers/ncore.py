@@ -1,11 +1,12 @@
 """NCore importer: recordings of version 4 (NVIDIA), read with the vendor's package.
 
-A recording is one or more stores ``NAME.ncore4[-GROUP].zarr.itar`` (or folders ``.zarr``) that belong together by NAME; a ``.json`` beside
-them lists them. Read are cameras with their lenses, LiDARs with all returns and the time of every ray, poses, boxes, and masks of the own
-vehicle; not radars, loose point clouds and labels of images.
+A recording is one or more stores ``NAME.ncore4[-GROUP].zarr.itar`` (or folders ``.zarr``) that belong together by NAME;
+a ``.json`` beside them lists them. Read are cameras with their lenses, LiDARs with all returns and the time of every
+ray, poses, boxes, and masks of the own vehicle; not radars, loose point clouds and labels of images.
 
-Every image is taken to be seen at the middle of its exposure, and every sweep is brought to the middle of its turn (or to the moment that
-is noted with it). Lenses are the package's own projections. Boxes hold at their own times, whichever frame they are told in.
+Every image is taken to be seen at the middle of its exposure, and every sweep is brought to the middle of its turn (or
+to the moment that is noted with it). Lenses are the package's own projections. Boxes hold at their own times, whichever
+frame they are told in.
 """
 
 from __future__ import annotations
@@ -61,14 +62,15 @@ from mudg.formats.ncore import (
 from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
 from mudg.scene import motion
 
-# container ------------------------------------------------------------------------------------------------------------
+# container ----------------------------------------------------------------------------------------
 #
-# The files of an NCore recording, checked before NVIDIA's package reads them: nothing is larger in memory than its file can hold, and
-# nothing is run.
+# The files of an NCore recording, checked before NVIDIA's package reads them: nothing is larger in memory than its file
+# can hold, and nothing is run.
 #
-# A store is a zarr hierarchy in one tar file (``.zarr.itar``: members, then an index, then a block that says where the index is) or in a
-# folder (``.zarr``). All metadata stand once more in one compressed member, which is what the package reads. The package trusts sizes and
-# codecs; here every size is held against the bytes that are there, and codecs other than the format's own (pickle is one) are refused.
+# A store is a zarr hierarchy in one tar file (``.zarr.itar``: members, then an index, then a block that says where the
+# index is) or in a folder (``.zarr``). All metadata stand once more in one compressed member, which is what the package
+# reads. The package trusts sizes and codecs; here every size is held against the bytes that are there, and codecs other
+# than the format's own (pickle is one) are refused.
 
 
 METADATA: Final = ".zmetadata.cbor.xz"
@@ -84,9 +86,9 @@ _CONTAINER_BYTES: Final = 72
 _MOST_LZ4: Final = 256
 _BLOSC_HEADER: Final = struct.Struct("<4B3I")
 _KINDS: Final = "biufS"
-COMPONENTS: Final = frozenset({
-    "poses", "intrinsics", "masks", "cameras", "lidars", "radars", "cuboids", "point_clouds", "camera_labels",
-})  # fmt: skip
+COMPONENTS: Final = frozenset(
+    {"poses", "intrinsics", "masks", "cameras", "lidars", "radars", "cuboids", "point_clouds", "camera_labels"}
+)
 """Components of the format, read or not."""
 
 
@@ -107,14 +109,19 @@ class _StoredMember:
 
 @contextmanager
 def foreign_reader(where: str) -> Iterator[None]:
-    """Code of the package that reads a file: whatever it raises becomes an InputError. It reports damage by errors of every kind."""
+    """Code of the package that reads a file: whatever it raises becomes an InputError. It reports damage by errors of
+    every kind."""
     try:
         yield
     except MudgError:
         raise
     except Exception as error:
-        raise InputError("NCore recording cannot be read", where=where, got=f"{type(error).__name__}: {error}"[:300],
-            remedy="is a file of it damaged, missing, or of another version? copy it again") from error  # fmt: skip
+        raise InputError(
+            "NCore recording cannot be read",
+            where=where,
+            got=f"{type(error).__name__}: {error}"[:300],
+            remedy="is a file of it damaged, missing, or of another version? copy it again",
+        ) from error
 
 
 def check_store(path: Path) -> None:
@@ -126,8 +133,12 @@ def check_store(path: Path) -> None:
     members = _members_of_folder(path) if path.is_dir() else _members_of_tar(path)
     where = f"{path}: {METADATA}"
     if METADATA not in members:
-        raise InputError("NCore store has no metadata", where=where, expected="a store that was finished",
-            remedy="was the program that wrote it stopped?")  # fmt: skip
+        raise InputError(
+            "NCore store has no metadata",
+            where=where,
+            expected="a store that was finished",
+            remedy="was the program that wrote it stopped?",
+        )
     with record_fields("NCore metadata make no sense", where, "groups and arrays of zarr 2"):
         metadata = _cbor(_unpacked(members[METADATA].read(), where), where)["metadata"]
         chunks = _chunk_sizes(members)
@@ -139,7 +150,7 @@ def check_store(path: Path) -> None:
                 _check_array(about, chunks.get(place, {}), f"{path}: {place.rstrip('/')}")
 
 
-# --- containers -----------------------------------------------------------------------------------------------------
+# --- containers -----------------------------------------------------------------------------------
 
 
 def _members_of_folder(path: Path) -> dict[str, _StoredMember]:
@@ -153,11 +164,21 @@ def _members_of_tar(path: Path) -> dict[str, _StoredMember]:
     last = _StoredMember(path, max(0, size - _BLOCK), _BLOCK).read()
     magic, kind, offset, length = _HEADER.unpack(last[: _HEADER.size].ljust(_HEADER.size, b"\0"))
     if magic != b"itar" or kind != 1 or size % _BLOCK:
-        raise InputError("not an indexed tar file, or cut off", where=str(path), expected="an index in the last 512 bytes",
-            got=f"{size} bytes, the last block begins with {last[:8]!r}", remedy="copy the file again")  # fmt: skip
+        raise InputError(
+            "not an indexed tar file, or cut off",
+            where=str(path),
+            expected="an index in the last 512 bytes",
+            got=f"{size} bytes, the last block begins with {last[:8]!r}",
+            remedy="copy the file again",
+        )
     if offset + length > size - _BLOCK:
-        raise InputError("index lies outside of the file", where=where, expected=f"at most {size - _BLOCK} bytes",
-            got=f"{length} bytes from {offset} on", remedy="copy the file again")  # fmt: skip
+        raise InputError(
+            "index lies outside of the file",
+            where=where,
+            expected=f"at most {size - _BLOCK} bytes",
+            got=f"{length} bytes from {offset} on",
+            remedy="copy the file again",
+        )
     with record_fields("index makes no sense", where, "names, offsets and sizes of members"):
         table = _cbor(_unpacked(_StoredMember(path, offset, length).read(), where), where)
         names, offsets, sizes = table["items"], table["offset_datas"], table["sizes"]
@@ -167,8 +188,13 @@ def _members_of_tar(path: Path) -> dict[str, _StoredMember]:
             )
         for name, begin, count in zip(names, offsets, sizes, strict=True):
             if not (isinstance(name, str) and _whole(begin) and _whole(count) and begin + count <= size):
-                raise InputError("member lies outside of the file", where=f"{path}: {str(name)[:80]}", expected=f"at most {size} bytes",
-                    got=f"{count} bytes from {begin} on"[:120], remedy="copy the file again")  # fmt: skip
+                raise InputError(
+                    "member lies outside of the file",
+                    where=f"{path}: {str(name)[:80]}",
+                    expected=f"at most {size} bytes",
+                    got=f"{count} bytes from {begin} on"[:120],
+                    remedy="copy the file again",
+                )
         return {
             name: _StoredMember(path, begin, count) for name, begin, count in zip(names, offsets, sizes, strict=True)
         }
@@ -189,8 +215,12 @@ def _unpacked(packed: bytes, where: str) -> bytes:
             "compressed metadata are damaged", where=where, got=str(error), remedy="copy the file again"
         ) from error
     if len(content) > most:
-        raise InputError("compressed metadata unpack to more than metadata can be", where=where, got=f"{len(packed)} bytes",
-            expected=f"at most {most} bytes when unpacked")  # fmt: skip
+        raise InputError(
+            "compressed metadata unpack to more than metadata can be",
+            where=where,
+            got=f"{len(packed)} bytes",
+            expected=f"at most {most} bytes when unpacked",
+        )
     if not unpacker.eof:
         raise InputError(
             "compressed metadata are cut off", where=where, got=f"{len(packed)} bytes", remedy="copy the file again"
@@ -199,7 +229,7 @@ def _unpacked(packed: bytes, where: str) -> bytes:
 
 
 def _cbor(content: bytes, where: str) -> Any:
-    import cbor2  # type: ignore[import-not-found]
+    import cbor2
 
     heads = len(content) - len(
         content.translate(None, _CONTAINERS)
@@ -224,7 +254,7 @@ def _cbor(content: bytes, where: str) -> Any:
     return found
 
 
-# --- arrays ---------------------------------------------------------------------------------------------------------
+# --- arrays ---------------------------------------------------------------------------------------
 
 
 def _chunk_sizes(members: Mapping[str, _StoredMember]) -> dict[str, dict[str, _StoredMember]]:
@@ -238,11 +268,16 @@ def _chunk_sizes(members: Mapping[str, _StoredMember]) -> dict[str, dict[str, _S
 
 
 def _check_array(about: Mapping[str, Any], chunks: Mapping[str, _StoredMember], where: str) -> None:
-    """Refuse an array that its chunks cannot fill, that is not of plain numbers or bytes, or that is packed in another way."""
+    """Refuse an array that its chunks cannot fill, that is not of plain numbers or bytes, or that is packed in another
+    way."""
     codec, nested = about["compressor"], about.get("dimension_separator", ".") != "."
     if nested or about.get("filters") or not (codec is None or codec["id"] == "blosc"):
-        raise InputError("array is packed in a way that is not read", where=where, expected="blosc or nothing, chunks named 0.0",
-            got=str(about.get("filters") or (about["dimension_separator"] if nested else codec))[:120])  # fmt: skip
+        raise InputError(
+            "array is packed in a way that is not read",
+            where=where,
+            expected="blosc or nothing, chunks named 0.0",
+            got=str(about.get("filters") or (about["dimension_separator"] if nested else codec))[:120],
+        )
     kind = np.dtype(about["dtype"])
     if kind.hasobject or kind.kind not in _KINDS:
         raise InputError("array is not of plain numbers or bytes", where=where, got=str(about["dtype"])[:80])
@@ -253,19 +288,34 @@ def _check_array(about: Mapping[str, Any], chunks: Mapping[str, _StoredMember], 
         )
     grid = [-(-side // piece) for side, piece in zip(shape, pieces, strict=True)]
     names = (".".join(map(str, place)) or "0" for place in (_places(grid) if math.prod(shape) else ()))
-    if (lost := next((name for name in names if name not in chunks), None)) is not None:  # the package would fill it with a constant
-        raise InputError("chunk of an array is missing", where=f"{where}/{lost}", expected=f"chunks of {pieces} for {shape}"[:120],
-            got=f"{len(chunks)} chunks", remedy="copy the recording again")  # fmt: skip
+    # the package would fill it with a constant
+    if (lost := next((name for name in names if name not in chunks), None)) is not None:
+        raise InputError(
+            "chunk of an array is missing",
+            where=f"{where}/{lost}",
+            expected=f"chunks of {pieces} for {shape}"[:120],
+            got=f"{len(chunks)} chunks",
+            remedy="copy the recording again",
+        )
     stored, growth = sum(chunk.size for chunk in chunks.values()), 1 if codec is None else _MOST_LZ4
     piece = math.prod(pieces) * kind.itemsize
     if max(math.prod(shape) * kind.itemsize, piece if math.prod(shape) else 0) > growth * stored:
-        raise InputError("array is larger than its file can hold", where=where, got=f"{shape} of {kind} in {stored} bytes"[:120],
-            remedy="is the file cut off?")  # fmt: skip
+        raise InputError(
+            "array is larger than its file can hold",
+            where=where,
+            got=f"{shape} of {kind} in {stored} bytes"[:120],
+            remedy="is the file cut off?",
+        )
     for name, chunk in chunks.items():
         size = chunk.size if codec is None else _blosc_size(chunk, f"{where}/{name}")
         if size != piece:
-            raise InputError("chunk of an array is of another size", where=f"{where}/{name}", expected=f"{piece} bytes", got=f"{size}",
-                remedy="copy the file again")  # fmt: skip
+            raise InputError(
+                "chunk of an array is of another size",
+                where=f"{where}/{name}",
+                expected=f"{piece} bytes",
+                got=f"{size}",
+                remedy="copy the file again",
+            )
 
 
 def _places(grid: Sequence[int]) -> Iterator[tuple[int, ...]]:
@@ -287,23 +337,44 @@ def _blosc_size(chunk: _StoredMember, where: str) -> int:
     return unpacked
 
 
-# importer -------------------------------------------------------------------------------------------------------------
+# importer -----------------------------------------------------------------------------------------
 
 
 Record = TypeVar("Record", ImageRecord, SweepRecord)
 _LIST: Final[Known] = {
     **dict.fromkeys(("sequence_id", "sequence_timestamp_interval_us", "generic_meta_data", "version")),
     "component_stores": dict.fromkeys(("path", "md5", "components")),
-}  # fmt: skip
+}
 """Fields of the list of a recording's stores."""
 UNKNOWN_LICENCE: Final = "not stated in the recording: see where it comes from"
 LABELS: Final[Mapping[str, str]] = {
-    "automobile": "car", "heavy_truck": "truck", "train_or_tram_car": "tram", "other_vehicle": "vehicle", "person": "pedestrian",
-    **{name: name for name in (
-        "vehicle", "car", "van", "truck", "bus", "trailer", "tram", "train", "pedestrian", "cyclist", "rider", "bicycle", "motorcycle",
-        "stroller", "animal", "protruding_object",
-    )},
-}  # fmt: skip
+    "automobile": "car",
+    "heavy_truck": "truck",
+    "train_or_tram_car": "tram",
+    "other_vehicle": "vehicle",
+    "person": "pedestrian",
+    **{
+        name: name
+        for name in (
+            "vehicle",
+            "car",
+            "van",
+            "truck",
+            "bus",
+            "trailer",
+            "tram",
+            "train",
+            "pedestrian",
+            "cyclist",
+            "rider",
+            "bicycle",
+            "motorcycle",
+            "stroller",
+            "animal",
+            "protruding_object",
+        )
+    },
+}
 """Classes of NVIDIA's recordings and of this program -> labels."""
 _EXACT: Final = 1e-7
 """Errors of rotations that are left as they are."""
@@ -332,7 +403,8 @@ def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     Raises:
         UsageError: there are several recordings and none was chosen, or no such camera.
-        InputError: missing, damaged or contradictory; nothing is left at ``out``. ResourceError: the package is not installed.
+        InputError: missing, damaged or contradictory; nothing is left at ``out``. ResourceError: the package is not
+            installed.
     """
     refuse_options(options, "NCore", "poses", "boxes", "bridge_gaps")
     package()
@@ -344,7 +416,7 @@ def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
         return write_log(_drive(recording, options), out, options)
 
 
-# --- files ----------------------------------------------------------------------------------------------------------
+# --- files ----------------------------------------------------------------------------------------
 
 
 def _recordings(source: Path) -> dict[str, list[Path]]:
@@ -391,8 +463,12 @@ def _listed(path: Path) -> list[Path]:
 def _choose(source: Path, options: ImportOptions) -> tuple[Path, ...]:
     found = _recordings(source)
     if not found or not all(found.values()):
-        raise InputError("no NCore recording found", where=str(source), expected=f"files NAME{MARK}.zarr.itar, or folders NAME{MARK}.zarr",
-            got=folder_contents(source) if source.is_dir() else "no such file")  # fmt: skip
+        raise InputError(
+            "no NCore recording found",
+            where=str(source),
+            expected=f"files NAME{MARK}.zarr.itar, or folders NAME{MARK}.zarr",
+            got=folder_contents(source) if source.is_dir() else "no such file",
+        )
     matching = [stores for name, stores in found.items() if name.startswith(options.sequence)]
     chosen = tuple(the_only(matching, list(found), options, source, "recording"))
     for path in chosen:
@@ -403,7 +479,7 @@ def _choose(source: Path, options: ImportOptions) -> tuple[Path, ...]:
     return chosen
 
 
-# --- a recording ----------------------------------------------------------------------------------------------------
+# --- a recording ----------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -439,7 +515,8 @@ class _OpenRecording:
         )
 
     def at_points(self, frame: str, times_us: Times, where: str) -> Matrix:
-        """As ``world_from`` at the many times of points: exact at every key and every millisecond, and between those as between keys."""
+        """As ``world_from`` at the many times of points: exact at every key and every millisecond, and between those as
+        between keys."""
         if len(times_us) < _MANY:
             return self.world_from(frame, times_us, where) if len(times_us) else np.empty((0, 4, 4))
         first, last = int(times_us[0]), int(times_us[-1])
@@ -455,9 +532,17 @@ def _opened(stores: tuple[Path, ...], where: str) -> Iterator[_OpenRecording]:
         reader = v4.SequenceComponentGroupsReader(list(stores))
     try:
         with foreign_reader(where):
-            of = {name: reader.open_component_readers(getattr(v4, name).Reader) for name in
-                  ("PosesComponent", "IntrinsicsComponent", "MasksComponent", "CuboidsComponent", "CameraSensorComponent",
-                   "LidarSensorComponent")}  # fmt: skip
+            of = {
+                name: reader.open_component_readers(getattr(v4, name).Reader)
+                for name in (
+                    "PosesComponent",
+                    "IntrinsicsComponent",
+                    "MasksComponent",
+                    "CuboidsComponent",
+                    "CameraSensorComponent",
+                    "LidarSensorComponent",
+                )
+            }
             poses = _single(of["PosesComponent"], "poses", where)
             fixed, moving = list(poses.get_static_poses()), list(poses.get_dynamic_poses())
         for (source, target), found in (
@@ -475,9 +560,18 @@ def _opened(stores: tuple[Path, ...], where: str) -> Iterator[_OpenRecording]:
             graph = package().transformations.PoseGraphInterpolator(edges)
         file = stores[0] if stores[0].is_file() else stores[0] / METADATA
         yield _OpenRecording(
-            reader, poses, _single(of["IntrinsicsComponent"], "intrinsics", where), _perhaps(of["MasksComponent"]),
-            _perhaps(of["CuboidsComponent"]), of["CameraSensorComponent"], of["LidarSensorComponent"], graph, knots, where, file,
-        )  # fmt: skip
+            reader,
+            poses,
+            _single(of["IntrinsicsComponent"], "intrinsics", where),
+            _perhaps(of["MasksComponent"]),
+            _perhaps(of["CuboidsComponent"]),
+            of["CameraSensorComponent"],
+            of["LidarSensorComponent"],
+            graph,
+            knots,
+            where,
+            file,
+        )
     finally:
         close(reader)
 
@@ -497,8 +591,13 @@ def _perhaps(found: Mapping[str, Any]) -> Any:
 def _single(found: Mapping[str, Any], kind: str, where: str) -> Any:
     one = _perhaps(found)
     if one is None:
-        raise InputError(f"recording has no {kind}", where=where, expected=f"a component {INSTANCE}, or one of another name",
-            got=", ".join(found) or "none", remedy="are all of its stores there?")  # fmt: skip
+        raise InputError(
+            f"recording has no {kind}",
+            where=where,
+            expected=f"a component {INSTANCE}, or one of another name",
+            got=", ".join(found) or "none",
+            remedy="are all of its stores there?",
+        )
     return one
 
 
@@ -521,13 +620,25 @@ def _drive(recording: _OpenRecording, options: ImportOptions) -> DriveLog:
     tracks, track_notes = _tracks(recording, zero_us)
     about = _about(recording)
     source = Source(
-        about.get("dataset", "ncore"), about.get("licence", UNKNOWN_LICENCE), None,
+        about.get("dataset", "ncore"),
+        about.get("licence", UNKNOWN_LICENCE),
+        None,
         (*notes, *([] if sweeps else ["no LiDAR sweeps in the recording"]), *track_notes),
-    )  # fmt: skip
+    )
     cameras = {name: one.recorded for name, one in optics.items()}
     return DriveLog(
-        str(recording.reader.sequence_id), cameras, names[chosen[0]], images, sweeps, tracks, ego, source, where, optics, box_times="own"
-    )  # fmt: skip
+        str(recording.reader.sequence_id),
+        cameras,
+        names[chosen[0]],
+        images,
+        sweeps,
+        tracks,
+        ego,
+        source,
+        where,
+        optics,
+        box_times="own",
+    )
 
 
 def _scene_names(sensors: Iterable[str], taken: Collection[str] = ()) -> dict[str, str]:
@@ -557,13 +668,17 @@ def _spans(reader: Any, where: str) -> Times:
             raise InputError("time stamp is no time in microseconds", where=where, got=str(int(spans.max())))
         spans = spans.astype(np.int64)
     if (spans[:, 1] < spans[:, 0]).any() or (len(spans) and spans.max() - spans.min() > _MOST_SPAN_US):
-        raise InputError("times of frames make no sense", where=where, expected="microseconds of one recording, begin before end",
-            got=f"{spans.min()} to {spans.max()}")  # fmt: skip
+        raise InputError(
+            "times of frames make no sense",
+            where=where,
+            expected="microseconds of one recording, begin before end",
+            got=f"{spans.min()} to {spans.max()}",
+        )
     seconds(spans[:, 1], "us", where)
     return spans
 
 
-# --- cameras --------------------------------------------------------------------------------------------------------
+# --- cameras --------------------------------------------------------------------------------------
 
 
 def _optics(recording: _OpenRecording, camera: str, name: str, spans: Times, notes: list[str]) -> CameraOptics:
@@ -617,8 +732,12 @@ def _mask(recording: _OpenRecording, camera: str, recorded: Camera) -> NDArray[n
             return None
         image = recording.masks.get_camera_mask_image(camera, EGO_MASK)
         if image.size != (recorded.width, recorded.height):
-            raise InputError("mask does not have its camera's size", where=where, got=f"{image.size}",
-                expected=f"{recorded.width}x{recorded.height}")  # fmt: skip
+            raise InputError(
+                "mask does not have its camera's size",
+                where=where,
+                got=f"{image.size}",
+                expected=f"{recorded.width}x{recorded.height}",
+            )
         return np.asarray(image.convert("L")) != 0
 
 
@@ -627,11 +746,15 @@ def _images(recording: _OpenRecording, camera: str, name: str, spans: Times, zer
     poses = recording.world_from(camera, spans.sum(1) // 2, where)
     return [
         ImageRecord(
-            name, (int(begin) + int(end) - 2 * zero_us) / (2 * MICRO), pose, recording.file,
-            partial(_picture, recording.cameras[camera], int(end), f"{where}: frame {end}"), f"{where}: frame {end}",
+            name,
+            (int(begin) + int(end) - 2 * zero_us) / (2 * MICRO),
+            pose,
+            recording.file,
+            partial(_picture, recording.cameras[camera], int(end), f"{where}: frame {end}"),
+            f"{where}: frame {end}",
         )
         for (begin, end), pose in zip(spans, poses, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def _picture(reader: Any, frame: int, where: str) -> bytes:
@@ -645,7 +768,7 @@ def _picture(reader: Any, frame: int, where: str) -> bytes:
     return content
 
 
-# --- LiDAR ----------------------------------------------------------------------------------------------------------
+# --- LiDAR ----------------------------------------------------------------------------------------
 
 
 def _sweeps(recording: _OpenRecording, lidar: str, name: str, spans: Times, zero_us: int) -> list[SweepRecord]:
@@ -654,11 +777,15 @@ def _sweeps(recording: _OpenRecording, lidar: str, name: str, spans: Times, zero
     poses = recording.world_from(lidar, at, where)
     return [
         SweepRecord(
-            name, (int(moment) - zero_us) / MICRO, pose, recording.file,
-            partial(_points, recording, lidar, int(end), int(moment), pose, f"{where}: frame {end}"), f"{where}: frame {end}",
+            name,
+            (int(moment) - zero_us) / MICRO,
+            pose,
+            recording.file,
+            partial(_points, recording, lidar, int(end), int(moment), pose, f"{where}: frame {end}"),
+            f"{where}: frame {end}",
         )
         for (_, end), moment, pose in zip(spans, at, poses, strict=True)
-    ]  # fmt: skip
+    ]
 
 
 def _moment(reader: Any, begin: int, end: int, where: str) -> int:
@@ -688,12 +815,20 @@ def _points(
         or distance.shape[1] != len(ray)
         or intensity.shape != distance.shape
     ):
-        raise InputError("rays and returns of a sweep do not pair up", where=where,
-            got=f"{ray.shape}, {times.shape}, {distance.shape}, {intensity.shape}")  # fmt: skip
+        raise InputError(
+            "rays and returns of a sweep do not pair up",
+            where=where,
+            got=f"{ray.shape}, {times.shape}, {distance.shape}, {intensity.shape}",
+        )
     if len(times) and not begin <= times.min() <= times.max() <= end:
-        raise InputError("points were measured outside of their sweep", where=where, expected=f"{begin} to {end} us",
-            got=f"{times.min()} to {times.max()}")  # fmt: skip
-    _, which = there = np.nonzero(np.isfinite(distance) & (distance != 0))  # NaN is how the format says that nothing came back
+        raise InputError(
+            "points were measured outside of their sweep",
+            where=where,
+            expected=f"{begin} to {end} us",
+            got=f"{times.min()} to {times.max()}",
+        )
+    # NaN is how the format says that nothing came back
+    _, which = there = np.nonzero(np.isfinite(distance) & (distance != 0))
     xyz, times, seen = ray[which] * distance[there][:, None], times[which], intensity[there]
     length = np.linalg.norm(ray, axis=1)
     if not np.isfinite(xyz).all() or (np.abs(length - 1) > 1e-3).any() or (distance[there] < 0).any():
@@ -725,11 +860,12 @@ def _classes(reader: Any, frame: int, count: int) -> NDArray[np.uint8] | None:
     return classes if known else None
 
 
-# --- vehicle and objects --------------------------------------------------------------------------------------------
+# --- vehicle and objects --------------------------------------------------------------------------
 
 
 def _ego(recording: _OpenRecording, zero_us: int, moments: Times) -> EgoPath:
-    """The path of the rig: its keys, or, where its poses are composed of others, its poses at the times of the frames."""
+    """The path of the rig: its keys, or, where its poses are composed of others, its poses at the times of the
+    frames."""
     where = f"{recording.where}: poses of {RIG}"
     with foreign_reader(where):
         keys = {
@@ -748,8 +884,13 @@ def _outside_gaps(records: list[Record], ego: EgoPath, options: ImportOptions) -
         if gap is None:
             there.append(record)
         elif not options.skip_missing:
-            raise InputError("vehicle poses have a gap here", where=record.place, got=f"at {record.time_s:.3f} s: {gap}",
-                expected="poses around every image and scan", remedy="leave such frames out with --skip-missing")  # fmt: skip
+            raise InputError(
+                "vehicle poses have a gap here",
+                where=record.place,
+                got=f"at {record.time_s:.3f} s: {gap}",
+                expected="poses around every image and scan",
+                remedy="leave such frames out with --skip-missing",
+            )
     if len(there) < len(records):
         log.warn(f"ncore: left out {len(records) - len(there)} records in gaps of the vehicle's poses")
     return there
@@ -781,5 +922,10 @@ def _add(tracks: BoxTracks, box: Any, world_from_frame: Matrix, zero_us: int, wh
         raise InputError("box is not finite", where=where, got=str(values.tolist())[:120])
     pose = world_from_frame @ from_rotation_translation(rotation_of(box.bbox3.rot), values[:3])
     tracks.add(
-        box.track_id, tracks.label_of(box.class_id), (box.timestamp_us - zero_us) / MICRO, box.bbox3.dim, pose, where=where
-    )  # fmt: skip
+        box.track_id,
+        tracks.label_of(box.class_id),
+        (box.timestamp_us - zero_us) / MICRO,
+        box.bbox3.dim,
+        pose,
+        where=where,
+    )

@@ -1,16 +1,16 @@
 """nuPlan importer: one log (a ``.db`` file) with its sensor blobs, or one scene (up to 20 s) of it.
 
-================================================ ===========================================================================
+================================================ =======================================================================
 ``<log>.db``                                     SQLite: poses at 100 Hz, calibration, images, clouds, tracked boxes
 ``sensor_blobs/<log>/CAM_F0`` ...                eight cameras, JPEG, 10 Hz, distorted (k1 k2 p1 p2 k3)
 ``sensor_blobs/<log>/MergedPointCloud/*.pcd``    points of five LiDARs in one cloud, 20 Hz
-================================================ ===========================================================================
+================================================ =======================================================================
 
 ``sensor_blobs`` is looked for beside the database and up to four folders above it.
 
 Frames. World: z up, origin and x axis at the vehicle of the first imported cloud (the log's own world lies thousands of
-kilometres from its origin). Frame numbers (``--frames``) count the clouds of the log or scene. A moment is an image time of
-the cameras; all clouds in between are taken.
+kilometres from its origin). Frame numbers (``--frames``) count the clouds of the log or scene. A moment is an image
+time of the cameras; all clouds in between are taken.
 
 Clouds are motion-compensated in the source; ``dt_s`` is 0. Image times are the start of a read-out of about 1/30 s; the
 middle row, and with it the pose, belongs 1/60 s later. Boxes come from an offline tracker, at every cloud.
@@ -64,12 +64,12 @@ from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.clouds import near_places
 from mudg.scene.schema import ref_problem
 
-# database -------------------------------------------------------------------------------------------------------------
+# database -----------------------------------------------------------------------------------------
 #
 # nuPlan log files: one SQLite database per log, opened read-only, the schema checked before the first question.
 #
-# Names of tables and columns are literal here. Nothing from the file becomes part of a query, a path outside the sensor blobs, or
-# code: calibration columns are pickles, read by ``plain_pickle``.
+# Names of tables and columns are literal here. Nothing from the file becomes part of a query, a path outside the sensor
+# blobs, or code: calibration columns are pickles, read by ``plain_pickle``.
 
 
 SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {
@@ -88,9 +88,9 @@ SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {
 _XYZ: Final = ("x", "y", "z")
 OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     "log": frozenset({"vehicle_name", "date", "timestamp", "map_version"}),
-    "ego_pose": frozenset({
-        "log_token", "epsg", *(f"{name}{axis}" for name in ("v", "acceleration_", "angular_rate_") for axis in _XYZ),
-    }),
+    "ego_pose": frozenset(
+        {"log_token", "epsg", *(f"{name}{axis}" for name in ("v", "acceleration_", "angular_rate_") for axis in _XYZ)}
+    ),
     "camera": frozenset({"log_token", "model"}),
     "image": frozenset({"next_token", "prev_token", "ego_pose_token"}),
     "lidar": frozenset({"log_token", "model"}),
@@ -101,7 +101,7 @@ OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     "scene": frozenset({"log_token", "goal_ego_pose_token", "roadblock_ids"}),
     "scenario_tag": frozenset(),
     "traffic_light_status": frozenset(),
-}  # fmt: skip
+}
 """Tables of the published schema, and those of their columns that are not read."""
 _MAX_CELL_BYTES: Final = 1024 * 1024
 """Calibrations are the longest values, of a few hundred bytes."""
@@ -116,7 +116,8 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
 
 @dataclass(frozen=True, slots=True)
 class NuplanCamera:
-    """One camera: name in the data set, place on the vehicle f64[4, 4], fx fy cx cy, lens k1 k2 p1 p2 k3, width, height."""
+    """One camera: name in the data set, place on the vehicle f64[4, 4], fx fy cx cy, lens k1 k2 p1 p2 k3, width,
+    height."""
 
     channel: str
     ego_from_cam: Matrix
@@ -127,8 +128,8 @@ class NuplanCamera:
 
 @dataclass(frozen=True, slots=True)
 class NuplanCloud:
-    """One point cloud: its token, file, time (us), world-from-lidar f64[4, 4] in the log's world, and where the log's LiDARs sit in the
-    cloud's frame, f64[3] each."""
+    """One point cloud: its token, file, time (us), world-from-lidar f64[4, 4] in the log's world, and where the log's
+    LiDARs sit in the cloud's frame, f64[3] each."""
 
     token: bytes
     file: Path
@@ -151,8 +152,9 @@ class NuplanLog:
             for row in self._connection.execute(question, values):  # noqa: UP028
                 yield row
         except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
-            raise InputError("log database is damaged", where=str(self.path), got=str(error)[:200],
-                remedy="copy the file again") from error  # fmt: skip
+            raise InputError(
+                "log database is damaged", where=str(self.path), got=str(error)[:200], remedy="copy the file again"
+            ) from error
 
     def check(self) -> None:
         """Refuse a database that is not a nuPlan log."""
@@ -161,8 +163,13 @@ class NuplanLog:
         }
         for table, columns in SCHEMA.items():
             if table not in tables or tables[table].upper().startswith("CREATE VIRTUAL"):
-                raise InputError(f"database has no table {table!r}", where=str(self.path), expected=", ".join(SCHEMA),
-                    got=", ".join(sorted(tables)) or "no tables", remedy="is it a nuPlan log (v1.1)?")  # fmt: skip
+                raise InputError(
+                    f"database has no table {table!r}",
+                    where=str(self.path),
+                    expected=", ".join(SCHEMA),
+                    got=", ".join(sorted(tables)) or "no tables",
+                    remedy="is it a nuPlan log (v1.1)?",
+                )
             there = [str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")]
             require_columns(columns, there, f"{self.path}: {table}")
             note_unknown(f"the table {table}", there, OFFICIAL[table].union(columns))
@@ -174,7 +181,12 @@ class NuplanLog:
             name = text_of(name, f"{self.path}: log.logfile")
             problem = "has folders in it" if "/" in name else ref_problem(name)
             if problem is not None:
-                raise InputError(f"log's name {problem}", where=f"{self.path}: log.logfile", got=repr(name), expected="a folder's name")
+                raise InputError(
+                    f"log's name {problem}",
+                    where=f"{self.path}: log.logfile",
+                    got=repr(name),
+                    expected="a folder's name",
+                )
             return name
         raise InputError("log has no name", where=f"{self.path}: log.logfile")
 
@@ -189,8 +201,12 @@ class NuplanLog:
             matrix = np.array(self._numbers(values[2], f"{where}.intrinsic", 9)).reshape(3, 3)
             skewed = abs(matrix[0, 1]) > 1e-6 or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6
             if skewed or min(matrix[0, 0], matrix[1, 1]) <= 0:
-                raise InputError("intrinsics are not of a pinhole camera", where=f"{where}.intrinsic",
-                    got=str(matrix.tolist()), expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")  # fmt: skip
+                raise InputError(
+                    "intrinsics are not of a pinhole camera",
+                    where=f"{where}.intrinsic",
+                    got=str(matrix.tolist()),
+                    expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
+                )
             width, height = (_whole(values[index], f"{where}.{name}") for index, name in ((4, "width"), (5, "height")))
             found[token_of(token, f"{where}.token")] = NuplanCamera(
                 channel,
@@ -241,7 +257,8 @@ class NuplanLog:
         """Times (us) and poses f64[n, 4, 4] of the vehicle from ``first_us`` to ``last_us``; doubled times once."""
         times, poses = [], []
         for time_us, *pose in self.rows(
-            "SELECT timestamp, x, y, z, qw, qx, qy, qz FROM ego_pose WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
+            "SELECT timestamp, x, y, z, qw, qx, qy, qz FROM ego_pose WHERE timestamp BETWEEN ? AND ? ORDER BY"
+            " timestamp",
             (first_us, last_us),
         ):
             time_us = self._time(time_us, "ego_pose")
@@ -253,7 +270,8 @@ class NuplanLog:
     def images(self, first_us: int, last_us: int, blobs: Path) -> Iterator[tuple[bytes, Path, int]]:
         """Camera token, file below ``blobs``, and time (us), in order of time."""
         for camera, file, time_us in self.rows(
-            "SELECT camera_token, filename_jpg, timestamp FROM image WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
+            "SELECT camera_token, filename_jpg, timestamp FROM image WHERE timestamp BETWEEN ? AND ? ORDER BY"
+            " timestamp",
             (first_us, last_us),
         ):
             time_us = self._time(time_us, "image")
@@ -261,27 +279,34 @@ class NuplanLog:
             yield token_of(camera, f"{where}: camera_token"), path_inside(blobs, file, where), time_us
 
     def boxes(self, first_us: int, last_us: int) -> Iterator[tuple[bytes, str, str, tuple[float, ...]]]:
-        """Cloud, track, class, and x y z yaw length width height (metres, radians, the log's world) of all boxes of a span.
+        """Cloud, track, class, and x y z yaw length width height (metres, radians, the log's world) of all boxes of a
+        span.
 
         One pass over the table: the databases need not have an index of boxes by cloud.
         """
         for cloud, track, label, *numbers in self.rows(
-            "SELECT p.token, b.track_token, c.name, b.x, b.y, b.z, b.yaw, b.length, b.width, b.height FROM lidar_pc AS p "
-            "JOIN lidar_box AS b ON b.lidar_pc_token = p.token LEFT JOIN track AS t ON t.token = b.track_token "
-            "LEFT JOIN category AS c ON c.token = t.category_token WHERE p.timestamp BETWEEN ? AND ?",
+            "SELECT p.token, b.track_token, c.name, b.x, b.y, b.z, b.yaw, b.length, b.width, b.height FROM lidar_pc AS"
+            " p JOIN lidar_box AS b ON b.lidar_pc_token = p.token LEFT JOIN track AS t ON t.token = b.track_token LEFT"
+            " JOIN category AS c ON c.token = t.category_token WHERE p.timestamp BETWEEN ? AND ?",
             (first_us, last_us),
         ):
             track = token_of(track, f"{self.path}: lidar_box.track_token").hex()
             where = f"{self.path}: lidar_box of track {track}"
             if label is None:
-                raise InputError("box names a track or class that is not there", where=where,
-                    expected="tokens of track and category", remedy="copy the file again")  # fmt: skip
+                raise InputError(
+                    "box names a track or class that is not there",
+                    where=where,
+                    expected="tokens of track and category",
+                    remedy="copy the file again",
+                )
             label = text_of(label, f"{self.path}: category.name")
             yield token_of(cloud, where), track, label, tuple(_finite(number, where) for number in numbers)
 
     def scenes(self) -> list[str]:
         """Names of the scenes (pieces of up to 20 s)."""
-        return [text_of(name, f"{self.path}: scene.name") for (name,) in self.rows("SELECT name FROM scene ORDER BY name")]
+        return [
+            text_of(name, f"{self.path}: scene.name") for (name,) in self.rows("SELECT name FROM scene ORDER BY name")
+        ]
 
     def _time(self, value: Any, table: str) -> int:
         return _whole(value, f"{self.path}: {table}.timestamp")
@@ -304,8 +329,9 @@ class NuplanLog:
         for item in as_list(read_pickle(blob, where, _MAKERS), where)[:_MAX_NUMBERS]:
             flat += [_finite(value, where) for value in (item if isinstance(item, list | tuple) else [item])]
         if count is not None and len(flat) != count:
-            raise InputError("calibration has the wrong number of values", where=where, expected=str(count),
-                got=str(len(flat)))  # fmt: skip
+            raise InputError(
+                "calibration has the wrong number of values", where=where, expected=str(count), got=str(len(flat))
+            )
         return flat
 
 
@@ -313,15 +339,22 @@ def token_of(value: Any, where: str) -> bytes:
     """A token: 1 to 64 bytes. InputError otherwise: SQLite columns may hold values of any type."""
     if not isinstance(value, bytes) or not 0 < len(value) <= _MAX_TOKEN_BYTES:
         got = f"{len(value)} bytes" if isinstance(value, bytes | str) else repr(value)[:40]
-        raise InputError("token is no short blob", where=where, expected=f"1 to {_MAX_TOKEN_BYTES} bytes",
-            got=f"{type(value).__name__}, {got}", remedy="is it a nuPlan log (v1.1)? copy the file again")  # fmt: skip
+        raise InputError(
+            "token is no short blob",
+            where=where,
+            expected=f"1 to {_MAX_TOKEN_BYTES} bytes",
+            got=f"{type(value).__name__}, {got}",
+            remedy="is it a nuPlan log (v1.1)? copy the file again",
+        )
     return value
 
 
 def text_of(value: Any, where: str) -> str:
     """A name: a text of 1 to 200 bytes."""
     if not isinstance(value, str) or not value:
-        raise InputError("name is no text", where=where, expected="a text", got=type(value).__name__ if value else repr(value))
+        raise InputError(
+            "name is no text", where=where, expected="a text", got=type(value).__name__ if value else repr(value)
+        )
     return foreign_name(value, where)
 
 
@@ -359,29 +392,46 @@ def open_log(path: Path) -> Iterator[NuplanLog]:
         opened.check()
         yield opened
     except sqlite3.Error as error:
-        raise InputError("file is not a readable SQLite database", where=str(path), got=str(error),
-            expected="a nuPlan log (.db)", remedy="is it cut off, or still packed?") from error  # fmt: skip
+        raise InputError(
+            "file is not a readable SQLite database",
+            where=str(path),
+            got=str(error),
+            expected="a nuPlan log (.db)",
+            remedy="is it cut off, or still packed?",
+        ) from error
     finally:
         if connection is not None:
             connection.close()
 
 
-# importer -------------------------------------------------------------------------------------------------------------
+# importer -----------------------------------------------------------------------------------------
 
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 4.0 with the nuPlan dataset licence (Motional; attribution, non-commercial, share-alike)"
 CAMERAS: Final = {
-    "CAM_F0": "front", "CAM_L0": "front_left", "CAM_R0": "front_right", "CAM_L1": "side_left", "CAM_R1": "side_right",
-    "CAM_L2": "back_left", "CAM_R2": "back_right", "CAM_B0": "back",
-}  # fmt: skip
+    "CAM_F0": "front",
+    "CAM_L0": "front_left",
+    "CAM_R0": "front_right",
+    "CAM_L1": "side_left",
+    "CAM_R1": "side_right",
+    "CAM_L2": "back_left",
+    "CAM_R2": "back_right",
+    "CAM_B0": "back",
+}
 SENSOR: Final = "merged"
 LABELS: Final = {
-    "vehicle": "vehicle", "bicycle": "bicycle", "pedestrian": "pedestrian", "traffic_cone": "traffic_cone",
-    "barrier": "barrier", "czone_sign": "sign", "generic_object": "generic_object",
-}  # fmt: skip
+    "vehicle": "vehicle",
+    "bicycle": "bicycle",
+    "pedestrian": "pedestrian",
+    "traffic_cone": "traffic_cone",
+    "barrier": "barrier",
+    "czone_sign": "sign",
+    "generic_object": "generic_object",
+}
 IMAGE_DELAY_US: Final = 16_667
-"""From an image's time stamp to the middle of its read-out. The data set's schema does not tell; reconstructions of it found this."""
+"""From an image's time stamp to the middle of its read-out. The data set's schema does not tell; reconstructions of it
+found this."""
 _MARGIN_US: Final = 100_000
 _REACH_US: Final = 60_000
 _PERIOD_US: Final = 100_000
@@ -389,7 +439,8 @@ _SQLITE: Final = b"SQLite format 3\0"
 
 
 def looks_like_nuplan(source: Path) -> bool:
-    """Whether ``source`` is a log database, or a folder that holds some (also as ``splits/*`` or ``nuplan-v1.1/splits/*``)."""
+    """Whether ``source`` is a log database, or a folder that holds some (also as ``splits/*`` or
+    ``nuplan-v1.1/splits/*``)."""
     if source.is_file():
         return _is_database(source)
     return source.is_dir() and any(_is_database(path) for path in _databases(source)[:1])
@@ -413,8 +464,8 @@ def import_nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
     Args:
         source: the log's ``.db`` file, or a folder of such files.
         out: destination.
-        options: ``sequence`` is the log's name (where ``source`` is a folder), a scene's name, or ``LOG/SCENE``. ``cameras``
-            default to all eight. ``poses``, ``boxes`` and ``untwist`` are refused; all others are used.
+        options: ``sequence`` is the log's name (where ``source`` is a folder), a scene's name, or ``LOG/SCENE``.
+            ``cameras`` default to all eight. ``poses``, ``boxes`` and ``untwist`` are refused; all others are used.
 
     Raises:
         UsageError: there are several logs and none was chosen, or an option does not apply.
@@ -437,8 +488,9 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
         raise InputError("nuPlan log does not exist", where=str(source), expected="a .db file or a folder of them")
     databases = {path.stem: path for path in _databases(source)}
     if not databases:
-        raise InputError("no nuPlan log found", where=str(source), expected="*.db here or in splits/*",
-            got=folder_contents(source))  # fmt: skip
+        raise InputError(
+            "no nuPlan log found", where=str(source), expected="*.db here or in splits/*", got=folder_contents(source)
+        )
     log_name, _, scene = options.sequence.partition("/")
     if log_name in databases:
         return databases[log_name], scene
@@ -460,7 +512,7 @@ def _sensor_blobs(path: Path, name: str) -> Path | None:
     return next((folder for folder in found if (folder / name).is_dir()), None)
 
 
-# --- what is imported -------------------------------------------------------------------------------------------------
+# --- what is imported -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -498,12 +550,16 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     name, where = opened.name(), str(opened.path)
     blobs = _sensor_blobs(opened.path, name)
     if blobs is None:
-        raise InputError("sensor blobs of the log were not found", where=where,
+        raise InputError(
+            "sensor blobs of the log were not found",
+            where=where,
             expected=f"sensor_blobs/{name} beside the database or up to four folders above it",
-            remedy="download the camera and LiDAR blobs of this log; the database alone holds no images")  # fmt: skip
+            remedy="download the camera and LiDAR blobs of this log; the database alone holds no images",
+        )
     if scene and scene not in opened.scenes():
-        raise UsageError("the log has no such scene", where=where, got=scene,
-            expected=", ".join(opened.scenes()[:12]) or "no scenes")  # fmt: skip
+        raise UsageError(
+            "the log has no such scene", where=where, got=scene, expected=", ".join(opened.scenes()[:12]) or "no scenes"
+        )
     every = list(opened.clouds(scene))
     first, end = options.frames or (0, len(every))
     chosen = every[first:end]
@@ -517,9 +573,13 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     if len(clouds) < len(placed):
         without = [token.hex() for token, cloud in placed.items() if cloud is None]
         if not options.skip_missing:
-            raise InputError("point cloud has no vehicle pose", where=f"{where}: lidar_pc {without[0]}.ego_pose_token",
-                expected="a token of ego_pose", got=f"{len(without)} of {len(placed)} clouds have none",
-                remedy="choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+            raise InputError(
+                "point cloud has no vehicle pose",
+                where=f"{where}: lidar_pc {without[0]}.ego_pose_token",
+                expected="a token of ego_pose",
+                got=f"{len(without)} of {len(placed)} clouds have none",
+                remedy="choose frames with --frames FIRST:END, or add --skip-missing",
+            )
         notes.append(f"{len(without)} clouds without a vehicle pose were left out")
     lacking = [cloud.file for cloud in clouds if not cloud.file.is_file()]
     if lacking:
@@ -540,17 +600,25 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     moments, moment_notes = _moments(shots, names, options, where)
     ego_us, poses = opened.ego_poses(span[0] - _MARGIN_US, span[1] + _MARGIN_US)
     return _NuplanPlan(
-        f"{name}_{scene}" if scene else name, {channel: cameras[channel] for channel in names}, clouds, moments,
-        ego_us, poses, (*notes, *moment_notes),
-    )  # fmt: skip
+        f"{name}_{scene}" if scene else name,
+        {channel: cameras[channel] for channel in names},
+        clouds,
+        moments,
+        ego_us,
+        poses,
+        (*notes, *moment_notes),
+    )
 
 
 def _refuse_missing(what: str, missing: Sequence[Path], total: int, options: ImportOptions) -> None:
     """Refuse a log of which files are missing, unless that is allowed."""
     if missing and not options.skip_missing:
-        raise InputError(f"file of a {what} is missing", where=str(missing[0]),
-            got=f"{len(missing)} of {total} are missing", remedy="download the log's sensor blobs, "
-            "choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+        raise InputError(
+            f"file of a {what} is missing",
+            where=str(missing[0]),
+            got=f"{len(missing)} of {total} are missing",
+            remedy="download the log's sensor blobs, choose frames with --frames FIRST:END, or add --skip-missing",
+        )
 
 
 def _moments(
@@ -565,12 +633,21 @@ def _moments(
     inner = [group for group, full in zip(groups[1:-1], complete[1:-1], strict=True) if not full]
     if inner and not options.skip_missing:
         absent = sorted(set(names) - {shot.channel for shot in inner[0]})
-        raise InputError("a moment lacks images of some cameras", where=f"{where}: image at {inner[0][0].time_us}",
-            got=f"no {', '.join(absent)}; {len(inner)} such moments", expected="every chosen camera",
-            remedy="choose cameras with --cameras, or add --skip-missing")  # fmt: skip
+        raise InputError(
+            "a moment lacks images of some cameras",
+            where=f"{where}: image at {inner[0][0].time_us}",
+            got=f"no {', '.join(absent)}; {len(inner)} such moments",
+            expected="every chosen camera",
+            remedy="choose cameras with --cameras, or add --skip-missing",
+        )
     if not kept:
-        raise InputError("no moment has images of all cameras", where=where, got=f"{len(shots)} images",
-            expected=", ".join(names), remedy="choose cameras with --cameras, or other frames with --frames")  # fmt: skip
+        raise InputError(
+            "no moment has images of all cameras",
+            where=where,
+            got=f"{len(shots)} images",
+            expected=", ".join(names),
+            remedy="choose cameras with --cameras, or other frames with --frames",
+        )
     cut = len(groups) - len(kept)
     return kept, [f"{cut} moments without images of all cameras were left out"] if cut else []
 
@@ -578,16 +655,21 @@ def _moments(
 def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list[list[_Shot]]:
     """Images put together by time, in order of time.
 
-    Cameras fire one after another, each at its own part of the period. So an image belongs to the nearest image of the camera
-    that has most of them, after its own camera's median delay is taken off. What lies half a period from all is alone.
+    Cameras fire one after another, each at its own part of the period. So an image belongs to the nearest image of the
+    camera that has most of them, after its own camera's median delay is taken off. What lies half a period from all is
+    alone.
     """
     by_camera = {name: [shot for shot in shots if shot.channel == name] for name in names}
     for name, found in by_camera.items():
         for shot, following in itertools.pairwise(found):
             if shot.time_us == following.time_us:
-                raise InputError("two images of one camera have the same time", where=f"{where}: image at {shot.time_us}",
-                    expected="a row for every image", got=f"{name}: {shot.file.name} and {following.file.name}",
-                    remedy="are rows of the table doubled? copy the file again")  # fmt: skip
+                raise InputError(
+                    "two images of one camera have the same time",
+                    where=f"{where}: image at {shot.time_us}",
+                    expected="a row for every image",
+                    got=f"{name}: {shot.file.name} and {following.file.name}",
+                    remedy="are rows of the table doubled? copy the file again",
+                )
     leading = max(by_camera.values(), key=len)
     if not leading:
         return []
@@ -608,7 +690,7 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list
     return sorted([*groups.values(), *alone], key=lambda group: min(shot.time_us for shot in group))
 
 
-# --- writing ----------------------------------------------------------------------------------------------------------
+# --- writing --------------------------------------------------------------------------------------
 
 
 def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> SceneContent[Any]:
@@ -617,9 +699,13 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
     ego = mended_path(_ego_path(plan, start_us, str(opened.path)), options, found)
     first = ego.pose_at(0.0)
     if first is None:
-        raise InputError("vehicle poses do not cover the log", where=f"{opened.path}: ego_pose",
-            expected=f"a pose at {start_us} us", got=f"{len(plan.ego_us)} poses near it",
-            remedy="are pose and cloud times both in microseconds?")  # fmt: skip
+        raise InputError(
+            "vehicle poses do not cover the log",
+            where=f"{opened.path}: ego_pose",
+            expected=f"a pose at {start_us} us",
+            got=f"{len(plan.ego_us)} poses near it",
+            remedy="are pose and cloud times both in microseconds?",
+        )
     world_from_source = world_from_first(first)
     ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
     fits = {CAMERAS[channel]: _fit(camera, options) for channel, camera in plan.cameras.items()}
@@ -635,7 +721,12 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
         if isinstance(what, NuplanCloud):
             time_s, path = (what.time_us - start_us) / 1e6, what.file
             yield SceneSweep(
-                SENSOR, index, time_s, world_from_source @ what.world_from_lidar, _read_points(path, what.places), str(path)
+                SENSOR,
+                index,
+                time_s,
+                world_from_source @ what.world_from_lidar,
+                _read_points(path, what.places),
+                str(path),
             )
             return
         for shot in what:
@@ -674,8 +765,12 @@ def _read_tracks(
 def _ego_path(plan: _NuplanPlan, start_us: int, where: str) -> EgoPath:
     """The vehicle in the log's world and the scene's clock."""
     if not len(plan.ego_us):
-        raise InputError("no vehicle poses at the time of the clouds", where=f"{where}: ego_pose.timestamp",
-            expected="microseconds, as lidar_pc.timestamp", remedy="are the two in different units?")  # fmt: skip
+        raise InputError(
+            "no vehicle poses at the time of the clouds",
+            where=f"{where}: ego_pose.timestamp",
+            expected="microseconds, as lidar_pc.timestamp",
+            remedy="are the two in different units?",
+        )
     return EgoPath(seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
 
 

@@ -1,4 +1,5 @@
-"""nuScenes importer: one scene of a release (``v1.0-mini``, ``v1.0-trainval``, ``v1.0-test``), or one annotated key frame.
+"""nuScenes importer: one scene of a release (``v1.0-mini``, ``v1.0-trainval``, ``v1.0-test``), or one annotated key
+frame.
 
 What is read, below the release's root:
 
@@ -10,12 +11,13 @@ What is read, below the release's root:
 ============== ==========================================================================================
 
 Each image and sweep has a vehicle pose of its own, at its own time; nothing is interpolated but the boxes between their
-2 Hz key frames. Images are rectified by the publisher. Sweeps are compensated for the vehicle's motion inside the sensor, to the
-end of the turn, which is the sweep's time stamp.
+2 Hz key frames. Images are rectified by the publisher. Sweeps are compensated for the vehicle's motion inside the
+sensor, to the end of the turn, which is the sweep's time stamp.
 
 A sweep file has no point times. It holds columns of 32 returns in firing order, so the time of a point follows from its
-column; where the columns are not complete, from its azimuth: the sensor turns clockwise in 50 ms and begins 93 degrees to the
-left of forward. ``dt_s`` is therefore between -0.05 and 0. Returns from the recording vehicle itself, a quarter of all, are dropped.
+column; where the columns are not complete, from its azimuth: the sensor turns clockwise in 50 ms and begins 93 degrees
+to the left of forward. ``dt_s`` is therefore between -0.05 and 0. Returns from the recording vehicle itself, a quarter
+of all, are dropped.
 """
 
 from __future__ import annotations
@@ -49,9 +51,13 @@ from mudg.formats.unknown_fields import note_unknown
 
 LICENCE: Final = "CC BY-NC-SA 4.0 and the nuScenes terms of use (Motional; attribution, non-commercial, share-alike)"
 CAMERAS: Final[Mapping[str, str]] = {
-    "CAM_FRONT": "front", "CAM_FRONT_LEFT": "front_left", "CAM_FRONT_RIGHT": "front_right", "CAM_BACK": "back",
-    "CAM_BACK_LEFT": "back_left", "CAM_BACK_RIGHT": "back_right",
-}  # fmt: skip
+    "CAM_FRONT": "front",
+    "CAM_FRONT_LEFT": "front_left",
+    "CAM_FRONT_RIGHT": "front_right",
+    "CAM_BACK": "back",
+    "CAM_BACK_LEFT": "back_left",
+    "CAM_BACK_RIGHT": "back_right",
+}
 SENSOR: Final = "lidar_top"
 TURN_PERIOD_S: Final = 0.05
 BEAMS: Final = 32
@@ -69,8 +75,12 @@ def camera_from_intrinsics(name: str, size: tuple[int, int], intrinsics: Any, wh
         raise InputError("intrinsics are not numbers", where=where, got=str(error)) from error
     off = k[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1] if k.shape == (3, 3) else np.array([np.nan])
     if not np.isfinite(k).all() or not (np.abs(off) < 1e-6).all():
-        raise InputError("intrinsics are malformed", where=where, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
-            got=str(intrinsics)[:120])  # fmt: skip
+        raise InputError(
+            "intrinsics are malformed",
+            where=where,
+            expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
+            got=str(intrinsics)[:120],
+        )
     return Camera(name, *size, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
 
 
@@ -85,9 +95,13 @@ def read_scan(path: Path) -> SweepPoints:
     rows, returns = read_float_rows(path, 5, "sweep")
     rings = rows[returns, 4]
     if len(rings) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
-        raise InputError("fifth value of the points is no ring number", where=str(path),
-            expected=f"whole numbers 0 to {BEAMS - 1}", got=f"{rings.min():g} to {rings.max():g}",
-            remedy="is this a file of another sensor or format?")  # fmt: skip
+        raise InputError(
+            "fifth value of the points is no ring number",
+            where=str(path),
+            expected=f"whole numbers 0 to {BEAMS - 1}",
+            got=f"{rings.min():g} to {rings.max():g}",
+            remedy="is this a file of another sensor or format?",
+        )
     dt_s = point_times(rows[:, :3], rows[:, 4])
     own = np.ones(len(rows), bool)
     for axis, (low, high) in enumerate(_OWN_VEHICLE_M):
@@ -111,20 +125,22 @@ def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray
     return ((fraction - 1) * TURN_PERIOD_S).astype(np.float32)
 
 
-# tables ---------------------------------------------------------------------------------------------------------------
+# tables -------------------------------------------------------------------------------------------
 #
 # The tables of a nuScenes release: JSON arrays of flat records, read one record at a time.
 #
-# The tables of the full release are large (``sample_data.json`` and ``ego_pose.json`` hold 2.6 million records each). What an
-# import needs of them is one scene, so records are found by the value of one field while the file passes through a
-# buffer of a few megabytes; only matching records become Python objects.
+# The tables of the full release are large (``sample_data.json`` and ``ego_pose.json`` hold 2.6 million records each).
+# What an import needs of them is one scene, so records are found by the value of one field while the file passes
+# through a buffer of a few megabytes; only matching records become Python objects.
 
 
 _BUFFER_BYTES: Final = 1 << 22
 _MAX_RECORD_BYTES: Final = 1 << 20
 _FLAT_RECORD: Final = rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}'
 """An object whose fields are not objects; braces may stand in its texts."""
-_RECORD: Final = functools.reduce(lambda inner, _: _FLAT_RECORD.replace(rb')*+\}', b"|" + inner + rb')*+\}'), range(3), _FLAT_RECORD)
+_RECORD: Final = functools.reduce(
+    lambda inner, _: _FLAT_RECORD.replace(rb")*+\}", b"|" + inner + rb")*+\}"), range(3), _FLAT_RECORD
+)
 """An object with objects in it, three deep: the data set has none, but programs add fields of their own."""
 _FLAT: Final = re.compile(_FLAT_RECORD, re.DOTALL)
 _ENTRY: Final = re.compile(rb"\s*+(,?)\s*+(" + _RECORD + rb"|\])", re.DOTALL)
@@ -135,24 +151,49 @@ OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     "calibrated_sensor.json": frozenset({"token", "sensor_token", "translation", "rotation", "camera_intrinsic"}),
     "category.json": frozenset({"token", "name", "description", "index"}),
     "ego_pose.json": frozenset({"token", "timestamp", "translation", "rotation"}),
-    "instance.json": frozenset({
-        "token", "category_token", "nbr_annotations", "first_annotation_token", "last_annotation_token",
-    }),
+    "instance.json": frozenset(
+        {"token", "category_token", "nbr_annotations", "first_annotation_token", "last_annotation_token"}
+    ),
     "sample.json": frozenset({"token", "timestamp", "scene_token", "next", "prev"}),
-    "sample_annotation.json": frozenset({
-        "token", "sample_token", "instance_token", "attribute_tokens", "visibility_token", "translation", "size", "rotation",
-        "num_lidar_pts", "num_radar_pts", "next", "prev",
-    }),
-    "sample_data.json": frozenset({
-        "token", "sample_token", "ego_pose_token", "calibrated_sensor_token", "filename", "fileformat", "width", "height", "timestamp",
-        "is_key_frame", "next", "prev",
-    }),
-    "scene.json": frozenset({
-        "token", "name", "description", "log_token", "nbr_samples", "first_sample_token", "last_sample_token",
-    }),
+    "sample_annotation.json": frozenset(
+        {
+            "token",
+            "sample_token",
+            "instance_token",
+            "attribute_tokens",
+            "visibility_token",
+            "translation",
+            "size",
+            "rotation",
+            "num_lidar_pts",
+            "num_radar_pts",
+            "next",
+            "prev",
+        }
+    ),
+    "sample_data.json": frozenset(
+        {
+            "token",
+            "sample_token",
+            "ego_pose_token",
+            "calibrated_sensor_token",
+            "filename",
+            "fileformat",
+            "width",
+            "height",
+            "timestamp",
+            "is_key_frame",
+            "next",
+            "prev",
+        }
+    ),
+    "scene.json": frozenset(
+        {"token", "name", "description", "log_token", "nbr_samples", "first_sample_token", "last_sample_token"}
+    ),
     "sensor.json": frozenset({"token", "channel", "modality"}),
-}  # fmt: skip
-"""Tables that are read -> their fields. Source: the release's published schema; ``index`` came with nuScenes-lidarseg."""
+}
+"""Tables that are read -> their fields. Source: the release's published schema; ``index`` came with
+nuScenes-lidarseg."""
 
 Row = dict[str, Any]
 
@@ -249,8 +290,9 @@ def _no_constant(name: str) -> Any:
 
 def _open(path: Path) -> BinaryIO:
     if not path.exists():
-        raise InputError("table is missing", where=str(path),
-            remedy="unpack the release's metadata archive, which holds all tables")  # fmt: skip
+        raise InputError(
+            "table is missing", where=str(path), remedy="unpack the release's metadata archive, which holds all tables"
+        )
     return store.open_file(path)
 
 
@@ -258,8 +300,13 @@ def _start_of_array(file: BinaryIO, path: Path, buffer_bytes: int) -> bytes:
     """The first piece of the file, to its opening bracket at least."""
     start = file.read(buffer_bytes)
     if start.lstrip()[:1] != b"[":
-        raise InputError("table does not start as a JSON array", where=str(path), expected="[ {...}, ... ]",
-            got=repr(start[:20]) if start else "an empty file", remedy="copy the table again")  # fmt: skip
+        raise InputError(
+            "table does not start as a JSON array",
+            where=str(path),
+            expected="[ {...}, ... ]",
+            got=repr(start[:20]) if start else "an empty file",
+            remedy="copy the table again",
+        )
     return start
 
 
@@ -269,11 +316,15 @@ def _cut_off(path: Path) -> InputError:
 
 
 def _no_records(path: Path, place: int, got: bytes) -> InputError:
-    return InputError("table is not an array of records", where=f"{path}: byte {place}", got=repr(got[:20]),
-        expected="flat records {...} of less than 1 MiB between commas")  # fmt: skip
+    return InputError(
+        "table is not an array of records",
+        where=f"{path}: byte {place}",
+        got=repr(got[:20]),
+        expected="flat records {...} of less than 1 MiB between commas",
+    )
 
 
-# --- rows -----------------------------------------------------------------------------------------------------------
+# --- rows -----------------------------------------------------------------------------------------
 
 
 def text(row: Row, key: str, where: str) -> str:
@@ -305,8 +356,12 @@ def _is_number(value: Any) -> bool:
 
 
 def _bad_field(row: Row, key: str, where: str, expected: str) -> InputError:
-    return InputError(f"field {key!r} is missing or malformed", where=f"{where}: record {row.get('token', '?')!r}",
-        expected=expected, got=repr(row.get(key))[:120])  # fmt: skip
+    return InputError(
+        f"field {key!r} is missing or malformed",
+        where=f"{where}: record {row.get('token', '?')!r}",
+        expected=expected,
+        got=repr(row.get(key))[:120],
+    )
 
 
 class TokenTable:
@@ -325,8 +380,13 @@ class TokenTable:
     def record(self, token: Any, where: str) -> Row:
         """The record of a token; ``where`` says who refers to it."""
         if not isinstance(token, str) or token not in self.rows:
-            raise InputError("a token points nowhere", where=where, got=repr(token),
-                expected=f"a record of {self.where}", remedy="are the tables of one release, and complete?")  # fmt: skip
+            raise InputError(
+                "a token points nowhere",
+                where=where,
+                got=repr(token),
+                expected=f"a record of {self.where}",
+                remedy="are the tables of one release, and complete?",
+            )
         return self.rows[token]
 
     def get(self, row: Row, key: str, where: str) -> Row:
@@ -334,7 +394,7 @@ class TokenTable:
         return self.record(row.get(key), f"{where}: record {row.get('token', '?')!r}: {key}")
 
 
-# importer -------------------------------------------------------------------------------------------------------------
+# importer -----------------------------------------------------------------------------------------
 
 
 Matrix = NDArray[np.float64]
@@ -346,17 +406,30 @@ MICROSECONDS: Final = 10**6
 _MAX_BEFORE_SCENE_S: Final = 1.0
 
 LABELS: Final[Mapping[str, str]] = {
-    "animal": "animal", "human.pedestrian.adult": "pedestrian", "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian", "human.pedestrian.personal_mobility": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian", "human.pedestrian.stroller": "stroller",
-    "human.pedestrian.wheelchair": "wheelchair", "movable_object.barrier": "barrier",
-    "movable_object.debris": "debris", "movable_object.pushable_pullable": "pushable",
-    "movable_object.trafficcone": "traffic_cone", "static_object.bicycle_rack": "bicycle_rack",
-    "vehicle.bicycle": "bicycle", "vehicle.bus.bendy": "bus", "vehicle.bus.rigid": "bus", "vehicle.car": "car",
-    "vehicle.construction": "construction_vehicle", "vehicle.emergency.ambulance": "van",
-    "vehicle.emergency.police": "car", "vehicle.motorcycle": "motorcycle", "vehicle.trailer": "trailer",
+    "animal": "animal",
+    "human.pedestrian.adult": "pedestrian",
+    "human.pedestrian.child": "pedestrian",
+    "human.pedestrian.construction_worker": "pedestrian",
+    "human.pedestrian.personal_mobility": "pedestrian",
+    "human.pedestrian.police_officer": "pedestrian",
+    "human.pedestrian.stroller": "stroller",
+    "human.pedestrian.wheelchair": "wheelchair",
+    "movable_object.barrier": "barrier",
+    "movable_object.debris": "debris",
+    "movable_object.pushable_pullable": "pushable",
+    "movable_object.trafficcone": "traffic_cone",
+    "static_object.bicycle_rack": "bicycle_rack",
+    "vehicle.bicycle": "bicycle",
+    "vehicle.bus.bendy": "bus",
+    "vehicle.bus.rigid": "bus",
+    "vehicle.car": "car",
+    "vehicle.construction": "construction_vehicle",
+    "vehicle.emergency.ambulance": "van",
+    "vehicle.emergency.police": "car",
+    "vehicle.motorcycle": "motorcycle",
+    "vehicle.trailer": "trailer",
     "vehicle.truck": "truck",
-}  # fmt: skip
+}
 """The release's categories -> labels."""
 _RIDDEN: Final[Mapping[str, str]] = {"bicycle": "cyclist", "motorcycle": "motorcyclist"}
 _WITH_RIDER: Final = "cycle.with_rider"
@@ -372,8 +445,9 @@ def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     Args:
         source: the release's root, or its table folder.
-        options: ``sequence`` names the scene (``scene-0061``, or ``v1.0-mini/scene-0061`` where several releases lie side
-            by side); ``frames`` counts images of the first chosen camera; ``cameras`` by either name, all six by default.
+        options: ``sequence`` names the scene (``scene-0061``, or ``v1.0-mini/scene-0061`` where several releases lie
+            side by side); ``frames`` counts images of the first chosen camera; ``cameras`` by either name, all six by
+            default.
 
     Raises:
         UsageError: the release holds several scenes and none was chosen, or there is no such scene or camera.
@@ -384,9 +458,13 @@ def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     layout.refuse_untwist(options, "nuScenes", str(source))
     releases = _releases(source)
     if not releases:
-        raise InputError("no nuScenes tables found", where=str(source), got=layout.folder_contents(source),
+        raise InputError(
+            "no nuScenes tables found",
+            where=str(source),
+            got=layout.folder_contents(source),
             expected="v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json",
-            remedy="give the folder that holds v1.0-*, samples and sweeps")  # fmt: skip
+            remedy="give the folder that holds v1.0-*, samples and sweeps",
+        )
     return drive_log.write_log(read_log(releases, options), out, options)
 
 
@@ -398,7 +476,8 @@ def _releases(source: Path) -> list[Path]:
 
 
 def files_of_nuscenes(source: Path, _options: ImportOptions) -> LogFiles:
-    """The tables, and which files there are beside them: which of those belong to a scene only the large tables know."""
+    """The tables, and which files there are beside them: which of those belong to a scene only the large tables
+    know."""
     tables_of = tuple(table for folder in _releases(source) for table in sorted(folder.glob("*.json")))
     if not tables_of:
         return LogFiles((source,))
@@ -407,7 +486,7 @@ def files_of_nuscenes(source: Path, _options: ImportOptions) -> LogFiles:
     return LogFiles(tables_of, tuple(sensors))
 
 
-# --- one scene ------------------------------------------------------------------------------------------------------
+# --- one scene ------------------------------------------------------------------------------------
 
 
 def _all_of(folder: Path, name: str) -> TokenTable:
@@ -495,9 +574,13 @@ def _samples_in_order(folder: Path, scene: Row) -> dict[str, int]:
     common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
     if (np.diff(values) <= 0).any():
         late = list(stamps)[int(np.flatnonzero(np.diff(values) <= 0)[0]) + 1]
-        raise InputError("time stamps of key frames do not increase along the scene",
-            where=f"{samples.where}: record {late!r}", got=f"{stamps[late]} after a later one",
-            expected="microseconds, increasing from one key frame to the next", remedy="copy the table again")  # fmt: skip
+        raise InputError(
+            "time stamps of key frames do not increase along the scene",
+            where=f"{samples.where}: record {late!r}",
+            got=f"{stamps[late]} after a later one",
+            expected="microseconds, increasing from one key frame to the next",
+            remedy="copy the table again",
+        )
     return stamps
 
 
@@ -508,9 +591,12 @@ def _check_times(rows: Sequence[Row], samples: Mapping[str, int], where: str) ->
     first, last = min(samples.values()), max(samples.values())
     beside = np.maximum(first - stamps, stamps - last) / MICROSECONDS
     if len(beside) and beside.max() > _MAX_BEFORE_SCENE_S:
-        raise InputError("an image or sweep lies outside its scene's time",
+        raise InputError(
+            "an image or sweep lies outside its scene's time",
             where=f"{where}: record {rows[int(beside.argmax())]['token']!r}",
-            got=f"{beside.max():.3f} s away from the key frames", expected="microseconds since 1970, within the scene")  # fmt: skip
+            got=f"{beside.max():.3f} s away from the key frames",
+            expected="microseconds since 1970, within the scene",
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -556,7 +642,7 @@ def _pose(row: Row, where: str) -> Matrix:
     return common.pose_from_quaternion(rotation, translation, f"{where}: record {row.get('token', '?')!r}")
 
 
-# --- boxes ----------------------------------------------------------------------------------------------------------
+# --- boxes ----------------------------------------------------------------------------------------
 
 
 def _read_tracks(folder: Path, samples: Mapping[str, int], zero_us: int) -> tuple[list[Track], list[str]]:

@@ -1,28 +1,30 @@
 """PandaSet importer: one sequence folder (``001``, ``002``, ...) of 80 frames at 10 Hz.
 
-========================================= ================================================================================
-``camera/<name>/NN.jpg``                   six cameras, rectified; ``intrinsics.json``, ``poses.json``, ``timestamps.json``
+========================================= ==============================================================================
+``camera/<name>/NN.jpg``                   six cameras, rectified; ``intrinsics.json``, ``poses.json``,
+                                           ``timestamps.json``
 ``lidar/NN.pkl.gz``                        points of both LiDARs in the world: x y z, i (0..255), t (s), d (which LiDAR)
 ``lidar/poses.json``, ``timestamps.json``  pose of the vehicle (x right, y forward, z up), not of a LiDAR
 ``annotations/cuboids/NN.pkl.gz``          boxes in the world
 ``annotations/semseg/NN.pkl.gz``           class of every point; ``classes.json`` names them
-========================================= ================================================================================
+========================================= ==============================================================================
 
 The tables are pickled pandas frames. They are read by ``pandas_frame``, which runs nothing of them and needs no pandas.
 
-Frames. World: z up, origin and x axis at the vehicle of the first frame. The given points are motion-compensated: each lies
-where it was at its own time ``t``; ``dt_s`` keeps that time. The two LiDARs become two sensors, ``pandar64`` (d = 0) and
-``pandar_gt`` (d = 1, solid state, looks forward). Their places on the vehicle follow from the front camera's recorded
-poses and the published static calibration. A cloud is filed under the end of its turn, 0.05 s after its middle and after the front
-camera's image; a sweep here stands at the middle.
+Frames. World: z up, origin and x axis at the vehicle of the first frame. The given points are motion-compensated: each
+lies where it was at its own time ``t``; ``dt_s`` keeps that time. The two LiDARs become two sensors, ``pandar64`` (d =
+0) and ``pandar_gt`` (d = 1, solid state, looks forward). Their places on the vehicle follow from the front camera's
+recorded poses and the published static calibration. A cloud is filed under the end of its turn, 0.05 s after its middle
+and after the front camera's image; a sweep here stands at the middle.
 
-Images. Measured on sequence 002 (see docs/formats/pandaset.md), images show what moves as it was ``EXPOSURE_S`` from their time stamp, and
-fit standing points when the camera is taken ``POSE_S`` along the vehicle's path. Both are applied to all cameras.
+Images. Measured on sequence 002 (see docs/formats/pandaset.md), images show what moves as it was ``EXPOSURE_S`` from
+their time stamp, and fit standing points when the camera is taken ``POSE_S`` along the vehicle's path. Both are applied
+to all cameras.
 
-Boxes. ``yaw`` 0 looks along the world's y axis, and ``dimensions.y`` is the length. Moving objects where both LiDARs look
-carry two boxes that name each other as siblings; they are one track here, and in a frame with both the turning LiDAR's box is
-kept. A box that may move belongs to the time its points were measured, not to the frame's (up to 0.05 s apart: 1 m at 20 m/s);
-it is moved to the sweep's time with its track's velocity.
+Boxes. ``yaw`` 0 looks along the world's y axis, and ``dimensions.y`` is the length. Moving objects where both LiDARs
+look carry two boxes that name each other as siblings; they are one track here, and in a frame with both the turning
+LiDAR's box is kept. A box that may move belongs to the time its points were measured, not to the frame's (up to 0.05 s
+apart: 1 m at 20 m/s); it is moved to the sweep's time with its track's velocity.
 """
 
 from __future__ import annotations
@@ -62,12 +64,13 @@ from mudg.formats.importers.images import ImageFit, fit_images, image_notes, ima
 from mudg.formats.importers.layout import LogFiles
 from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
 
-# pandas frame ---------------------------------------------------------------------------------------------------------
+# pandas frame -------------------------------------------------------------------------------------
 #
 # Tables that pandas pickled, read as columns of numpy arrays without pandas and without running the pickle.
 #
-# The forms of pandas 0.2x, 1.x and 2.x are understood: a data frame is a manager of blocks, each block an array of several
-# columns and the places of these columns. Extension types (categories, text arrays of pandas 3) are refused by name.
+# The forms of pandas 0.2x, 1.x and 2.x are understood: a data frame is a manager of blocks, each block an array of
+# several columns and the places of these columns. Extension types (categories, text arrays of pandas 3) are refused by
+# name.
 
 
 _MANAGERS: Final = ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")
@@ -134,8 +137,9 @@ def gunzip(content: bytes, where: str) -> bytes:
     if len(unpacked) > MAX_BYTES:
         raise InputError("gzip file unpacks to too much", where=where, expected=f"<= {MAX_BYTES} bytes")
     if not unpacker.eof:
-        raise InputError("gzip file is cut off", where=where, got=f"{len(content)} bytes, no end",
-            remedy="copy the file again")  # fmt: skip
+        raise InputError(
+            "gzip file is cut off", where=where, got=f"{len(content)} bytes, no end", remedy="copy the file again"
+        )
     return unpacked
 
 
@@ -145,10 +149,13 @@ def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     try:
         return _columns_pandas_frame(value)
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise InputError("pickle is not a plain data frame", where=where,
+        raise InputError(
+            "pickle is not a plain data frame",
+            where=where,
             expected="a table of numbers and texts as pandas 0.2x to 2.x writes it",
             got=f"{type(error).__name__}: {error}"[:200],
-            remedy="read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2") from error  # fmt: skip
+            remedy="read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2",
+        ) from error
 
 
 def _columns_pandas_frame(frame: Any) -> dict[str, NDArray[Any]]:
@@ -206,34 +213,51 @@ def _array(value: Any) -> NDArray[Any]:
 
 
 CLASS_OF: Final[dict[str, str]] = {
-    "Smoke": "", "Exhaust": "", "Spray or rain": "",  # no surface
+    "Smoke": "",
+    "Exhaust": "",
+    "Spray or rain": "",  # no surface
     "Reflection": "",  # a ghost: nothing is there
     "Vegetation": "vegetation",
     "Ground": "terrain",  # unpaved ground
-    "Road": "road", "Lane Line Marking": "road", "Stop Line Marking": "road", "Other Road Marking": "road",
+    "Road": "road",
+    "Lane Line Marking": "road",
+    "Stop Line Marking": "road",
+    "Other Road Marking": "road",
     "Sidewalk": "sidewalk",
     "Driveway": "",  # crosses the sidewalk and is driven on: people label it either way
     "Car": "car",
     "Pickup Truck": "truck",  # by definition of Cityscapes, as their boxes here
-    "Medium-sized Truck": "truck", "Semi-truck": "truck",
+    "Medium-sized Truck": "truck",
+    "Semi-truck": "truck",
     "Towed Object": "",  # trailers behind cars have no class of their own
-    "Motorcycle": "motorcycle", "Motorized Scooter": "motorcycle",
+    "Motorcycle": "motorcycle",
+    "Motorized Scooter": "motorcycle",
     "Other Vehicle - Construction Vehicle": "truck",
-    "Other Vehicle - Uncommon": "", "Other Vehicle - Pedicab": "",
+    "Other Vehicle - Uncommon": "",
+    "Other Vehicle - Pedicab": "",
     "Emergency Vehicle": "",  # cars and trucks
     "Bus": "bus",
     "Personal Mobility Device": "",
     "Bicycle": "bicycle",
-    "Train": "train", "Trolley": "train", "Tram / Subway": "train",
-    "Pedestrian": "person", "Pedestrian with Object": "person",
-    "Animals - Bird": "", "Animals - Other": "",
-    "Pylons": "", "Cones": "", "Rolling Containers": "",
-    "Road Barriers": "", "Temporary Construction Barriers": "",  # walls, fences and guard rails
-    "Signs": "traffic sign", "Construction Signs": "traffic sign",
+    "Train": "train",
+    "Trolley": "train",
+    "Tram / Subway": "train",
+    "Pedestrian": "person",
+    "Pedestrian with Object": "person",
+    "Animals - Bird": "",
+    "Animals - Other": "",
+    "Pylons": "",
+    "Cones": "",
+    "Rolling Containers": "",
+    "Road Barriers": "",
+    "Temporary Construction Barriers": "",  # walls, fences and guard rails
+    "Signs": "traffic sign",
+    "Construction Signs": "traffic sign",
     "Building": "building",
     "Other Static Object": "",  # poles, traffic lights, walls, fences and more
-}  # fmt: skip
-"""The data set's classes -> classes of ``palette.CLASSES``; empty = unlabelled, because no class or several would fit."""
+}
+"""The data set's classes -> classes of ``palette.CLASSES``; empty = unlabelled, because no class or several would
+fit."""
 
 
 class PointClasses:
@@ -252,8 +276,12 @@ class PointClasses:
         self._files: dict[int, Path] = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
         lacks = [number for number in frames if number not in self._files]
         if self._files and lacks and not options.skip_missing:
-            raise InputError("a frame has no classes of points", where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz",
-                remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+            raise InputError(
+                "a frame has no classes of points",
+                where=str(folder),
+                expected=f"{lacks[0]:02d}.pkl.gz",
+                remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing",
+            )
         self._names = _names(folder / "classes.json") if self._files else {}
         unknown = sorted(set(self._names.values()) - set(CLASS_OF))
         self.notes = (
@@ -271,9 +299,13 @@ class PointClasses:
         note_unknown("annotations/semseg/*.pkl.gz", table, frozenset({"class"}))
         numbers = finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
         if len(numbers) != points:
-            raise InputError("classes do not fit the points", where=f"{path}: class", got=f"{len(numbers)} rows",
+            raise InputError(
+                "classes do not fit the points",
+                where=f"{path}: class",
+                got=f"{len(numbers)} rows",
                 expected=f"{points} rows, one for each point of the frame's cloud",
-                remedy="is the file of another frame or sequence?")  # fmt: skip
+                remedy="is the file of another frame or sequence?",
+            )
         return self._train_ids(numbers, path)
 
     def _train_ids(self, numbers: NDArray[np.int64], path: Path) -> NDArray[np.uint8]:
@@ -293,61 +325,107 @@ def train_id(name: str) -> int:
 def _names(path: Path) -> Mapping[int, str]:
     """Number -> name of the data set's classes."""
     if not path.is_file():
-        raise InputError("table of class names is missing", where=str(path), expected='{"1": "Smoke", ...}',
-            remedy="copy annotations/semseg/classes.json, or leave out annotations/semseg")  # fmt: skip
+        raise InputError(
+            "table of class names is missing",
+            where=str(path),
+            expected='{"1": "Smoke", ...}',
+            remedy="copy annotations/semseg/classes.json, or leave out annotations/semseg",
+        )
     values: Any = store.read_json(path)
     if not isinstance(values, dict) or not all(str(key).isdigit() and isinstance(values[key], str) for key in values):
-        raise InputError("table of class names is malformed", where=str(path), expected='{"1": "Smoke", ...}',
-            got=str(values)[:80])  # fmt: skip
+        raise InputError(
+            "table of class names is malformed", where=str(path), expected='{"1": "Smoke", ...}', got=str(values)[:80]
+        )
     return {int(key): name for key, name in values.items()}
 
 
-# importer -------------------------------------------------------------------------------------------------------------
+# importer -----------------------------------------------------------------------------------------
 
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY 4.0 (PandaSet: Hesai and Scale AI; attribution)"
 CAMERAS: Final = {
-    "front_camera": "front", "front_left_camera": "front_left", "front_right_camera": "front_right",
-    "left_camera": "left", "right_camera": "right", "back_camera": "back",
-}  # fmt: skip
+    "front_camera": "front",
+    "front_left_camera": "front_left",
+    "front_right_camera": "front_right",
+    "left_camera": "left",
+    "right_camera": "right",
+    "back_camera": "back",
+}
 SENSORS: Final = {0: "pandar64", 1: "pandar_gt"}
 OFFSET_FROM_FRONT_CAMERA_M: Final = {0: (-0.044, 0.0, 0.039), 1: (0.562, 0.0, -0.263)}
 """Places of the LiDARs from the front camera's centre: forward, left, up. Source: the data set's static calibration."""
 LABELS: Final = {
-    "Car": "car", "Pickup Truck": "truck", "Medium-sized Truck": "truck", "Semi-truck": "truck", "Towed Object": "trailer",
-    "Motorcycle": "motorcycle", "Motorized Scooter": "motorcycle", "Bicycle": "bicycle", "Bus": "bus", "Train": "train",
-    "Trolley": "tram", "Tram / Subway": "tram", "Emergency Vehicle": "vehicle", "Pedestrian": "pedestrian",
-    "Pedestrian with Object": "pedestrian", "Personal Mobility Device": "personal_mobility_device",
-    "Other Vehicle - Construction Vehicle": "vehicle", "Other Vehicle - Uncommon": "vehicle",
-    "Other Vehicle - Pedicab": "pedicab", "Animals - Bird": "animal", "Animals - Other": "animal", "Pylons": "pylon",
-    "Road Barriers": "barrier", "Cones": "traffic_cone", "Signs": "sign", "Construction Signs": "sign",
-    "Temporary Construction Barriers": "barrier", "Rolling Containers": "container",
-}  # fmt: skip
+    "Car": "car",
+    "Pickup Truck": "truck",
+    "Medium-sized Truck": "truck",
+    "Semi-truck": "truck",
+    "Towed Object": "trailer",
+    "Motorcycle": "motorcycle",
+    "Motorized Scooter": "motorcycle",
+    "Bicycle": "bicycle",
+    "Bus": "bus",
+    "Train": "train",
+    "Trolley": "tram",
+    "Tram / Subway": "tram",
+    "Emergency Vehicle": "vehicle",
+    "Pedestrian": "pedestrian",
+    "Pedestrian with Object": "pedestrian",
+    "Personal Mobility Device": "personal_mobility_device",
+    "Other Vehicle - Construction Vehicle": "vehicle",
+    "Other Vehicle - Uncommon": "vehicle",
+    "Other Vehicle - Pedicab": "pedicab",
+    "Animals - Bird": "animal",
+    "Animals - Other": "animal",
+    "Pylons": "pylon",
+    "Road Barriers": "barrier",
+    "Cones": "traffic_cone",
+    "Signs": "sign",
+    "Construction Signs": "sign",
+    "Temporary Construction Barriers": "barrier",
+    "Rolling Containers": "container",
+}
 """The data set's classes -> labels; pickup trucks count as trucks, as in Cityscapes."""
 FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
 """Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
 EXPOSURE_S: Final = -0.01
 """When an image was taken, from its time stamp on, by the places of moving cars in the images of three cameras."""
 POSE_S: Final = -0.02
-"""Where on the vehicle's path the camera's pose is taken, from its time stamp on, by standing points in the images of five cameras."""
+"""Where on the vehicle's path the camera's pose is taken, from its time stamp on, by standing points in the images of
+five cameras."""
 MAX_POINT_DELAY_S: Final = 0.25
 MAX_CAMERA_DELAY_S: Final = 1.0
 _MIN_BOX_POINTS: Final = 5
 _POINT_COLUMNS: Final = ("x", "y", "z", "i", "t", "d")
 _CUBOID_COLUMNS: Final = (
-    "uuid", "label", "yaw", "stationary", "position.x", "position.y", "position.z",
-    "dimensions.x", "dimensions.y", "dimensions.z",
-)  # fmt: skip
+    "uuid",
+    "label",
+    "yaw",
+    "stationary",
+    "position.x",
+    "position.y",
+    "position.z",
+    "dimensions.x",
+    "dimensions.y",
+    "dimensions.z",
+)
 _POINTS, _CUBOIDS, _POSES = "lidar/*.pkl.gz", "annotations/cuboids/*.pkl.gz", "poses.json"
 OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     _POINTS: frozenset(_POINT_COLUMNS),
-    _CUBOIDS: frozenset({
-        *_CUBOID_COLUMNS, "camera_used", "attributes.object_motion", "attributes.rider_status", "attributes.pedestrian_behavior",
-        "attributes.pedestrian_age", "cuboids.sibling_id", "cuboids.sensor_id",
-    }),
+    _CUBOIDS: frozenset(
+        {
+            *_CUBOID_COLUMNS,
+            "camera_used",
+            "attributes.object_motion",
+            "attributes.rider_status",
+            "attributes.pedestrian_behavior",
+            "attributes.pedestrian_age",
+            "cuboids.sibling_id",
+            "cuboids.sensor_id",
+        }
+    ),
     "intrinsics.json": frozenset({"fx", "fy", "cx", "cy"}),
-}  # fmt: skip
+}
 """Kinds of files -> their fields, read or not."""
 _POSE_FIELDS: Final[Known] = {"heading": dict.fromkeys("wxyz"), "position": dict.fromkeys("xyz")}
 
@@ -388,8 +466,8 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
     Args:
         source: a sequence's folder, or the folder of sequences with ``options.sequence``.
         out: destination.
-        options: ``frames``, ``cameras`` (default all six), ``sequence``, ``skip_missing``, ``test_every``, ``resolution`` and
-            ``workers`` are used; ``poses``, ``boxes`` and ``untwist`` are refused.
+        options: ``frames``, ``cameras`` (default all six), ``sequence``, ``skip_missing``, ``test_every``,
+            ``resolution`` and ``workers`` are used; ``poses``, ``boxes`` and ``untwist`` are refused.
 
     Raises:
         UsageError: the folder holds several sequences and none was chosen, or an option does not apply.
@@ -445,8 +523,15 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     origin, numbers = Source("pandaset", LICENCE, None, tuple(notes)), range(len(frames))
     content = SceneContent(
-        folder.resolve().name, origin, fits, numbers, convert, lambda index: f"frame {frames[index]}", motion.ego(), tracks
-    )  # fmt: skip
+        folder.resolve().name,
+        origin,
+        fits,
+        numbers,
+        convert,
+        lambda index: f"frame {frames[index]}",
+        motion.ego(),
+        tracks,
+    )
     return write_scene(content, out, options)
 
 
@@ -457,8 +542,12 @@ def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
         return source
     sequences = _sequences(source)
     if not sequences and not options.sequence:
-        raise InputError("no PandaSet sequence found", where=str(source), got=layout.folder_contents(source),
-            expected="lidar/poses.json and camera/front_camera and so on")  # fmt: skip
+        raise InputError(
+            "no PandaSet sequence found",
+            where=str(source),
+            got=layout.folder_contents(source),
+            expected="lidar/poses.json and camera/front_camera and so on",
+        )
     matching = [name for name in sequences if options.sequence in ("", name)]
     return source / layout.the_only(matching, sequences, options, source, "sequence")
 
@@ -468,8 +557,12 @@ def _cuboid_files(folder: Path, frames: Sequence[int], options: ImportOptions) -
     cuboids = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
     lacks = [number for number in frames if number not in cuboids]
     if cuboids and lacks and not options.skip_missing:
-        raise InputError("a frame has no boxes", where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz",
-            remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+        raise InputError(
+            "a frame has no boxes",
+            where=str(folder),
+            expected=f"{lacks[0]:02d}.pkl.gz",
+            remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing",
+        )
     return cuboids
 
 
@@ -478,7 +571,7 @@ def files_of_pandaset(source: Path, options: ImportOptions) -> LogFiles:
     return LogFiles((_chosen_sequence(source, options),))
 
 
-# --- poses and times ------------------------------------------------------------------------------------------------
+# --- poses and times ------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -508,7 +601,8 @@ class _Motion:
         cls, folder: Path, frames: Sequence[int], cameras: Sequence[str], options: ImportOptions, notes: list[str]
     ) -> _Motion:
         file = folder / "lidar" / "timestamps.json"
-        known = range(max(frames[0] - 1, 0), frames[-1] + 1)  # those of frames that are left out tell where the vehicle was, too
+        # those of frames that are left out tell where the vehicle was, too
+        known = range(max(frames[0] - 1, 0), frames[-1] + 1)
         first = frames[0] - known[0]
         raw_s = _times(file, known)
         start_s = float(raw_s[first])
@@ -528,17 +622,22 @@ class _Motion:
             times = _times(stamps, frames)
             late = np.abs(times - raw_s)
             if late.max() > MAX_CAMERA_DELAY_S:
-                raise InputError("camera and LiDAR do not share a clock",
+                raise InputError(
+                    "camera and LiDAR do not share a clock",
                     where=f"{stamps}: entry {frames[int(late.argmax())]}",
                     expected=f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json",
-                    got=f"{late.max():.3f} s apart", remedy="are the times in seconds, and of this sequence?")  # fmt: skip
+                    got=f"{late.max():.3f} s apart",
+                    remedy="are the times in seconds, and of this sequence?",
+                )
             stamped_s = seconds(times, "s", str(stamps), start_s)
             camera_s[name] = stamped_s + EXPOSURE_S
             given = world_from_source @ _poses(here / "poses.json", frames)
-            world_from_cam[name] = np.stack([
-                pose_on_path(path, time_s + POSE_S) @ invert(pose_on_path(path, time_s)) @ pose
-                for time_s, pose in zip(stamped_s, given, strict=True)
-            ])  # fmt: skip
+            world_from_cam[name] = np.stack(
+                [
+                    pose_on_path(path, time_s + POSE_S) @ invert(pose_on_path(path, time_s)) @ pose
+                    for time_s, pose in zip(stamped_s, given, strict=True)
+                ]
+            )
         places = _lidar_places(path, camera_s.get("front_camera"), world_from_cam.get("front_camera"))
         return cls(world_from_source, raw_s, start_s, camera_s, world_from_cam, path, places)
 
@@ -547,7 +646,8 @@ class _Motion:
         return pose_on_path(self.path, time_s) @ from_rotation_translation(np.eye(3), self.places[d])
 
     def ego(self) -> EgoPath:
-        """The vehicle's path from its pose before the first image on; where there is none before, it starts with the image."""
+        """The vehicle's path from its pose before the first image on; where there is none before, it starts with the
+        image."""
         first_s = min(float(times[0]) for times in self.camera_s.values())
         times_s, poses = self.path.times_s, self.path.world_from_ego
         if first_s < times_s[0] - 1e-3:
@@ -581,9 +681,13 @@ def _entries(path: Path, frames: Sequence[int]) -> list[Any]:
     values = store.read_json(path)
     if not isinstance(values, list) or len(values) <= frames[-1]:
         got = f"{len(values)} entries" if isinstance(values, list) else type(values).__name__
-        raise InputError("list does not cover the frames", where=str(path), got=got,
+        raise InputError(
+            "list does not cover the frames",
+            where=str(path),
+            got=got,
             expected=f"a list with an entry per frame, at least {frames[-1] + 1}",
-            remedy="is the file cut off, or of another sequence?")  # fmt: skip
+            remedy="is the file cut off, or of another sequence?",
+        )
     return [values[n] for n in frames]
 
 
@@ -594,8 +698,13 @@ def _times(path: Path, frames: Sequence[int]) -> NDArray[np.float64]:
     times = np.array(values, np.float64)
     seconds(times, "s", str(path))
     if times[0] > 1e11:
-        raise InputError("timestamps are in another unit than expected", where=str(path),
-            expected="seconds of the epoch", got=f"{times[0]:.6g}", remedy="divide them by 1000 or 1000000")  # fmt: skip
+        raise InputError(
+            "timestamps are in another unit than expected",
+            where=str(path),
+            expected="seconds of the epoch",
+            got=f"{times[0]:.6g}",
+            remedy="divide them by 1000 or 1000000",
+        )
     return times
 
 
@@ -620,7 +729,7 @@ def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageF
     return fit_images(Camera(name, *image_size(image), fx, fy, cx + 0.5, cy + 0.5), options)
 
 
-# --- points -----------------------------------------------------------------------------------------------------------
+# --- points ---------------------------------------------------------------------------------------
 
 
 def _columns(path: Path, names: Sequence[str], kind: str) -> dict[str, NDArray[Any]]:
@@ -632,9 +741,9 @@ def _columns(path: Path, names: Sequence[str], kind: str) -> dict[str, NDArray[A
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cloud:
-    """One cloud: ``xyz`` f64[N, 3] in the data set's world, ``intensity`` 0..1, ``dt_s`` seconds from ``time_s`` (of the scene's clock, the
-    middle of the turn), ``d`` 0 or 1. Beams without a return are left out: ``returns`` bool[M] says which rows of the file are none, and
-    ``without`` how many of them each LiDAR has."""
+    """One cloud: ``xyz`` f64[N, 3] in the data set's world, ``intensity`` 0..1, ``dt_s`` seconds from ``time_s`` (of
+    the scene's clock, the middle of the turn), ``d`` 0 or 1. Beams without a return are left out: ``returns`` bool[M]
+    says which rows of the file are none, and ``without`` how many of them each LiDAR has."""
 
     time_s: float
     xyz: Matrix
@@ -661,20 +770,25 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
     columns = {name: finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
     late_s = columns["t"] - frame_s
     if len(late_s) and np.abs(late_s).max() > MAX_POINT_DELAY_S:
-        raise InputError("points do not belong to their frame's time", where=f"{path}: t",
+        raise InputError(
+            "points do not belong to their frame's time",
+            where=f"{path}: t",
             expected=f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})",
             got=f"{columns['t'].min():.6g} to {columns['t'].max():.6g}",
-            remedy="is the file of another frame or sequence?")  # fmt: skip
+            remedy="is the file of another frame or sequence?",
+        )
     if not np.isin(columns["d"], list(SENSORS)).all():
         raise InputError("a point is of a LiDAR that does not exist", where=f"{path}: d", expected="0 or 1")
     turning = late_s[columns["d"] == 0]
     middle_s = float(turning.min() + turning.max()) / 2 if len(turning) else 0.0
     xyz = np.stack([columns[axis] for axis in "xyz"], 1)
     intensity = unit_intensity(columns["i"], 255, f"{path}: i")
-    return _Cloud(frame_s - motion.start_s + middle_s, xyz, intensity, late_s - middle_s, columns["d"], returns, without)
+    return _Cloud(
+        frame_s - motion.start_s + middle_s, xyz, intensity, late_s - middle_s, columns["d"], returns, without
+    )
 
 
-# --- boxes ------------------------------------------------------------------------------------------------------------
+# --- boxes ----------------------------------------------------------------------------------------
 
 
 def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
@@ -715,7 +829,8 @@ class _MeasuringTimes:
         self._turning: tuple[NDArray[np.intp], NDArray[np.float64]] | None = None
 
     def delay_s(self, source_from_box: Matrix, size_m: tuple[float, float, float], sensor: int) -> float:
-        """Seconds from the sweep's time: the median of the points inside; with few of them, of the points in that direction."""
+        """Seconds from the sweep's time: the median of the points inside; with few of them, of the points in that
+        direction."""
         xyz, dt_s, d = self._cloud.xyz, self._cloud.dt_s, self._cloud.d
         centre, reach = source_from_box[:3, 3], float(np.linalg.norm(size_m)) / 2
         near = np.flatnonzero((np.abs(xyz[:, :2] - centre[:2]) < reach).all(1) & (d == max(sensor, 0)))

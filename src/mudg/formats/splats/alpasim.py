@@ -5,8 +5,9 @@
     sequence_tracks.json   paths, classes and sizes of the objects
     mesh_ground.ply        the ground as triangles, facing up
 
-Times are microseconds, the first record at 1 s. World, and what NuRec calls its own frame, are the world of the file: z up, metres. The rig
-is the vehicle, x forward, y left, z up. Source: the layouts of AlpaSim's reader, of NuRec's writer, and of Autoware's 3dgs_io.
+Times are microseconds, the first record at 1 s. World, and what NuRec calls its own frame, are the world of the file: z
+up, metres. The rig is the vehicle, x forward, y left, z up. Source: the layouts of AlpaSim's reader, of NuRec's writer,
+and of Autoware's 3dgs_io.
 """
 
 from __future__ import annotations
@@ -34,10 +35,23 @@ STANDING: Final = "NONE"
 MOVES_M: Final = 1.0
 """Objects that go no farther stand."""
 CLASSES: Final[Mapping[str, str]] = {
-    "car": "automobile", "van": "automobile", "vehicle": "other_vehicle", "truck": "heavy_truck", "bus": "bus", "tram": "train_or_tram_car",
-    "train": "train_or_tram_car", "pedestrian": "person", "person": "person", "cyclist": "rider", "rider": "rider", "bicycle": "bicycle",
-    "motorcycle": "motorcycle", "trailer": "trailer", "stroller": "stroller", "animal": "animal",
-}  # fmt: skip
+    "car": "automobile",
+    "van": "automobile",
+    "vehicle": "other_vehicle",
+    "truck": "heavy_truck",
+    "bus": "bus",
+    "tram": "train_or_tram_car",
+    "train": "train_or_tram_car",
+    "pedestrian": "person",
+    "person": "person",
+    "cyclist": "rider",
+    "rider": "rider",
+    "bicycle": "bicycle",
+    "motorcycle": "motorcycle",
+    "trailer": "trailer",
+    "stroller": "stroller",
+    "animal": "animal",
+}
 """Classes of objects as NVIDIA's recordings call them; others keep their names."""
 _NO_DATE: Final = "1970-01-01"
 """The hour of writing is not noted: the same scene gives the same bytes."""
@@ -53,11 +67,17 @@ def to_package(scene: SplatScene, log: Scene | None, ground: HeightMap | None) -
         InputError: no drive or no ground is known, or a camera has no place on the vehicle.
     """
     if log is None or not len(log.ego.times_s):
-        raise InputError("AlpaSim replays a drive, and none is known here", where=scene.name,
-            remedy="give --scene SCENE, or a folder made by `mudg run`")  # fmt: skip
+        raise InputError(
+            "AlpaSim replays a drive, and none is known here",
+            where=scene.name,
+            remedy="give --scene SCENE, or a folder made by `mudg run`",
+        )
     if ground is None:
-        raise InputError("AlpaSim needs the ground, and none is known here", where=scene.name,
-            remedy="export a folder made by `mudg run`, whose points have classes")  # fmt: skip
+        raise InputError(
+            "AlpaSim needs the ground, and none is known here",
+            where=scene.name,
+            remedy="export a folder made by `mudg run`, whose points have classes",
+        )
     clock = _PackageClock(log, scene)
     rig = store.json_text(_rig(log, scene, clock)).encode()
     files = {
@@ -95,12 +115,17 @@ def _metadata(log: Scene, scene: SplatScene, clock: _PackageClock, rig: bytes) -
         content.update(node.cloud.means.tobytes() + node.cloud.sh.tobytes() + node.world_from_node.tobytes())
     path = _path(log, scene, clock)
     return {
-        "scene_id": log.id, "version_string": str(scene.facts.get("generator", "mudg")), "training_date": _NO_DATE, "dataset_hash": digest,
-        "uuid": str(uuid.uuid5(uuid.NAMESPACE_URL, f"mudg:{content.hexdigest()}")), "is_resumable": False,
+        "scene_id": log.id,
+        "version_string": str(scene.facts.get("generator", "mudg")),
+        "training_date": _NO_DATE,
+        "dataset_hash": digest,
+        "uuid": str(uuid.uuid5(uuid.NAMESPACE_URL, f"mudg:{content.hexdigest()}")),
+        "is_resumable": False,
         "sensors": {"camera_ids": list(log.cameras), "lidar_ids": sorted({sweep.sensor for sweep in log.sweeps})},
         "logger": {"name": "mudg", "run_id": None, "run_url": None},
-        "time_range": {"start": int(path.times_us[0]), "end": int(path.times_us[-1])}, "training_step_outputs": {},
-    }  # fmt: skip
+        "time_range": {"start": int(path.times_us[0]), "end": int(path.times_us[-1])},
+        "training_step_outputs": {},
+    }
 
 
 def _path(log: Scene, scene: SplatScene, clock: _PackageClock) -> PoseKeys:
@@ -116,21 +141,30 @@ def _rig(log: Scene, scene: SplatScene, clock: _PackageClock) -> dict[str, Any]:
     path = _path(log, scene, clock)
     cameras = {f"{name}@{log.id}": camera for name, camera in log.cameras.items()}
     trajectory = {
-        "sequence_id": log.id, "rig_bbox": None, "T_rig_world_timestamps_us": path.times_us.tolist(), "T_rig_worlds": path.poses.tolist(),
+        "sequence_id": log.id,
+        "rig_bbox": None,
+        "T_rig_world_timestamps_us": path.times_us.tolist(),
+        "T_rig_worlds": path.poses.tolist(),
         "cameras_frame_timestamps_us": {unique: _spans(log, camera, clock) for unique, camera in cameras.items()},
         "lidars_frame_timestamps_us": {},
-    }  # fmt: skip
+    }
     calibrations = {
         unique: {
-            "sequence_id": log.id, "logical_sensor_name": camera.name, "unique_sensor_idx": index,
-            "T_sensor_rig": _mount(log, camera).tolist(), "camera_model": {"type": "opencv-pinhole", "parameters": intrinsics(camera)},
+            "sequence_id": log.id,
+            "logical_sensor_name": camera.name,
+            "unique_sensor_idx": index,
+            "T_sensor_rig": _mount(log, camera).tolist(),
+            "camera_model": {"type": "opencv-pinhole", "parameters": intrinsics(camera)},
         }
         for index, (unique, camera) in enumerate(cameras.items())
-    }  # fmt: skip
+    }
     return {
-        "world_to_nre": {"matrix": np.eye(4).tolist()}, "T_world_base": np.eye(4).tolist(), "rig_trajectories": [trajectory],
-        "camera_calibrations": calibrations, "lidar_calibrations": {},
-    }  # fmt: skip
+        "world_to_nre": {"matrix": np.eye(4).tolist()},
+        "T_world_base": np.eye(4).tolist(),
+        "rig_trajectories": [trajectory],
+        "camera_calibrations": calibrations,
+        "lidar_calibrations": {},
+    }
 
 
 def _mount(log: Scene, camera: Camera) -> NDArray[np.float64]:
@@ -146,10 +180,15 @@ def _mount(log: Scene, camera: Camera) -> NDArray[np.float64]:
 def intrinsics(camera: Camera) -> dict[str, Any]:
     """A pinhole camera as NCore tells it: principal point from the corner of the image."""
     return {
-        "resolution": [camera.width, camera.height], "shutter_type": "ROLLING_TOP_TO_BOTTOM" if camera.readout_s > 0 else "GLOBAL",
-        "external_distortion_parameters": None, "principal_point": [camera.cx, camera.cy], "focal_length": [camera.fx, camera.fy],
-        "radial_coeffs": [0.0] * 6, "tangential_coeffs": [0.0] * 2, "thin_prism_coeffs": [0.0] * 4,
-    }  # fmt: skip
+        "resolution": [camera.width, camera.height],
+        "shutter_type": "ROLLING_TOP_TO_BOTTOM" if camera.readout_s > 0 else "GLOBAL",
+        "external_distortion_parameters": None,
+        "principal_point": [camera.cx, camera.cy],
+        "focal_length": [camera.fx, camera.fy],
+        "radial_coeffs": [0.0] * 6,
+        "tangential_coeffs": [0.0] * 2,
+        "thin_prism_coeffs": [0.0] * 4,
+    }
 
 
 def _tracks(scene: SplatScene, clock: _PackageClock) -> dict[str, Any]:

@@ -1,4 +1,5 @@
-"""Reading and writing bytes that nobody vouches for: parts within bounds, inflating within bounds, zips without surprises."""
+"""Reading and writing bytes that nobody vouches for: parts within bounds, inflating within bounds, zips without
+surprises."""
 
 from __future__ import annotations
 
@@ -22,8 +23,13 @@ MAX_BYTES: Final = 8 << 30
 def part(content: bytes, start: int, size: int, what: str, where: str) -> memoryview:
     """``size`` bytes from ``start``; InputError if the content ends before."""
     if start < 0 or size < 0 or start + size > len(content):
-        raise InputError(f"the file ends within {what}", where=where, expected=f"{start + size} bytes", got=f"{len(content)} bytes",
-            remedy="it was cut off, or its header is damaged: get the file again")  # fmt: skip
+        raise InputError(
+            f"the file ends within {what}",
+            where=where,
+            expected=f"{start + size} bytes",
+            got=f"{len(content)} bytes",
+            remedy="it was cut off, or its header is damaged: get the file again",
+        )
     return memoryview(content)[start : start + size]
 
 
@@ -41,18 +47,27 @@ def unpacked(layout: str, content: bytes, start: int, what: str, where: str) -> 
 def refuse_count(count: int, where: str) -> None:
     """InputError for a number of Gaussians that no file holds."""
     if not 0 < count <= MAX_GAUSSIANS:
-        raise InputError("the number of Gaussians in the header is not possible", where=where, expected=f"1 to {MAX_GAUSSIANS}",
-            got=str(count))  # fmt: skip
+        raise InputError(
+            "the number of Gaussians in the header is not possible",
+            where=where,
+            expected=f"1 to {MAX_GAUSSIANS}",
+            got=str(count),
+        )
 
 
 def refuse_bomb(count: int, content: bytes, where: str) -> None:
-    """InputError for more Gaussians than a compressed file of this size holds: at most 20 a byte, hundreds of times what is usual."""
+    """InputError for more Gaussians than a compressed file of this size holds: at most 20 a byte, hundreds of times
+    what is usual."""
     if count > 20 * len(content) + 65536:
-        raise InputError("the header names more Gaussians than a file of this size can hold", where=where,
-            expected=f"at most {20 * len(content) + 65536}", got=str(count))  # fmt: skip
+        raise InputError(
+            "the header names more Gaussians than a file of this size can hold",
+            where=where,
+            expected=f"at most {20 * len(content) + 65536}",
+            got=str(count),
+        )
 
 
-# -- compressed streams --------------------------------------------------------------------------------------------------
+# -- compressed streams ----------------------------------------------------------------------------
 
 
 def gzip_bytes(content: bytes) -> bytes:
@@ -81,8 +96,13 @@ class GzipStream:
         except zlib.error as error:
             raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
         if len(found) < size:
-            raise InputError(f"the file ends within {what}", where=self._where, expected=f"{size} bytes", got=f"{len(found)} bytes",
-                remedy="it was cut off, or its header is damaged: get the file again")  # fmt: skip
+            raise InputError(
+                f"the file ends within {what}",
+                where=self._where,
+                expected=f"{size} bytes",
+                got=f"{len(found)} bytes",
+                remedy="it was cut off, or its header is damaged: get the file again",
+            )
         return bytes(found)
 
     def rest(self, most: int) -> bytes:
@@ -109,7 +129,7 @@ class GzipStream:
             )
 
 
-# -- zips ----------------------------------------------------------------------------------------------------------------
+# -- zips ------------------------------------------------------------------------------------------
 
 _EPOCH: Final = (1980, 1, 1, 0, 0, 0)
 
@@ -180,12 +200,16 @@ class BoundedZip:
         ) as error:
             raise InputError("a file in the zip is damaged", where=where, got=str(error)) from error
         if rest or len(content) != info.file_size:
-            raise InputError("a file in the zip has another size than listed", where=where, expected=str(info.file_size),
-                got=str(len(content)))  # fmt: skip
+            raise InputError(
+                "a file in the zip has another size than listed",
+                where=where,
+                expected=str(info.file_size),
+                got=str(len(content)),
+            )
         return content
 
 
-# -- order and packing ---------------------------------------------------------------------------------------------------
+# -- order and packing -----------------------------------------------------------------------------
 
 
 def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
@@ -204,14 +228,20 @@ def morton_order(means: NDArray[np.floating]) -> NDArray[np.intp]:
 def _spread(bits: NDArray[np.uint64]) -> NDArray[np.uint64]:
     """Two zero bits after every bit of 21."""
     v = bits
-    for shift, mask in ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-                        (2, 0x1249249249249249)):  # fmt: skip
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
         v = (v | (v << np.uint64(shift))) & np.uint64(mask)
     return v
 
 
 def smallest_three(quats: Floats) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Index of the largest of four components, i[n], and the other three in order, f64[n, 3], signed so that the largest is positive."""
+    """Index of the largest of four components, i[n], and the other three in order, f64[n, 3], signed so that the
+    largest is positive."""
     q = quats.astype(np.float64)
     q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30)
     largest = np.abs(q).argmax(1)

@@ -1,10 +1,14 @@
 """The bundle: everything that an export can carry, for programs that move objects themselves. A stored zip:
 
 bundle.json            what it is: names, files, axes, classes, times
-static.ply             what stands, in the axes of the file          objects/NAME.ply   objects in the frame of their box
-tracks.json            paths of the objects: layout splatsim.sequence_tracks/v2 (times in microseconds, translation, rotation x y z w)
-deform/NAME.safetensors  ``displacement`` f32[K, n, 3]: what the Gaussians of a deforming object are moved by at each key, linear between
-sky.png                panorama: zenith on top, longitude from -pi to pi growing to the right of the picture (to the left as one looks)
+static.ply             what stands, in the axes of the file          objects/NAME.ply   objects in the frame of their
+                       box
+tracks.json            paths of the objects: layout splatsim.sequence_tracks/v2 (times in microseconds, translation,
+                       rotation x y z w)
+deform/NAME.safetensors  ``displacement`` f32[K, n, 3]: what the Gaussians of a deforming object are moved by at each
+                         key, linear between
+sky.png                panorama: zenith on top, longitude from -pi to pi growing to the right of the picture (to the
+                       left as one looks)
 cameras.json           intrinsics and recorded poses, where the log is known
 """
 
@@ -27,9 +31,14 @@ SCHEMA: Final = "mudg.bundle/v1"
 TRACKS: Final = "splatsim.sequence_tracks/v2"
 MICROSECONDS: Final = 1_000_000
 CONVENTION: Final = {
-    "world": "right-handed, z up", "object": "centre of the box, x forward, y left, z up", "camera": "opencv: x right, y down, z forward",
-    "rotation": "x y z w", "matrix": "row-major, a_from_b", "unit": "metre", "time_unit": "microsecond",
-}  # fmt: skip
+    "world": "right-handed, z up",
+    "object": "centre of the box, x forward, y left, z up",
+    "camera": "opencv: x right, y down, z forward",
+    "rotation": "x y z w",
+    "matrix": "row-major, a_from_b",
+    "unit": "metre",
+    "time_unit": "microsecond",
+}
 
 
 def to_bytes(scene: SplatScene, log: Scene | None = None) -> bytes:
@@ -52,8 +61,16 @@ def to_bytes(scene: SplatScene, log: Scene | None = None) -> bytes:
         files["sky.png"] = png(scene.sky)
     if log is not None:
         files["cameras.json"] = _json(cameras_of(log, scene))
-    about = {"schema": SCHEMA, "name": scene.name, "nodes": listed, "frame_convention": CONVENTION, "classes": list(CLASSES),
-             "file_from_world": scene.file_from_world.tolist(), "span_s": list(scene.span_s), "facts": dict(scene.facts)}  # fmt: skip
+    about = {
+        "schema": SCHEMA,
+        "name": scene.name,
+        "nodes": listed,
+        "frame_convention": CONVENTION,
+        "classes": list(CLASSES),
+        "file_from_world": scene.file_from_world.tolist(),
+        "span_s": list(scene.span_s),
+        "facts": dict(scene.facts),
+    }
     return binary.stored_zip({"bundle.json": _json(about), **files})
 
 
@@ -65,14 +82,23 @@ def tracks_of(scene: SplatScene, listed: list[dict[str, Any]]) -> dict[str, Any]
             continue
         poses = scene.file_from_world @ node.world_from_node
         frames = [
-            {"timestamp_us": round(float(time_s) * MICROSECONDS), "translation": pose[:3, 3].tolist(),
-             "rotation": geometry.quaternion_from_matrix(pose)[[1, 2, 3, 0]].tolist()}
+            {
+                "timestamp_us": round(float(time_s) * MICROSECONDS),
+                "translation": pose[:3, 3].tolist(),
+                "rotation": geometry.quaternion_from_matrix(pose)[[1, 2, 3, 0]].tolist(),
+            }
             for time_s, pose in zip(node.times_s, poses)
-        ]  # fmt: skip
-        tracks.append({
-            "track_id": node.name, "class_name": node.label, "size": list(node.size_m), "flag": "CONTROLLABLE", "frames": frames,
-            "metadata": {"file": entry["file"], "deform": entry.get("deform")},
-        })  # fmt: skip
+        ]
+        tracks.append(
+            {
+                "track_id": node.name,
+                "class_name": node.label,
+                "size": list(node.size_m),
+                "flag": "CONTROLLABLE",
+                "frames": frames,
+                "metadata": {"file": entry["file"], "deform": entry.get("deform")},
+            }
+        )
     return {"schema": TRACKS, "frame": "world", "frame_convention": CONVENTION, "tracks": tracks}
 
 
@@ -90,10 +116,14 @@ def cameras_of(log: Scene, scene: SplatScene) -> dict[str, Any]:
         for name, camera in log.cameras.items()
     }
     frames = [
-        {"id": frame.id, "camera": frame.view.camera.name, "timestamp_us": round(frame.view.time_s * MICROSECONDS),
-         "world_from_camera": (scene.file_from_world @ frame.view.world_from_cam).tolist()}
+        {
+            "id": frame.id,
+            "camera": frame.view.camera.name,
+            "timestamp_us": round(frame.view.time_s * MICROSECONDS),
+            "world_from_camera": (scene.file_from_world @ frame.view.world_from_cam).tolist(),
+        }
         for frame in log.frames
-    ]  # fmt: skip
+    ]
     return {"frame_convention": CONVENTION, "cameras": cameras, "frames": frames}
 
 

@@ -13,7 +13,7 @@ from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.core import harmonics
 
-# axes -----------------------------------------------------------------------------------------------------------------
+# axes ---------------------------------------------------------------------------------------------
 #
 # Where x, y and z of a file point: three letters of Left, Right, Up, Down, Forward and Back, as seen along the road.
 #
@@ -21,21 +21,29 @@ from mudg.core import harmonics
 
 
 _WAYS: Final = {
-    "F": ("forward", (1.0, 0.0, 0.0)), "B": ("back", (-1.0, 0.0, 0.0)), "L": ("left", (0.0, 1.0, 0.0)),
-    "R": ("right", (0.0, -1.0, 0.0)), "U": ("up", (0.0, 0.0, 1.0)), "D": ("down", (0.0, 0.0, -1.0)),
-}  # fmt: skip
+    "F": ("forward", (1.0, 0.0, 0.0)),
+    "B": ("back", (-1.0, 0.0, 0.0)),
+    "L": ("left", (0.0, 1.0, 0.0)),
+    "R": ("right", (0.0, -1.0, 0.0)),
+    "U": ("up", (0.0, 0.0, 1.0)),
+    "D": ("down", (0.0, 0.0, -1.0)),
+}
 WORLD: Final = "FLU"
 VERTICAL: Final = {"z": WORLD, "-z": "FRD", "x": "UFL", "-x": "DFR", "-y": "RDF"}
-"""Axes of which only the vertical one is known; where forward is, is chosen. ``y`` alone is ambiguous: programs that mean down write it."""
+"""Axes of which only the vertical one is known; where forward is, is chosen. ``y`` alone is ambiguous: programs that
+mean down write it."""
 
 
 def known(axes: str) -> bool:
     """Whether three letters name three directions at right angles."""
-    return len(axes) == 3 and all(letter in _WAYS for letter in axes) and abs(np.linalg.det(world_from_axes(axes))) > 0.5
+    return (
+        len(axes) == 3 and all(letter in _WAYS for letter in axes) and abs(np.linalg.det(world_from_axes(axes))) > 0.5
+    )
 
 
 def world_from_axes(axes: str) -> NDArray[np.float64]:
-    """f64[3, 3], columns are the axes of a file in those of this program; of determinant -1 where they are left-handed."""
+    """f64[3, 3], columns are the axes of a file in those of this program; of determinant -1 where they are
+    left-handed."""
     return np.array([_WAYS[letter][1] for letter in axes]).T
 
 
@@ -44,7 +52,7 @@ def in_words(axes: str) -> str:
     return ", ".join(f"{axis} {_WAYS[letter][0]}" for axis, letter in zip("xyz", axes))
 
 
-# cloud ----------------------------------------------------------------------------------------------------------------
+# cloud --------------------------------------------------------------------------------------------
 
 
 MAX_GAUSSIANS: Final = 50_000_000
@@ -65,10 +73,12 @@ class SplatCloud:
     """Gaussians of one frame.
 
     Args:
-        means: f32[n, 3] metres; f64 from a reader, until an origin near them is taken away. quats: f32[n, 4] (w, x, y, z) of length 1.
-        log_scales: f32[n, 3], natural logarithm of metres. logits: f32[n], opacity = sigmoid. sh: f32[n, K, 3], K = 1, 4, 9 or 16 harmonics
-            of the directions of the same frame.
-        class_ids: u8[n] train ids (255 = unknown), or None. antialias: they are to be drawn antialiased, as they were fitted.
+        means: f32[n, 3] metres; f64 from a reader, until an origin near them is taken away. quats: f32[n, 4] (w, x, y,
+            z) of length 1.
+        log_scales: f32[n, 3], natural logarithm of metres. logits: f32[n], opacity = sigmoid. sh: f32[n, K, 3], K = 1,
+            4, 9 or 16 harmonics of the directions of the same frame.
+        class_ids: u8[n] train ids (255 = unknown), or None. antialias: they are to be drawn antialiased, as they were
+            fitted.
     """
 
     means: Floats | Matrix
@@ -109,7 +119,8 @@ class SplatCloud:
     def mirrored(self) -> SplatCloud:
         """The same Gaussians with y turned round: from left-handed axes to right-handed ones."""
         flip = np.array([1.0, -1.0, 1.0])
-        quats = self.quats * np.array([1, -1, 1, -1], np.float32)  # an axis of rotation changes its sign once more than a place
+        # an axis of rotation changes its sign once more than a place
+        quats = self.quats * np.array([1, -1, 1, -1], np.float32)
         sh = self.sh if self.degree == 0 else harmonics.rotated(self.sh, np.diag(flip))
         return replace(self, means=(self.means * flip).astype(self.means.dtype), quats=quats, sh=sh)
 
@@ -125,7 +136,8 @@ class SplatCloud:
 
 
 def joined(clouds: Sequence[SplatCloud]) -> SplatCloud:
-    """Several clouds of one frame as one, of the highest degree among them; classes are kept where one of them has some."""
+    """Several clouds of one frame as one, of the highest degree among them; classes are kept where one of them has
+    some."""
     if len(clouds) == 1:
         return clouds[0]
     degree = max(cloud.degree for cloud in clouds)
@@ -134,7 +146,9 @@ def joined(clouds: Sequence[SplatCloud]) -> SplatCloud:
     if any(cloud.class_ids is not None for cloud in parts):
         unknown = [np.full(len(c), 255, np.uint8) if c.class_ids is None else c.class_ids for c in parts]
         classes = np.concatenate(unknown)
-    columns = [np.concatenate([getattr(c, name) for c in parts]) for name in ("means", "quats", "log_scales", "logits", "sh")]
+    columns = [
+        np.concatenate([getattr(c, name) for c in parts]) for name in ("means", "quats", "log_scales", "logits", "sh")
+    ]
     return SplatCloud(*columns, class_ids=classes, antialias=any(cloud.antialias for cloud in parts))
 
 
@@ -144,8 +158,10 @@ class SplatFile:
 
     Args:
         cloud: Gaussians in the axes of the file, ``means`` f64.
-        axes: where x, y and z of the file point, a letter each (``cloud.py``), as the file states them; empty: it does not.
-        axes_by: what states them. step_m: distance of neighbouring numbers in which most places are stored; 0 = not worth a word.
+        axes: where x, y and z of the file point, a letter each (``cloud.py``), as the file states them; empty: it does
+            not.
+        axes_by: what states them. step_m: distance of neighbouring numbers in which most places are stored; 0 = not
+            worth a word.
         notes: what a person may want to know. warnings: what may have come in otherwise than its program meant it.
     """
 
@@ -162,12 +178,14 @@ class SplatNode:
     """Gaussians that move together.
 
     Args:
-        name: of the object; the first node of a scene is what stands. label: class name of the object, empty for what stands.
+        name: of the object; the first node of a scene is what stands. label: class name of the object, empty for what
+            stands.
         size_m: length, width, height of its box.
         cloud: Gaussians in the node's own frame (the world for what stands).
-        times_s, world_from_node: keys of its path, f64[K] and f64[K, 4, 4]; before the first and after the last the node does not
-            exist. No keys: it is always there, in the world. Between keys: straight lines, slerp.
-        displacement: f32[K, n, 3] metres in the node's frame, what its Gaussians are moved by at every key; linear between; or None.
+        times_s, world_from_node: keys of its path, f64[K] and f64[K, 4, 4]; before the first and after the last the
+            node does not exist. No keys: it is always there, in the world. Between keys: straight lines, slerp.
+        displacement: f32[K, n, 3] metres in the node's frame, what its Gaussians are moved by at every key; linear
+            between; or None.
     """
 
     name: str
@@ -208,7 +226,8 @@ class SplatScene:
     Args:
         name: of the scene. nodes: what stands first.
         file_from_world: rigid f64[4, 4]: from the axes of this program to those of the file. Nodes are in world axes.
-        sky: u8[H, 2 H, 3] panorama: zenith in row 0, columns from longitude -pi to pi (growing to the left as one looks), or None.
+        sky: u8[H, 2 H, 3] panorama: zenith in row 0, columns from longitude -pi to pi (growing to the left as one
+            looks), or None.
         facts: JSON values for people (method, times, versions).
     """
 
@@ -236,7 +255,7 @@ class SplatScene:
         return whole if np.array_equal(self.file_from_world, np.eye(4)) else whole.moved(self.file_from_world)
 
 
-# -- numbers -------------------------------------------------------------------------------------------------------------
+# -- numbers ---------------------------------------------------------------------------------------
 
 
 def sigmoid(logits: Floats) -> Floats:
@@ -265,14 +284,19 @@ def unit(quats: NDArray[np.floating], where: str) -> Floats:
     bad = ~(np.isfinite(length[:, 0]) & (length[:, 0] > 1e-12))
     if bad.any():
         row = int(bad.argmax())
-        raise InputError("a rotation is no quaternion", where=f"{where}: Gaussian {row}", expected="four finite numbers, not all 0",
-            got=f"{q[row].tolist()}; {int(bad.sum())} of {len(q)} are damaged", remedy="take them out, or write 1, 0, 0, 0")  # fmt: skip
+        raise InputError(
+            "a rotation is no quaternion",
+            where=f"{where}: Gaussian {row}",
+            expected="four finite numbers, not all 0",
+            got=f"{q[row].tolist()}; {int(bad.sum())} of {len(q)} are damaged",
+            remedy="take them out, or write 1, 0, 0, 0",
+        )
     return (q / length).astype(np.float32)
 
 
 def checked(cloud: SplatCloud, where: str) -> SplatCloud:
-    """A cloud as it was read, rotations brought to length 1. Opacities of exactly 0 and 1 and sizes of 0, whose logits and logarithms are
-    infinite, become the nearest that can be worked with.
+    """A cloud as it was read, rotations brought to length 1. Opacities of exactly 0 and 1 and sizes of 0, whose logits
+    and logarithms are infinite, become the nearest that can be worked with.
 
     Raises:
         InputError: values that are not finite, or places and sizes that nothing has.
@@ -282,26 +306,37 @@ def checked(cloud: SplatCloud, where: str) -> SplatCloud:
     logits = np.nan_to_num(cloud.logits, nan=np.nan, posinf=MOST_LOGIT, neginf=-MOST_LOGIT)
     logs = np.where(np.isneginf(cloud.log_scales), np.float32(LEAST_LOG), cloud.log_scales)
     cloud = replace(cloud, logits=logits, log_scales=logs)
-    columns = {"position": cloud.means, "scale": cloud.log_scales, "opacity": cloud.logits[:, None],
-               "color": cloud.sh.reshape(len(cloud), -1)}  # fmt: skip
+    columns = {
+        "position": cloud.means,
+        "scale": cloud.log_scales,
+        "opacity": cloud.logits[:, None],
+        "color": cloud.sh.reshape(len(cloud), -1),
+    }
     for name, values in columns.items():
         bad = ~np.isfinite(values).all(1)
         if bad.any():
             row = int(bad.argmax())
-            raise InputError(f"the {name} of a Gaussian is not finite", where=f"{where}: Gaussian {row}",
+            raise InputError(
+                f"the {name} of a Gaussian is not finite",
+                where=f"{where}: Gaussian {row}",
                 got=f"{values[row].tolist()[:4]}; {int(bad.sum())} of {len(cloud)} are damaged",
-                remedy="take them out, for example with splat-transform --filter-nan")  # fmt: skip
+                remedy="take them out, for example with splat-transform --filter-nan",
+            )
     far = (np.abs(cloud.means) > LARGEST_M).any(1) | (cloud.log_scales > MOST_LOG).any(1)
     if far.any():
         row = int(far.argmax())
-        raise InputError("a Gaussian lies or reaches too far away", where=f"{where}: Gaussian {row}",
+        raise InputError(
+            "a Gaussian lies or reaches too far away",
+            where=f"{where}: Gaussian {row}",
             expected=f"positions within {LARGEST_M:g} m, logarithms of sizes below {MOST_LOG:g}",
-            got=f"{cloud.means[row].tolist()}, {cloud.log_scales[row].tolist()}")  # fmt: skip
+            got=f"{cloud.means[row].tolist()}, {cloud.log_scales[row].tolist()}",
+        )
     return replace(cloud, quats=unit(cloud.quats, where), log_scales=cloud.log_scales.clip(LEAST_LOG))
 
 
 def spacing_m(places: NDArray[np.floating], kind: type[np.floating] = np.float32) -> float:
-    """Distance of neighbouring numbers of a kind, at the farthest places [n, 3] but for a tenth: outliers are far anyway."""
+    """Distance of neighbouring numbers of a kind, at the farthest places [n, 3] but for a tenth: outliers are far
+    anyway."""
     return float(np.spacing(kind(np.quantile(np.abs(places).max(1), 0.9))))
 
 
@@ -314,21 +349,35 @@ def doubtful_values(cloud: SplatCloud, where: str) -> list[str]:
     plain_opacity = bool((cloud.logits >= 0).all() and (cloud.logits <= 1).all() and (cloud.logits > 0).any())
     plain_size = bool((cloud.log_scales[:, :2] > 0).all())  # the third is that of flat Gaussians
     if plain_opacity and plain_size:
-        raise InputError("sizes and opacities are plain values, where files of Gaussians hold logarithms and logits", where=where,
+        raise InputError(
+            "sizes and opacities are plain values, where files of Gaussians hold logarithms and logits",
+            where=where,
             expected="negative numbers for sizes below 1 m and opacities below 0.5",
-            got=f"sizes from {cloud.log_scales[:, :2].min():.3g}, opacities from {cloud.logits.min():.3g} to {cloud.logits.max():.3g}",
-            remedy="write log(scale) and log(opacity / (1 - opacity)) into the file")  # fmt: skip
+            got=(
+                f"sizes from {cloud.log_scales[:, :2].min():.3g}, opacities from {cloud.logits.min():.3g} to"
+                f" {cloud.logits.max():.3g}"
+            ),
+            remedy="write log(scale) and log(opacity / (1 - opacity)) into the file",
+        )
     found = []
     if plain_opacity:
-        found.append("all opacities lie between 0.5 and 0.73, as if values from 0 to 1 had been stored where logits are due: if it looks "
-                     "like fog, write log(opacity / (1 - opacity)) into the file")  # fmt: skip
+        found.append(
+            "all opacities lie between 0.5 and 0.73, as if values from 0 to 1 had been stored where logits are due: if"
+            " it looks like fog, write log(opacity / (1 - opacity)) into the file"
+        )
     if plain_size:
-        found.append("all Gaussians are wider than 1 m, as if sizes had been stored where their logarithms are due: if it looks like "
-                     "fog, write log(scale) into the file")  # fmt: skip
+        found.append(
+            "all Gaussians are wider than 1 m, as if sizes had been stored where their logarithms are due: if it looks"
+            " like fog, write log(scale) into the file"
+        )
     if len(cloud) and (cloud.logits >= 0).all() and cloud.logits.max() > 2 * MOST_LOGIT:
-        found.append(f"opacities reach {cloud.logits.max():.4g}, as if values from 0 to 255 had been stored where logits are due: all "
-                     "Gaussians count as solid")  # fmt: skip
+        found.append(
+            f"opacities reach {cloud.logits.max():.4g}, as if values from 0 to 255 had been stored where logits are"
+            " due: all Gaussians count as solid"
+        )
     if len(cloud) and np.median(np.abs(cloud.sh[:, 0])) > 8:
-        found.append("colours lie far beyond black and white, as if values from 0 to 255 had been stored as f_dc: write "
-                     "(colour / 255 - 0.5) / 0.2821 into the file")  # fmt: skip
+        found.append(
+            "colours lie far beyond black and white, as if values from 0 to 255 had been stored as f_dc: write "
+            "(colour / 255 - 0.5) / 0.2821 into the file"
+        )
     return found

@@ -2,10 +2,12 @@
 
     element chunk ceil(N / 256): min_x y z max_x y z  min_scale_x y z max_scale_x y z  min_r g b max_r g b   f32
     element vertex N: packed_position packed_rotation packed_scale packed_color                              u32
-    element sh N: f_rest_0..                                                                                 u8, from degree 1 on
+    element sh N: f_rest_0..                                                                                 u8, from
+                                                                                                             degree 1 on
 
-Positions and scales (natural logarithm): 11, 10, 11 bits from the top. Rotation: 2 bits index of the largest of (w, x, y, z), the others
-in order, 10 bits each, ``v / sqrt 2 + 0.5``. Colour: 8 bits each of the colour of degree 0 within the chunk, and opacity.
+Positions and scales (natural logarithm): 11, 10, 11 bits from the top. Rotation: 2 bits index of the largest of (w, x,
+y, z), the others in order, 10 bits each, ``v / sqrt 2 + 0.5``. Colour: 8 bits each of the colour of degree 0 within the
+chunk, and opacity.
 """
 
 from __future__ import annotations
@@ -24,9 +26,11 @@ from mudg.formats.unknown_fields import listed, sentence
 
 CHUNK: Final = 256
 _BOUNDS: Final = tuple(
-    f"{side}_{name}" for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
-    for side in ("min", "max") for name in names
-)  # fmt: skip
+    f"{side}_{name}"
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for side in ("min", "max")
+    for name in names
+)
 _PACKED: Final = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 _REST: Final = {9: 1, 24: 2, 45: 3}
 _LOG_RANGE: Final = 20.0
@@ -35,7 +39,8 @@ Array = NDArray[np.float64]
 
 
 def to_bytes(cloud: SplatCloud, marks: Sequence[str] = ()) -> bytes:
-    """A cloud as a compressed PLY file; rows are brought into Morton order. ``marks``: comments, as in ``ply.marks_of``."""
+    """A cloud as a compressed PLY file; rows are brought into Morton order. ``marks``: comments, as in
+    ``ply.marks_of``."""
     cloud = cloud.take(binary.morton_order(cloud.means))
     chunks = -(-len(cloud) // CHUNK)
     of_chunk = np.arange(len(cloud)) // CHUNK
@@ -90,13 +95,20 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         )
     if any(vertex.dtype[name].kind not in "iu" or vertex.dtype[name].itemsize != 4 for name in _PACKED):
         raise InputError(
-            "the packed columns of a compressed PLY are no words", where=where, expected="uint", got=str(vertex.dtype)[:200]
+            "the packed columns of a compressed PLY are no words",
+            where=where,
+            expected="uint",
+            got=str(vertex.dtype)[:200],
         )
     words = {name: vertex[name].astype("<u4") for name in _PACKED}
     names = chunk.dtype.names or ()
     if len(chunk) != -(-len(vertex) // CHUNK) or any(name not in names for name in _BOUNDS[:12]):
-        raise InputError("the chunks of the compressed PLY do not fit its vertices", where=where,
-            expected=f"{-(-len(vertex) // CHUNK)} chunks", got=f"{len(chunk)}: {listed(names[:4])}, ...")  # fmt: skip
+        raise InputError(
+            "the chunks of the compressed PLY do not fit its vertices",
+            where=where,
+            expected=f"{-(-len(vertex) // CHUNK)} chunks",
+            got=f"{len(chunk)}: {listed(names[:4])}, ...",
+        )
     of_chunk = np.arange(len(vertex)) // CHUNK
     bounds = {name: chunk[name].astype(np.float64) for name in _BOUNDS if name in names}
     low, high = (np.stack([bounds[name] for name in _BOUNDS[at : at + 3]], 1) for at in (0, 3))
@@ -116,7 +128,10 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     cloud = checked(SplatCloud(means, *columns, antialias=file.antialias), where)
     step = spacing_m(np.concatenate([low, high])) if chunk.dtype["min_x"].itemsize == 4 else 0.0
     known = {"chunk": _BOUNDS, "vertex": _PACKED, "sh": tuple(f"f_rest_{index}" for index in range(max(_REST)))}
-    unknown = {element: [n for n in table.dtype.names or () if n not in known[element]] for element, table in file.tables.items()}
+    unknown = {
+        element: [n for n in table.dtype.names or () if n not in known[element]]
+        for element, table in file.tables.items()
+    }
     notes = [sentence(names, f"element {element}") for element, names in unknown.items() if names]
     return SplatFile(cloud, file.axes, file.axes_by, step, (*file.notes, *notes), file.warnings)
 
@@ -126,9 +141,17 @@ def _rest(table: NDArray[np.void] | None, count: int, where: str) -> Array:
         return np.zeros((count, 0, 3))
     names = table.dtype.names or ()
     rest = tuple(f"f_rest_{index}" for index in range(sum(name.startswith("f_rest_") for name in names)))
-    if len(table) != count or len(rest) not in _REST or any(name not in names or table.dtype[name] != np.uint8 for name in rest):
-        raise InputError("the harmonics of the compressed PLY do not fit its vertices", where=where,
-            expected=f"{count} rows of 9, 24 or 45 uchar", got=f"{len(table)} rows of {listed(names)}")  # fmt: skip
+    if (
+        len(table) != count
+        or len(rest) not in _REST
+        or any(name not in names or table.dtype[name] != np.uint8 for name in rest)
+    ):
+        raise InputError(
+            "the harmonics of the compressed PLY do not fit its vertices",
+            where=where,
+            expected=f"{count} rows of 9, 24 or 45 uchar",
+            got=f"{len(table)} rows of {listed(names)}",
+        )
     raw = ply.columns_of(table, rest)
     values = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
     return ply.coefficient_major(((values - 0.5) * 8).astype(np.float32)).astype(np.float64)

@@ -1,4 +1,5 @@
-"""The table of formats: what each is called, which axes its readers expect, what it carries, who writes and reads it."""
+"""The table of formats: what each is called, which axes its readers expect, what it carries, who writes and reads
+it."""
 
 from __future__ import annotations
 
@@ -25,8 +26,8 @@ class WriteRequest:
     """What is to be written.
 
     Args:
-        scene: with the axes of the file. time_s: the moment, or None = all of the motion. spz_version: 3 or 4. log: whose cameras are
-            listed, where a format can. ground: where a format needs it.
+        scene: with the axes of the file. time_s: the moment, or None = all of the motion. spz_version: 3 or 4. log:
+            whose cameras are listed, where a format can. ground: where a format needs it.
     """
 
     scene: SplatScene
@@ -61,8 +62,8 @@ class SplatFormat:
     """One format.
 
     Args:
-        suffixes: of its files, the usual one first. axes: of ``cloud.py``, what its readers expect. write: bytes of a request, or None:
-            written elsewhere. read: Gaussians of bytes, or None: not read.
+        suffixes: of its files, the usual one first. axes: of ``cloud.py``, what its readers expect. write: bytes of a
+            request, or None: written elsewhere. read: Gaussians of bytes, or None: not read.
         carries: of ``motion``, ``deformation``, ``classes``, ``sky``, ``harmonics``, ``antialias``.
     """
 
@@ -74,38 +75,87 @@ class SplatFormat:
 
 
 FORMATS: Final[Mapping[str, SplatFormat]] = {
-    "ply": SplatFormat((".ply",), "RDF", lambda r: ply.to_bytes(r.cloud, classes=True, marks=r.marks),
-                       ply.from_bytes, frozenset({"harmonics", "classes", "antialias"})),
-    "bundle": SplatFormat((".zip",), axes.WORLD, lambda r: bundle.to_bytes(r.scene, r.log), None,
-                          frozenset({"harmonics", "motion", "deformation", "classes", "sky", "antialias"})),
-    "spz": SplatFormat((".spz",), "RUB", lambda r: spz.to_bytes(r.cloud, r.spz_version, r.antialias),
-                       spz.from_bytes, frozenset({"harmonics", "antialias"})),
-    "glb": SplatFormat((".glb",), "FUR", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf_read.from_bytes,
-                       frozenset({"harmonics", "motion", "antialias"})),
-    "usda": SplatFormat((".usda", ".usd"), axes.WORLD, lambda r: usd.to_text(r.scene, r.time_s, log=r.log), None,
-                        frozenset({"harmonics", "motion", "deformation", "classes"})),
-    "usdz": SplatFormat((".usdz",), axes.WORLD, lambda r: usd.to_package(r.scene, r.time_s, r.log), None,
-                        frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
-    "alpasim": SplatFormat((".usdz",), axes.WORLD, lambda r: alpasim.to_package(r.scene, r.log, r.ground), None,
-                           frozenset({"harmonics", "motion", "deformation", "classes", "sky"})),
-    "compressed-ply": SplatFormat((".compressed.ply", ".ply"), "RDF", lambda r: compressed_ply.to_bytes(r.cloud, r.marks),
-                                  compressed_ply.from_bytes, frozenset({"harmonics", "antialias"})),
-    "sog": SplatFormat((".sog",), "RDF", lambda r: sog.to_bytes(r.cloud, r.antialias), sog.from_bytes,
-                       frozenset({"harmonics", "antialias"})),
+    "ply": SplatFormat(
+        (".ply",),
+        "RDF",
+        lambda r: ply.to_bytes(r.cloud, classes=True, marks=r.marks),
+        ply.from_bytes,
+        frozenset({"harmonics", "classes", "antialias"}),
+    ),
+    "bundle": SplatFormat(
+        (".zip",),
+        axes.WORLD,
+        lambda r: bundle.to_bytes(r.scene, r.log),
+        None,
+        frozenset({"harmonics", "motion", "deformation", "classes", "sky", "antialias"}),
+    ),
+    "spz": SplatFormat(
+        (".spz",),
+        "RUB",
+        lambda r: spz.to_bytes(r.cloud, r.spz_version, r.antialias),
+        spz.from_bytes,
+        frozenset({"harmonics", "antialias"}),
+    ),
+    "glb": SplatFormat(
+        (".glb",),
+        "FUR",
+        lambda r: gltf.to_bytes(r.scene, r.time_s),
+        gltf_read.from_bytes,
+        frozenset({"harmonics", "motion", "antialias"}),
+    ),
+    "usda": SplatFormat(
+        (".usda", ".usd"),
+        axes.WORLD,
+        lambda r: usd.to_text(r.scene, r.time_s, log=r.log),
+        None,
+        frozenset({"harmonics", "motion", "deformation", "classes"}),
+    ),
+    "usdz": SplatFormat(
+        (".usdz",),
+        axes.WORLD,
+        lambda r: usd.to_package(r.scene, r.time_s, r.log),
+        None,
+        frozenset({"harmonics", "motion", "deformation", "classes", "sky"}),
+    ),
+    "alpasim": SplatFormat(
+        (".usdz",),
+        axes.WORLD,
+        lambda r: alpasim.to_package(r.scene, r.log, r.ground),
+        None,
+        frozenset({"harmonics", "motion", "deformation", "classes", "sky"}),
+    ),
+    "compressed-ply": SplatFormat(
+        (".compressed.ply", ".ply"),
+        "RDF",
+        lambda r: compressed_ply.to_bytes(r.cloud, r.marks),
+        compressed_ply.from_bytes,
+        frozenset({"harmonics", "antialias"}),
+    ),
+    "sog": SplatFormat(
+        (".sog",),
+        "RDF",
+        lambda r: sog.to_bytes(r.cloud, r.antialias),
+        sog.from_bytes,
+        frozenset({"harmonics", "antialias"}),
+    ),
     "splat": SplatFormat((".splat",), "RDF", lambda r: splat.to_bytes(r.cloud), splat.from_bytes, frozenset()),
-}  # fmt: skip
+}
 
 
 COARSE_M: Final = 1e-3
 """Steps between places beyond this are worth a word."""
 _OF_TRAINING: Final = "export PLY from the program that trained the Gaussians"
 _UNREAD: Final[Mapping[str, str]] = {
-    ".ksplat": "convert it, for example with splat-transform in.ksplat out.ply", ".lcc": "convert it, for example with splat-transform",
+    ".ksplat": "convert it, for example with splat-transform in.ksplat out.ply",
+    ".lcc": "convert it, for example with splat-transform",
     ".json": "give the .sog file that holds meta.json and its pictures (splat-transform meta.json out.sog)",
     ".gltf": "pack it with its buffers into a .glb file",
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), "export it again as ply, spz or glb"),
-    ".ckpt": _OF_TRAINING, ".pt": _OF_TRAINING, ".pth": _OF_TRAINING, ".npz": _OF_TRAINING,
-}  # fmt: skip
+    ".ckpt": _OF_TRAINING,
+    ".pt": _OF_TRAINING,
+    ".pth": _OF_TRAINING,
+    ".npz": _OF_TRAINING,
+}
 """What to do with files of Gaussians, or that come with them, that are not read."""
 
 
@@ -142,12 +192,14 @@ def format_of(content: bytes, name: str) -> str:
 
 
 def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCloud, str]:
-    """The Gaussians of a file in the axes of this program (z up), and the name of its format; ``means`` f64: take an origin near them away
-    before they become f32. Says on stderr what the file holds that was passed over or taken with doubt.
+    """The Gaussians of a file in the axes of this program (z up), and the name of its format; ``means`` f64: take an
+    origin near them away before they become f32. Says on stderr what the file holds that was passed over or taken with
+    doubt.
 
     Args:
-        name: of the file, for messages and for formats without a mark. choice: of axes. ``file``: what the file says, else those that
-            viewers of its format expect; ``viewer``: these; ``world``: those of this program; or letters of ``cloud.py``.
+        name: of the file, for messages and for formats without a mark. choice: of axes. ``file``: what the file says,
+            else those that viewers of its format expect; ``viewer``: these; ``world``: those of this program; or
+            letters of ``cloud.py``.
 
     Raises:
         InputError: another or a damaged file. ResourceError: a package that this file needs is not installed.
@@ -166,11 +218,20 @@ def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCl
     for warning in (*file.warnings, *doubts):
         log.warn(f"{name}: {warning}")
     if file.axes and file.axes != chosen:
-        log.warn(f"{name}: {file.axes_by} says {axes.in_words(file.axes)}; --axes {choice} reads it as {axes.in_words(chosen)}")
+        log.warn(
+            f"{name}: {file.axes_by} says {axes.in_words(file.axes)}; --axes {choice} reads it as"
+            f" {axes.in_words(chosen)}"
+        )
     elif choice == "file" and file.axes and file.axes != FORMATS[found].axes:
-        log.info(f"{name}: read as {axes.in_words(chosen)}, as {file.axes_by} says; --axes viewer reads it as viewers of its format do")
+        log.info(
+            f"{name}: read as {axes.in_words(chosen)}, as {file.axes_by} says; --axes viewer reads it as viewers of its"
+            " format do"
+        )
     if file.step_m > COARSE_M:
-        log.warn(f"{name}: its places are stored in steps of {file.step_m * 1000:.3g} mm: take an offset away before the file is written")
+        log.warn(
+            f"{name}: its places are stored in steps of {file.step_m * 1000:.3g} mm: take an offset away before the"
+            " file is written"
+        )
     return in_world(file.cloud, chosen), found
 
 

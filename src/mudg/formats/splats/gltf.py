@@ -1,7 +1,7 @@
 """glTF 2.0 with KHR_gaussian_splatting, as one GLB file; objects are nodes of their own, which an animation moves.
 
-Axes: y up; (x, y, z) of this program is (x, z, -y). Quaternions x, y, z, w; scales in metres; opacities 0 to 1; one accessor per harmonic.
-An animation's times begin at 0. Where an object does not exist, its node has the scale `HIDDEN`.
+Axes: y up; (x, y, z) of this program is (x, z, -y). Quaternions x, y, z, w; scales in metres; opacities 0 to 1; one
+accessor per harmonic. An animation's times begin at 0. Where an object does not exist, its node has the scale `HIDDEN`.
 """
 
 from __future__ import annotations
@@ -76,12 +76,17 @@ class _Buffer:
 
 
 def to_bytes(scene: SplatScene, time_s: float | None = None) -> bytes:
-    """A scene as a GLB file: as it is at a time, in one mesh, or (None) with a node per object and an animation of their paths."""
+    """A scene as a GLB file: as it is at a time, in one mesh, or (None) with a node per object and an animation of
+    their paths."""
     buffer = _Buffer()
     document: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "mudg", "extras": dict(scene.facts)},
-        "extensionsUsed": [EXTENSION], "scene": 0, "scenes": [{"name": scene.name, "nodes": []}], "nodes": [], "meshes": [],
-    }  # fmt: skip
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"name": scene.name, "nodes": []}],
+        "nodes": [],
+        "meshes": [],
+    }
     channels, samplers = list[dict[str, Any]](), list[dict[str, Any]]()
     nodes = scene.nodes if time_s is None else (SplatNode("scene", scene.at(time_s)),)
     for node in nodes:
@@ -118,7 +123,7 @@ def _primitive(buffer: _Buffer, cloud: SplatCloud) -> dict[str, Any]:
         PREFIX + "ROTATION": buffer.add(cloud.quats[:, [1, 2, 3, 0]]),
         PREFIX + "SCALE": buffer.add(np.exp(cloud.log_scales.astype(np.float64))),
         PREFIX + "OPACITY": buffer.add(cloud.opacity),
-    }  # fmt: skip
+    }
     for degree in range(cloud.degree + 1):
         for order in range(2 * degree + 1):
             attributes[f"{PREFIX}SH_DEGREE_{degree}_COEF_{order}"] = buffer.add(cloud.sh[:, degree**2 + order])
@@ -181,7 +186,7 @@ def rising(times: NDArray[np.float64]) -> NDArray[np.float32]:
     return made
 
 
-# gltf read ------------------------------------------------------------------------------------------------------------
+# gltf read ----------------------------------------------------------------------------------------
 #
 # Gaussians of GLB files with KHR_gaussian_splatting, in the axes and the place that the file's scene gives them.
 
@@ -190,26 +195,71 @@ _KINDS: Final = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS: Final = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _READ: Final = (EXTENSION, "KHR_mesh_quantization", "KHR_node_visibility", "KHR_materials_unlit")
 """Extensions without which a file can be read, or that are read."""
-_LINEAR: Final = {
-    "srgb_rec709_display": False, "lin_rec709_display": True, "BT.709-sRGB": False, "BT.709-linear": True,
-}  # fmt: skip
+_LINEAR: Final = {"srgb_rec709_display": False, "lin_rec709_display": True, "BT.709-sRGB": False, "BT.709-linear": True}
 """Colour spaces and whether they are linear; the last two are names of the drafts."""
 _KIND: Final = ("kernel", "colorSpace", "projection", "sortingMethod", "extensions", "extras")
 _STANDARD: Final[Mapping[str, frozenset[str]]] = {
-    "": frozenset({
-        "accessors", "animations", "asset", "buffers", "bufferViews", "cameras", "extensions", "extensionsRequired", "extensionsUsed",
-        "extras", "images", "materials", "meshes", "nodes", "samplers", "scene", "scenes", "skins", "textures",
-    }),
-    "nodes.": frozenset({
-        "camera", "children", "extensions", "extras", "matrix", "mesh", "name", "rotation", "scale", "skin", "translation", "weights",
-    }),
+    "": frozenset(
+        {
+            "accessors",
+            "animations",
+            "asset",
+            "buffers",
+            "bufferViews",
+            "cameras",
+            "extensions",
+            "extensionsRequired",
+            "extensionsUsed",
+            "extras",
+            "images",
+            "materials",
+            "meshes",
+            "nodes",
+            "samplers",
+            "scene",
+            "scenes",
+            "skins",
+            "textures",
+        }
+    ),
+    "nodes.": frozenset(
+        {
+            "camera",
+            "children",
+            "extensions",
+            "extras",
+            "matrix",
+            "mesh",
+            "name",
+            "rotation",
+            "scale",
+            "skin",
+            "translation",
+            "weights",
+        }
+    ),
     "primitives.": frozenset({"attributes", "extensions", "extras", "indices", "material", "mode", "targets"}),
-    "accessors.": frozenset({
-        "bufferView", "byteOffset", "componentType", "count", "extensions", "extras", "max", "min", "name", "normalized", "sparse", "type",
-    }),
-}  # fmt: skip
+    "accessors.": frozenset(
+        {
+            "bufferView",
+            "byteOffset",
+            "componentType",
+            "count",
+            "extensions",
+            "extras",
+            "max",
+            "min",
+            "name",
+            "normalized",
+            "sparse",
+            "type",
+        }
+    ),
+}
 """Objects of glTF 2.0 -> their fields, read or not; ``extras`` belong to users."""
-_ATTRIBUTE: Final = re.compile(r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|" + re.escape(PREFIX) + r".*", re.DOTALL)
+_ATTRIBUTE: Final = re.compile(
+    r"POSITION|NORMAL|TANGENT|(TEXCOORD|COLOR|JOINTS|WEIGHTS)_\d+|" + re.escape(PREFIX) + r".*", re.DOTALL
+)
 _ROUNDING: Final = 1e-3
 _MOST_JSON: Final = 64 << 20
 _DEPTH: Final = 32
@@ -218,7 +268,8 @@ Array = NDArray[np.float64]
 
 
 def from_bytes(content: bytes, where: str) -> SplatFile:
-    """The Gaussians of a GLB file, all meshes where the scene's nodes put them (without its animations), in the axes of the file.
+    """The Gaussians of a GLB file, all meshes where the scene's nodes put them (without its animations), in the axes of
+    the file.
 
     Fields that it does not know are passed over, unless the file says that they are required.
 
@@ -235,8 +286,12 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
             else:
                 triangles += 1
     if not clouds:
-        raise InputError("the GLB file holds no Gaussians", where=where, expected=f"meshes with {EXTENSION}",
-            remedy="triangles and points cannot be imported")  # fmt: skip
+        raise InputError(
+            "the GLB file holds no Gaussians",
+            where=where,
+            expected=f"meshes with {EXTENSION}",
+            remedy="triangles and points cannot be imported",
+        )
     if triangles:
         file.warnings[f"{triangles} meshes without Gaussians were passed over"] = None
     if file.entries(file.document, "animations"):
@@ -245,7 +300,9 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         file.notes[sentence(sorted(file.passed), "the document")] = None
     axes = "RDF" if file.of_old_transform(2) else ""
     if axes:
-        file.warnings[f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so; --axes viewer reads as glTF"] = None
+        file.warnings[
+            f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so; --axes viewer reads as glTF"
+        ] = None
     cloud = replace(joined(clouds), antialias=file.antialias)
     return SplatFile(cloud, axes, f"its program {file.generator}", file.step_m, tuple(file.notes), tuple(file.warnings))
 
@@ -256,8 +313,12 @@ def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
         return cloud
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not np.isfinite(scale) or scale <= 0 or geometry.rigid_problem(rigid := _without_scale(matrix, scale), 1e-3):
-        raise InputError("a node of the GLB file is mirrored or scaled unevenly", where=where, got=str(matrix[:3, :3].tolist()),
-            remedy="apply the scale of the node to its Gaussians in the program that wrote the file")  # fmt: skip
+        raise InputError(
+            "a node of the GLB file is mirrored or scaled unevenly",
+            where=where,
+            got=str(matrix[:3, :3].tolist()),
+            remedy="apply the scale of the node to its Gaussians in the program that wrote the file",
+        )
     if scale != 1:
         logs = (cloud.log_scales + np.float32(np.log(scale))).astype(np.float32)
         cloud = checked(replace(cloud, means=cloud.means * scale, log_scales=logs), where)
@@ -281,8 +342,13 @@ class _GlbFile:
         if version != 2:
             raise InputError("this version of glTF is not read", where=where, expected="2", got=str(version))
         if size != len(content):
-            raise InputError("the GLB file has another length than it says", where=where, expected=f"{size} bytes", got=f"{len(content)}",
-                remedy="it was cut off: get it again")  # fmt: skip
+            raise InputError(
+                "the GLB file has another length than it says",
+                where=where,
+                expected=f"{size} bytes",
+                got=f"{len(content)}",
+                remedy="it was cut off: get it again",
+            )
         length, kind = binary.unpacked("<II", content, 12, "the first chunk", where)
         if kind != JSON_CHUNK or length > _MOST_JSON:
             raise InputError(
@@ -316,15 +382,21 @@ class _GlbFile:
         self.passed.update(f"{within}{name}" for name in owner if name not in _STANDARD[within])
 
     def _check_extensions(self) -> None:
-        """Refuse a file that cannot be read without extensions that are not known here; list those that it can be read without."""
+        """Refuse a file that cannot be read without extensions that are not known here; list those that it can be read
+        without."""
         for name in ("extensionsRequired", "extensionsUsed"):
             stated = self.document.get(name, [])
             if not isinstance(stated, list) or any(not isinstance(one, str) for one in stated):
                 raise InputError(f"{name} is no list of names", where=f"{self.where}: JSON", got=repr(stated)[:60])
             unknown = [one for one in stated if one not in _READ]
             if unknown and name == "extensionsRequired":
-                raise InputError("the GLB file needs an extension that is not read", where=f"{self.where}: JSON",
-                    got=listed(unknown), expected=", ".join(_READ), remedy="write the file without it, or as SPZ")  # fmt: skip
+                raise InputError(
+                    "the GLB file needs an extension that is not read",
+                    where=f"{self.where}: JSON",
+                    got=listed(unknown),
+                    expected=", ".join(_READ),
+                    remedy="write the file without it, or as SPZ",
+                )
             self.passed.update(unknown)
 
     def of_old_transform(self, before: int) -> bool:
@@ -343,8 +415,12 @@ class _GlbFile:
         """The object that an index names."""
         found = self.entries(self.document, name)
         if type(index) is not int or not 0 <= index < len(found):
-            raise InputError(f"an index names nothing in {name}", where=f"{self.where}: JSON", expected=f"0 to {len(found) - 1}",
-                got=repr(index)[:40])  # fmt: skip
+            raise InputError(
+                f"an index names nothing in {name}",
+                where=f"{self.where}: JSON",
+                expected=f"0 to {len(found) - 1}",
+                got=repr(index)[:40],
+            )
         return found[index]
 
     def number(self, owner: dict[str, Any], name: str, default: int) -> int:
@@ -373,7 +449,7 @@ class _GlbFile:
             raise InputError(f"{name} holds a number that is not finite", where=f"{self.where}: JSON")
         return made
 
-    # -- nodes -----------------------------------------------------------------------------------------------------------
+    # -- nodes -------------------------------------------------------------------------------------
 
     def placed(self) -> Iterator[tuple[Array, dict[str, Any]]]:
         """Matrix and mesh of every node of the scene."""
@@ -421,7 +497,7 @@ class _GlbFile:
         matrix[:3, :3] *= scale
         return matrix
 
-    # -- accessors -------------------------------------------------------------------------------------------------------
+    # -- accessors ---------------------------------------------------------------------------------
 
     def cloud(self, primitive: dict[str, Any], kind: Any) -> SplatCloud:
         """The Gaussians of a primitive, in the frame of its node."""
@@ -436,15 +512,25 @@ class _GlbFile:
         if space is None:
             self.warnings["it names no colorSpace, which the standard requires: read as sRGB"] = None
         elif not isinstance(space, str) or space not in _LINEAR:
-            raise InputError("the colour space of the Gaussians is not known", where=f"{self.where}: {EXTENSION}: colorSpace",
-                expected=", ".join(_LINEAR), got=repr(space)[:60], remedy="convert the colours to sRGB")  # fmt: skip
+            raise InputError(
+                "the colour space of the Gaussians is not known",
+                where=f"{self.where}: {EXTENSION}: colorSpace",
+                expected=", ".join(_LINEAR),
+                got=repr(space)[:60],
+                remedy="convert the colours to sRGB",
+            )
         self._note("primitives.", primitive)
         self.passed.update(f"attributes.{name}" for name in attributes if not _ATTRIBUTE.fullmatch(name))
         inner = kind.get("extensions")
         compressed = [name for name in inner if "compression" in name] if isinstance(inner, dict) else []
         if compressed:
-            raise InputError("the Gaussians of the GLB file are compressed", where=f"{self.where}: {EXTENSION}",
-                got=listed(compressed), expected="attributes without compression", remedy="write it without, or as SPZ")  # fmt: skip
+            raise InputError(
+                "the Gaussians of the GLB file are compressed",
+                where=f"{self.where}: {EXTENSION}",
+                got=listed(compressed),
+                expected="attributes without compression",
+                remedy="write it without, or as SPZ",
+            )
         self.passed.update(f"{EXTENSION}.{name}" for name in kind if name not in _KIND)
         self.passed.update(f"{EXTENSION}.extensions.{name}" for name in (inner if isinstance(inner, dict) else ()))
         for name, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
@@ -487,24 +573,38 @@ class _GlbFile:
         if beyond:
             self.warnings[f"harmonics beyond degree 3 were dropped: {listed(beyond)}"] = None
         self.step_m = max(self.step_m, spacing_m(means))
-        quats, logs, logits, sh = (values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh))
+        quats, logs, logits, sh = (
+            values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)
+        )
         return checked(SplatCloud(means, quats, logs, logits, sh), self.where)
 
     def _logits_and_logs(self, opacity: Array, scale: Array) -> tuple[NDArray[np.floating], Array]:
-        """Logits f64[n] and logarithms f64[n, 3]; a program that is known for it wrote these in place of opacities and sizes."""
+        """Logits f64[n] and logarithms f64[n, 3]; a program that is known for it wrote these in place of opacities and
+        sizes."""
         raw = (scale < 0).any() or (opacity < -_ROUNDING).any() or (opacity > 1 + _ROUNDING).any()
         if raw and self.of_old_transform(3):
-            self.warnings[f"{self.generator} wrote logits and logarithms, where glTF has opacities and sizes: read so"] = None
+            self.warnings[
+                f"{self.generator} wrote logits and logarithms, where glTF has opacities and sizes: read so"
+            ] = None
             return opacity, scale
         if (bad := (opacity < -_ROUNDING) | (opacity > 1 + _ROUNDING)).any():
             row = int(bad.argmax())
-            raise InputError("the opacity of a Gaussian is not between 0 and 1", where=f"{self.where}: Gaussian {row}", expected="0 to 1",
+            raise InputError(
+                "the opacity of a Gaussian is not between 0 and 1",
+                where=f"{self.where}: Gaussian {row}",
+                expected="0 to 1",
                 got=f"{opacity[row]:.4g}; {int(bad.sum())} of {len(opacity)}: they look like logits",
-                remedy="write 1 / (1 + exp(-logit)) into the file")  # fmt: skip
+                remedy="write 1 / (1 + exp(-logit)) into the file",
+            )
         if raw:
             row = int((scale < 0).any(1).argmax())
-            raise InputError("the size of a Gaussian is negative", where=f"{self.where}: Gaussian {row}", expected="metres",
-                got=f"{scale[row].tolist()}: they look like logarithms", remedy="write exp(scale) into the file")  # fmt: skip
+            raise InputError(
+                "the size of a Gaussian is negative",
+                where=f"{self.where}: Gaussian {row}",
+                expected="metres",
+                got=f"{scale[row].tolist()}: they look like logarithms",
+                remedy="write exp(scale) into the file",
+            )
         with np.errstate(divide="ignore", invalid="ignore"):
             return logit(opacity), np.maximum(np.log(scale), LEAST_LOG)
 
@@ -521,20 +621,32 @@ class _GlbFile:
         self._note("accessors.", accessor)
         component = accessor.get("componentType")
         if component not in _KINDS or _WIDTHS.get(str(accessor.get("type"))) != width or "sparse" in accessor:
-            raise InputError("an attribute of the Gaussians has the wrong type", where=f"{self.where}: {name}", expected=f"{width} numbers",
-                got=f"{accessor.get('type')} of {component}")  # fmt: skip
+            raise InputError(
+                "an attribute of the Gaussians has the wrong type",
+                where=f"{self.where}: {name}",
+                expected=f"{width} numbers",
+                got=f"{accessor.get('type')} of {component}",
+            )
         rows, dtype = self.number(accessor, "count", 0), np.dtype(_KINDS[component])
         binary.refuse_count(rows, f"{self.where}: {name}")
         if count is not None and rows != count:
-            raise InputError("the attributes of the Gaussians differ in length", where=f"{self.where}: {name}", expected=str(count),
-                got=str(rows))  # fmt: skip
+            raise InputError(
+                "the attributes of the Gaussians differ in length",
+                where=f"{self.where}: {name}",
+                expected=str(count),
+                got=str(rows),
+            )
         view = self.entry("bufferViews", accessor.get("bufferView"))
         packed = view.get("extensions")
         buffers = self.entries(self.document, "buffers")
         if view.get("buffer", 0) != 0 or packed or (buffers and "uri" in buffers[0]):
-            raise InputError("an attribute of the Gaussians lies outside the file, or is compressed", where=f"{self.where}: {name}",
-                expected="the binary chunk", got=f"buffer {view.get('buffer', 0)!r:.20}, extensions {listed(packed or ())}",
-                remedy="pack the file with its buffers, without compression")  # fmt: skip
+            raise InputError(
+                "an attribute of the Gaussians lies outside the file, or is compressed",
+                where=f"{self.where}: {name}",
+                expected="the binary chunk",
+                got=f"buffer {view.get('buffer', 0)!r:.20}, extensions {listed(packed or ())}",
+                remedy="pack the file with its buffers, without compression",
+            )
         stride = self.number(view, "byteStride", 0) or width * dtype.itemsize
         begins, inner = self.number(view, "byteOffset", 0), self.number(accessor, "byteOffset", 0)
         size = (rows - 1) * stride + width * dtype.itemsize
@@ -553,7 +665,8 @@ class _GlbFile:
 
 
 def _of_display(sh: Array) -> Array:
-    """Harmonics of linear light to such of display values: exact for the constant band, to first order for the others."""
+    """Harmonics of linear light to such of display values: exact for the constant band, to first order for the
+    others."""
     linear = np.maximum(sh[:, :1] * C0 + 0.5, 1e-4)
     display = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
     slope = np.where(linear <= 0.0031308, 12.92, 1.055 / 2.4 * linear ** (1 / 2.4 - 1))

@@ -1,12 +1,14 @@
 """The PLY of Gaussian splatting (Kerbl et al. 2023), which every viewer reads.
 
     ply / format binary_little_endian 1.0 / element vertex N / property float x ... / end_header, then rows of f32:
-    x y z  nx ny nz (zero)  f_dc_0..2  f_rest_0..(3 (K - 1) - 1)  opacity (logit)  scale_0..2 (natural logarithm)  rot_0..3 (w x y z)
+    x y z  nx ny nz (zero)  f_dc_0..2  f_rest_0..(3 (K - 1) - 1)  opacity (logit)  scale_0..2 (natural logarithm)
+    rot_0..3 (w x y z)
 
-``f_rest`` holds all red coefficients, then green, then blue. Columns of our own stand last (``class``: train id, 255 = unknown).
+``f_rest`` holds all red coefficients, then green, then blue. Columns of our own stand last (``class``: train id, 255 =
+unknown).
 
-Read besides: files without ``scale_2`` (2DGS: flat), ``filter_3D`` (Mip-Splatting: the least size that the recording resolved, which
-belongs to size and opacity), elements and lists of others, and what comments say of drawing and axes:
+Read besides: files without ``scale_2`` (2DGS: flat), ``filter_3D`` (Mip-Splatting: the least size that the recording
+resolved, which belongs to size and opacity), elements and lists of others, and what comments say of drawing and axes:
 
     comment SplatRenderMode: mip      (Brush, gsplat; also written here)      comment antialiased 1 (Postshot)
     comment Vertical Axis: z          (nerfstudio; also written here, where a file has the axes of this program)
@@ -34,18 +36,55 @@ MOST_LISTS: Final = 2_000_000
 FLAT_LOG: Final = float(np.log(1e-6))
 """Thickness of flat Gaussians, whose files state none."""
 _MODES: Final = {"mip": True, "antialiased": True, "antialias": True, "default": False, "classic": False, "2dgs": False}
-_MOTION: Final = ("trbf", "motion", "omega", "t_", "time", "scale_t", "scaling_t", "rot_r", "rotation_r", "velocity", "duration")
+_MOTION: Final = (
+    "trbf",
+    "motion",
+    "omega",
+    "t_",
+    "time",
+    "scale_t",
+    "scaling_t",
+    "rot_r",
+    "rotation_r",
+    "velocity",
+    "duration",
+)
 """Beginnings of columns with which methods for moving scenes move their Gaussians."""
 _UNREAD: Final = ("nx", "ny", "nz", "red", "green", "blue", "alpha")
 _ELEMENTS: Final = (
-    "face", "edge", "tristrips", "material", "camera", "extrinsic", "intrinsic", "image_size", "frame", "disparity", "color_space",
+    "face",
+    "edge",
+    "tristrips",
+    "material",
+    "camera",
+    "extrinsic",
+    "intrinsic",
+    "image_size",
+    "frame",
+    "disparity",
+    "color_space",
     "version",
-)  # fmt: skip
-"""Columns and elements of others that say nothing about Gaussians (from ``extrinsic`` on: ml-sharp). PLY has no closed list."""
+)
+"""Columns and elements of others that say nothing about Gaussians (from ``extrinsic`` on: ml-sharp). PLY has no closed
+list."""
 _TYPES: Final = {
-    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2", "uint16": "u2",
-    "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4", "double": "f8", "float64": "f8",
-}  # fmt: skip
+    "char": "i1",
+    "int8": "i1",
+    "uchar": "u1",
+    "uint8": "u1",
+    "short": "i2",
+    "int16": "i2",
+    "ushort": "u2",
+    "uint16": "u2",
+    "int": "i4",
+    "int32": "i4",
+    "uint": "u4",
+    "uint32": "u4",
+    "float": "f4",
+    "float32": "f4",
+    "double": "f8",
+    "float64": "f8",
+}
 _LENGTHS: Final = {name for name, kind in _TYPES.items() if kind[0] != "f"}
 _REST: Final = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 """Number of ``f_rest`` columns: degree."""
@@ -54,8 +93,15 @@ _REST: Final = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 def to_bytes(cloud: SplatCloud, *, classes: bool = False, marks: Sequence[str] = ()) -> bytes:
     """A cloud as a PLY file; ``classes`` adds the column of our own, ``marks`` are comments (``marks_of``)."""
     with_classes = classes and cloud.class_ids is not None
-    columns = [cloud.means, np.zeros_like(cloud.means), cloud.sh[:, 0], channel_major(cloud.sh), cloud.logits[:, None],
-               cloud.log_scales, cloud.quats]  # fmt: skip
+    columns = [
+        cloud.means,
+        np.zeros_like(cloud.means),
+        cloud.sh[:, 0],
+        channel_major(cloud.sh),
+        cloud.logits[:, None],
+        cloud.log_scales,
+        cloud.quats,
+    ]
     if with_classes and cloud.class_ids is not None:
         columns.append(cloud.class_ids[:, None])
     rows = np.concatenate([column.astype("<f4") for column in columns], 1)
@@ -94,7 +140,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         1,
     )
     classes = None
-    if ours := "class" in names and table.dtype["class"].kind == "f":  # others number classes in whole numbers, and otherwise
+    # others number classes in whole numbers, and otherwise
+    if ours := "class" in names and table.dtype["class"].kind == "f":
         with np.errstate(invalid="ignore"):
             ids = np.asarray(table["class"], np.float64)
             classes = np.where((ids >= 0) & (ids <= 255), ids, 255).astype(np.uint8)
@@ -104,8 +151,18 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if flat:
         logs = np.column_stack([logs, np.full(len(logs), FLAT_LOG, np.float32)])
         notes.append("it has no scale_2: read as flat Gaussians (2DGS)")
-    cloud = checked(SplatCloud(means, columns_of(table, _indexed("rot", 4)), logs, np.asarray(table["opacity"], np.float32), sh, classes,
-                               file.antialias), where)  # fmt: skip
+    cloud = checked(
+        SplatCloud(
+            means,
+            columns_of(table, _indexed("rot", 4)),
+            logs,
+            np.asarray(table["opacity"], np.float32),
+            sh,
+            classes,
+            file.antialias,
+        ),
+        where,
+    )
     filters = [name for name in names if name.lower() == "filter_3d"]
     if filters:
         cloud = _filtered(cloud, np.asarray(table[filters[0]], np.float64), where)
@@ -130,20 +187,39 @@ def _refuse_columns(table: NDArray[Any], wanted: tuple[str, ...], where: str) ->
     names = table.dtype.names or ()
     missing = [name for name in wanted if name not in names]
     if missing:
-        alike = any(name.lower().startswith(("scal", "rot", "quat", "opac", "f_dc", "f_rest", "sh", "feat")) for name in names)
-        remedy = f"name the columns as 3D Gaussian Splatting does: {', '.join(wanted)}" if alike else "points or meshes cannot be imported"
-        raise InputError("the PLY file holds no Gaussians" if not alike else "a column of the Gaussians is missing", where=where,
-            expected=f"a property {missing[0]!r}", got=listed(names), remedy=remedy)  # fmt: skip
+        alike = any(
+            name.lower().startswith(("scal", "rot", "quat", "opac", "f_dc", "f_rest", "sh", "feat")) for name in names
+        )
+        remedy = (
+            f"name the columns as 3D Gaussian Splatting does: {', '.join(wanted)}"
+            if alike
+            else "points or meshes cannot be imported"
+        )
+        raise InputError(
+            "the PLY file holds no Gaussians" if not alike else "a column of the Gaussians is missing",
+            where=where,
+            expected=f"a property {missing[0]!r}",
+            got=listed(names),
+            remedy=remedy,
+        )
     whole = [name for name in wanted if name not in "xyz" and table.dtype[name].kind != "f"]
     if whole:
-        raise InputError("a column of the Gaussians holds whole numbers", where=where, expected=f"{whole[0]} as float",
-            got=str(table.dtype[whole[0]]), remedy="write logits, logarithms of sizes, and harmonics")  # fmt: skip
+        raise InputError(
+            "a column of the Gaussians holds whole numbers",
+            where=where,
+            expected=f"{whole[0]} as float",
+            got=str(table.dtype[whole[0]]),
+            remedy="write logits, logarithms of sizes, and harmonics",
+        )
 
 
 def _filtered(cloud: SplatCloud, filter_m: NDArray[np.float64], where: str) -> SplatCloud:
-    """Gaussians blurred by a filter f64[n] in metres (Mip-Splatting, eq. 7): sizes grow, opacities fall with the volume."""
+    """Gaussians blurred by a filter f64[n] in metres (Mip-Splatting, eq. 7): sizes grow, opacities fall with the
+    volume."""
     if not np.isfinite(filter_m).all():
-        raise InputError("a filter_3D is not finite", where=f"{where}: Gaussian {int((~np.isfinite(filter_m)).argmax())}")
+        raise InputError(
+            "a filter_3D is not finite", where=f"{where}: Gaussian {int((~np.isfinite(filter_m)).argmax())}"
+        )
     variance = np.exp(2 * cloud.log_scales.astype(np.float64))
     grown = variance + (filter_m**2)[:, None]
     share = np.exp(0.5 * (np.log(variance) - np.log(grown)).sum(1))
@@ -151,11 +227,12 @@ def _filtered(cloud: SplatCloud, filter_m: NDArray[np.float64], where: str) -> S
     return checked(replace(cloud, log_scales=logs, logits=logit(cloud.opacity * share)), where)
 
 
-# -- headers -------------------------------------------------------------------------------------------------------------
+# -- headers ---------------------------------------------------------------------------------------
 
 
 def marks_of(antialias: bool, z_up: bool) -> list[str]:
-    """Comments on what differs from the usual PLY of Gaussians: they are to be drawn antialiased; the axes are those of this program."""
+    """Comments on what differs from the usual PLY of Gaussians: they are to be drawn antialiased; the axes are those of
+    this program."""
     return ["SplatRenderMode: mip"] * antialias + ["Vertical Axis: z"] * z_up
 
 
@@ -169,7 +246,8 @@ def header(elements: list[tuple[str, int, list[tuple[str, str]]]], comments: Seq
 
 @dataclass
 class _Element:
-    """An element of the header; a column of a list has the types of its length and of its entries, another one of no length."""
+    """An element of the header; a column of a list has the types of its length and of its entries, another one of no
+    length."""
 
     name: str
     count: int
@@ -201,15 +279,21 @@ def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFil
         lists = any(length for length, _, _ in element.columns)
         if lists and element.name in wanted:
             name = next(name for length, _, name in element.columns if length)
-            raise InputError("the Gaussians of a PLY file have lists", where=f"{where}: element {element.name!r}",
-                got=f"property list {name!r}", remedy="write one property for each number")  # fmt: skip
+            raise InputError(
+                "the Gaussians of a PLY file have lists",
+                where=f"{where}: element {element.name!r}",
+                got=f"property list {name!r}",
+                remedy="write one property for each number",
+            )
         if lists:
             place = _after_lists(content, place, element, order, where)
             continue
         try:
             dtype = np.dtype([(name, order + kind) for _, kind, name in element.columns])
         except ValueError as error:
-            raise InputError("two properties of a PLY element have one name", where=where, got=str(error)[:200]) from error
+            raise InputError(
+                "two properties of a PLY element have one name", where=where, got=str(error)[:200]
+            ) from error
         size = element.count * dtype.itemsize
         rows = binary.part(content, place, size, f"element {element.name!r}", where)
         if dtype.itemsize and element.name in wanted:
@@ -224,7 +308,9 @@ def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFil
     if colors:  # of apple/ml-sharp, for example
         warnings.append(f"the colour space in element {listed(colors)} is not read: colours are taken as sRGB")
     if offset:
-        warnings.append(f"the comment {offset[:80]!r} is not used: places are as the file has them (--origin-m chooses the origin)")
+        warnings.append(
+            f"the comment {offset[:80]!r} is not used: places are as the file has them (--origin-m chooses the origin)"
+        )
     return PlyFile(tables, antialias, axes, by, (sentence(unknown, "the header"),) if unknown else (), tuple(warnings))
 
 
@@ -248,17 +334,32 @@ def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str
         elif words[0] == "format" and len(words) == 3:
             order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1], "")
             if not order:
-                raise InputError("this kind of PLY is not read", where=where, expected="binary_little_endian", got=words[1][:40],
-                    remedy="save it as a binary PLY")  # fmt: skip
+                raise InputError(
+                    "this kind of PLY is not read",
+                    where=where,
+                    expected="binary_little_endian",
+                    got=words[1][:40],
+                    remedy="save it as a binary PLY",
+                )
         elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 12:
             elements.append(_Element(words[1], int(words[2]), []))
         elif words[0] == "property" and len(words) == 3 and words[1] in _TYPES and elements:
             elements[-1].columns.append(("", _TYPES[words[1]], words[2]))
-        elif words[:2] == ["property", "list"] and len(words) == 5 and words[2] in _LENGTHS and words[3] in _TYPES and elements:
+        elif (
+            words[:2] == ["property", "list"]
+            and len(words) == 5
+            and words[2] in _LENGTHS
+            and words[3] in _TYPES
+            and elements
+        ):
             elements[-1].columns.append((_TYPES[words[2]], _TYPES[words[3]], words[4]))
         else:
-            raise InputError("a line in the header of the PLY file is not understood", where=where, got=repr(line[:80]),
-                expected="format, element NAME COUNT, property TYPE NAME, or property list TYPE TYPE NAME")  # fmt: skip
+            raise InputError(
+                "a line in the header of the PLY file is not understood",
+                where=where,
+                got=repr(line[:80]),
+                expected="format, element NAME COUNT, property TYPE NAME, or property list TYPE TYPE NAME",
+            )
     if not order or not elements:
         raise InputError("the header of the PLY file names no format or no elements", where=where)
     for element in elements:
@@ -270,8 +371,13 @@ def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str
 def _after_lists(content: bytes, place: int, element: _Element, order: str, where: str) -> int:
     """Where the rows of an element with lists, which stand before the Gaussians, end."""
     if element.count > MOST_LISTS:
-        raise InputError("a PLY file has too many lists before its Gaussians", where=f"{where}: element {element.name!r}",
-            expected=f"at most {MOST_LISTS}", got=str(element.count), remedy="write the vertices first")  # fmt: skip
+        raise InputError(
+            "a PLY file has too many lists before its Gaussians",
+            where=f"{where}: element {element.name!r}",
+            expected=f"at most {MOST_LISTS}",
+            got=str(element.count),
+            remedy="write the vertices first",
+        )
     columns = [
         (struct.Struct(order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize)
         for length, kind, _ in element.columns
@@ -289,7 +395,7 @@ def _after_lists(content: bytes, place: int, element: _Element, order: str, wher
     return place
 
 
-# -- comments ------------------------------------------------------------------------------------------------------------
+# -- comments --------------------------------------------------------------------------------------
 
 
 def _antialias(comments: list[str], warnings: list[str]) -> bool:
@@ -323,12 +429,14 @@ def _axes(comments: list[str], warnings: list[str]) -> tuple[str, str]:
         if axis in VERTICAL:
             return VERTICAL[axis], f"the comment {line[:80]!r}"
         if not any("brush" in other.lower() for other in comments):  # which writes it into every file
-            warnings.append(f"the comment {line[:80]!r} does not tell whether y points up or down: read with y down, as usual; "
-                            "if it stands on its head, add --axes RUB")  # fmt: skip
+            warnings.append(
+                f"the comment {line[:80]!r} does not tell whether y points up or down: read with y down, as usual; "
+                "if it stands on its head, add --axes RUB"
+            )
     return "", ""
 
 
-# -- columns -------------------------------------------------------------------------------------------------------------
+# -- columns ---------------------------------------------------------------------------------------
 
 
 def columns_of(table: NDArray[Any], names: tuple[str, ...]) -> NDArray[np.float32]:
@@ -346,8 +454,19 @@ def _indexed(name: str, count: int) -> tuple[str, ...]:
 
 def _names(degree: int) -> tuple[str, ...]:
     rest = 3 * ((degree + 1) ** 2 - 1)
-    return ("x", "y", "z", "nx", "ny", "nz", *_indexed("f_dc", 3), *_indexed("f_rest", rest), "opacity", *_indexed("scale", 3),
-            *_indexed("rot", 4))  # fmt: skip
+    return (
+        "x",
+        "y",
+        "z",
+        "nx",
+        "ny",
+        "nz",
+        *_indexed("f_dc", 3),
+        *_indexed("f_rest", rest),
+        "opacity",
+        *_indexed("scale", 3),
+        *_indexed("rot", 4),
+    )
 
 
 def channel_major(sh: NDArray[np.float32]) -> NDArray[np.float32]:

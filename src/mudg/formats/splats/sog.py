@@ -1,9 +1,12 @@
-"""SOG (PlayCanvas), version 2: a stored zip of lossless WebP pictures, one pixel a Gaussian, and ``meta.json``. The smallest of all here.
+"""SOG (PlayCanvas), version 2: a stored zip of lossless WebP pictures, one pixel a Gaussian, and ``meta.json``. The
+smallest of all here.
 
 means_l, means_u   low and high byte of 16 bits of sign(x) ln(|x| + 1), between ``mins`` and ``maxs``
-quats              r g b: the three smallest of (w, x, y, z) times sqrt 2, as (v + 1) / 2; alpha: 252 + index of the largest
+quats              r g b: the three smallest of (w, x, y, z) times sqrt 2, as (v + 1) / 2; alpha: 252 + index of the
+                   largest
 scales, sh0        index into a table of 256 values: natural logarithms of sizes; f_dc, with the opacity in alpha
-shN_labels         16 bits (red, green): which row of ``shN_centroids``; these hold indices into another table of 256 values
+shN_labels         16 bits (red, green): which row of ``shN_centroids``; these hold indices into another table of 256
+                   values
 meta.json          besides: ``antialias``, or in newer files ``model``: default, antialiased, 2dgs
 """
 
@@ -88,7 +91,7 @@ class SogMeta(ForeignRecord):
     model: Any = None
 
 
-# -- writing -------------------------------------------------------------------------------------------------------------
+# -- writing ---------------------------------------------------------------------------------------
 
 
 def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
@@ -104,16 +107,21 @@ def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
     opacity = np.round(cloud.opacity * 255.0)
     solid = np.full(len(cloud), 255)
     files = {
-        "means_l.webp": np.column_stack([place & 255, solid]), "means_u.webp": np.column_stack([place >> 8, solid]),
-        "quats.webp": turn, "scales.webp": np.column_stack([size_index, solid]),
+        "means_l.webp": np.column_stack([place & 255, solid]),
+        "means_u.webp": np.column_stack([place >> 8, solid]),
+        "quats.webp": turn,
+        "scales.webp": np.column_stack([size_index, solid]),
         "sh0.webp": np.column_stack([color_index, opacity]),
-    }  # fmt: skip
+    }
     meta: dict[str, Any] = {
-        "version": 2, "count": len(cloud), "asset": {"generator": "mudg"},
+        "version": 2,
+        "count": len(cloud),
+        "asset": {"generator": "mudg"},
         "means": {"mins": low.tolist(), "maxs": high.tolist(), "files": ["means_l.webp", "means_u.webp"]},
-        "scales": {"codebook": sizes.tolist(), "files": ["scales.webp"]}, "quats": {"files": ["quats.webp"]},
+        "scales": {"codebook": sizes.tolist(), "files": ["scales.webp"]},
+        "quats": {"files": ["quats.webp"]},
         "sh0": {"codebook": colors.tolist(), "files": ["sh0.webp"]},
-    }  # fmt: skip
+    }
     if antialias:
         meta |= {"antialias": True, "model": "antialiased"}  # for programs before and since splat-transform 3.2
     pictures = {name: _webp(_laid_out(rgba.astype(np.uint8))) for name, rgba in files.items()}
@@ -123,13 +131,18 @@ def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
         pictures["shN_centroids.webp"] = _webp(_centroid_picture(index))
         columns = np.column_stack([labels & 255, labels >> 8, np.zeros_like(labels), solid])
         pictures["shN_labels.webp"] = _webp(_laid_out(columns.astype(np.uint8)))
-        meta["shN"] = {"count": len(palette), "bands": cloud.degree, "codebook": table.tolist(),
-                       "files": ["shN_centroids.webp", "shN_labels.webp"]}  # fmt: skip
+        meta["shN"] = {
+            "count": len(palette),
+            "bands": cloud.degree,
+            "codebook": table.tolist(),
+            "files": ["shN_centroids.webp", "shN_labels.webp"],
+        }
     return binary.stored_zip({"meta.json": json.dumps(meta, allow_nan=False).encode(), **pictures})
 
 
 def codebook(values: NDArray[np.floating]) -> tuple[Array, NDArray[np.intp]]:
-    """256 values, rising, and for each of ``values`` the index of the nearest: k-means of numbers, begun at quantiles."""
+    """256 values, rising, and for each of ``values`` the index of the nearest: k-means of numbers, begun at
+    quantiles."""
     flat = np.asarray(values, np.float64).reshape(-1)
     ordered = np.sort(flat)
     distinct = np.unique(ordered)
@@ -149,7 +162,8 @@ def codebook(values: NDArray[np.floating]) -> tuple[Array, NDArray[np.intp]]:
 
 
 def _palette(rows: NDArray[np.float32]) -> tuple[Array, NDArray[np.int64]]:
-    """Up to 65536 representative rows, and for each row the index of its own: k-means, begun at rows spread over the file."""
+    """Up to 65536 representative rows, and for each row the index of its own: k-means, begun at rows spread over the
+    file."""
     count = len(rows) if len(rows) <= 1024 else min(64, 1 << (len(rows) // 1024).bit_length() - 1) * 1024
     palette = rows[np.linspace(0, len(rows) - 1, count).round().astype(int)].astype(np.float64)
     labels = np.arange(len(rows))
@@ -188,7 +202,7 @@ def _webp(picture: Picture) -> bytes:
     return target.getvalue()
 
 
-# -- reading -------------------------------------------------------------------------------------------------------------
+# -- reading ---------------------------------------------------------------------------------------
 
 
 def from_bytes(content: bytes, where: str) -> SplatFile:
@@ -200,13 +214,21 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     archive = binary.BoundedZip(content, where)
     names = [name for name in archive.names if name.rpartition("/")[2] == "meta.json"]
     if not names:
-        raise InputError("the zip is no SOG file", where=where, expected="meta.json", got=listed(archive.names) or "an empty zip",
-            remedy="of a bundle, give the PLY files within" if "bundle.json" in archive.names else "")  # fmt: skip
+        raise InputError(
+            "the zip is no SOG file",
+            where=where,
+            expected="meta.json",
+            got=listed(archive.names) or "an empty zip",
+            remedy="of a bundle, give the PLY files within" if "bundle.json" in archive.names else "",
+        )
     folder = names[0].removesuffix("meta.json")
     stated = store.parse_json(archive.read(names[0], _MOST_META), f"{where}: {names[0]}")
     if isinstance(stated, dict) and stated.get("version") != 2:
         raise InputError(
-            "this version of SOG is not read", where=where, expected="2", got=str(stated.get("version", "1 (none stated)"))[:20],
+            "this version of SOG is not read",
+            where=where,
+            expected="2",
+            got=str(stated.get("version", "1 (none stated)"))[:20],
             remedy="convert it, for example with splat-transform",
         )
     meta = parse_record(SogMeta, stated, f"{where}: {names[0]}: ")
@@ -221,8 +243,12 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     turn = pixels.rows(meta.quats.files[0])
     largest = turn[:, 3].astype(np.int64) - 252
     if (largest < 0).any():
-        raise InputError("a rotation names no component", where=f"{where}: {meta.quats.files[0]}", expected="alpha from 252 to 255",
-            got=str(int(turn[:, 3].min())))  # fmt: skip
+        raise InputError(
+            "a rotation names no component",
+            where=f"{where}: {meta.quats.files[0]}",
+            expected="alpha from 252 to 255",
+            got=str(int(turn[:, 3].min())),
+        )
     quats = binary.from_smallest_three(largest, (turn[:, :3] / 255.0 * 2 - 1) / np.sqrt(2))
     scales = np.array(meta.scales.codebook)[pixels.rows(meta.scales.files[0])[:, :3]]
     first = pixels.rows(meta.sh0.files[0])
@@ -248,8 +274,12 @@ def _harmonics(stated: SogHarmonics, pixels: _Pictures, where: str) -> Array:
     palette = picture.reshape(-1, coefficients, 4)[: stated.count, :, :3]
     labels = pixels.rows(stated.files[1])[:, :2] @ np.array([1, 256])
     if len(labels) and int(labels.max()) >= stated.count:
-        raise InputError("a Gaussian names harmonics that the palette does not have", where=f"{where}: {stated.files[1]}",
-            expected=f"below {stated.count}", got=str(int(labels.max())))  # fmt: skip
+        raise InputError(
+            "a Gaussian names harmonics that the palette does not have",
+            where=f"{where}: {stated.files[1]}",
+            expected=f"below {stated.count}",
+            got=str(int(labels.max())),
+        )
     return np.array(stated.codebook)[palette][labels]
 
 

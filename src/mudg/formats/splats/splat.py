@@ -1,6 +1,7 @@
 """The ``.splat`` of web viewers: no header, 32 bytes a Gaussian, no harmonics beyond degree 0.
 
-f32 x y z   f32 scale x y z (metres)   u8 r g b (colour of degree 0), opacity   u8 rotation w x y z = round((q + 1) / 2 * 255)
+f32 x y z  f32 scale x y z (metres)  u8 r g b (colour of degree 0), opacity
+u8 rotation w x y z = round((q + 1) / 2 * 255)
 """
 
 from __future__ import annotations
@@ -36,18 +37,27 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         InputError: no such file, or a damaged one.
     """
     if len(content) % ROW.itemsize:
-        raise InputError("the length of a .splat file is a multiple of 32 bytes", where=where, got=f"{len(content)} bytes",
-            remedy="it was cut off, or is another kind of file")  # fmt: skip
+        raise InputError(
+            "the length of a .splat file is a multiple of 32 bytes",
+            where=where,
+            got=f"{len(content)} bytes",
+            remedy="it was cut off, or is another kind of file",
+        )
     binary.refuse_count(len(content) // ROW.itemsize, where)
     rows = np.frombuffer(content, ROW)
     scales = rows["scales"].astype(np.float64)
     if (scales < 0).any():
-        raise InputError("the size of a Gaussian is negative", where=f"{where}: Gaussian {int((scales < 0).any(1).argmax())}",
-            remedy="a .splat file holds sizes in metres, not their logarithms: write exp(scale)")  # fmt: skip
+        raise InputError(
+            "the size of a Gaussian is negative",
+            where=f"{where}: Gaussian {int((scales < 0).any(1).argmax())}",
+            remedy="a .splat file holds sizes in metres, not their logarithms: write exp(scale)",
+        )
     with np.errstate(divide="ignore"):
         logs = np.maximum(np.log(scales), LEAST_LOG)
     rgba = rows["rgba"] / 255
     sh = ((rgba[:, None, :3] - 0.5) / C0).astype(np.float32)
     quats = (rows["quats"] / 255 * 2 - 1).astype(np.float32)
-    cloud = checked(SplatCloud(rows["means"].astype(np.float64), quats, logs.astype(np.float32), logit(rgba[:, 3]), sh), where)
+    cloud = checked(
+        SplatCloud(rows["means"].astype(np.float64), quats, logs.astype(np.float32), logit(rgba[:, 3]), sh), where
+    )
     return SplatFile(cloud, step_m=spacing_m(rows["means"]))

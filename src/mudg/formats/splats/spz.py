@@ -1,13 +1,15 @@
-"""SPZ (Niantic): about 20 bytes a Gaussian before compression. Versions 1 to 3 are one gzip stream; version 4 is zstandard.
+"""SPZ (Niantic): about 20 bytes a Gaussian before compression. Versions 1 to 3 are one gzip stream; version 4 is
+zstandard.
 
     header: u32 "NGSP", u32 version, u32 N, u8 degree, u8 fractional bits, u8 flags (1 antialiased, 2 extensions), u8 0
     planes: positions 3 x i24 (version 1: 3 x f16)   opacities u8   colours 3 x u8   scales 3 x u8
             rotations u32 (versions 1 and 2: 3 x u8)   harmonics u8
-    extensions: u32 type, u32 length, content; after the planes, in version 4 between header and table. 0xADBE0003: u32 axes
+    extensions: u32 type, u32 length, content; after the planes, in version 4 between header and table. 0xADBE0003: u32
+        axes
 
-Position = value / 2^bits; scale (natural logarithm) = value / 16 - 10; colour f_dc = (value / 255 - 0.5) / 0.15; harmonics
-(value - 128) / 128, coefficient by coefficient. Rotation of versions 3 and 4: 2 bits index of the largest of (x, y, z, w), the others in
-order, a sign and 9 bits each. Axes x right, y up, z back, or those of the extension.
+Position = value / 2^bits; scale (natural logarithm) = value / 16 - 10; colour f_dc = (value / 255 - 0.5) / 0.15;
+harmonics (value - 128) / 128, coefficient by coefficient. Rotation of versions 3 and 4: 2 bits index of the largest of
+(x, y, z, w), the others in order, a sign and 9 bits each. Axes x right, y up, z back, or those of the extension.
 """
 
 from __future__ import annotations
@@ -32,7 +34,25 @@ _COLOR: Final = 0.15
 _PLANES: Final = ("positions", "opacities", "colors", "scales", "rotations", "harmonics")
 _ANTIALIAS, _EXTENSIONS = 1, 2
 _AXES: Final = 0xADBE0003
-_AXES_CODES: Final = ("", "LDB", "RDB", "LUB", "RUB", "LDF", "RDF", "LUF", "RUF", "LFD", "RFD", "LFU", "RFU", "LBD", "RBD", "LBU", "RBU")
+_AXES_CODES: Final = (
+    "",
+    "LDB",
+    "RDB",
+    "LUB",
+    "RUB",
+    "LDF",
+    "RDF",
+    "LUF",
+    "RUF",
+    "LFD",
+    "RFD",
+    "LFU",
+    "RFU",
+    "LBD",
+    "RBD",
+    "LBU",
+    "RBU",
+)
 _MOST_EXTENSIONS: Final = 1 << 20
 _HARMLESS: Final = {0xADBE0002}
 """Extensions that say nothing about the Gaussians: where a viewer's camera may go."""
@@ -82,7 +102,9 @@ class _Header:
         """Sizes of the planes, after the header was found possible."""
         binary.refuse_count(self.count, where)
         if self.degree > 4:
-            raise InputError("harmonics of this degree are not read", where=where, expected="0 to 3", got=str(self.degree))
+            raise InputError(
+                "harmonics of this degree are not read", where=where, expected="0 to 3", got=str(self.degree)
+            )
         if self.bits > 23:
             raise InputError(
                 "the number of fractional bits is not possible", where=where, expected="0 to 23", got=str(self.bits)
@@ -96,7 +118,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     """The Gaussians of an SPZ file of version 1 to 4.
 
     Raises:
-        InputError: no SPZ file, a damaged one, or of another version. ResourceError: version 4 without the package zstandard.
+        InputError: no SPZ file, a damaged one, or of another version. ResourceError: version 4 without the package
+            zstandard.
     """
     if content[:4] == struct.pack("<I", MAGIC):
         return _from_streams(content, where)
@@ -125,13 +148,20 @@ def _from_streams(content: bytes, where: str) -> SplatFile:
     head = _Header(*fields)
     if head.version != 4:
         raise InputError(
-            "this version of SPZ is not read", where=where, expected="4 without gzip, 1 to 3 within", got=str(head.version)
+            "this version of SPZ is not read",
+            where=where,
+            expected="4 without gzip, 1 to 3 within",
+            got=str(head.version),
         )
     binary.refuse_bomb(head.count, content, where)
     sizes = [size for size in head.sizes(where) if size]
     if streams != len(sizes) or toc < 32:
-        raise InputError("the header of the SPZ file does not fit its content", where=where, expected=f"{len(sizes)} streams",
-            got=f"{streams} streams, table at {toc}")  # fmt: skip
+        raise InputError(
+            "the header of the SPZ file does not fit its content",
+            where=where,
+            expected=f"{len(sizes)} streams",
+            got=f"{streams} streams, table at {toc}",
+        )
     table = binary.numbers(content, toc, "<u8", 2 * streams, "the table of streams", where).reshape(-1, 2)
     extensions = _extensions(content[32:toc], where) if head.flags & _EXTENSIONS else {}
     package, place, planes = _zstandard("read"), toc + 16 * streams, list[bytes]()
@@ -168,16 +198,28 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
     if _AXES in extensions:
         code = int.from_bytes(extensions[_AXES], "little")
         if len(extensions[_AXES]) != 4 or code >= len(_AXES_CODES):
-            raise InputError("the axes of the SPZ file are not known", where=f"{where}: extension {_AXES:#010x}",
-                expected=f"a number up to {len(_AXES_CODES) - 1}", got=extensions[_AXES][:8].hex(),
-                remedy="convert it with the program that wrote it")  # fmt: skip
+            raise InputError(
+                "the axes of the SPZ file are not known",
+                where=f"{where}: extension {_AXES:#010x}",
+                expected=f"a number up to {len(_AXES_CODES) - 1}",
+                got=extensions[_AXES][:8].hex(),
+                remedy="convert it with the program that wrote it",
+            )
         axes = _AXES_CODES[code]
     elif head.version == 4:
-        warnings.append("it does not state its axes: read with y up, as the format says; splat-transform from 3 on writes y down: if it "
-                        "stands on its head, add --axes RDF")  # fmt: skip
+        warnings.append(
+            "it does not state its axes: read with y up, as the format says; splat-transform from 3 on writes y down:"
+            " if it stands on its head, add --axes RDF"
+        )
     else:
-        notes.append("it does not state its axes: read with y up, as the format says; if it stands on its head, add --axes RDF")
-    unknown = [f"{kind:#010x} ({len(part)} bytes)" for kind, part in extensions.items() if kind != _AXES and kind not in _HARMLESS]
+        notes.append(
+            "it does not state its axes: read with y up, as the format says; if it stands on its head, add --axes RDF"
+        )
+    unknown = [
+        f"{kind:#010x} ({len(part)} bytes)"
+        for kind, part in extensions.items()
+        if kind != _AXES and kind not in _HARMLESS
+    ]
     if unknown:
         warnings.append(f"extensions that are not known were passed over: {listed(unknown)}")
     if head.flags & ~(_ANTIALIAS | _EXTENSIONS):
@@ -194,12 +236,14 @@ def _zstandard(done: str) -> Any:
     try:
         import zstandard
     except ImportError as error:
-        raise ResourceError(f"SPZ of version 4 is {done} with the package zstandard, which is not installed",
-            remedy="pip install zstandard, or use version 3 (--spz-version 3)") from error  # fmt: skip
+        raise ResourceError(
+            f"SPZ of version 4 is {done} with the package zstandard, which is not installed",
+            remedy="pip install zstandard, or use version 3 (--spz-version 3)",
+        ) from error
     return zstandard
 
 
-# -- values --------------------------------------------------------------------------------------------------------------
+# -- values ----------------------------------------------------------------------------------------
 
 
 def _planes(cloud: SplatCloud, bits: int) -> list[bytes]:
@@ -211,9 +255,13 @@ def _planes(cloud: SplatCloud, bits: int) -> list[bytes]:
     bucket[:3] = 8
     snapped = (harmonics + bucket[:, None] // 2) // bucket[:, None] * bucket[:, None]
     return [
-        fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes(), _bytes(np.round(cloud.opacity * 255.0)), _bytes(colors), _bytes(scales),
-        _packed_rotations(cloud.quats).tobytes(), _bytes(snapped),
-    ]  # fmt: skip
+        fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
+        _bytes(np.round(cloud.opacity * 255.0)),
+        _bytes(colors),
+        _bytes(scales),
+        _packed_rotations(cloud.quats).tobytes(),
+        _bytes(snapped),
+    ]
 
 
 def _bytes(values: NDArray[np.floating]) -> bytes:

@@ -1,8 +1,8 @@
 """OpenUSD with ParticleField3DGaussianSplat (26.03 and later): text (.usda), or a package with the sky (.usdz).
 
-The stage is z up in metres, a time code is a millisecond. Every object is an Xform with translation, rotation and visibility over time;
-what deforms has positions over time. Quaternions are written w, x, y, z; scales in metres; opacities 0 to 1; harmonics Gaussian by
-Gaussian, the constant band first.
+The stage is z up in metres, a time code is a millisecond. Every object is an Xform with translation, rotation and
+visibility over time; what deforms has positions over time. Quaternions are written w, x, y, z; scales in metres;
+opacities 0 to 1; harmonics Gaussian by Gaussian, the constant band first.
 """
 
 from __future__ import annotations
@@ -28,7 +28,8 @@ CODES_PER_S: Final = 1000
 FOCAL: Final = 24.0
 SKY_FILE: Final = "sky.png"
 DOME: Final = "(0.5, 0.5, 0.5, 0.5)"
-"""A dome looks along its z axis at the middle of its picture, y up, x (left) at a quarter: turned to x, z and y of the world."""
+"""A dome looks along its z axis at the middle of its picture, y up, x (left) at a quarter: turned to x, z and y of the
+world."""
 _MOST_PACKAGE: Final = (1 << 32) - 1
 
 
@@ -41,8 +42,14 @@ def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False, l
     static = time_s is not None
     nodes = (SplatNode("scene", scene.at(time_s)),) if time_s is not None else scene.nodes
     first, last = scene.span_s
-    lines = ["#usda 1.0", "(", '    defaultPrim = "World"', '    upAxis = "Z"', "    metersPerUnit = 1",
-             f"    timeCodesPerSecond = {CODES_PER_S}"]  # fmt: skip
+    lines = [
+        "#usda 1.0",
+        "(",
+        '    defaultPrim = "World"',
+        '    upAxis = "Z"',
+        "    metersPerUnit = 1",
+        f"    timeCodesPerSecond = {CODES_PER_S}",
+    ]
     if not static:
         lines += [f"    startTimeCode = {first * CODES_PER_S:.9g}", f"    endTimeCode = {last * CODES_PER_S:.9g}"]
     lines += [
@@ -61,16 +68,23 @@ def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False, l
             _camera(name, camera, [frame.view for frame in log.frames_of(camera.name)], scene.file_from_world)
         )
     if sky:
-        lines += ['    def DomeLight "Sky"', "    {", f"        asset inputs:texture:file = @{SKY_FILE}@",
-                  '        token inputs:texture:format = "latlong"', f"        quatf xformOp:orient = {DOME}",
-                  '        uniform token[] xformOpOrder = ["xformOp:orient"]', "    }"]  # fmt: skip
+        lines += [
+            '    def DomeLight "Sky"',
+            "    {",
+            f"        asset inputs:texture:file = @{SKY_FILE}@",
+            '        token inputs:texture:format = "latlong"',
+            f"        quatf xformOp:orient = {DOME}",
+            '        uniform token[] xformOpOrder = ["xformOp:orient"]',
+            "    }",
+        ]
     return "\n".join([*lines, "}", ""]).encode()
 
 
 def to_package(
     scene: SplatScene, time_s: float | None = None, log: Scene | None = None, more: Mapping[str, bytes] | None = None
 ) -> bytes:
-    """A scene as a USDZ package: the text, the sky as a picture (zenith on top, as one looks at it), and ``more`` files after these.
+    """A scene as a USDZ package: the text, the sky as a picture (zenith on top, as one looks at it), and ``more`` files
+    after these.
 
     Raises:
         InputError: more than 4 GiB, which a package cannot hold.
@@ -81,8 +95,12 @@ def to_package(
     files |= dict(more or {})
     size = sum(map(len, files.values()))
     if size > _MOST_PACKAGE - (1 << 20):
-        raise InputError("the scene is too large for a USDZ package", expected="below 4 GiB", got=f"{size} bytes",
-            remedy="choose some --nodes, or export usda")  # fmt: skip
+        raise InputError(
+            "the scene is too large for a USDZ package",
+            expected="below 4 GiB",
+            got=f"{size} bytes",
+            remedy="choose some --nodes, or export usda",
+        )
     return binary.stored_zip(files, align=64)
 
 
@@ -93,7 +111,7 @@ def png(picture: NDArray[np.uint8]) -> bytes:
     return target.getvalue()
 
 
-# -- prims ---------------------------------------------------------------------------------------------------------------
+# -- prims -----------------------------------------------------------------------------------------
 
 
 def _node(name: str, node: SplatNode, file_from_world: NDArray[np.float64]) -> list[str]:
@@ -121,12 +139,20 @@ def _node(name: str, node: SplatNode, file_from_world: NDArray[np.float64]) -> l
 
 
 def _camera(name: str, camera: Camera, views: Sequence[View], file_from_world: NDArray[np.float64]) -> list[str]:
-    """A camera that looks along -z with y up; focal length and apertures share a unit, in which the focal length is `FOCAL`."""
+    """A camera that looks along -z with y up; focal length and apertures share a unit, in which the focal length is
+    `FOCAL`."""
     wide, high = camera.width / camera.fx * FOCAL, camera.height / camera.fy * FOCAL
     right, up = (camera.width / 2 - camera.cx) / camera.fx * FOCAL, (camera.cy - camera.height / 2) / camera.fy * FOCAL
-    lines = [f"def Camera {quoted(name)}", "{", f"    float focalLength = {FOCAL:g}", f"    float horizontalAperture = {wide:.9g}",
-             f"    float verticalAperture = {high:.9g}", f"    float horizontalApertureOffset = {right:.9g}",
-             f"    float verticalApertureOffset = {up:.9g}", "    float2 clippingRange = (0.1, 10000)"]  # fmt: skip
+    lines = [
+        f"def Camera {quoted(name)}",
+        "{",
+        f"    float focalLength = {FOCAL:g}",
+        f"    float horizontalAperture = {wide:.9g}",
+        f"    float verticalAperture = {high:.9g}",
+        f"    float horizontalApertureOffset = {right:.9g}",
+        f"    float verticalApertureOffset = {up:.9g}",
+        "    float2 clippingRange = (0.1, 10000)",
+    ]
     if views:
         poses = file_from_world @ np.stack([view.world_from_cam for view in views]) @ np.diag([1.0, -1.0, -1.0, 1.0])
         codes = np.array([view.time_s for view in views]) * CODES_PER_S
@@ -161,8 +187,10 @@ def _splats(node: SplatNode) -> list[str]:
         '    uniform token sortingModeHint = "cameraDistance"',
     ]
     if cloud.class_ids is not None:
-        lines += [f"    int[] primvars:mudg:class = [{', '.join(map(str, cloud.class_ids.tolist()))}]",
-                  f"    custom token[] mudg:classes = [{', '.join(map(quoted, CLASSES))}]"]  # fmt: skip
+        lines += [
+            f"    int[] primvars:mudg:class = [{', '.join(map(str, cloud.class_ids.tolist()))}]",
+            f"    custom token[] mudg:classes = [{', '.join(map(quoted, CLASSES))}]",
+        ]
     return [*lines, "}"]
 
 
@@ -175,7 +203,7 @@ def extent(cloud: SplatCloud, means: Floats | None = None) -> Floats:
     return np.stack([(place - reach).min(0), (place + reach).max(0)]).astype(np.float32)
 
 
-# -- text ----------------------------------------------------------------------------------------------------------------
+# -- text ------------------------------------------------------------------------------------------
 
 
 def _over_time(name: str, codes: NDArray[np.float64], values: Sequence[str]) -> list[str]:

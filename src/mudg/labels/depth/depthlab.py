@@ -1,16 +1,18 @@
-"""Dense depth from an image and LiDAR by a DepthLab folder, as ``mudg convert`` writes it: depth inpainting by latent diffusion.
+"""Dense depth from an image and LiDAR by a DepthLab folder, as ``mudg convert`` writes it: depth inpainting by latent
+diffusion.
 
-Liu et al., "DepthLab: from partial to complete" (2024). Two U-Nets of one layout: the reference U-Net sees the image's latent once, and
-what its self-attentions read is kept; each self-attention of the denoising U-Net reads that beside its own features. The denoising
-U-Net sees the noisy latent of depth, the latent of the mask (1 = missing) and the latent of known depth, interpolated. Both are
-conditioned on one vector: the image's CLIP embedding through a linear layer.
+Liu et al., "DepthLab: from partial to complete" (2024). Two U-Nets of one layout: the reference U-Net sees the image's
+latent once, and what its self-attentions read is kept; each self-attention of the denoising U-Net reads that beside its
+own features. The denoising U-Net sees the noisy latent of depth, the latent of the mask (1 = missing) and the latent of
+known depth, interpolated. Both are conditioned on one vector: the image's CLIP embedding through a linear layer.
 
-Depth is scaled by the least and greatest known depth to -1..1. Denoising starts part of the way (``strength``) at known depth filled by
-the nearest; after every step but the last, latent cells that are known get that depth's latent with the noise of the step
-(Avrahami et al., "Blended diffusion", 2022). So the last step alone is free of them: known depth is kept nearly, not exactly.
+Depth is scaled by the least and greatest known depth to -1..1. Denoising starts part of the way (``strength``) at known
+depth filled by the nearest; after every step but the last, latent cells that are known get that depth's latent with the
+noise of the step (Avrahami et al., "Blended diffusion", 2022). So the last step alone is free of them: known depth is
+kept nearly, not exactly.
 
-The published code runs every step twice, with and without image, and mixes the two with weight 1, which is the one with the image: only
-that one is computed here. The noise is the same for every image.
+The published code runs every step twice, with and without image, and mixes the two with weight 1, which is the one with
+the image: only that one is computed here. The noise is the same for every image.
 """
 
 from __future__ import annotations
@@ -50,9 +52,17 @@ LATENT_SCALE: Final = 0.18215
 UNETS: Final = ("denoising_unet", "reference_unet")
 PARTS: Final = (*UNETS, "mapping_layer", "vae", "image_encoder")
 _VISION: Final = (
-    "hidden_size", "intermediate_size", "projection_dim", "num_hidden_layers", "num_attention_heads", "num_channels", "image_size",
-    "patch_size", "hidden_act", "layer_norm_eps",
-)  # fmt: skip
+    "hidden_size",
+    "intermediate_size",
+    "projection_dim",
+    "num_hidden_layers",
+    "num_attention_heads",
+    "num_channels",
+    "image_size",
+    "patch_size",
+    "hidden_act",
+    "layer_norm_eps",
+)
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -73,14 +83,18 @@ class DepthLabSampling:
 
     def __post_init__(self) -> None:
         if int(self.steps * self.strength) < 1:
-            raise UsageError("too few denoising steps: none is left of them", where="--depth-steps",
-                got=str(self.steps), expected=f"at least {int(np.ceil(1 / self.strength))}")  # fmt: skip
+            raise UsageError(
+                "too few denoising steps: none is left of them",
+                where="--depth-steps",
+                got=str(self.steps),
+                expected=f"at least {int(np.ceil(1 / self.strength))}",
+            )
 
 
 PUBLISHED_SAMPLING: Final = DepthLabSampling()
 
 
-# --- the networks -----------------------------------------------------------------------------------------------------
+# --- the networks ---------------------------------------------------------------------------------
 
 
 def part_configs(
@@ -98,8 +112,12 @@ def part_configs(
     except KeyError as error:
         raise InputError("a network's description lacks a number", where="DepthLab", expected=str(error)) from error
     if abs(float(vae.get("scaling_factor", LATENT_SCALE)) - LATENT_SCALE) > 1e-9:
-        raise InputError("the autoencoder scales its latents otherwise than DepthLab does", where="vae: scaling_factor",
-            expected=str(LATENT_SCALE), got=str(vae["scaling_factor"]))  # fmt: skip
+        raise InputError(
+            "the autoencoder scales its latents otherwise than DepthLab does",
+            where="vae: scaling_factor",
+            expected=str(LATENT_SCALE),
+            got=str(vae["scaling_factor"]),
+        )
     return {
         "denoising_unet": {**plain, "in_channels": 3 * latent},
         "reference_unet": {**plain, "in_channels": latent},
@@ -134,8 +152,9 @@ def blank_parts(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, nn.Module
             network_class = folders.member(transformers, "CLIPVisionModelWithProjection")
             made[name] = network_class(vision(**configs[name]))
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise InputError("a network cannot be made as it is described", where=f"DepthLab: {name}",
-            got=str(error)[:300]) from error  # fmt: skip
+        raise InputError(
+            "a network cannot be made as it is described", where=f"DepthLab: {name}", got=str(error)[:300]
+        ) from error
     reference: Any = made["reference_unet"]
     reference.conv_norm_out, reference.conv_out = None, nn.Identity()
     return made
@@ -162,7 +181,8 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
     """The networks of a converted folder in float32 on their device, every file checked against its sha256.
 
     Raises:
-        InputError: the description is not whole, or tensors do not fit it. IntegrityError: a file is missing or altered.
+        InputError: the description is not whole, or tensors do not fit it. IntegrityError: a file is missing or
+            altered.
         ResourceError: a package or the device is missing.
     """
     device, where = place.ready(), folder / DESCRIPTION
@@ -171,8 +191,12 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
         files = {name: {str(f): str(d) for f, d in described["parts"][name]["files"].items()} for name in PARTS}
         schedule = dict(described["scheduler"])
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise InputError("the description of a DepthLab model is not whole", where=str(where), got=repr(error)[:200],
-            remedy="convert the published files again") from error  # fmt: skip
+        raise InputError(
+            "the description of a DepthLab model is not whole",
+            where=str(where),
+            got=repr(error)[:200],
+            remedy="convert the published files again",
+        ) from error
     with records.understood("a DepthLab model", str(where)):
         made = blank_parts(configs)
     for name, network in made.items():
@@ -185,7 +209,8 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
 
 
 def _fill_tables(network: nn.Module, part: str) -> None:
-    """Numbers the places of the image encoder's patches: the one table that a network has and its file does not hold."""
+    """Numbers the places of the image encoder's patches: the one table that a network has and its file does not
+    hold."""
     for name, table in list(network.named_buffers()):
         if not table.is_meta:
             continue
@@ -195,13 +220,14 @@ def _fill_tables(network: nn.Module, part: str) -> None:
         setattr(network.get_submodule(owner), short, torch.arange(table.shape[-1]).expand(table.shape).clone())
 
 
-# --- from the reference U-Net to the denoising U-Net ------------------------------------------------------------------
+# --- from the reference U-Net to the denoising U-Net ----------------------------------------------
 
 
 class _SharedAttention:
     """A processor of diffusers for one self-attention: the given one, with features passed from one U-Net to the other.
 
-    Without a ``source`` it keeps the block's features [N, L, C]; with one, keys and values also come from the features kept there.
+    Without a ``source`` it keeps the block's features [N, L, C]; with one, keys and values also come from the features
+    kept there.
     """
 
     features: Tensor
@@ -210,9 +236,13 @@ class _SharedAttention:
         self._attend, self._source = attend, source
 
     def __call__(
-        self, attn: Any, hidden_states: Tensor, encoder_hidden_states: Tensor | None = None,
-        attention_mask: Tensor | None = None, temb: Tensor | None = None,
-    ) -> Tensor:  # fmt: skip
+        self,
+        attn: Any,
+        hidden_states: Tensor,
+        encoder_hidden_states: Tensor | None = None,
+        attention_mask: Tensor | None = None,
+        temb: Tensor | None = None,
+    ) -> Tensor:
         if self._source is None:
             self.features, context = hidden_states, None
         else:
@@ -221,9 +251,11 @@ class _SharedAttention:
 
 
 def share_features(reference_unet: Any, denoising_unet: Any) -> None:
-    """Let every self-attention of the denoising U-Net read, beside its own, the features of the same block of the reference U-Net.
+    """Let every self-attention of the denoising U-Net read, beside its own, the features of the same block of the
+    reference U-Net.
 
-    From then on a pass of the reference U-Net must come before those of the denoising U-Net, with the same size and batch.
+    From then on a pass of the reference U-Net must come before those of the denoising U-Net, with the same size and
+    batch.
 
     Raises:
         InputError: the two differ in their blocks, or have none.
@@ -233,26 +265,30 @@ def share_features(reference_unet: Any, denoising_unet: Any) -> None:
         for unet in (reference_unet, denoising_unet)
     )
     if set(writers) != set(readers) or not writers:
-        raise InputError("the two U-Nets differ in their self-attentions", where="DepthLab",
-            got=", ".join(sorted(set(writers) ^ set(readers))[:4]) or "none at all")  # fmt: skip
+        raise InputError(
+            "the two U-Nets differ in their self-attentions",
+            where="DepthLab",
+            got=", ".join(sorted(set(writers) ^ set(readers))[:4]) or "none at all",
+        )
     for name, writer in writers.items():
         source = _SharedAttention(writer.processor)
         writer.set_processor(source)
         readers[name].set_processor(_SharedAttention(readers[name].processor, source))
 
 
-# --- inputs of the networks -------------------------------------------------------------------------------------------
+# --- inputs of the networks -----------------------------------------------------------------------
 
 
 @dataclasses.dataclass(frozen=True, slots=True, eq=False)
 class Prepared:
-    """One image and its known depth at the size of the networks, padded to whole latent cells by the last row and column.
+    """One image and its known depth at the size of the networks, padded to whole latent cells by the last row and
+    column.
 
     Args:
         image: f32[1, 3, H, W] in -1..1.
         crop: f32[1, 3, S, S], the middle of the image as CLIP wants it.
-        nearest, linear: f32[1, 1, H, W], known depth in -scale..scale, filled by the nearest known and by linear interpolation
-            (0 outside the triangles between the known).
+        nearest, linear: f32[1, 1, H, W], known depth in -scale..scale, filled by the nearest known and by linear
+            interpolation (0 outside the triangles between the known).
         missing: f32[1, 1, H, W], 1 where depth is not known.
         size: height and width without the padding.
         low_m, high_m: least and greatest known depth.
@@ -269,7 +305,8 @@ class Prepared:
 
 
 def prepare(given: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: int) -> Prepared:
-    """Inputs of the networks for an image; ``cell``: pixels per latent cell and side, ``crop_px``: side of CLIP's image.
+    """Inputs of the networks for an image; ``cell``: pixels per latent cell and side, ``crop_px``: side of CLIP's
+    image.
 
     Raises:
         InputError: no depth is known.
@@ -294,7 +331,8 @@ def prepare(given: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: i
 
 
 def known_depth(measured: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
-    """Measured depth at another size, f32[h, w]: the nearest one in the part of the image that a pixel covers, NaN where there is none.
+    """Measured depth at another size, f32[h, w]: the nearest one in the part of the image that a pixel covers, NaN
+    where there is none.
 
     The published code picks single pixels instead, which loses most returns when an image shrinks.
     """
@@ -304,7 +342,8 @@ def known_depth(measured: NDArray[np.float32], size: tuple[int, int]) -> NDArray
 
 
 def linear_fill(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Known values f[h, w] (NaN = unknown) interpolated linearly in the triangles between them; 0 outside, f32[h, w]."""
+    """Known values f[h, w] (NaN = unknown) interpolated linearly in the triangles between them; 0 outside, f32[h,
+    w]."""
     row, column = np.nonzero(np.isfinite(values))
     try:
         between = LinearNDInterpolator(np.stack([row, column], 1), values[row, column], fill_value=0)
@@ -316,7 +355,8 @@ def linear_fill(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
-    """Image u8[H, W, 3] as CLIP's own preparation gives it, f32[1, 3, S, S]: bicubic to the shorter side, middle cut out, normalised."""
+    """Image u8[H, W, 3] as CLIP's own preparation gives it, f32[1, 3, S, S]: bicubic to the shorter side, middle cut
+    out, normalised."""
     height, width = rgb.shape[:2]
     shorter = min(height, width)
     high, wide = height * side_px // shorter, width * side_px // shorter
@@ -325,13 +365,15 @@ def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
     return folders.normalized(scaled[top : top + side_px, left : left + side_px], clip.MEAN, clip.DEVIATION)
 
 
-# --- denoising --------------------------------------------------------------------------------------------------------
+# --- denoising ------------------------------------------------------------------------------------
 
 
 class DepthLab:
     """A DepthLab model ready for use; ``load`` makes one from a converted folder."""
 
-    def __init__(self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, place: Place = CPU) -> None:
+    def __init__(
+        self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, place: Place = CPU
+    ) -> None:
         """Raises: UsageError: more steps than the noise schedule has."""
         check_steps(parts.scheduler, sampling.steps)
         self._parts, self._sampling, self._place = parts, sampling, place
@@ -349,9 +391,13 @@ class DepthLab:
         file = Path(folder) / DESCRIPTION
         described = folders.read_settings(file)
         if described.get("kind") != KIND or described.get("schema") != SCHEMA:
-            raise InputError("not a DepthLab model of this version", where=str(file),
-                expected=f"kind {KIND}, schema {SCHEMA}", got=f"{described.get('kind')}, {described.get('schema')}",
-                remedy="convert the published files again")  # fmt: skip
+            raise InputError(
+                "not a DepthLab model of this version",
+                where=str(file),
+                expected=f"kind {KIND}, schema {SCHEMA}",
+                got=f"{described.get('kind')}, {described.get('schema')}",
+                remedy="convert the published files again",
+            )
         sampling = records.parse_dataclass(DepthLabSampling, described.get("sampling"), f"{file}: sampling")
         sampling = dataclasses.replace(sampling, steps=options.steps or sampling.steps)
         return cls(read_parts(Path(folder), described, place), sampling, place)
@@ -369,14 +415,14 @@ class DepthLab:
         return Prediction.resized(found, given, "depth", least=0)
 
     def predict(self, made: Prepared, noise: Tensor) -> Tensor:
-        """Depth f32[1, 1, h, w], 0..1 between the least and the greatest known (others go beyond), from noise [1, C, H, W] in cells."""
+        """Depth f32[1, 1, h, w], 0..1 between the least and the greatest known (others go beyond), from noise [1, C, H,
+        W] in cells."""
         parts, sampling, device = self._parts, self._sampling, self._place.device
         noise = noise.to(device)
         with torch.inference_mode():
             depth, known, mask, image = (
-                self._encoded(plane)
-                for plane in (made.nearest, made.linear, 2 * made.missing - 1, made.image)
-            )  # fmt: skip
+                self._encoded(plane) for plane in (made.nearest, made.linear, 2 * made.missing - 1, made.image)
+            )
             # one pixel of every cell decides, as published
             missing = functional.interpolate(made.missing, size=noise.shape[2:], mode="nearest").to(device)
             with self._place.autocast():
@@ -405,25 +451,26 @@ class DepthLab:
         return latent.float() * LATENT_SCALE
 
 
-# depthlab -------------------------------------------------------------------------------------------------------------
+# depthlab -----------------------------------------------------------------------------------------
 #
-# convert, of DepthLab: three published pickles, Marigold's folder and CLIP's -> one folder that ``annotate --depth-network`` reads.
+# convert, of DepthLab: three published pickles, Marigold's folder and CLIP's -> one folder that ``annotate
+# --depth-network`` reads.
 #
 #     FOLDER/
 #       DepthLab/                denoising_unet.pth, reference_unet.pth, mapping_layer.pth
 #       marigold-depth-v1-0/     model_index.json, scheduler, vae, and of unet the description alone
 #       CLIP-ViT-H-14-.../       config.json, and model.safetensors or pytorch_model.bin
 #
-# The three are recognised by what lies in them, not by their names. Tensors are compared with the networks that the descriptions stand
-# for, by name and shape, all of them before the first is written. The published code takes what the pickle of the denoising U-Net or of
-# the linear layer lacks from Marigold or leaves it random; here that is an error.
+# The three are recognised by what lies in them, not by their names. Tensors are compared with the networks that the
+# descriptions stand for, by name and shape, all of them before the first is written. The published code takes what the
+# pickle of the denoising U-Net or of the linear layer lacks from Marigold or leaves it random; here that is an error.
 
 
 PICKLES = {part: f"{part}.pth" for part in (*UNETS, "mapping_layer")}
 """Part -> the published file that holds it."""
 LICENCE = (
-    "Weights keep the terms of those who published them: DepthLab, Marigold (made from Stable Diffusion) and the CLIP image encoder. "
-    "Read the pages they came from before any use."
+    "Weights keep the terms of those who published them: DepthLab, Marigold (made from Stable Diffusion) and the CLIP"
+    " image encoder. Read the pages they came from before any use."
 )
 _ENCODER_FILES = ("model.safetensors", "pytorch_model.bin")
 _ENCODER = ("vision_model.", "visual_projection.")
@@ -450,8 +497,9 @@ class Sources:
         for name in _ENCODER_FILES:
             if (self.encoder / name).is_file():
                 return self.encoder / name
-        raise InputError("the image encoder has no weight file", where=str(self.encoder),
-            expected=" or ".join(_ENCODER_FILES))  # fmt: skip
+        raise InputError(
+            "the image encoder has no weight file", where=str(self.encoder), expected=" or ".join(_ENCODER_FILES)
+        )
 
 
 def find(folder: Path) -> Sources:
@@ -462,31 +510,40 @@ def find(folder: Path) -> Sources:
     """
     places = [folder, *sorted(place for place in folder.iterdir() if place.is_dir())]
     pickles = _only(
-        folder, [place for place in places if any((place / name).is_file() for name in PICKLES.values())],
+        folder,
+        [place for place in places if any((place / name).is_file() for name in PICKLES.values())],
         f"the published files {', '.join(PICKLES.values())}",
-    )  # fmt: skip
+    )
     for name in PICKLES.values():
         if not (pickles / name).is_file():
             raise InputError("a published file is missing", where=str(pickles), expected=name)
     marigolds = ("MarigoldPipeline", "MarigoldDepthPipeline")
     base = _only(
-        folder, [place for place in places if _json_value(place / "model_index.json", "_class_name") in marigolds],
+        folder,
+        [place for place in places if _json_value(place / "model_index.json", "_class_name") in marigolds],
         "marigold-depth-v1-0, a folder of diffusers",
-    )  # fmt: skip
+    )
     encoder = _only(
-        folder, [place for place in places if _json_value(place / "config.json", "model_type") in ("clip", "clip_vision_model")],
+        folder,
+        [
+            place
+            for place in places
+            if _json_value(place / "config.json", "model_type") in ("clip", "clip_vision_model")
+        ],
         "CLIP-ViT-H-14-laion2B-s32B-b79K, a folder of transformers",
-    )  # fmt: skip
+    )
     return Sources(pickles, base, encoder)
 
 
 def _only(folder: Path, found: list[Path], what: str) -> Path:
     if len(found) != 1:
         raise InputError(
-            "a part of DepthLab is missing" if not found else "a part of DepthLab was found more than once", where=str(folder),
-            expected=f"one folder with {what}", got=", ".join(place.name for place in found) or "none",
+            "a part of DepthLab is missing" if not found else "a part of DepthLab was found more than once",
+            where=str(folder),
+            expected=f"one folder with {what}",
+            got=", ".join(place.name for place in found) or "none",
             remedy="put the three folders into one, as DepthLab's page says, and give that folder",
-        )  # fmt: skip
+        )
     return found[0]
 
 
@@ -511,15 +568,20 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
     try:
         vision_config = folders.member(transformers, "CLIPVisionConfig").from_dict(vision).to_dict()
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError("the image encoder has no description", where=str(sources.encoder / "config.json"),
-                         got=str(error)[:300]) from error  # fmt: skip
+        raise InputError(
+            "the image encoder has no description", where=str(sources.encoder / "config.json"), got=str(error)[:300]
+        ) from error
     file = sources.base / marigold.SCHEDULE_FILE
     schedule = folders.read_settings(file)
     marigold.ddim_scheduler(schedule, str(file))
     if schedule.get("rescale_betas_zero_snr"):
-        raise InputError("this is the noise schedule of a later Marigold", where=str(file),
-            got="rescale_betas_zero_snr: true", expected="that of marigold-depth-v1-0, which DepthLab was made from",
-            remedy="take marigold-depth-v1-0")  # fmt: skip
+        raise InputError(
+            "this is the noise schedule of a later Marigold",
+            where=str(file),
+            got="rescale_betas_zero_snr: true",
+            expected="that of marigold-depth-v1-0, which DepthLab was made from",
+            remedy="take marigold-depth-v1-0",
+        )
     return part_configs(unet, vae, vision_config), schedule
 
 
@@ -538,8 +600,11 @@ def read(sources: Sources, configs: Mapping[str, Mapping[str, Any]]) -> dict[str
     found["image_encoder"] = {
         name: value for name, value in encoder.items() if name.startswith(_ENCODER) and name != _PLACES
     }
-    files = {**{part: sources.pickles / name for part, name in PICKLES.items()}, "vae": sources.base / "vae",
-             "image_encoder": sources.encoder_file()}  # fmt: skip
+    files = {
+        **{part: sources.pickles / name for part, name in PICKLES.items()},
+        "vae": sources.base / "vae",
+        "image_encoder": sources.encoder_file(),
+    }
     for part, network in blank_parts(configs).items():
         weights.match_exactly(found[part], shapes_of(network), str(files[part]), f"DepthLab's {part}")
         weights.refuse_bad_values(found[part], str(files[part]))
@@ -550,7 +615,8 @@ def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_byte
     """The conversion, in this process; ``to`` is complete or not there.
 
     Args:
-        folder: what holds the sources. dtype: number format of the weights (None: as published). shard_bytes: of one file.
+        folder: what holds the sources. dtype: number format of the weights (None: as published). shard_bytes: of one
+            file.
 
     Raises:
         InputError: something is missing or is not DepthLab. ResourceError: a package is missing, or the disk is full.
@@ -560,21 +626,32 @@ def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_byte
     found = read(sources, configs)
     facts = {
         "sources": [
-            {"file": path.relative_to(folder).as_posix(), "bytes": path.stat().st_size, "sha256": store.sha256_file(path)}
+            {
+                "file": path.relative_to(folder).as_posix(),
+                "bytes": path.stat().st_size,
+                "sha256": store.sha256_file(path),
+            }
             for path in sources.files()
         ],
         "licence": LICENCE,
-    }  # fmt: skip
+    }
     with store.atomic_directory(to) as partial:
         parts = {
-            part: {"config": configs[part], "files": checkpoint.write_shards(partial / part, found[part], shard_bytes, dtype)}
+            part: {
+                "config": configs[part],
+                "files": checkpoint.write_shards(partial / part, found[part], shard_bytes, dtype),
+            }
             for part in PARTS
-        }  # fmt: skip
+        }
         store.write_text(partial / "MODEL_CARD.md", _card(facts))
         description = {
-            "schema": SCHEMA, "kind": KIND, "parts": parts, "scheduler": schedule,
-            "sampling": asdict(PUBLISHED_SAMPLING), "facts": facts,
-        }  # fmt: skip
+            "schema": SCHEMA,
+            "kind": KIND,
+            "parts": parts,
+            "scheduler": schedule,
+            "sampling": asdict(PUBLISHED_SAMPLING),
+            "facts": facts,
+        }
         store.write_json(partial / DESCRIPTION, description)
         store.sync_tree(partial)
 

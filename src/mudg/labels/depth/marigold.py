@@ -1,15 +1,17 @@
 """Depth by a latent diffusion model from a Marigold folder of diffusers, optionally guided by LiDAR.
 
-Ke et al., "Repurposing diffusion-based image generators for monocular depth estimation" (2024): a U-Net denoises the latent of a depth
-map beside the latent of the image; the decoder's mean over three channels, from -1 to 1, is depth up to scale and shift.
+Ke et al., "Repurposing diffusion-based image generators for monocular depth estimation" (2024): a U-Net denoises the
+latent of a depth map beside the latent of the image; the decoder's mean over three channels, from -1 to 1, is depth up
+to scale and shift.
 
-With guidance, after Viola et al., "Marigold-DC: zero-shot monocular depth completion with guided diffusion" (2024): at every step the
-clean latent that the network foresees is decoded and compared with LiDAR; the noisy latent is moved down the gradient of the
-difference, which is brought to the length of the foreseen noise, by Adam. Scale and shift are not learnt along, as there, but
-fitted anew at every step (``core.align.fit_affine``), which needs no rate and lets go of wrong returns.
+With guidance, after Viola et al., "Marigold-DC: zero-shot monocular depth completion with guided diffusion" (2024): at
+every step the clean latent that the network foresees is decoded and compared with LiDAR; the noisy latent is moved down
+the gradient of the difference, which is brought to the length of the foreseen noise, by Adam. Scale and shift are not
+learnt along, as there, but fitted anew at every step (``core.align.fit_affine``), which needs no rate and lets go of
+wrong returns.
 
-Only the networks in the folder are used, not the package's pipeline: it would import what a file names. The noise is the same for every
-image, so that a video does not flicker for its sake.
+Only the networks in the folder are used, not the package's pipeline: it would import what a file names. The noise is
+the same for every image, so that a video does not flicker for its sake.
 """
 
 from __future__ import annotations
@@ -45,7 +47,8 @@ MAX_RETURNS: Final = 50_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarigoldParts:
-    """The networks of a folder: U-Net, autoencoder and scheduler of diffusers, and the embedding [1, N, D] of the empty text."""
+    """The networks of a folder: U-Net, autoencoder and scheduler of diffusers, and the embedding [1, N, D] of the empty
+    text."""
 
     unet: Any
     vae: Any
@@ -55,8 +58,8 @@ class MarigoldParts:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Returns:
-    """Where LiDAR steers: places ``grid`` f32[1, 1, N, 2] in -1..1 of the unpadded image, metres f32[N], and what the network's
-    numbers stand for there, depth or its inverse, f32[N]."""
+    """Where LiDAR steers: places ``grid`` f32[1, 1, N, 2] in -1..1 of the unpadded image, metres f32[N], and what the
+    network's numbers stand for there, depth or its inverse, f32[N]."""
 
     grid: Tensor
     depth_m: Tensor
@@ -67,10 +70,17 @@ class Marigold:
     """A Marigold model ready for use; ``load`` makes one from a folder."""
 
     def __init__(
-        self, parts: MarigoldParts, *, space: Space = "depth", steps: int = PLAIN_STEPS, guided: bool = False,
-        longest_px: int = PROCESSING_PX, place: Place = CPU,
-    ) -> None:  # fmt: skip
-        """``longest_px``: longest side at which the networks work. Raises: UsageError: more steps than the noise schedule has."""
+        self,
+        parts: MarigoldParts,
+        *,
+        space: Space = "depth",
+        steps: int = PLAIN_STEPS,
+        guided: bool = False,
+        longest_px: int = PROCESSING_PX,
+        place: Place = CPU,
+    ) -> None:
+        """``longest_px``: longest side at which the networks work. Raises: UsageError: more steps than the noise
+        schedule has."""
         check_steps(parts.scheduler, steps)
         self._parts, self._space, self._steps, self._guided = parts, space, steps, guided
         self._longest_px, self._place = longest_px, place
@@ -81,7 +91,8 @@ class Marigold:
         """Read the networks of a folder.
 
         Raises:
-            ResourceError: a package or the device is missing. InputError: a part is missing or another kind. UsageError: too many steps.
+            ResourceError: a package or the device is missing. InputError: a part is missing or another kind.
+                UsageError: too many steps.
         """
         path = Path(folder)
         index = folders.read_settings(path / "model_index.json")
@@ -95,26 +106,32 @@ class Marigold:
             folders.load_network(folders.member(diffusers, "AutoencoderKL"), path, place, "vae"),
             ddim_scheduler(folders.read_settings(schedule), str(schedule)),
             empty_text,
-        )  # fmt: skip
+        )
         space: Space = "disparity" if index.get("prediction_type") == "disparity" else "depth"
         usual = GUIDED_STEPS if options.guided else int(index.get("default_denoising_steps") or PLAIN_STEPS)
         longest_px = int(index.get("default_processing_resolution") or PROCESSING_PX)
-        return cls(parts, space=space, steps=options.steps or usual, guided=options.guided, longest_px=longest_px, place=place)
+        return cls(
+            parts, space=space, steps=options.steps or usual, guided=options.guided, longest_px=longest_px, place=place
+        )
 
     def __call__(self, given: DepthInput) -> Prediction:
         """Depth of one image at the image's size, up to scale and shift (to what is near the LiDAR's with guidance)."""
         image, size = self._prepared(given.rgb)
         noise = torch.randn(
-            1, self._parts.vae.config.latent_channels, image.shape[2] // self._cell, image.shape[3] // self._cell,
+            1,
+            self._parts.vae.config.latent_channels,
+            image.shape[2] // self._cell,
+            image.shape[3] // self._cell,
             generator=seeds.torch_generator(0, 0, "marigold"),
-        )  # fmt: skip
+        )
         found = self.predict(
             image, size, noise, _returns(given, self._space, self._place.device) if self._guided else None
         )
         return Prediction.resized(found, given, self._space)
 
     def _prepared(self, rgb: NDArray[np.uint8]) -> tuple[Tensor, tuple[int, int]]:
-        """Image u8[H, W, 3] -> f32[1, 3, h, w] in -1..1 with the last row and column repeated to whole cells; and its unpadded size."""
+        """Image u8[H, W, 3] -> f32[1, 3, h, w] in -1..1 with the last row and column repeated to whole cells; and its
+        unpadded size."""
         image = torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None].float() / 127.5 - 1
         size = working_size(rgb, self._longest_px)
         image = functional.interpolate(image, size=size, mode="bilinear", antialias=True)
@@ -122,7 +139,8 @@ class Marigold:
         return functional.pad(image, fill, mode="replicate").to(self._place.device), size
 
     def predict(self, image: Tensor, size: tuple[int, int], noise: Tensor, returns: _Returns | None = None) -> Tensor:
-        """Depth f32[1, 1, h, w] in 0..1 of a prepared image [1, 3, H, W], from noise [1, C, H / cell, W / cell]; steered by returns."""
+        """Depth f32[1, 1, h, w] in 0..1 of a prepared image [1, 3, H, W], from noise [1, C, H / cell, W / cell];
+        steered by returns."""
         scheduler, vae = self._parts.scheduler, self._parts.vae
         scheduler.set_timesteps(self._steps)
         with torch.no_grad(), self._place.autocast():
@@ -199,8 +217,8 @@ class _Adam:
 
 
 def _towards(fit: AffineFit, goal: Tensor) -> tuple[float, float, float]:
-    """Scale and shift to compare with, and half of the errors' spread. Where the foreseen depth does not rise with the returns, as
-    in the first steps, 0..1 stands for the range of the returns."""
+    """Scale and shift to compare with, and half of the errors' spread. Where the foreseen depth does not rise with the
+    returns, as in the first steps, 0..1 stands for the range of the returns."""
     if math.isfinite(fit.residual) and fit.scale > 0:
         return fit.scale, fit.shift, fit.residual
     low, high = (float(goal.quantile(share)) for share in (0.02, 0.98))
@@ -242,8 +260,12 @@ def ddim_scheduler(settings: Mapping[str, Any], where: str) -> Any:
     """
     kind, prediction = settings.get("_class_name"), settings.get("prediction_type", "epsilon")
     if kind != "DDIMScheduler" or prediction not in _PREDICTIONS:
-        raise InputError("the folder's noise schedule is of another kind", where=where, got=f"{kind}, {prediction}",
-            expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}")  # fmt: skip
+        raise InputError(
+            "the folder's noise schedule is of another kind",
+            where=where,
+            got=f"{kind}, {prediction}",
+            expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}",
+        )
     scheduler_class = folders.member(folders.package("diffusers"), "DDIMScheduler")
     return scheduler_class.from_config({name: value for name, value in settings.items() if not name.startswith("_")})
 

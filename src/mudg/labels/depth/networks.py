@@ -7,9 +7,10 @@
 | Marigold (``models.depth.marigold``) | depth up to scale and shift | diffusion; LiDAR may steer it |
 | DepthLab (``models.depth.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
 
-The result is aligned to the visible LiDAR returns with one robust scale and shift per frame (``core.align.fit_affine``), the sky gets
-its fixed distance, and the confidence follows from the error of the aligned depth at the returns near a pixel. There is no result
-where too few returns are visible, or where the network's depth does not fit them.
+The result is aligned to the visible LiDAR returns with one robust scale and shift per frame
+(``core.align.fit_affine``), the sky gets its fixed distance, and the confidence follows from the error of the aligned
+depth at the returns near a pixel. There is no result where too few returns are visible, or where the network's depth
+does not fit them.
 """
 
 from __future__ import annotations
@@ -41,12 +42,13 @@ _ERROR_SCALE: Final = 0.05
 _SKY_CONFIDENCE: Final = 0.8
 
 
-# --- networks of transformers -----------------------------------------------------------------------------------------
+# --- networks of transformers ---------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """Preparation of images as a folder describes it: size in pixels, the multiple of both sides, mean and deviation of colours in 0..1."""
+    """Preparation of images as a folder describes it: size in pixels, the multiple of both sides, mean and deviation of
+    colours in 0..1."""
 
     height: int
     width: int
@@ -64,10 +66,13 @@ class Preparation:
         if not isinstance(size, dict):
             size = {"height": size, "width": size}
         return cls(
-            int(size.get("height", side_px)), int(size.get("width", side_px)), int(settings.get("ensure_multiple_of") or multiple),
-            bool(settings.get("keep_aspect_ratio", True)), tuple(settings.get("image_mean") or folders.MEAN),
+            int(size.get("height", side_px)),
+            int(size.get("width", side_px)),
+            int(settings.get("ensure_multiple_of") or multiple),
+            bool(settings.get("keep_aspect_ratio", True)),
+            tuple(settings.get("image_mean") or folders.MEAN),
             tuple(settings.get("image_std") or folders.DEVIATION),
-        )  # fmt: skip
+        )
 
     def size_for(self, height: int, width: int) -> tuple[int, int]:
         """Height and width the network reads: with the aspect kept, the side that changes less gets its size."""
@@ -105,9 +110,11 @@ class TransformersDepth:
 
 
 def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
-    """Small depth map f32[1, 1, h, w] metres without holes: returns filled along the image, the sky as far as the farthest.
+    """Small depth map f32[1, 1, h, w] metres without holes: returns filled along the image, the sky as far as the
+    farthest.
 
-    The network scales the map to 0..1 by its least and greatest value; the sky at its own distance would squeeze all the rest.
+    The network scales the map to 0..1 by its least and greatest value; the sky at its own distance would squeeze all
+    the rest.
 
     Raises:
         InputError: nothing was measured.
@@ -134,10 +141,12 @@ def _load_transformers(folder: Path, place: Place, *, with_lidar: bool) -> Trans
     network: Any = folders.load_network(network_class, folder, place)
     preparation = Preparation.read(folder, 756 if with_lidar else 518, int(network.config.patch_size))
     metric = with_lidar or network.config.depth_estimation_type == "metric"
-    return TransformersDepth(network, preparation, "depth" if metric else "disparity", with_lidar=with_lidar, place=place)
+    return TransformersDepth(
+        network, preparation, "depth" if metric else "disparity", with_lidar=with_lidar, place=place
+    )
 
 
-# --- folders ----------------------------------------------------------------------------------------------------------
+# --- folders --------------------------------------------------------------------------------------
 
 
 KINDS: Final[Mapping[str, Callable[[Path, Place, DepthOptions], DepthNetwork]]] = {
@@ -147,8 +156,9 @@ KINDS: Final[Mapping[str, Callable[[Path, Place, DepthOptions], DepthNetwork]]] 
     "MarigoldPipeline": Marigold.load,
     "depthlab": DepthLab.load,
 }
-"""``model_type`` of a folder's ``config.json``, ``_class_name`` of its ``model_index.json``, or ``kind`` of the ``model.json`` that
-``mudg convert`` writes -> what reads the folder. The two of Marigold are one kind: early folders have the shorter name."""
+"""``model_type`` of a folder's ``config.json``, ``_class_name`` of its ``model_index.json``, or ``kind`` of the
+``model.json`` that ``mudg convert`` writes -> what reads the folder. The two of Marigold are one kind: early folders
+have the shorter name."""
 _DESCRIPTIONS: Final = (("config.json", "model_type"), ("model_index.json", "_class_name"), ("model.json", "kind"))
 
 
@@ -163,16 +173,24 @@ def kind_of(folder: str | Path) -> str:
         if folder and (path / name).is_file():
             kind = str(folders.read_settings(path / name).get(key))
             if kind not in KINDS:
-                raise InputError("the folder holds another kind of network", where=str(path / name),
-                    expected=", ".join(KINDS), got=kind)  # fmt: skip
+                raise InputError(
+                    "the folder holds another kind of network",
+                    where=str(path / name),
+                    expected=", ".join(KINDS),
+                    got=kind,
+                )
             return kind
-    raise ResourceError("the depth network's weights are missing", where=str(folder) or "--depth-network",
+    raise ResourceError(
+        "the depth network's weights are missing",
+        where=str(folder) or "--depth-network",
         expected="a folder with config.json (transformers), model_index.json (diffusers) or model.json (mudg convert)",
-        remedy="give the folder of such a network as --depth-network, or leave the flag out")  # fmt: skip
+        remedy="give the folder of such a network as --depth-network, or leave the flag out",
+    )
 
 
 def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> DepthNetwork:
-    """A depth network of the table, read from its folder, or from the Hugging Face cache by its name (``folders.find``).
+    """A depth network of the table, read from its folder, or from the Hugging Face cache by its name
+    (``folders.find``).
 
     Raises:
         ResourceError: folder, package or device is missing. InputError: another kind of network, or not all of it.
@@ -181,7 +199,7 @@ def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOpt
     return KINDS[kind_of(path)](path, place, options)
 
 
-# --- alignment to LiDAR, for every network ----------------------------------------------------------------------------
+# --- alignment to LiDAR, for every network --------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,8 +217,12 @@ def align_to_lidar(prediction: Prediction, given: DepthInput, rules: CompletionR
         InputError: prediction and image differ in size.
     """
     if prediction.values.shape != given.measured.shape:
-        raise InputError("a network's depth and its image differ in size", where="depth network",
-            expected=str(given.measured.shape), got=str(prediction.values.shape))  # fmt: skip
+        raise InputError(
+            "a network's depth and its image differ in size",
+            where="depth network",
+            expected=str(given.measured.shape),
+            got=str(prediction.values.shape),
+        )
     known = np.isfinite(given.measured) & ~given.sky
     values, measured = prediction.values[known], given.measured[known]
     fit = fit_affine(torch.from_numpy(values), torch.from_numpy(measured), prediction.space)
@@ -215,10 +237,12 @@ def align_to_lidar(prediction: Prediction, given: DepthInput, rules: CompletionR
 def residual_confidence(
     depth: NDArray[np.float32], measured: NDArray[np.float32], sky: NDArray[np.bool_], sky_m: float
 ) -> NDArray[np.float32]:
-    """exp(-e / 0.05) of the relative error e to be expected, f32[H, W] in 0..1; the same scale as that of ``core.complete``.
+    """exp(-e / 0.05) of the relative error e to be expected, f32[H, W] in 0..1; the same scale as that of
+    ``core.complete``.
 
-    e is the mean error at the measurements around a pixel, within the distance that most pixels have to one. Away from all of them it
-    goes over to twice the frame's mean error: nothing was compared there. Steps of depth around the pixel add to it.
+    e is the mean error at the measurements around a pixel, within the distance that most pixels have to one. Away from
+    all of them it goes over to twice the frame's mean error: nothing was compared there. Steps of depth around the
+    pixel add to it.
 
     Args:
         depth, measured: f32[H, W] metres, the latter NaN where nothing was measured.

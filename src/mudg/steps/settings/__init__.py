@@ -1,4 +1,5 @@
-"""Settings that belong to no single room: presets, those of whole runs, and what runs cost. Beside: where those of each verb are."""
+"""Settings that belong to no single room: presets, those of whole runs, and what runs cost. Beside: where those of each
+verb are."""
 
 from __future__ import annotations
 

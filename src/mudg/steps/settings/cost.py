@@ -1,8 +1,10 @@
-"""What the chain takes on a scene: time of every step, memory and bytes, from counts of views, pixels, Gaussians and points.
+"""What the chain takes on a scene: time of every step, memory and bytes, from counts of views, pixels, Gaussians and
+points.
 
-Unit costs are processor seconds on the machine where they were measured (2 virtual cores with AVX-512 and AMX). `core/raster/probe.py`
-says how fast another machine is beside it, by one short step of a fit. On a CUDA card nothing was measured: there the memory is counted
-and the time is unknown. So is the time of a published-type model, on any device.
+Unit costs are processor seconds on the machine where they were measured (2 virtual cores with AVX-512 and AMX).
+`core/raster/probe.py` says how fast another machine is beside it, by one short step of a fit. On a CUDA card nothing
+was measured: there the memory is counted and the time is unknown. So is the time of a published-type model, on any
+device.
 """
 
 from __future__ import annotations
@@ -21,7 +23,8 @@ if TYPE_CHECKING:
 FACTOR: Final = 1.5
 """The time of a whole run is within this factor of its forecast (tests/test_cost.py)."""
 FIT_S: Final = 0.38e-6
-"""A step of a fit, per Gaussian and per pixel of its view. A virtual view beside the recorded one costs VIRTUAL such steps more."""
+"""A step of a fit, per Gaussian and per pixel of its view. A virtual view beside the recorded one costs VIRTUAL such
+steps more."""
 VIRTUAL: Final = 1.5
 NETWORK_VIEW_S, NETWORK_PIXEL_S = 0.25, 5.5e-6
 """A view that a network makes or labels, and each of its pixels; every denoising step adds a tenth of the first."""
@@ -36,7 +39,8 @@ START_S, PROCESS_S = 0.5, 4.0
 SHARED: Final = 0.79
 """Share of a step in one process that is divided among the cores."""
 SHORT_FIT: Final = 1000
-"""Fits of no more iterations end with at most three Gaussians per point of a sweep, longer ones with one per three recorded pixels."""
+"""Fits of no more iterations end with at most three Gaussians per point of a sweep, longer ones with one per three
+recorded pixels."""
 PROGRAM_BYTES, NETWORK_BYTES, NETWORK_PIXEL_BYTES = 600_000_000, 680_000_000, 1_600
 """The program after a fit; each process in which a network runs, and a pixel of its view."""
 PUBLISHED_BYTES: Final = {"cpu": 19_000_000_000, "cuda": 9_000_000_000}
@@ -52,8 +56,10 @@ class SceneSize:
     """What a forecast depends on.
 
     Args:
-        images: that are fitted. path_images: of the camera that is shifted, one per frame. width, height: of an image, pixels.
-        points: LiDAR points of a sweep (0 = not counted). exact: the truth of shifted views is known (generated cities).
+        images: that are fitted. path_images: of the camera that is shifted, one per frame. width, height: of an image,
+            pixels.
+        points: LiDAR points of a sweep (0 = not counted). exact: the truth of shifted views is known (generated
+            cities).
         labelled: semantic labels are there. adapts: the diffusion model can be adapted to the log.
     """
 
@@ -69,7 +75,8 @@ class SceneSize:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Seconds by the clock and of all processors, per step (None: not measured), most memory and size of all results, in bytes."""
+    """Seconds by the clock and of all processors, per step (None: not measured), most memory and size of all results,
+    in bytes."""
 
     seconds: Mapping[str, float | None]
     processor_s: Mapping[str, float | None]
@@ -84,7 +91,9 @@ class Estimate:
 
     def fits(self, free_bytes: int, free_disk_bytes: int) -> bool:
         """Whether memory and disk that are free suffice; 0 = not known, and then not asked."""
-        return self.memory_bytes <= (free_bytes or self.memory_bytes) and self.written_bytes <= (free_disk_bytes or self.written_bytes)
+        return self.memory_bytes <= (free_bytes or self.memory_bytes) and self.written_bytes <= (
+            free_disk_bytes or self.written_bytes
+        )
 
 
 def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0, device: str = "cpu") -> Estimate:
@@ -105,7 +114,10 @@ def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0,
     step_s, part = FIT_S * (gaussians + fit_pixels), 0.5 if config.continue_fit else 1.0
     share = fit.virtual.continued_probability if config.continue_fit else fit.virtual.probability
     view_s = NETWORK_VIEW_S * (1 + config.synthesize.steps / 10) + NETWORK_PIXEL_S * pixels
-    lessons, trained = 2 * config.adapt.gaps + len(config.adapt.shifts_m), config.adapt.steps * config.adapt.batch_frames
+    lessons, trained = (
+        2 * config.adapt.gaps + len(config.adapt.shifts_m),
+        config.adapt.steps * config.adapt.batch_frames,
+    )
     work = {  # core-seconds, and processes among which they are divided (0: threads)
         "annotate": (size.images * (NETWORK_VIEW_S + NETWORK_PIXEL_S * pixels), cores),
         "fuse": (size.images * size.points * POINT_S, 0),
@@ -118,20 +130,26 @@ def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0,
         "score": (scored * (SHOWN_VIEW_S + SHOWN_PIXEL_S * pixels), 0),
         "viewer": (START_S, 0),
         "report": ((2 * rendered + made) * SHOWN_VIEW_S * min(1.0, pixels / 100_000), 0),
-    }  # fmt: skip
+    }
     seconds, processor_s = dict[str, float | None](), dict[str, float | None]()
     for name, (core_s, among) in work.items():
         if (name == "annotate" and size.labelled) or (name == "adapt" and not adapts):
             continue
         known = device == "cpu" and not (name == "synthesize" and published)
         spread = 1 / min(among, cores) if among else 1 - SHARED + SHARED / cores
-        seconds[name], processor_s[name] = ((core_s * held + START_S) / speed if known else None for held in (spread, 1.0))
+        seconds[name], processor_s[name] = (
+            (core_s * held + START_S) / speed if known else None for held in (spread, 1.0)
+        )
     columns = 11 + 3 * (fit.sh_degree + 1) ** 2 + len(CLASSES) * fit.semantics
     views = min(VIEW_PIXEL_BYTES * (size.images + made) * fit_pixels, VIEWS_BYTES) if device == "cpu" else 0
     networks = max(processes * (NETWORK_BYTES + NETWORK_PIXEL_BYTES * pixels), adapts * (processes + 1) * NETWORK_BYTES)
-    memory_bytes = max(PARAMETER_BYTES * columns * gaussians + views, PUBLISHED_BYTES[device] if published else networks)
+    memory_bytes = max(
+        PARAMETER_BYTES * columns * gaussians + views, PUBLISHED_BYTES[device] if published else networks
+    )
     judged = (rendered if size.exact else size.path_images) + (0 if size.labelled else size.images)
-    written = pixels * (VIEW_PIXEL_BYTES * (made + 2 * rendered) + SCORED_PIXEL_BYTES * judged) + GAUSSIAN_BYTES * gaussians
+    written = (
+        pixels * (VIEW_PIXEL_BYTES * (made + 2 * rendered) + SCORED_PIXEL_BYTES * judged) + GAUSSIAN_BYTES * gaussians
+    )
     return Estimate(seconds, processor_s, round(PROGRAM_BYTES + memory_bytes), round(written))
 
 
@@ -140,8 +158,11 @@ def of_presets(size: SceneSize, cores: int, speed: float = 1.0, device: str = "c
     return {name: estimate(run_preset(name), size, cores, speed, device) for name in PRESETS}
 
 
-def in_words(found: Mapping[PresetName, Estimate], free_bytes: int, device: str = "cpu", free_disk_bytes: int = 0) -> list[str]:
-    """A line per preset: time, memory, disk; then which presets fit into what is free (0: unknown), and the time of every step."""
+def in_words(
+    found: Mapping[PresetName, Estimate], free_bytes: int, device: str = "cpu", free_disk_bytes: int = 0
+) -> list[str]:
+    """A line per preset: time, memory, disk; then which presets fit into what is free (0: unknown), and the time of
+    every step."""
     lines = [f"forecasts for mudg run on this scene ({device}):"]
     for name, one in found.items():
         fits = "" if not free_bytes else "fits" if one.memory_bytes <= free_bytes else "does NOT fit"
@@ -151,7 +172,9 @@ def in_words(found: Mapping[PresetName, Estimate], free_bytes: int, device: str 
         lines.append(f"  --preset {name:<8} {_time(one)}; {space}")
     if free_bytes:
         able = [name for name, one in found.items() if one.fits(free_bytes, free_disk_bytes)]
-        lines.append(f"  memory and disk of this machine suffice for: {', '.join(able) or 'none (smaller images, fewer frames)'}")
+        lines.append(
+            f"  memory and disk of this machine suffice for: {', '.join(able) or 'none (smaller images, fewer frames)'}"
+        )
     lines.append(f"  {'time per step':<30}" + "".join(f"{name:>12}" for name in found))
     for step in max((one.seconds for one in found.values()), key=len):
         cells = ["not taken" if step not in one.seconds else _duration(one.seconds[step]) for one in found.values()]
@@ -180,4 +203,10 @@ def _time(one: Estimate) -> str:
 def _duration(seconds: float | None) -> str:
     if seconds is None:
         return "-"
-    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+    return (
+        f"{seconds:.0f} s"
+        if seconds < 90
+        else f"{seconds / 60:.0f} min"
+        if seconds < 5400
+        else f"{seconds / 3600:.1f} h"
+    )

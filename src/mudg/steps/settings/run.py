@@ -21,13 +21,14 @@ class RunConfig:
     """Settings of all steps, in one group per step."""
 
     adaptation: Literal["auto", "on", "off"] = "auto"
-    """Adapt the diffusion model to the log before it generates views. auto: for recorded logs that are long enough, not for
-    generated cities."""
+    """Adapt the diffusion model to the log before it generates views. auto: for recorded logs that are long enough, not
+    for generated cities."""
     device: DeviceName = "auto"
-    """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by --fit.device, keeps
-    that one."""
+    """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by
+    --fit.device, keeps that one."""
     continue_fit: bool = True
-    """Make the fit with virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published."""
+    """Make the fit with virtual views from the one without, with half as many steps. Off: from nothing with all steps,
+    as published."""
     ingest: IngestConfig = setting(default_factory=IngestConfig)
     annotate: AnnotateConfig = setting(default_factory=AnnotateConfig)
     fuse: FuseConfig = setting(default_factory=FuseConfig)

@@ -1,4 +1,5 @@
-"""KITTI vehicle poses: GPS/IMU packets (``oxts``), odometry pose files, velodyne pose files; and the clocks beside them."""
+"""KITTI vehicle poses: GPS/IMU packets (``oxts``), odometry pose files, velodyne pose files; and the clocks beside
+them."""
 
 from __future__ import annotations
 
@@ -22,12 +23,12 @@ from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import blend_motion, rigid_pose, rigid_rotation, unit_intensity
 from mudg.formats.unknown_fields import note_unknown
 
-# scans ----------------------------------------------------------------------------------------------------------------
+# scans --------------------------------------------------------------------------------------------
 #
 # KITTI velodyne scans: reading, and how the sensor turns while the vehicle drives.
 #
-# The sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured a / 2 pi
-# turns later.
+# The sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured
+# a / 2 pi turns later.
 
 
 SENSOR: Final = "velodyne"
@@ -50,7 +51,8 @@ def read_scan(path: Path) -> SweepPoints:
 
 
 def azimuth_delay_s(azimuth_rad: float | NDArray[np.floating]) -> float | NDArray[np.floating]:
-    """When the sensor looks to ``azimuth_rad`` (counter-clockwise from forward, -pi..pi), seconds after looking forward."""
+    """When the sensor looks to ``azimuth_rad`` (counter-clockwise from forward, -pi..pi), seconds after looking
+    forward."""
     return azimuth_rad / (2 * np.pi) * TURN_PERIOD_S
 
 
@@ -59,7 +61,8 @@ def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s
 
     Args:
         points: as measured.
-        velo_at: world-from-velodyne f64[4, 4] at a time; asked at 37 moments of the turn, points in between are blended.
+        velo_at: world-from-velodyne f64[4, 4] at a time; asked at 37 moments of the turn, points in between are
+            blended.
         time_s: the scan's time.
 
     Returns:
@@ -74,19 +77,34 @@ def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s
     return replace(points, xyz=blend_motion(points.xyz, corrections, place), dt_s=dt_s)
 
 
-# calib ----------------------------------------------------------------------------------------------------------------
+# calib --------------------------------------------------------------------------------------------
 #
 # KITTI calibration text, both forms: the object/tracking/odometry ``calib.txt`` and the three files of a raw-data day.
 #
-# KITTI counts pixels from the centre of the top-left pixel; this package from its corner. So 0.5 is added to the principal
-# point here, once.
+# KITTI counts pixels from the centre of the top-left pixel; this package from its corner. So 0.5 is added to the
+# principal point here, once.
 
 
 PIXEL_CENTRE_PX = 0.5
-_NUMBERED = tuple(f"{name}_{number:02d}" for name in ("S", "K", "D", "R", "T", "S_rect", "R_rect", "P_rect") for number in range(4))
-_TEXT = frozenset({
-    "P0", "P1", "P2", "P3", "R0_rect", "R_rect", "Tr", "Tr_velo_to_cam", "Tr_velo_cam", "Tr_imu_to_velo", "Tr_imu_velo", "calib_time",
-})  # fmt: skip
+_NUMBERED = tuple(
+    f"{name}_{number:02d}" for name in ("S", "K", "D", "R", "T", "S_rect", "R_rect", "P_rect") for number in range(4)
+)
+_TEXT = frozenset(
+    {
+        "P0",
+        "P1",
+        "P2",
+        "P3",
+        "R0_rect",
+        "R_rect",
+        "Tr",
+        "Tr_velo_to_cam",
+        "Tr_velo_cam",
+        "Tr_imu_to_velo",
+        "Tr_imu_velo",
+        "calib_time",
+    }
+)
 _OFFICIAL: Mapping[str, frozenset[str]] = {
     "calib_cam_to_cam.txt": frozenset({"calib_time", "corner_dist", *_NUMBERED}),
     "calib_velo_to_cam.txt": frozenset({"calib_time", "R", "T", "delta_f", "delta_c"}),
@@ -94,7 +112,8 @@ _OFFICIAL: Mapping[str, frozenset[str]] = {
     "perspective.txt": frozenset({"calib_time", "corner_dist", *_NUMBERED}),
     "calib_cam_to_pose.txt": frozenset({"image_00", "image_01", "image_02", "image_03"}),
 }
-"""Entries of the data sets' files, read or not; any other file is the calibration text of an object, a sequence or a drive."""
+"""Entries of the data sets' files, read or not; any other file is the calibration text of an object, a sequence or a
+drive."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,8 +147,11 @@ class KittiCalibration:
 
     def _projection(self, number: int) -> Matrix:
         if number not in self.projections:
-            raise InputError(f"calibration does not tell camera {number}", where=self.source,
-                got=", ".join(f"P{n}" for n in self.projections) or "no projection matrices")  # fmt: skip
+            raise InputError(
+                f"calibration does not tell camera {number}",
+                where=self.source,
+                got=", ".join(f"P{n}" for n in self.projections) or "no projection matrices",
+            )
         return self.projections[number]
 
 
@@ -146,12 +168,21 @@ def pinhole_camera(projection: Matrix, name: str, size: tuple[int, int], where: 
         InputError: skew, another last row than 0 0 1, or a focal length that is not positive.
     """
     if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
-        raise InputError("projection matrix is not of a rectified pinhole camera", where=where,
-            expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()))  # fmt: skip
+        raise InputError(
+            "projection matrix is not of a rectified pinhole camera",
+            where=where,
+            expected="no skew, last row 0 0 1",
+            got=str(projection[:, :3].tolist()),
+        )
     fx, fy, cx, cy = (float(projection[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if fx <= 0 or fy <= 0:
-        raise InputError("focal length is not positive", where=where, expected="pixels, about 700 for KITTI",
-            got=f"fx={fx:g}, fy={fy:g}", remedy="check the calibration file")  # fmt: skip
+        raise InputError(
+            "focal length is not positive",
+            where=where,
+            expected="pixels, about 700 for KITTI",
+            got=f"fx={fx:g}, fy={fy:g}",
+            remedy="check the calibration file",
+        )
     return Camera(name, *size, fx, fy, cx + PIXEL_CENTRE_PX, cy + PIXEL_CENTRE_PX)
 
 
@@ -171,8 +202,9 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
         except ValueError:
             continue
         if not np.isfinite(numbers).all():
-            raise InputError("calibration holds a value that is not finite", where=f"{path}: {match[1]}",
-                got=match[2][:80])  # fmt: skip
+            raise InputError(
+                "calibration holds a value that is not finite", where=f"{path}: {match[1]}", got=match[2][:80]
+            )
         table[match[1]] = numbers
     return table
 
@@ -187,11 +219,21 @@ def table_entry(
     """
     key = next((key for key in keys if key in table), None)
     if key is None:
-        raise InputError(f"calibration lacks {keys[0]}", where=str(where), expected=" or ".join(keys),
-            got=", ".join(table) or "no entries", remedy="use the calibration file that belongs to this recording")  # fmt: skip
+        raise InputError(
+            f"calibration lacks {keys[0]}",
+            where=str(where),
+            expected=" or ".join(keys),
+            got=", ".join(table) or "no entries",
+            remedy="use the calibration file that belongs to this recording",
+        )
     if table[key].size != np.prod(shape):
-        raise InputError("calibration entry has the wrong number of values", where=f"{where}: {key}",
-            expected=f"{np.prod(shape)} numbers", got=f"{table[key].size}", remedy="is the file cut off?")  # fmt: skip
+        raise InputError(
+            "calibration entry has the wrong number of values",
+            where=f"{where}: {key}",
+            expected=f"{np.prod(shape)} numbers",
+            got=f"{table[key].size}",
+            remedy="is the file cut off?",
+        )
     return table[key].reshape(shape)
 
 
@@ -212,7 +254,8 @@ def read_calibration_text(path: Path) -> KittiCalibration:
 
 
 def read_calibration_day(folder: Path) -> KittiCalibration:
-    """Raw-data calibration of one day: ``calib_cam_to_cam.txt``, ``calib_velo_to_cam.txt``, ``calib_imu_to_velo.txt``."""
+    """Raw-data calibration of one day: ``calib_cam_to_cam.txt``, ``calib_velo_to_cam.txt``,
+    ``calib_imu_to_velo.txt``."""
     path = folder / "calib_cam_to_cam.txt"
     table = read_number_table(path)
     projections = {n: table_entry(table, (f"P_rect_0{n}",), (3, 4), path) for n in range(4) if f"P_rect_0{n}" in table}
@@ -230,7 +273,7 @@ def _pose_file(path: Path) -> Matrix:
     return from_rotation_translation(rotation, table_entry(table, ("T",), (3,), path))
 
 
-# poses ----------------------------------------------------------------------------------------------------------------
+# poses --------------------------------------------------------------------------------------------
 
 
 Matrix = NDArray[np.float64]
@@ -239,7 +282,8 @@ _OXTS_VALUES = 30
 
 
 def read_lines(path: Path) -> dict[int, str]:
-    """The lines of a text file by their number, from 0. An empty one is a record that is missing: it is left out, and keeps its number."""
+    """The lines of a text file by their number, from 0. An empty one is a record that is missing: it is left out, and
+    keeps its number."""
     return {number: line for number, line in enumerate(store.read_text(path).splitlines()) if line.strip()}
 
 
@@ -250,11 +294,17 @@ def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDA
     except ValueError as error:
         raise InputError(f"{what}: a value is not a number", where=where, got=line.strip()[:80]) from error
     if len(numbers) not in counts:
-        raise InputError(f"{what}: wrong number of values", where=where, expected=" or ".join(str(c) for c in counts),
-            got=str(len(numbers)), remedy="is the file cut off, or of another format?")  # fmt: skip
+        raise InputError(
+            f"{what}: wrong number of values",
+            where=where,
+            expected=" or ".join(str(c) for c in counts),
+            got=str(len(numbers)),
+            remedy="is the file cut off, or of another format?",
+        )
     if not np.isfinite(numbers).all():
-        raise InputError(f"{what}: a value is not finite", where=where, got=line.strip()[:80],
-            expected="finite numbers")  # fmt: skip
+        raise InputError(
+            f"{what}: a value is not finite", where=where, got=line.strip()[:80], expected="finite numbers"
+        )
     return numbers
 
 
@@ -284,17 +334,22 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
     elif len(rows) == count == len(frame_numbers):
         poses = dict(zip(frame_numbers, rows.values(), strict=True))
         if frame_numbers[-1] - frame_numbers[0] >= count:
-            log.warn(f"kitti: {path} has a line for each of the {count} frames: line k is taken for the k-th of them, gaps or not")
+            log.warn(
+                f"kitti: {path} has a line for each of the {count} frames: line k is taken for the k-th of them, gaps"
+                " or not"
+            )
     else:
         expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)"
-        raise InputError("pose file does not cover the frames", where=str(path), got=f"{count} lines",
-            expected=expected)  # fmt: skip
+        raise InputError(
+            "pose file does not cover the frames", where=str(path), got=f"{count} lines", expected=expected
+        )
     sensor = "velo" if widths == {13} else "cam0"
     return {n: rigid_pose(row.reshape(3, 4), f"{path}: pose of frame {n}") for n, row in poses.items()}, sensor
 
 
 def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.float64]]:
-    """GPS/IMU packets f64[30] by frame number, from the first to the last of ``frames``; empty files and lines are missing packets.
+    """GPS/IMU packets f64[30] by frame number, from the first to the last of ``frames``; empty files and lines are
+    missing packets.
 
     Args:
         path: a folder with one file per frame (raw data), or one file with a line per frame (tracking).
@@ -343,8 +398,8 @@ def _roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Matrix:
 def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, float]:
     """Seconds by number: plain seconds, or ``2011-09-26 13:02:25.964389445`` (nanoseconds kept; seconds of the epoch).
 
-    Line k is number k, and an empty line a number without a stamp. A file without empty lines that is too short for that, but has just one
-    line per recorded file, counts those instead.
+    Line k is number k, and an empty line a number without a stamp. A file without empty lines that is too short for
+    that, but has just one line per recorded file, counts those instead.
 
     Args:
         numbers: of the recorded files, increasing.
@@ -359,11 +414,18 @@ def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, 
     if count > last:
         return stamps
     if len(stamps) == max(stamps, default=-1) + 1 == len(numbers) > 0:
-        log.warn(f"kitti: {path} has a line for each of the {len(numbers)} files: line k is taken for the k-th of them, gaps or not")
+        log.warn(
+            f"kitti: {path} has a line for each of the {len(numbers)} files: line k is taken for the k-th of them, gaps"
+            " or not"
+        )
         return dict(zip(numbers, stamps.values(), strict=True))
-    raise InputError("timestamps do not cover the frames", where=str(path), got=f"{count} lines, {len(numbers)} files",
+    raise InputError(
+        "timestamps do not cover the frames",
+        where=str(path),
+        got=f"{count} lines, {len(numbers)} files",
         expected=f"at least {last + 1} lines (line k = frame k, empty where it is missing), or one per file",
-        remedy="is the file cut off?")  # fmt: skip
+        remedy="is the file cut off?",
+    )
 
 
 def _stamp(line: str, where: str) -> float:
@@ -377,9 +439,10 @@ def _stamp(line: str, where: str) -> float:
     return second.timestamp() + float(match[2] or 0)
 
 
-# boxes ----------------------------------------------------------------------------------------------------------------
+# boxes --------------------------------------------------------------------------------------------
 #
-# KITTI boxes: tracking and object label text, raw-data tracklets; all become boxes in the velodyne frame per frame number.
+# KITTI boxes: tracking and object label text, raw-data tracklets; all become boxes in the velodyne frame per frame
+# number.
 
 
 MAX_TRACKLET_BYTES = 256 * 1024 * 1024
@@ -388,10 +451,25 @@ LABELS = frozenset(
 )
 """Classes of the benchmarks, in lower case."""
 _TRACKLET = frozenset({"objectType", "h", "w", "l", "first_frame", "poses", "finished"})
-_TRACKLET_POSE = frozenset({
-    "tx", "ty", "tz", "rx", "ry", "rz", "state", "occlusion", "occlusion_kf", "truncation", "amt_occlusion", "amt_occlusion_kf",
-    "amt_border_l", "amt_border_r", "amt_border_kf",
-})  # fmt: skip
+_TRACKLET_POSE = frozenset(
+    {
+        "tx",
+        "ty",
+        "tz",
+        "rx",
+        "ry",
+        "rz",
+        "state",
+        "occlusion",
+        "occlusion_kf",
+        "truncation",
+        "amt_occlusion",
+        "amt_occlusion_kf",
+        "amt_border_l",
+        "amt_border_r",
+        "amt_border_kf",
+    }
+)
 """Fields of the data set's tracklets, read or not."""
 
 
@@ -417,7 +495,8 @@ class KittiBox:
 
 
 def rect0_from_box(bottom_centre_m: Sequence[float], height_m: float, rotation_y: float) -> Matrix:
-    """Box frame to rectified camera 0 from KITTI's bottom centre (y down) and turn about the camera's y axis, f64[4, 4]."""
+    """Box frame to rectified camera 0 from KITTI's bottom centre (y down) and turn about the camera's y axis, f64[4,
+    4]."""
     c, s = np.cos(rotation_y), np.sin(rotation_y)
     forward, left, up = (c, 0.0, -s), (s, 0.0, c), (0.0, -1.0, 0.0)
     centre = np.asarray(bottom_centre_m, np.float64) - [0, height_m / 2, 0]
@@ -441,9 +520,13 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
     for index, line in read_lines(path).items():
         columns, where = line.split(), f"{path}: line {index + 1}"
         if len(columns) - skip not in (15, 16):
-            raise InputError("label line has the wrong number of columns", where=where, got=str(len(columns)),
+            raise InputError(
+                "label line has the wrong number of columns",
+                where=where,
+                got=str(len(columns)),
                 expected=f"{15 + skip} (or {16 + skip} with a score)",
-                remedy="is this a tracking or an object label file?")  # fmt: skip
+                remedy="is this a tracking or an object label file?",
+            )
         if columns[skip] == "DontCare":
             continue
         try:
@@ -466,8 +549,11 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     if len(content) > MAX_TRACKLET_BYTES:
         raise InputError("tracklet file is too large", where=str(path), got=f"{len(content)} bytes")
     if b"<!ENTITY" in content:
-        raise InputError("tracklet file declares XML entities, which no KITTI file does", where=str(path),
-            remedy="use the file from the data set")  # fmt: skip
+        raise InputError(
+            "tracklet file declares XML entities, which no KITTI file does",
+            where=str(path),
+            remedy="use the file from the data set",
+        )
     try:
         root = ElementTree.fromstring(content)  # noqa: S314 - entities are refused above, the size is bounded
     except ElementTree.ParseError as error:
@@ -508,16 +594,17 @@ def build_tracks(
 ) -> tuple[list[Track], list[str]]:
     """Tracks in the world from boxes per frame, in the order of their numbers.
 
-    Boxes of frames that are not imported are left out. A track that is not seen for longer than ``box_tracks.MAX_GAP_S``
-    is split into ``7``, ``7.1``, ... The size is the median over the track.
+    Boxes of frames that are not imported are left out. A track that is not seen for longer than
+    ``box_tracks.MAX_GAP_S`` is split into ``7``, ``7.1``, ... The size is the median over the track.
 
     Args:
         boxes: in any order.
         world_from_velo: pose of the velodyne f64[4, 4] by frame number.
         times_s: time of the scan by frame number, seconds.
         where: the file the boxes come from, for messages.
-        velo_at: pose of the velodyne at any time, when boxes were drawn into scans that were still twisted: each box then
-            belongs to the moment its azimuth was measured, and is moved to the scan's time with the track's velocity.
+        velo_at: pose of the velodyne at any time, when boxes were drawn into scans that were still twisted: each box
+            then belongs to the moment its azimuth was measured, and is moved to the scan's time with the track's
+            velocity.
 
     Returns:
         The tracks, and notes for people (splits, boxes left out).

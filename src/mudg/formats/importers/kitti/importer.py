@@ -6,18 +6,20 @@ What is read (the parts that are there are found by looking, and each choice is 
 images      ``image_02/data``, ``image_02``, ``image_2``, or ``image_02/<sequence>``
 scans       ``velodyne_points/data``, ``velodyne``, or ``velodyne/<sequence>``
 calibration ``calib.txt``, ``calib/<frame or sequence>.txt``, or the day's ``calib_*_to_*.txt`` here or one folder up
-poses       ``oxts/data`` (raw) or ``oxts/<sequence>.txt``; ``poses.txt``; ``poses_velo.txt``; ``poses_cam0.txt``; also in ``derived/``
-boxes       ``tracklet_labels.xml``; ``label_02.txt`` or ``label_02/<sequence>.txt``, also in ``derived/``; ``label_2/<frame>.txt``
+poses       ``oxts/data`` (raw) or ``oxts/<sequence>.txt``; ``poses.txt``; ``poses_velo.txt``; ``poses_cam0.txt``; also
+            in ``derived/``
+boxes       ``tracklet_labels.xml``; ``label_02.txt`` or ``label_02/<sequence>.txt``, also in ``derived/``;
+            ``label_2/<frame>.txt``
 times       ``timestamps.txt`` per sensor, ``times.txt``; without them 10 Hz is assumed, and said
 =========== =============================================================================================
 
 Frames. World: z up, origin and x axis at the first ego pose. The ego frame is the IMU where there is GPS/IMU data, else
 the velodyne. Camera ``image_02`` is called ``front``.
 
-Scans of raw drives are distorted by the vehicle's motion. They are untwisted here when poses come from GPS/IMU packets: the
-sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured a / 2 pi
-turns later, and ``dt_s`` says so. The odometry, tracking and object benchmarks document their scans as compensated; those
-keep ``dt_s`` = 0.
+Scans of raw drives are distorted by the vehicle's motion. They are untwisted here when poses come from GPS/IMU packets:
+the sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured a
+/ 2 pi turns later, and ``dt_s`` says so. The odometry, tracking and object benchmarks document their scans as
+compensated; those keep ``dt_s`` = 0.
 """
 
 from __future__ import annotations
@@ -156,14 +158,21 @@ def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     origin = Source("kitti", LICENCE, None, (*notes, *image_notes(fits)))
     content = SceneContent(
-        source.resolve().name, origin, fits, range(len(frames)), convert, lambda index: f"frame {frames[index]}",
-        motion.ego, tracks=lambda: (tracks, ()),
-    )  # fmt: skip
+        source.resolve().name,
+        origin,
+        fits,
+        range(len(frames)),
+        convert,
+        lambda index: f"frame {frames[index]}",
+        motion.ego,
+        tracks=lambda: (tracks, ()),
+    )
     return write_scene(content, out, options)
 
 
 def files_of_kitti(source: Path, options: ImportOptions) -> LogFiles:
-    """The folder, with the calibration and poses beside it; of a folder with many sequences or frames only what is chosen."""
+    """The folder, with the calibration and poses beside it; of a folder with many sequences or frames only what is
+    chosen."""
     beside = [*source.parent.glob("calib_*.txt"), *_odometry_poses(source)]
     beside = [path for path in beside if path.is_file()]
     wanted = options.sequence
@@ -179,7 +188,7 @@ def files_of_kitti(source: Path, options: ImportOptions) -> LogFiles:
     return LogFiles((*chosen, *here, *sorted(beside)))
 
 
-# --- finding files --------------------------------------------------------------------------------------------------
+# --- finding files --------------------------------------------------------------------------------
 
 
 def find_files(source: Path, options: ImportOptions) -> KittiFiles:
@@ -209,11 +218,19 @@ def _refuse_without_images(source: Path, options: ImportOptions) -> None:
     folders = (path for name in ("image_02", "image_2") for path in (source / name).glob("*/"))
     sequences = sorted(path.name for path in folders if path.name != "data")
     if sequences:
-        raise UsageError("the folder holds several sequences", where=str(source),
-            expected="--sequence with one of " + ", ".join(sequences[:12]), got=options.sequence or "none chosen")  # fmt: skip
-    raise InputError("no KITTI images found", where=str(source), got=layout.folder_contents(source),
+        raise UsageError(
+            "the folder holds several sequences",
+            where=str(source),
+            expected="--sequence with one of " + ", ".join(sequences[:12]),
+            got=options.sequence or "none chosen",
+        )
+    raise InputError(
+        "no KITTI images found",
+        where=str(source),
+        got=layout.folder_contents(source),
         expected="image_02/data, image_02 or image_2 with numbered PNG files",
-        remedy="give the folder of one drive, sequence or training set")  # fmt: skip
+        remedy="give the folder of one drive, sequence or training set",
+    )
 
 
 def _choose_frames(files: KittiFiles, stamps: Mapping[str, Mapping[int, float]], options: ImportOptions) -> list[int]:
@@ -236,9 +253,12 @@ def _single_frame(files: KittiFiles, options: ImportOptions) -> int:
     if options.frames is not None:
         numbers = [n for n in numbers if options.frames[0] <= n < options.frames[1]]
     if len(numbers) != 1:
-        raise UsageError("an object-benchmark folder holds unrelated frames; a scene is one of them",
-            where=str(files.folder), expected="--sequence with one frame number, e.g. 000008",
-            got=f"{len(numbers)} frames: {layout.number_ranges(numbers)}")  # fmt: skip
+        raise UsageError(
+            "an object-benchmark folder holds unrelated frames; a scene is one of them",
+            where=str(files.folder),
+            expected="--sequence with one frame number, e.g. 000008",
+            got=f"{len(numbers)} frames: {layout.number_ranges(numbers)}",
+        )
     if files.scans and numbers[0] not in files.scans:
         raise InputError("frame has no scan", where=str(files.folder / "velodyne"), expected=f"{numbers[0]:06d}.bin")
     return numbers[0]
@@ -258,12 +278,15 @@ def _find_calibration(files: KittiFiles, frames: Sequence[int], options: ImportO
         if (day / "calib_cam_to_cam.txt").is_file():
             log.info(f"kitti: calibration from {day}/calib_*.txt")
             return read_calibration_day(day)
-    raise InputError("no calibration found", where=str(folder),
+    raise InputError(
+        "no calibration found",
+        where=str(folder),
         expected="calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up",
-        remedy="download the day's calibration archive and unpack it beside the drive")  # fmt: skip
+        remedy="download the day's calibration archive and unpack it beside the drive",
+    )
 
 
-# --- time and motion ------------------------------------------------------------------------------------------------
+# --- time and motion ------------------------------------------------------------------------------
 
 
 def _read_stamps(files: KittiFiles, options: ImportOptions) -> dict[str, dict[int, float]]:
@@ -308,7 +331,8 @@ def _make_clock(
 
 
 def _with_poses(recording: _Recording, motion: _VeloMotion, options: ImportOptions) -> list[int]:
-    """Frames whose image and scan lie where the vehicle's path is known; others are refused, or left out if that is asked for."""
+    """Frames whose image and scan lie where the vehicle's path is known; others are refused, or left out if that is
+    asked for."""
     clock, reach_s = recording.clock, TURN_PERIOD_S / 2 if motion.untwist else 0.0
     placed = []
     for n in recording.frames:
@@ -335,8 +359,12 @@ def _find_motion(recording: _Recording, options: ImportOptions, notes: list[str]
         ego_from_velo, untwist = np.eye(4), options.untwist == "yes"
     else:
         if calibration.velo_from_imu is None:
-            raise InputError("calibration does not tell where the IMU is", where=calibration.source,
-                expected="calib_imu_to_velo.txt or Tr_imu_to_velo", remedy="add it, or give a pose file with --poses")  # fmt: skip
+            raise InputError(
+                "calibration does not tell where the IMU is",
+                where=calibration.source,
+                expected="calib_imu_to_velo.txt or Tr_imu_to_velo",
+                remedy="add it, or give a pose file with --poses",
+            )
         log.info(f"kitti: poses from GPS/IMU packets in {packets}")
         notes.append("poses from GPS/IMU packets")
         ego = _ego_from_packets(packets, frames, recording.clock, options)
@@ -359,9 +387,12 @@ def _ego_from_file(recording: _Recording, options: ImportOptions, notes: list[st
     if path is None and len(frames) == 1:
         return EgoPath(np.array([recording.clock.scan_s[frames[0]]]), np.eye(4)[None])
     if path is None:
-        raise InputError("no vehicle poses found", where=str(folder),
+        raise InputError(
+            "no vehicle poses found",
+            where=str(folder),
             expected="oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE",
-            remedy="without poses the frames of a moving vehicle cannot be put into one world")  # fmt: skip
+            remedy="without poses the frames of a moving vehicle cannot be put into one world",
+        )
     log.info(f"kitti: poses from {path}")
     notes.append(f"poses from {path.name}")
     poses, sensor = kitti_poses.read_pose_file(path, frames)
@@ -374,14 +405,16 @@ def _ego_from_file(recording: _Recording, options: ImportOptions, notes: list[st
     return EgoPath(np.array([recording.clock.scan_s[n] for n in known]), invert(stacked[0]) @ stacked)
 
 
-def _known(
-    frames: Sequence[int], there: Container[int], what: str, path: Path, options: ImportOptions
-) -> list[int]:
+def _known(frames: Sequence[int], there: Container[int], what: str, path: Path, options: ImportOptions) -> list[int]:
     """The frames that are ``there``; lost ones are refused unless frames may be left out."""
     missing = [n for n in frames if n not in there]
     if missing and (not options.skip_missing or len(missing) == len(frames)):
-        raise InputError(what, where=str(path), got=f"nothing for frames {layout.number_ranges(missing)}",
-            remedy="copy them, choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+        raise InputError(
+            what,
+            where=str(path),
+            got=f"nothing for frames {layout.number_ranges(missing)}",
+            remedy="copy them, choose frames with --frames FIRST:END, or add --skip-missing",
+        )
     return [n for n in frames if n in there]
 
 
@@ -416,7 +449,7 @@ def _ego_from_packets(path: Path, frames: Sequence[int], clock: _Clock, options:
     return EgoPath(times[later], poses[later])
 
 
-# --- boxes and cameras ------------------------------------------------------------------------------------------------
+# --- boxes and cameras ----------------------------------------------------------------------------
 
 
 def _find_tracks(

@@ -2,18 +2,20 @@
 
 What becomes what:
 
-=========== =============================================================================================================
-images      five cameras (``front``, ``front_left``, ``front_right``, ``side_left``, ``side_right``), rectified; the view is the one
-            of the middle column's exposure
+=========== ============================================================================================================
+images      five cameras (``front``, ``front_left``, ``front_right``, ``side_left``, ``side_right``), rectified; the
+            view is the one of the middle column's exposure
 labels      panoptic labels, where an image has them: ``semantics``, ``instance``, ``sky``, ``ego``
-scans       five LiDARs (``lidar_top``, ``lidar_front``, ...), both returns, at the frame's pose; ``dt_s`` for the top one
+scans       five LiDARs (``lidar_top``, ``lidar_front``, ...), both returns, at the frame's pose; ``dt_s`` for the top
+            one
 boxes       3D boxes as tracks, carried to the moment of the frame's pose (``tracks``)
-world       z up, origin and x axis at the vehicle's pose of the first imported frame; the offset stands in the scene's notes
+world       z up, origin and x axis at the vehicle's pose of the first imported frame; the offset stands in the scene's
+            notes
 time        seconds since the first imported frame's timestamp
-=========== =============================================================================================================
+=========== ============================================================================================================
 
-A frame's timestamp is when the top LiDAR began its turn; the frame's pose belongs to the middle of the turn. Its time is that of the
-image recorded with the same pose (the front camera's).
+A frame's timestamp is when the top LiDAR began its turn; the frame's pose belongs to the middle of the turn. Its time
+is that of the image recorded with the same pose (the front camera's).
 """
 
 from __future__ import annotations
@@ -104,16 +106,29 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
     path = EgoPath(np.array([plan.pose_s(f) for f in frames]), np.stack([plan.world_from_vehicle(f) for f in frames]))
     origin = Source("waymo", LICENCE, None, tuple(notes))
     content = SceneContent(
-        waymo.name, origin, plan.fits, items(), convert, lambda item: item[0].where, path, lambda: (found, ()), len(frames)
-    )  # fmt: skip
+        waymo.name,
+        origin,
+        plan.fits,
+        items(),
+        convert,
+        lambda item: item[0].where,
+        path,
+        lambda: (found, ()),
+        len(frames),
+    )
     return write_scene(content, out, options)
 
 
 def _refuse_options(options: ImportOptions) -> None:
     refuse_options(options, "Waymo", "poses", "boxes")
     if options.untwist == "no":
-        raise UsageError("Waymo scans cannot be left twisted", where="--untwist", got="no", remedy="leave it out",
-            expected="auto or yes: points carry the pose they were measured at")  # fmt: skip
+        raise UsageError(
+            "Waymo scans cannot be left twisted",
+            where="--untwist",
+            got="no",
+            remedy="leave it out",
+            expected="auto or yes: points carry the pose they were measured at",
+        )
 
 
 def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
@@ -122,7 +137,7 @@ def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
     return LogFiles((record,) if record is not None else tuple(sorted(source.glob(f"*/{segment}.parquet"))))
 
 
-# --- finding the log ------------------------------------------------------------------------------------------------
+# --- finding the log ------------------------------------------------------------------------------
 
 
 def open_log(source: Path, options: ImportOptions) -> WaymoLog:
@@ -144,8 +159,12 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path | None, str]:
     records = {path.stem: path for path in sorted(source.glob(f"*{_SUFFIX}"))}
     segments = records or sorted({path.stem for name in REQUIRED for path in (source / name).glob("*.parquet")})
     if not segments:
-        raise InputError("no Waymo log found", where=str(source), got=folder_contents(source),
-            expected=f"*{_SUFFIX} files, or component folders: {', '.join(REQUIRED)}")  # fmt: skip
+        raise InputError(
+            "no Waymo log found",
+            where=str(source),
+            got=folder_contents(source),
+            expected=f"*{_SUFFIX} files, or component folders: {', '.join(REQUIRED)}",
+        )
     matching = [name for name in segments if name == options.sequence] or [n for n in segments if options.sequence in n]
     name = the_only(matching, matching or list(segments), options, source, "log")
     return records.get(name), name
@@ -155,14 +174,23 @@ def _chosen_cameras(waymo: WaymoLog, options: ImportOptions, source: Path) -> li
     recorded = {name for frame in waymo.frames for name in frame.shots}
     there = {name: name for name in CAMERAS.values() if name in recorded}
     if not there:
-        raise InputError("the log has no images", where=str(source), expected="images of the cameras",
+        raise InputError(
+            "the log has no images",
+            where=str(source),
+            expected="images of the cameras",
             got=f"{len(waymo.frames)} frames with poses and boxes only",
-            remedy="take the files with camera and LiDAR data")  # fmt: skip
+            remedy="take the files with camera and LiDAR data",
+        )
     chosen = chosen_cameras(there, options, str(source), tuple(there))
     lacking = [name for name in chosen if name not in waymo.cameras]
     if lacking:
-        raise InputError("cameras have images and no calibration", where=str(source), got=", ".join(lacking),
-            expected=", ".join(waymo.cameras) or "a calibration for each", remedy="choose others with --cameras")  # fmt: skip
+        raise InputError(
+            "cameras have images and no calibration",
+            where=str(source),
+            got=", ".join(lacking),
+            expected=", ".join(waymo.cameras) or "a calibration for each",
+            remedy="choose others with --cameras",
+        )
     return chosen
 
 
@@ -173,21 +201,29 @@ def _usable_frames(waymo: WaymoLog, options: ImportOptions) -> tuple[list[FrameR
     lasers = sorted({name for frame in waymo.frames for name in frame.lasers})
     without = [name for name in lasers if name not in waymo.lasers]
     if without:
-        raise InputError("LiDARs have scans and no calibration", where=waymo.frames[0].where, got=", ".join(without),
-            expected=", ".join(waymo.lasers) or "a calibration for each")  # fmt: skip
+        raise InputError(
+            "LiDARs have scans and no calibration",
+            where=waymo.frames[0].where,
+            got=", ".join(without),
+            expected=", ".join(waymo.lasers) or "a calibration for each",
+        )
     complete, missing = [], []
     for frame in waymo.frames:
         lack = sorted(cameras - set(frame.shots)) + [f"LiDAR {name}" for name in lasers if name not in frame.lasers]
         (missing if lack else complete).append((frame, lack))
     if missing and not options.skip_missing:
         frame, lack = missing[0]
-        raise InputError("frame lacks images or scans", where=frame.where,
+        raise InputError(
+            "frame lacks images or scans",
+            where=frame.where,
             got=f"no {', '.join(lack)}" + (f"; {len(missing)} frames in all" if len(missing) > 1 else ""),
             expected="what the other frames have",
-            remedy="choose frames with --frames FIRST:END, or add --skip-missing")  # fmt: skip
+            remedy="choose frames with --frames FIRST:END, or add --skip-missing",
+        )
     if not complete:
-        raise InputError("no frame is complete", where=waymo.frames[0].where,
-            got=f"the first has no {', '.join(missing[0][1])}")  # fmt: skip
+        raise InputError(
+            "no frame is complete", where=waymo.frames[0].where, got=f"the first has no {', '.join(missing[0][1])}"
+        )
     notes = [f"Waymo Open Dataset, {waymo.form}" + (f"; {waymo.conditions}" if waymo.conditions else "")]
     if missing:
         notes.append(
@@ -199,7 +235,7 @@ def _usable_frames(waymo: WaymoLog, options: ImportOptions) -> tuple[list[FrameR
     return [frame for frame, _ in complete], notes
 
 
-# --- time, world, cameras -------------------------------------------------------------------------------------------
+# --- time, world, cameras -------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -251,7 +287,8 @@ class _Plan:
         return TimedBoxes(self.pose_s(frame), self.world_from_vehicle(frame), frame.boxes, late, frame.where, images_s)
 
     def seen_s(self, frame: FrameRecord) -> NDArray[np.float64]:
-        """When the top LiDAR looked at each box, seconds after the timestamp; without one, the moment of the frame's pose."""
+        """When the top LiDAR looked at each box, seconds after the timestamp; without one, the moment of the frame's
+        pose."""
         if TOP not in frame.lasers or not frame.boxes:
             return np.full(len(frame.boxes), self.middle_s[frame.number])
         centres = np.array([box.centre for box in frame.boxes])
@@ -275,7 +312,8 @@ def _plan(
     turn = _measure_turn(waymo, frames)
     if turn.measured:
         notes.append(
-            f"the top LiDAR's turns begin {turn.start_s * 1e3:.1f} ms after the timestamp and take {turn.duration_s * 1e3:.1f} ms"
+            f"the top LiDAR's turns begin {turn.start_s * 1e3:.1f} ms after the timestamp and take"
+            f" {turn.duration_s * 1e3:.1f} ms"
         )
     middles = {frame.number: _pose_moment(frame, turn) for frame in frames}
     assumed = sum(not exact for _, exact in middles.values())
@@ -355,7 +393,7 @@ def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan
     return moment, f"boxes hold {texts[moment]} (points that lie in boxes of fast objects if they do: {tallies})"
 
 
-# --- writing --------------------------------------------------------------------------------------------------------
+# --- writing --------------------------------------------------------------------------------------
 
 
 def _converted(plan: _Plan, frame: FrameRecord, content: FrameContent, index: int) -> Iterator[SceneImage | SceneSweep]:
@@ -403,6 +441,7 @@ def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: 
     texts = ", ".join(f"{camera} {median:.1f} px" for camera, median in medians.items())
     if max(medians.values()) > DOUBTFUL_PROJECTION_PX:
         log.warn(
-            f"waymo: points do not fall where the log says they do ({texts}, median); are calibrations and poses of this log?"
+            f"waymo: points do not fall where the log says they do ({texts}, median); are calibrations and poses of"
+            " this log?"
         )
     return f"points fall where the log says they do, up to (median, first frame): {texts}"

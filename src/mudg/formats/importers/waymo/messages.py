@@ -1,9 +1,10 @@
 """Reading protocol-buffer messages by a table of the fields that are wanted; no generated code.
 
-A message is a row of fields, each a key (number and wire type, a varint) and a value. ``Message`` lists what to keep; all else is
-skipped by its wire type. Values of bytes fields are views of the input: nothing large is copied.
+A message is a row of fields, each a key (number and wire type, a varint) and a value. ``Message`` lists what to keep;
+all else is skipped by its wire type. Values of bytes fields are views of the input: nothing large is copied.
 
-Source: the protocol-buffer encoding guide; the field numbers of the Waymo Open Dataset's published message descriptions.
+Source: the protocol-buffer encoding guide; the field numbers of the Waymo Open Dataset's published message
+descriptions.
 """
 
 from __future__ import annotations
@@ -23,9 +24,17 @@ Kind = Literal["int", "float", "double", "bytes", "text", "message", "doubles", 
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _WIRE: Final[Mapping[Kind, int]] = {
-    "int": _VARINT, "ints": _VARINT, "double": _FIXED64, "doubles": _FIXED64, "float": _FIXED32, "floats": _FIXED32,
-    "bytes": _BYTES, "text": _BYTES, "message": _BYTES, "messages": _BYTES,
-}  # fmt: skip
+    "int": _VARINT,
+    "ints": _VARINT,
+    "double": _FIXED64,
+    "doubles": _FIXED64,
+    "float": _FIXED32,
+    "floats": _FIXED32,
+    "bytes": _BYTES,
+    "text": _BYTES,
+    "message": _BYTES,
+    "messages": _BYTES,
+}
 _DTYPE: Final[Mapping[Kind, str]] = {"doubles": "<f8", "floats": "<f4"}
 _MAX_FIELDS: Final = 4_000_000
 
@@ -41,7 +50,8 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message description: its name, for errors; field number -> field; and numbers of the data set's fields that are not kept."""
+    """A message description: its name, for errors; field number -> field; and numbers of the data set's fields that are
+    not kept."""
 
     name: str
     fields: Mapping[int, Field]
@@ -97,9 +107,13 @@ class _MessageReader:
         self._place = 0
 
     def broken(self, place: int, got: str) -> InputError:
-        return InputError("message cannot be decoded", where=f"{self._where}: {self._message.name}, byte {place}",
-            expected="a protocol-buffer message of the Waymo Open Dataset", got=got,
-            remedy="is this a file of another data set, or of the motion data?")  # fmt: skip
+        return InputError(
+            "message cannot be decoded",
+            where=f"{self._where}: {self._message.name}, byte {place}",
+            expected="a protocol-buffer message of the Waymo Open Dataset",
+            got=got,
+            remedy="is this a file of another data set, or of the motion data?",
+        )
 
     def fields(self) -> Iterator[tuple[int, int, int, Any]]:
         """Place, number, wire type and raw value (an int, or a view) of every field."""
@@ -186,50 +200,90 @@ def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
     return np.add.reduceat((codes & np.uint8(0x7F)).astype(np.uint64) << shift, first).view(np.int64)
 
 
-# --- the messages of the data set -----------------------------------------------------------------------------------
+# --- the messages of the data set -----------------------------------------------------------------
 
 
 def _message(title: str, /, *passed: int, **fields: tuple[Any, ...]) -> Message:
-    """A description from fields by name: number, kind and, for messages, their description. ``passed``: numbers of official fields that are
-    not kept."""
+    """A description from fields by name: number, kind and, for messages, their description. ``passed``: numbers of
+    official fields that are not kept."""
     return Message(title, {number: Field(field, *kind) for field, (number, *kind) in fields.items()}, frozenset(passed))
 
 
 _TRANSFORM = _message("Transform", values=(1, "doubles"))
 _CAMERA_CALIBRATION = _message(
-    "CameraCalibration", name=(1, "int"), intrinsic=(2, "doubles"), extrinsic=(3, "message", _TRANSFORM),
-    width=(4, "int"), height=(5, "int"), direction=(6, "int")
-)  # fmt: skip
+    "CameraCalibration",
+    name=(1, "int"),
+    intrinsic=(2, "doubles"),
+    extrinsic=(3, "message", _TRANSFORM),
+    width=(4, "int"),
+    height=(5, "int"),
+    direction=(6, "int"),
+)
 _LASER_CALIBRATION = _message(
-    "LaserCalibration", name=(1, "int"), inclinations=(2, "doubles"), inclination_min=(3, "double"),
-    inclination_max=(4, "double"), extrinsic=(5, "message", _TRANSFORM)
-)  # fmt: skip
+    "LaserCalibration",
+    name=(1, "int"),
+    inclinations=(2, "doubles"),
+    inclination_min=(3, "double"),
+    inclination_max=(4, "double"),
+    extrinsic=(5, "message", _TRANSFORM),
+)
 _STATS = _message("Stats", 1, 5, time_of_day=(2, "text"), location=(3, "text"), weather=(4, "text"))
 CONTEXT: Final = _message(
-    "Context", name=(1, "text"), cameras=(2, "messages", _CAMERA_CALIBRATION),
-    lasers=(3, "messages", _LASER_CALIBRATION), stats=(4, "message", _STATS)
-)  # fmt: skip
+    "Context",
+    name=(1, "text"),
+    cameras=(2, "messages", _CAMERA_CALIBRATION),
+    lasers=(3, "messages", _LASER_CALIBRATION),
+    stats=(4, "message", _STATS),
+)
 _VELOCITY = _message(
-    "Velocity", v_x=(1, "float"), v_y=(2, "float"), v_z=(3, "float"), w_x=(4, "double"), w_y=(5, "double"),
-    w_z=(6, "double")
-)  # fmt: skip
+    "Velocity",
+    v_x=(1, "float"),
+    v_y=(2, "float"),
+    v_z=(3, "float"),
+    w_x=(4, "double"),
+    w_y=(5, "double"),
+    w_z=(6, "double"),
+)
 _PANOPTIC = _message("CameraSegmentationLabel", 3, 4, 5, divisor=(1, "int"), png=(2, "bytes"))
 _CAMERA_IMAGE = _message(
-    "CameraImage", name=(1, "int"), image=(2, "bytes"), pose=(3, "message", _TRANSFORM),
-    velocity=(4, "message", _VELOCITY), pose_time_s=(5, "double"), shutter_s=(6, "double"), trigger_s=(7, "double"),
-    done_s=(8, "double"), panoptic=(10, "message", _PANOPTIC)
-)  # fmt: skip
+    "CameraImage",
+    name=(1, "int"),
+    image=(2, "bytes"),
+    pose=(3, "message", _TRANSFORM),
+    velocity=(4, "message", _VELOCITY),
+    pose_time_s=(5, "double"),
+    shutter_s=(6, "double"),
+    trigger_s=(7, "double"),
+    done_s=(8, "double"),
+    panoptic=(10, "message", _PANOPTIC),
+)
 _RANGE_IMAGE = _message("RangeImage", 1, 5, 6, ranges=(2, "bytes"), projections=(3, "bytes"), poses=(4, "bytes"))
 _LASER = _message("Laser", name=(1, "int"), return1=(2, "message", _RANGE_IMAGE), return2=(3, "message", _RANGE_IMAGE))
 _BOX = _message(
-    "Box", x=(1, "double"), y=(2, "double"), z=(3, "double"), width=(4, "double"), length=(5, "double"),
-    height=(6, "double"), heading=(7, "double")
-)  # fmt: skip
+    "Box",
+    x=(1, "double"),
+    y=(2, "double"),
+    z=(3, "double"),
+    width=(4, "double"),
+    length=(5, "double"),
+    height=(6, "double"),
+    heading=(7, "double"),
+)
 _LABEL = _message("Label", 2, 5, 6, 7, 8, 9, 10, 11, 12, 13, box=(1, "message", _BOX), type=(3, "int"), id=(4, "text"))
 FRAME: Final = _message(
-    "Frame", 7, 8, 9, 10, 11, context=(1, "bytes"), timestamp_us=(2, "int"), pose=(3, "message", _TRANSFORM),
-    images=(4, "messages", _CAMERA_IMAGE), lasers=(5, "messages", _LASER), labels=(6, "messages", _LABEL)
-)  # fmt: skip
+    "Frame",
+    7,
+    8,
+    9,
+    10,
+    11,
+    context=(1, "bytes"),
+    timestamp_us=(2, "int"),
+    pose=(3, "message", _TRANSFORM),
+    images=(4, "messages", _CAMERA_IMAGE),
+    lasers=(5, "messages", _LASER),
+    labels=(6, "messages", _LABEL),
+)
 _SHAPE = _message("MatrixShape", dims=(1, "ints"))
 MATRIX_FLOAT: Final = _message("MatrixFloat", data=(1, "floats"), shape=(2, "message", _SHAPE))
 MATRIX_INT: Final = _message("MatrixInt32", data=(1, "ints"), shape=(2, "message", _SHAPE))

@@ -1,7 +1,7 @@
 """Waymo logs of format 2: a folder per component (``camera_image``, ``lidar``, ...) with one Parquet file per log.
 
-Rows are read one at a time and in the order of the file, so that memory stays at one page of a column; the keys of all rows are
-read first and tell which row belongs to which frame.
+Rows are read one at a time and in the order of the file, so that memory stays at one page of a column; the keys of all
+rows are read first and tell which row belongs to which frame.
 """
 
 from __future__ import annotations
@@ -35,29 +35,61 @@ _STREAM_BYTES: Final = 1 << 20
 _TWO_RETURNS: Final = tuple(f"range_image_return{number}.{part}" for number in (1, 2) for part in ("values", "shape"))
 OFFICIAL: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     "camera_image": ("CameraImageComponent", ("image", "pose.transform", "pose_timestamp", *_VELOCITY, *_EXPOSURE)),
-    "camera_calibration": ("CameraCalibrationComponent", (
-        *(f"intrinsic.{name}" for name in _INTRINSIC), "extrinsic.transform", "width", "height", "rolling_shutter_direction",
-    )),
-    "camera_segmentation": ("CameraSegmentationLabelComponent", (
-        "panoptic_label", "panoptic_label_divisor", "sequence_id", "num_cameras_covered",
-        *(f"instance_id_to_global_id_mapping.{name}" for name in ("local_instance_ids", "global_instance_ids", "is_tracked")),
-    )),
+    "camera_calibration": (
+        "CameraCalibrationComponent",
+        (
+            *(f"intrinsic.{name}" for name in _INTRINSIC),
+            "extrinsic.transform",
+            "width",
+            "height",
+            "rolling_shutter_direction",
+        ),
+    ),
+    "camera_segmentation": (
+        "CameraSegmentationLabelComponent",
+        (
+            "panoptic_label",
+            "panoptic_label_divisor",
+            "sequence_id",
+            "num_cameras_covered",
+            *(
+                f"instance_id_to_global_id_mapping.{name}"
+                for name in ("local_instance_ids", "global_instance_ids", "is_tracked")
+            ),
+        ),
+    ),
     "lidar": ("LiDARComponent", _TWO_RETURNS),
-    "lidar_box": ("LiDARBoxComponent", (
-        "type", *_BOX, *(f"{name}.{axis}" for name in ("speed", "acceleration") for axis in "xyz"), "num_lidar_points_in_box",
-        "num_top_lidar_points_in_box", "difficulty_level.detection", "difficulty_level.tracking",
-    )),
-    "lidar_calibration": ("LiDARCalibrationComponent", (
-        "extrinsic.transform", *(f"beam_inclination.{name}" for name in ("min", "max", "values")),
-    )),
+    "lidar_box": (
+        "LiDARBoxComponent",
+        (
+            "type",
+            *_BOX,
+            *(f"{name}.{axis}" for name in ("speed", "acceleration") for axis in "xyz"),
+            "num_lidar_points_in_box",
+            "num_top_lidar_points_in_box",
+            "difficulty_level.detection",
+            "difficulty_level.tracking",
+        ),
+    ),
+    "lidar_calibration": (
+        "LiDARCalibrationComponent",
+        ("extrinsic.transform", *(f"beam_inclination.{name}" for name in ("min", "max", "values"))),
+    ),
     "lidar_camera_projection": ("LiDARCameraProjectionComponent", _TWO_RETURNS),
     "lidar_pose": ("LiDARPoseComponent", _TWO_RETURNS[:2]),
-    "stats": ("StatsComponent", (
-        "time_of_day", "location", "weather", *(f"{of}_object_counts.{part}" for of in ("lidar", "camera") for part in ("types", "counts")),
-    )),
+    "stats": (
+        "StatsComponent",
+        (
+            "time_of_day",
+            "location",
+            "weather",
+            *(f"{of}_object_counts.{part}" for of in ("lidar", "camera") for part in ("types", "counts")),
+        ),
+    ),
     "vehicle_pose": ("VehiclePoseComponent", ("world_from_vehicle.transform",)),
-}  # fmt: skip
-"""Folders that are read -> name of the component, and its columns, read or not. Source: the data set's published components."""
+}
+"""Folders that are read -> name of the component, and its columns, read or not. Source: the data set's published
+components."""
 _KEYS: Final = (_SEGMENT, _TIME, _CAMERA, _LASER, _OBJECT, "index", "__index_level_0__")
 """Columns that every table may have; the last two are the index of pandas."""
 
@@ -89,9 +121,12 @@ class ParquetLog:
         calibration = self._table("lidar_calibration") if self._lidar is None else self._need("lidar_calibration")
         self.lasers: Mapping[str, records.LaserCalibration] = {} if calibration is None else dict(_lasers(calibration))
         if self._lidar is not None and self._poses is None:
-            raise InputError("the top LiDAR's pixel poses are missing", where=str(root),
+            raise InputError(
+                "the top LiDAR's pixel poses are missing",
+                where=str(root),
                 expected=f"lidar_pose/{segment}.parquet",
-                remedy="download the component: without it the scans of a moving vehicle are twisted")  # fmt: skip
+                remedy="download the component: without it the scans of a moving vehicle are twisted",
+            )
         self.frames: Sequence[FrameRecord] = self._frames(wanted)
         self.conditions = self._conditions()
 
@@ -129,8 +164,9 @@ class ParquetLog:
         returns = [image for image in found if image is not None]
         poses = self.pixel_poses(frame) if name == records.TOP else None
         if name == records.TOP and poses is None:
-            raise InputError("frame has no pixel poses", where=f"{frame.where}: lidar_pose",
-                expected="a row for the top LiDAR")  # fmt: skip
+            raise InputError(
+                "frame has no pixel poses", where=f"{frame.where}: lidar_pose", expected="a row for the top LiDAR"
+            )
         places: list[NDArray[np.int64]] = []
         if projections and self._projections is not None:
             for other, place in self._projections.rows(frame.timestamp_us, _LASER, LASERS):
@@ -140,15 +176,16 @@ class ParquetLog:
                     places = [image.astype(np.int64) for image in images if image is not None]
         return LaserScan(returns, poses, places if len(places) == len(returns) else ())
 
-    # --- facts ------------------------------------------------------------------------------------------------------
+    # --- facts ------------------------------------------------------------------------------------
 
     def _frames(self, wanted: tuple[int, int] | None) -> list[FrameRecord]:
         where, column = str(self._vehicle.path), "[VehiclePoseComponent].world_from_vehicle.transform"
         table = self._vehicle.columns((_SEGMENT, _TIME, column))
         others = {str(name) for name in table[_SEGMENT]} - {self.name}
         if others:
-            raise InputError("the file holds other logs", where=where, expected=self.name,
-                got=", ".join(sorted(others)[:4]))  # fmt: skip
+            raise InputError(
+                "the file holds other logs", where=where, expected=self.name, got=", ".join(sorted(others)[:4])
+            )
         poses = {int(time): pose for time, pose in zip(table[_TIME], table[column], strict=True)}
         twice = len(table[_TIME]) - len(poses)
         if twice:
@@ -202,14 +239,20 @@ class ParquetLog:
         if not path.is_file():
             return None
         table, (prefix, columns) = ParquetTable(path), OFFICIAL[component]
-        note_unknown(f"{component}/*.parquet", table.names, frozenset({*_KEYS, *(f"[{prefix}].{name}" for name in columns)}))
+        note_unknown(
+            f"{component}/*.parquet", table.names, frozenset({*_KEYS, *(f"[{prefix}].{name}" for name in columns)})
+        )
         return table
 
     def _need(self, component: str) -> ParquetTable:
         table = self._table(component)
         if table is None:
-            raise InputError("a component of the log is missing", where=str(self._root),
-                expected=f"{component}/{self.name}.parquet", remedy="download it beside the others")  # fmt: skip
+            raise InputError(
+                "a component of the log is missing",
+                where=str(self._root),
+                expected=f"{component}/{self.name}.parquet",
+                remedy="download it beside the others",
+            )
         return table
 
 
@@ -231,7 +274,7 @@ def _lasers(table: ParquetTable) -> Iterator[tuple[str, records.LaserCalibration
             yield name, records.laser_of(name, row[beams] or (), limits, row["extrinsic.transform"], where)
 
 
-# --- tables ---------------------------------------------------------------------------------------------------------
+# --- tables ---------------------------------------------------------------------------------------
 
 
 class ParquetTable:
@@ -247,7 +290,9 @@ class ParquetTable:
         with arrow_files(path):
             from pyarrow.parquet import ParquetFile
 
-            self._file = ParquetFile(store.regular(path), buffer_size=_STREAM_BYTES, pre_buffer=False, page_checksum_verification=True)
+            self._file = ParquetFile(
+                store.regular(path), buffer_size=_STREAM_BYTES, pre_buffer=False, page_checksum_verification=True
+            )
         self.names: tuple[str, ...] = tuple(self._file.schema_arrow.names)
         counts = [self._file.metadata.row_group(n).num_rows for n in range(self._file.num_row_groups)]
         self._starts = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
@@ -304,7 +349,8 @@ class ParquetTable:
         return records.shaped(data, shape.as_py(), channels, f"{self.path}: row {row}, {prefix}")
 
     def _row(self, row: int, names: tuple[str, ...]) -> Any:
-        """One row of some columns. Going forward goes on where the last call stopped; going back starts a row group anew."""
+        """One row of some columns. Going forward goes on where the last call stopped; going back starts a row group
+        anew."""
         require_columns(names, self.names, self.path)
         next_row, stream = self._streams.get(names, (-1, iter(())))
         group = int(np.searchsorted(self._starts, row, side="right")) - 1

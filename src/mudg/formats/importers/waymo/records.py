@@ -1,7 +1,8 @@
-"""What a Waymo log holds, whichever form it comes in: calibrations, one record of facts per frame, and the bulky parts on demand.
+"""What a Waymo log holds, whichever form it comes in: calibrations, one record of facts per frame, and the bulky parts
+on demand.
 
-Poses and transforms are f64[4, 4]. ``global`` is the data set's own world, which may lie tens of kilometres from the car. The
-data set's camera frame is x forward, y left, z up.
+Poses and transforms are f64[4, 4]. ``global`` is the data set's own world, which may lie tens of kilometres from the
+car. The data set's camera frame is x forward, y left, z up.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ class CameraCalibration:
 
 @dataclass(frozen=True, slots=True)
 class LaserCalibration:
-    """A LiDAR: beam ``inclinations`` in radians from the lowest up, or () where they are even between the two limits."""
+    """A LiDAR: beam ``inclinations`` in radians from the lowest up, or () where they are even between the two
+    limits."""
 
     name: str
     inclinations: tuple[float, ...]
@@ -63,8 +65,12 @@ class LaserCalibration:
         """Inclination of every row of a range image, f64[rows] radians; the top row looks highest."""
         if self.inclinations:
             if len(self.inclinations) != rows:
-                raise InputError("range image does not have a row for every beam", where=where,
-                    expected=f"{len(self.inclinations)} rows (calibration of LiDAR {self.name})", got=f"{rows} rows")  # fmt: skip
+                raise InputError(
+                    "range image does not have a row for every beam",
+                    where=where,
+                    expected=f"{len(self.inclinations)} rows (calibration of LiDAR {self.name})",
+                    got=f"{rows} rows",
+                )
             return np.array(self.inclinations)[::-1]
         step = (self.inclination_max - self.inclination_min) / rows
         return self.inclination_max - (np.arange(rows, dtype=np.float64) + 0.5) * step
@@ -77,7 +83,8 @@ class CameraShot:
     Args:
         global_from_vehicle: at ``pose_time_s``, seconds of the epoch.
         velocity: linear m/s and angular rad/s, both in the global frame, f64[6]; None if not recorded.
-        shutter_s, trigger_s, done_s: exposure of a column, start of the exposure and end of the readout; 0 if not recorded.
+        shutter_s, trigger_s, done_s: exposure of a column, start of the exposure and end of the readout; 0 if not
+            recorded.
     """
 
     global_from_vehicle: Matrix
@@ -90,7 +97,8 @@ class CameraShot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WaymoBox:
-    """A box in the vehicle frame of its frame: centre, (length, width, height) in metres, heading in radians about z."""
+    """A box in the vehicle frame of its frame: centre, (length, width, height) in metres, heading in radians about
+    z."""
 
     id: str
     label: str
@@ -127,8 +135,10 @@ class LaserScan:
 
     Args:
         returns: range images f32[H, W, 4]: range in metres (not above 0: none), intensity, elongation, no-label flag.
-        poses: of the top LiDAR, f32[H, W, 6]: roll, pitch, yaw, x, y, z of global from vehicle when the pixel was measured.
-        projections: for each return, i64[H, W, 6]: camera number, x, y of the first two images a point falls into; or empty.
+        poses: of the top LiDAR, f32[H, W, 6]: roll, pitch, yaw, x, y, z of global from vehicle when the pixel was
+            measured.
+        projections: for each return, i64[H, W, 6]: camera number, x, y of the first two images a point falls into; or
+            empty.
     """
 
     returns: Sequence[NDArray[np.float32]]
@@ -172,7 +182,7 @@ class WaymoLog(Protocol):
         ...
 
 
-# --- records from the numbers of either form ----------------------------------------------------------------------------
+# --- records from the numbers of either form ------------------------------------------------------
 
 
 def transform_of(values: Numbers, where: str) -> Matrix:
@@ -222,9 +232,12 @@ def box_of(box_id: str, number: int, values: Sequence[float], where: str) -> Way
     """
     x, y, z, length, width, height, heading = (float(value) for value in values)
     if not np.isfinite(values).all() or min(length, width, height) <= 0:
-        raise InputError("box makes no sense", where=f"{where}: box {box_id}",
+        raise InputError(
+            "box makes no sense",
+            where=f"{where}: box {box_id}",
             expected="finite numbers, positive length, width and height",
-            got=f"centre {(x, y, z)}, size {(length, width, height)}, heading {heading}")  # fmt: skip
+            got=f"centre {(x, y, z)}, size {(length, width, height)}, heading {heading}",
+        )
     return WaymoBox(box_id, LABELS.get(number, "unknown"), (x, y, z), (length, width, height), heading)
 
 
@@ -232,7 +245,8 @@ def by_name(shots: Iterable[tuple[str, CameraShot]], timestamp_us: int, where: s
     """The images of one frame by camera, their clock compared with the frame's: seconds and microseconds of one epoch.
 
     Raises:
-        InputError: two images of one camera; times that are not finite, contradict each other, or are more than a second off.
+        InputError: two images of one camera; times that are not finite, contradict each other, or are more than a
+            second off.
     """
     found: dict[str, CameraShot] = {}
     for name, shot in shots:
@@ -241,14 +255,20 @@ def by_name(shots: Iterable[tuple[str, CameraShot]], timestamp_us: int, where: s
             raise InputError("frame has two images of one camera", where=here)
         times = (shot.pose_time_s, *((shot.trigger_s, shot.done_s) if shot.done_s else ()))
         if not max(abs(time - timestamp_us / 1e6) for time in times) <= MAX_CLOCK_GAP_S:
-            raise InputError("image and frame are not of one time", where=here,
+            raise InputError(
+                "image and frame are not of one time",
+                where=here,
                 expected=f"seconds within {MAX_CLOCK_GAP_S} s of the frame's {timestamp_us} microseconds",
                 got=", ".join(f"{time!r}" for time in times),
-                remedy="are the units seconds (images) and microseconds (frames)?")  # fmt: skip
+                remedy="are the units seconds (images) and microseconds (frames)?",
+            )
         if shot.done_s and not 0 <= shot.shutter_s <= shot.done_s - shot.trigger_s < MAX_CLOCK_GAP_S:
-            raise InputError("exposure times contradict each other", where=here,
+            raise InputError(
+                "exposure times contradict each other",
+                where=here,
                 expected="0 <= shutter <= readout end - trigger, seconds",
-                got=f"shutter {shot.shutter_s:g}, trigger to readout end {shot.done_s - shot.trigger_s:g}")  # fmt: skip
+                got=f"shutter {shot.shutter_s:g}, trigger to readout end {shot.done_s - shot.trigger_s:g}",
+            )
         found[name] = shot
     return found
 
@@ -260,7 +280,7 @@ def each_once(lasers: Sequence[str], where: str) -> tuple[str, ...]:
     return tuple(lasers)
 
 
-# --- range images -------------------------------------------------------------------------------------------------------
+# --- range images ---------------------------------------------------------------------------------
 
 
 def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, where: str) -> NDArray[Any]:
@@ -276,8 +296,12 @@ def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, w
         raise InputError("range image cannot be unpacked", where=where, got=str(error)) from error
     if not unpacker.eof:
         cut_off = not unpacker.unconsumed_tail
-        raise InputError("range image is cut off" if cut_off else "range image unpacks to more than any has",
-            where=where, expected=f"at most {MAX_UNPACKED_BYTES} bytes", got=f"{len(content)} bytes")  # fmt: skip
+        raise InputError(
+            "range image is cut off" if cut_off else "range image unpacks to more than any has",
+            where=where,
+            expected=f"at most {MAX_UNPACKED_BYTES} bytes",
+            got=f"{len(content)} bytes",
+        )
     values = parse_message(content, message, where)
     return shaped(values["data"], values.get("shape", {}).get("dims", ()), channels, where)
 
@@ -286,9 +310,12 @@ def shaped(data: NDArray[Any], dims: Sequence[int] | NDArray[np.integer], channe
     """``data`` [H * W * channels] as [H, W, channels], if its declared shape says so."""
     shape = tuple(int(n) for n in dims)
     if len(shape) != 3 or min(shape) < 1 or shape[2] != channels or int(np.prod(shape)) != len(data):
-        raise InputError("range image has the wrong shape", where=where,
+        raise InputError(
+            "range image has the wrong shape",
+            where=where,
             expected=f"[rows, columns, {channels}], as many values as that",
-            got=f"{list(shape)} with {len(data)} values")  # fmt: skip
+            got=f"{list(shape)} with {len(data)} values",
+        )
     return data.reshape(shape)
 
 
@@ -302,14 +329,14 @@ def int_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[
     return unpack_matrix(packed, MATRIX_INT, channels, where)
 
 
-# tracks ---------------------------------------------------------------------------------------------------------------
+# tracks -------------------------------------------------------------------------------------------
 #
 # Boxes per frame -> tracks in the world, and the question for which moment a box holds.
 #
-# The points of a frame were measured over a tenth of a second, in which a car drives two metres. A box drawn around points holds where
-# its object was when the LiDAR passed it; a description of the data set speaks of the frame's start instead. So the log is asked: under
-# which of the ``Moment`` do most points near fast objects lie inside their boxes? Each box is then carried, with its object's own
-# speed, to the moment that all of the frame's points are given for.
+# The points of a frame were measured over a tenth of a second, in which a car drives two metres. A box drawn around
+# points holds where its object was when the LiDAR passed it; a description of the data set speaks of the frame's start
+# instead. So the log is asked: under which of the ``Moment`` do most points near fast objects lie inside their boxes?
+# Each box is then carried, with its object's own speed, to the moment that all of the frame's points are given for.
 
 
 Moment = Literal["seen", "start", "pose"]
@@ -347,11 +374,12 @@ class TimedBoxes:
 def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
     """Tracks, and notes about what was done to them.
 
-    A track begins with the first image of its first frame and ends with the last image of its last one: some hundredths of a
-    second are added to either end with the object's velocity, or else images at the ends would lack the object.
+    A track begins with the first image of its first frame and ends with the last image of its last one: some hundredths
+    of a second are added to either end with the object's velocity, or else images at the ends would lack the object.
 
     Raises:
-        InputError: a box without an id, two boxes of one id in a frame, a class that changes, or length and width are swapped.
+        InputError: a box without an id, two boxes of one id in a frame, a class that changes, or length and width are
+            swapped.
     """
     tracks = BoxTracks(frames[0].where if frames else "", {})
     labels: dict[str, str] = {}
@@ -359,12 +387,19 @@ def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
         seen: set[str] = set()
         for box, late in zip(frame.boxes, frame.late_s, strict=True):
             if not box.id or box.id in seen:
-                raise InputError("frame has two boxes of one object" if box.id else "box has no id", where=frame.where,
-                    got=repr(box.id))  # fmt: skip
+                raise InputError(
+                    "frame has two boxes of one object" if box.id else "box has no id",
+                    where=frame.where,
+                    got=repr(box.id),
+                )
             seen.add(box.id)
             if labels.setdefault(box.id, box.label) != box.label:
-                raise InputError("the class of an object changes", where=f"{frame.where}: object {box.id}",
-                    expected=labels[box.id], got=box.label)  # fmt: skip
+                raise InputError(
+                    "the class of an object changes",
+                    where=f"{frame.where}: object {box.id}",
+                    expected=labels[box.id],
+                    got=box.label,
+                )
             # a track's name begins with no sign, as the data set's random ids may
             name = box.id if box.id[0].isalnum() else f"t{box.id}"
             pose = frame.world_from_vehicle @ yaw_matrix(box.heading, box.centre)
@@ -424,13 +459,15 @@ def points_inside(
 
 
 def choose_moment(counts: NDArray[np.int64]) -> Moment:
-    """The moment under which most points lie inside their boxes, sums i64[3]; ``seen`` unless another is clearly better."""
+    """The moment under which most points lie inside their boxes, sums i64[3]; ``seen`` unless another is clearly
+    better."""
     best = int(counts.argmax())
     return MOMENTS[best] if counts[best] > _CLEAR_GAIN * counts[0] else MOMENTS[0]
 
 
 def velocities(frames: Sequence[TimedBoxes]) -> list[dict[str, NDArray[np.float64]]]:
-    """Velocity of every box in the world by id, f64[3] m/s, for each frame: between the frames beside it; zero for single boxes."""
+    """Velocity of every box in the world by id, f64[3] m/s, for each frame: between the frames beside it; zero for
+    single boxes."""
     centres = [{box.id: (frame.world_from_vehicle @ [*box.centre, 1.0])[:3] for box in frame.boxes} for frame in frames]
     found: list[dict[str, NDArray[np.float64]]] = []
     for index, here in enumerate(centres):

@@ -1,13 +1,14 @@
-"""Waymo sensors: range images as points, when the top LiDAR's columns were measured, where a view is, and panoptic classes.
+"""Waymo sensors: range images as points, when the top LiDAR's columns were measured, where a view is, and panoptic
+classes.
 
-A range image has a row per beam (the highest first) and a column per step of the turn. Column 0 looks backwards, the middle
-column along the vehicle's x axis, and time runs with the columns: the sensor turns clockwise seen from above (the side-left
-camera is triggered before the front one, the side-right one after). Azimuth is counter-clockwise in the LiDAR's own frame,
-whose x axis may point anywhere; the heading of that frame is taken off.
+A range image has a row per beam (the highest first) and a column per step of the turn. Column 0 looks backwards, the
+middle column along the vehicle's x axis, and time runs with the columns: the sensor turns clockwise seen from above
+(the side-left camera is triggered before the front one, the side-right one after). Azimuth is counter-clockwise in the
+LiDAR's own frame, whose x axis may point anywhere; the heading of that frame is taken off.
 
-The cameras' shutters roll from left to right within some 45 ms; scenes know one pose per image. That pose is the vehicle's at the
-moment the middle column was exposed: the recorded one, up to a few milliseconds older or newer, carried on with the recorded
-velocity.
+The cameras' shutters roll from left to right within some 45 ms; scenes know one pose per image. That pose is the
+vehicle's at the moment the middle column was exposed: the recorded one, up to a few milliseconds older or newer,
+carried on with the recorded velocity.
 
 Source: the message description and the conversion documented with the data set.
 """
@@ -45,22 +46,38 @@ GLOBAL_SHUTTER: Final = 5
 EGO_CLASS: Final = 1
 SKY_CLASS: Final = 25
 TRAIN_IDS: Final[Mapping[int, int]] = {
-    2: ID["car"], 3: ID["truck"], 4: ID["bus"], 5: ID["truck"], 6: ID["bicycle"], 7: ID["motorcycle"], 9: ID["person"],
-    10: ID["rider"], 11: ID["rider"], 15: ID["pole"], 17: ID["traffic sign"], 18: ID["traffic light"], 19: ID["building"],
-    20: ID["road"], 21: ID["road"], 22: ID["road"], 23: ID["sidewalk"], 24: ID["vegetation"], 25: ID["sky"],
-}  # fmt: skip
-"""Class of a camera segmentation label -> train id. A cyclist is labelled together with the bicycle; other large vehicles count as
-trucks. Without a counterpart, so unlabelled: undefined, own vehicle, trailer, bird, animal, cone, carried object, other ground,
-other things."""
+    2: ID["car"],
+    3: ID["truck"],
+    4: ID["bus"],
+    5: ID["truck"],
+    6: ID["bicycle"],
+    7: ID["motorcycle"],
+    9: ID["person"],
+    10: ID["rider"],
+    11: ID["rider"],
+    15: ID["pole"],
+    17: ID["traffic sign"],
+    18: ID["traffic light"],
+    19: ID["building"],
+    20: ID["road"],
+    21: ID["road"],
+    22: ID["road"],
+    23: ID["sidewalk"],
+    24: ID["vegetation"],
+    25: ID["sky"],
+}
+"""Class of a camera segmentation label -> train id. A cyclist is labelled together with the bicycle; other large
+vehicles count as trucks. Without a counterpart, so unlabelled: undefined, own vehicle, trailer, bird, animal, cone,
+carried object, other ground, other things."""
 
 
-# --- range images ---------------------------------------------------------------------------------------------------
+# --- range images ---------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ScanPoints:
-    """Points of one turn in the LiDAR's frame at the frame's pose, where each came from in the range images, and how many
-    were left out because no pose was recorded for their pixel.
+    """Points of one turn in the LiDAR's frame at the frame's pose, where each came from in the range images, and how
+    many were left out because no pose was recorded for their pixel.
 
     Args:
         xyz: f64[N, 3] metres.
@@ -82,8 +99,9 @@ def points_of_scan(
 ) -> ScanPoints:
     """All points of a scan, first returns and then second ones.
 
-    Where pixels have poses of their own (top LiDAR), a point is carried from where the vehicle was when it was measured to
-    where the vehicle was at the frame's pose. The other LiDARs are recorded as if all was measured at the frame's pose.
+    Where pixels have poses of their own (top LiDAR), a point is carried from where the vehicle was when it was measured
+    to where the vehicle was at the frame's pose. The other LiDARs are recorded as if all was measured at the frame's
+    pose.
 
     Raises:
         InputError: shapes that contradict each other, or values that are not finite.
@@ -103,8 +121,11 @@ def points_of_scan(
         pixel = np.flatnonzero(image[..., 0].reshape(-1) > 0)
         values = image.reshape(-1, image.shape[2])[pixel, :2]
         if not np.isfinite(values).all():
-            raise InputError("range image holds values that are not finite", where=f"{where}: return {index + 1}",
-                got=f"{int((~np.isfinite(values).all(1)).sum())} of {len(values)} points")  # fmt: skip
+            raise InputError(
+                "range image holds values that are not finite",
+                where=f"{where}: return {index + 1}",
+                got=f"{int((~np.isfinite(values).all(1)).sum())} of {len(values)} points",
+            )
         row, column = np.divmod(pixel, columns)
         reach = values[:, 0].astype(np.float64)
         flat = reach * np.cos(inclination)[row]
@@ -138,8 +159,8 @@ def _carried(
 ) -> NDArray[np.float64]:
     """Points of the LiDAR's frame, each with the pose (roll, pitch, yaw, x, y, z) of its moment, to the frame's moment.
 
-    Rotations are about z, then y, then x of the vehicle. Positions are taken relative to the frame's pose first: they are
-    tens of kilometres, and their differences centimetres.
+    Rotations are about z, then y, then x of the vehicle. Positions are taken relative to the frame's pose first: they
+    are tens of kilometres, and their differences centimetres.
     """
     x, y, z = (xyz @ vehicle_from_lidar[:3, :3].T + vehicle_from_lidar[:3, 3]).T
     (cr, cp, cy), (sr, sp, sy) = np.cos(poses[:, :3].T), np.sin(poses[:, :3].T)
@@ -152,18 +173,20 @@ def _carried(
 
 
 def sweep_points(points: ScanPoints, dt_s: NDArray[np.float64]) -> SweepPoints:
-    """Points as a sweep holds them. Intensity has no limit in the data set; tanh, as is customary, brings it to 0..1."""
+    """Points as a sweep holds them. Intensity has no limit in the data set; tanh, as is customary, brings it to
+    0..1."""
     intensity = np.tanh(np.maximum(points.intensity.astype(np.float64), 0))
     return SweepPoints(points.xyz.astype(np.float32), intensity.astype(np.float32), dt_s.astype(np.float32))
 
 
-# --- time -----------------------------------------------------------------------------------------------------------
+# --- time -----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class TurnClock:
-    """When the columns of the top LiDAR are measured: ``start_s`` after the frame's timestamp the turn begins, and lasts
-    ``duration_s``. ``measured``: found by comparing pixel poses with the vehicle's path; else the nominal turn."""
+    """When the columns of the top LiDAR are measured: ``start_s`` after the frame's timestamp the turn begins, and
+    lasts ``duration_s``. ``measured``: found by comparing pixel poses with the vehicle's path; else the nominal
+    turn."""
 
     start_s: float = 0.0
     duration_s: float = TURN_S
@@ -224,16 +247,23 @@ def median_clock(turns: Sequence[tuple[float, float]]) -> TurnClock:
     return TurnClock(start, duration, True)
 
 
-# --- cameras --------------------------------------------------------------------------------------------------------
+# --- cameras --------------------------------------------------------------------------------------
 
 
 def recorded_camera(calibration: CameraCalibration, shot: records.CameraShot) -> tuple[Camera, Lens | None]:
     """The camera as recorded, and its lens (None where the coefficients are all zero)."""
     fx, fy, cx, cy, *coefficients = calibration.intrinsic
     camera = Camera(
-        calibration.name, calibration.width, calibration.height, fx, fy, cx, cy, tuple(coefficients),
+        calibration.name,
+        calibration.width,
+        calibration.height,
+        fx,
+        fy,
+        cx,
+        cy,
+        tuple(coefficients),
         0.0 if calibration.direction == GLOBAL_SHUTTER else readout_s(shot),
-    )  # fmt: skip
+    )
     return camera, brown_conrady(*coefficients) if any(coefficients) else None
 
 
@@ -243,7 +273,8 @@ def readout_s(shot: records.CameraShot) -> float:
 
 
 def middle_of_exposure(shot: records.CameraShot) -> tuple[Matrix, float]:
-    """Vehicle pose f64[4, 4] in the global frame when the middle column was exposed, and this time in seconds of the epoch.
+    """Vehicle pose f64[4, 4] in the global frame when the middle column was exposed, and this time in seconds of the
+    epoch.
 
     Without recorded exposure times or velocity, or where the two are far apart, pose and time are those recorded.
     """
@@ -269,14 +300,18 @@ def panoptic_ids(label: records.Panoptic, camera: Camera, where: str) -> NDArray
         InputError: no 16-bit PNG of the camera's size, or no divisor.
     """
     if label.divisor < 1:
-        raise InputError("panoptic label has no divisor", where=where, expected="a positive number",
-            got=str(label.divisor))  # fmt: skip
+        raise InputError(
+            "panoptic label has no divisor", where=where, expected="a positive number", got=str(label.divisor)
+        )
     try:
         with Image.open(io.BytesIO(label.png), formats=("PNG",)) as image:
             if image.size != (camera.width, camera.height) or not image.mode.startswith("I"):
-                raise InputError("panoptic label is not a 16-bit image of its camera's size", where=where,
+                raise InputError(
+                    "panoptic label is not a 16-bit image of its camera's size",
+                    where=where,
                     expected=f"{camera.width}x{camera.height}, 16 bits",
-                    got=f"{image.width}x{image.height}, mode {image.mode}")  # fmt: skip
+                    got=f"{image.width}x{image.height}, mode {image.mode}",
+                )
             return np.array(image).astype(np.int32)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise InputError("panoptic label cannot be decoded (is it cut off?)", where=where, got=str(error)) from error
@@ -285,7 +320,8 @@ def panoptic_ids(label: records.Panoptic, camera: Camera, where: str) -> NDArray
 def panoptic_labels(ids: NDArray[np.int32], divisor: int) -> dict[str, NDArray[Any]]:
     """Labels of one image: ``semantics`` u8[H, W] train ids, ``instance`` i32[H, W], ``sky`` and ``ego`` bool[H, W].
 
-    An instance is called class * divisor + number, 0 where there is none: it means the same thing in this one image only.
+    An instance is called class * divisor + number, 0 where there is none: it means the same thing in this one image
+    only.
     """
     classes, numbers = np.divmod(ids, divisor)
     table = np.full(256, UNLABELLED, np.uint8)
@@ -307,8 +343,8 @@ def projection_errors(
 ) -> dict[str, NDArray[np.float64]]:
     """How far our projections of a scan lie from those recorded with it, in pixels of the recorded images.
 
-    The recorded ones follow the rolling shutter, ours hold for the middle column, so while the vehicle moves some pixels are
-    normal; wrong calibrations, poses or conversions show as hundreds.
+    The recorded ones follow the rolling shutter, ours hold for the middle column, so while the vehicle moves some
+    pixels are normal; wrong calibrations, poses or conversions show as hundreds.
 
     Args:
         points, scan, laser: a scan with projections, and its points.

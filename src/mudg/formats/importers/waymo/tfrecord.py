@@ -1,7 +1,7 @@
 """Waymo logs of format 1: one TFRecord file with a ``Frame`` message per record; read one record at a time.
 
-Layout of a record: u64 length, u32 masked CRC32C of these eight bytes, the payload, u32 masked CRC32C of the payload, all
-little-endian. A mask turns the sum by 15 bits to the right and adds a constant.
+Layout of a record: u64 length, u32 masked CRC32C of these eight bytes, the payload, u32 masked CRC32C of the payload,
+all little-endian. A mask turns the sum by 15 bits to the right and adds a constant.
 
 Source: TensorFlow's documentation of the format; CRC32C is the Castagnoli polynomial of RFC 3720.
 """
@@ -33,12 +33,13 @@ _MASK_DELTA: Final = 0xA282EAD8
 _POLYNOMIAL_REFLECTED: Final = 0x82F63B78
 
 SPARSE_MULTIPLES: Final = ((5685, (1362, 426, 0)), (290, (136, 113, 107, 32, 0)))
-"""Multiples of the CRC32C polynomial with few terms, as (degree, lower exponents): x^5685 + x^1362 + x^426 + 1, and one of
-degree 290. Squaring a polynomial over GF(2) six times multiplies its exponents by 64, so each is also a multiple whose terms lie
-whole 64-bit words apart: a word may be removed by adding it to the words that many places further on."""
+"""Multiples of the CRC32C polynomial with few terms, as (degree, lower exponents): x^5685 + x^1362 + x^426 + 1, and one
+of degree 290. Squaring a polynomial over GF(2) six times multiplies its exponents by 64, so each is also a multiple
+whose terms lie whole 64-bit words apart: a word may be removed by adding it to the words that many places further
+on."""
 
 
-# --- checksums --------------------------------------------------------------------------------------------------------
+# --- checksums ------------------------------------------------------------------------------------
 
 
 def _make_table() -> tuple[int, ...]:
@@ -94,7 +95,7 @@ def masked_crc32c(data: bytes | memoryview) -> int:
     return (((crc >> 15) | (crc << 17)) + _MASK_DELTA) & 0xFFFFFFFF
 
 
-# --- records of a file ------------------------------------------------------------------------------------------------
+# --- records of a file ----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,15 +135,27 @@ def _read_header(file: BinaryIO, path: Path, number: int, offset: int, size: int
     length, crc = struct.unpack("<QI", header)
     if masked_crc32c(header[:8]) != crc:
         if number:
-            raise InputError("record header is damaged", where=where, expected="a length that fits its checksum",
-                remedy="copy the file again")  # fmt: skip
+            raise InputError(
+                "record header is damaged",
+                where=where,
+                expected="a length that fits its checksum",
+                remedy="copy the file again",
+            )
         packed = header[:2] == b"\x1f\x8b"
-        raise InputError("file is compressed" if packed else "file is not a TFRecord", where=str(path),
-            expected="a record's length and its checksum", got=f"{size} bytes starting {header!r}",
-            remedy="unpack it with gunzip" if packed else "is it a download page, a placeholder, or of another format?")  # fmt: skip
+        raise InputError(
+            "file is compressed" if packed else "file is not a TFRecord",
+            where=str(path),
+            expected="a record's length and its checksum",
+            got=f"{size} bytes starting {header!r}",
+            remedy="unpack it with gunzip" if packed else "is it a download page, a placeholder, or of another format?",
+        )
     if length > MAX_RECORD_BYTES:
-        raise InputError("record declares a length that no frame has", where=where,
-            expected=f"at most {MAX_RECORD_BYTES} bytes", got=f"{length} bytes")  # fmt: skip
+        raise InputError(
+            "record declares a length that no frame has",
+            where=where,
+            expected=f"at most {MAX_RECORD_BYTES} bytes",
+            got=f"{length} bytes",
+        )
     if offset + _HEADER_BYTES + length + _FOOTER_BYTES > size:
         raise _cut_off(where, f"{size - offset - _HEADER_BYTES} of {length + _FOOTER_BYTES} bytes")
     return RecordPlace(number, offset, length)
@@ -162,9 +175,13 @@ def read_record(file: BinaryIO, path: Path, place: RecordPlace) -> bytes:
     payload = content[: place.length]
     (crc,) = struct.unpack("<I", content[place.length :])
     if masked_crc32c(payload) != crc:
-        raise InputError("record is damaged: its bytes do not fit their checksum", where=where,
-            expected=f"checksum {crc:#010x}", got=f"{masked_crc32c(payload):#010x} over {place.length} bytes",
-            remedy="copy the file again, or choose other frames with --frames FIRST:END")  # fmt: skip
+        raise InputError(
+            "record is damaged: its bytes do not fit their checksum",
+            where=where,
+            expected=f"checksum {crc:#010x}",
+            got=f"{masked_crc32c(payload):#010x} over {place.length} bytes",
+            remedy="copy the file again, or choose other frames with --frames FIRST:END",
+        )
     return payload
 
 
@@ -173,11 +190,12 @@ def _where(path: Path, number: int, offset: int) -> str:
 
 
 def _cut_off(where: str, got: str) -> InputError:
-    return InputError("TFRecord file is cut off", where=where, expected="a whole record", got=got,
-        remedy="copy the file again")  # fmt: skip
+    return InputError(
+        "TFRecord file is cut off", where=where, expected="a whole record", got=got, remedy="copy the file again"
+    )
 
 
-# --- the log ----------------------------------------------------------------------------------------------------------
+# --- the log --------------------------------------------------------------------------------------
 
 
 class TfrecordLog:
@@ -199,8 +217,12 @@ class TfrecordLog:
         first, end = wanted or (0, None)
         places = list(islice(record_places(path), first, end))
         if not places:
-            raise InputError("no frames to import", where=str(path),
-                expected="records" + (f" {first} to {end - 1}" if end is not None else ""), got="none")  # fmt: skip
+            raise InputError(
+                "no frames to import",
+                where=str(path),
+                expected="records" + (f" {first} to {end - 1}" if end is not None else ""),
+                got="none",
+            )
         frames: list[FrameRecord] = []
         context = b""
         with store.open_file(path) as file, log.task("checking records", len(places)) as bar:
@@ -293,10 +315,13 @@ def _laser(name: str, item: dict[str, Any], where: str) -> records.LaserCalibrat
 def _shot(item: dict[str, Any], where: str) -> records.CameraShot:
     velocity = item.get("velocity")
     return records.CameraShot(
-        records.transform_of(_sixteen(item, "pose"), f"{where}: pose"), item.get("pose_time_s", 0.0),
+        records.transform_of(_sixteen(item, "pose"), f"{where}: pose"),
+        item.get("pose_time_s", 0.0),
         None if velocity is None else np.array([velocity.get(key, 0.0) for key in records.VELOCITY]),
-        item.get("shutter_s", 0.0), item.get("trigger_s", 0.0), item.get("done_s", 0.0),
-    )  # fmt: skip
+        item.get("shutter_s", 0.0),
+        item.get("trigger_s", 0.0),
+        item.get("done_s", 0.0),
+    )
 
 
 def _frame_record(message: dict[str, Any], number: int, where: str) -> FrameRecord:
