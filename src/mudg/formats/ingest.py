@@ -12,7 +12,7 @@ from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.run_folder import RunDir, run_state
 from mudg.base.types import Scene
-from mudg.formats.importers import IMPORTERS, RECOGNISERS, files_of
+from mudg.formats.importers import RECOGNISERS, files_of, import_log, known_formats
 from mudg.formats.importers.common import ImportOptions, parse_frame_range, parse_resolution, processors
 from mudg.formats.settings import IngestConfig
 from mudg.scene import check, contact_sheet
@@ -25,7 +25,7 @@ CITY = "city"
 
 def files_read(config: IngestConfig, source: Path, kind: str) -> dict[str, Path]:
     """Files of the log that an import of this kind reads, by names for messages."""
-    if kind not in IMPORTERS:
+    if kind in (CITY, _SCENE):
         return {}
     files = files_of(kind, source, import_options(config))
     return {f"file {n} of the log": path for n, path in enumerate((*files.files, *files.entries))}
@@ -99,11 +99,10 @@ def kind_of(config: IngestConfig, source: Path) -> str:
     """
     if str(source) == CITY:
         return CITY
-    if config.format not in ("auto", *IMPORTERS):
-        raise UsageError(
-            "there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)), got=config.format
-        )
     if config.format != "auto":
+        if config.format not in known_formats():
+            expected = ", ".join(("auto", *known_formats()))
+            raise UsageError("there is no such format", where="--format", expected=expected, got=config.format)
         return config.format
     if is_scene(source):
         return _SCENE
@@ -116,7 +115,7 @@ def kind_of(config: IngestConfig, source: Path) -> str:
     raise InputError(
         "the log's format was not recognised",
         where=str(source),
-        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}",
+        expected=f"a scene, or a log of one of: {', '.join(known_formats())}",
         got=inside,
         remedy="give the folder of one drive or sequence, or name the format with --format",
     )
@@ -128,7 +127,7 @@ def _make(kind: str, config: IngestConfig, source: Path, out: Path) -> Scene:
         return _city(config, out)
     if kind == _SCENE:
         return _copy_scene(config, source, out)
-    return IMPORTERS[kind](source, out, import_options(config))
+    return import_log(kind, source, out, import_options(config))
 
 
 def is_scene(source: Path) -> bool:

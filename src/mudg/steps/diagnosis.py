@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from mudg.base import memory
 from mudg.base.errors import plain_lines
+from mudg.base.plugins import origin, plugins
 from mudg.base.versions import version
 
 if TYPE_CHECKING:
@@ -51,12 +52,15 @@ def report_machine() -> dict[str, Any]:
         "native library": _native(problems),
         "packages": _packages(problems),
         "optional packages": _optional(),
+        "plugins": {
+            f"{kind} {name}": origin(point) for kind in ("importer", "method") for name, point in plugins(kind).items()
+        },
         "video": _video(problems),
         "weights": _weights(problems),
     }
     lines = []
     for title, rows in sections.items():
-        lines.append(title)
+        lines += [title] if rows else []
         lines += [f"  {name:<18} {value}" for name, value in rows.items()]
     lines.append("")
     lines += [f"problem: {problem}" for problem in problems] or ["everything that the default run needs is here"]

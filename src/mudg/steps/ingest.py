@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from mudg.base.errors import InputError, UsageError, similar_path
 from mudg.base.layout import SCENE_FILES
+from mudg.base.plugins import plugins
 from mudg.steps.engine import Make
 from mudg.steps.outputs import Listed
 from mudg.steps.step import Flag, usage
@@ -18,6 +19,12 @@ if TYPE_CHECKING:
     from mudg.formats.settings import IngestConfig
 
 FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom", "kitti")
+
+
+def _is_format(word: str) -> bool:
+    return word in ("auto", *FORMATS) or word in plugins("importer")
+
+
 OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolution", "skip_missing", "untwist")
 """Settings that a generated city does not have."""
 
@@ -60,11 +67,8 @@ class Ingest(Listed):
     def from_words(cls, words: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
         """``[FORMAT] LOG [OUT]``, with ``--list`` ``[FORMAT] [OUT]``; the format is a setting."""
         left, values, many, named = list(words), dict[str, Any](), "list" in given, "out" in given
-        if (
-            left
-            and left[0] in ("auto", *FORMATS)
-            and (len(left) > (not many) + (not named) or not Path(left[0]).exists())
-        ):
+        many_words = len(left) > (not many) + (not named)
+        if left and _is_format(left[0]) and (many_words or not Path(left[0]).exists()):
             values["format"] = left.pop(0)
         if not many and not left:
             raise UsageError("no log was given", expected=usage(cls))
@@ -73,9 +77,8 @@ class Ingest(Listed):
         if left and not named:
             values["out"] = left.pop(0)
         if left and not many and values["log"] != "city" and not Path(values["log"]).exists():
-            raise UsageError(
-                "no such format and no such log", expected=", ".join(("auto", *FORMATS)), got=values["log"]
-            )
+            expected = ", ".join(("auto", *FORMATS, *plugins("importer")))
+            raise UsageError("no such format and no such log", expected=expected, got=values["log"])
         if left:
             raise UsageError("too many words", expected=usage(cls), got=" ".join(words))
         return values

@@ -12,8 +12,9 @@ from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
 
+from mudg.base.plugins import load_plugin, plugins
 from mudg.base.types import Scene
-from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers.common import ImportOptions, foreign_numbers
 from mudg.formats.importers.layout import LogFiles
 from mudg.formats.unknown_fields import named_once
 
@@ -84,14 +85,22 @@ def _functions(name: str) -> tuple[Recogniser, Importer, Finder]:
 
             return looks_like_kitti, import_kitti, files_of_kitti
         case _:
-            raise KeyError(name)
+            return (lambda source: False), load_plugin("importer", name), _whole_source
 
 
-def _import(name: str, source: Path, out: Path, options: ImportOptions) -> Scene:
-    from mudg.formats.importers.common import foreign_numbers
+def import_log(name: str, source: Path, out: Path, options: ImportOptions) -> Scene:
+    """Import a log as one of ``known_formats``.
 
+    Raises:
+        UsageError: another package offers the format, and its code cannot be loaded. InputError: the log is malformed.
+    """
     with foreign_numbers(), named_once():
         return _functions(name)[1](source, out, options)
+
+
+def known_formats() -> tuple[str, ...]:
+    """``FORMATS``, and those of other packages, which are used only when they are named."""
+    return (*FORMATS, *(name for name in plugins("importer") if name not in FORMATS))
 
 
 def _looks_like(name: str, source: Path) -> bool:
@@ -107,7 +116,7 @@ def files_of(name: str, source: Path, options: ImportOptions) -> LogFiles:
     return _functions(name)[2](source, options)
 
 
-IMPORTERS: Mapping[str, Importer] = {name: partial(_import, name) for name in FORMATS}
+IMPORTERS: Mapping[str, Importer] = {name: partial(import_log, name) for name in FORMATS}
 """Format name -> importer ``(source, out, options) -> Scene``."""
 
 RECOGNISERS: Mapping[str, Recogniser] = {name: partial(_looks_like, name) for name in FORMATS}
