@@ -100,9 +100,8 @@ def kind_of(config: IngestConfig, source: Path) -> str:
     if str(source) == CITY:
         return CITY
     if config.format not in ("auto", *IMPORTERS):
-        raise UsageError(
-            "there is no such format", where="--format", expected=", ".join(("auto", *IMPORTERS)), got=config.format
-        )
+        what = "there is no such format"
+        raise UsageError(what, where="--format", expected=", ".join(("auto", *IMPORTERS)), got=config.format)
     if config.format != "auto":
         return config.format
     if is_scene(source):
@@ -113,13 +112,9 @@ def kind_of(config: IngestConfig, source: Path) -> str:
     inside = "a file"
     if source.is_dir():
         inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
-    raise InputError(
-        "the log's format was not recognised",
-        where=str(source),
-        expected=f"a scene, or a log of one of: {', '.join(IMPORTERS)}",
-        got=inside,
-        remedy="give the folder of one drive or sequence, or name the format with --format",
-    )
+    what, expected = "the log's format was not recognised", f"a scene, or a log of one of: {', '.join(IMPORTERS)}"
+    remedy = "give the folder of one drive or sequence, or name the format with --format"
+    raise InputError(what, where=str(source), expected=expected, got=inside, remedy=remedy)
 
 
 def _make(kind: str, config: IngestConfig, source: Path, out: Path) -> Scene:

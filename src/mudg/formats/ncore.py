@@ -61,11 +61,8 @@ def package() -> NCorePackage:
         sensors = importlib.import_module("ncore.sensors")
         return NCorePackage(data, files, sensors, importlib.import_module("ncore.impl.common.transformations"))
     except ImportError as error:
-        raise ResourceError(
-            "NCore files need the package nvidia-ncore, which is not installed",
-            got=str(error),
-            remedy="pip install 'mudg[ncore]'",
-        ) from error
+        what = "NCore files need the package nvidia-ncore, which is not installed"
+        raise ResourceError(what, got=str(error), remedy="pip install 'mudg[ncore]'") from error
 
 
 def close(reader: Any) -> None:

@@ -176,13 +176,10 @@ def _logs(source: Path) -> list[Path]:
 def _choose_log(source: Path, options: ImportOptions) -> Path:
     logs = _logs(source)
     if not logs:
-        raise InputError(
-            "no Argoverse 2 log found",
-            where=str(source),
-            got=folder_contents(source),
-            expected="city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders",
-            remedy="give the folder of one log of the sensor data set",
-        )
+        what = "no Argoverse 2 log found"
+        expected = "city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders"
+        remedy = "give the folder of one log of the sensor data set"
+        raise InputError(what, where=str(source), got=folder_contents(source), expected=expected, remedy=remedy)
     matching = [path for path in logs if path.resolve().name.startswith(options.sequence)]
     return the_only(matching, [path.name for path in logs], options, source, "log")
 
@@ -199,12 +196,9 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
     image_folder, sweep_folder = folder / "sensors" / "cameras", folder / "sensors" / "lidar"
     there = {raw: name for raw, name in CAMERAS.items() if (image_folder / raw).is_dir()}
     if not there:
-        raise InputError(
-            "the log has no images",
-            where=str(image_folder),
-            expected="folders ring_front_center, ring_front_left, ... with images named by nanoseconds",
-            remedy="download the sensor data set's camera archives, too; a scene is made of images",
-        )
+        expected = "folders ring_front_center, ring_front_left, ... with images named by nanoseconds"
+        remedy = "download the sensor data set's camera archives, too; a scene is made of images"
+        raise InputError("the log has no images", where=str(image_folder), expected=expected, remedy=remedy)
     refuse_missing_cameras(there.values(), (CAMERAS[raw] for raw in RING_CAMERAS), options, image_folder)
     chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, RING_CAMERAS)}
     files = {name: _files_by_time(image_folder / raw, (".jpg", ".jpeg", ".png")) for name, raw in chosen.items()}
@@ -389,12 +383,9 @@ def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()
     if offset_ns.dtype.kind not in "iu" or (
         len(offset_ns) and int(np.abs(offset_ns.astype(np.int64)).max()) > _MAX_OFFSET_NS
     ):
-        raise InputError(
-            "point times are no nanoseconds of one turn",
-            where=f"{where}: offset_ns",
-            expected="whole nanoseconds since the sweep's time, under half a second",
-            got=f"{offset_ns.dtype}, up to {offset_ns.max():g}",
-        )
+        what, where = "point times are no nanoseconds of one turn", f"{where}: offset_ns"
+        expected = "whole nanoseconds since the sweep's time, under half a second"
+        raise InputError(what, where=where, expected=expected, got=f"{offset_ns.dtype}, up to {offset_ns.max():g}")
     xyz = transform_points(invert(ego_from_lidar), xyz_ego).astype(np.float32)
     dt_s = (offset_ns.astype(np.float64) / NANOSECONDS).astype(np.float32)
     return SweepPoints(xyz, intensity, dt_s, no_returns=int((~returns).sum()))

@@ -169,12 +169,9 @@ def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, f
     except (TypeError, ValueError) as error:
         raise InputError("box size is not made of numbers", where=where, got=str(error)) from error
     if not all(np.isfinite(side) and 0 < side <= MAX_SIDE_M for side in size):
-        raise InputError(
-            "box size makes no sense",
-            where=where,
-            expected=f"length, width and height in metres, above 0 and at most {MAX_SIDE_M:g}",
-            got=f"length {length}, width {width}, height {height}",
-        )
+        what = "box size makes no sense"
+        expected = f"length, width and height in metres, above 0 and at most {MAX_SIDE_M:g}"
+        raise InputError(what, where=where, expected=expected, got=f"length {length}, width {width}, height {height}")
     return size
 
 
@@ -271,12 +268,8 @@ class BoxTracks:
             times = rows[:, 0]
             if (np.diff(times) <= 0).any():
                 at = float(times[int(np.flatnonzero(np.diff(times) <= 0)[0])])
-                raise InputError(
-                    "an object has two boxes at one moment",
-                    where=f"{self._where}: object {name}",
-                    got=f"time {at:.3f} s of the log",
-                    remedy="are two logs mixed?",
-                )
+                what, where = "an object has two boxes at one moment", f"{self._where}: object {name}"
+                raise InputError(what, where=where, got=f"time {at:.3f} s of the log", remedy="are two logs mixed?")
             size = np.median(rows[:, 2:5], axis=0)
             label = max(member.labels, key=lambda name: member.labels[name])
             poses = np.tile(np.eye(4), (len(rows), 1, 1))

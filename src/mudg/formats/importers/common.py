@@ -54,13 +54,9 @@ def require_columns(names: Iterable[str], there: Iterable[str], where: object) -
     """Refuse a table that lacks one of ``names``."""
     there, names = list(there), list(names)
     if not set(names) <= set(there):
-        raise InputError(
-            "table lacks columns",
-            where=str(where),
-            got=", ".join(sorted(there)[:40]) or "no columns",
-            expected=", ".join(names),
-            remedy="is this a file of another data set, version or kind?",
-        )
+        got = ", ".join(sorted(there)[:40]) or "no columns"
+        remedy = "is this a file of another data set, version or kind?"
+        raise InputError("table lacks columns", where=str(where), got=got, expected=", ".join(names), remedy=remedy)
 
 
 def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDArray[np.float64]:
@@ -76,11 +72,8 @@ def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDA
         raise InputError("column does not hold numbers", where=where, got=str(error)[:120]) from error
     bad = ~np.isfinite(table).all(1)
     if bad.any():
-        raise InputError(
-            "column holds values that are not finite",
-            where=where,
-            got=f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}",
-        )
+        got = f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}"
+        raise InputError("column holds values that are not finite", where=where, got=got)
     return table
 
 
@@ -93,13 +86,9 @@ def unit_intensity(values: NDArray[Any], largest: float, where: object, remedy: 
     """
     scaled = values.astype(np.float64) / largest
     if not ((scaled > -_ROUNDING) & (scaled < 1 + _ROUNDING)).all():
-        raise InputError(
-            "intensity is out of range",
-            where=str(where),
-            expected=f"0 to {largest:g}",
-            got=f"{values.min():g} to {values.max():g}",
-            remedy=remedy or "scale the values as the data set does",
-        )
+        what, got = "intensity is out of range", f"{values.min():g} to {values.max():g}"
+        remedy = remedy or "scale the values as the data set does"
+        raise InputError(what, where=str(where), expected=f"0 to {largest:g}", got=got, remedy=remedy)
     return scaled.clip(0, 1).astype(np.float32)
 
 
@@ -133,20 +122,13 @@ def arrow_files(path: Path) -> Iterator[None]:
     try:
         import pyarrow
     except ImportError as error:
-        raise ResourceError(
-            "Feather and Parquet files need pyarrow, which is not installed",
-            where=str(path),
-            remedy="pip install 'mudg[data]'",
-        ) from error
+        what = "Feather and Parquet files need pyarrow, which is not installed"
+        raise ResourceError(what, where=str(path), remedy="pip install 'mudg[data]'") from error
     try:
         yield
     except (pyarrow.ArrowException, OSError, MemoryError, StopIteration, UnicodeDecodeError) as error:
-        raise InputError(
-            "table cannot be read, or is cut off",
-            where=str(path),
-            remedy="copy the file again",
-            got=str(error)[:200] or "it ends early",
-        ) from error
+        what, remedy = "table cannot be read, or is cut off", "copy the file again"
+        raise InputError(what, where=str(path), remedy=remedy, got=str(error)[:200] or "it ends early") from error
 
 
 # options ------------------------------------------------------------------------------------------
@@ -198,9 +180,8 @@ def parse_frame_range(text: str) -> tuple[int, int] | None:
         return None
     match = re.fullmatch(r"(\d{1,9}):(\d{1,9})", text.strip())
     if match is None or int(match[1]) >= int(match[2]):
-        raise UsageError(
-            "frame range makes no sense", where="--frames", expected="FIRST:END with FIRST < END, e.g. 0:16", got=text
-        )
+        what = "frame range makes no sense"
+        raise UsageError(what, where="--frames", expected="FIRST:END with FIRST < END, e.g. 0:16", got=text)
     return int(match[1]), int(match[2])
 
 
@@ -215,12 +196,8 @@ def parse_resolution(text: str) -> Resolution | None:
     match = re.fullmatch(r"(\d{2,5})(?:x(\d{2,5}))?", text.strip().lower())
     sides = [int(side) for side in match.groups() if side] if match is not None else []
     if not sides or min(sides) < 16:
-        raise UsageError(
-            "image size makes no sense",
-            where="--resolution",
-            expected="the longest side, e.g. 960, or WIDTHxHEIGHT, e.g. 960x640; at least 16 pixels",
-            got=text,
-        )
+        expected = "the longest side, e.g. 960, or WIDTHxHEIGHT, e.g. 960x640; at least 16 pixels"
+        raise UsageError("image size makes no sense", where="--resolution", expected=expected, got=text)
     return sides[0] if len(sides) == 1 else (sides[0], sides[1])
 
 
@@ -375,24 +352,16 @@ def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, wh
     steps = np.diff(since_start)
     if (steps <= 0).any():
         at = int(np.flatnonzero(steps <= 0)[0])
-        raise InputError(
-            "timestamps do not increase",
-            where=f"{where}: record {at + 1}",
-            expected=f"later than {numbers[at]} {unit}",
-            got=str(numbers[at + 1]),
-            remedy="sort the records by time, and remove doubled ones",
-        )
+        what, where = "timestamps do not increase", f"{where}: record {at + 1}"
+        expected, remedy = f"later than {numbers[at]} {unit}", "sort the records by time, and remove doubled ones"
+        raise InputError(what, where=where, expected=expected, got=str(numbers[at + 1]), remedy=remedy)
     low, high = PLAUSIBLE_PERIOD_S
     if len(steps) and not low <= (period := float(np.median(steps))) <= high:
         raw = period * UNITS_PER_SECOND[unit]
         fitting = [u for u, scale in UNITS_PER_SECOND.items() if low <= raw / scale <= high]
-        raise InputError(
-            "timestamps are in another unit than expected",
-            where=where,
-            expected=f"{unit}; records {low:g} to {high:g} s apart",
-            got=f"records {period:.3g} s apart",
-            remedy=f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording",
-        )
+        what, expected = "timestamps are in another unit than expected", f"{unit}; records {low:g} to {high:g} s apart"
+        remedy = f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording"
+        raise InputError(what, where=where, expected=expected, got=f"records {period:.3g} s apart", remedy=remedy)
     return since_start
 
 
@@ -401,21 +370,12 @@ def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> Non
     unit = {10**6: "microseconds", 10**9: "nanoseconds"}[per_second]
     outside = (stamps < _EPOCH_S[0] * per_second) | (stamps > _EPOCH_S[1] * per_second)
     if outside.any():
-        raise InputError(
-            "time stamp is in another unit",
-            where=where,
-            expected=f"{unit} since 1970",
-            got=f"{int(stamps[outside][0])}",
-            remedy=f"convert the stamps to {unit}",
-        )
+        what, expected, got = "time stamp is in another unit", f"{unit} since 1970", f"{int(stamps[outside][0])}"
+        raise InputError(what, where=where, expected=expected, got=got, remedy=f"convert the stamps to {unit}")
     if len(stamps) and int(stamps.max()) - int(stamps.min()) > _MAX_LOG_S * per_second:
-        raise InputError(
-            "time stamps of one log span more than hours",
-            where=where,
-            got=f"{int(stamps.min())} to {int(stamps.max())}",
-            expected=f"{unit}, all of one recording",
-            remedy="are records of another log, or of another unit, mixed in?",
-        )
+        what, got = "time stamps of one log span more than hours", f"{int(stamps.min())} to {int(stamps.max())}"
+        remedy = "are records of another log, or of another unit, mixed in?"
+        raise InputError(what, where=where, got=got, expected=f"{unit}, all of one recording", remedy=remedy)
 
 
 def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArray[np.intp]:
@@ -441,12 +401,8 @@ def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
     if len(numbers) == 4 and np.abs(numbers[3] - [0, 0, 0, 1]).max() > POSE_TOLERANCE:
         got = numbers[3].tolist()
         transposed = np.abs(numbers[:3, 3]).max() < POSE_TOLERANCE
-        raise InputError(
-            "pose does not end in the row 0 0 0 1",
-            where=where,
-            got=str(got),
-            remedy="it looks transposed: write it row by row" if transposed else "write it row by row",
-        )
+        remedy = "it looks transposed: write it row by row" if transposed else "write it row by row"
+        raise InputError("pose does not end in the row 0 0 0 1", where=where, got=str(got), remedy=remedy)
     return from_rotation_translation(rigid_rotation(numbers[:3, :3], where), numbers[:3, 3])
 
 
@@ -455,29 +411,17 @@ def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
     u, stretch, vt = np.linalg.svd(matrix)
     handed = float(np.linalg.det(u @ vt))
     if stretch[0] - stretch[2] <= POSE_TOLERANCE * stretch[0] and abs(stretch[1] - 1) > POSE_TOLERANCE:
-        raise InputError(
-            "pose is scaled",
-            where=where,
-            expected="a rotation (scale 1)",
-            got=f"scale {stretch[1]:.6g}",
-            remedy="divide the rotation part by its scale; are the translations in metres?",
-        )
+        expected = "a rotation (scale 1)"
+        remedy = "divide the rotation part by its scale; are the translations in metres?"
+        raise InputError("pose is scaled", where=where, expected=expected, got=f"scale {stretch[1]:.6g}", remedy=remedy)
     if np.abs(stretch - 1).max() > POSE_TOLERANCE:
-        raise InputError(
-            "pose is not a rigid motion",
-            where=where,
-            expected="an orthonormal rotation part",
-            got=f"stretches {', '.join(f'{s:.4g}' for s in stretch)}",
-            remedy="is it row-major, without shear or scale?",
-        )
+        what, got = "pose is not a rigid motion", f"stretches {', '.join(f'{s:.4g}' for s in stretch)}"
+        remedy = "is it row-major, without shear or scale?"
+        raise InputError(what, where=where, expected="an orthonormal rotation part", got=got, remedy=remedy)
     if handed < 0:
-        raise InputError(
-            "pose is left-handed",
-            where=where,
-            expected="determinant +1",
-            got="a reflection (determinant -1)",
-            remedy="one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras",
-        )
+        got = "a reflection (determinant -1)"
+        remedy = "one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras"
+        raise InputError("pose is left-handed", where=where, expected="determinant +1", got=got, remedy=remedy)
     return u @ vt
 
 
@@ -489,20 +433,12 @@ def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matri
     """
     q, t = np.asarray(wxyz, np.float64).reshape(-1), np.asarray(xyz_m, np.float64).reshape(-1)
     if q.shape != (4,) or t.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(t).all():
-        raise InputError(
-            "pose is not a quaternion and a translation",
-            where=where,
-            expected="4 and 3 finite numbers",
-            got=f"{q.tolist()} and {t.tolist()}",
-        )
+        what = "pose is not a quaternion and a translation"
+        raise InputError(what, where=where, expected="4 and 3 finite numbers", got=f"{q.tolist()} and {t.tolist()}")
     length = float(np.linalg.norm(q))
     if abs(length - 1) > QUATERNION_TOLERANCE:
-        raise InputError(
-            "quaternion does not have length 1",
-            where=where,
-            expected="w, x, y, z of a rotation",
-            got=f"length {length:.6g}",
-        )
+        what = "quaternion does not have length 1"
+        raise InputError(what, where=where, expected="w, x, y, z of a rotation", got=f"length {length:.6g}")
     return from_rotation_translation(matrix_from_quaternion(q), t)
 
 
@@ -548,13 +484,9 @@ def pose_near(
 
 def gap_problem(gap: motion.Gap, time_s: float, where: str) -> InputError:
     """The error about an image or scan in a gap of the vehicle's path."""
-    return InputError(
-        "vehicle poses have a gap here",
-        where=where,
-        got=f"at {time_s:.3f} s: {gap}",
-        expected="poses around every image and scan",
-        remedy="leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps",
-    )
+    what, got = "vehicle poses have a gap here", f"at {time_s:.3f} s: {gap}"
+    remedy = "leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps"
+    return InputError(what, where=where, got=got, expected="poses around every image and scan", remedy=remedy)
 
 
 def has_pose(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S) -> bool:
@@ -618,13 +550,9 @@ def check_motion(ego: EgoPath, where: str) -> None:
     wrong then."""
     upright = float(np.median(ego.world_from_ego[:, 2, 2]))
     if upright < _LEAST_UPRIGHT:
-        raise InputError(
-            "the vehicle does not stand upright",
-            where=where,
-            expected="vehicle and map with z up",
-            got=f"its z axis rises by {upright:.2f} per metre",
-            remedy="check the order of quaternions (w, x, y, z) and the axes",
-        )
+        what, got = "the vehicle does not stand upright", f"its z axis rises by {upright:.2f} per metre"
+        remedy = "check the order of quaternions (w, x, y, z) and the axes"
+        raise InputError(what, where=where, expected="vehicle and map with z up", got=got, remedy=remedy)
     if len(ego.times_s) < 2:
         return
     # over a twentieth of a second at least: pose noise over less is no speed
@@ -635,26 +563,20 @@ def check_motion(ego: EgoPath, where: str) -> None:
     speed = np.linalg.norm(steps, axis=1) / (ego.times_s[last] - ego.times_s[first])
     at = int(speed.argmax())
     if speed[at] > MAX_SPEED_M_S:
-        raise InputError(
-            "the vehicle moves impossibly fast",
-            where=where,
-            got=f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose",
-            expected=f"under {MAX_SPEED_M_S:.0f} m/s",
-            remedy="check the units of times and translations, and that all poses are of one log",
-        )
+        what = "the vehicle moves impossibly fast"
+        got = f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose"
+        remedy = "check the units of times and translations, and that all poses are of one log"
+        raise InputError(what, where=where, got=got, expected=f"under {MAX_SPEED_M_S:.0f} m/s", remedy=remedy)
     # over a gap it may turn
     drives = (speed > _DRIVES_M_S) & (ego.times_s[last] - ego.times_s[first] <= _COURSE_WITHIN_S)
     if drives.any():
         forward = np.einsum("ni,ni->n", ego.world_from_ego[first[drives], :3, 0], steps[drives])
         along = float(np.median(np.abs(forward) / np.linalg.norm(steps[drives], axis=1)))  # reversing is driving, too
         if along < _LEAST_ALONG:
-            raise InputError(
-                "the vehicle does not drive where it looks",
-                where=where,
-                expected="vehicle axes x forward, y left, z up",
-                got=f"it moves {np.rad2deg(np.arccos(along)):.0f} degrees off its x axis",
-                remedy="check the order of quaternions (w, x, y, z) and the axes",
-            )
+            what = "the vehicle does not drive where it looks"
+            got = f"it moves {np.rad2deg(np.arccos(along)):.0f} degrees off its x axis"
+            remedy = "check the order of quaternions (w, x, y, z) and the axes"
+            raise InputError(what, where=where, expected="vehicle axes x forward, y left, z up", got=got, remedy=remedy)
 
 
 def deskew(

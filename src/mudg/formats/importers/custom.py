@@ -571,12 +571,9 @@ def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> Sw
     if options.untwist == "no" or (options.untwist == "auto" and lidar.motion_compensated):
         return points
     if not lidar.time_field:
-        raise InputError(
-            "sweeps are not motion-compensated, and their points have no times",
-            where=f"{content.root / INDEX}: lidars.{sweep.sensor}",
-            expected="time_field and time_unit",
-            remedy="name the field with the time of each point, or add --untwist no",
-        )
+        what, expected = "sweeps are not motion-compensated, and their points have no times", "time_field and time_unit"
+        remedy = "name the field with the time of each point, or add --untwist no"
+        raise InputError(what, where=f"{content.root / INDEX}: lidars.{sweep.sensor}", expected=expected, remedy=remedy)
 
     def world_from_lidar(time_s: float) -> NDArray[np.float64]:
         return pose_near(content.ego, time_s) @ sweep.ego_from_sensor

@@ -185,12 +185,8 @@ def _scenes(source: Path) -> list[Path]:
 def _choose_scene(source: Path, options: ImportOptions) -> Path:
     scenes = _scenes(source)
     if not scenes:
-        raise InputError(
-            "no DGP scene found",
-            where=str(source),
-            got=folder_contents(source),
-            expected="scene_<hash>.json beside a calibration folder, here or in sub-folders",
-        )
+        expected = "scene_<hash>.json beside a calibration folder, here or in sub-folders"
+        raise InputError("no DGP scene found", where=str(source), got=folder_contents(source), expected=expected)
     matching = [p for p in scenes if options.sequence in ("", p.parent.resolve().name, p.stem, p.name)]
     names = [f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes]
     return the_only(matching, names, options, source, "scene")
@@ -327,12 +323,8 @@ class _DgpCalibration:
 
     def mount(self, sensor: str, where: str) -> Matrix:
         if sensor not in self.mounts:
-            raise InputError(
-                "calibration lacks a sensor",
-                where=self.where,
-                expected=f"{sensor} ({where})",
-                got=", ".join(self.mounts),
-            )
+            what = "calibration lacks a sensor"
+            raise InputError(what, where=self.where, expected=f"{sensor} ({where})", got=", ".join(self.mounts))
         return self.mounts[sensor]
 
 
@@ -341,9 +333,8 @@ def _read_calibration(folder: Path, key: str) -> _DgpCalibration:
     record = _json(path, "calibration/*.json")
     names = [str(name) for name in record["names"]]
     if not len(names) == len(record["extrinsics"]) == len(record["intrinsics"]):
-        raise InputError(
-            "calibration lists differ in length", where=str(path), expected="names, extrinsics, intrinsics"
-        )
+        what = "calibration lists differ in length"
+        raise InputError(what, where=str(path), expected="names, extrinsics, intrinsics")
     mounts = {n: _pose(value, f"{path}: {n}") for n, value in zip(names, record["extrinsics"], strict=True)}
     return _DgpCalibration(dict(zip(names, record["intrinsics"], strict=True)), mounts, str(path))
 
@@ -359,12 +350,8 @@ def _add_camera(cameras: dict[str, Camera], calibration: _DgpCalibration, name: 
     width, height = int(datum.record["width"]), int(datum.record["height"])
     camera = Camera(name, width, height, k["fx"], k["fy"], k["cx"] + 0.5, k["cy"] + 0.5)
     if cameras.setdefault(name, camera) != camera:
-        raise InputError(
-            "images of one camera differ in size or calibration",
-            where=datum.where,
-            expected=str(cameras[name]),
-            got=str(camera),
-        )
+        what = "images of one camera differ in size or calibration"
+        raise InputError(what, where=datum.where, expected=str(cameras[name]), got=str(camera))
 
 
 # --- boxes and clouds -----------------------------------------------------------------------------
@@ -386,12 +373,8 @@ def _read_tracks(
         for index, item in enumerate(_json(path, "bounding_box_3d/*.json")["annotations"]):
             where = f"{path}: annotations[{index}]"
             if item["class_id"] not in names:
-                raise InputError(
-                    "box has a class that the ontology lacks",
-                    where=where,
-                    got=str(item["class_id"]),
-                    expected=", ".join(str(number) for number in names),
-                )
+                what, got = "box has a class that the ontology lacks", str(item["class_id"])
+                raise InputError(what, where=where, got=got, expected=", ".join(str(number) for number in names))
             box = item["box"]
             size = box["length"], box["width"], box["height"]
             label = tracks.label_of(names[item["class_id"]])
@@ -420,20 +403,13 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
     note_unknown("point_format", columns, _CHANNELS)
     fits = data.ndim == 2 and data.shape[1] == len(columns) and data.dtype.kind in "fiu"
     if not fits or not {"X", "Y", "Z"} <= {*columns}:
-        raise InputError(
-            "cloud does not have its columns",
-            where=f"{where}: data",
-            got=f"{data.dtype} {data.shape}",
-            expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}",
-        )
+        what, expected = "cloud does not have its columns", f"[N, {len(columns)}] numbers: {', '.join(columns)}"
+        raise InputError(what, where=f"{where}: data", got=f"{data.dtype} {data.shape}", expected=expected)
     returns = is_return(data[:, [columns.index(axis) for axis in "XYZ"]])
     no_returns, data = int((~returns).sum()), data[returns].astype(np.float32)
     if not np.isfinite(data).all():
-        raise InputError(
-            "cloud holds values that are not finite",
-            where=where,
-            got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points",
-        )
+        what = "cloud holds values that are not finite"
+        raise InputError(what, where=where, got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points")
     xyz = np.ascontiguousarray(data[:, [columns.index(axis) for axis in "XYZ"]])
     intensity = data[:, columns.index("INTENSITY")] if "INTENSITY" in columns else np.zeros(len(data), np.float32)
     # the format states no range

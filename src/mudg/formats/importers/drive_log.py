@@ -365,22 +365,14 @@ def _choose_frames(drive: DriveLog, options: ImportOptions) -> _Chosen:
     check_sensor_times(drive)
     lacking = [name for name in drive.cameras if not any(image.camera == name for image in drive.images)]
     if lacking:
-        raise InputError(
-            "a camera has no images in this log",
-            where=drive.where,
-            got=", ".join(lacking),
-            expected="images of every chosen camera",
-            remedy="unpack the archives with its images, or choose others with --cameras",
-        )
+        what, got = "a camera has no images in this log", ", ".join(lacking)
+        remedy = "unpack the archives with its images, or choose others with --cameras"
+        raise InputError(what, where=drive.where, got=got, expected="images of every chosen camera", remedy=remedy)
     reference_s = np.sort([image.time_s for image in drive.images if image.camera == drive.reference])
     first, end = options.frames if options.frames is not None else (0, len(reference_s))
     if first >= len(reference_s):
-        raise UsageError(
-            "no frame lies in the chosen range",
-            where="--frames",
-            got=f"{first}:{end}",
-            expected=f"frames 0 to {len(reference_s) - 1} ({len(reference_s)} images of {drive.reference})",
-        )
+        expected = f"frames 0 to {len(reference_s) - 1} ({len(reference_s)} images of {drive.reference})"
+        raise UsageError("no frame lies in the chosen range", where="--frames", got=f"{first}:{end}", expected=expected)
 
     def numbered(records: Sequence[Any]) -> list[tuple[Any, int]]:
         nearest = nearest_index(reference_s, np.array([record.time_s for record in records])).tolist()
@@ -399,13 +391,10 @@ def _without_missing(chosen: _Chosen, options: ImportOptions) -> _Chosen:
         by_sensor.setdefault(_sensor_of(record), []).append(path)
     lacks = "; ".join(f"{sensor} lacks {len(paths)} (first: {paths[0].name})" for sensor, paths in by_sensor.items())
     if not options.skip_missing or not set(chosen.images) - set(absent):
-        raise InputError(
-            "files that the log names are missing",
-            where=str(next(iter(absent.values()))),
-            got=lacks,
-            expected=f"all {len(chosen.images) + len(chosen.sweeps)} images and sweeps of the chosen frames",
-            remedy="unpack the missing archives, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        what = "files that the log names are missing"
+        expected = f"all {len(chosen.images) + len(chosen.sweeps)} images and sweeps of the chosen frames"
+        remedy = "unpack the missing archives, choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError(what, where=str(next(iter(absent.values()))), got=lacks, expected=expected, remedy=remedy)
     log.warn(f"left out files that are missing: {lacks}")
     images = {image: number for image, number in chosen.images.items() if image not in absent}
     return _Chosen(images, [sweep for sweep in chosen.sweeps if sweep not in absent])
@@ -434,12 +423,9 @@ def check_sensor_times(drive: DriveLog) -> None:
     for sensor, values in times.items():
         steps = np.diff(np.sort(values))
         if len(steps) and steps.min() <= 0:
-            raise InputError(
-                "two records of one sensor have the same time",
-                where=f"{drive.where}: {sensor}",
-                got=f"{np.sort(values)[int(steps.argmin())]:.6f} s",
-                expected="a time of its own for every image and sweep",
-            )
+            what, where = "two records of one sensor have the same time", f"{drive.where}: {sensor}"
+            got = f"{np.sort(values)[int(steps.argmin())]:.6f} s"
+            raise InputError(what, where=where, got=got, expected="a time of its own for every image and sweep")
 
 
 def _ego_between(ego: EgoPath, start_s: float, end_s: float, where: str) -> EgoPath:

@@ -144,12 +144,8 @@ class ImageFit:
         are mixed."""
         height, width = self.recorded.height, self.recorded.width
         if ids.shape != (height, width):
-            raise InputError(
-                "label does not have its camera's size",
-                where=f"camera {self.camera.name}",
-                expected=f"[{height}, {width}]",
-                got=str(list(ids.shape)),
-            )
+            what, where = "label does not have its camera's size", f"camera {self.camera.name}"
+            raise InputError(what, where=where, expected=f"[{height}, {width}]", got=str(list(ids.shape)))
         if self.table is not None:
             ids = self.table.nearest(ids)
         return resize_nearest(ids, self.camera.height, self.camera.width)
@@ -203,12 +199,8 @@ def resized(width: int, height: int, resolution: Resolution | None, where: str =
         scale = min(1.0, resolution / max(width, height))
         return max(1, round(width * scale)), max(1, round(height * scale))
     if resolution[0] > width or resolution[1] > height:
-        raise UsageError(
-            "images are never enlarged",
-            where=where or "--resolution",
-            expected=f"at most {width}x{height}",
-            got=f"{resolution[0]}x{resolution[1]}",
-        )
+        what, expected = "images are never enlarged", f"at most {width}x{height}"
+        raise UsageError(what, where=where or "--resolution", expected=expected, got=f"{resolution[0]}x{resolution[1]}")
     return resolution
 
 
@@ -230,13 +222,10 @@ def covering_camera(camera: Camera, lens: Lens) -> Camera:
         return camera
     problem = _border_problem(at(high), camera, lens)
     if problem is not None:
-        raise InputError(
-            "lens cannot be rectified to a pinhole camera of its own size",
-            where=f"camera {camera.name}",
-            got=problem,
-            expected=f"rays that cover the image with at most {MAX_FOCAL_GAIN:g} times the focal length",
-            remedy="check the order of the coefficients; for a very wide lens choose a narrower pinhole camera",
-        )
+        what = "lens cannot be rectified to a pinhole camera of its own size"
+        expected = f"rays that cover the image with at most {MAX_FOCAL_GAIN:g} times the focal length"
+        remedy = "check the order of the coefficients; for a very wide lens choose a narrower pinhole camera"
+        raise InputError(what, where=f"camera {camera.name}", got=problem, expected=expected, remedy=remedy)
     while high - low > 1e-4:
         middle = (low + high) / 2
         low, high = (middle, high) if _border_problem(at(middle), camera, lens) else (low, middle)
@@ -286,12 +275,8 @@ class _Table:
             place = lens(xy) * [camera.fx, camera.fy] + [camera.cx, camera.cy] - 0.5
             outside = (place < -0.51) | (place > np.array([camera.width, camera.height]) - 0.49)
             if not np.isfinite(place).all() or outside.any():
-                raise InputError(
-                    "rectified camera looks beyond the recorded image",
-                    where=f"camera {camera.name}",
-                    got=f"row {rows.start} on",
-                    remedy="choose a narrower pinhole camera",
-                )
+                what, remedy = "rectified camera looks beyond the recorded image", "choose a narrower pinhole camera"
+                raise InputError(what, where=f"camera {camera.name}", got=f"row {rows.start} on", remedy=remedy)
             place = place.clip(0, np.array([camera.width, camera.height]) - 1.0)
             whole = np.minimum(place.astype(np.int64), [max(camera.width - 2, 0), max(camera.height - 2, 0)])
             part = np.minimum(np.round((place - whole) * 256), 255).astype(np.uint8)

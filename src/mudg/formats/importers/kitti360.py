@@ -239,11 +239,8 @@ def _refuse_entities(content: bytes, where: str, first: bool) -> None:
     head = content[:200].lower()
     other = first and b"encoding" in head and not any(name in head for name in (b"utf-8", b"ascii"))
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content or b"\0" in content or other:
-        raise InputError(
-            "box file declares a document type, entities or another encoding, which the data set's files do not",
-            where=where,
-            remedy="use the file from the data set",
-        )
+        what = "box file declares a document type, entities or another encoding, which the data set's files do not"
+        raise InputError(what, where=where, remedy="use the file from the data set")
 
 
 def _label(item: ElementTree.Element, where: str) -> str:
@@ -276,12 +273,8 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
     rows, columns = _integer(node, "rows", f"{where}.{key}"), _integer(node, "cols", f"{where}.{key}")
     texts = (node.findtext("data") or "").split()
     if rows * columns != len(texts) or not 0 < rows * columns <= _MAX_VALUES:
-        raise InputError(
-            "matrix does not have the size it declares",
-            where=f"{where}.{key}",
-            expected=f"{rows} x {columns} numbers",
-            got=f"{len(texts)} values",
-        )
+        what, where = "matrix does not have the size it declares", f"{where}.{key}"
+        raise InputError(what, where=where, expected=f"{rows} x {columns} numbers", got=f"{len(texts)} values")
     try:
         values = np.array([float(text) for text in texts])
     except ValueError as error:
@@ -300,11 +293,8 @@ def _shape(
     them the annotation tool called x does not matter for the box.
     """
     if transform.shape != (4, 4) or vertices.shape[1] != 3 or np.abs(transform[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError(
-            "box is not a 4x4 transform of 3-D vertices",
-            where=where,
-            got=f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}",
-        )
+        got = f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}"
+        raise InputError("box is not a 4x4 transform of 3-D vertices", where=where, got=got)
     low, high = vertices.min(0), vertices.max(0)
     scale = np.linalg.norm(transform[:3, :3], axis=0)
     sizes = scale * (high - low)
@@ -441,13 +431,9 @@ def _rigid_file(path: Path) -> Matrix:
 
 def _check_size(size: tuple[int, int], declared: tuple[int, int], where: str) -> None:
     if size != declared:
-        raise InputError(
-            "images do not have the size that the calibration is for",
-            where=where,
-            expected=f"{declared[0]}x{declared[1]}",
-            got=f"{size[0]}x{size[1]}",
-            remedy="use the images as the data set ships them",
-        )
+        what, expected = "images do not have the size that the calibration is for", f"{declared[0]}x{declared[1]}"
+        remedy = "use the images as the data set ships them"
+        raise InputError(what, where=where, expected=expected, got=f"{size[0]}x{size[1]}", remedy=remedy)
 
 
 def _read_fisheye(path: Path) -> dict[str, float]:
@@ -455,12 +441,8 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     text = store.read_bytes(path).decode("utf-8", "replace")
     model = re.search(r"^\s*model_type\s*:\s*\"?(\w+)", text, re.MULTILINE)
     if model is None or model[1] != "MEI":
-        raise InputError(
-            "fisheye calibration is of another camera model",
-            where=str(path),
-            expected="model_type: MEI",
-            got=model[1] if model else "no model_type",
-        )
+        what = "fisheye calibration is of another camera model"
+        raise InputError(what, where=str(path), expected="model_type: MEI", got=model[1] if model else "no model_type")
     note_unknown(path.name, re.findall(r"^\s*(\w+)\s*:", text, re.MULTILINE), _FISHEYE)
     found: dict[str, float] = {}
     for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
@@ -470,20 +452,12 @@ def _read_fisheye(path: Path) -> dict[str, float]:
             raise InputError("fisheye calibration holds no number", where=f"{path}: {key}", got=value[:40]) from error
     missing = [key for key in _FISHEYE_VALUES if key not in found]
     if missing:
-        raise InputError(
-            "fisheye calibration is incomplete",
-            where=str(path),
-            expected=", ".join(_FISHEYE_VALUES),
-            got=f"no {', '.join(missing)}",
-            remedy="is the file cut off?",
-        )
+        what, where, got = "fisheye calibration is incomplete", str(path), f"no {', '.join(missing)}"
+        raise InputError(what, where=where, expected=", ".join(_FISHEYE_VALUES), got=got, remedy="is the file cut off?")
     if found["xi"] < 0 or found["gamma1"] <= 0 or found["gamma2"] <= 0:
-        raise InputError(
-            "fisheye calibration makes no sense",
-            where=str(path),
-            expected="xi >= 0, gamma1 and gamma2 > 0",
-            got=f"xi={found['xi']:g}, gamma1={found['gamma1']:g}, gamma2={found['gamma2']:g}",
-        )
+        what = "fisheye calibration makes no sense"
+        got = f"xi={found['xi']:g}, gamma1={found['gamma1']:g}, gamma2={found['gamma2']:g}"
+        raise InputError(what, where=str(path), expected="xi >= 0, gamma1 and gamma2 > 0", got=got)
     return found
 
 
@@ -640,12 +614,8 @@ def _find(source: Path, options: ImportOptions) -> _Folders:
         return _Folders(source.absolute().parent.parent, source.absolute().name)
     raw = source / "data_2d_raw"
     if not raw.is_dir():
-        raise InputError(
-            "no KITTI-360 recording found",
-            where=str(source),
-            got=layout.folder_contents(source),
-            expected="data_2d_raw, data_poses and calibration in it",
-        )
+        what, got = "no KITTI-360 recording found", layout.folder_contents(source)
+        raise InputError(what, where=str(source), got=got, expected="data_2d_raw, data_poses and calibration in it")
     drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
     wanted = options.sequence
     matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
@@ -698,12 +668,8 @@ def _find_poses(folders: _Folders, options: ImportOptions) -> Path:
     here = folders.root / "data_poses" / folders.drive
     path = layout.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
     if path is None:
-        raise InputError(
-            "no vehicle poses found",
-            where=str(options.poses or here),
-            expected="poses.txt or cam0_to_world.txt",
-            remedy="download the data set's vehicle poses",
-        )
+        expected, remedy = "poses.txt or cam0_to_world.txt", "download the data set's vehicle poses"
+        raise InputError("no vehicle poses found", where=str(options.poses or here), expected=expected, remedy=remedy)
     return path
 
 
@@ -715,21 +681,16 @@ def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np
         row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
         number = int(row[0])
         if number != row[0] or number <= before:
-            raise InputError(
-                "first column is not a list of growing frame numbers",
-                where=where,
-                got=f"{row[0]:g}",
-                remedy="is the file of another kind?",
-            )
+            what = "first column is not a list of growing frame numbers"
+            raise InputError(what, where=where, got=f"{row[0]:g}", remedy="is the file of another kind?")
         before = number
         if number < len(clock) and np.isfinite(clock[number]):
             pose = rigid_pose(row[1:].reshape(-1, 4), where)
             numbers.append(number)
             poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
     if not poses:
-        raise InputError(
-            "no pose belongs to a frame", where=str(path), expected=f"frame numbers up to {len(clock) - 1}"
-        )
+        what = "no pose belongs to a frame"
+        raise InputError(what, where=str(path), expected=f"frame numbers up to {len(clock) - 1}")
     times = clock[numbers]
     if (np.diff(times) <= 0).any():
         frame = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
@@ -822,9 +783,8 @@ def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[
         return {}
     ids = _grey(path)
     if ids.dtype != np.uint8 or (ids[ids != UNLABELLED] > _LAST_ID).any():
-        raise InputError(
-            "semantic image holds ids that do not exist", where=str(path), expected=f"0..{_LAST_ID}, 8 bits"
-        )
+        what = "semantic image holds ids that do not exist"
+        raise InputError(what, where=str(path), expected=f"0..{_LAST_ID}, 8 bits")
     table = np.full(256, UNLABELLED, np.uint8)
     table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())
     labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
@@ -841,9 +801,8 @@ def _grey(path: Path) -> NDArray[Any]:
     try:
         with Image.open(io.BytesIO(store.read_bytes(path)), formats=("PNG",)) as image:
             if image.mode not in ("L", "P", "I;16", "I"):
-                raise InputError(
-                    "label image is not grey", where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits"
-                )
+                what = "label image is not grey"
+                raise InputError(what, where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits")
             array = np.array(image)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error

@@ -68,24 +68,17 @@ def complete_frames(
     missing = {name: sorted(everything - found) for name, found in numbers.items() if everything - found}
     gaps = "; ".join(f"{name} lacks {number_ranges(lacks)}" for name, lacks in missing.items())
     if missing and not options.skip_missing:
-        raise InputError(
-            "images and sweeps do not pair up",
-            where=where,
-            expected="every camera and LiDAR for every frame",
-            got=gaps,
-            remedy="copy the missing files, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        what = "images and sweeps do not pair up"
+        remedy = "copy the missing files, choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError(what, where=where, expected="every camera and LiDAR for every frame", got=gaps, remedy=remedy)
     if missing:
         log.warn(f"{title}: left out incomplete frames: {gaps}")
     for lacks in missing.values():
         everything -= set(lacks)
     if not everything:
-        raise InputError(
-            "no frames to import",
-            where=where,
-            expected="numbered images" + (f" in {options.frames[0]}:{options.frames[1]}" if options.frames else ""),
-            got=", ".join(f"{name}: {number_ranges(sorted(found))}" for name, found in numbers.items()) or "nothing",
-        )
+        expected = "numbered images" + (f" in {options.frames[0]}:{options.frames[1]}" if options.frames else "")
+        got = ", ".join(f"{name}: {number_ranges(sorted(found))}" for name, found in numbers.items()) or "nothing"
+        raise InputError("no frames to import", where=where, expected=expected, got=got)
     return sorted(everything)
 
 
@@ -129,12 +122,9 @@ def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOpti
     if len(matching) == 1:
         return matching[0]
     listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
-    raise UsageError(
-        f"the folder holds several {kind}s" if matching else f"there is no such {kind}",
-        where=str(where),
-        expected=f"--sequence with one of {listed}",
-        got=options.sequence or "none chosen",
-    )
+    what = f"the folder holds several {kind}s" if matching else f"there is no such {kind}"
+    expected = f"--sequence with one of {listed}"
+    raise UsageError(what, where=str(where), expected=expected, got=options.sequence or "none chosen")
 
 
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
@@ -154,9 +144,8 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
     if not options.cameras:
         chosen = [name for name in available if name in usual]
         if not chosen:
-            raise InputError(
-                "the log has no camera that can be imported", where=where, expected=", ".join(usual), got=listed
-            )
+            what = "the log has no camera that can be imported"
+            raise InputError(what, where=where, expected=", ".join(usual), got=listed)
         return chosen
     unknown = [name for name in options.cameras if name not in available and name not in by_scene_name]
     if unknown:
@@ -176,13 +165,9 @@ def refuse_missing_cameras(there: Iterable[str], usual: Iterable[str], options: 
     there, usual = list(there), list(usual)
     absent = [name for name in usual if name not in there]
     if absent and not options.cameras and not options.skip_missing:
-        raise InputError(
-            "cameras are missing in the log",
-            where=str(where),
-            got=f"no images of {', '.join(absent)}",
-            expected=f"{len(usual)} cameras",
-            remedy=f"choose those that are there with --cameras {' '.join(there)}, or add --skip-missing",
-        )
+        what, got = "cameras are missing in the log", f"no images of {', '.join(absent)}"
+        remedy = f"choose those that are there with --cameras {' '.join(there)}, or add --skip-missing"
+        raise InputError(what, where=str(where), got=got, expected=f"{len(usual)} cameras", remedy=remedy)
 
 
 def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
@@ -202,12 +187,8 @@ def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
     """Refuse ``--untwist yes``, ``--poses`` and ``--boxes`` for a data set that brings its own and compensates its
     sweeps."""
     if options.untwist == "yes":
-        raise UsageError(
-            f"sweeps of {dataset} are already compensated for the vehicle's motion",
-            where=where,
-            got="--untwist yes",
-            remedy="leave --untwist out",
-        )
+        what = f"sweeps of {dataset} are already compensated for the vehicle's motion"
+        raise UsageError(what, where=where, got="--untwist yes", remedy="leave --untwist out")
     refuse_options(options, dataset, "poses", "boxes")
 
 
@@ -215,7 +196,6 @@ def path_inside(root: Path, name: Any, where: str) -> Path:
     """A file below ``root`` from a name in a foreign table; absolute names and ``..`` are refused."""
     problem = ref_problem(name)
     if problem is not None:
-        raise InputError(
-            f"file name {problem}", where=where, got=repr(name)[:120], expected="a relative path inside the log"
-        )
+        what = f"file name {problem}"
+        raise InputError(what, where=where, got=repr(name)[:120], expected="a relative path inside the log")
     return root / name

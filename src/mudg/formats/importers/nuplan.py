@@ -152,9 +152,8 @@ class NuplanLog:
             for row in self._connection.execute(question, values):  # noqa: UP028
                 yield row
         except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
-            raise InputError(
-                "log database is damaged", where=str(self.path), got=str(error)[:200], remedy="copy the file again"
-            ) from error
+            what = "log database is damaged"
+            raise InputError(what, where=str(self.path), got=str(error)[:200], remedy="copy the file again") from error
 
     def check(self) -> None:
         """Refuse a database that is not a nuPlan log."""
@@ -163,13 +162,9 @@ class NuplanLog:
         }
         for table, columns in SCHEMA.items():
             if table not in tables or tables[table].upper().startswith("CREATE VIRTUAL"):
-                raise InputError(
-                    f"database has no table {table!r}",
-                    where=str(self.path),
-                    expected=", ".join(SCHEMA),
-                    got=", ".join(sorted(tables)) or "no tables",
-                    remedy="is it a nuPlan log (v1.1)?",
-                )
+                what, got = f"database has no table {table!r}", ", ".join(sorted(tables)) or "no tables"
+                remedy = "is it a nuPlan log (v1.1)?"
+                raise InputError(what, where=str(self.path), expected=", ".join(SCHEMA), got=got, remedy=remedy)
             there = [str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")]
             require_columns(columns, there, f"{self.path}: {table}")
             note_unknown(f"the table {table}", there, OFFICIAL[table].union(columns))
@@ -181,12 +176,8 @@ class NuplanLog:
             name = text_of(name, f"{self.path}: log.logfile")
             problem = "has folders in it" if "/" in name else ref_problem(name)
             if problem is not None:
-                raise InputError(
-                    f"log's name {problem}",
-                    where=f"{self.path}: log.logfile",
-                    got=repr(name),
-                    expected="a folder's name",
-                )
+                what = f"log's name {problem}"
+                raise InputError(what, where=f"{self.path}: log.logfile", got=repr(name), expected="a folder's name")
             return name
         raise InputError("log has no name", where=f"{self.path}: log.logfile")
 
@@ -201,12 +192,8 @@ class NuplanLog:
             matrix = np.array(self._numbers(values[2], f"{where}.intrinsic", 9)).reshape(3, 3)
             skewed = abs(matrix[0, 1]) > 1e-6 or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6
             if skewed or min(matrix[0, 0], matrix[1, 1]) <= 0:
-                raise InputError(
-                    "intrinsics are not of a pinhole camera",
-                    where=f"{where}.intrinsic",
-                    got=str(matrix.tolist()),
-                    expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
-                )
+                what, where, got = "intrinsics are not of a pinhole camera", f"{where}.intrinsic", str(matrix.tolist())
+                raise InputError(what, where=where, got=got, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
             width, height = (_whole(values[index], f"{where}.{name}") for index, name in ((4, "width"), (5, "height")))
             found[token_of(token, f"{where}.token")] = NuplanCamera(
                 channel,
@@ -293,12 +280,8 @@ class NuplanLog:
             track = token_of(track, f"{self.path}: lidar_box.track_token").hex()
             where = f"{self.path}: lidar_box of track {track}"
             if label is None:
-                raise InputError(
-                    "box names a track or class that is not there",
-                    where=where,
-                    expected="tokens of track and category",
-                    remedy="copy the file again",
-                )
+                what, expected = "box names a track or class that is not there", "tokens of track and category"
+                raise InputError(what, where=where, expected=expected, remedy="copy the file again")
             label = text_of(label, f"{self.path}: category.name")
             yield token_of(cloud, where), track, label, tuple(_finite(number, where) for number in numbers)
 
@@ -329,9 +312,8 @@ class NuplanLog:
         for item in as_list(read_pickle(blob, where, _MAKERS), where)[:_MAX_NUMBERS]:
             flat += [_finite(value, where) for value in (item if isinstance(item, list | tuple) else [item])]
         if count is not None and len(flat) != count:
-            raise InputError(
-                "calibration has the wrong number of values", where=where, expected=str(count), got=str(len(flat))
-            )
+            what = "calibration has the wrong number of values"
+            raise InputError(what, where=where, expected=str(count), got=str(len(flat)))
         return flat
 
 
@@ -339,22 +321,17 @@ def token_of(value: Any, where: str) -> bytes:
     """A token: 1 to 64 bytes. InputError otherwise: SQLite columns may hold values of any type."""
     if not isinstance(value, bytes) or not 0 < len(value) <= _MAX_TOKEN_BYTES:
         got = f"{len(value)} bytes" if isinstance(value, bytes | str) else repr(value)[:40]
-        raise InputError(
-            "token is no short blob",
-            where=where,
-            expected=f"1 to {_MAX_TOKEN_BYTES} bytes",
-            got=f"{type(value).__name__}, {got}",
-            remedy="is it a nuPlan log (v1.1)? copy the file again",
-        )
+        what, expected = "token is no short blob", f"1 to {_MAX_TOKEN_BYTES} bytes"
+        remedy = "is it a nuPlan log (v1.1)? copy the file again"
+        raise InputError(what, where=where, expected=expected, got=f"{type(value).__name__}, {got}", remedy=remedy)
     return value
 
 
 def text_of(value: Any, where: str) -> str:
     """A name: a text of 1 to 200 bytes."""
     if not isinstance(value, str) or not value:
-        raise InputError(
-            "name is no text", where=where, expected="a text", got=type(value).__name__ if value else repr(value)
-        )
+        what = "name is no text"
+        raise InputError(what, where=where, expected="a text", got=type(value).__name__ if value else repr(value))
     return foreign_name(value, where)
 
 
@@ -392,13 +369,8 @@ def open_log(path: Path) -> Iterator[NuplanLog]:
         opened.check()
         yield opened
     except sqlite3.Error as error:
-        raise InputError(
-            "file is not a readable SQLite database",
-            where=str(path),
-            got=str(error),
-            expected="a nuPlan log (.db)",
-            remedy="is it cut off, or still packed?",
-        ) from error
+        what, remedy = "file is not a readable SQLite database", "is it cut off, or still packed?"
+        raise InputError(what, where=str(path), got=str(error), expected="a nuPlan log (.db)", remedy=remedy) from error
     finally:
         if connection is not None:
             connection.close()
@@ -488,9 +460,8 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
         raise InputError("nuPlan log does not exist", where=str(source), expected="a .db file or a folder of them")
     databases = {path.stem: path for path in _databases(source)}
     if not databases:
-        raise InputError(
-            "no nuPlan log found", where=str(source), expected="*.db here or in splits/*", got=folder_contents(source)
-        )
+        what = "no nuPlan log found"
+        raise InputError(what, where=str(source), expected="*.db here or in splits/*", got=folder_contents(source))
     log_name, _, scene = options.sequence.partition("/")
     if log_name in databases:
         return databases[log_name], scene
@@ -550,16 +521,12 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     name, where = opened.name(), str(opened.path)
     blobs = _sensor_blobs(opened.path, name)
     if blobs is None:
-        raise InputError(
-            "sensor blobs of the log were not found",
-            where=where,
-            expected=f"sensor_blobs/{name} beside the database or up to four folders above it",
-            remedy="download the camera and LiDAR blobs of this log; the database alone holds no images",
-        )
+        expected = f"sensor_blobs/{name} beside the database or up to four folders above it"
+        remedy = "download the camera and LiDAR blobs of this log; the database alone holds no images"
+        raise InputError("sensor blobs of the log were not found", where=where, expected=expected, remedy=remedy)
     if scene and scene not in opened.scenes():
-        raise UsageError(
-            "the log has no such scene", where=where, got=scene, expected=", ".join(opened.scenes()[:12]) or "no scenes"
-        )
+        what = "the log has no such scene"
+        raise UsageError(what, where=where, got=scene, expected=", ".join(opened.scenes()[:12]) or "no scenes")
     every = list(opened.clouds(scene))
     first, end = options.frames or (0, len(every))
     chosen = every[first:end]
@@ -573,13 +540,10 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     if len(clouds) < len(placed):
         without = [token.hex() for token, cloud in placed.items() if cloud is None]
         if not options.skip_missing:
-            raise InputError(
-                "point cloud has no vehicle pose",
-                where=f"{where}: lidar_pc {without[0]}.ego_pose_token",
-                expected="a token of ego_pose",
-                got=f"{len(without)} of {len(placed)} clouds have none",
-                remedy="choose frames with --frames FIRST:END, or add --skip-missing",
-            )
+            what, where = "point cloud has no vehicle pose", f"{where}: lidar_pc {without[0]}.ego_pose_token"
+            got = f"{len(without)} of {len(placed)} clouds have none"
+            remedy = "choose frames with --frames FIRST:END, or add --skip-missing"
+            raise InputError(what, where=where, expected="a token of ego_pose", got=got, remedy=remedy)
         notes.append(f"{len(without)} clouds without a vehicle pose were left out")
     lacking = [cloud.file for cloud in clouds if not cloud.file.is_file()]
     if lacking:
@@ -613,12 +577,9 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
 def _refuse_missing(what: str, missing: Sequence[Path], total: int, options: ImportOptions) -> None:
     """Refuse a log of which files are missing, unless that is allowed."""
     if missing and not options.skip_missing:
-        raise InputError(
-            f"file of a {what} is missing",
-            where=str(missing[0]),
-            got=f"{len(missing)} of {total} are missing",
-            remedy="download the log's sensor blobs, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        what = f"file of a {what} is missing"
+        remedy = "download the log's sensor blobs, choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError(what, where=str(missing[0]), got=f"{len(missing)} of {total} are missing", remedy=remedy)
 
 
 def _moments(
@@ -633,21 +594,14 @@ def _moments(
     inner = [group for group, full in zip(groups[1:-1], complete[1:-1], strict=True) if not full]
     if inner and not options.skip_missing:
         absent = sorted(set(names) - {shot.channel for shot in inner[0]})
-        raise InputError(
-            "a moment lacks images of some cameras",
-            where=f"{where}: image at {inner[0][0].time_us}",
-            got=f"no {', '.join(absent)}; {len(inner)} such moments",
-            expected="every chosen camera",
-            remedy="choose cameras with --cameras, or add --skip-missing",
-        )
+        what, where = "a moment lacks images of some cameras", f"{where}: image at {inner[0][0].time_us}"
+        got = f"no {', '.join(absent)}; {len(inner)} such moments"
+        remedy = "choose cameras with --cameras, or add --skip-missing"
+        raise InputError(what, where=where, got=got, expected="every chosen camera", remedy=remedy)
     if not kept:
-        raise InputError(
-            "no moment has images of all cameras",
-            where=where,
-            got=f"{len(shots)} images",
-            expected=", ".join(names),
-            remedy="choose cameras with --cameras, or other frames with --frames",
-        )
+        what = "no moment has images of all cameras"
+        remedy = "choose cameras with --cameras, or other frames with --frames"
+        raise InputError(what, where=where, got=f"{len(shots)} images", expected=", ".join(names), remedy=remedy)
     cut = len(groups) - len(kept)
     return kept, [f"{cut} moments without images of all cameras were left out"] if cut else []
 
@@ -663,13 +617,10 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list
     for name, found in by_camera.items():
         for shot, following in itertools.pairwise(found):
             if shot.time_us == following.time_us:
-                raise InputError(
-                    "two images of one camera have the same time",
-                    where=f"{where}: image at {shot.time_us}",
-                    expected="a row for every image",
-                    got=f"{name}: {shot.file.name} and {following.file.name}",
-                    remedy="are rows of the table doubled? copy the file again",
-                )
+                what, where = "two images of one camera have the same time", f"{where}: image at {shot.time_us}"
+                got = f"{name}: {shot.file.name} and {following.file.name}"
+                remedy = "are rows of the table doubled? copy the file again"
+                raise InputError(what, where=where, expected="a row for every image", got=got, remedy=remedy)
     leading = max(by_camera.values(), key=len)
     if not leading:
         return []
@@ -699,13 +650,9 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
     ego = mended_path(_ego_path(plan, start_us, str(opened.path)), options, found)
     first = ego.pose_at(0.0)
     if first is None:
-        raise InputError(
-            "vehicle poses do not cover the log",
-            where=f"{opened.path}: ego_pose",
-            expected=f"a pose at {start_us} us",
-            got=f"{len(plan.ego_us)} poses near it",
-            remedy="are pose and cloud times both in microseconds?",
-        )
+        what, where = "vehicle poses do not cover the log", f"{opened.path}: ego_pose"
+        expected, remedy = f"a pose at {start_us} us", "are pose and cloud times both in microseconds?"
+        raise InputError(what, where=where, expected=expected, got=f"{len(plan.ego_us)} poses near it", remedy=remedy)
     world_from_source = world_from_first(first)
     ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
     fits = {CAMERAS[channel]: _fit(camera, options) for channel, camera in plan.cameras.items()}
@@ -765,12 +712,9 @@ def _read_tracks(
 def _ego_path(plan: _NuplanPlan, start_us: int, where: str) -> EgoPath:
     """The vehicle in the log's world and the scene's clock."""
     if not len(plan.ego_us):
-        raise InputError(
-            "no vehicle poses at the time of the clouds",
-            where=f"{where}: ego_pose.timestamp",
-            expected="microseconds, as lidar_pc.timestamp",
-            remedy="are the two in different units?",
-        )
+        what, where = "no vehicle poses at the time of the clouds", f"{where}: ego_pose.timestamp"
+        expected = "microseconds, as lidar_pc.timestamp"
+        raise InputError(what, where=where, expected=expected, remedy="are the two in different units?")
     return EgoPath(seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
 
 

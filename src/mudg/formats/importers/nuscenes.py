@@ -75,12 +75,8 @@ def camera_from_intrinsics(name: str, size: tuple[int, int], intrinsics: Any, wh
         raise InputError("intrinsics are not numbers", where=where, got=str(error)) from error
     off = k[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1] if k.shape == (3, 3) else np.array([np.nan])
     if not np.isfinite(k).all() or not (np.abs(off) < 1e-6).all():
-        raise InputError(
-            "intrinsics are malformed",
-            where=where,
-            expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
-            got=str(intrinsics)[:120],
-        )
+        what = "intrinsics are malformed"
+        raise InputError(what, where=where, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", got=str(intrinsics)[:120])
     return Camera(name, *size, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
 
 
@@ -95,13 +91,9 @@ def read_scan(path: Path) -> SweepPoints:
     rows, returns = read_float_rows(path, 5, "sweep")
     rings = rows[returns, 4]
     if len(rings) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
-        raise InputError(
-            "fifth value of the points is no ring number",
-            where=str(path),
-            expected=f"whole numbers 0 to {BEAMS - 1}",
-            got=f"{rings.min():g} to {rings.max():g}",
-            remedy="is this a file of another sensor or format?",
-        )
+        what, got = "fifth value of the points is no ring number", f"{rings.min():g} to {rings.max():g}"
+        remedy = "is this a file of another sensor or format?"
+        raise InputError(what, where=str(path), expected=f"whole numbers 0 to {BEAMS - 1}", got=got, remedy=remedy)
     dt_s = point_times(rows[:, :3], rows[:, 4])
     own = np.ones(len(rows), bool)
     for axis, (low, high) in enumerate(_OWN_VEHICLE_M):
@@ -290,9 +282,8 @@ def _no_constant(name: str) -> Any:
 
 def _open(path: Path) -> BinaryIO:
     if not path.exists():
-        raise InputError(
-            "table is missing", where=str(path), remedy="unpack the release's metadata archive, which holds all tables"
-        )
+        what = "table is missing"
+        raise InputError(what, where=str(path), remedy="unpack the release's metadata archive, which holds all tables")
     return store.open_file(path)
 
 
@@ -300,13 +291,8 @@ def _start_of_array(file: BinaryIO, path: Path, buffer_bytes: int) -> bytes:
     """The first piece of the file, to its opening bracket at least."""
     start = file.read(buffer_bytes)
     if start.lstrip()[:1] != b"[":
-        raise InputError(
-            "table does not start as a JSON array",
-            where=str(path),
-            expected="[ {...}, ... ]",
-            got=repr(start[:20]) if start else "an empty file",
-            remedy="copy the table again",
-        )
+        what, got = "table does not start as a JSON array", repr(start[:20]) if start else "an empty file"
+        raise InputError(what, where=str(path), expected="[ {...}, ... ]", got=got, remedy="copy the table again")
     return start
 
 
@@ -316,12 +302,8 @@ def _cut_off(path: Path) -> InputError:
 
 
 def _no_records(path: Path, place: int, got: bytes) -> InputError:
-    return InputError(
-        "table is not an array of records",
-        where=f"{path}: byte {place}",
-        got=repr(got[:20]),
-        expected="flat records {...} of less than 1 MiB between commas",
-    )
+    what, expected = "table is not an array of records", "flat records {...} of less than 1 MiB between commas"
+    return InputError(what, where=f"{path}: byte {place}", got=repr(got[:20]), expected=expected)
 
 
 # --- rows -----------------------------------------------------------------------------------------
@@ -356,12 +338,8 @@ def _is_number(value: Any) -> bool:
 
 
 def _bad_field(row: Row, key: str, where: str, expected: str) -> InputError:
-    return InputError(
-        f"field {key!r} is missing or malformed",
-        where=f"{where}: record {row.get('token', '?')!r}",
-        expected=expected,
-        got=repr(row.get(key))[:120],
-    )
+    what, where = f"field {key!r} is missing or malformed", f"{where}: record {row.get('token', '?')!r}"
+    return InputError(what, where=where, expected=expected, got=repr(row.get(key))[:120])
 
 
 class TokenTable:
@@ -380,13 +358,8 @@ class TokenTable:
     def record(self, token: Any, where: str) -> Row:
         """The record of a token; ``where`` says who refers to it."""
         if not isinstance(token, str) or token not in self.rows:
-            raise InputError(
-                "a token points nowhere",
-                where=where,
-                got=repr(token),
-                expected=f"a record of {self.where}",
-                remedy="are the tables of one release, and complete?",
-            )
+            what, remedy = "a token points nowhere", "are the tables of one release, and complete?"
+            raise InputError(what, where=where, got=repr(token), expected=f"a record of {self.where}", remedy=remedy)
         return self.rows[token]
 
     def get(self, row: Row, key: str, where: str) -> Row:
@@ -458,13 +431,10 @@ def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     layout.refuse_untwist(options, "nuScenes", str(source))
     releases = _releases(source)
     if not releases:
-        raise InputError(
-            "no nuScenes tables found",
-            where=str(source),
-            got=layout.folder_contents(source),
-            expected="v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json",
-            remedy="give the folder that holds v1.0-*, samples and sweeps",
-        )
+        what = "no nuScenes tables found"
+        expected = "v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json"
+        remedy = "give the folder that holds v1.0-*, samples and sweeps"
+        raise InputError(what, where=str(source), got=layout.folder_contents(source), expected=expected, remedy=remedy)
     return drive_log.write_log(read_log(releases, options), out, options)
 
 
@@ -574,13 +544,9 @@ def _samples_in_order(folder: Path, scene: Row) -> dict[str, int]:
     common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
     if (np.diff(values) <= 0).any():
         late = list(stamps)[int(np.flatnonzero(np.diff(values) <= 0)[0]) + 1]
-        raise InputError(
-            "time stamps of key frames do not increase along the scene",
-            where=f"{samples.where}: record {late!r}",
-            got=f"{stamps[late]} after a later one",
-            expected="microseconds, increasing from one key frame to the next",
-            remedy="copy the table again",
-        )
+        what, where = "time stamps of key frames do not increase along the scene", f"{samples.where}: record {late!r}"
+        got, expected = f"{stamps[late]} after a later one", "microseconds, increasing from one key frame to the next"
+        raise InputError(what, where=where, got=got, expected=expected, remedy="copy the table again")
     return stamps
 
 
@@ -591,12 +557,9 @@ def _check_times(rows: Sequence[Row], samples: Mapping[str, int], where: str) ->
     first, last = min(samples.values()), max(samples.values())
     beside = np.maximum(first - stamps, stamps - last) / MICROSECONDS
     if len(beside) and beside.max() > _MAX_BEFORE_SCENE_S:
-        raise InputError(
-            "an image or sweep lies outside its scene's time",
-            where=f"{where}: record {rows[int(beside.argmax())]['token']!r}",
-            got=f"{beside.max():.3f} s away from the key frames",
-            expected="microseconds since 1970, within the scene",
-        )
+        where = f"{where}: record {rows[int(beside.argmax())]['token']!r}"
+        got, expected = f"{beside.max():.3f} s away from the key frames", "microseconds since 1970, within the scene"
+        raise InputError("an image or sweep lies outside its scene's time", where=where, got=got, expected=expected)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -137,9 +137,8 @@ def gunzip(content: bytes, where: str) -> bytes:
     if len(unpacked) > MAX_BYTES:
         raise InputError("gzip file unpacks to too much", where=where, expected=f"<= {MAX_BYTES} bytes")
     if not unpacker.eof:
-        raise InputError(
-            "gzip file is cut off", where=where, got=f"{len(content)} bytes, no end", remedy="copy the file again"
-        )
+        what = "gzip file is cut off"
+        raise InputError(what, where=where, got=f"{len(content)} bytes, no end", remedy="copy the file again")
     return unpacked
 
 
@@ -149,13 +148,11 @@ def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     try:
         return _columns_pandas_frame(value)
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise InputError(
-            "pickle is not a plain data frame",
-            where=where,
-            expected="a table of numbers and texts as pandas 0.2x to 2.x writes it",
-            got=f"{type(error).__name__}: {error}"[:200],
-            remedy="read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2",
-        ) from error
+        what = "pickle is not a plain data frame"
+        expected = "a table of numbers and texts as pandas 0.2x to 2.x writes it"
+        got = f"{type(error).__name__}: {error}"[:200]
+        remedy = "read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2"
+        raise InputError(what, where=where, expected=expected, got=got, remedy=remedy) from error
 
 
 def _columns_pandas_frame(frame: Any) -> dict[str, NDArray[Any]]:
@@ -276,12 +273,9 @@ class PointClasses:
         self._files: dict[int, Path] = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
         lacks = [number for number in frames if number not in self._files]
         if self._files and lacks and not options.skip_missing:
-            raise InputError(
-                "a frame has no classes of points",
-                where=str(folder),
-                expected=f"{lacks[0]:02d}.pkl.gz",
-                remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing",
-            )
+            what = "a frame has no classes of points"
+            remedy = "copy it, choose frames with --frames FIRST:END, or add --skip-missing"
+            raise InputError(what, where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz", remedy=remedy)
         self._names = _names(folder / "classes.json") if self._files else {}
         unknown = sorted(set(self._names.values()) - set(CLASS_OF))
         self.notes = (
@@ -299,13 +293,9 @@ class PointClasses:
         note_unknown("annotations/semseg/*.pkl.gz", table, frozenset({"class"}))
         numbers = finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
         if len(numbers) != points:
-            raise InputError(
-                "classes do not fit the points",
-                where=f"{path}: class",
-                got=f"{len(numbers)} rows",
-                expected=f"{points} rows, one for each point of the frame's cloud",
-                remedy="is the file of another frame or sequence?",
-            )
+            what, expected = "classes do not fit the points", f"{points} rows, one for each point of the frame's cloud"
+            remedy = "is the file of another frame or sequence?"
+            raise InputError(what, where=f"{path}: class", got=f"{len(numbers)} rows", expected=expected, remedy=remedy)
         return self._train_ids(numbers, path)
 
     def _train_ids(self, numbers: NDArray[np.int64], path: Path) -> NDArray[np.uint8]:
@@ -325,17 +315,12 @@ def train_id(name: str) -> int:
 def _names(path: Path) -> Mapping[int, str]:
     """Number -> name of the data set's classes."""
     if not path.is_file():
-        raise InputError(
-            "table of class names is missing",
-            where=str(path),
-            expected='{"1": "Smoke", ...}',
-            remedy="copy annotations/semseg/classes.json, or leave out annotations/semseg",
-        )
+        where, remedy = str(path), "copy annotations/semseg/classes.json, or leave out annotations/semseg"
+        raise InputError("table of class names is missing", where=where, expected='{"1": "Smoke", ...}', remedy=remedy)
     values: Any = store.read_json(path)
     if not isinstance(values, dict) or not all(str(key).isdigit() and isinstance(values[key], str) for key in values):
-        raise InputError(
-            "table of class names is malformed", where=str(path), expected='{"1": "Smoke", ...}', got=str(values)[:80]
-        )
+        what = "table of class names is malformed"
+        raise InputError(what, where=str(path), expected='{"1": "Smoke", ...}', got=str(values)[:80])
     return {int(key): name for key, name in values.items()}
 
 
@@ -542,12 +527,8 @@ def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
         return source
     sequences = _sequences(source)
     if not sequences and not options.sequence:
-        raise InputError(
-            "no PandaSet sequence found",
-            where=str(source),
-            got=layout.folder_contents(source),
-            expected="lidar/poses.json and camera/front_camera and so on",
-        )
+        what, expected = "no PandaSet sequence found", "lidar/poses.json and camera/front_camera and so on"
+        raise InputError(what, where=str(source), got=layout.folder_contents(source), expected=expected)
     matching = [name for name in sequences if options.sequence in ("", name)]
     return source / layout.the_only(matching, sequences, options, source, "sequence")
 
@@ -557,12 +538,8 @@ def _cuboid_files(folder: Path, frames: Sequence[int], options: ImportOptions) -
     cuboids = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
     lacks = [number for number in frames if number not in cuboids]
     if cuboids and lacks and not options.skip_missing:
-        raise InputError(
-            "a frame has no boxes",
-            where=str(folder),
-            expected=f"{lacks[0]:02d}.pkl.gz",
-            remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        remedy = "copy it, choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError("a frame has no boxes", where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz", remedy=remedy)
     return cuboids
 
 
@@ -622,13 +599,10 @@ class _Motion:
             times = _times(stamps, frames)
             late = np.abs(times - raw_s)
             if late.max() > MAX_CAMERA_DELAY_S:
-                raise InputError(
-                    "camera and LiDAR do not share a clock",
-                    where=f"{stamps}: entry {frames[int(late.argmax())]}",
-                    expected=f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json",
-                    got=f"{late.max():.3f} s apart",
-                    remedy="are the times in seconds, and of this sequence?",
-                )
+                what, where = "camera and LiDAR do not share a clock", f"{stamps}: entry {frames[int(late.argmax())]}"
+                expected = f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json"
+                remedy = "are the times in seconds, and of this sequence?"
+                raise InputError(what, where=where, expected=expected, got=f"{late.max():.3f} s apart", remedy=remedy)
             stamped_s = seconds(times, "s", str(stamps), start_s)
             camera_s[name] = stamped_s + EXPOSURE_S
             given = world_from_source @ _poses(here / "poses.json", frames)
@@ -681,13 +655,9 @@ def _entries(path: Path, frames: Sequence[int]) -> list[Any]:
     values = store.read_json(path)
     if not isinstance(values, list) or len(values) <= frames[-1]:
         got = f"{len(values)} entries" if isinstance(values, list) else type(values).__name__
-        raise InputError(
-            "list does not cover the frames",
-            where=str(path),
-            got=got,
-            expected=f"a list with an entry per frame, at least {frames[-1] + 1}",
-            remedy="is the file cut off, or of another sequence?",
-        )
+        expected = f"a list with an entry per frame, at least {frames[-1] + 1}"
+        remedy = "is the file cut off, or of another sequence?"
+        raise InputError("list does not cover the frames", where=str(path), got=got, expected=expected, remedy=remedy)
     return [values[n] for n in frames]
 
 
@@ -698,13 +668,8 @@ def _times(path: Path, frames: Sequence[int]) -> NDArray[np.float64]:
     times = np.array(values, np.float64)
     seconds(times, "s", str(path))
     if times[0] > 1e11:
-        raise InputError(
-            "timestamps are in another unit than expected",
-            where=str(path),
-            expected="seconds of the epoch",
-            got=f"{times[0]:.6g}",
-            remedy="divide them by 1000 or 1000000",
-        )
+        what, remedy = "timestamps are in another unit than expected", "divide them by 1000 or 1000000"
+        raise InputError(what, where=str(path), expected="seconds of the epoch", got=f"{times[0]:.6g}", remedy=remedy)
     return times
 
 
@@ -770,13 +735,11 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
     columns = {name: finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
     late_s = columns["t"] - frame_s
     if len(late_s) and np.abs(late_s).max() > MAX_POINT_DELAY_S:
-        raise InputError(
-            "points do not belong to their frame's time",
-            where=f"{path}: t",
-            expected=f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})",
-            got=f"{columns['t'].min():.6g} to {columns['t'].max():.6g}",
-            remedy="is the file of another frame or sequence?",
-        )
+        what = "points do not belong to their frame's time"
+        expected = f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})"
+        got = f"{columns['t'].min():.6g} to {columns['t'].max():.6g}"
+        remedy = "is the file of another frame or sequence?"
+        raise InputError(what, where=f"{path}: t", expected=expected, got=got, remedy=remedy)
     if not np.isin(columns["d"], list(SENSORS)).all():
         raise InputError("a point is of a LiDAR that does not exist", where=f"{path}: d", expected="0 or 1")
     turning = late_s[columns["d"] == 0]

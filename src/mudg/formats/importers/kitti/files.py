@@ -147,11 +147,8 @@ class KittiCalibration:
 
     def _projection(self, number: int) -> Matrix:
         if number not in self.projections:
-            raise InputError(
-                f"calibration does not tell camera {number}",
-                where=self.source,
-                got=", ".join(f"P{n}" for n in self.projections) or "no projection matrices",
-            )
+            got = ", ".join(f"P{n}" for n in self.projections) or "no projection matrices"
+            raise InputError(f"calibration does not tell camera {number}", where=self.source, got=got)
         return self.projections[number]
 
 
@@ -168,21 +165,12 @@ def pinhole_camera(projection: Matrix, name: str, size: tuple[int, int], where: 
         InputError: skew, another last row than 0 0 1, or a focal length that is not positive.
     """
     if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
-        raise InputError(
-            "projection matrix is not of a rectified pinhole camera",
-            where=where,
-            expected="no skew, last row 0 0 1",
-            got=str(projection[:, :3].tolist()),
-        )
+        what = "projection matrix is not of a rectified pinhole camera"
+        raise InputError(what, where=where, expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()))
     fx, fy, cx, cy = (float(projection[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if fx <= 0 or fy <= 0:
-        raise InputError(
-            "focal length is not positive",
-            where=where,
-            expected="pixels, about 700 for KITTI",
-            got=f"fx={fx:g}, fy={fy:g}",
-            remedy="check the calibration file",
-        )
+        what, expected, got = "focal length is not positive", "pixels, about 700 for KITTI", f"fx={fx:g}, fy={fy:g}"
+        raise InputError(what, where=where, expected=expected, got=got, remedy="check the calibration file")
     return Camera(name, *size, fx, fy, cx + PIXEL_CENTRE_PX, cy + PIXEL_CENTRE_PX)
 
 
@@ -202,9 +190,8 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
         except ValueError:
             continue
         if not np.isfinite(numbers).all():
-            raise InputError(
-                "calibration holds a value that is not finite", where=f"{path}: {match[1]}", got=match[2][:80]
-            )
+            what = "calibration holds a value that is not finite"
+            raise InputError(what, where=f"{path}: {match[1]}", got=match[2][:80])
         table[match[1]] = numbers
     return table
 
@@ -219,21 +206,13 @@ def table_entry(
     """
     key = next((key for key in keys if key in table), None)
     if key is None:
-        raise InputError(
-            f"calibration lacks {keys[0]}",
-            where=str(where),
-            expected=" or ".join(keys),
-            got=", ".join(table) or "no entries",
-            remedy="use the calibration file that belongs to this recording",
-        )
+        what, expected = f"calibration lacks {keys[0]}", " or ".join(keys)
+        remedy = "use the calibration file that belongs to this recording"
+        raise InputError(what, where=str(where), expected=expected, got=", ".join(table) or "no entries", remedy=remedy)
     if table[key].size != np.prod(shape):
-        raise InputError(
-            "calibration entry has the wrong number of values",
-            where=f"{where}: {key}",
-            expected=f"{np.prod(shape)} numbers",
-            got=f"{table[key].size}",
-            remedy="is the file cut off?",
-        )
+        what, where = "calibration entry has the wrong number of values", f"{where}: {key}"
+        expected = f"{np.prod(shape)} numbers"
+        raise InputError(what, where=where, expected=expected, got=f"{table[key].size}", remedy="is the file cut off?")
     return table[key].reshape(shape)
 
 
@@ -294,17 +273,12 @@ def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDA
     except ValueError as error:
         raise InputError(f"{what}: a value is not a number", where=where, got=line.strip()[:80]) from error
     if len(numbers) not in counts:
-        raise InputError(
-            f"{what}: wrong number of values",
-            where=where,
-            expected=" or ".join(str(c) for c in counts),
-            got=str(len(numbers)),
-            remedy="is the file cut off, or of another format?",
-        )
+        what, expected = f"{what}: wrong number of values", " or ".join(str(c) for c in counts)
+        remedy = "is the file cut off, or of another format?"
+        raise InputError(what, where=where, expected=expected, got=str(len(numbers)), remedy=remedy)
     if not np.isfinite(numbers).all():
-        raise InputError(
-            f"{what}: a value is not finite", where=where, got=line.strip()[:80], expected="finite numbers"
-        )
+        what = f"{what}: a value is not finite"
+        raise InputError(what, where=where, got=line.strip()[:80], expected="finite numbers")
     return numbers
 
 
@@ -340,9 +314,8 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
             )
     else:
         expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)"
-        raise InputError(
-            "pose file does not cover the frames", where=str(path), got=f"{count} lines", expected=expected
-        )
+        what = "pose file does not cover the frames"
+        raise InputError(what, where=str(path), got=f"{count} lines", expected=expected)
     sensor = "velo" if widths == {13} else "cam0"
     return {n: rigid_pose(row.reshape(3, 4), f"{path}: pose of frame {n}") for n, row in poses.items()}, sensor
 
@@ -419,13 +392,9 @@ def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, 
             " or not"
         )
         return dict(zip(numbers, stamps.values(), strict=True))
-    raise InputError(
-        "timestamps do not cover the frames",
-        where=str(path),
-        got=f"{count} lines, {len(numbers)} files",
-        expected=f"at least {last + 1} lines (line k = frame k, empty where it is missing), or one per file",
-        remedy="is the file cut off?",
-    )
+    what, got = "timestamps do not cover the frames", f"{count} lines, {len(numbers)} files"
+    expected = f"at least {last + 1} lines (line k = frame k, empty where it is missing), or one per file"
+    raise InputError(what, where=str(path), got=got, expected=expected, remedy="is the file cut off?")
 
 
 def _stamp(line: str, where: str) -> float:
@@ -520,13 +489,9 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
     for index, line in read_lines(path).items():
         columns, where = line.split(), f"{path}: line {index + 1}"
         if len(columns) - skip not in (15, 16):
-            raise InputError(
-                "label line has the wrong number of columns",
-                where=where,
-                got=str(len(columns)),
-                expected=f"{15 + skip} (or {16 + skip} with a score)",
-                remedy="is this a tracking or an object label file?",
-            )
+            what, expected = "label line has the wrong number of columns", f"{15 + skip} (or {16 + skip} with a score)"
+            remedy = "is this a tracking or an object label file?"
+            raise InputError(what, where=where, got=str(len(columns)), expected=expected, remedy=remedy)
         if columns[skip] == "DontCare":
             continue
         try:
@@ -549,11 +514,8 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     if len(content) > MAX_TRACKLET_BYTES:
         raise InputError("tracklet file is too large", where=str(path), got=f"{len(content)} bytes")
     if b"<!ENTITY" in content:
-        raise InputError(
-            "tracklet file declares XML entities, which no KITTI file does",
-            where=str(path),
-            remedy="use the file from the data set",
-        )
+        what = "tracklet file declares XML entities, which no KITTI file does"
+        raise InputError(what, where=str(path), remedy="use the file from the data set")
     try:
         root = ElementTree.fromstring(content)  # noqa: S314 - entities are refused above, the size is bounded
     except ElementTree.ParseError as error:

@@ -218,19 +218,11 @@ def _refuse_without_images(source: Path, options: ImportOptions) -> None:
     folders = (path for name in ("image_02", "image_2") for path in (source / name).glob("*/"))
     sequences = sorted(path.name for path in folders if path.name != "data")
     if sequences:
-        raise UsageError(
-            "the folder holds several sequences",
-            where=str(source),
-            expected="--sequence with one of " + ", ".join(sequences[:12]),
-            got=options.sequence or "none chosen",
-        )
-    raise InputError(
-        "no KITTI images found",
-        where=str(source),
-        got=layout.folder_contents(source),
-        expected="image_02/data, image_02 or image_2 with numbered PNG files",
-        remedy="give the folder of one drive, sequence or training set",
-    )
+        what, expected = "the folder holds several sequences", "--sequence with one of " + ", ".join(sequences[:12])
+        raise UsageError(what, where=str(source), expected=expected, got=options.sequence or "none chosen")
+    what, expected = "no KITTI images found", "image_02/data, image_02 or image_2 with numbered PNG files"
+    remedy = "give the folder of one drive, sequence or training set"
+    raise InputError(what, where=str(source), got=layout.folder_contents(source), expected=expected, remedy=remedy)
 
 
 def _choose_frames(files: KittiFiles, stamps: Mapping[str, Mapping[int, float]], options: ImportOptions) -> list[int]:
@@ -253,12 +245,9 @@ def _single_frame(files: KittiFiles, options: ImportOptions) -> int:
     if options.frames is not None:
         numbers = [n for n in numbers if options.frames[0] <= n < options.frames[1]]
     if len(numbers) != 1:
-        raise UsageError(
-            "an object-benchmark folder holds unrelated frames; a scene is one of them",
-            where=str(files.folder),
-            expected="--sequence with one frame number, e.g. 000008",
-            got=f"{len(numbers)} frames: {layout.number_ranges(numbers)}",
-        )
+        what, where = "an object-benchmark folder holds unrelated frames; a scene is one of them", str(files.folder)
+        got = f"{len(numbers)} frames: {layout.number_ranges(numbers)}"
+        raise UsageError(what, where=where, expected="--sequence with one frame number, e.g. 000008", got=got)
     if files.scans and numbers[0] not in files.scans:
         raise InputError("frame has no scan", where=str(files.folder / "velodyne"), expected=f"{numbers[0]:06d}.bin")
     return numbers[0]
@@ -278,12 +267,9 @@ def _find_calibration(files: KittiFiles, frames: Sequence[int], options: ImportO
         if (day / "calib_cam_to_cam.txt").is_file():
             log.info(f"kitti: calibration from {day}/calib_*.txt")
             return read_calibration_day(day)
-    raise InputError(
-        "no calibration found",
-        where=str(folder),
-        expected="calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up",
-        remedy="download the day's calibration archive and unpack it beside the drive",
-    )
+    expected = "calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up"
+    remedy = "download the day's calibration archive and unpack it beside the drive"
+    raise InputError("no calibration found", where=str(folder), expected=expected, remedy=remedy)
 
 
 # --- time and motion ------------------------------------------------------------------------------
@@ -359,12 +345,9 @@ def _find_motion(recording: _Recording, options: ImportOptions, notes: list[str]
         ego_from_velo, untwist = np.eye(4), options.untwist == "yes"
     else:
         if calibration.velo_from_imu is None:
-            raise InputError(
-                "calibration does not tell where the IMU is",
-                where=calibration.source,
-                expected="calib_imu_to_velo.txt or Tr_imu_to_velo",
-                remedy="add it, or give a pose file with --poses",
-            )
+            what, where = "calibration does not tell where the IMU is", calibration.source
+            expected = "calib_imu_to_velo.txt or Tr_imu_to_velo"
+            raise InputError(what, where=where, expected=expected, remedy="add it, or give a pose file with --poses")
         log.info(f"kitti: poses from GPS/IMU packets in {packets}")
         notes.append("poses from GPS/IMU packets")
         ego = _ego_from_packets(packets, frames, recording.clock, options)
@@ -387,12 +370,9 @@ def _ego_from_file(recording: _Recording, options: ImportOptions, notes: list[st
     if path is None and len(frames) == 1:
         return EgoPath(np.array([recording.clock.scan_s[frames[0]]]), np.eye(4)[None])
     if path is None:
-        raise InputError(
-            "no vehicle poses found",
-            where=str(folder),
-            expected="oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE",
-            remedy="without poses the frames of a moving vehicle cannot be put into one world",
-        )
+        expected = "oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE"
+        remedy = "without poses the frames of a moving vehicle cannot be put into one world"
+        raise InputError("no vehicle poses found", where=str(folder), expected=expected, remedy=remedy)
     log.info(f"kitti: poses from {path}")
     notes.append(f"poses from {path.name}")
     poses, sensor = kitti_poses.read_pose_file(path, frames)
@@ -409,12 +389,8 @@ def _known(frames: Sequence[int], there: Container[int], what: str, path: Path, 
     """The frames that are ``there``; lost ones are refused unless frames may be left out."""
     missing = [n for n in frames if n not in there]
     if missing and (not options.skip_missing or len(missing) == len(frames)):
-        raise InputError(
-            what,
-            where=str(path),
-            got=f"nothing for frames {layout.number_ranges(missing)}",
-            remedy="copy them, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        where, remedy = str(path), "copy them, choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError(what, where=where, got=f"nothing for frames {layout.number_ranges(missing)}", remedy=remedy)
     return [n for n in frames if n in there]
 
 

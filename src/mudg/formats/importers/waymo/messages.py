@@ -107,13 +107,10 @@ class _MessageReader:
         self._place = 0
 
     def broken(self, place: int, got: str) -> InputError:
-        return InputError(
-            "message cannot be decoded",
-            where=f"{self._where}: {self._message.name}, byte {place}",
-            expected="a protocol-buffer message of the Waymo Open Dataset",
-            got=got,
-            remedy="is this a file of another data set, or of the motion data?",
-        )
+        where = f"{self._where}: {self._message.name}, byte {place}"
+        expected = "a protocol-buffer message of the Waymo Open Dataset"
+        remedy = "is this a file of another data set, or of the motion data?"
+        return InputError("message cannot be decoded", where=where, expected=expected, got=got, remedy=remedy)
 
     def fields(self) -> Iterator[tuple[int, int, int, Any]]:
         """Place, number, wire type and raw value (an int, or a view) of every field."""

@@ -121,12 +121,9 @@ class ParquetLog:
         calibration = self._table("lidar_calibration") if self._lidar is None else self._need("lidar_calibration")
         self.lasers: Mapping[str, records.LaserCalibration] = {} if calibration is None else dict(_lasers(calibration))
         if self._lidar is not None and self._poses is None:
-            raise InputError(
-                "the top LiDAR's pixel poses are missing",
-                where=str(root),
-                expected=f"lidar_pose/{segment}.parquet",
-                remedy="download the component: without it the scans of a moving vehicle are twisted",
-            )
+            what = "the top LiDAR's pixel poses are missing"
+            remedy = "download the component: without it the scans of a moving vehicle are twisted"
+            raise InputError(what, where=str(root), expected=f"lidar_pose/{segment}.parquet", remedy=remedy)
         self.frames: Sequence[FrameRecord] = self._frames(wanted)
         self.conditions = self._conditions()
 
@@ -164,9 +161,8 @@ class ParquetLog:
         returns = [image for image in found if image is not None]
         poses = self.pixel_poses(frame) if name == records.TOP else None
         if name == records.TOP and poses is None:
-            raise InputError(
-                "frame has no pixel poses", where=f"{frame.where}: lidar_pose", expected="a row for the top LiDAR"
-            )
+            what = "frame has no pixel poses"
+            raise InputError(what, where=f"{frame.where}: lidar_pose", expected="a row for the top LiDAR")
         places: list[NDArray[np.int64]] = []
         if projections and self._projections is not None:
             for other, place in self._projections.rows(frame.timestamp_us, _LASER, LASERS):
@@ -183,18 +179,16 @@ class ParquetLog:
         table = self._vehicle.columns((_SEGMENT, _TIME, column))
         others = {str(name) for name in table[_SEGMENT]} - {self.name}
         if others:
-            raise InputError(
-                "the file holds other logs", where=where, expected=self.name, got=", ".join(sorted(others)[:4])
-            )
+            what = "the file holds other logs"
+            raise InputError(what, where=where, expected=self.name, got=", ".join(sorted(others)[:4]))
         poses = {int(time): pose for time, pose in zip(table[_TIME], table[column], strict=True)}
         twice = len(table[_TIME]) - len(poses)
         if twice:
             raise InputError("the table has a frame twice", where=f"{where}: {_TIME}", got=f"{twice} times")
         chosen = list(enumerate(sorted(poses)))[slice(*wanted) if wanted else slice(None)]
         if not chosen:
-            raise InputError(
-                "no frames to import", where=where, got=f"{len(poses)} frames", expected=f"frames {wanted}"
-            )
+            what = "no frames to import"
+            raise InputError(what, where=where, got=f"{len(poses)} frames", expected=f"frames {wanted}")
         shots, boxes = self._shots(), self._boxes()
         frames = []
         for number, time in chosen:
@@ -247,12 +241,8 @@ class ParquetLog:
     def _need(self, component: str) -> ParquetTable:
         table = self._table(component)
         if table is None:
-            raise InputError(
-                "a component of the log is missing",
-                where=str(self._root),
-                expected=f"{component}/{self.name}.parquet",
-                remedy="download it beside the others",
-            )
+            what, expected = "a component of the log is missing", f"{component}/{self.name}.parquet"
+            raise InputError(what, where=str(self._root), expected=expected, remedy="download it beside the others")
         return table
 
 

@@ -65,12 +65,9 @@ class LaserCalibration:
         """Inclination of every row of a range image, f64[rows] radians; the top row looks highest."""
         if self.inclinations:
             if len(self.inclinations) != rows:
-                raise InputError(
-                    "range image does not have a row for every beam",
-                    where=where,
-                    expected=f"{len(self.inclinations)} rows (calibration of LiDAR {self.name})",
-                    got=f"{rows} rows",
-                )
+                what = "range image does not have a row for every beam"
+                expected = f"{len(self.inclinations)} rows (calibration of LiDAR {self.name})"
+                raise InputError(what, where=where, expected=expected, got=f"{rows} rows")
             return np.array(self.inclinations)[::-1]
         step = (self.inclination_max - self.inclination_min) / rows
         return self.inclination_max - (np.arange(rows, dtype=np.float64) + 0.5) * step
@@ -232,12 +229,9 @@ def box_of(box_id: str, number: int, values: Sequence[float], where: str) -> Way
     """
     x, y, z, length, width, height, heading = (float(value) for value in values)
     if not np.isfinite(values).all() or min(length, width, height) <= 0:
-        raise InputError(
-            "box makes no sense",
-            where=f"{where}: box {box_id}",
-            expected="finite numbers, positive length, width and height",
-            got=f"centre {(x, y, z)}, size {(length, width, height)}, heading {heading}",
-        )
+        expected = "finite numbers, positive length, width and height"
+        got = f"centre {(x, y, z)}, size {(length, width, height)}, heading {heading}"
+        raise InputError("box makes no sense", where=f"{where}: box {box_id}", expected=expected, got=got)
     return WaymoBox(box_id, LABELS.get(number, "unknown"), (x, y, z), (length, width, height), heading)
 
 
@@ -255,20 +249,15 @@ def by_name(shots: Iterable[tuple[str, CameraShot]], timestamp_us: int, where: s
             raise InputError("frame has two images of one camera", where=here)
         times = (shot.pose_time_s, *((shot.trigger_s, shot.done_s) if shot.done_s else ()))
         if not max(abs(time - timestamp_us / 1e6) for time in times) <= MAX_CLOCK_GAP_S:
-            raise InputError(
-                "image and frame are not of one time",
-                where=here,
-                expected=f"seconds within {MAX_CLOCK_GAP_S} s of the frame's {timestamp_us} microseconds",
-                got=", ".join(f"{time!r}" for time in times),
-                remedy="are the units seconds (images) and microseconds (frames)?",
-            )
+            what = "image and frame are not of one time"
+            expected = f"seconds within {MAX_CLOCK_GAP_S} s of the frame's {timestamp_us} microseconds"
+            got = ", ".join(f"{time!r}" for time in times)
+            remedy = "are the units seconds (images) and microseconds (frames)?"
+            raise InputError(what, where=here, expected=expected, got=got, remedy=remedy)
         if shot.done_s and not 0 <= shot.shutter_s <= shot.done_s - shot.trigger_s < MAX_CLOCK_GAP_S:
-            raise InputError(
-                "exposure times contradict each other",
-                where=here,
-                expected="0 <= shutter <= readout end - trigger, seconds",
-                got=f"shutter {shot.shutter_s:g}, trigger to readout end {shot.done_s - shot.trigger_s:g}",
-            )
+            what = "exposure times contradict each other"
+            got = f"shutter {shot.shutter_s:g}, trigger to readout end {shot.done_s - shot.trigger_s:g}"
+            raise InputError(what, where=here, expected="0 <= shutter <= readout end - trigger, seconds", got=got)
         found[name] = shot
     return found
 
@@ -296,12 +285,8 @@ def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, w
         raise InputError("range image cannot be unpacked", where=where, got=str(error)) from error
     if not unpacker.eof:
         cut_off = not unpacker.unconsumed_tail
-        raise InputError(
-            "range image is cut off" if cut_off else "range image unpacks to more than any has",
-            where=where,
-            expected=f"at most {MAX_UNPACKED_BYTES} bytes",
-            got=f"{len(content)} bytes",
-        )
+        what = "range image is cut off" if cut_off else "range image unpacks to more than any has"
+        raise InputError(what, where=where, expected=f"at most {MAX_UNPACKED_BYTES} bytes", got=f"{len(content)} bytes")
     values = parse_message(content, message, where)
     return shaped(values["data"], values.get("shape", {}).get("dims", ()), channels, where)
 
@@ -310,12 +295,8 @@ def shaped(data: NDArray[Any], dims: Sequence[int] | NDArray[np.integer], channe
     """``data`` [H * W * channels] as [H, W, channels], if its declared shape says so."""
     shape = tuple(int(n) for n in dims)
     if len(shape) != 3 or min(shape) < 1 or shape[2] != channels or int(np.prod(shape)) != len(data):
-        raise InputError(
-            "range image has the wrong shape",
-            where=where,
-            expected=f"[rows, columns, {channels}], as many values as that",
-            got=f"{list(shape)} with {len(data)} values",
-        )
+        what, expected = "range image has the wrong shape", f"[rows, columns, {channels}], as many values as that"
+        raise InputError(what, where=where, expected=expected, got=f"{list(shape)} with {len(data)} values")
     return data.reshape(shape)
 
 
@@ -387,19 +368,12 @@ def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
         seen: set[str] = set()
         for box, late in zip(frame.boxes, frame.late_s, strict=True):
             if not box.id or box.id in seen:
-                raise InputError(
-                    "frame has two boxes of one object" if box.id else "box has no id",
-                    where=frame.where,
-                    got=repr(box.id),
-                )
+                what = "frame has two boxes of one object" if box.id else "box has no id"
+                raise InputError(what, where=frame.where, got=repr(box.id))
             seen.add(box.id)
             if labels.setdefault(box.id, box.label) != box.label:
-                raise InputError(
-                    "the class of an object changes",
-                    where=f"{frame.where}: object {box.id}",
-                    expected=labels[box.id],
-                    got=box.label,
-                )
+                what = "the class of an object changes"
+                raise InputError(what, where=f"{frame.where}: object {box.id}", expected=labels[box.id], got=box.label)
             # a track's name begins with no sign, as the data set's random ids may
             name = box.id if box.id[0].isalnum() else f"t{box.id}"
             pose = frame.world_from_vehicle @ yaw_matrix(box.heading, box.centre)

@@ -135,27 +135,15 @@ def _read_header(file: BinaryIO, path: Path, number: int, offset: int, size: int
     length, crc = struct.unpack("<QI", header)
     if masked_crc32c(header[:8]) != crc:
         if number:
-            raise InputError(
-                "record header is damaged",
-                where=where,
-                expected="a length that fits its checksum",
-                remedy="copy the file again",
-            )
+            expected = "a length that fits its checksum"
+            raise InputError("record header is damaged", where=where, expected=expected, remedy="copy the file again")
         packed = header[:2] == b"\x1f\x8b"
-        raise InputError(
-            "file is compressed" if packed else "file is not a TFRecord",
-            where=str(path),
-            expected="a record's length and its checksum",
-            got=f"{size} bytes starting {header!r}",
-            remedy="unpack it with gunzip" if packed else "is it a download page, a placeholder, or of another format?",
-        )
+        what, got = "file is compressed" if packed else "file is not a TFRecord", f"{size} bytes starting {header!r}"
+        remedy = "unpack it with gunzip" if packed else "is it a download page, a placeholder, or of another format?"
+        raise InputError(what, where=str(path), expected="a record's length and its checksum", got=got, remedy=remedy)
     if length > MAX_RECORD_BYTES:
-        raise InputError(
-            "record declares a length that no frame has",
-            where=where,
-            expected=f"at most {MAX_RECORD_BYTES} bytes",
-            got=f"{length} bytes",
-        )
+        what = "record declares a length that no frame has"
+        raise InputError(what, where=where, expected=f"at most {MAX_RECORD_BYTES} bytes", got=f"{length} bytes")
     if offset + _HEADER_BYTES + length + _FOOTER_BYTES > size:
         raise _cut_off(where, f"{size - offset - _HEADER_BYTES} of {length + _FOOTER_BYTES} bytes")
     return RecordPlace(number, offset, length)
@@ -175,13 +163,10 @@ def read_record(file: BinaryIO, path: Path, place: RecordPlace) -> bytes:
     payload = content[: place.length]
     (crc,) = struct.unpack("<I", content[place.length :])
     if masked_crc32c(payload) != crc:
-        raise InputError(
-            "record is damaged: its bytes do not fit their checksum",
-            where=where,
-            expected=f"checksum {crc:#010x}",
-            got=f"{masked_crc32c(payload):#010x} over {place.length} bytes",
-            remedy="copy the file again, or choose other frames with --frames FIRST:END",
-        )
+        what = "record is damaged: its bytes do not fit their checksum"
+        got = f"{masked_crc32c(payload):#010x} over {place.length} bytes"
+        remedy = "copy the file again, or choose other frames with --frames FIRST:END"
+        raise InputError(what, where=where, expected=f"checksum {crc:#010x}", got=got, remedy=remedy)
     return payload
 
 
@@ -190,9 +175,8 @@ def _where(path: Path, number: int, offset: int) -> str:
 
 
 def _cut_off(where: str, got: str) -> InputError:
-    return InputError(
-        "TFRecord file is cut off", where=where, expected="a whole record", got=got, remedy="copy the file again"
-    )
+    what = "TFRecord file is cut off"
+    return InputError(what, where=where, expected="a whole record", got=got, remedy="copy the file again")
 
 
 # --- the log --------------------------------------------------------------------------------------
@@ -217,12 +201,8 @@ class TfrecordLog:
         first, end = wanted or (0, None)
         places = list(islice(record_places(path), first, end))
         if not places:
-            raise InputError(
-                "no frames to import",
-                where=str(path),
-                expected="records" + (f" {first} to {end - 1}" if end is not None else ""),
-                got="none",
-            )
+            expected = "records" + (f" {first} to {end - 1}" if end is not None else "")
+            raise InputError("no frames to import", where=str(path), expected=expected, got="none")
         frames: list[FrameRecord] = []
         context = b""
         with store.open_file(path) as file, log.task("checking records", len(places)) as bar:
