@@ -13,8 +13,7 @@ from functools import partial
 from pathlib import Path
 
 from mudg.base.types import Scene
-from mudg.formats.importers.common import ImportOptions
-from mudg.formats.importers.layout import LogFiles
+from mudg.formats.importers.common import ImportOptions, LogFiles
 from mudg.formats.unknown_fields import named_once
 
 Importer = Callable[[Path, Path, ImportOptions], Scene]

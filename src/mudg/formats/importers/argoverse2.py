@@ -29,50 +29,39 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common, drive_log
-from mudg.formats.importers.box_tracks import BoxTracks
 from mudg.formats.importers.common import (
     Columns,
     ImportOptions,
-    arrow_files,
-    finite_columns,
-    require_columns,
-    returns_of,
-    unit_intensity,
-)
-from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.formats.importers.layout import (
     LogFiles,
+    arrow_files,
     chosen_cameras,
+    finite_columns,
     folder_contents,
+    name_table,
     refuse_missing_cameras,
     refuse_untwist,
+    require_columns,
+    returns_of,
     the_only,
+    unit_intensity,
 )
+from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
 from mudg.formats.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 
 LICENCE: Final = "CC BY-NC-SA 4.0 (Argoverse 2: Wilson et al.; attribution, non-commercial, share-alike)"
-RING_CAMERAS: Final = (
-    "ring_front_center",
-    "ring_front_left",
-    "ring_front_right",
-    "ring_side_left",
-    "ring_side_right",
-    "ring_rear_left",
-    "ring_rear_right",
+RING_CAMERAS: Final = tuple(
+    (
+        "ring_front_center ring_front_left ring_front_right ring_side_left ring_side_right ring_rear_left "
+        "ring_rear_right"
+    ).split()
 )
-CAMERAS: Final[Mapping[str, str]] = {
-    "ring_front_center": "front",
-    "ring_front_left": "front_left",
-    "ring_front_right": "front_right",
-    "ring_side_left": "side_left",
-    "ring_side_right": "side_right",
-    "ring_rear_left": "rear_left",
-    "ring_rear_right": "rear_right",
-    "stereo_front_left": "stereo_left",
-    "stereo_front_right": "stereo_right",
-}
+CAMERAS: Final[Mapping[str, str]] = name_table(
+    """front: ring_front_center; front_left: ring_front_left; front_right: ring_front_right;
+    side_left: ring_side_left; side_right: ring_side_right; rear_left: ring_rear_left;
+    rear_right: ring_rear_right; stereo_left: stereo_front_left; stereo_right: stereo_front_right"""
+)
 SENSOR: Final = "lidar"
 _UPPER: Final = "up_lidar"
 _LOWER: Final = "down_lidar"
@@ -104,39 +93,16 @@ OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
 }
 """Tables -> their columns."""
 
-LABELS: Final[Mapping[str, str]] = {
-    "REGULAR_VEHICLE": "car",
-    "PEDESTRIAN": "pedestrian",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "BICYCLE": "bicycle",
-    "BICYCLIST": "rider",
-    "MOTORCYCLE": "motorcycle",
-    "MOTORCYCLIST": "rider",
-    "WHEELED_RIDER": "rider",
-    "WHEELED_DEVICE": "wheeled_device",
-    "BUS": "bus",
-    "SCHOOL_BUS": "bus",
-    "ARTICULATED_BUS": "bus",
-    "LARGE_VEHICLE": "truck",
-    "BOX_TRUCK": "truck",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "truck",
-    "VEHICULAR_TRAILER": "trailer",
-    "RAILED_VEHICLE": "tram",
-    "STROLLER": "stroller",
-    "WHEELCHAIR": "wheelchair",
-    "DOG": "animal",
-    "ANIMAL": "animal",
-    "BOLLARD": "bollard",
-    "CONSTRUCTION_CONE": "traffic_cone",
-    "CONSTRUCTION_BARREL": "construction_barrel",
-    "STOP_SIGN": "traffic_sign",
-    "SIGN": "traffic_sign",
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "traffic_sign",
-    "MOBILE_PEDESTRIAN_SIGN": "traffic_sign",
-    "MESSAGE_BOARD_TRAILER": "message_board_trailer",
-    "TRAFFIC_LIGHT_TRAILER": "traffic_light_trailer",
-}
+LABELS: Final[Mapping[str, str]] = name_table(
+    """car: REGULAR_VEHICLE; pedestrian: PEDESTRIAN, OFFICIAL_SIGNALER; bicycle: BICYCLE;
+    rider: BICYCLIST, MOTORCYCLIST, WHEELED_RIDER; motorcycle: MOTORCYCLE; wheeled_device: WHEELED_DEVICE;
+    bus: BUS, SCHOOL_BUS, ARTICULATED_BUS; truck: LARGE_VEHICLE, BOX_TRUCK, TRUCK, TRUCK_CAB;
+    trailer: VEHICULAR_TRAILER; tram: RAILED_VEHICLE; stroller: STROLLER; wheelchair: WHEELCHAIR;
+    animal: DOG, ANIMAL; bollard: BOLLARD; traffic_cone: CONSTRUCTION_CONE;
+    construction_barrel: CONSTRUCTION_BARREL;
+    traffic_sign: STOP_SIGN, SIGN, MOBILE_PEDESTRIAN_CROSSING_SIGN, MOBILE_PEDESTRIAN_SIGN;
+    message_board_trailer: MESSAGE_BOARD_TRAILER; traffic_light_trailer: TRAFFIC_LIGHT_TRAILER"""
+)
 """The data set's categories -> labels."""
 
 

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.formats.importers.common import name_table
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.clouds import is_return
 
@@ -30,64 +31,13 @@ _LZF_MAX_GROWTH: Final = 90
 """A token of 3 bytes makes at most 264."""
 
 USUAL: Final = frozenset(
-    {
-        "x",
-        "y",
-        "z",
-        "intensity",
-        "reflectivity",
-        "reflectance",
-        "remission",
-        "i",
-        "ring",
-        "channel",
-        "laser_id",
-        "lidar_info",
-        "line",
-        "tag",
-        "t",
-        "time",
-        "timestamp",
-        "time_stamp",
-        "offset_time",
-        "offset_ns",
-        "range",
-        "distance",
-        "azimuth",
-        "elevation",
-        "ambient",
-        "noise",
-        "near_ir",
-        "signal",
-        "return_type",
-        "return_number",
-        "number_of_returns",
-        "confidence",
-        "rgb",
-        "rgba",
-        "r",
-        "g",
-        "b",
-        "a",
-        "red",
-        "green",
-        "blue",
-        "alpha",
-        "nx",
-        "ny",
-        "nz",
-        "normal_x",
-        "normal_y",
-        "normal_z",
-        "curvature",
-        "label",
-        "class",
-        "classification",
-        "instance",
-        "object",
-        "velocity",
-        "doppler",
-    }
+    (
+        "x y z intensity reflectivity reflectance remission i ring channel laser_id lidar_info line tag t "
+        "time timestamp time_stamp offset_time offset_ns range distance azimuth elevation ambient noise "
+        "near_ir signal return_type return_number number_of_returns confidence rgb rgba r g b a red green "
+        "blue alpha nx ny nz normal_x normal_y normal_z curvature label class classification instance "
+        "object velocity doppler"
+    ).split()
 )
 """Fields that clouds of LiDARs usually have, whatever their case: no format of clouds closes its list."""
 
@@ -312,24 +262,10 @@ def _count(word: str, where: str, largest: int = MAX_POINTS) -> int:
 
 # --- PLY ------------------------------------------------------------------------------------------
 
-_PLY_TYPES: Final = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
+_PLY_TYPES: Final = name_table(
+    """i1: char, int8; u1: uchar, uint8; i2: short, int16; u2: ushort, uint16; i4: int, int32;
+    u4: uint, uint32; f4: float, float32; f8: double, float64"""
+)
 _PLY_ORDER: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
 

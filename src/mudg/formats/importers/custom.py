@@ -24,17 +24,18 @@ from mudg.formats.importers.clouds import Cloud, read_cloud
 from mudg.formats.importers.common import (
     UNITS_PER_SECOND,
     ImportOptions,
+    chosen_cameras,
     deskew,
     has_pose,
     holdout_split,
     mended_path,
     nearest_index,
     pose_near,
+    refuse_options,
     unit_intensity,
 )
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import Lens, brown_conrady, equidistant, fit_images, image_notes
-from mudg.formats.importers.layout import chosen_cameras, refuse_options
 from mudg.scene import check as scene_check
 from mudg.scene import schema
 from mudg.scene.check import Finding

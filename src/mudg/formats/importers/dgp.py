@@ -32,18 +32,19 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import invert
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common, drive_log
-from mudg.formats.importers.box_tracks import BoxTracks
 from mudg.formats.importers.clouds import npz_arrays
-from mudg.formats.importers.common import ImportOptions, record_fields
-from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.formats.importers.layout import (
+from mudg.formats.importers.common import (
+    ImportOptions,
     LogFiles,
     chosen_cameras,
     folder_contents,
+    name_table,
     path_inside,
+    record_fields,
     refuse_untwist,
     the_only,
 )
+from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
 from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
 from mudg.scene.clouds import is_return
 
@@ -102,22 +103,7 @@ _LENS: Final = (
     "equirectangular",
 )
 _CHANNELS: Final = frozenset(
-    {
-        "X",
-        "Y",
-        "Z",
-        "INTENSITY",
-        "R",
-        "G",
-        "B",
-        "RING",
-        "NORMAL_X",
-        "NORMAL_Y",
-        "NORMAL_Z",
-        "CLASS_ID",
-        "INSTANCE_ID",
-        "TIMESTAMP",
-    }
+    "X Y Z INTENSITY R G B RING NORMAL_X NORMAL_Y NORMAL_Z CLASS_ID INSTANCE_ID TIMESTAMP".split()
 )
 OFFICIAL: Final[Mapping[str, Known]] = {
     "scene_*.json": _SCENE,
@@ -132,22 +118,11 @@ OFFICIAL: Final[Mapping[str, Known]] = {
 }
 """Kinds of files -> their fields, read or not; what is in metadata and attributes is free. Source: the format's
 published messages."""
-LABELS: Final[Mapping[str, str]] = {
-    "Car": "car",
-    "Truck": "truck",
-    "Bus/RV/Caravan": "bus",
-    "Bus": "bus",
-    "Motorcycle": "motorcycle",
-    "Motorcyclist": "rider",
-    "Bicycle": "bicycle",
-    "Bicyclist": "rider",
-    "Person": "pedestrian",
-    "Pedestrian": "pedestrian",
-    "Train": "train",
-    "Trailer": "trailer",
-    "Towed Object": "towed_object",
-    "Wheeled Slow": "wheeled_slow",
-}
+LABELS: Final[Mapping[str, str]] = name_table(
+    """car: Car; truck: Truck; bus: Bus/RV/Caravan, Bus; motorcycle: Motorcycle;
+    rider: Motorcyclist, Bicyclist; bicycle: Bicycle; pedestrian: Person, Pedestrian; train: Train;
+    trailer: Trailer; towed_object: Towed Object; wheeled_slow: Wheeled Slow"""
+)
 """Class names of common ontologies -> the labels of this package."""
 
 

@@ -44,13 +44,14 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, transform_points
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
-from mudg.formats.importers import layout
-from mudg.formats.importers.box_tracks import BoxTracks
+from mudg.formats.importers import common
 from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import (
     ImportOptions,
+    LogFiles,
     deskew,
     mended_path,
+    name_table,
     origin_note,
     pose_near,
     rigid_pose,
@@ -58,7 +59,7 @@ from mudg.formats.importers.common import (
     seconds,
     world_from_first,
 )
-from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes, image_size
 from mudg.formats.importers.kitti import files as kitti_poses
 from mudg.formats.importers.kitti.files import (
@@ -69,7 +70,6 @@ from mudg.formats.importers.kitti.files import (
     read_scan,
     table_entry,
 )
-from mudg.formats.importers.layout import LogFiles
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.motion import GAP_M
 
@@ -100,43 +100,17 @@ LABEL_OF_ID: Final = {
 }
 """The annotation tool's class numbers (``semanticId``) of what can move. Source: the data set's label table
 (kittiId)."""
-LABEL_OF: Final = {
-    "car": "car",
-    "truck": "truck",
-    "bus": "bus",
-    "caravan": "caravan",
-    "trailer": "trailer",
-    "train": "train",
-    "motorcycle": "motorcycle",
-    "bicycle": "bicycle",
-    "person": "pedestrian",
-    "pedestrian": "pedestrian",
-    "rider": "cyclist",
-    "unknown vehicle": "vehicle",
-}
+LABEL_OF: Final = name_table(
+    """car: car; truck: truck; bus: bus; caravan: caravan; trailer: trailer; train: train;
+    motorcycle: motorcycle; bicycle: bicycle; pedestrian: person, pedestrian; cyclist: rider;
+    vehicle: unknown vehicle"""
+)
 """Classes that become tracks -> the labels of this package. Buildings, poles, vegetation and ground are no tracks."""
 _OFFICIAL: Final = frozenset(
-    {
-        "index",
-        "label",
-        "category",
-        "semanticId",
-        "semanticId_orig",
-        "instanceId",
-        "timestamp",
-        "start_frame",
-        "end_frame",
-        "dynamic",
-        "dynamicSeq",
-        "dynamicIdx",
-        "dynamicIndex",
-        "level_min",
-        "level_max",
-        "color",
-        "transform",
-        "vertices",
-        "faces",
-    }
+    (
+        "index label category semanticId semanticId_orig instanceId timestamp start_frame end_frame dynamic "
+        "dynamicSeq dynamicIdx dynamicIndex level_min level_max color transform vertices faces"
+    ).split()
 )
 """Fields of the data set's objects, read or not."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
@@ -546,10 +520,10 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     folders = _find(source, options)
     calibration = read_calibration(folders.root / "calibration")
-    images = {name: layout.numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
+    images = {name: common.numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
     available = {name: ours for name, ours in CAMERAS.items() if images[name] and name in calibration.ego_from_camera}
-    chosen = layout.chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
-    scans = layout.numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
+    chosen = common.chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
+    scans = common.numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
     streams = {**{name: images[name] for name in chosen}, **({SENSOR: scans} if scans else {})}
     notes: list[str] = []
     clock = _clock(folders, streams, notes)
@@ -557,7 +531,7 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     notes.append(f"poses from {poses.name}")
     ego = mended_path(_read_motion(poses, calibration, clock), options, notes)
     placed = {name: [n for n in found if _has_pose(ego, clock[n])] for name, found in streams.items()}
-    frames = layout.complete_frames(placed, options, str(folders.root), "kitti360")
+    frames = common.complete_frames(placed, options, str(folders.root), "kitti360")
     notes += _without_pose(streams.values(), placed.values(), options)
     start_s = float(clock[frames[0]])
     first = pose_near(ego, clock[frames[0]])
@@ -614,12 +588,12 @@ def _find(source: Path, options: ImportOptions) -> _Folders:
         return _Folders(source.absolute().parent.parent, source.absolute().name)
     raw = source / "data_2d_raw"
     if not raw.is_dir():
-        what, got = "no KITTI-360 recording found", layout.folder_contents(source)
+        what, got = "no KITTI-360 recording found", common.folder_contents(source)
         raise InputError(what, where=str(source), got=got, expected="data_2d_raw, data_poses and calibration in it")
     drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
     wanted = options.sequence
     matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
-    return _Folders(source, layout.the_only(matching, drives, options, raw, "drive"))
+    return _Folders(source, common.the_only(matching, drives, options, raw, "drive"))
 
 
 def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
@@ -637,7 +611,7 @@ def _without_pose(
     """A note about the frames within ``options.frames`` that some stream has and none could place."""
     first, end = options.frames or (0, 2**63)
     lost = {n for found in streams for n in found if first <= n < end}.difference(*placed)
-    return [f"frames without a pose or time stamp were left out: {layout.number_ranges(sorted(lost))}"] if lost else []
+    return [f"frames without a pose or time stamp were left out: {common.number_ranges(sorted(lost))}"] if lost else []
 
 
 # --- time and motion ------------------------------------------------------------------------------
@@ -666,7 +640,7 @@ def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.floa
 
 def _find_poses(folders: _Folders, options: ImportOptions) -> Path:
     here = folders.root / "data_poses" / folders.drive
-    path = layout.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
+    path = common.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
     if path is None:
         expected, remedy = "poses.txt or cam0_to_world.txt", "download the data set's vehicle poses"
         raise InputError("no vehicle poses found", where=str(options.poses or here), expected=expected, remedy=remedy)
@@ -736,7 +710,7 @@ class _SickLines:
     def find(
         cls, folders: _Folders, calibration: Kitti360Calibration, ego: EgoPath, start_s: float, notes: list[str]
     ) -> _SickLines | None:
-        files = layout.numbered_files(folders.raw("sick_points") / "data", (".bin",))
+        files = common.numbered_files(folders.raw("sick_points") / "data", (".bin",))
         stamps = folders.raw("sick_points") / "timestamps.txt"
         if not files:
             return None
@@ -814,7 +788,7 @@ def _read_tracks(
 ) -> list[Track]:
     """Tracks within the imported frames: moving boxes at their frames, standing ones over the window they were drawn
     in."""
-    path = options.boxes or layout.first_file(*folders.boxes())
+    path = options.boxes or common.first_file(*folders.boxes())
     if path is None:
         notes.append("no boxes found: everything counts as static")
         return []

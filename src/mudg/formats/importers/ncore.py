@@ -30,18 +30,22 @@ from mudg.base.errors import InputError, MudgError
 from mudg.base.geometry import all_rigid, from_rotation_translation
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
-from mudg.formats.importers.box_tracks import BoxTracks
-from mudg.formats.importers.common import POSE_TOLERANCE, ImportOptions, ego_path, record_fields, rigid_pose, seconds
-from mudg.formats.importers.drive_log import CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
-from mudg.formats.importers.images import Lens
-from mudg.formats.importers.layout import (
+from mudg.formats.importers.common import (
+    POSE_TOLERANCE,
+    ImportOptions,
     LogFiles,
     chosen_cameras,
+    ego_path,
     folder_contents,
     path_inside,
+    record_fields,
     refuse_options,
+    rigid_pose,
+    seconds,
     the_only,
 )
+from mudg.formats.importers.drive_log import BoxTracks, CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
+from mudg.formats.importers.images import Lens
 from mudg.formats.ncore import (
     ABOUT,
     EGO_MASK,
@@ -310,23 +314,11 @@ LABELS: Final[Mapping[str, str]] = {
     "person": "pedestrian",
     **{
         name: name
-        for name in (
-            "vehicle",
-            "car",
-            "van",
-            "truck",
-            "bus",
-            "trailer",
-            "tram",
-            "train",
-            "pedestrian",
-            "cyclist",
-            "rider",
-            "bicycle",
-            "motorcycle",
-            "stroller",
-            "animal",
-            "protruding_object",
+        for name in tuple(
+            (
+                "vehicle car van truck bus trailer tram train pedestrian cyclist rider bicycle motorcycle stroller "
+                "animal protruding_object"
+            ).split()
         )
     },
 }
@@ -485,13 +477,11 @@ def _opened(stores: tuple[Path, ...], where: str) -> Iterator[_OpenRecording]:
         with foreign_reader(where):
             of = {
                 name: reader.open_component_readers(getattr(v4, name).Reader)
-                for name in (
-                    "PosesComponent",
-                    "IntrinsicsComponent",
-                    "MasksComponent",
-                    "CuboidsComponent",
-                    "CameraSensorComponent",
-                    "LidarSensorComponent",
+                for name in tuple(
+                    (
+                        "PosesComponent IntrinsicsComponent MasksComponent CuboidsComponent CameraSensorComponent "
+                        "LidarSensorComponent"
+                    ).split()
                 )
             }
             poses = _single(of["PosesComponent"], "poses", where)

@@ -35,31 +35,29 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.plain_pickle import NUMPY_MAKERS, Maker, as_list, read_pickle
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, foreign_name
-from mudg.formats.importers.box_tracks import BoxTracks
 from mudg.formats.importers.clouds import read_cloud
 from mudg.formats.importers.common import (
     ImportOptions,
-    has_pose,
-    mended_path,
-    nearest_index,
-    origin_note,
-    pose_from_quaternion,
-    pose_near,
-    require_columns,
-    seconds,
-    unit_intensity,
-    world_from_first,
-)
-from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
-from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes
-from mudg.formats.importers.layout import (
     LogFiles,
     chosen_cameras,
     folder_contents,
+    has_pose,
+    mended_path,
+    name_table,
+    nearest_index,
+    origin_note,
     path_inside,
+    pose_from_quaternion,
+    pose_near,
     refuse_options,
+    require_columns,
+    seconds,
     the_only,
+    unit_intensity,
+    world_from_first,
 )
+from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.clouds import near_places
 from mudg.scene.schema import ref_problem
@@ -381,26 +379,15 @@ def open_log(path: Path) -> Iterator[NuplanLog]:
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 4.0 with the nuPlan dataset licence (Motional; attribution, non-commercial, share-alike)"
-CAMERAS: Final = {
-    "CAM_F0": "front",
-    "CAM_L0": "front_left",
-    "CAM_R0": "front_right",
-    "CAM_L1": "side_left",
-    "CAM_R1": "side_right",
-    "CAM_L2": "back_left",
-    "CAM_R2": "back_right",
-    "CAM_B0": "back",
-}
+CAMERAS: Final = name_table(
+    """front: CAM_F0; front_left: CAM_L0; front_right: CAM_R0; side_left: CAM_L1; side_right: CAM_R1;
+    back_left: CAM_L2; back_right: CAM_R2; back: CAM_B0"""
+)
 SENSOR: Final = "merged"
-LABELS: Final = {
-    "vehicle": "vehicle",
-    "bicycle": "bicycle",
-    "pedestrian": "pedestrian",
-    "traffic_cone": "traffic_cone",
-    "barrier": "barrier",
-    "czone_sign": "sign",
-    "generic_object": "generic_object",
-}
+LABELS: Final = name_table(
+    """vehicle: vehicle; bicycle: bicycle; pedestrian: pedestrian; traffic_cone: traffic_cone;
+    barrier: barrier; sign: czone_sign; generic_object: generic_object"""
+)
 IMAGE_DELAY_US: Final = 16_667
 """From an image's time stamp to the middle of its read-out. The data set's schema does not tell; reconstructions of it
 found this."""

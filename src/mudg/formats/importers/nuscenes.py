@@ -38,26 +38,20 @@ from numpy.typing import NDArray
 from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
-from mudg.formats.importers import common, drive_log, layout
-from mudg.formats.importers.box_tracks import BoxTracks
+from mudg.formats.importers import common, drive_log
 from mudg.formats.importers.clouds import read_float_rows
-from mudg.formats.importers.common import ImportOptions, unit_intensity
-from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.formats.importers.layout import LogFiles
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table, unit_intensity
+from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
 from mudg.formats.unknown_fields import note_unknown
 
 # nuScenes sensors: cameras from their intrinsics, and ``LIDAR_TOP`` files with the time of every point ----------------
 
 
 LICENCE: Final = "CC BY-NC-SA 4.0 and the nuScenes terms of use (Motional; attribution, non-commercial, share-alike)"
-CAMERAS: Final[Mapping[str, str]] = {
-    "CAM_FRONT": "front",
-    "CAM_FRONT_LEFT": "front_left",
-    "CAM_FRONT_RIGHT": "front_right",
-    "CAM_BACK": "back",
-    "CAM_BACK_LEFT": "back_left",
-    "CAM_BACK_RIGHT": "back_right",
-}
+CAMERAS: Final[Mapping[str, str]] = name_table(
+    """front: CAM_FRONT; front_left: CAM_FRONT_LEFT; front_right: CAM_FRONT_RIGHT; back: CAM_BACK;
+    back_left: CAM_BACK_LEFT; back_right: CAM_BACK_RIGHT"""
+)
 SENSOR: Final = "lidar_top"
 TURN_PERIOD_S: Final = 0.05
 BEAMS: Final = 32
@@ -148,36 +142,16 @@ OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     ),
     "sample.json": frozenset({"token", "timestamp", "scene_token", "next", "prev"}),
     "sample_annotation.json": frozenset(
-        {
-            "token",
-            "sample_token",
-            "instance_token",
-            "attribute_tokens",
-            "visibility_token",
-            "translation",
-            "size",
-            "rotation",
-            "num_lidar_pts",
-            "num_radar_pts",
-            "next",
-            "prev",
-        }
+        (
+            "token sample_token instance_token attribute_tokens visibility_token translation size rotation "
+            "num_lidar_pts num_radar_pts next prev"
+        ).split()
     ),
     "sample_data.json": frozenset(
-        {
-            "token",
-            "sample_token",
-            "ego_pose_token",
-            "calibrated_sensor_token",
-            "filename",
-            "fileformat",
-            "width",
-            "height",
-            "timestamp",
-            "is_key_frame",
-            "next",
-            "prev",
-        }
+        (
+            "token sample_token ego_pose_token calibrated_sensor_token filename fileformat width height "
+            "timestamp is_key_frame next prev"
+        ).split()
     ),
     "scene.json": frozenset(
         {"token", "name", "description", "log_token", "nbr_samples", "first_sample_token", "last_sample_token"}
@@ -378,31 +352,18 @@ MAX_GAP_S: Final = 1.1
 MICROSECONDS: Final = 10**6
 _MAX_BEFORE_SCENE_S: Final = 1.0
 
-LABELS: Final[Mapping[str, str]] = {
-    "animal": "animal",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.personal_mobility": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-    "human.pedestrian.stroller": "stroller",
-    "human.pedestrian.wheelchair": "wheelchair",
-    "movable_object.barrier": "barrier",
-    "movable_object.debris": "debris",
-    "movable_object.pushable_pullable": "pushable",
-    "movable_object.trafficcone": "traffic_cone",
-    "static_object.bicycle_rack": "bicycle_rack",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.bus.bendy": "bus",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.car": "car",
-    "vehicle.construction": "construction_vehicle",
-    "vehicle.emergency.ambulance": "van",
-    "vehicle.emergency.police": "car",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.trailer": "trailer",
-    "vehicle.truck": "truck",
-}
+LABELS: Final[Mapping[str, str]] = name_table(
+    """animal: animal;
+    pedestrian: human.pedestrian.adult, human.pedestrian.child, human.pedestrian.construction_worker,
+        human.pedestrian.personal_mobility, human.pedestrian.police_officer;
+    stroller: human.pedestrian.stroller; wheelchair: human.pedestrian.wheelchair;
+    barrier: movable_object.barrier; debris: movable_object.debris;
+    pushable: movable_object.pushable_pullable; traffic_cone: movable_object.trafficcone;
+    bicycle_rack: static_object.bicycle_rack; bicycle: vehicle.bicycle;
+    bus: vehicle.bus.bendy, vehicle.bus.rigid; car: vehicle.car, vehicle.emergency.police;
+    construction_vehicle: vehicle.construction; van: vehicle.emergency.ambulance;
+    motorcycle: vehicle.motorcycle; trailer: vehicle.trailer; truck: vehicle.truck"""
+)
 """The release's categories -> labels."""
 _RIDDEN: Final[Mapping[str, str]] = {"bicycle": "cyclist", "motorcycle": "motorcyclist"}
 _WITH_RIDER: Final = "cycle.with_rider"
@@ -428,13 +389,13 @@ def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")
-    layout.refuse_untwist(options, "nuScenes", str(source))
+    common.refuse_untwist(options, "nuScenes", str(source))
     releases = _releases(source)
     if not releases:
         what = "no nuScenes tables found"
         expected = "v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json"
         remedy = "give the folder that holds v1.0-*, samples and sweeps"
-        raise InputError(what, where=str(source), got=layout.folder_contents(source), expected=expected, remedy=remedy)
+        raise InputError(what, where=str(source), got=common.folder_contents(source), expected=expected, remedy=remedy)
     return drive_log.write_log(read_log(releases, options), out, options)
 
 
@@ -485,8 +446,8 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
         sensor = sensors.get(calibration, "sensor_token", calibrations.where)
         channel_of[row["token"]] = text(sensor, "channel", sensors.where)
     there = {raw: name for raw, name in CAMERAS.items() if raw in channel_of.values()}
-    chosen = {there[raw]: raw for raw in layout.chosen_cameras(there, options, where, tuple(CAMERAS))}
-    layout.refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
+    chosen = {there[raw]: raw for raw in common.chosen_cameras(there, options, where, tuple(CAMERAS))}
+    common.refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
     used = [row for row in data.rows.values() if channel_of[row["token"]] in (*chosen.values(), LIDAR)]
     _check_times(used, samples, data.where)
     used.sort(key=lambda row: row["timestamp"])
@@ -525,7 +486,7 @@ def _choose_scene(releases: Sequence[Path], options: ImportOptions) -> tuple[Pat
             if wanted in ("", name, row.get("token")):
                 found.append((folder, row))
     # the same scene may lie in two releases: the smaller one is quicker
-    return layout.the_only(found[:1] if wanted else found, names, options, releases[0].parent, "scene")
+    return common.the_only(found[:1] if wanted else found, names, options, releases[0].parent, "scene")
 
 
 def _samples_in_order(folder: Path, scene: Row) -> dict[str, int]:
@@ -583,7 +544,7 @@ class _RowReader:
         return self.map_from_ego(row) @ _pose(calibration, self.calibrations.where)
 
     def file(self, row: Row) -> Path:
-        return layout.path_inside(self.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
+        return common.path_inside(self.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
 
     def image(self, row: Row, camera: str) -> ImageRecord:
         return ImageRecord(camera, self.time_s(row), self.map_from_sensor(row), self.file(row))

@@ -43,12 +43,13 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix
 from mudg.base.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
-from mudg.formats.importers import layout
-from mudg.formats.importers.box_tracks import BoxTracks
+from mudg.formats.importers import common
 from mudg.formats.importers.common import (
     ImportOptions,
+    LogFiles,
     finite_columns,
     mended_path,
+    name_table,
     origin_note,
     pose_from_quaternion,
     pose_near,
@@ -59,9 +60,8 @@ from mudg.formats.importers.common import (
     unit_intensity,
     world_from_first,
 )
-from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, Tracks, write_scene
+from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, Tracks, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
-from mudg.formats.importers.layout import LogFiles
 from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
 
 # pandas frame -------------------------------------------------------------------------------------
@@ -270,7 +270,7 @@ class PointClasses:
     """
 
     def __init__(self, folder: Path, frames: Sequence[int], options: ImportOptions) -> None:
-        self._files: dict[int, Path] = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
+        self._files: dict[int, Path] = common.numbered_files(folder, (".pkl.gz", ".pkl"))
         lacks = [number for number in frames if number not in self._files]
         if self._files and lacks and not options.skip_missing:
             what = "a frame has no classes of points"
@@ -329,47 +329,23 @@ def _names(path: Path) -> Mapping[int, str]:
 
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY 4.0 (PandaSet: Hesai and Scale AI; attribution)"
-CAMERAS: Final = {
-    "front_camera": "front",
-    "front_left_camera": "front_left",
-    "front_right_camera": "front_right",
-    "left_camera": "left",
-    "right_camera": "right",
-    "back_camera": "back",
-}
+CAMERAS: Final = name_table(
+    """front: front_camera; front_left: front_left_camera; front_right: front_right_camera; left: left_camera;
+    right: right_camera; back: back_camera"""
+)
 SENSORS: Final = {0: "pandar64", 1: "pandar_gt"}
 OFFSET_FROM_FRONT_CAMERA_M: Final = {0: (-0.044, 0.0, 0.039), 1: (0.562, 0.0, -0.263)}
 """Places of the LiDARs from the front camera's centre: forward, left, up. Source: the data set's static calibration."""
-LABELS: Final = {
-    "Car": "car",
-    "Pickup Truck": "truck",
-    "Medium-sized Truck": "truck",
-    "Semi-truck": "truck",
-    "Towed Object": "trailer",
-    "Motorcycle": "motorcycle",
-    "Motorized Scooter": "motorcycle",
-    "Bicycle": "bicycle",
-    "Bus": "bus",
-    "Train": "train",
-    "Trolley": "tram",
-    "Tram / Subway": "tram",
-    "Emergency Vehicle": "vehicle",
-    "Pedestrian": "pedestrian",
-    "Pedestrian with Object": "pedestrian",
-    "Personal Mobility Device": "personal_mobility_device",
-    "Other Vehicle - Construction Vehicle": "vehicle",
-    "Other Vehicle - Uncommon": "vehicle",
-    "Other Vehicle - Pedicab": "pedicab",
-    "Animals - Bird": "animal",
-    "Animals - Other": "animal",
-    "Pylons": "pylon",
-    "Road Barriers": "barrier",
-    "Cones": "traffic_cone",
-    "Signs": "sign",
-    "Construction Signs": "sign",
-    "Temporary Construction Barriers": "barrier",
-    "Rolling Containers": "container",
-}
+LABELS: Final = name_table(
+    """car: Car; truck: Pickup Truck, Medium-sized Truck, Semi-truck; trailer: Towed Object;
+    motorcycle: Motorcycle, Motorized Scooter; bicycle: Bicycle; bus: Bus; train: Train;
+    tram: Trolley, Tram / Subway;
+    vehicle: Emergency Vehicle, Other Vehicle - Construction Vehicle, Other Vehicle - Uncommon;
+    pedestrian: Pedestrian, Pedestrian with Object; personal_mobility_device: Personal Mobility Device;
+    pedicab: Other Vehicle - Pedicab; animal: Animals - Bird, Animals - Other; pylon: Pylons;
+    barrier: Road Barriers, Temporary Construction Barriers; traffic_cone: Cones;
+    sign: Signs, Construction Signs; container: Rolling Containers"""
+)
 """The data set's classes -> labels; pickup trucks count as trucks, as in Cityscapes."""
 FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
 """Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
@@ -382,17 +358,8 @@ MAX_POINT_DELAY_S: Final = 0.25
 MAX_CAMERA_DELAY_S: Final = 1.0
 _MIN_BOX_POINTS: Final = 5
 _POINT_COLUMNS: Final = ("x", "y", "z", "i", "t", "d")
-_CUBOID_COLUMNS: Final = (
-    "uuid",
-    "label",
-    "yaw",
-    "stationary",
-    "position.x",
-    "position.y",
-    "position.z",
-    "dimensions.x",
-    "dimensions.y",
-    "dimensions.z",
+_CUBOID_COLUMNS: Final = tuple(
+    "uuid label yaw stationary position.x position.y position.z dimensions.x dimensions.y dimensions.z".split()
 )
 _POINTS, _CUBOIDS, _POSES = "lidar/*.pkl.gz", "annotations/cuboids/*.pkl.gz", "poses.json"
 OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
@@ -458,13 +425,13 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
         UsageError: the folder holds several sequences and none was chosen, or an option does not apply.
         InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
-    layout.refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
+    common.refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
     folder = _chosen_sequence(source, options)
     cameras = {name: CAMERAS[name] for name in CAMERAS if (folder / "camera" / name).is_dir()}
-    chosen = layout.chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
-    images = {name: layout.numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
-    clouds = layout.numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
-    frames = layout.complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
+    chosen = common.chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
+    images = {name: common.numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
+    clouds = common.numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
+    frames = common.complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
     notes: list[str] = []
     motion = _Motion.read(folder, frames, chosen, options, notes)
     fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
@@ -528,14 +495,14 @@ def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
     sequences = _sequences(source)
     if not sequences and not options.sequence:
         what, expected = "no PandaSet sequence found", "lidar/poses.json and camera/front_camera and so on"
-        raise InputError(what, where=str(source), got=layout.folder_contents(source), expected=expected)
+        raise InputError(what, where=str(source), got=common.folder_contents(source), expected=expected)
     matching = [name for name in sequences if options.sequence in ("", name)]
-    return source / layout.the_only(matching, sequences, options, source, "sequence")
+    return source / common.the_only(matching, sequences, options, source, "sequence")
 
 
 def _cuboid_files(folder: Path, frames: Sequence[int], options: ImportOptions) -> dict[int, Path]:
     """Cuboid tables by frame number; none at all is allowed, gaps are not."""
-    cuboids = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
+    cuboids = common.numbered_files(folder, (".pkl.gz", ".pkl"))
     lacks = [number for number in frames if number not in cuboids]
     if cuboids and lacks and not options.skip_missing:
         remedy = "copy it, choose frames with --frames FIRST:END, or add --skip-missing"

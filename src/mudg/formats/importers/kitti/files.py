@@ -18,9 +18,9 @@ from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, yaw_matrix, yaw_of
 from mudg.base.types import Camera, SweepPoints, Track
-from mudg.formats.importers.box_tracks import BoxTracks, box_size
 from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import blend_motion, rigid_pose, rigid_rotation, unit_intensity
+from mudg.formats.importers.drive_log import BoxTracks, box_size
 from mudg.formats.unknown_fields import note_unknown
 
 # scans --------------------------------------------------------------------------------------------
@@ -90,20 +90,7 @@ _NUMBERED = tuple(
     f"{name}_{number:02d}" for name in ("S", "K", "D", "R", "T", "S_rect", "R_rect", "P_rect") for number in range(4)
 )
 _TEXT = frozenset(
-    {
-        "P0",
-        "P1",
-        "P2",
-        "P3",
-        "R0_rect",
-        "R_rect",
-        "Tr",
-        "Tr_velo_to_cam",
-        "Tr_velo_cam",
-        "Tr_imu_to_velo",
-        "Tr_imu_velo",
-        "calib_time",
-    }
+    "P0 P1 P2 P3 R0_rect R_rect Tr Tr_velo_to_cam Tr_velo_cam Tr_imu_to_velo Tr_imu_velo calib_time".split()
 )
 _OFFICIAL: Mapping[str, frozenset[str]] = {
     "calib_cam_to_cam.txt": frozenset({"calib_time", "corner_dist", *_NUMBERED}),
@@ -421,23 +408,10 @@ LABELS = frozenset(
 """Classes of the benchmarks, in lower case."""
 _TRACKLET = frozenset({"objectType", "h", "w", "l", "first_frame", "poses", "finished"})
 _TRACKLET_POSE = frozenset(
-    {
-        "tx",
-        "ty",
-        "tz",
-        "rx",
-        "ry",
-        "rz",
-        "state",
-        "occlusion",
-        "occlusion_kf",
-        "truncation",
-        "amt_occlusion",
-        "amt_occlusion_kf",
-        "amt_border_l",
-        "amt_border_r",
-        "amt_border_kf",
-    }
+    (
+        "tx ty tz rx ry rz state occlusion occlusion_kf truncation amt_occlusion amt_occlusion_kf "
+        "amt_border_l amt_border_r amt_border_kf"
+    ).split()
 )
 """Fields of the data set's tracklets, read or not."""
 

@@ -32,13 +32,20 @@ from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import transform_points, yaw_matrix, yaw_of
 from mudg.base.types import EgoPath, Scene, Source
-from mudg.formats.importers.common import ImportOptions, seconds
+from mudg.formats.importers.common import (
+    ImportOptions,
+    LogFiles,
+    chosen_cameras,
+    folder_contents,
+    refuse_options,
+    seconds,
+    the_only,
+)
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images
-from mudg.formats.importers.layout import LogFiles, chosen_cameras, folder_contents, refuse_options, the_only
 from mudg.formats.importers.waymo import records as tracks
 from mudg.formats.importers.waymo import sensors
-from mudg.formats.importers.waymo.parquet import REQUIRED, ParquetLog
+from mudg.formats.importers.waymo.logs import REQUIRED, ParquetLog, TfrecordLog
 from mudg.formats.importers.waymo.records import (
     CAMERAS,
     TOP,
@@ -50,7 +57,6 @@ from mudg.formats.importers.waymo.records import (
     TimedBoxes,
     WaymoLog,
 )
-from mudg.formats.importers.waymo.tfrecord import TfrecordLog
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
 DOUBTFUL_PROJECTION_PX: Final = 30.0
