@@ -98,11 +98,8 @@ def _looks_like(name: str, source: Path) -> bool:
 
 
 def files_of(name: str, source: Path, options: ImportOptions) -> LogFiles:
-    """What identifies the log that format ``name`` would import from ``source``; nothing large is read.
-
-    Raises:
-        UsageError: several logs and none was chosen. InputError: none is there.
-    """
+    """What identifies the log that format ``name`` would import from ``source``; nothing large is read. Raises
+    UsageError: several logs and none was chosen. InputError: none is there."""
     return _functions(name)[2](source, options)
 
 

@@ -112,17 +112,14 @@ def looks_like_argoverse2(source: Path) -> bool:
 
 
 def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one log into the scene directory ``out``; see the module text for what is read.
+    """Import one log into the scene directory ``out``; see the module text for what is read. Raises UsageError: there
+    are several logs and none was chosen, or there is no such log or camera. InputError: something is missing, malformed
+    or contradictory; nothing is left at ``out``. ResourceError: pyarrow, which reads Feather files, is not installed.
 
     Args:
         source: a log's folder, or a folder of logs.
         options: ``sequence`` names the log (its beginning is enough) where there are several; ``frames`` counts images
             of the first chosen camera; ``cameras`` by either name, the seven ring cameras by default.
-
-    Raises:
-        UsageError: there are several logs and none was chosen, or there is no such log or camera.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
-        ResourceError: pyarrow, which reads Feather files, is not installed.
     """
     if not source.is_dir():
         raise InputError("Argoverse 2 folder does not exist", where=str(source), expected="a folder")
@@ -229,12 +226,8 @@ def _with_poses(files: Mapping[int, Path], ego: EgoPath, zero_ns: int, sensor: s
 
 
 def read_feather(path: Path, columns: Sequence[str]) -> Columns:
-    """Named columns of a Feather (Arrow IPC) file as arrays of one length.
-
-    Raises:
-        ResourceError: pyarrow is not installed.
-        InputError: missing, cut off, without one of the columns, or with empty values.
-    """
+    """Named columns of a Feather (Arrow IPC) file as arrays of one length. Raises ResourceError: pyarrow is not
+    installed. InputError: missing, cut off, without one of the columns, or with empty values."""
     with arrow_files(path):
         import pyarrow.feather
 
@@ -334,11 +327,8 @@ def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()
     """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time.
 
     Beams without a return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it,
-    f64[3] each.
-
-    Raises:
-        InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn.
-    """
+    f64[3] each. Raises InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one
+    turn."""
     where = str(path)
     columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
     returns = returns_of(columns, where, places)

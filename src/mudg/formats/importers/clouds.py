@@ -58,13 +58,11 @@ class Cloud:
 
 
 def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
-    """Read a cloud by the suffix of its name.
+    """Read a cloud by the suffix of its name. Raises InputError: unknown suffix, cut off, sizes that contradict each
+    other, no coordinates, values not finite.
 
     Args:
         known: names of fields that the caller reads, or knows to be there, besides ``USUAL``.
-
-    Raises:
-        InputError: unknown suffix, cut off, sizes that contradict each other, no coordinates, values not finite.
     """
     reader = READERS.get(path.suffix.lower())
     if reader is None:
@@ -209,11 +207,8 @@ def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
     """Unpack LibLZF data to exactly ``length`` bytes.
 
     A token below 32 is that many + 1 literal bytes. Any other copies from what was unpacked: its upper 3 bits + 2 are
-    the length (7: one more byte to add), its lower 5 bits and the next byte are how far back, less 1.
-
-    Raises:
-        InputError: reads or writes beyond an end, or another length comes out.
-    """
+    the length (7: one more byte to add), its lower 5 bits and the next byte are how far back, less 1. Raises
+    InputError: reads or writes beyond an end, or another length comes out."""
     out = bytearray(length)
     at = to = 0
     try:
@@ -313,14 +308,11 @@ def read_float_rows(
     path: Path, columns: int, what: str = "scan", axes: int = 3
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], and which of them are
-    returns bool[N].
+    returns bool[N]. Raises InputError: missing, cut off, or values of a return that are not finite.
 
     Args:
         what: what one file holds, for messages.
         axes: the first so many columns are coordinates in the sensor's frame.
-
-    Raises:
-        InputError: missing, cut off, or values of a return that are not finite.
     """
     content = store.read_bytes(path)
     if len(content) % (4 * columns):
@@ -346,11 +338,8 @@ def read_bin(content: bytes, where: str) -> dict[str, NDArray]:
 
 
 def npz_arrays(content: bytes, where: str) -> dict[str, NDArray]:
-    """All arrays of a numpy archive by name.
-
-    Raises:
-        InputError: damaged, cut off, or not plain numbers of the declared size.
-    """
+    """All arrays of a numpy archive by name. Raises InputError: damaged, cut off, or not plain numbers of the declared
+    size."""
     arrays = {}
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -382,12 +371,9 @@ def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
 def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
     """One array of an archive, from its member of ``size`` bytes.
 
-    Its header is compared with this size before anything is allocated; arrays of objects (pickles) are refused.
-
-    Raises:
-        InputError: not numbers, or of another size than declared. ValueError, zipfile.BadZipFile, zlib.error: no array,
-            or damaged.
-    """
+    Its header is compared with this size before anything is allocated; arrays of objects (pickles) are refused. Raises
+    InputError: not numbers, or of another size than declared. ValueError, zipfile.BadZipFile, zlib.error: no array, or
+    damaged."""
     version = np.lib.format.read_magic(handle)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:

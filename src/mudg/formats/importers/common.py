@@ -68,11 +68,7 @@ def require_columns(names: Iterable[str], there: Iterable[str], where: object) -
 
 
 def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDArray[np.float64]:
-    """Columns as f64[n, k].
-
-    Raises:
-        InputError: no numbers, or not all finite.
-    """
+    """Columns as f64[n, k]. Raises InputError: no numbers, or not all finite."""
     where = f"{where}: {', '.join(names)}"
     try:
         table = np.stack([columns[name].astype(np.float64) for name in names], 1)
@@ -87,11 +83,7 @@ def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDA
 
 def unit_intensity(values: NDArray[Any], largest: float, where: object, remedy: str = "") -> NDArray[np.float32]:
     """Intensities of a cloud, from 0 to the ``largest`` that its format has, as f32 from 0 to 1; rounding beyond that
-    is taken off.
-
-    Raises:
-        InputError: other values, which would all become 0 or 1, or some that are not finite.
-    """
+    is taken off. Raises InputError: other values, which would all become 0 or 1, or some that are not finite."""
     scaled = values.astype(np.float64) / largest
     if not ((scaled > -_ROUNDING) & (scaled < 1 + _ROUNDING)).all():
         what, got = "intensity is out of range", f"{values.min():g} to {values.max():g}"
@@ -121,12 +113,8 @@ def record_fields(what: str, where: object, expected: str) -> Iterator[None]:
 
 @contextmanager
 def arrow_files(path: Path) -> Iterator[None]:
-    """Code that reads a Feather or Parquet file with pyarrow.
-
-    Raises:
-        ResourceError: pyarrow is not installed.
-        InputError: the file is damaged or cut off.
-    """
+    """Code that reads a Feather or Parquet file with pyarrow. Raises ResourceError: pyarrow is not installed.
+    InputError: the file is damaged or cut off."""
     try:
         import pyarrow
     except ImportError as error:
@@ -179,11 +167,7 @@ class ImportOptions:
 
 
 def parse_frame_range(text: str) -> tuple[int, int] | None:
-    """``"10:26"`` -> (10, 26); an empty text -> None.
-
-    Raises:
-        UsageError: not of this form, or empty.
-    """
+    """``"10:26"`` -> (10, 26); an empty text -> None. Raises UsageError: not of this form, or empty."""
     if not text:
         return None
     match = re.fullmatch(r"(\d{1,9}):(\d{1,9})", text.strip())
@@ -194,11 +178,8 @@ def parse_frame_range(text: str) -> tuple[int, int] | None:
 
 
 def parse_resolution(text: str) -> Resolution | None:
-    """``"960"`` -> 960 (longest side), ``"960x640"`` -> (960, 640); an empty text -> None.
-
-    Raises:
-        UsageError: not of this form, or below 16 pixels.
-    """
+    """``"960"`` -> 960 (longest side), ``"960x640"`` -> (960, 640); an empty text -> None. Raises UsageError: not of
+    this form, or below 16 pixels."""
     if not text:
         return None
     match = re.fullmatch(r"(\d{2,5})(?:x(\d{2,5}))?", text.strip().lower())
@@ -345,11 +326,8 @@ def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]
 def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, where: str, start: float = 0) -> Matrix:
     """Times of one sensor's records as seconds f64[N] since ``start`` (same unit), checked.
 
-    Integers are subtracted before they become floats, so nanoseconds of the epoch keep their digits.
-
-    Raises:
-        InputError: not increasing (with the first place), not finite, or so close or far apart that the unit is wrong.
-    """
+    Integers are subtracted before they become floats, so nanoseconds of the epoch keep their digits. Raises InputError:
+    not increasing (with the first place), not finite, or so close or far apart that the unit is wrong."""
     numbers = np.asarray(times)
     if numbers.dtype.kind not in "iuf" or numbers.ndim != 1 or not np.isfinite(numbers.astype(np.float64)).all():
         raise InputError("timestamps are not a list of finite numbers", where=where, got=str(numbers)[:80])
@@ -396,11 +374,8 @@ def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArra
 
 
 def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
-    """A pose from a file, [3, 4] or [4, 4], as f64[4, 4]; rounding up to 1e-3 in the rotation is cleaned.
-
-    Raises:
-        InputError: scaled (the factor is told), left-handed, not a rotation, or not finite.
-    """
+    """A pose from a file, [3, 4] or [4, 4], as f64[4, 4]; rounding up to 1e-3 in the rotation is cleaned. Raises
+    InputError: scaled (the factor is told), left-handed, not a rotation, or not finite."""
     numbers = np.asarray(matrix, np.float64)
     if numbers.shape not in ((3, 4), (4, 4)):
         raise InputError("pose has the wrong shape", where=where, expected="3x4 or 4x4 numbers", got=str(numbers.shape))
@@ -434,11 +409,8 @@ def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
 
 
 def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matrix:
-    """Pose f64[4, 4] from a unit quaternion (w, x, y, z) and a translation in metres.
-
-    Raises:
-        InputError: not finite, wrong count, or a quaternion whose length is not 1 within 1 %.
-    """
+    """Pose f64[4, 4] from a unit quaternion (w, x, y, z) and a translation in metres. Raises InputError: not finite,
+    wrong count, or a quaternion whose length is not 1 within 1 %."""
     q, t = np.asarray(wxyz, np.float64).reshape(-1), np.asarray(xyz_m, np.float64).reshape(-1)
     if q.shape != (4,) or t.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(t).all():
         what = "pose is not a quaternion and a translation"
@@ -453,12 +425,9 @@ def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matri
 def pose_near(
     ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S, where: str = "ego path"
 ) -> Matrix:
-    """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys.
-
-    Raises:
-        InputError: more than ``max_beyond_s`` outside, or in a gap of the path where the pose would be a guess
-            (``motion.gap_at``).
-    """
+    """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys. Raises
+    InputError: more than ``max_beyond_s`` outside, or in a gap of the path where the pose would be a guess
+    (``motion.gap_at``)."""
     inside = pose_at(ego.times_s, ego.world_from_ego, time_s)
     if inside is not None:
         gap = motion.gap_at(ego, time_s)
@@ -672,7 +641,8 @@ def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
 def complete_frames(
     streams: Mapping[str, Iterable[int]], options: ImportOptions, where: str, title: str, optional: Iterable[int] = ()
 ) -> list[int]:
-    """Frame numbers to import: those that every stream has, within ``options.frames``.
+    """Frame numbers to import: those that every stream has, within ``options.frames``. Raises InputError: a stream
+    lacks frames that others have (unless ``skip_missing``), or nothing is left.
 
     Args:
         streams: name of a camera or LiDAR -> its frame numbers.
@@ -680,9 +650,6 @@ def complete_frames(
         where: the log, for messages.
         title: the format's name, for messages.
         optional: frames that may be missing from every stream without a warning (documented gaps).
-
-    Raises:
-        InputError: a stream lacks frames that others have (unless ``skip_missing``), or nothing is left.
     """
     numbers = {name: set(found) for name, found in streams.items()}
     everything = set().union(*numbers.values()) - set(optional)
@@ -730,7 +697,7 @@ def folder_contents(folder: Path) -> str:
 
 
 def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOptions, where: Path, kind: str) -> Item:
-    """The one log that ``options.sequence`` means.
+    """The one log that ``options.sequence`` means. Raises UsageError: none fits, or several do.
 
     Args:
         matching: logs that fit it; all of them where none was chosen.
@@ -738,9 +705,6 @@ def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOpti
         options: ``sequence`` is used.
         where: folder that holds them.
         kind: what one is called: log, scene, drive, sequence.
-
-    Raises:
-        UsageError: none fits, or several do.
     """
     if len(matching) == 1:
         return matching[0]
@@ -751,16 +715,14 @@ def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOpti
 
 
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
-    """The data set's names of the cameras to import, in the order of ``available``.
+    """The data set's names of the cameras to import, in the order of ``available``. Raises UsageError: no such camera.
+    InputError: none of the usual ones is there.
 
     Args:
         available: the data set's name -> the name in the scene; either may be asked for.
         options: ``cameras`` is used.
         where: the log, for messages.
         usual: the data set's names taken when none is asked for; those that are not there are left out.
-
-    Raises:
-        UsageError: no such camera. InputError: none of the usual ones is there.
     """
     by_scene_name = {ours: theirs for theirs, ours in available.items()}
     listed = ", ".join(o if o == t else f"{o} ({t})" for t, o in available.items()) or "no cameras"
@@ -794,11 +756,8 @@ def refuse_missing_cameras(there: Iterable[str], usual: Iterable[str], options: 
 
 
 def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
-    """Refuse options of other formats that were set here: better than to do something else than asked.
-
-    Raises:
-        UsageError: one of ``names`` differs from its default.
-    """
+    """Refuse options of other formats that were set here: better than to do something else than asked. Raises
+    UsageError: one of ``names`` differs from its default."""
     default = ImportOptions()
     for name in names:
         if getattr(options, name) != getattr(default, name):

@@ -132,16 +132,14 @@ def looks_like_dgp(source: Path) -> bool:
 
 
 def import_dgp(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one scene into the scene directory ``out``; see the module text for what is read.
+    """Import one scene into the scene directory ``out``; see the module text for what is read. Raises UsageError: there
+    are several scenes and none was chosen, or there is no such scene or camera. InputError: something is missing,
+    malformed or contradictory; nothing is left at ``out``.
 
     Args:
         source: a scene's folder, or a folder of scenes.
         options: ``sequence`` names the scene's folder where there are several; ``frames`` counts images of the first
             chosen camera; ``cameras`` by either name (``CAMERA_01`` or ``camera_01``), all by default.
-
-    Raises:
-        UsageError: there are several scenes and none was chosen, or there is no such scene or camera.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     if not source.is_dir():
         raise InputError("DGP folder does not exist", where=str(source), expected="a folder")
@@ -365,11 +363,8 @@ def _class_names(folder: Path, scene: Mapping[str, Any]) -> dict[int, str]:
 
 
 def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
-    """A cloud: array ``data`` of an npz file, columns named by ``point_format`` (empty = X, Y, Z, INTENSITY).
-
-    Raises:
-        InputError: cut off, damaged, of another size than it declares, without coordinates, or not finite.
-    """
+    """A cloud: array ``data`` of an npz file, columns named by ``point_format`` (empty = X, Y, Z, INTENSITY). Raises
+    InputError: cut off, damaged, of another size than it declares, without coordinates, or not finite."""
     where = str(path)
     arrays = npz_arrays(store.read_bytes(path), where)
     note_unknown("point_cloud/*.npz", arrays, frozenset({"data"}))

@@ -128,11 +128,8 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
     turned back; both are counted in the scene's notes.
 
     Images whose size is kept are copied byte for byte, after a check that they are complete and of their camera's size.
-    At most two items per worker are in memory, beside the few that wait for the disk.
-
-    Raises:
-        InputError: an item is missing or damaged, or what is written contradicts itself. Nothing is left at ``out``.
-    """
+    At most two items per worker are in memory, beside the few that wait for the disk. Raises InputError: an item is
+    missing or damaged, or what is written contradicts itself. Nothing is left at ``out``."""
     dataset = content.source.dataset
     types.foreign_name(content.name, f"{dataset}: name of the log")
     moments: list[tuple[int, str]] = []
@@ -289,13 +286,8 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
 
     Tracks reach 0.05 s beyond their boxes, so that images at their ends are covered. Boxes of moving objects are
     brought to the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep counts as one moment,
-    without point times, and boxes stay as drawn.
-
-    Raises:
-        UsageError: no frame lies in the chosen range.
-        InputError: a file is missing or damaged; poses, times and units contradict each other. Nothing is left at
-            ``out``.
-    """
+    without point times, and boxes stay as drawn. Raises UsageError: no frame lies in the chosen range. InputError: a
+    file is missing or damaged; poses, times and units contradict each other. Nothing is left at ``out``."""
     check_motion(drive.ego, drive.where)
     chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
     records = sorted((*chosen.images, *chosen.sweeps), key=lambda record: record.time_s)
@@ -644,7 +636,7 @@ class BoxTracks:
         late_s: float = 0.0,
         where: str = "",
     ) -> None:
-        """Add one box.
+        """Add one box. Raises InputError: the size is not positive or absurd, or the id is longer than 200 bytes.
 
         Args:
             track: the object's id, the same in all frames.
@@ -657,9 +649,6 @@ class BoxTracks:
             late_s: how long after ``time_s`` the box was measured (a turning LiDAR reaches it at its own time). The
                 track's key stands at ``time_s``, moved there with the object's velocity.
             where: file and record, for messages.
-
-        Raises:
-            InputError: the size is not positive or absurd, or the id is longer than 200 bytes.
         """
         foreign_name(track, f"{where or self._where}: id of an object")
         size = box_size(*size_m, where=where or f"{self._where}: object {track} ({label})")
@@ -675,14 +664,12 @@ class BoxTracks:
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
+        Raises InputError: an object has two boxes at one moment; length and width are swapped.
 
         Args:
             speeds: how velocities are found; None = from the neighbouring boxes of a piece.
             images_s: time of a box -> times of the first and last image that show the object; a track reaches from the
                 first image of its first box to the last one of its last. None = from box to box.
-
-        Raises:
-            InputError: an object has two boxes at one moment; length and width are swapped.
         """
         tracks: list[Track] = []
         split = 0

@@ -102,7 +102,8 @@ class ImageFit:
         return not self.note
 
     def image(self, image: NDArray[np.uint8] | Path | bytes, where: str = "") -> NDArray[np.uint8] | Path | bytes:
-        """One recorded image as ``SceneWriter.add_frame`` wants it.
+        """One recorded image as ``SceneWriter.add_frame`` wants it. Raises InputError: damaged, or not of the recorded
+        size.
 
         Args:
             image: u8[H, W, 3], or path or bytes of a PNG or JPEG.
@@ -111,9 +112,6 @@ class ImageFit:
         Returns:
             ``image`` itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95
             for a JPEG, PNG for a PNG, grey for grey) for a file.
-
-        Raises:
-            InputError: damaged, or not of the recorded size.
         """
         if self.keeps_bytes:
             return image
@@ -154,16 +152,14 @@ class ImageFit:
 def fit_images(
     camera: Camera, options: ImportOptions, lens: Lens | None = None, target: Camera | None = None
 ) -> ImageFit:
-    """Plan what happens to the images of a camera.
+    """Plan what happens to the images of a camera. Raises InputError: the lens cannot be rectified like this.
+    UsageError: ``resolution`` is larger than the images.
 
     Args:
         camera: as recorded: size and intrinsics of the files; with a lens, its coefficients in ``distortion``.
         options: ``resolution`` is used.
         lens: the lens' distortion; None = images are rectified.
         target: pinhole camera to rectify to (size free, same name), for lenses that do not fit one by themselves.
-
-    Raises:
-        InputError: the lens cannot be rectified like this. UsageError: ``resolution`` is larger than the images.
     """
     changes = []
     table = None
@@ -209,10 +205,8 @@ def resized(width: int, height: int, resolution: Resolution | None, where: str =
 
 def covering_camera(camera: Camera, lens: Lens) -> Camera:
     """The pinhole camera of the recorded size with the shortest focal length, not below the lens', that sees no border.
-
-    Raises:
-        InputError: it would be more than ``MAX_FOCAL_GAIN`` times the lens', or the polynomial turns back inside it.
-    """
+    Raises InputError: it would be more than ``MAX_FOCAL_GAIN`` times the lens', or the polynomial turns back inside
+    it."""
     low, high = 1.0, MAX_FOCAL_GAIN
 
     def at(gain: float) -> Camera:

@@ -142,14 +142,12 @@ class Kitti360Box:
 
 
 def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
-    """Boxes of the classes in ``LABEL_OF``, one by one.
+    """Boxes of the classes in ``LABEL_OF``, one by one. Raises InputError: missing, cut off, malformed, or it declares
+    XML entities.
 
     Args:
         path: the XML file.
         left_out: filled with what is not read (``that are not cuboids``) and how often.
-
-    Raises:
-        InputError: missing, cut off, malformed, or it declares XML entities.
     """
     for number, item in enumerate(_objects(path)):
         where = f"{path}: object {number} ({item.tag})"
@@ -367,11 +365,7 @@ class Kitti360Calibration:
 
 
 def read_calibration(folder: Path) -> Kitti360Calibration:
-    """Read ``calibration/``.
-
-    Raises:
-        InputError: a file or entry is missing, or a matrix is not a rigid motion.
-    """
+    """Read ``calibration/``. Raises InputError: a file or entry is missing, or a matrix is not a rigid motion."""
     path = folder / "calib_cam_to_pose.txt"
     table = read_number_table(path)
     imu_from_camera = {
@@ -506,17 +500,15 @@ def looks_like_kitti360(source: Path) -> bool:
 
 
 def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one KITTI-360 drive into the scene directory ``out``; see the module text for what is understood.
+    """Import one KITTI-360 drive into the scene directory ``out``; see the module text for what is understood. Raises
+    UsageError: there are several drives and none was chosen, or an option does not apply. InputError: something is
+    missing, malformed or contradictory; nothing is left at ``out``.
 
     Args:
         source: the data set's folder, or ``data_2d_raw/<drive>`` in it.
         out: destination.
         options: ``sequence`` is the drive (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the
             stereo pair; all others are used too.
-
-    Raises:
-        UsageError: there are several drives and none was chosen, or an option does not apply.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     folders = _find(source, options)
     calibration = read_calibration(folders.root / "calibration")

@@ -127,10 +127,7 @@ def foreign_reader(where: str) -> Iterator[None]:
 
 def check_store(path: Path) -> None:
     """Refuse a store that is cut off, that contradicts itself, or that would take more memory than its files can need.
-
-    Raises:
-        InputError: so it is; nothing of the size that was promised has been allocated.
-    """
+    Raises InputError: so it is; nothing of the size that was promised has been allocated."""
     members = _members_of_folder(path) if path.is_dir() else _members_of_tar(path)
     where = f"{path}: {METADATA}"
     if METADATA not in members:
@@ -342,16 +339,13 @@ def files_of_ncore(source: Path, options: ImportOptions) -> LogFiles:
 
 
 def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one recording into the scene directory ``out``; see the module text for what is read.
+    """Import one recording into the scene directory ``out``; see the module text for what is read. Raises UsageError:
+    there are several recordings and none was chosen, or no such camera. InputError: missing, damaged or contradictory;
+    nothing is left at ``out``. ResourceError: the package is not installed.
 
     Args:
         source: a folder of stores, one of them, or the ``.json`` that lists them.
         options: ``sequence`` names the recording where a folder holds several (its beginning is enough).
-
-    Raises:
-        UsageError: there are several recordings and none was chosen, or no such camera.
-        InputError: missing, damaged or contradictory; nothing is left at ``out``. ResourceError: the package is not
-            installed.
     """
     refuse_options(options, "NCore", "poses", "boxes", "bridge_gaps")
     package()

@@ -349,11 +349,8 @@ def _finite(value: Any, where: str) -> float:
 
 @contextmanager
 def open_log(path: Path) -> Iterator[NuplanLog]:
-    """Open a log database read-only and check its schema.
-
-    Raises:
-        InputError: missing, not SQLite, damaged, or another schema.
-    """
+    """Open a log database read-only and check its schema. Raises InputError: missing, not SQLite, damaged, or another
+    schema."""
     if not path.is_file():
         raise InputError("log database does not exist", where=str(path), expected="a .db file")
     connection = None
@@ -418,17 +415,15 @@ def _databases(folder: Path) -> list[Path]:
 
 
 def import_nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one nuPlan log, or one scene of it, into the scene directory ``out``; see the module text.
+    """Import one nuPlan log, or one scene of it, into the scene directory ``out``; see the module text. Raises
+    UsageError: there are several logs and none was chosen, or an option does not apply. InputError: something is
+    missing, malformed or contradictory; nothing is left at ``out``.
 
     Args:
         source: the log's ``.db`` file, or a folder of such files.
         out: destination.
         options: ``sequence`` is the log's name (where ``source`` is a folder), a scene's name, or ``LOG/SCENE``.
             ``cameras`` default to all eight. ``poses``, ``boxes`` and ``untwist`` are refused; all others are used.
-
-    Raises:
-        UsageError: there are several logs and none was chosen, or an option does not apply.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     refuse_options(options, "nuPlan", "poses", "boxes", "untwist")
     path, scene = _find(source, options)

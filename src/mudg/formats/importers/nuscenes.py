@@ -78,10 +78,7 @@ def read_scan(path: Path) -> SweepPoints:
     """A ``LIDAR_TOP`` file: float32 rows x, y, z, intensity (0..255), ring; LiDAR axes x right, y forward, z up.
 
     Returns of the recording vehicle are dropped, and beams without a return, which are counted; intensity becomes 0..1.
-
-    Raises:
-        InputError: cut off, not finite, or rings that no 32-beam sensor has.
-    """
+    Raises InputError: cut off, not finite, or rings that no 32-beam sensor has."""
     rows, returns = read_float_rows(path, 5, "sweep")
     rings = rows[returns, 4]
     if len(rings) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
@@ -165,11 +162,8 @@ Row = dict[str, Any]
 
 
 def iter_records(path: Path, *, buffer_bytes: int = _BUFFER_BYTES) -> Iterator[Row]:
-    """Every record of a table, in file order. The file is read in pieces; one record is an object at a time.
-
-    Raises:
-        InputError: not a JSON array of flat objects, a record over 1 MiB, or the file is cut off.
-    """
+    """Every record of a table, in file order. The file is read in pieces; one record is an object at a time. Raises
+    InputError: not a JSON array of flat objects, a record over 1 MiB, or the file is cut off."""
     with _open(path) as file:
         buffer, offset, first = _start_of_array(file, path, buffer_bytes), 0, True
         position = buffer.index(b"[") + 1
@@ -198,11 +192,8 @@ def find_records(
 
     Records that do not match are not parsed: the field is looked for in the bytes, and the record around a hit is cut
     out and parsed strictly. Where that fails (braces inside texts) every record is parsed instead. The file's first and
-    last character are checked, so that a cut-off table is noticed. ``values`` are tokens: texts without escapes.
-
-    Raises:
-        InputError: no JSON array, a matching record that is malformed, or the file is cut off.
-    """
+    last character are checked, so that a cut-off table is noticed. ``values`` are tokens: texts without escapes. Raises
+    InputError: no JSON array, a matching record that is malformed, or the file is cut off."""
     found = 0
     try:
         for record in _search(path, field, values, buffer_bytes):
@@ -376,16 +367,14 @@ def looks_like_nuscenes(source: Path) -> bool:
 
 def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import one scene of a nuScenes release into the scene directory ``out``; see the module text for what is read.
+    Raises UsageError: the release holds several scenes and none was chosen, or there is no such scene or camera.
+    InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
 
     Args:
         source: the release's root, or its table folder.
         options: ``sequence`` names the scene (``scene-0061``, or ``v1.0-mini/scene-0061`` where several releases lie
             side by side); ``frames`` counts images of the first chosen camera; ``cameras`` by either name, all six by
             default.
-
-    Raises:
-        UsageError: the release holds several scenes and none was chosen, or there is no such scene or camera.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     if not source.is_dir():
         raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")

@@ -112,11 +112,8 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
 
 
 def read_frame(path: Path) -> dict[str, NDArray[Any]]:
-    """Columns of a pickled, gzipped data frame (``.pkl.gz``; plain ``.pkl`` too), by their names.
-
-    Raises:
-        InputError: missing, cut off, not a data frame, or it asks for something that is not plain data.
-    """
+    """Columns of a pickled, gzipped data frame (``.pkl.gz``; plain ``.pkl`` too), by their names. Raises InputError:
+    missing, cut off, not a data frame, or it asks for something that is not plain data."""
     content = store.read_bytes(path)
     if content[:2] == b"\x1f\x8b":
         content = gunzip(content, str(path))
@@ -124,11 +121,7 @@ def read_frame(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def gunzip(content: bytes, where: str) -> bytes:
-    """Unpack gzip, not beyond ``MAX_BYTES``.
-
-    Raises:
-        InputError: cut off, damaged, or larger than that.
-    """
+    """Unpack gzip, not beyond ``MAX_BYTES``. Raises InputError: cut off, damaged, or larger than that."""
     unpacker = zlib.decompressobj(wbits=31)
     try:
         unpacked = unpacker.decompress(content, MAX_BYTES + 1)
@@ -258,15 +251,13 @@ fit."""
 
 
 class PointClasses:
-    """The class tables of the chosen frames.
+    """The class tables of the chosen frames. Raises InputError: a frame has no table though others have one, or
+    ``classes.json`` is missing or malformed.
 
     Args:
         folder: ``annotations/semseg``. Without any table there no point has a class.
         frames: numbers of the chosen frames.
         options: ``skip_missing`` allows frames without a table.
-
-    Raises:
-        InputError: a frame has no table though others have one, or ``classes.json`` is missing or malformed.
     """
 
     def __init__(self, folder: Path, frames: Sequence[int], options: ImportOptions) -> None:
@@ -413,17 +404,15 @@ def _sequences(source: Path) -> list[str]:
 
 
 def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one PandaSet sequence into the scene directory ``out``; see the module text for what is understood.
+    """Import one PandaSet sequence into the scene directory ``out``; see the module text for what is understood. Raises
+    UsageError: the folder holds several sequences and none was chosen, or an option does not apply. InputError:
+    something is missing, malformed or contradictory; nothing is left at ``out``.
 
     Args:
         source: a sequence's folder, or the folder of sequences with ``options.sequence``.
         out: destination.
         options: ``frames``, ``cameras`` (default all six), ``sequence``, ``skip_missing``, ``test_every``,
             ``resolution`` and ``workers`` are used; ``poses``, ``boxes`` and ``untwist`` are refused.
-
-    Raises:
-        UsageError: the folder holds several sequences and none was chosen, or an option does not apply.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     common.refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
     folder = _chosen_sequence(source, options)

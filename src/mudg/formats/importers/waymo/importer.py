@@ -79,16 +79,14 @@ def looks_like_waymo(source: Path) -> bool:
 
 
 def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a Waymo log into the scene directory ``out``; see the module text for what is understood.
+    """Import a Waymo log into the scene directory ``out``; see the module text for what is understood. Raises
+    UsageError: several logs and none was chosen, or an option that this format cannot honour. InputError: something is
+    missing, damaged or contradictory; nothing is left at ``out``.
 
     Args:
         source: a TFRecord file, a folder of them, or a folder with the component folders of format 2.
         out: scene directory to make.
         options: ``sequence`` chooses a log where there are several, by its name or a part of it.
-
-    Raises:
-        UsageError: several logs and none was chosen, or an option that this format cannot honour.
-        InputError: something is missing, damaged or contradictory; nothing is left at ``out``.
     """
     _refuse_options(options)
     waymo = open_log(source, options)
@@ -143,11 +141,8 @@ def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
 
 
 def open_log(source: Path, options: ImportOptions) -> WaymoLog:
-    """The log that ``source`` and ``options.sequence`` name, its facts read and checked.
-
-    Raises:
-        UsageError: there are several, and none or more than one was meant. InputError: there is none, or it is damaged.
-    """
+    """The log that ``source`` and ``options.sequence`` name, its facts read and checked. Raises UsageError: there are
+    several, and none or more than one was meant. InputError: there is none, or it is damaged."""
     record, segment = _find(source, options)
     return TfrecordLog(record, options.frames) if record is not None else ParquetLog(source, segment, options.frames)
 
