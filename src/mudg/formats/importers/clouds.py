@@ -86,7 +86,6 @@ def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
 
 
 # --- PCD ------------------------------------------------------------------------------------------
-
 _PCD_TYPES: Final = {
     ("F", 4): "<f4",
     ("F", 8): "<f8",
@@ -256,7 +255,6 @@ def _count(word: str, where: str, largest: int = MAX_POINTS) -> int:
 
 
 # --- PLY ------------------------------------------------------------------------------------------
-
 _PLY_TYPES: Final = name_table(
     """i1: char, int8; u1: uchar, uint8; i2: short, int16; u2: ushort, uint16; i4: int, int32;
     u4: uint, uint32; f4: float, float32; f8: double, float64"""

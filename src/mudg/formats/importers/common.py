@@ -52,8 +52,6 @@ def name_table(text: str) -> dict[str, str]:
 #
 # Foreign tables and records: columns that must be there, numbers that must be finite, and the pyarrow package behind
 # some files.
-
-
 Columns = Mapping[str, NDArray[Any]]
 _ROUNDING: Final = 1e-3
 
@@ -130,8 +128,6 @@ def arrow_files(path: Path) -> Iterator[None]:
 # options ------------------------------------------------------------------------------------------
 #
 # What a user may choose when importing a log; every importer reads the same options and says which it cannot honour.
-
-
 Resolution = int | tuple[int, int]
 """Longest side in pixels, or width and height."""
 
@@ -205,8 +201,6 @@ def holdout_split(frame_ids_by_time: list[list[str]], test_every: int) -> dict[s
 
 
 # common -------------------------------------------------------------------------------------------
-
-
 Item = TypeVar("Item")
 Matrix = NDArray[np.float64]
 TimeUnit = Literal["ns", "us", "ms", "s"]

@@ -47,8 +47,6 @@ from mudg.scene.read import decode_image
 #
 # As in ``scene/schema.py``, the parser takes ``complain``: the importer raises at the first problem, ``mudg doctor``
 # collects all.
-
-
 Matrix = NDArray[np.float64]
 INDEX: Final = "log.json"
 FORMAT: Final = "mudg-log"
@@ -407,8 +405,6 @@ class _LogReader:
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 MAX_ALIKE: Final = 5
 """Findings with the same text that are listed one by one."""
 MAX_DELAY_S: Final = 1.0

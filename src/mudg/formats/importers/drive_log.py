@@ -450,8 +450,6 @@ def _ego_between(ego: EgoPath, start_s: float, end_s: float, where: str) -> EgoP
 #
 # Images are taken a little before or after the sweep they belong to; ``reach_images`` lets a track cover those at its
 # ends.
-
-
 MOVES_M: Final = 1.0
 """A track whose keys lie farther apart than this moves; boxes of others stay as they were drawn."""
 REACH_S: Final = 0.05
@@ -561,8 +559,6 @@ def clip_track(track: Track, start_s: float, end_s: float) -> Track | None:
 
 
 # box tracks ---------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 MAX_GAP_S: Final = 0.55
 """A moving object that is not seen for longer than this is split: interpolating across would invent its path."""

@@ -83,8 +83,6 @@ from mudg.scene.motion import GAP_M
 #
 # The files hold a hundred thousand objects of all classes; they are read in pieces and only the classes of ``LABEL_OF``
 # are kept.
-
-
 LABEL_OF_ID: Final = {
     13: "car",
     14: "truck",
@@ -293,8 +291,6 @@ def _shape(
 #
 # The data set's vehicle frame is that of the GPS/IMU: x forward, y right, z down. The ego frame here is the same point
 # with y to the left and z up.
-
-
 IMU_FROM_EGO: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 FISHEYES: Final = ("image_02", "image_03")
 FISHEYE_VIEW_DEG: Final = 90.0
@@ -430,8 +426,6 @@ def _read_fisheye(path: Path) -> dict[str, float]:
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI-360: Liao, Xie, Geiger; attribution, non-commercial, share-alike)"
 CAMERAS: Final = {"image_00": "front", "image_01": "front_stereo", "image_02": "side_left", "image_03": "side_right"}

@@ -75,8 +75,6 @@ from mudg.scene import motion
 # index is) or in a folder (``.zarr``). All metadata stand once more in one compressed member, which is what the package
 # reads. The package trusts sizes and codecs; here every size is held against the bytes that are there, and codecs other
 # than the format's own (pickle is one) are refused.
-
-
 METADATA: Final = ".zmetadata.cbor.xz"
 _BLOCK: Final = 512
 _HEADER: Final = struct.Struct("<4sIQI")
@@ -294,8 +292,6 @@ def _blosc_size(chunk: _StoredMember, where: str) -> int:
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 Record = TypeVar("Record", ImageRecord, SweepRecord)
 _LIST: Final[Known] = {
     **dict.fromkeys(("sequence_id", "sequence_timestamp_interval_us", "generic_meta_data", "version")),

@@ -68,8 +68,6 @@ from mudg.scene.schema import ref_problem
 #
 # Names of tables and columns are literal here. Nothing from the file becomes part of a query, a path outside the sensor
 # blobs, or code: calibration columns are pickles, read by ``plain_pickle``.
-
-
 SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {
     "log": ("token", "logfile", "location"),
     "ego_pose": ("token", "timestamp", "x", "y", "z", "qw", "qx", "qy", "qz"),
@@ -372,8 +370,6 @@ def open_log(path: Path) -> Iterator[NuplanLog]:
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 4.0 with the nuPlan dataset licence (Motional; attribution, non-commercial, share-alike)"
 CAMERAS: Final = name_table(

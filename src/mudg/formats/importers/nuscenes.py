@@ -45,8 +45,6 @@ from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, S
 from mudg.formats.unknown_fields import note_unknown
 
 # nuScenes sensors: cameras from their intrinsics, and ``LIDAR_TOP`` files with the time of every point ----------------
-
-
 LICENCE: Final = "CC BY-NC-SA 4.0 and the nuScenes terms of use (Motional; attribution, non-commercial, share-alike)"
 CAMERAS: Final[Mapping[str, str]] = name_table(
     """front: CAM_FRONT; front_left: CAM_FRONT_LEFT; front_right: CAM_FRONT_RIGHT; back: CAM_BACK;
@@ -115,8 +113,6 @@ def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray
 # The tables of the full release are large (``sample_data.json`` and ``ego_pose.json`` hold 2.6 million records each).
 # What an import needs of them is one scene, so records are found by the value of one field while the file passes
 # through a buffer of a few megabytes; only matching records become Python objects.
-
-
 _BUFFER_BYTES: Final = 1 << 22
 _MAX_RECORD_BYTES: Final = 1 << 20
 _FLAT_RECORD: Final = rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}'
@@ -333,8 +329,6 @@ class TokenTable:
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 
 LIDAR: Final = "LIDAR_TOP"

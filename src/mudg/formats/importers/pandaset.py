@@ -71,8 +71,6 @@ from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
 # The forms of pandas 0.2x, 1.x and 2.x are understood: a data frame is a manager of blocks, each block an array of
 # several columns and the places of these columns. Extension types (categories, text arrays of pandas 3) are refused by
 # name.
-
-
 _MANAGERS: Final = ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")
 MAX_COLUMNS: Final = 1000
 _NEW_BLOCK: Final = "pandas.core.internals.blocks.new_block"
@@ -200,8 +198,6 @@ def _array(value: Any) -> NDArray[Any]:
 
 
 # classes that people gave to PandaSet's points: ``annotations/semseg`` -> train ids of ``base/palette.py`` ------------
-
-
 CLASS_OF: Final[dict[str, str]] = {
     "Smoke": "",
     "Exhaust": "",
@@ -316,8 +312,6 @@ def _names(path: Path) -> Mapping[int, str]:
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY 4.0 (PandaSet: Hesai and Scale AI; attribution)"
 CAMERAS: Final = name_table(

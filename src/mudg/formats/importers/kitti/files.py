@@ -29,8 +29,6 @@ from mudg.formats.unknown_fields import note_unknown
 #
 # The sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured
 # a / 2 pi turns later.
-
-
 SENSOR: Final = "velodyne"
 TURN_PERIOD_S: Final = 0.1
 _TURN_STEPS: Final = 36
@@ -80,8 +78,6 @@ def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s
 #
 # KITTI counts pixels from the centre of the top-left pixel; this package from its corner. So 0.5 is added to the
 # principal point here, once.
-
-
 PIXEL_CENTRE_PX = 0.5
 _NUMBERED = tuple(
     f"{name}_{number:02d}" for name in ("S", "K", "D", "R", "T", "S_rect", "R_rect", "P_rect") for number in range(4)
@@ -232,8 +228,6 @@ def _pose_file(path: Path) -> Matrix:
 
 
 # poses --------------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 EARTH_RADIUS_M = 6378137.0
 _OXTS_VALUES = 30
@@ -388,8 +382,6 @@ def _stamp(line: str, where: str) -> float:
 #
 # KITTI boxes: tracking and object label text, raw-data tracklets; all become boxes in the velodyne frame per frame
 # number.
-
-
 MAX_TRACKLET_BYTES = 256 * 1024 * 1024
 LABELS = frozenset(
     ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")

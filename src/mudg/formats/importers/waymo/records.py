@@ -301,8 +301,6 @@ def int_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[
 # points holds where its object was when the LiDAR passed it; a description of the data set speaks of the frame's start
 # instead. So the log is asked: under which of the ``Moment`` do most points near fast objects lie inside their boxes?
 # Each box is then carried, with its object's own speed, to the moment that all of the frame's points are given for.
-
-
 Moment = Literal["seen", "start", "pose"]
 """A box holds when the LiDAR looked at its object, at the frame's timestamp, or at the moment of the frame's pose."""
 
