@@ -23,7 +23,7 @@ import numpy as np
 from PIL import Image
 
 from mudg.base.geometry import yaw_matrix
-from mudg.formats.importers.waymo.tfrecord import crc32c, masked_crc32c
+from mudg.formats.importers.waymo.logs import crc32c, masked_crc32c
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 import write_waymo

@@ -15,9 +15,17 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Source, SweepPoints, Track
 from mudg.formats.importers import common
-from mudg.formats.importers.box_tracks import BoxTimes, BoxTracks, clip_track, reach_images
 from mudg.formats.importers.common import ImportOptions, nearest_index
-from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord, write_log
+from mudg.formats.importers.drive_log import (
+    BoxTimes,
+    BoxTracks,
+    DriveLog,
+    ImageRecord,
+    SweepRecord,
+    clip_track,
+    reach_images,
+    write_log,
+)
 from mudg.scene.check import check_records
 
 UP = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 1.5], [0, 0, 0, 1]])

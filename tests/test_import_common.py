@@ -13,8 +13,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import from_rotation_translation, matrix_from_quaternion, yaw_matrix
 from mudg.base.types import Camera
 from mudg.formats.importers import common, images
-from mudg.formats.importers.common import ImportOptions, parse_resolution
-from mudg.formats.importers.layout import number_ranges
+from mudg.formats.importers.common import ImportOptions, number_ranges, parse_resolution
 
 CAMERA = Camera("front", 96, 64, 70.0, 72.0, 47.0, 33.0)
 

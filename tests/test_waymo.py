@@ -19,10 +19,11 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.city import sensors as rig
-from mudg.formats.importers.waymo import messages, records, sensors, tfrecord
-from mudg.formats.importers.waymo.parquet import ParquetTable
+from mudg.formats.importers.waymo import logs as tfrecord
+from mudg.formats.importers.waymo import records, sensors
+from mudg.formats.importers.waymo import records as messages
+from mudg.formats.importers.waymo.logs import ParquetTable, TfrecordLog
 from mudg.formats.importers.waymo.records import WaymoBox
-from mudg.formats.importers.waymo.tfrecord import TfrecordLog
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points
 

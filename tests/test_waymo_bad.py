@@ -17,9 +17,9 @@ from waymo_logs import ingest, write
 
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.formats.importers import RECOGNISERS
+from mudg.formats.importers.waymo import logs as waymo_tfrecord
 from mudg.formats.importers.waymo import records as waymo_log
-from mudg.formats.importers.waymo import tfrecord as waymo_tfrecord
-from mudg.formats.importers.waymo.parquet import ParquetTable
+from mudg.formats.importers.waymo.logs import ParquetTable
 from mudg.scene.read import read_points
 
 

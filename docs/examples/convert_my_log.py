@@ -60,13 +60,9 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def camera(values: dict) -> dict:
     (fx, _, cx), (_, fy, cy), _ = values["K"]
+    pinhole = {"width": values["width"], "height": values["height"], "fx": fx, "fy": fy, "cx": cx, "cy": cy}
     return {
-        "width": values["width"],
-        "height": values["height"],
-        "fx": fx,
-        "fy": fy,
-        "cx": cx,
-        "cy": cy,
+        **pinhole,
         "distortion": {"model": "brown_conrady", "coefficients": values["D"]},  # leave out if images are rectified
         "ego_from_camera": values["ego_from_sensor"],  # camera axes: x right, y down, z forward
     }

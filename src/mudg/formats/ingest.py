@@ -39,11 +39,7 @@ def is_abandoned(out: Path) -> bool:
 
 def write_scene(config: IngestConfig, source: Path, kind: str, work: RunDir) -> dict[str, Any]:
     """Make the scene in its folder and draw its contact sheet; returns a summary. An import that fails in a new or
-    empty folder leaves nothing.
-
-    Raises:
-        InputError: the log is malformed or contradictory.
-    """
+    empty folder leaves nothing. Raises InputError: the log is malformed or contradictory."""
     if kind not in (CITY, _SCENE, config.format):
         log.info(f"ingest: {source} recognised as {kind}")
     try:
@@ -92,11 +88,8 @@ _SCENE = "scene"
 
 
 def kind_of(config: IngestConfig, source: Path) -> str:
-    """Which format ``source`` has: one of a log, ``city`` or ``scene``.
-
-    Raises:
-        UsageError: there is no such format. InputError: the log has none that is known.
-    """
+    """Which format ``source`` has: one of a log, ``city`` or ``scene``. Raises UsageError: there is no such format.
+    InputError: the log has none that is known."""
     if str(source) == CITY:
         return CITY
     if config.format != "auto":
@@ -112,13 +105,9 @@ def kind_of(config: IngestConfig, source: Path) -> str:
     inside = "a file"
     if source.is_dir():
         inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
-    raise InputError(
-        "the log's format was not recognised",
-        where=str(source),
-        expected=f"a scene, or a log of one of: {', '.join(known_formats())}",
-        got=inside,
-        remedy="give the folder of one drive or sequence, or name the format with --format",
-    )
+    what, expected = "the log's format was not recognised", f"a scene, or a log of one of: {', '.join(known_formats())}"
+    remedy = "give the folder of one drive or sequence, or name the format with --format"
+    raise InputError(what, where=str(source), expected=expected, got=inside, remedy=remedy)
 
 
 def _make(kind: str, config: IngestConfig, source: Path, out: Path) -> Scene:
@@ -154,14 +143,12 @@ def import_options(config: IngestConfig) -> ImportOptions:
 
 def source_digest(source: Path, kind: str, config: IngestConfig) -> str:
     """What identifies a log without reading all of it: names, sizes and modification times of the files that belong to
-    the chosen one; a scene's own digest.
+    the chosen one; a scene's own digest. Raises UsageError: several logs and none was chosen. InputError: none is
+    there.
 
     Args:
         kind: format, or ``scene``.
         config: chooses the log, where a folder holds many; files it names count, too.
-
-    Raises:
-        UsageError: several logs and none was chosen. InputError: none is there.
     """
     if kind == _SCENE:
         return store.digest(source)

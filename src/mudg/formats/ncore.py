@@ -51,21 +51,14 @@ class NCorePackage:
 
 
 def package() -> NCorePackage:
-    """The package, loaded when it is first asked for.
-
-    Raises:
-        ResourceError: it is not installed.
-    """
+    """The package, loaded when it is first asked for. Raises ResourceError: it is not installed."""
     try:
         data, files = importlib.import_module("ncore.data"), importlib.import_module("ncore.data.v4")
         sensors = importlib.import_module("ncore.sensors")
         return NCorePackage(data, files, sensors, importlib.import_module("ncore.impl.common.transformations"))
     except ImportError as error:
-        raise ResourceError(
-            "NCore files need the package nvidia-ncore, which is not installed",
-            got=str(error),
-            remedy="pip install 'mudg[ncore]'",
-        ) from error
+        what = "NCore files need the package nvidia-ncore, which is not installed"
+        raise ResourceError(what, got=str(error), remedy="pip install 'mudg[ncore]'") from error
 
 
 def close(reader: Any) -> None:

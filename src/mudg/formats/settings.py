@@ -14,19 +14,11 @@ class IngestConfig:
     """Convert a dataset log, or the built-in procedural city, to a scene directory."""
 
     FIXED: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "city": (
-            "rate_hz",
-            "hfov_deg",
-            "rig_variation",
-            "lidar_lower_deg",
-            "lidar_upper_deg",
-            "lidar_range_m",
-            "lidar_noise_m",
-            "lidar_dropout",
-            "style",
-            "crossing",
-            "shift_margin_m",
-            "sensor_noise",
+        "city": tuple(
+            (
+                "rate_hz hfov_deg rig_variation lidar_lower_deg lidar_upper_deg lidar_range_m lidar_noise_m "
+                "lidar_dropout style crossing shift_margin_m sensor_noise"
+            ).split()
         )
     }
 

@@ -14,8 +14,7 @@ from pathlib import Path
 
 from mudg.base.plugins import load_plugin, plugins
 from mudg.base.types import Scene
-from mudg.formats.importers.common import ImportOptions, foreign_numbers
-from mudg.formats.importers.layout import LogFiles
+from mudg.formats.importers.common import ImportOptions, LogFiles, foreign_numbers
 from mudg.formats.unknown_fields import named_once
 
 Importer = Callable[[Path, Path, ImportOptions], Scene]
@@ -108,11 +107,8 @@ def _looks_like(name: str, source: Path) -> bool:
 
 
 def files_of(name: str, source: Path, options: ImportOptions) -> LogFiles:
-    """What identifies the log that format ``name`` would import from ``source``; nothing large is read.
-
-    Raises:
-        UsageError: several logs and none was chosen. InputError: none is there.
-    """
+    """What identifies the log that format ``name`` would import from ``source``; nothing large is read. Raises
+    UsageError: several logs and none was chosen. InputError: none is there."""
     return _functions(name)[2](source, options)
 
 

@@ -29,50 +29,39 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common, drive_log
-from mudg.formats.importers.box_tracks import BoxTracks
 from mudg.formats.importers.common import (
     Columns,
     ImportOptions,
-    arrow_files,
-    finite_columns,
-    require_columns,
-    returns_of,
-    unit_intensity,
-)
-from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.formats.importers.layout import (
     LogFiles,
+    arrow_files,
     chosen_cameras,
+    finite_columns,
     folder_contents,
+    name_table,
     refuse_missing_cameras,
     refuse_untwist,
+    require_columns,
+    returns_of,
     the_only,
+    unit_intensity,
 )
+from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
 from mudg.formats.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 
 LICENCE: Final = "CC BY-NC-SA 4.0 (Argoverse 2: Wilson et al.; attribution, non-commercial, share-alike)"
-RING_CAMERAS: Final = (
-    "ring_front_center",
-    "ring_front_left",
-    "ring_front_right",
-    "ring_side_left",
-    "ring_side_right",
-    "ring_rear_left",
-    "ring_rear_right",
+RING_CAMERAS: Final = tuple(
+    (
+        "ring_front_center ring_front_left ring_front_right ring_side_left ring_side_right ring_rear_left "
+        "ring_rear_right"
+    ).split()
 )
-CAMERAS: Final[Mapping[str, str]] = {
-    "ring_front_center": "front",
-    "ring_front_left": "front_left",
-    "ring_front_right": "front_right",
-    "ring_side_left": "side_left",
-    "ring_side_right": "side_right",
-    "ring_rear_left": "rear_left",
-    "ring_rear_right": "rear_right",
-    "stereo_front_left": "stereo_left",
-    "stereo_front_right": "stereo_right",
-}
+CAMERAS: Final[Mapping[str, str]] = name_table(
+    """front: ring_front_center; front_left: ring_front_left; front_right: ring_front_right;
+    side_left: ring_side_left; side_right: ring_side_right; rear_left: ring_rear_left;
+    rear_right: ring_rear_right; stereo_left: stereo_front_left; stereo_right: stereo_front_right"""
+)
 SENSOR: Final = "lidar"
 _UPPER: Final = "up_lidar"
 _LOWER: Final = "down_lidar"
@@ -104,39 +93,16 @@ OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
 }
 """Tables -> their columns."""
 
-LABELS: Final[Mapping[str, str]] = {
-    "REGULAR_VEHICLE": "car",
-    "PEDESTRIAN": "pedestrian",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "BICYCLE": "bicycle",
-    "BICYCLIST": "rider",
-    "MOTORCYCLE": "motorcycle",
-    "MOTORCYCLIST": "rider",
-    "WHEELED_RIDER": "rider",
-    "WHEELED_DEVICE": "wheeled_device",
-    "BUS": "bus",
-    "SCHOOL_BUS": "bus",
-    "ARTICULATED_BUS": "bus",
-    "LARGE_VEHICLE": "truck",
-    "BOX_TRUCK": "truck",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "truck",
-    "VEHICULAR_TRAILER": "trailer",
-    "RAILED_VEHICLE": "tram",
-    "STROLLER": "stroller",
-    "WHEELCHAIR": "wheelchair",
-    "DOG": "animal",
-    "ANIMAL": "animal",
-    "BOLLARD": "bollard",
-    "CONSTRUCTION_CONE": "traffic_cone",
-    "CONSTRUCTION_BARREL": "construction_barrel",
-    "STOP_SIGN": "traffic_sign",
-    "SIGN": "traffic_sign",
-    "MOBILE_PEDESTRIAN_CROSSING_SIGN": "traffic_sign",
-    "MOBILE_PEDESTRIAN_SIGN": "traffic_sign",
-    "MESSAGE_BOARD_TRAILER": "message_board_trailer",
-    "TRAFFIC_LIGHT_TRAILER": "traffic_light_trailer",
-}
+LABELS: Final[Mapping[str, str]] = name_table(
+    """car: REGULAR_VEHICLE; pedestrian: PEDESTRIAN, OFFICIAL_SIGNALER; bicycle: BICYCLE;
+    rider: BICYCLIST, MOTORCYCLIST, WHEELED_RIDER; motorcycle: MOTORCYCLE; wheeled_device: WHEELED_DEVICE;
+    bus: BUS, SCHOOL_BUS, ARTICULATED_BUS; truck: LARGE_VEHICLE, BOX_TRUCK, TRUCK, TRUCK_CAB;
+    trailer: VEHICULAR_TRAILER; tram: RAILED_VEHICLE; stroller: STROLLER; wheelchair: WHEELCHAIR;
+    animal: DOG, ANIMAL; bollard: BOLLARD; traffic_cone: CONSTRUCTION_CONE;
+    construction_barrel: CONSTRUCTION_BARREL;
+    traffic_sign: STOP_SIGN, SIGN, MOBILE_PEDESTRIAN_CROSSING_SIGN, MOBILE_PEDESTRIAN_SIGN;
+    message_board_trailer: MESSAGE_BOARD_TRAILER; traffic_light_trailer: TRAFFIC_LIGHT_TRAILER"""
+)
 """The data set's categories -> labels."""
 
 
@@ -146,17 +112,14 @@ def looks_like_argoverse2(source: Path) -> bool:
 
 
 def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one log into the scene directory ``out``; see the module text for what is read.
+    """Import one log into the scene directory ``out``; see the module text for what is read. Raises UsageError: there
+    are several logs and none was chosen, or there is no such log or camera. InputError: something is missing, malformed
+    or contradictory; nothing is left at ``out``. ResourceError: pyarrow, which reads Feather files, is not installed.
 
     Args:
         source: a log's folder, or a folder of logs.
         options: ``sequence`` names the log (its beginning is enough) where there are several; ``frames`` counts images
             of the first chosen camera; ``cameras`` by either name, the seven ring cameras by default.
-
-    Raises:
-        UsageError: there are several logs and none was chosen, or there is no such log or camera.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
-        ResourceError: pyarrow, which reads Feather files, is not installed.
     """
     if not source.is_dir():
         raise InputError("Argoverse 2 folder does not exist", where=str(source), expected="a folder")
@@ -176,13 +139,10 @@ def _logs(source: Path) -> list[Path]:
 def _choose_log(source: Path, options: ImportOptions) -> Path:
     logs = _logs(source)
     if not logs:
-        raise InputError(
-            "no Argoverse 2 log found",
-            where=str(source),
-            got=folder_contents(source),
-            expected="city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders",
-            remedy="give the folder of one log of the sensor data set",
-        )
+        what = "no Argoverse 2 log found"
+        expected = "city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders"
+        remedy = "give the folder of one log of the sensor data set"
+        raise InputError(what, where=str(source), got=folder_contents(source), expected=expected, remedy=remedy)
     matching = [path for path in logs if path.resolve().name.startswith(options.sequence)]
     return the_only(matching, [path.name for path in logs], options, source, "log")
 
@@ -199,12 +159,9 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
     image_folder, sweep_folder = folder / "sensors" / "cameras", folder / "sensors" / "lidar"
     there = {raw: name for raw, name in CAMERAS.items() if (image_folder / raw).is_dir()}
     if not there:
-        raise InputError(
-            "the log has no images",
-            where=str(image_folder),
-            expected="folders ring_front_center, ring_front_left, ... with images named by nanoseconds",
-            remedy="download the sensor data set's camera archives, too; a scene is made of images",
-        )
+        expected = "folders ring_front_center, ring_front_left, ... with images named by nanoseconds"
+        remedy = "download the sensor data set's camera archives, too; a scene is made of images"
+        raise InputError("the log has no images", where=str(image_folder), expected=expected, remedy=remedy)
     refuse_missing_cameras(there.values(), (CAMERAS[raw] for raw in RING_CAMERAS), options, image_folder)
     chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, RING_CAMERAS)}
     files = {name: _files_by_time(image_folder / raw, (".jpg", ".jpeg", ".png")) for name, raw in chosen.items()}
@@ -269,12 +226,8 @@ def _with_poses(files: Mapping[int, Path], ego: EgoPath, zero_ns: int, sensor: s
 
 
 def read_feather(path: Path, columns: Sequence[str]) -> Columns:
-    """Named columns of a Feather (Arrow IPC) file as arrays of one length.
-
-    Raises:
-        ResourceError: pyarrow is not installed.
-        InputError: missing, cut off, without one of the columns, or with empty values.
-    """
+    """Named columns of a Feather (Arrow IPC) file as arrays of one length. Raises ResourceError: pyarrow is not
+    installed. InputError: missing, cut off, without one of the columns, or with empty values."""
     with arrow_files(path):
         import pyarrow.feather
 
@@ -374,11 +327,8 @@ def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()
     """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time.
 
     Beams without a return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it,
-    f64[3] each.
-
-    Raises:
-        InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn.
-    """
+    f64[3] each. Raises InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one
+    turn."""
     where = str(path)
     columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
     returns = returns_of(columns, where, places)
@@ -389,12 +339,9 @@ def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()
     if offset_ns.dtype.kind not in "iu" or (
         len(offset_ns) and int(np.abs(offset_ns.astype(np.int64)).max()) > _MAX_OFFSET_NS
     ):
-        raise InputError(
-            "point times are no nanoseconds of one turn",
-            where=f"{where}: offset_ns",
-            expected="whole nanoseconds since the sweep's time, under half a second",
-            got=f"{offset_ns.dtype}, up to {offset_ns.max():g}",
-        )
+        what, where = "point times are no nanoseconds of one turn", f"{where}: offset_ns"
+        expected = "whole nanoseconds since the sweep's time, under half a second"
+        raise InputError(what, where=where, expected=expected, got=f"{offset_ns.dtype}, up to {offset_ns.max():g}")
     xyz = transform_points(invert(ego_from_lidar), xyz_ego).astype(np.float32)
     dt_s = (offset_ns.astype(np.float64) / NANOSECONDS).astype(np.float32)
     return SweepPoints(xyz, intensity, dt_s, no_returns=int((~returns).sum()))

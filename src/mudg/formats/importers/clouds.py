@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 
 from mudg.base import store
 from mudg.base.errors import InputError
+from mudg.formats.importers.common import name_table
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.clouds import is_return
 
@@ -30,64 +31,13 @@ _LZF_MAX_GROWTH: Final = 90
 """A token of 3 bytes makes at most 264."""
 
 USUAL: Final = frozenset(
-    {
-        "x",
-        "y",
-        "z",
-        "intensity",
-        "reflectivity",
-        "reflectance",
-        "remission",
-        "i",
-        "ring",
-        "channel",
-        "laser_id",
-        "lidar_info",
-        "line",
-        "tag",
-        "t",
-        "time",
-        "timestamp",
-        "time_stamp",
-        "offset_time",
-        "offset_ns",
-        "range",
-        "distance",
-        "azimuth",
-        "elevation",
-        "ambient",
-        "noise",
-        "near_ir",
-        "signal",
-        "return_type",
-        "return_number",
-        "number_of_returns",
-        "confidence",
-        "rgb",
-        "rgba",
-        "r",
-        "g",
-        "b",
-        "a",
-        "red",
-        "green",
-        "blue",
-        "alpha",
-        "nx",
-        "ny",
-        "nz",
-        "normal_x",
-        "normal_y",
-        "normal_z",
-        "curvature",
-        "label",
-        "class",
-        "classification",
-        "instance",
-        "object",
-        "velocity",
-        "doppler",
-    }
+    (
+        "x y z intensity reflectivity reflectance remission i ring channel laser_id lidar_info line tag t "
+        "time timestamp time_stamp offset_time offset_ns range distance azimuth elevation ambient noise "
+        "near_ir signal return_type return_number number_of_returns confidence rgb rgba r g b a red green "
+        "blue alpha nx ny nz normal_x normal_y normal_z curvature label class classification instance "
+        "object velocity doppler"
+    ).split()
 )
 """Fields that clouds of LiDARs usually have, whatever their case: no format of clouds closes its list."""
 
@@ -108,49 +58,34 @@ class Cloud:
 
 
 def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
-    """Read a cloud by the suffix of its name.
+    """Read a cloud by the suffix of its name. Raises InputError: unknown suffix, cut off, sizes that contradict each
+    other, no coordinates, values not finite.
 
     Args:
         known: names of fields that the caller reads, or knows to be there, besides ``USUAL``.
-
-    Raises:
-        InputError: unknown suffix, cut off, sizes that contradict each other, no coordinates, values not finite.
     """
     reader = READERS.get(path.suffix.lower())
     if reader is None:
-        raise InputError(
-            "point cloud format is not known",
-            where=str(path),
-            expected=", ".join(READERS),
-            got=path.suffix or "no suffix",
-        )
+        what = "point cloud format is not known"
+        raise InputError(what, where=str(path), expected=", ".join(READERS), got=path.suffix or "no suffix")
     columns = reader(store.read_bytes(path), str(path))
     absent = [name for name in "xyz" if name not in columns]
     if absent:
-        raise InputError(
-            "cloud has no coordinates",
-            where=str(path),
-            expected="fields x, y, z",
-            got=", ".join(columns) or "no fields",
-        )
+        what = "cloud has no coordinates"
+        raise InputError(what, where=str(path), expected="fields x, y, z", got=", ".join(columns) or "no fields")
     note_unknown(f"*{path.suffix}", [name for name in columns if name.lower() not in USUAL], frozenset(known))
     xyz = np.stack([columns[name].astype(np.float64) for name in "xyz"], 1)
     nowhere = ~is_return(xyz)
     xyz = xyz[~nowhere]
     if not np.isfinite(xyz).all():
         bad = int((~np.isfinite(xyz).all(1)).sum())
-        raise InputError(
-            "cloud holds coordinates that are not finite",
-            where=str(path),
-            got=f"{bad} of {len(xyz)} points",
-            remedy="leave missing returns out, or write all three coordinates as NaN",
-        )
+        got, remedy = f"{bad} of {len(xyz)} points", "leave missing returns out, or write all three coordinates as NaN"
+        raise InputError("cloud holds coordinates that are not finite", where=str(path), got=got, remedy=remedy)
     rest = {name: values[~nowhere] for name, values in columns.items() if name not in "xyz"}
     return Cloud(xyz, rest, int(nowhere.sum()))
 
 
 # --- PCD ------------------------------------------------------------------------------------------
-
 _PCD_TYPES: Final = {
     ("F", 4): "<f4",
     ("F", 8): "<f8",
@@ -183,12 +118,8 @@ def read_pcd(content: bytes, where: str) -> dict[str, NDArray]:
     points = _count(header["POINTS"][0], f"{where}: POINTS")
     width, height = (_count(header[key][0], f"{where}: {key}") for key in ("WIDTH", "HEIGHT"))
     if width * height != points:
-        raise InputError(
-            "cloud contradicts itself",
-            where=where,
-            expected=f"WIDTH x HEIGHT = {width * height} points",
-            got=f"POINTS {points}",
-        )
+        expected = f"WIDTH x HEIGHT = {width * height} points"
+        raise InputError("cloud contradicts itself", where=where, expected=expected, got=f"POINTS {points}")
     body = content[start:]
     kind = header["DATA"][0].lower()
     if kind == "ascii":
@@ -203,9 +134,8 @@ def read_pcd(content: bytes, where: str) -> dict[str, NDArray]:
     if kind == "binary_compressed":  # field after field, all points of one together
         flat = _pcd_unpacked(body, points, size, where)
         return {field.name: np.frombuffer(flat, field.kind, points, field.byte * points).copy() for field in fields}
-    raise InputError(
-        "cloud's DATA is of no known kind", where=where, expected="ascii, binary or binary_compressed", got=kind[:40]
-    )
+    what = "cloud's DATA is of no known kind"
+    raise InputError(what, where=where, expected="ascii, binary or binary_compressed", got=kind[:40])
 
 
 def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
@@ -214,13 +144,8 @@ def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
     while "DATA" not in header:
         end = content.find(b"\n", start, _MAX_HEADER_BYTES)
         if end < 0:
-            raise InputError(
-                "not a PCD file",
-                where=where,
-                expected=f"a header with {', '.join(_PCD_KEYS)}",
-                got=f"{len(content)} bytes without the line DATA",
-                remedy="is the file cut off?",
-            )
+            expected, got = f"a header with {', '.join(_PCD_KEYS)}", f"{len(content)} bytes without the line DATA"
+            raise InputError("not a PCD file", where=where, expected=expected, got=got, remedy="is the file cut off?")
         words = content[start:end].decode("ascii", "replace").split()
         start = end + 1
         if words and not words[0].startswith("#"):
@@ -229,12 +154,8 @@ def _pcd_header(content: bytes, where: str) -> tuple[dict[str, list[str]], int]:
     header.setdefault("HEIGHT", ["1"])
     absent = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT", "POINTS", "DATA") if not header.get(key)]
     if absent:
-        raise InputError(
-            "PCD header is incomplete",
-            where=where,
-            expected=", ".join(absent),
-            got=", ".join(f"{key} {' '.join(values)}" for key, values in header.items())[:200],
-        )
+        got = ", ".join(f"{key} {' '.join(values)}" for key, values in header.items())[:200]
+        raise InputError("PCD header is incomplete", where=where, expected=", ".join(absent), got=got)
     return header, start
 
 
@@ -243,12 +164,8 @@ def _pcd_fields(header: dict[str, list[str]], where: str) -> tuple[list[_PcdFiel
     numbers a row."""
     names, sizes, types, counts = (header[key] for key in ("FIELDS", "SIZE", "TYPE", "COUNT"))
     if not len(names) == len(sizes) == len(types) == len(counts):
-        raise InputError(
-            "PCD header contradicts itself",
-            where=where,
-            expected="as many SIZE, TYPE and COUNT as FIELDS",
-            got=f"{len(names)}, {len(sizes)}, {len(types)}, {len(counts)}",
-        )
+        what, got = "PCD header contradicts itself", f"{len(names)}, {len(sizes)}, {len(types)}, {len(counts)}"
+        raise InputError(what, where=where, expected="as many SIZE, TYPE and COUNT as FIELDS", got=got)
     fields: dict[str, _PcdField] = {}
     byte = column = 0
     for name, size, kind, count in zip(names, sizes, types, counts, strict=True):
@@ -270,12 +187,8 @@ def _number_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[n
     except ValueError as error:
         raise InputError("cloud holds a value that is no number", where=where, got=str(error)[:120]) from error
     if len(table) != rows * columns:
-        raise InputError(
-            "cloud is cut off or has rows of another length",
-            where=where,
-            got=f"{len(table)} numbers",
-            expected=f"{rows} rows of {columns}",
-        )
+        what = "cloud is cut off or has rows of another length"
+        raise InputError(what, where=where, got=f"{len(table)} numbers", expected=f"{rows} rows of {columns}")
     return table.reshape(rows, columns)
 
 
@@ -284,12 +197,8 @@ def _pcd_unpacked(body: bytes, points: int, size: int, where: str) -> bytes:
     packed, unpacked = (int(n) for n in np.frombuffer(body, "<u4", 2))
     _enough(body, 8 + packed, where)
     if unpacked != points * size or unpacked > packed * _LZF_MAX_GROWTH + 1:
-        raise InputError(
-            "compressed cloud contradicts itself",
-            where=where,
-            expected=f"{points} points of {size} bytes",
-            got=f"{packed} bytes said to unpack to {unpacked}",
-        )
+        what, expected = "compressed cloud contradicts itself", f"{points} points of {size} bytes"
+        raise InputError(what, where=where, expected=expected, got=f"{packed} bytes said to unpack to {unpacked}")
     return lzf_decompress(body[8 : 8 + packed], unpacked, where)
 
 
@@ -297,11 +206,8 @@ def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
     """Unpack LibLZF data to exactly ``length`` bytes.
 
     A token below 32 is that many + 1 literal bytes. Any other copies from what was unpacked: its upper 3 bits + 2 are
-    the length (7: one more byte to add), its lower 5 bits and the next byte are how far back, less 1.
-
-    Raises:
-        InputError: reads or writes beyond an end, or another length comes out.
-    """
+    the length (7: one more byte to add), its lower 5 bits and the next byte are how far back, less 1. Raises
+    InputError: reads or writes beyond an end, or another length comes out."""
     out = bytearray(length)
     at = to = 0
     try:
@@ -338,13 +244,8 @@ def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
 
 def _enough(body: bytes, needed: int, where: str) -> None:
     if len(body) < needed:
-        raise InputError(
-            "cloud is cut off",
-            where=where,
-            expected=f"at least {needed} bytes after the header",
-            got=str(len(body)),
-            remedy="copy the file again",
-        )
+        what, expected = "cloud is cut off", f"at least {needed} bytes after the header"
+        raise InputError(what, where=where, expected=expected, got=str(len(body)), remedy="copy the file again")
 
 
 def _count(word: str, where: str, largest: int = MAX_POINTS) -> int:
@@ -354,25 +255,10 @@ def _count(word: str, where: str, largest: int = MAX_POINTS) -> int:
 
 
 # --- PLY ------------------------------------------------------------------------------------------
-
-_PLY_TYPES: Final = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
-}
+_PLY_TYPES: Final = name_table(
+    """i1: char, int8; u1: uchar, uint8; i2: short, int16; u2: ushort, uint16; i4: int, int32;
+    u4: uint, uint32; f4: float, float32; f8: double, float64"""
+)
 _PLY_ORDER: Final = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
 
@@ -382,9 +268,8 @@ def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
     end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
     start = content.find(b"\n", end) + 1
     if not content.startswith(b"ply") or end < 0 or start == 0:
-        raise InputError(
-            "not a PLY file", where=where, expected="a header from 'ply' to 'end_header'", got=f"{len(content)} bytes"
-        )
+        what = "not a PLY file"
+        raise InputError(what, where=where, expected="a header from 'ply' to 'end_header'", got=f"{len(content)} bytes")
     order, points, properties, element = "?", -1, [], ""
     for line in content[:end].decode("ascii", "replace").splitlines():
         words = line.split()
@@ -401,9 +286,8 @@ def read_ply(content: bytes, where: str) -> dict[str, NDArray]:
                 raise InputError("vertex property is of no known type", where=where, got=line.strip()[:80])
             properties.append((words[2], _PLY_TYPES[words[1]]))
     if order not in _PLY_ORDER or points < 0 or not properties or len({n for n, _ in properties}) != len(properties):
-        raise InputError(
-            "PLY header is incomplete", where=where, expected="format, element vertex, properties", got=order
-        )
+        what = "PLY header is incomplete"
+        raise InputError(what, where=where, expected="format, element vertex, properties", got=order)
     body = content[start:]
     if order == "ascii":
         lines = body.split(b"\n", points)  # faces may follow
@@ -422,56 +306,38 @@ def read_float_rows(
     path: Path, columns: int, what: str = "scan", axes: int = 3
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], and which of them are
-    returns bool[N].
+    returns bool[N]. Raises InputError: missing, cut off, or values of a return that are not finite.
 
     Args:
         what: what one file holds, for messages.
         axes: the first so many columns are coordinates in the sensor's frame.
-
-    Raises:
-        InputError: missing, cut off, or values of a return that are not finite.
     """
     content = store.read_bytes(path)
     if len(content) % (4 * columns):
-        raise InputError(
-            f"{what} is cut off",
-            where=str(path),
-            got=f"{len(content)} bytes",
-            expected=f"a multiple of {4 * columns} bytes ({columns} float32 a row)",
-            remedy="copy the file again",
-        )
+        what, got = f"{what} is cut off", f"{len(content)} bytes"
+        expected = f"a multiple of {4 * columns} bytes ({columns} float32 a row)"
+        raise InputError(what, where=str(path), got=got, expected=expected, remedy="copy the file again")
     rows = np.frombuffer(content, "<f4").reshape(-1, columns).astype(np.float32)
     returns = is_return(rows[:, :axes])
     bad = ~np.isfinite(rows[returns]).all(1)
     if bad.any():
-        raise InputError(
-            f"{what} holds values that are not finite",
-            where=str(path),
-            got=f"{int(bad.sum())} of {len(rows)} rows",
-            remedy="copy the file again",
-        )
+        what, where = f"{what} holds values that are not finite", str(path)
+        raise InputError(what, where=where, got=f"{int(bad.sum())} of {len(rows)} rows", remedy="copy the file again")
     return rows, returns
 
 
 def read_bin(content: bytes, where: str) -> dict[str, NDArray]:
     """KITTI's form: little-endian float32 rows x, y, z, intensity, nothing else."""
     if len(content) % 16:
-        raise InputError(
-            "cloud is cut off, or is not of this form",
-            where=where,
-            got=f"{len(content)} bytes",
-            expected="a multiple of 16 bytes: float32 x, y, z, intensity a point",
-        )
+        got, expected = f"{len(content)} bytes", "a multiple of 16 bytes: float32 x, y, z, intensity a point"
+        raise InputError("cloud is cut off, or is not of this form", where=where, got=got, expected=expected)
     rows = np.frombuffer(content, "<f4").reshape(-1, 4)
     return {name: rows[:, index].copy() for index, name in enumerate(("x", "y", "z", "intensity"))}
 
 
 def npz_arrays(content: bytes, where: str) -> dict[str, NDArray]:
-    """All arrays of a numpy archive by name.
-
-    Raises:
-        InputError: damaged, cut off, or not plain numbers of the declared size.
-    """
+    """All arrays of a numpy archive by name. Raises InputError: damaged, cut off, or not plain numbers of the declared
+    size."""
     arrays = {}
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -480,9 +346,8 @@ def npz_arrays(content: bytes, where: str) -> dict[str, NDArray]:
                     member = f"{where}: {entry.filename}"
                     arrays[entry.filename.removesuffix(".npy")] = read_npy(handle, entry.file_size, member)
     except (ValueError, OSError, EOFError, zipfile.BadZipFile, NotImplementedError, RuntimeError, zlib.error) as error:
-        raise InputError(
-            "not a readable NPZ file, or cut off", where=where, got=str(error)[:120], remedy="copy the file again"
-        ) from error
+        what = "not a readable NPZ file, or cut off"
+        raise InputError(what, where=where, got=str(error)[:120], remedy="copy the file again") from error
     return arrays
 
 
@@ -491,32 +356,22 @@ def read_npz(content: bytes, where: str) -> dict[str, NDArray]:
     columns = npz_arrays(content, where)
     xyz = columns.pop("xyz", None)
     if xyz is None or xyz.ndim != 2 or xyz.shape[1] != 3 or xyz.dtype.kind not in "fiu":
-        raise InputError(
-            "NPZ cloud has no coordinates",
-            where=where,
-            expected="an array xyz [N, 3] of numbers",
-            got=", ".join(columns) or ("nothing" if xyz is None else f"{xyz.dtype} {xyz.shape}"),
-        )
+        what = "NPZ cloud has no coordinates"
+        got = ", ".join(columns) or ("nothing" if xyz is None else f"{xyz.dtype} {xyz.shape}")
+        raise InputError(what, where=where, expected="an array xyz [N, 3] of numbers", got=got)
     for name, values in columns.items():
         if values.shape != (len(xyz),) or values.dtype.kind not in "fiub":
-            raise InputError(
-                "NPZ array does not fit the points",
-                where=f"{where}: {name}",
-                expected=f"numbers [{len(xyz)}]",
-                got=f"{values.dtype} {values.shape}",
-            )
+            what, where = "NPZ array does not fit the points", f"{where}: {name}"
+            raise InputError(what, where=where, expected=f"numbers [{len(xyz)}]", got=f"{values.dtype} {values.shape}")
     return {"x": xyz[:, 0], "y": xyz[:, 1], "z": xyz[:, 2], **columns}
 
 
 def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
     """One array of an archive, from its member of ``size`` bytes.
 
-    Its header is compared with this size before anything is allocated; arrays of objects (pickles) are refused.
-
-    Raises:
-        InputError: not numbers, or of another size than declared. ValueError, zipfile.BadZipFile, zlib.error: no array,
-            or damaged.
-    """
+    Its header is compared with this size before anything is allocated; arrays of objects (pickles) are refused. Raises
+    InputError: not numbers, or of another size than declared. ValueError, zipfile.BadZipFile, zlib.error: no array, or
+    damaged."""
     version = np.lib.format.read_magic(handle)
     readers = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}
     if version not in readers:
@@ -529,9 +384,8 @@ def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
         RecursionError,
         MemoryError,
     ) as error:  # of the parser that numpy hands the header to
-        raise InputError(
-            "array's header makes no sense", where=where, got=str(error)[:120], remedy="copy the file again"
-        ) from error
+        what = "array's header makes no sense"
+        raise InputError(what, where=where, got=str(error)[:120], remedy="copy the file again") from error
     length = math.prod(shape) * dtype.itemsize
     if (
         dtype.hasobject
@@ -539,12 +393,8 @@ def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
         or length > min(size, MAX_POINTS * 24)
         or handle.tell() + length != size
     ):
-        raise InputError(
-            "array is not plain numbers of the declared size",
-            where=where,
-            got=f"{dtype} {shape} in {size} bytes",
-            remedy="save it with numpy.savez from an array of numbers",
-        )
+        what, got = "array is not plain numbers of the declared size", f"{dtype} {shape} in {size} bytes"
+        raise InputError(what, where=where, got=got, remedy="save it with numpy.savez from an array of numbers")
     content = handle.read(length)
     handle.read(1)  # at its end an archive's member compares its checksum
     return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")

@@ -39,13 +39,19 @@ from mudg.base.geometry import (
 from mudg.base.types import EgoPath
 from mudg.scene import motion
 from mudg.scene.clouds import is_return, near_places
+from mudg.scene.schema import ref_problem
+
+
+def name_table(text: str) -> dict[str, str]:
+    """``here: theirs, theirs; here: theirs`` -> their name -> the name here, in this order."""
+    rows = (row.split(":") for row in text.split(";"))
+    return {name.strip(): here.strip() for here, names in rows for name in names.split(",")}
+
 
 # columns ------------------------------------------------------------------------------------------
 #
 # Foreign tables and records: columns that must be there, numbers that must be finite, and the pyarrow package behind
 # some files.
-
-
 Columns = Mapping[str, NDArray[Any]]
 _ROUNDING: Final = 1e-3
 
@@ -54,21 +60,13 @@ def require_columns(names: Iterable[str], there: Iterable[str], where: object) -
     """Refuse a table that lacks one of ``names``."""
     there, names = list(there), list(names)
     if not set(names) <= set(there):
-        raise InputError(
-            "table lacks columns",
-            where=str(where),
-            got=", ".join(sorted(there)[:40]) or "no columns",
-            expected=", ".join(names),
-            remedy="is this a file of another data set, version or kind?",
-        )
+        got = ", ".join(sorted(there)[:40]) or "no columns"
+        remedy = "is this a file of another data set, version or kind?"
+        raise InputError("table lacks columns", where=str(where), got=got, expected=", ".join(names), remedy=remedy)
 
 
 def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDArray[np.float64]:
-    """Columns as f64[n, k].
-
-    Raises:
-        InputError: no numbers, or not all finite.
-    """
+    """Columns as f64[n, k]. Raises InputError: no numbers, or not all finite."""
     where = f"{where}: {', '.join(names)}"
     try:
         table = np.stack([columns[name].astype(np.float64) for name in names], 1)
@@ -76,30 +74,19 @@ def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDA
         raise InputError("column does not hold numbers", where=where, got=str(error)[:120]) from error
     bad = ~np.isfinite(table).all(1)
     if bad.any():
-        raise InputError(
-            "column holds values that are not finite",
-            where=where,
-            got=f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}",
-        )
+        got = f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}"
+        raise InputError("column holds values that are not finite", where=where, got=got)
     return table
 
 
 def unit_intensity(values: NDArray[Any], largest: float, where: object, remedy: str = "") -> NDArray[np.float32]:
     """Intensities of a cloud, from 0 to the ``largest`` that its format has, as f32 from 0 to 1; rounding beyond that
-    is taken off.
-
-    Raises:
-        InputError: other values, which would all become 0 or 1, or some that are not finite.
-    """
+    is taken off. Raises InputError: other values, which would all become 0 or 1, or some that are not finite."""
     scaled = values.astype(np.float64) / largest
     if not ((scaled > -_ROUNDING) & (scaled < 1 + _ROUNDING)).all():
-        raise InputError(
-            "intensity is out of range",
-            where=str(where),
-            expected=f"0 to {largest:g}",
-            got=f"{values.min():g} to {values.max():g}",
-            remedy=remedy or "scale the values as the data set does",
-        )
+        what, got = "intensity is out of range", f"{values.min():g} to {values.max():g}"
+        remedy = remedy or "scale the values as the data set does"
+        raise InputError(what, where=str(where), expected=f"0 to {largest:g}", got=got, remedy=remedy)
     return scaled.clip(0, 1).astype(np.float32)
 
 
@@ -124,36 +111,23 @@ def record_fields(what: str, where: object, expected: str) -> Iterator[None]:
 
 @contextmanager
 def arrow_files(path: Path) -> Iterator[None]:
-    """Code that reads a Feather or Parquet file with pyarrow.
-
-    Raises:
-        ResourceError: pyarrow is not installed.
-        InputError: the file is damaged or cut off.
-    """
+    """Code that reads a Feather or Parquet file with pyarrow. Raises ResourceError: pyarrow is not installed.
+    InputError: the file is damaged or cut off."""
     try:
         import pyarrow
     except ImportError as error:
-        raise ResourceError(
-            "Feather and Parquet files need pyarrow, which is not installed",
-            where=str(path),
-            remedy="pip install 'mudg[data]'",
-        ) from error
+        what = "Feather and Parquet files need pyarrow, which is not installed"
+        raise ResourceError(what, where=str(path), remedy="pip install 'mudg[data]'") from error
     try:
         yield
     except (pyarrow.ArrowException, OSError, MemoryError, StopIteration, UnicodeDecodeError) as error:
-        raise InputError(
-            "table cannot be read, or is cut off",
-            where=str(path),
-            remedy="copy the file again",
-            got=str(error)[:200] or "it ends early",
-        ) from error
+        what, remedy = "table cannot be read, or is cut off", "copy the file again"
+        raise InputError(what, where=str(path), remedy=remedy, got=str(error)[:200] or "it ends early") from error
 
 
 # options ------------------------------------------------------------------------------------------
 #
 # What a user may choose when importing a log; every importer reads the same options and says which it cannot honour.
-
-
 Resolution = int | tuple[int, int]
 """Longest side in pixels, or width and height."""
 
@@ -189,38 +163,26 @@ class ImportOptions:
 
 
 def parse_frame_range(text: str) -> tuple[int, int] | None:
-    """``"10:26"`` -> (10, 26); an empty text -> None.
-
-    Raises:
-        UsageError: not of this form, or empty.
-    """
+    """``"10:26"`` -> (10, 26); an empty text -> None. Raises UsageError: not of this form, or empty."""
     if not text:
         return None
     match = re.fullmatch(r"(\d{1,9}):(\d{1,9})", text.strip())
     if match is None or int(match[1]) >= int(match[2]):
-        raise UsageError(
-            "frame range makes no sense", where="--frames", expected="FIRST:END with FIRST < END, e.g. 0:16", got=text
-        )
+        what = "frame range makes no sense"
+        raise UsageError(what, where="--frames", expected="FIRST:END with FIRST < END, e.g. 0:16", got=text)
     return int(match[1]), int(match[2])
 
 
 def parse_resolution(text: str) -> Resolution | None:
-    """``"960"`` -> 960 (longest side), ``"960x640"`` -> (960, 640); an empty text -> None.
-
-    Raises:
-        UsageError: not of this form, or below 16 pixels.
-    """
+    """``"960"`` -> 960 (longest side), ``"960x640"`` -> (960, 640); an empty text -> None. Raises UsageError: not of
+    this form, or below 16 pixels."""
     if not text:
         return None
     match = re.fullmatch(r"(\d{2,5})(?:x(\d{2,5}))?", text.strip().lower())
     sides = [int(side) for side in match.groups() if side] if match is not None else []
     if not sides or min(sides) < 16:
-        raise UsageError(
-            "image size makes no sense",
-            where="--resolution",
-            expected="the longest side, e.g. 960, or WIDTHxHEIGHT, e.g. 960x640; at least 16 pixels",
-            got=text,
-        )
+        expected = "the longest side, e.g. 960, or WIDTHxHEIGHT, e.g. 960x640; at least 16 pixels"
+        raise UsageError("image size makes no sense", where="--resolution", expected=expected, got=text)
     return sides[0] if len(sides) == 1 else (sides[0], sides[1])
 
 
@@ -239,8 +201,6 @@ def holdout_split(frame_ids_by_time: list[list[str]], test_every: int) -> dict[s
 
 
 # common -------------------------------------------------------------------------------------------
-
-
 Item = TypeVar("Item")
 Matrix = NDArray[np.float64]
 TimeUnit = Literal["ns", "us", "ms", "s"]
@@ -360,11 +320,8 @@ def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]
 def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, where: str, start: float = 0) -> Matrix:
     """Times of one sensor's records as seconds f64[N] since ``start`` (same unit), checked.
 
-    Integers are subtracted before they become floats, so nanoseconds of the epoch keep their digits.
-
-    Raises:
-        InputError: not increasing (with the first place), not finite, or so close or far apart that the unit is wrong.
-    """
+    Integers are subtracted before they become floats, so nanoseconds of the epoch keep their digits. Raises InputError:
+    not increasing (with the first place), not finite, or so close or far apart that the unit is wrong."""
     numbers = np.asarray(times)
     if numbers.dtype.kind not in "iuf" or numbers.ndim != 1 or not np.isfinite(numbers.astype(np.float64)).all():
         raise InputError("timestamps are not a list of finite numbers", where=where, got=str(numbers)[:80])
@@ -375,24 +332,16 @@ def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, wh
     steps = np.diff(since_start)
     if (steps <= 0).any():
         at = int(np.flatnonzero(steps <= 0)[0])
-        raise InputError(
-            "timestamps do not increase",
-            where=f"{where}: record {at + 1}",
-            expected=f"later than {numbers[at]} {unit}",
-            got=str(numbers[at + 1]),
-            remedy="sort the records by time, and remove doubled ones",
-        )
+        what, where = "timestamps do not increase", f"{where}: record {at + 1}"
+        expected, remedy = f"later than {numbers[at]} {unit}", "sort the records by time, and remove doubled ones"
+        raise InputError(what, where=where, expected=expected, got=str(numbers[at + 1]), remedy=remedy)
     low, high = PLAUSIBLE_PERIOD_S
     if len(steps) and not low <= (period := float(np.median(steps))) <= high:
         raw = period * UNITS_PER_SECOND[unit]
         fitting = [u for u, scale in UNITS_PER_SECOND.items() if low <= raw / scale <= high]
-        raise InputError(
-            "timestamps are in another unit than expected",
-            where=where,
-            expected=f"{unit}; records {low:g} to {high:g} s apart",
-            got=f"records {period:.3g} s apart",
-            remedy=f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording",
-        )
+        what, expected = "timestamps are in another unit than expected", f"{unit}; records {low:g} to {high:g} s apart"
+        remedy = f"they look like {' or '.join(fitting)}" if fitting else "check the clock of the recording"
+        raise InputError(what, where=where, expected=expected, got=f"records {period:.3g} s apart", remedy=remedy)
     return since_start
 
 
@@ -401,21 +350,12 @@ def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> Non
     unit = {10**6: "microseconds", 10**9: "nanoseconds"}[per_second]
     outside = (stamps < _EPOCH_S[0] * per_second) | (stamps > _EPOCH_S[1] * per_second)
     if outside.any():
-        raise InputError(
-            "time stamp is in another unit",
-            where=where,
-            expected=f"{unit} since 1970",
-            got=f"{int(stamps[outside][0])}",
-            remedy=f"convert the stamps to {unit}",
-        )
+        what, expected, got = "time stamp is in another unit", f"{unit} since 1970", f"{int(stamps[outside][0])}"
+        raise InputError(what, where=where, expected=expected, got=got, remedy=f"convert the stamps to {unit}")
     if len(stamps) and int(stamps.max()) - int(stamps.min()) > _MAX_LOG_S * per_second:
-        raise InputError(
-            "time stamps of one log span more than hours",
-            where=where,
-            got=f"{int(stamps.min())} to {int(stamps.max())}",
-            expected=f"{unit}, all of one recording",
-            remedy="are records of another log, or of another unit, mixed in?",
-        )
+        what, got = "time stamps of one log span more than hours", f"{int(stamps.min())} to {int(stamps.max())}"
+        remedy = "are records of another log, or of another unit, mixed in?"
+        raise InputError(what, where=where, got=got, expected=f"{unit}, all of one recording", remedy=remedy)
 
 
 def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArray[np.intp]:
@@ -428,11 +368,8 @@ def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArra
 
 
 def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
-    """A pose from a file, [3, 4] or [4, 4], as f64[4, 4]; rounding up to 1e-3 in the rotation is cleaned.
-
-    Raises:
-        InputError: scaled (the factor is told), left-handed, not a rotation, or not finite.
-    """
+    """A pose from a file, [3, 4] or [4, 4], as f64[4, 4]; rounding up to 1e-3 in the rotation is cleaned. Raises
+    InputError: scaled (the factor is told), left-handed, not a rotation, or not finite."""
     numbers = np.asarray(matrix, np.float64)
     if numbers.shape not in ((3, 4), (4, 4)):
         raise InputError("pose has the wrong shape", where=where, expected="3x4 or 4x4 numbers", got=str(numbers.shape))
@@ -441,12 +378,8 @@ def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
     if len(numbers) == 4 and np.abs(numbers[3] - [0, 0, 0, 1]).max() > POSE_TOLERANCE:
         got = numbers[3].tolist()
         transposed = np.abs(numbers[:3, 3]).max() < POSE_TOLERANCE
-        raise InputError(
-            "pose does not end in the row 0 0 0 1",
-            where=where,
-            got=str(got),
-            remedy="it looks transposed: write it row by row" if transposed else "write it row by row",
-        )
+        remedy = "it looks transposed: write it row by row" if transposed else "write it row by row"
+        raise InputError("pose does not end in the row 0 0 0 1", where=where, got=str(got), remedy=remedy)
     return from_rotation_translation(rigid_rotation(numbers[:3, :3], where), numbers[:3, 3])
 
 
@@ -455,66 +388,40 @@ def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
     u, stretch, vt = np.linalg.svd(matrix)
     handed = float(np.linalg.det(u @ vt))
     if stretch[0] - stretch[2] <= POSE_TOLERANCE * stretch[0] and abs(stretch[1] - 1) > POSE_TOLERANCE:
-        raise InputError(
-            "pose is scaled",
-            where=where,
-            expected="a rotation (scale 1)",
-            got=f"scale {stretch[1]:.6g}",
-            remedy="divide the rotation part by its scale; are the translations in metres?",
-        )
+        expected = "a rotation (scale 1)"
+        remedy = "divide the rotation part by its scale; are the translations in metres?"
+        raise InputError("pose is scaled", where=where, expected=expected, got=f"scale {stretch[1]:.6g}", remedy=remedy)
     if np.abs(stretch - 1).max() > POSE_TOLERANCE:
-        raise InputError(
-            "pose is not a rigid motion",
-            where=where,
-            expected="an orthonormal rotation part",
-            got=f"stretches {', '.join(f'{s:.4g}' for s in stretch)}",
-            remedy="is it row-major, without shear or scale?",
-        )
+        what, got = "pose is not a rigid motion", f"stretches {', '.join(f'{s:.4g}' for s in stretch)}"
+        remedy = "is it row-major, without shear or scale?"
+        raise InputError(what, where=where, expected="an orthonormal rotation part", got=got, remedy=remedy)
     if handed < 0:
-        raise InputError(
-            "pose is left-handed",
-            where=where,
-            expected="determinant +1",
-            got="a reflection (determinant -1)",
-            remedy="one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras",
-        )
+        got = "a reflection (determinant -1)"
+        remedy = "one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras"
+        raise InputError("pose is left-handed", where=where, expected="determinant +1", got=got, remedy=remedy)
     return u @ vt
 
 
 def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matrix:
-    """Pose f64[4, 4] from a unit quaternion (w, x, y, z) and a translation in metres.
-
-    Raises:
-        InputError: not finite, wrong count, or a quaternion whose length is not 1 within 1 %.
-    """
+    """Pose f64[4, 4] from a unit quaternion (w, x, y, z) and a translation in metres. Raises InputError: not finite,
+    wrong count, or a quaternion whose length is not 1 within 1 %."""
     q, t = np.asarray(wxyz, np.float64).reshape(-1), np.asarray(xyz_m, np.float64).reshape(-1)
     if q.shape != (4,) or t.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(t).all():
-        raise InputError(
-            "pose is not a quaternion and a translation",
-            where=where,
-            expected="4 and 3 finite numbers",
-            got=f"{q.tolist()} and {t.tolist()}",
-        )
+        what = "pose is not a quaternion and a translation"
+        raise InputError(what, where=where, expected="4 and 3 finite numbers", got=f"{q.tolist()} and {t.tolist()}")
     length = float(np.linalg.norm(q))
     if abs(length - 1) > QUATERNION_TOLERANCE:
-        raise InputError(
-            "quaternion does not have length 1",
-            where=where,
-            expected="w, x, y, z of a rotation",
-            got=f"length {length:.6g}",
-        )
+        what = "quaternion does not have length 1"
+        raise InputError(what, where=where, expected="w, x, y, z of a rotation", got=f"length {length:.6g}")
     return from_rotation_translation(matrix_from_quaternion(q), t)
 
 
 def pose_near(
     ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S, where: str = "ego path"
 ) -> Matrix:
-    """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys.
-
-    Raises:
-        InputError: more than ``max_beyond_s`` outside, or in a gap of the path where the pose would be a guess
-            (``motion.gap_at``).
-    """
+    """Ego pose at a time; a little outside the path it goes on as it did between its two nearest keys. Raises
+    InputError: more than ``max_beyond_s`` outside, or in a gap of the path where the pose would be a guess
+    (``motion.gap_at``)."""
     inside = pose_at(ego.times_s, ego.world_from_ego, time_s)
     if inside is not None:
         gap = motion.gap_at(ego, time_s)
@@ -548,13 +455,9 @@ def pose_near(
 
 def gap_problem(gap: motion.Gap, time_s: float, where: str) -> InputError:
     """The error about an image or scan in a gap of the vehicle's path."""
-    return InputError(
-        "vehicle poses have a gap here",
-        where=where,
-        got=f"at {time_s:.3f} s: {gap}",
-        expected="poses around every image and scan",
-        remedy="leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps",
-    )
+    what, got = "vehicle poses have a gap here", f"at {time_s:.3f} s: {gap}"
+    remedy = "leave such frames out with --skip-missing, or lay a curve through the gap with --bridge-gaps"
+    return InputError(what, where=where, got=got, expected="poses around every image and scan", remedy=remedy)
 
 
 def has_pose(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATION_S) -> bool:
@@ -618,13 +521,9 @@ def check_motion(ego: EgoPath, where: str) -> None:
     wrong then."""
     upright = float(np.median(ego.world_from_ego[:, 2, 2]))
     if upright < _LEAST_UPRIGHT:
-        raise InputError(
-            "the vehicle does not stand upright",
-            where=where,
-            expected="vehicle and map with z up",
-            got=f"its z axis rises by {upright:.2f} per metre",
-            remedy="check the order of quaternions (w, x, y, z) and the axes",
-        )
+        what, got = "the vehicle does not stand upright", f"its z axis rises by {upright:.2f} per metre"
+        remedy = "check the order of quaternions (w, x, y, z) and the axes"
+        raise InputError(what, where=where, expected="vehicle and map with z up", got=got, remedy=remedy)
     if len(ego.times_s) < 2:
         return
     # over a twentieth of a second at least: pose noise over less is no speed
@@ -635,26 +534,20 @@ def check_motion(ego: EgoPath, where: str) -> None:
     speed = np.linalg.norm(steps, axis=1) / (ego.times_s[last] - ego.times_s[first])
     at = int(speed.argmax())
     if speed[at] > MAX_SPEED_M_S:
-        raise InputError(
-            "the vehicle moves impossibly fast",
-            where=where,
-            got=f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose",
-            expected=f"under {MAX_SPEED_M_S:.0f} m/s",
-            remedy="check the units of times and translations, and that all poses are of one log",
-        )
+        what = "the vehicle moves impossibly fast"
+        got = f"{speed[at]:.0f} m/s, {ego.times_s[first[at]] - ego.times_s[0]:.3f} s after its first pose"
+        remedy = "check the units of times and translations, and that all poses are of one log"
+        raise InputError(what, where=where, got=got, expected=f"under {MAX_SPEED_M_S:.0f} m/s", remedy=remedy)
     # over a gap it may turn
     drives = (speed > _DRIVES_M_S) & (ego.times_s[last] - ego.times_s[first] <= _COURSE_WITHIN_S)
     if drives.any():
         forward = np.einsum("ni,ni->n", ego.world_from_ego[first[drives], :3, 0], steps[drives])
         along = float(np.median(np.abs(forward) / np.linalg.norm(steps[drives], axis=1)))  # reversing is driving, too
         if along < _LEAST_ALONG:
-            raise InputError(
-                "the vehicle does not drive where it looks",
-                where=where,
-                expected="vehicle axes x forward, y left, z up",
-                got=f"it moves {np.rad2deg(np.arccos(along)):.0f} degrees off its x axis",
-                remedy="check the order of quaternions (w, x, y, z) and the axes",
-            )
+            what = "the vehicle does not drive where it looks"
+            got = f"it moves {np.rad2deg(np.arccos(along)):.0f} degrees off its x axis"
+            remedy = "check the order of quaternions (w, x, y, z) and the axes"
+            raise InputError(what, where=where, expected="vehicle axes x forward, y left, z up", got=got, remedy=remedy)
 
 
 def deskew(
@@ -701,3 +594,184 @@ def blend_motion(
             before, after = (transform_points(corrections[n], points[chosen]) for n in (index, index + 1))
             out[chosen] = before + share * (after - before)
     return out
+
+
+# Finding the files of a log: numbered files, frames that are whole, cameras that were asked for, options that do not
+
+
+Item = TypeVar("Item")
+
+
+@dataclass(frozen=True, slots=True)
+class LogFiles:
+    """What identifies the log that was chosen from a folder of many.
+
+    Args:
+        files: files, and folders that count with everything in them.
+        entries: folders too large for that, of which only their own times count: these change when a file comes or
+            goes.
+    """
+
+    files: tuple[Path, ...]
+    entries: tuple[Path, ...] = ()
+
+
+def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
+    """Files called by a frame number, in order: ``0000000012.png`` with suffix ``.png``, ``07.pkl.gz`` with
+    ``.pkl.gz``.
+
+    A folder that does not exist holds none.
+    """
+    if not folder.is_dir():
+        return {}
+    found = {}
+    for path in folder.iterdir():
+        stem, dot, rest = path.name.partition(".")
+        if stem.isascii() and stem.isdigit() and dot + rest.lower() in suffixes:
+            found[int(stem)] = path
+    return dict(sorted(found.items()))
+
+
+def complete_frames(
+    streams: Mapping[str, Iterable[int]], options: ImportOptions, where: str, title: str, optional: Iterable[int] = ()
+) -> list[int]:
+    """Frame numbers to import: those that every stream has, within ``options.frames``. Raises InputError: a stream
+    lacks frames that others have (unless ``skip_missing``), or nothing is left.
+
+    Args:
+        streams: name of a camera or LiDAR -> its frame numbers.
+        options: ``frames`` and ``skip_missing`` are used.
+        where: the log, for messages.
+        title: the format's name, for messages.
+        optional: frames that may be missing from every stream without a warning (documented gaps).
+    """
+    numbers = {name: set(found) for name, found in streams.items()}
+    everything = set().union(*numbers.values()) - set(optional)
+    if options.frames is not None:
+        everything = {n for n in everything if options.frames[0] <= n < options.frames[1]}
+    missing = {name: sorted(everything - found) for name, found in numbers.items() if everything - found}
+    gaps = "; ".join(f"{name} lacks {number_ranges(lacks)}" for name, lacks in missing.items())
+    if missing and not options.skip_missing:
+        what = "images and sweeps do not pair up"
+        remedy = "copy the missing files, choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError(what, where=where, expected="every camera and LiDAR for every frame", got=gaps, remedy=remedy)
+    if missing:
+        log.warn(f"{title}: left out incomplete frames: {gaps}")
+    for lacks in missing.values():
+        everything -= set(lacks)
+    if not everything:
+        expected = "numbered images" + (f" in {options.frames[0]}:{options.frames[1]}" if options.frames else "")
+        got = ", ".join(f"{name}: {number_ranges(sorted(found))}" for name, found in numbers.items()) or "nothing"
+        raise InputError("no frames to import", where=where, expected=expected, got=got)
+    return sorted(everything)
+
+
+def number_ranges(numbers: Sequence[int]) -> str:
+    """Increasing frame numbers as text: three or more in a row as first and last, a long list cut short."""
+    if not numbers:
+        return "none"
+    runs: list[list[int]] = []
+    for number in numbers:
+        if runs and number == runs[-1][-1] + 1:
+            runs[-1].append(number)
+        else:
+            runs.append([number])
+    ranges = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs]
+    return ", ".join(ranges[:8]) + (f", ... ({len(numbers)} in all)" if len(ranges) > 8 else "")
+
+
+def first_file(*candidates: Path) -> Path | None:
+    """The first of some paths that is a file."""
+    return next((path for path in candidates if path.is_file()), None)
+
+
+def folder_contents(folder: Path) -> str:
+    """The first names in a folder, for messages."""
+    return ", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder"
+
+
+def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOptions, where: Path, kind: str) -> Item:
+    """The one log that ``options.sequence`` means. Raises UsageError: none fits, or several do.
+
+    Args:
+        matching: logs that fit it; all of them where none was chosen.
+        names: of all logs that are there, for the message.
+        options: ``sequence`` is used.
+        where: folder that holds them.
+        kind: what one is called: log, scene, drive, sequence.
+    """
+    if len(matching) == 1:
+        return matching[0]
+    listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
+    what = f"the folder holds several {kind}s" if matching else f"there is no such {kind}"
+    expected = f"--sequence with one of {listed}"
+    raise UsageError(what, where=str(where), expected=expected, got=options.sequence or "none chosen")
+
+
+def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
+    """The data set's names of the cameras to import, in the order of ``available``. Raises UsageError: no such camera.
+    InputError: none of the usual ones is there.
+
+    Args:
+        available: the data set's name -> the name in the scene; either may be asked for.
+        options: ``cameras`` is used.
+        where: the log, for messages.
+        usual: the data set's names taken when none is asked for; those that are not there are left out.
+    """
+    by_scene_name = {ours: theirs for theirs, ours in available.items()}
+    listed = ", ".join(o if o == t else f"{o} ({t})" for t, o in available.items()) or "no cameras"
+    if not options.cameras:
+        chosen = [name for name in available if name in usual]
+        if not chosen:
+            what = "the log has no camera that can be imported"
+            raise InputError(what, where=where, expected=", ".join(usual), got=listed)
+        return chosen
+    unknown = [name for name in options.cameras if name not in available and name not in by_scene_name]
+    if unknown:
+        raise UsageError("the log has no such camera", where=where, expected=listed, got=", ".join(unknown))
+    wanted = {by_scene_name.get(name, name) for name in options.cameras}
+    return [name for name in available if name in wanted]
+
+
+def refuse_missing_cameras(there: Iterable[str], usual: Iterable[str], options: ImportOptions, where: object) -> None:
+    """Refuse a log that lacks cameras of its data set, unless cameras were chosen or ``skip_missing`` says otherwise.
+
+    Args:
+        there, usual: the cameras' names in the scene.
+        options: ``cameras`` and ``skip_missing`` are used.
+        where: the log, for messages.
+    """
+    there, usual = list(there), list(usual)
+    absent = [name for name in usual if name not in there]
+    if absent and not options.cameras and not options.skip_missing:
+        what, got = "cameras are missing in the log", f"no images of {', '.join(absent)}"
+        remedy = f"choose those that are there with --cameras {' '.join(there)}, or add --skip-missing"
+        raise InputError(what, where=str(where), got=got, expected=f"{len(usual)} cameras", remedy=remedy)
+
+
+def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
+    """Refuse options of other formats that were set here: better than to do something else than asked. Raises
+    UsageError: one of ``names`` differs from its default."""
+    default = ImportOptions()
+    for name in names:
+        if getattr(options, name) != getattr(default, name):
+            flag = "--" + name.replace("_", "-")
+            raise UsageError(f"{title} logs have no use for {flag}", where=flag, remedy="leave it out")
+
+
+def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
+    """Refuse ``--untwist yes``, ``--poses`` and ``--boxes`` for a data set that brings its own and compensates its
+    sweeps."""
+    if options.untwist == "yes":
+        what = f"sweeps of {dataset} are already compensated for the vehicle's motion"
+        raise UsageError(what, where=where, got="--untwist yes", remedy="leave --untwist out")
+    refuse_options(options, dataset, "poses", "boxes")
+
+
+def path_inside(root: Path, name: Any, where: str) -> Path:
+    """A file below ``root`` from a name in a foreign table; absolute names and ``..`` are refused."""
+    problem = ref_problem(name)
+    if problem is not None:
+        what = f"file name {problem}"
+        raise InputError(what, where=where, got=repr(name)[:120], expected="a relative path inside the log")
+    return root / name

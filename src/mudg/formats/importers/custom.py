@@ -24,17 +24,18 @@ from mudg.formats.importers.clouds import Cloud, read_cloud
 from mudg.formats.importers.common import (
     UNITS_PER_SECOND,
     ImportOptions,
+    chosen_cameras,
     deskew,
     has_pose,
     holdout_split,
     mended_path,
     nearest_index,
     pose_near,
+    refuse_options,
     unit_intensity,
 )
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import Lens, brown_conrady, equidistant, fit_images, image_notes
-from mudg.formats.importers.layout import chosen_cameras, refuse_options
 from mudg.scene import check as scene_check
 from mudg.scene import schema
 from mudg.scene.check import Finding
@@ -46,8 +47,6 @@ from mudg.scene.read import decode_image
 #
 # As in ``scene/schema.py``, the parser takes ``complain``: the importer raises at the first problem, ``mudg doctor``
 # collects all.
-
-
 Matrix = NDArray[np.float64]
 INDEX: Final = "log.json"
 FORMAT: Final = "mudg-log"
@@ -247,13 +246,11 @@ class CustomLog:
 
 
 def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> CustomLog:
-    """Parse ``root/log.json``.
+    """Parse ``root/log.json``. Raises InputError: the frame of the file or the vehicle's path is wrong, or ``complain``
+    raised.
 
     Args:
         complain: called with each problem; a record with a problem is left out.
-
-    Raises:
-        InputError: the frame of the file or the vehicle's path is wrong, or ``complain`` raised.
     """
     where = str(root / INDEX)
     top = _parse_index(schema.parse_object(store.read_bytes(root / INDEX), where), where)
@@ -408,8 +405,6 @@ class _LogReader:
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 MAX_ALIKE: Final = 5
 """Findings with the same text that are listed one by one."""
 MAX_DELAY_S: Final = 1.0
@@ -427,12 +422,9 @@ def looks_like_custom(source: Path) -> bool:
 
 
 def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a log in the neutral layout into the scene directory ``out``.
-
-    Raises:
-        UsageError: an option that this format does not have, or a camera that the log does not have.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
-    """
+    """Import a log in the neutral layout into the scene directory ``out``. Raises UsageError: an option that this
+    format does not have, or a camera that the log does not have. InputError: something is missing, malformed or
+    contradictory; nothing is left at ``out``."""
     refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
     read, notes = read_log(source), []
     read = replace(read, ego=mended_path(read.ego, options, notes))
@@ -554,12 +546,8 @@ def refuse_grey(path: Path) -> None:
 
 
 def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> SweepPoints:
-    """The points of a sweep, motion-compensated to its time.
-
-    Raises:
-        InputError: no points, a field that was declared is not there, intensities above the declared largest one,
-            points that need their times and have none.
-    """
+    """The points of a sweep, motion-compensated to its time. Raises InputError: no points, a field that was declared is
+    not there, intensities above the declared largest one, points that need their times and have none."""
     lidar, path = content.lidars[sweep.sensor], _file(content, sweep)
     cloud = read_cloud(path, known=(lidar.intensity_field, lidar.time_field))
     if len(cloud.xyz) == 0:
@@ -571,12 +559,9 @@ def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> Sw
     if options.untwist == "no" or (options.untwist == "auto" and lidar.motion_compensated):
         return points
     if not lidar.time_field:
-        raise InputError(
-            "sweeps are not motion-compensated, and their points have no times",
-            where=f"{content.root / INDEX}: lidars.{sweep.sensor}",
-            expected="time_field and time_unit",
-            remedy="name the field with the time of each point, or add --untwist no",
-        )
+        what, expected = "sweeps are not motion-compensated, and their points have no times", "time_field and time_unit"
+        remedy = "name the field with the time of each point, or add --untwist no"
+        raise InputError(what, where=f"{content.root / INDEX}: lidars.{sweep.sensor}", expected=expected, remedy=remedy)
 
     def world_from_lidar(time_s: float) -> NDArray[np.float64]:
         return pose_near(content.ego, time_s) @ sweep.ego_from_sensor

@@ -32,18 +32,19 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import invert
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common, drive_log
-from mudg.formats.importers.box_tracks import BoxTracks
 from mudg.formats.importers.clouds import npz_arrays
-from mudg.formats.importers.common import ImportOptions, record_fields
-from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.formats.importers.layout import (
+from mudg.formats.importers.common import (
+    ImportOptions,
     LogFiles,
     chosen_cameras,
     folder_contents,
+    name_table,
     path_inside,
+    record_fields,
     refuse_untwist,
     the_only,
 )
+from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
 from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
 from mudg.scene.clouds import is_return
 
@@ -102,22 +103,7 @@ _LENS: Final = (
     "equirectangular",
 )
 _CHANNELS: Final = frozenset(
-    {
-        "X",
-        "Y",
-        "Z",
-        "INTENSITY",
-        "R",
-        "G",
-        "B",
-        "RING",
-        "NORMAL_X",
-        "NORMAL_Y",
-        "NORMAL_Z",
-        "CLASS_ID",
-        "INSTANCE_ID",
-        "TIMESTAMP",
-    }
+    "X Y Z INTENSITY R G B RING NORMAL_X NORMAL_Y NORMAL_Z CLASS_ID INSTANCE_ID TIMESTAMP".split()
 )
 OFFICIAL: Final[Mapping[str, Known]] = {
     "scene_*.json": _SCENE,
@@ -132,22 +118,11 @@ OFFICIAL: Final[Mapping[str, Known]] = {
 }
 """Kinds of files -> their fields, read or not; what is in metadata and attributes is free. Source: the format's
 published messages."""
-LABELS: Final[Mapping[str, str]] = {
-    "Car": "car",
-    "Truck": "truck",
-    "Bus/RV/Caravan": "bus",
-    "Bus": "bus",
-    "Motorcycle": "motorcycle",
-    "Motorcyclist": "rider",
-    "Bicycle": "bicycle",
-    "Bicyclist": "rider",
-    "Person": "pedestrian",
-    "Pedestrian": "pedestrian",
-    "Train": "train",
-    "Trailer": "trailer",
-    "Towed Object": "towed_object",
-    "Wheeled Slow": "wheeled_slow",
-}
+LABELS: Final[Mapping[str, str]] = name_table(
+    """car: Car; truck: Truck; bus: Bus/RV/Caravan, Bus; motorcycle: Motorcycle;
+    rider: Motorcyclist, Bicyclist; bicycle: Bicycle; pedestrian: Person, Pedestrian; train: Train;
+    trailer: Trailer; towed_object: Towed Object; wheeled_slow: Wheeled Slow"""
+)
 """Class names of common ontologies -> the labels of this package."""
 
 
@@ -157,16 +132,14 @@ def looks_like_dgp(source: Path) -> bool:
 
 
 def import_dgp(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one scene into the scene directory ``out``; see the module text for what is read.
+    """Import one scene into the scene directory ``out``; see the module text for what is read. Raises UsageError: there
+    are several scenes and none was chosen, or there is no such scene or camera. InputError: something is missing,
+    malformed or contradictory; nothing is left at ``out``.
 
     Args:
         source: a scene's folder, or a folder of scenes.
         options: ``sequence`` names the scene's folder where there are several; ``frames`` counts images of the first
             chosen camera; ``cameras`` by either name (``CAMERA_01`` or ``camera_01``), all by default.
-
-    Raises:
-        UsageError: there are several scenes and none was chosen, or there is no such scene or camera.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     if not source.is_dir():
         raise InputError("DGP folder does not exist", where=str(source), expected="a folder")
@@ -185,12 +158,8 @@ def _scenes(source: Path) -> list[Path]:
 def _choose_scene(source: Path, options: ImportOptions) -> Path:
     scenes = _scenes(source)
     if not scenes:
-        raise InputError(
-            "no DGP scene found",
-            where=str(source),
-            got=folder_contents(source),
-            expected="scene_<hash>.json beside a calibration folder, here or in sub-folders",
-        )
+        expected = "scene_<hash>.json beside a calibration folder, here or in sub-folders"
+        raise InputError("no DGP scene found", where=str(source), got=folder_contents(source), expected=expected)
     matching = [p for p in scenes if options.sequence in ("", p.parent.resolve().name, p.stem, p.name)]
     names = [f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes]
     return the_only(matching, names, options, source, "scene")
@@ -327,12 +296,8 @@ class _DgpCalibration:
 
     def mount(self, sensor: str, where: str) -> Matrix:
         if sensor not in self.mounts:
-            raise InputError(
-                "calibration lacks a sensor",
-                where=self.where,
-                expected=f"{sensor} ({where})",
-                got=", ".join(self.mounts),
-            )
+            what = "calibration lacks a sensor"
+            raise InputError(what, where=self.where, expected=f"{sensor} ({where})", got=", ".join(self.mounts))
         return self.mounts[sensor]
 
 
@@ -341,9 +306,8 @@ def _read_calibration(folder: Path, key: str) -> _DgpCalibration:
     record = _json(path, "calibration/*.json")
     names = [str(name) for name in record["names"]]
     if not len(names) == len(record["extrinsics"]) == len(record["intrinsics"]):
-        raise InputError(
-            "calibration lists differ in length", where=str(path), expected="names, extrinsics, intrinsics"
-        )
+        what = "calibration lists differ in length"
+        raise InputError(what, where=str(path), expected="names, extrinsics, intrinsics")
     mounts = {n: _pose(value, f"{path}: {n}") for n, value in zip(names, record["extrinsics"], strict=True)}
     return _DgpCalibration(dict(zip(names, record["intrinsics"], strict=True)), mounts, str(path))
 
@@ -359,12 +323,8 @@ def _add_camera(cameras: dict[str, Camera], calibration: _DgpCalibration, name: 
     width, height = int(datum.record["width"]), int(datum.record["height"])
     camera = Camera(name, width, height, k["fx"], k["fy"], k["cx"] + 0.5, k["cy"] + 0.5)
     if cameras.setdefault(name, camera) != camera:
-        raise InputError(
-            "images of one camera differ in size or calibration",
-            where=datum.where,
-            expected=str(cameras[name]),
-            got=str(camera),
-        )
+        what = "images of one camera differ in size or calibration"
+        raise InputError(what, where=datum.where, expected=str(cameras[name]), got=str(camera))
 
 
 # --- boxes and clouds -----------------------------------------------------------------------------
@@ -386,12 +346,8 @@ def _read_tracks(
         for index, item in enumerate(_json(path, "bounding_box_3d/*.json")["annotations"]):
             where = f"{path}: annotations[{index}]"
             if item["class_id"] not in names:
-                raise InputError(
-                    "box has a class that the ontology lacks",
-                    where=where,
-                    got=str(item["class_id"]),
-                    expected=", ".join(str(number) for number in names),
-                )
+                what, got = "box has a class that the ontology lacks", str(item["class_id"])
+                raise InputError(what, where=where, got=got, expected=", ".join(str(number) for number in names))
             box = item["box"]
             size = box["length"], box["width"], box["height"]
             label = tracks.label_of(names[item["class_id"]])
@@ -407,11 +363,8 @@ def _class_names(folder: Path, scene: Mapping[str, Any]) -> dict[int, str]:
 
 
 def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
-    """A cloud: array ``data`` of an npz file, columns named by ``point_format`` (empty = X, Y, Z, INTENSITY).
-
-    Raises:
-        InputError: cut off, damaged, of another size than it declares, without coordinates, or not finite.
-    """
+    """A cloud: array ``data`` of an npz file, columns named by ``point_format`` (empty = X, Y, Z, INTENSITY). Raises
+    InputError: cut off, damaged, of another size than it declares, without coordinates, or not finite."""
     where = str(path)
     arrays = npz_arrays(store.read_bytes(path), where)
     note_unknown("point_cloud/*.npz", arrays, frozenset({"data"}))
@@ -420,20 +373,13 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
     note_unknown("point_format", columns, _CHANNELS)
     fits = data.ndim == 2 and data.shape[1] == len(columns) and data.dtype.kind in "fiu"
     if not fits or not {"X", "Y", "Z"} <= {*columns}:
-        raise InputError(
-            "cloud does not have its columns",
-            where=f"{where}: data",
-            got=f"{data.dtype} {data.shape}",
-            expected=f"[N, {len(columns)}] numbers: {', '.join(columns)}",
-        )
+        what, expected = "cloud does not have its columns", f"[N, {len(columns)}] numbers: {', '.join(columns)}"
+        raise InputError(what, where=f"{where}: data", got=f"{data.dtype} {data.shape}", expected=expected)
     returns = is_return(data[:, [columns.index(axis) for axis in "XYZ"]])
     no_returns, data = int((~returns).sum()), data[returns].astype(np.float32)
     if not np.isfinite(data).all():
-        raise InputError(
-            "cloud holds values that are not finite",
-            where=where,
-            got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points",
-        )
+        what = "cloud holds values that are not finite"
+        raise InputError(what, where=where, got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points")
     xyz = np.ascontiguousarray(data[:, [columns.index(axis) for axis in "XYZ"]])
     intensity = data[:, columns.index("INTENSITY")] if "INTENSITY" in columns else np.zeros(len(data), np.float32)
     # the format states no range

@@ -102,7 +102,8 @@ class ImageFit:
         return not self.note
 
     def image(self, image: NDArray[np.uint8] | Path | bytes, where: str = "") -> NDArray[np.uint8] | Path | bytes:
-        """One recorded image as ``SceneWriter.add_frame`` wants it.
+        """One recorded image as ``SceneWriter.add_frame`` wants it. Raises InputError: damaged, or not of the recorded
+        size.
 
         Args:
             image: u8[H, W, 3], or path or bytes of a PNG or JPEG.
@@ -111,9 +112,6 @@ class ImageFit:
         Returns:
             ``image`` itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95
             for a JPEG, PNG for a PNG, grey for grey) for a file.
-
-        Raises:
-            InputError: damaged, or not of the recorded size.
         """
         if self.keeps_bytes:
             return image
@@ -144,12 +142,8 @@ class ImageFit:
         are mixed."""
         height, width = self.recorded.height, self.recorded.width
         if ids.shape != (height, width):
-            raise InputError(
-                "label does not have its camera's size",
-                where=f"camera {self.camera.name}",
-                expected=f"[{height}, {width}]",
-                got=str(list(ids.shape)),
-            )
+            what, where = "label does not have its camera's size", f"camera {self.camera.name}"
+            raise InputError(what, where=where, expected=f"[{height}, {width}]", got=str(list(ids.shape)))
         if self.table is not None:
             ids = self.table.nearest(ids)
         return resize_nearest(ids, self.camera.height, self.camera.width)
@@ -158,16 +152,14 @@ class ImageFit:
 def fit_images(
     camera: Camera, options: ImportOptions, lens: Lens | None = None, target: Camera | None = None
 ) -> ImageFit:
-    """Plan what happens to the images of a camera.
+    """Plan what happens to the images of a camera. Raises InputError: the lens cannot be rectified like this.
+    UsageError: ``resolution`` is larger than the images.
 
     Args:
         camera: as recorded: size and intrinsics of the files; with a lens, its coefficients in ``distortion``.
         options: ``resolution`` is used.
         lens: the lens' distortion; None = images are rectified.
         target: pinhole camera to rectify to (size free, same name), for lenses that do not fit one by themselves.
-
-    Raises:
-        InputError: the lens cannot be rectified like this. UsageError: ``resolution`` is larger than the images.
     """
     changes = []
     table = None
@@ -203,12 +195,8 @@ def resized(width: int, height: int, resolution: Resolution | None, where: str =
         scale = min(1.0, resolution / max(width, height))
         return max(1, round(width * scale)), max(1, round(height * scale))
     if resolution[0] > width or resolution[1] > height:
-        raise UsageError(
-            "images are never enlarged",
-            where=where or "--resolution",
-            expected=f"at most {width}x{height}",
-            got=f"{resolution[0]}x{resolution[1]}",
-        )
+        what, expected = "images are never enlarged", f"at most {width}x{height}"
+        raise UsageError(what, where=where or "--resolution", expected=expected, got=f"{resolution[0]}x{resolution[1]}")
     return resolution
 
 
@@ -217,10 +205,8 @@ def resized(width: int, height: int, resolution: Resolution | None, where: str =
 
 def covering_camera(camera: Camera, lens: Lens) -> Camera:
     """The pinhole camera of the recorded size with the shortest focal length, not below the lens', that sees no border.
-
-    Raises:
-        InputError: it would be more than ``MAX_FOCAL_GAIN`` times the lens', or the polynomial turns back inside it.
-    """
+    Raises InputError: it would be more than ``MAX_FOCAL_GAIN`` times the lens', or the polynomial turns back inside
+    it."""
     low, high = 1.0, MAX_FOCAL_GAIN
 
     def at(gain: float) -> Camera:
@@ -230,13 +216,10 @@ def covering_camera(camera: Camera, lens: Lens) -> Camera:
         return camera
     problem = _border_problem(at(high), camera, lens)
     if problem is not None:
-        raise InputError(
-            "lens cannot be rectified to a pinhole camera of its own size",
-            where=f"camera {camera.name}",
-            got=problem,
-            expected=f"rays that cover the image with at most {MAX_FOCAL_GAIN:g} times the focal length",
-            remedy="check the order of the coefficients; for a very wide lens choose a narrower pinhole camera",
-        )
+        what = "lens cannot be rectified to a pinhole camera of its own size"
+        expected = f"rays that cover the image with at most {MAX_FOCAL_GAIN:g} times the focal length"
+        remedy = "check the order of the coefficients; for a very wide lens choose a narrower pinhole camera"
+        raise InputError(what, where=f"camera {camera.name}", got=problem, expected=expected, remedy=remedy)
     while high - low > 1e-4:
         middle = (low + high) / 2
         low, high = (middle, high) if _border_problem(at(middle), camera, lens) else (low, middle)
@@ -286,12 +269,8 @@ class _Table:
             place = lens(xy) * [camera.fx, camera.fy] + [camera.cx, camera.cy] - 0.5
             outside = (place < -0.51) | (place > np.array([camera.width, camera.height]) - 0.49)
             if not np.isfinite(place).all() or outside.any():
-                raise InputError(
-                    "rectified camera looks beyond the recorded image",
-                    where=f"camera {camera.name}",
-                    got=f"row {rows.start} on",
-                    remedy="choose a narrower pinhole camera",
-                )
+                what, remedy = "rectified camera looks beyond the recorded image", "choose a narrower pinhole camera"
+                raise InputError(what, where=f"camera {camera.name}", got=f"row {rows.start} on", remedy=remedy)
             place = place.clip(0, np.array([camera.width, camera.height]) - 1.0)
             whole = np.minimum(place.astype(np.int64), [max(camera.width - 2, 0), max(camera.height - 2, 0)])
             part = np.minimum(np.round((place - whole) * 256), 255).astype(np.uint8)

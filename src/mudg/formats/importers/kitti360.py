@@ -44,13 +44,14 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, transform_points
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
-from mudg.formats.importers import layout
-from mudg.formats.importers.box_tracks import BoxTracks
+from mudg.formats.importers import common
 from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import (
     ImportOptions,
+    LogFiles,
     deskew,
     mended_path,
+    name_table,
     origin_note,
     pose_near,
     rigid_pose,
@@ -58,7 +59,7 @@ from mudg.formats.importers.common import (
     seconds,
     world_from_first,
 )
-from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes, image_size
 from mudg.formats.importers.kitti import files as kitti_poses
 from mudg.formats.importers.kitti.files import (
@@ -69,7 +70,6 @@ from mudg.formats.importers.kitti.files import (
     read_scan,
     table_entry,
 )
-from mudg.formats.importers.layout import LogFiles
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.motion import GAP_M
 
@@ -83,8 +83,6 @@ from mudg.scene.motion import GAP_M
 #
 # The files hold a hundred thousand objects of all classes; they are read in pieces and only the classes of ``LABEL_OF``
 # are kept.
-
-
 LABEL_OF_ID: Final = {
     13: "car",
     14: "truck",
@@ -100,43 +98,17 @@ LABEL_OF_ID: Final = {
 }
 """The annotation tool's class numbers (``semanticId``) of what can move. Source: the data set's label table
 (kittiId)."""
-LABEL_OF: Final = {
-    "car": "car",
-    "truck": "truck",
-    "bus": "bus",
-    "caravan": "caravan",
-    "trailer": "trailer",
-    "train": "train",
-    "motorcycle": "motorcycle",
-    "bicycle": "bicycle",
-    "person": "pedestrian",
-    "pedestrian": "pedestrian",
-    "rider": "cyclist",
-    "unknown vehicle": "vehicle",
-}
+LABEL_OF: Final = name_table(
+    """car: car; truck: truck; bus: bus; caravan: caravan; trailer: trailer; train: train;
+    motorcycle: motorcycle; bicycle: bicycle; pedestrian: person, pedestrian; cyclist: rider;
+    vehicle: unknown vehicle"""
+)
 """Classes that become tracks -> the labels of this package. Buildings, poles, vegetation and ground are no tracks."""
 _OFFICIAL: Final = frozenset(
-    {
-        "index",
-        "label",
-        "category",
-        "semanticId",
-        "semanticId_orig",
-        "instanceId",
-        "timestamp",
-        "start_frame",
-        "end_frame",
-        "dynamic",
-        "dynamicSeq",
-        "dynamicIdx",
-        "dynamicIndex",
-        "level_min",
-        "level_max",
-        "color",
-        "transform",
-        "vertices",
-        "faces",
-    }
+    (
+        "index label category semanticId semanticId_orig instanceId timestamp start_frame end_frame dynamic "
+        "dynamicSeq dynamicIdx dynamicIndex level_min level_max color transform vertices faces"
+    ).split()
 )
 """Fields of the data set's objects, read or not."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
@@ -168,14 +140,12 @@ class Kitti360Box:
 
 
 def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
-    """Boxes of the classes in ``LABEL_OF``, one by one.
+    """Boxes of the classes in ``LABEL_OF``, one by one. Raises InputError: missing, cut off, malformed, or it declares
+    XML entities.
 
     Args:
         path: the XML file.
         left_out: filled with what is not read (``that are not cuboids``) and how often.
-
-    Raises:
-        InputError: missing, cut off, malformed, or it declares XML entities.
     """
     for number, item in enumerate(_objects(path)):
         where = f"{path}: object {number} ({item.tag})"
@@ -239,11 +209,8 @@ def _refuse_entities(content: bytes, where: str, first: bool) -> None:
     head = content[:200].lower()
     other = first and b"encoding" in head and not any(name in head for name in (b"utf-8", b"ascii"))
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content or b"\0" in content or other:
-        raise InputError(
-            "box file declares a document type, entities or another encoding, which the data set's files do not",
-            where=where,
-            remedy="use the file from the data set",
-        )
+        what = "box file declares a document type, entities or another encoding, which the data set's files do not"
+        raise InputError(what, where=where, remedy="use the file from the data set")
 
 
 def _label(item: ElementTree.Element, where: str) -> str:
@@ -276,12 +243,8 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
     rows, columns = _integer(node, "rows", f"{where}.{key}"), _integer(node, "cols", f"{where}.{key}")
     texts = (node.findtext("data") or "").split()
     if rows * columns != len(texts) or not 0 < rows * columns <= _MAX_VALUES:
-        raise InputError(
-            "matrix does not have the size it declares",
-            where=f"{where}.{key}",
-            expected=f"{rows} x {columns} numbers",
-            got=f"{len(texts)} values",
-        )
+        what, where = "matrix does not have the size it declares", f"{where}.{key}"
+        raise InputError(what, where=where, expected=f"{rows} x {columns} numbers", got=f"{len(texts)} values")
     try:
         values = np.array([float(text) for text in texts])
     except ValueError as error:
@@ -300,11 +263,8 @@ def _shape(
     them the annotation tool called x does not matter for the box.
     """
     if transform.shape != (4, 4) or vertices.shape[1] != 3 or np.abs(transform[3] - [0, 0, 0, 1]).max() > 1e-6:
-        raise InputError(
-            "box is not a 4x4 transform of 3-D vertices",
-            where=where,
-            got=f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}",
-        )
+        got = f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}"
+        raise InputError("box is not a 4x4 transform of 3-D vertices", where=where, got=got)
     low, high = vertices.min(0), vertices.max(0)
     scale = np.linalg.norm(transform[:3, :3], axis=0)
     sizes = scale * (high - low)
@@ -331,8 +291,6 @@ def _shape(
 #
 # The data set's vehicle frame is that of the GPS/IMU: x forward, y right, z down. The ego frame here is the same point
 # with y to the left and z up.
-
-
 IMU_FROM_EGO: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 FISHEYES: Final = ("image_02", "image_03")
 FISHEYE_VIEW_DEG: Final = 90.0
@@ -403,11 +361,7 @@ class Kitti360Calibration:
 
 
 def read_calibration(folder: Path) -> Kitti360Calibration:
-    """Read ``calibration/``.
-
-    Raises:
-        InputError: a file or entry is missing, or a matrix is not a rigid motion.
-    """
+    """Read ``calibration/``. Raises InputError: a file or entry is missing, or a matrix is not a rigid motion."""
     path = folder / "calib_cam_to_pose.txt"
     table = read_number_table(path)
     imu_from_camera = {
@@ -441,13 +395,9 @@ def _rigid_file(path: Path) -> Matrix:
 
 def _check_size(size: tuple[int, int], declared: tuple[int, int], where: str) -> None:
     if size != declared:
-        raise InputError(
-            "images do not have the size that the calibration is for",
-            where=where,
-            expected=f"{declared[0]}x{declared[1]}",
-            got=f"{size[0]}x{size[1]}",
-            remedy="use the images as the data set ships them",
-        )
+        what, expected = "images do not have the size that the calibration is for", f"{declared[0]}x{declared[1]}"
+        remedy = "use the images as the data set ships them"
+        raise InputError(what, where=where, expected=expected, got=f"{size[0]}x{size[1]}", remedy=remedy)
 
 
 def _read_fisheye(path: Path) -> dict[str, float]:
@@ -455,12 +405,8 @@ def _read_fisheye(path: Path) -> dict[str, float]:
     text = store.read_bytes(path).decode("utf-8", "replace")
     model = re.search(r"^\s*model_type\s*:\s*\"?(\w+)", text, re.MULTILINE)
     if model is None or model[1] != "MEI":
-        raise InputError(
-            "fisheye calibration is of another camera model",
-            where=str(path),
-            expected="model_type: MEI",
-            got=model[1] if model else "no model_type",
-        )
+        what = "fisheye calibration is of another camera model"
+        raise InputError(what, where=str(path), expected="model_type: MEI", got=model[1] if model else "no model_type")
     note_unknown(path.name, re.findall(r"^\s*(\w+)\s*:", text, re.MULTILINE), _FISHEYE)
     found: dict[str, float] = {}
     for key, value in re.findall(r"^\s*(\w+)\s*:\s*([-+.\deE]+)\s*$", text, re.MULTILINE):
@@ -470,26 +416,16 @@ def _read_fisheye(path: Path) -> dict[str, float]:
             raise InputError("fisheye calibration holds no number", where=f"{path}: {key}", got=value[:40]) from error
     missing = [key for key in _FISHEYE_VALUES if key not in found]
     if missing:
-        raise InputError(
-            "fisheye calibration is incomplete",
-            where=str(path),
-            expected=", ".join(_FISHEYE_VALUES),
-            got=f"no {', '.join(missing)}",
-            remedy="is the file cut off?",
-        )
+        what, where, got = "fisheye calibration is incomplete", str(path), f"no {', '.join(missing)}"
+        raise InputError(what, where=where, expected=", ".join(_FISHEYE_VALUES), got=got, remedy="is the file cut off?")
     if found["xi"] < 0 or found["gamma1"] <= 0 or found["gamma2"] <= 0:
-        raise InputError(
-            "fisheye calibration makes no sense",
-            where=str(path),
-            expected="xi >= 0, gamma1 and gamma2 > 0",
-            got=f"xi={found['xi']:g}, gamma1={found['gamma1']:g}, gamma2={found['gamma2']:g}",
-        )
+        what = "fisheye calibration makes no sense"
+        got = f"xi={found['xi']:g}, gamma1={found['gamma1']:g}, gamma2={found['gamma2']:g}"
+        raise InputError(what, where=str(path), expected="xi >= 0, gamma1 and gamma2 > 0", got=got)
     return found
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI-360: Liao, Xie, Geiger; attribution, non-commercial, share-alike)"
 CAMERAS: Final = {"image_00": "front", "image_01": "front_stereo", "image_02": "side_left", "image_03": "side_right"}
@@ -558,24 +494,22 @@ def looks_like_kitti360(source: Path) -> bool:
 
 
 def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one KITTI-360 drive into the scene directory ``out``; see the module text for what is understood.
+    """Import one KITTI-360 drive into the scene directory ``out``; see the module text for what is understood. Raises
+    UsageError: there are several drives and none was chosen, or an option does not apply. InputError: something is
+    missing, malformed or contradictory; nothing is left at ``out``.
 
     Args:
         source: the data set's folder, or ``data_2d_raw/<drive>`` in it.
         out: destination.
         options: ``sequence`` is the drive (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the
             stereo pair; all others are used too.
-
-    Raises:
-        UsageError: there are several drives and none was chosen, or an option does not apply.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     folders = _find(source, options)
     calibration = read_calibration(folders.root / "calibration")
-    images = {name: layout.numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
+    images = {name: common.numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
     available = {name: ours for name, ours in CAMERAS.items() if images[name] and name in calibration.ego_from_camera}
-    chosen = layout.chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
-    scans = layout.numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
+    chosen = common.chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
+    scans = common.numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
     streams = {**{name: images[name] for name in chosen}, **({SENSOR: scans} if scans else {})}
     notes: list[str] = []
     clock = _clock(folders, streams, notes)
@@ -583,7 +517,7 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     notes.append(f"poses from {poses.name}")
     ego = mended_path(_read_motion(poses, calibration, clock), options, notes)
     placed = {name: [n for n in found if _has_pose(ego, clock[n])] for name, found in streams.items()}
-    frames = layout.complete_frames(placed, options, str(folders.root), "kitti360")
+    frames = common.complete_frames(placed, options, str(folders.root), "kitti360")
     notes += _without_pose(streams.values(), placed.values(), options)
     start_s = float(clock[frames[0]])
     first = pose_near(ego, clock[frames[0]])
@@ -640,16 +574,12 @@ def _find(source: Path, options: ImportOptions) -> _Folders:
         return _Folders(source.absolute().parent.parent, source.absolute().name)
     raw = source / "data_2d_raw"
     if not raw.is_dir():
-        raise InputError(
-            "no KITTI-360 recording found",
-            where=str(source),
-            got=layout.folder_contents(source),
-            expected="data_2d_raw, data_poses and calibration in it",
-        )
+        what, got = "no KITTI-360 recording found", common.folder_contents(source)
+        raise InputError(what, where=str(source), got=got, expected="data_2d_raw, data_poses and calibration in it")
     drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
     wanted = options.sequence
     matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
-    return _Folders(source, layout.the_only(matching, drives, options, raw, "drive"))
+    return _Folders(source, common.the_only(matching, drives, options, raw, "drive"))
 
 
 def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
@@ -667,7 +597,7 @@ def _without_pose(
     """A note about the frames within ``options.frames`` that some stream has and none could place."""
     first, end = options.frames or (0, 2**63)
     lost = {n for found in streams for n in found if first <= n < end}.difference(*placed)
-    return [f"frames without a pose or time stamp were left out: {layout.number_ranges(sorted(lost))}"] if lost else []
+    return [f"frames without a pose or time stamp were left out: {common.number_ranges(sorted(lost))}"] if lost else []
 
 
 # --- time and motion ------------------------------------------------------------------------------
@@ -696,14 +626,10 @@ def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.floa
 
 def _find_poses(folders: _Folders, options: ImportOptions) -> Path:
     here = folders.root / "data_poses" / folders.drive
-    path = layout.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
+    path = common.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
     if path is None:
-        raise InputError(
-            "no vehicle poses found",
-            where=str(options.poses or here),
-            expected="poses.txt or cam0_to_world.txt",
-            remedy="download the data set's vehicle poses",
-        )
+        expected, remedy = "poses.txt or cam0_to_world.txt", "download the data set's vehicle poses"
+        raise InputError("no vehicle poses found", where=str(options.poses or here), expected=expected, remedy=remedy)
     return path
 
 
@@ -715,21 +641,16 @@ def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np
         row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
         number = int(row[0])
         if number != row[0] or number <= before:
-            raise InputError(
-                "first column is not a list of growing frame numbers",
-                where=where,
-                got=f"{row[0]:g}",
-                remedy="is the file of another kind?",
-            )
+            what = "first column is not a list of growing frame numbers"
+            raise InputError(what, where=where, got=f"{row[0]:g}", remedy="is the file of another kind?")
         before = number
         if number < len(clock) and np.isfinite(clock[number]):
             pose = rigid_pose(row[1:].reshape(-1, 4), where)
             numbers.append(number)
             poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
     if not poses:
-        raise InputError(
-            "no pose belongs to a frame", where=str(path), expected=f"frame numbers up to {len(clock) - 1}"
-        )
+        what = "no pose belongs to a frame"
+        raise InputError(what, where=str(path), expected=f"frame numbers up to {len(clock) - 1}")
     times = clock[numbers]
     if (np.diff(times) <= 0).any():
         frame = numbers[int(np.flatnonzero(np.diff(times) <= 0)[0]) + 1]
@@ -775,7 +696,7 @@ class _SickLines:
     def find(
         cls, folders: _Folders, calibration: Kitti360Calibration, ego: EgoPath, start_s: float, notes: list[str]
     ) -> _SickLines | None:
-        files = layout.numbered_files(folders.raw("sick_points") / "data", (".bin",))
+        files = common.numbered_files(folders.raw("sick_points") / "data", (".bin",))
         stamps = folders.raw("sick_points") / "timestamps.txt"
         if not files:
             return None
@@ -822,9 +743,8 @@ def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[
         return {}
     ids = _grey(path)
     if ids.dtype != np.uint8 or (ids[ids != UNLABELLED] > _LAST_ID).any():
-        raise InputError(
-            "semantic image holds ids that do not exist", where=str(path), expected=f"0..{_LAST_ID}, 8 bits"
-        )
+        what = "semantic image holds ids that do not exist"
+        raise InputError(what, where=str(path), expected=f"0..{_LAST_ID}, 8 bits")
     table = np.full(256, UNLABELLED, np.uint8)
     table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())
     labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
@@ -841,9 +761,8 @@ def _grey(path: Path) -> NDArray[Any]:
     try:
         with Image.open(io.BytesIO(store.read_bytes(path)), formats=("PNG",)) as image:
             if image.mode not in ("L", "P", "I;16", "I"):
-                raise InputError(
-                    "label image is not grey", where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits"
-                )
+                what = "label image is not grey"
+                raise InputError(what, where=str(path), got=f"mode {image.mode}", expected="8 or 16 bits")
             array = np.array(image)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError, EOFError) as error:
         raise InputError("label image cannot be decoded (is it cut off?)", where=str(path), got=str(error)) from error
@@ -855,7 +774,7 @@ def _read_tracks(
 ) -> list[Track]:
     """Tracks within the imported frames: moving boxes at their frames, standing ones over the window they were drawn
     in."""
-    path = options.boxes or layout.first_file(*folders.boxes())
+    path = options.boxes or common.first_file(*folders.boxes())
     if path is None:
         notes.append("no boxes found: everything counts as static")
         return []

@@ -30,18 +30,22 @@ from mudg.base.errors import InputError, MudgError
 from mudg.base.geometry import all_rigid, from_rotation_translation
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
-from mudg.formats.importers.box_tracks import BoxTracks
-from mudg.formats.importers.common import POSE_TOLERANCE, ImportOptions, ego_path, record_fields, rigid_pose, seconds
-from mudg.formats.importers.drive_log import CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
-from mudg.formats.importers.images import Lens
-from mudg.formats.importers.layout import (
+from mudg.formats.importers.common import (
+    POSE_TOLERANCE,
+    ImportOptions,
     LogFiles,
     chosen_cameras,
+    ego_path,
     folder_contents,
     path_inside,
+    record_fields,
     refuse_options,
+    rigid_pose,
+    seconds,
     the_only,
 )
+from mudg.formats.importers.drive_log import BoxTracks, CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
+from mudg.formats.importers.images import Lens
 from mudg.formats.ncore import (
     ABOUT,
     EGO_MASK,
@@ -71,8 +75,6 @@ from mudg.scene import motion
 # index is) or in a folder (``.zarr``). All metadata stand once more in one compressed member, which is what the package
 # reads. The package trusts sizes and codecs; here every size is held against the bytes that are there, and codecs other
 # than the format's own (pickle is one) are refused.
-
-
 METADATA: Final = ".zmetadata.cbor.xz"
 _BLOCK: Final = 512
 _HEADER: Final = struct.Struct("<4sIQI")
@@ -116,29 +118,19 @@ def foreign_reader(where: str) -> Iterator[None]:
     except MudgError:
         raise
     except Exception as error:
-        raise InputError(
-            "NCore recording cannot be read",
-            where=where,
-            got=f"{type(error).__name__}: {error}"[:300],
-            remedy="is a file of it damaged, missing, or of another version? copy it again",
-        ) from error
+        what = "NCore recording cannot be read"
+        remedy = "is a file of it damaged, missing, or of another version? copy it again"
+        raise InputError(what, where=where, got=f"{type(error).__name__}: {error}"[:300], remedy=remedy) from error
 
 
 def check_store(path: Path) -> None:
     """Refuse a store that is cut off, that contradicts itself, or that would take more memory than its files can need.
-
-    Raises:
-        InputError: so it is; nothing of the size that was promised has been allocated.
-    """
+    Raises InputError: so it is; nothing of the size that was promised has been allocated."""
     members = _members_of_folder(path) if path.is_dir() else _members_of_tar(path)
     where = f"{path}: {METADATA}"
     if METADATA not in members:
-        raise InputError(
-            "NCore store has no metadata",
-            where=where,
-            expected="a store that was finished",
-            remedy="was the program that wrote it stopped?",
-        )
+        what, expected = "NCore store has no metadata", "a store that was finished"
+        raise InputError(what, where=where, expected=expected, remedy="was the program that wrote it stopped?")
     with record_fields("NCore metadata make no sense", where, "groups and arrays of zarr 2"):
         metadata = _cbor(_unpacked(members[METADATA].read(), where), where)["metadata"]
         chunks = _chunk_sizes(members)
@@ -164,37 +156,23 @@ def _members_of_tar(path: Path) -> dict[str, _StoredMember]:
     last = _StoredMember(path, max(0, size - _BLOCK), _BLOCK).read()
     magic, kind, offset, length = _HEADER.unpack(last[: _HEADER.size].ljust(_HEADER.size, b"\0"))
     if magic != b"itar" or kind != 1 or size % _BLOCK:
-        raise InputError(
-            "not an indexed tar file, or cut off",
-            where=str(path),
-            expected="an index in the last 512 bytes",
-            got=f"{size} bytes, the last block begins with {last[:8]!r}",
-            remedy="copy the file again",
-        )
+        what, expected = "not an indexed tar file, or cut off", "an index in the last 512 bytes"
+        got = f"{size} bytes, the last block begins with {last[:8]!r}"
+        raise InputError(what, where=str(path), expected=expected, got=got, remedy="copy the file again")
     if offset + length > size - _BLOCK:
-        raise InputError(
-            "index lies outside of the file",
-            where=where,
-            expected=f"at most {size - _BLOCK} bytes",
-            got=f"{length} bytes from {offset} on",
-            remedy="copy the file again",
-        )
+        what, got, remedy = "index lies outside of the file", f"{length} bytes from {offset} on", "copy the file again"
+        raise InputError(what, where=where, expected=f"at most {size - _BLOCK} bytes", got=got, remedy=remedy)
     with record_fields("index makes no sense", where, "names, offsets and sizes of members"):
         table = _cbor(_unpacked(_StoredMember(path, offset, length).read(), where), where)
         names, offsets, sizes = table["items"], table["offset_datas"], table["sizes"]
         if not len(names) == len(offsets) == len(sizes):
-            raise InputError(
-                "index contradicts itself", where=where, got=f"{len(names)}, {len(offsets)}, {len(sizes)} entries"
-            )
+            what = "index contradicts itself"
+            raise InputError(what, where=where, got=f"{len(names)}, {len(offsets)}, {len(sizes)} entries")
         for name, begin, count in zip(names, offsets, sizes, strict=True):
             if not (isinstance(name, str) and _whole(begin) and _whole(count) and begin + count <= size):
-                raise InputError(
-                    "member lies outside of the file",
-                    where=f"{path}: {str(name)[:80]}",
-                    expected=f"at most {size} bytes",
-                    got=f"{count} bytes from {begin} on"[:120],
-                    remedy="copy the file again",
-                )
+                what, where = "member lies outside of the file", f"{path}: {str(name)[:80]}"
+                expected, got = f"at most {size} bytes", f"{count} bytes from {begin} on"[:120]
+                raise InputError(what, where=where, expected=expected, got=got, remedy="copy the file again")
         return {
             name: _StoredMember(path, begin, count) for name, begin, count in zip(names, offsets, sizes, strict=True)
         }
@@ -211,20 +189,14 @@ def _unpacked(packed: bytes, where: str) -> bytes:
     try:
         content = unpacker.decompress(packed, most + 1)
     except (lzma.LZMAError, EOFError) as error:
-        raise InputError(
-            "compressed metadata are damaged", where=where, got=str(error), remedy="copy the file again"
-        ) from error
+        what = "compressed metadata are damaged"
+        raise InputError(what, where=where, got=str(error), remedy="copy the file again") from error
     if len(content) > most:
-        raise InputError(
-            "compressed metadata unpack to more than metadata can be",
-            where=where,
-            got=f"{len(packed)} bytes",
-            expected=f"at most {most} bytes when unpacked",
-        )
+        what = "compressed metadata unpack to more than metadata can be"
+        raise InputError(what, where=where, got=f"{len(packed)} bytes", expected=f"at most {most} bytes when unpacked")
     if not unpacker.eof:
-        raise InputError(
-            "compressed metadata are cut off", where=where, got=f"{len(packed)} bytes", remedy="copy the file again"
-        )
+        what = "compressed metadata are cut off"
+        raise InputError(what, where=where, got=f"{len(packed)} bytes", remedy="copy the file again")
     return content
 
 
@@ -246,9 +218,8 @@ def _cbor(content: bytes, where: str) -> Any:
         MemoryError,
         UnicodeDecodeError,
     ) as error:
-        raise InputError(
-            "metadata are damaged", where=where, got=str(error)[:120], remedy="copy the file again"
-        ) from error
+        what = "metadata are damaged"
+        raise InputError(what, where=where, got=str(error)[:120], remedy="copy the file again") from error
     if not isinstance(found, dict):
         raise InputError("metadata are of another kind", where=where, expected="a map", got=type(found).__name__)
     return found
@@ -272,50 +243,33 @@ def _check_array(about: Mapping[str, Any], chunks: Mapping[str, _StoredMember], 
     way."""
     codec, nested = about["compressor"], about.get("dimension_separator", ".") != "."
     if nested or about.get("filters") or not (codec is None or codec["id"] == "blosc"):
-        raise InputError(
-            "array is packed in a way that is not read",
-            where=where,
-            expected="blosc or nothing, chunks named 0.0",
-            got=str(about.get("filters") or (about["dimension_separator"] if nested else codec))[:120],
-        )
+        what = "array is packed in a way that is not read"
+        got = str(about.get("filters") or (about["dimension_separator"] if nested else codec))[:120]
+        raise InputError(what, where=where, expected="blosc or nothing, chunks named 0.0", got=got)
     kind = np.dtype(about["dtype"])
     if kind.hasobject or kind.kind not in _KINDS:
         raise InputError("array is not of plain numbers or bytes", where=where, got=str(about["dtype"])[:80])
     shape, pieces = about["shape"], about["chunks"]
     if len(shape) != len(pieces) or not all(map(_whole, (*shape, *pieces))) or 0 in pieces:
-        raise InputError(
-            "array has a shape that makes no sense", where=where, got=f"{shape} in chunks of {pieces}"[:120]
-        )
+        what = "array has a shape that makes no sense"
+        raise InputError(what, where=where, got=f"{shape} in chunks of {pieces}"[:120])
     grid = [-(-side // piece) for side, piece in zip(shape, pieces, strict=True)]
     names = (".".join(map(str, place)) or "0" for place in (_places(grid) if math.prod(shape) else ()))
     # the package would fill it with a constant
     if (lost := next((name for name in names if name not in chunks), None)) is not None:
-        raise InputError(
-            "chunk of an array is missing",
-            where=f"{where}/{lost}",
-            expected=f"chunks of {pieces} for {shape}"[:120],
-            got=f"{len(chunks)} chunks",
-            remedy="copy the recording again",
-        )
+        what, expected = "chunk of an array is missing", f"chunks of {pieces} for {shape}"[:120]
+        got = f"{len(chunks)} chunks"
+        raise InputError(what, where=f"{where}/{lost}", expected=expected, got=got, remedy="copy the recording again")
     stored, growth = sum(chunk.size for chunk in chunks.values()), 1 if codec is None else _MOST_LZ4
     piece = math.prod(pieces) * kind.itemsize
     if max(math.prod(shape) * kind.itemsize, piece if math.prod(shape) else 0) > growth * stored:
-        raise InputError(
-            "array is larger than its file can hold",
-            where=where,
-            got=f"{shape} of {kind} in {stored} bytes"[:120],
-            remedy="is the file cut off?",
-        )
+        got = f"{shape} of {kind} in {stored} bytes"[:120]
+        raise InputError("array is larger than its file can hold", where=where, got=got, remedy="is the file cut off?")
     for name, chunk in chunks.items():
         size = chunk.size if codec is None else _blosc_size(chunk, f"{where}/{name}")
         if size != piece:
-            raise InputError(
-                "chunk of an array is of another size",
-                where=f"{where}/{name}",
-                expected=f"{piece} bytes",
-                got=f"{size}",
-                remedy="copy the file again",
-            )
+            what, where = "chunk of an array is of another size", f"{where}/{name}"
+            raise InputError(what, where=where, expected=f"{piece} bytes", got=f"{size}", remedy="copy the file again")
 
 
 def _places(grid: Sequence[int]) -> Iterator[tuple[int, ...]]:
@@ -338,8 +292,6 @@ def _blosc_size(chunk: _StoredMember, where: str) -> int:
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 Record = TypeVar("Record", ImageRecord, SweepRecord)
 _LIST: Final[Known] = {
     **dict.fromkeys(("sequence_id", "sequence_timestamp_interval_us", "generic_meta_data", "version")),
@@ -355,23 +307,11 @@ LABELS: Final[Mapping[str, str]] = {
     "person": "pedestrian",
     **{
         name: name
-        for name in (
-            "vehicle",
-            "car",
-            "van",
-            "truck",
-            "bus",
-            "trailer",
-            "tram",
-            "train",
-            "pedestrian",
-            "cyclist",
-            "rider",
-            "bicycle",
-            "motorcycle",
-            "stroller",
-            "animal",
-            "protruding_object",
+        for name in tuple(
+            (
+                "vehicle car van truck bus trailer tram train pedestrian cyclist rider bicycle motorcycle stroller "
+                "animal protruding_object"
+            ).split()
         )
     },
 }
@@ -395,16 +335,13 @@ def files_of_ncore(source: Path, options: ImportOptions) -> LogFiles:
 
 
 def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one recording into the scene directory ``out``; see the module text for what is read.
+    """Import one recording into the scene directory ``out``; see the module text for what is read. Raises UsageError:
+    there are several recordings and none was chosen, or no such camera. InputError: missing, damaged or contradictory;
+    nothing is left at ``out``. ResourceError: the package is not installed.
 
     Args:
         source: a folder of stores, one of them, or the ``.json`` that lists them.
         options: ``sequence`` names the recording where a folder holds several (its beginning is enough).
-
-    Raises:
-        UsageError: there are several recordings and none was chosen, or no such camera.
-        InputError: missing, damaged or contradictory; nothing is left at ``out``. ResourceError: the package is not
-            installed.
     """
     refuse_options(options, "NCore", "poses", "boxes", "bridge_gaps")
     package()
@@ -463,19 +400,15 @@ def _listed(path: Path) -> list[Path]:
 def _choose(source: Path, options: ImportOptions) -> tuple[Path, ...]:
     found = _recordings(source)
     if not found or not all(found.values()):
-        raise InputError(
-            "no NCore recording found",
-            where=str(source),
-            expected=f"files NAME{MARK}.zarr.itar, or folders NAME{MARK}.zarr",
-            got=folder_contents(source) if source.is_dir() else "no such file",
-        )
+        expected = f"files NAME{MARK}.zarr.itar, or folders NAME{MARK}.zarr"
+        got = folder_contents(source) if source.is_dir() else "no such file"
+        raise InputError("no NCore recording found", where=str(source), expected=expected, got=got)
     matching = [stores for name, stores in found.items() if name.startswith(options.sequence)]
     chosen = tuple(the_only(matching, list(found), options, source, "recording"))
     for path in chosen:
         if not path.exists():
-            raise InputError(
-                "a store of the recording is missing", where=str(path), expected="all stores that its list names"
-            )
+            what = "a store of the recording is missing"
+            raise InputError(what, where=str(path), expected="all stores that its list names")
     return chosen
 
 
@@ -534,13 +467,11 @@ def _opened(stores: tuple[Path, ...], where: str) -> Iterator[_OpenRecording]:
         with foreign_reader(where):
             of = {
                 name: reader.open_component_readers(getattr(v4, name).Reader)
-                for name in (
-                    "PosesComponent",
-                    "IntrinsicsComponent",
-                    "MasksComponent",
-                    "CuboidsComponent",
-                    "CameraSensorComponent",
-                    "LidarSensorComponent",
+                for name in tuple(
+                    (
+                        "PosesComponent IntrinsicsComponent MasksComponent CuboidsComponent CameraSensorComponent "
+                        "LidarSensorComponent"
+                    ).split()
                 )
             }
             poses = _single(of["PosesComponent"], "poses", where)
@@ -591,13 +522,9 @@ def _perhaps(found: Mapping[str, Any]) -> Any:
 def _single(found: Mapping[str, Any], kind: str, where: str) -> Any:
     one = _perhaps(found)
     if one is None:
-        raise InputError(
-            f"recording has no {kind}",
-            where=where,
-            expected=f"a component {INSTANCE}, or one of another name",
-            got=", ".join(found) or "none",
-            remedy="are all of its stores there?",
-        )
+        what, expected = f"recording has no {kind}", f"a component {INSTANCE}, or one of another name"
+        got = ", ".join(found) or "none"
+        raise InputError(what, where=where, expected=expected, got=got, remedy="are all of its stores there?")
     return one
 
 
@@ -668,12 +595,8 @@ def _spans(reader: Any, where: str) -> Times:
             raise InputError("time stamp is no time in microseconds", where=where, got=str(int(spans.max())))
         spans = spans.astype(np.int64)
     if (spans[:, 1] < spans[:, 0]).any() or (len(spans) and spans.max() - spans.min() > _MOST_SPAN_US):
-        raise InputError(
-            "times of frames make no sense",
-            where=where,
-            expected="microseconds of one recording, begin before end",
-            got=f"{spans.min()} to {spans.max()}",
-        )
+        what, expected = "times of frames make no sense", "microseconds of one recording, begin before end"
+        raise InputError(what, where=where, expected=expected, got=f"{spans.min()} to {spans.max()}")
     seconds(spans[:, 1], "us", where)
     return spans
 
@@ -693,9 +616,8 @@ def _optics(recording: _OpenRecording, camera: str, name: str, spans: Times, not
         plain = model.type() == "ideal-pinhole" or getattr(model, "is_distortion_free", False)
     exposure_us = float(np.median(spans[:, 1] - spans[:, 0])) if rolling and len(spans) else 0.0
     if exposure_us > _MOST_EXPOSURE_US:
-        raise InputError(
-            "images take longer than a shutter can", where=where, got=f"{exposure_us:g} us", expected="at most a second"
-        )
+        what = "images take longer than a shutter can"
+        raise InputError(what, where=where, got=f"{exposure_us:g} us", expected="at most a second")
     recorded = Camera(name, width, height, fx, fy, cx, cy, readout_s=exposure_us / MICRO)
     if exposure_us:
         notes.append(
@@ -732,12 +654,8 @@ def _mask(recording: _OpenRecording, camera: str, recorded: Camera) -> NDArray[n
             return None
         image = recording.masks.get_camera_mask_image(camera, EGO_MASK)
         if image.size != (recorded.width, recorded.height):
-            raise InputError(
-                "mask does not have its camera's size",
-                where=where,
-                got=f"{image.size}",
-                expected=f"{recorded.width}x{recorded.height}",
-            )
+            what = "mask does not have its camera's size"
+            raise InputError(what, where=where, got=f"{image.size}", expected=f"{recorded.width}x{recorded.height}")
         return np.asarray(image.convert("L")) != 0
 
 
@@ -762,9 +680,8 @@ def _picture(reader: Any, frame: int, where: str) -> bytes:
     with foreign_reader(where):
         content = bytes(reader.get_frame_data(frame).get_encoded_image_data())
     if content[:4] != b"\x89PNG" and content[:2] != b"\xff\xd8":
-        raise InputError(
-            "image is of a kind that is not read", where=where, expected="PNG or JPEG", got=repr(content[:8])
-        )
+        what = "image is of a kind that is not read"
+        raise InputError(what, where=where, expected="PNG or JPEG", got=repr(content[:8]))
     return content
 
 
@@ -815,28 +732,18 @@ def _points(
         or distance.shape[1] != len(ray)
         or intensity.shape != distance.shape
     ):
-        raise InputError(
-            "rays and returns of a sweep do not pair up",
-            where=where,
-            got=f"{ray.shape}, {times.shape}, {distance.shape}, {intensity.shape}",
-        )
+        what = "rays and returns of a sweep do not pair up"
+        raise InputError(what, where=where, got=f"{ray.shape}, {times.shape}, {distance.shape}, {intensity.shape}")
     if len(times) and not begin <= times.min() <= times.max() <= end:
-        raise InputError(
-            "points were measured outside of their sweep",
-            where=where,
-            expected=f"{begin} to {end} us",
-            got=f"{times.min()} to {times.max()}",
-        )
+        what = "points were measured outside of their sweep"
+        raise InputError(what, where=where, expected=f"{begin} to {end} us", got=f"{times.min()} to {times.max()}")
     # NaN is how the format says that nothing came back
     _, which = there = np.nonzero(np.isfinite(distance) & (distance != 0))
     xyz, times, seen = ray[which] * distance[there][:, None], times[which], intensity[there]
     length = np.linalg.norm(ray, axis=1)
     if not np.isfinite(xyz).all() or (np.abs(length - 1) > 1e-3).any() or (distance[there] < 0).any():
-        raise InputError(
-            "rays of a sweep make no sense",
-            where=where,
-            expected="directions of length 1, distances that are not negative",
-        )
+        what = "rays of a sweep make no sense"
+        raise InputError(what, where=where, expected="directions of length 1, distances that are not negative")
     if not ((seen >= 0) & (seen <= 1)).all():
         raise InputError("intensity is not in 0 to 1", where=where, got=f"{np.nanmin(seen):g} to {np.nanmax(seen):g}")
     moments, index = np.unique(times, return_inverse=True)
@@ -884,13 +791,9 @@ def _outside_gaps(records: list[Record], ego: EgoPath, options: ImportOptions) -
         if gap is None:
             there.append(record)
         elif not options.skip_missing:
-            raise InputError(
-                "vehicle poses have a gap here",
-                where=record.place,
-                got=f"at {record.time_s:.3f} s: {gap}",
-                expected="poses around every image and scan",
-                remedy="leave such frames out with --skip-missing",
-            )
+            what, where, got = "vehicle poses have a gap here", record.place, f"at {record.time_s:.3f} s: {gap}"
+            remedy = "leave such frames out with --skip-missing"
+            raise InputError(what, where=where, got=got, expected="poses around every image and scan", remedy=remedy)
     if len(there) < len(records):
         log.warn(f"ncore: left out {len(records) - len(there)} records in gaps of the vehicle's poses")
     return there

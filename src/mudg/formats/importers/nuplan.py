@@ -35,31 +35,29 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.plain_pickle import NUMPY_MAKERS, Maker, as_list, read_pickle
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, foreign_name
-from mudg.formats.importers.box_tracks import BoxTracks
 from mudg.formats.importers.clouds import read_cloud
 from mudg.formats.importers.common import (
     ImportOptions,
-    has_pose,
-    mended_path,
-    nearest_index,
-    origin_note,
-    pose_from_quaternion,
-    pose_near,
-    require_columns,
-    seconds,
-    unit_intensity,
-    world_from_first,
-)
-from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
-from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes
-from mudg.formats.importers.layout import (
     LogFiles,
     chosen_cameras,
     folder_contents,
+    has_pose,
+    mended_path,
+    name_table,
+    nearest_index,
+    origin_note,
     path_inside,
+    pose_from_quaternion,
+    pose_near,
     refuse_options,
+    require_columns,
+    seconds,
     the_only,
+    unit_intensity,
+    world_from_first,
 )
+from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
+from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes
 from mudg.formats.unknown_fields import note_unknown
 from mudg.scene.clouds import near_places
 from mudg.scene.schema import ref_problem
@@ -70,8 +68,6 @@ from mudg.scene.schema import ref_problem
 #
 # Names of tables and columns are literal here. Nothing from the file becomes part of a query, a path outside the sensor
 # blobs, or code: calibration columns are pickles, read by ``plain_pickle``.
-
-
 SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {
     "log": ("token", "logfile", "location"),
     "ego_pose": ("token", "timestamp", "x", "y", "z", "qw", "qx", "qy", "qz"),
@@ -152,9 +148,8 @@ class NuplanLog:
             for row in self._connection.execute(question, values):  # noqa: UP028
                 yield row
         except (sqlite3.Error, OverflowError, UnicodeDecodeError) as error:
-            raise InputError(
-                "log database is damaged", where=str(self.path), got=str(error)[:200], remedy="copy the file again"
-            ) from error
+            what = "log database is damaged"
+            raise InputError(what, where=str(self.path), got=str(error)[:200], remedy="copy the file again") from error
 
     def check(self) -> None:
         """Refuse a database that is not a nuPlan log."""
@@ -163,13 +158,9 @@ class NuplanLog:
         }
         for table, columns in SCHEMA.items():
             if table not in tables or tables[table].upper().startswith("CREATE VIRTUAL"):
-                raise InputError(
-                    f"database has no table {table!r}",
-                    where=str(self.path),
-                    expected=", ".join(SCHEMA),
-                    got=", ".join(sorted(tables)) or "no tables",
-                    remedy="is it a nuPlan log (v1.1)?",
-                )
+                what, got = f"database has no table {table!r}", ", ".join(sorted(tables)) or "no tables"
+                remedy = "is it a nuPlan log (v1.1)?"
+                raise InputError(what, where=str(self.path), expected=", ".join(SCHEMA), got=got, remedy=remedy)
             there = [str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")]
             require_columns(columns, there, f"{self.path}: {table}")
             note_unknown(f"the table {table}", there, OFFICIAL[table].union(columns))
@@ -181,12 +172,8 @@ class NuplanLog:
             name = text_of(name, f"{self.path}: log.logfile")
             problem = "has folders in it" if "/" in name else ref_problem(name)
             if problem is not None:
-                raise InputError(
-                    f"log's name {problem}",
-                    where=f"{self.path}: log.logfile",
-                    got=repr(name),
-                    expected="a folder's name",
-                )
+                what = f"log's name {problem}"
+                raise InputError(what, where=f"{self.path}: log.logfile", got=repr(name), expected="a folder's name")
             return name
         raise InputError("log has no name", where=f"{self.path}: log.logfile")
 
@@ -201,12 +188,8 @@ class NuplanLog:
             matrix = np.array(self._numbers(values[2], f"{where}.intrinsic", 9)).reshape(3, 3)
             skewed = abs(matrix[0, 1]) > 1e-6 or np.abs(matrix[2] - [0, 0, 1]).max() > 1e-6
             if skewed or min(matrix[0, 0], matrix[1, 1]) <= 0:
-                raise InputError(
-                    "intrinsics are not of a pinhole camera",
-                    where=f"{where}.intrinsic",
-                    got=str(matrix.tolist()),
-                    expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels",
-                )
+                what, where, got = "intrinsics are not of a pinhole camera", f"{where}.intrinsic", str(matrix.tolist())
+                raise InputError(what, where=where, got=got, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
             width, height = (_whole(values[index], f"{where}.{name}") for index, name in ((4, "width"), (5, "height")))
             found[token_of(token, f"{where}.token")] = NuplanCamera(
                 channel,
@@ -293,12 +276,8 @@ class NuplanLog:
             track = token_of(track, f"{self.path}: lidar_box.track_token").hex()
             where = f"{self.path}: lidar_box of track {track}"
             if label is None:
-                raise InputError(
-                    "box names a track or class that is not there",
-                    where=where,
-                    expected="tokens of track and category",
-                    remedy="copy the file again",
-                )
+                what, expected = "box names a track or class that is not there", "tokens of track and category"
+                raise InputError(what, where=where, expected=expected, remedy="copy the file again")
             label = text_of(label, f"{self.path}: category.name")
             yield token_of(cloud, where), track, label, tuple(_finite(number, where) for number in numbers)
 
@@ -329,9 +308,8 @@ class NuplanLog:
         for item in as_list(read_pickle(blob, where, _MAKERS), where)[:_MAX_NUMBERS]:
             flat += [_finite(value, where) for value in (item if isinstance(item, list | tuple) else [item])]
         if count is not None and len(flat) != count:
-            raise InputError(
-                "calibration has the wrong number of values", where=where, expected=str(count), got=str(len(flat))
-            )
+            what = "calibration has the wrong number of values"
+            raise InputError(what, where=where, expected=str(count), got=str(len(flat)))
         return flat
 
 
@@ -339,22 +317,17 @@ def token_of(value: Any, where: str) -> bytes:
     """A token: 1 to 64 bytes. InputError otherwise: SQLite columns may hold values of any type."""
     if not isinstance(value, bytes) or not 0 < len(value) <= _MAX_TOKEN_BYTES:
         got = f"{len(value)} bytes" if isinstance(value, bytes | str) else repr(value)[:40]
-        raise InputError(
-            "token is no short blob",
-            where=where,
-            expected=f"1 to {_MAX_TOKEN_BYTES} bytes",
-            got=f"{type(value).__name__}, {got}",
-            remedy="is it a nuPlan log (v1.1)? copy the file again",
-        )
+        what, expected = "token is no short blob", f"1 to {_MAX_TOKEN_BYTES} bytes"
+        remedy = "is it a nuPlan log (v1.1)? copy the file again"
+        raise InputError(what, where=where, expected=expected, got=f"{type(value).__name__}, {got}", remedy=remedy)
     return value
 
 
 def text_of(value: Any, where: str) -> str:
     """A name: a text of 1 to 200 bytes."""
     if not isinstance(value, str) or not value:
-        raise InputError(
-            "name is no text", where=where, expected="a text", got=type(value).__name__ if value else repr(value)
-        )
+        what = "name is no text"
+        raise InputError(what, where=where, expected="a text", got=type(value).__name__ if value else repr(value))
     return foreign_name(value, where)
 
 
@@ -374,11 +347,8 @@ def _finite(value: Any, where: str) -> float:
 
 @contextmanager
 def open_log(path: Path) -> Iterator[NuplanLog]:
-    """Open a log database read-only and check its schema.
-
-    Raises:
-        InputError: missing, not SQLite, damaged, or another schema.
-    """
+    """Open a log database read-only and check its schema. Raises InputError: missing, not SQLite, damaged, or another
+    schema."""
     if not path.is_file():
         raise InputError("log database does not exist", where=str(path), expected="a .db file")
     connection = None
@@ -392,43 +362,25 @@ def open_log(path: Path) -> Iterator[NuplanLog]:
         opened.check()
         yield opened
     except sqlite3.Error as error:
-        raise InputError(
-            "file is not a readable SQLite database",
-            where=str(path),
-            got=str(error),
-            expected="a nuPlan log (.db)",
-            remedy="is it cut off, or still packed?",
-        ) from error
+        what, remedy = "file is not a readable SQLite database", "is it cut off, or still packed?"
+        raise InputError(what, where=str(path), got=str(error), expected="a nuPlan log (.db)", remedy=remedy) from error
     finally:
         if connection is not None:
             connection.close()
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY-NC-SA 4.0 with the nuPlan dataset licence (Motional; attribution, non-commercial, share-alike)"
-CAMERAS: Final = {
-    "CAM_F0": "front",
-    "CAM_L0": "front_left",
-    "CAM_R0": "front_right",
-    "CAM_L1": "side_left",
-    "CAM_R1": "side_right",
-    "CAM_L2": "back_left",
-    "CAM_R2": "back_right",
-    "CAM_B0": "back",
-}
+CAMERAS: Final = name_table(
+    """front: CAM_F0; front_left: CAM_L0; front_right: CAM_R0; side_left: CAM_L1; side_right: CAM_R1;
+    back_left: CAM_L2; back_right: CAM_R2; back: CAM_B0"""
+)
 SENSOR: Final = "merged"
-LABELS: Final = {
-    "vehicle": "vehicle",
-    "bicycle": "bicycle",
-    "pedestrian": "pedestrian",
-    "traffic_cone": "traffic_cone",
-    "barrier": "barrier",
-    "czone_sign": "sign",
-    "generic_object": "generic_object",
-}
+LABELS: Final = name_table(
+    """vehicle: vehicle; bicycle: bicycle; pedestrian: pedestrian; traffic_cone: traffic_cone;
+    barrier: barrier; sign: czone_sign; generic_object: generic_object"""
+)
 IMAGE_DELAY_US: Final = 16_667
 """From an image's time stamp to the middle of its read-out. The data set's schema does not tell; reconstructions of it
 found this."""
@@ -459,17 +411,15 @@ def _databases(folder: Path) -> list[Path]:
 
 
 def import_nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one nuPlan log, or one scene of it, into the scene directory ``out``; see the module text.
+    """Import one nuPlan log, or one scene of it, into the scene directory ``out``; see the module text. Raises
+    UsageError: there are several logs and none was chosen, or an option does not apply. InputError: something is
+    missing, malformed or contradictory; nothing is left at ``out``.
 
     Args:
         source: the log's ``.db`` file, or a folder of such files.
         out: destination.
         options: ``sequence`` is the log's name (where ``source`` is a folder), a scene's name, or ``LOG/SCENE``.
             ``cameras`` default to all eight. ``poses``, ``boxes`` and ``untwist`` are refused; all others are used.
-
-    Raises:
-        UsageError: there are several logs and none was chosen, or an option does not apply.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     refuse_options(options, "nuPlan", "poses", "boxes", "untwist")
     path, scene = _find(source, options)
@@ -488,9 +438,8 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
         raise InputError("nuPlan log does not exist", where=str(source), expected="a .db file or a folder of them")
     databases = {path.stem: path for path in _databases(source)}
     if not databases:
-        raise InputError(
-            "no nuPlan log found", where=str(source), expected="*.db here or in splits/*", got=folder_contents(source)
-        )
+        what = "no nuPlan log found"
+        raise InputError(what, where=str(source), expected="*.db here or in splits/*", got=folder_contents(source))
     log_name, _, scene = options.sequence.partition("/")
     if log_name in databases:
         return databases[log_name], scene
@@ -550,16 +499,12 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     name, where = opened.name(), str(opened.path)
     blobs = _sensor_blobs(opened.path, name)
     if blobs is None:
-        raise InputError(
-            "sensor blobs of the log were not found",
-            where=where,
-            expected=f"sensor_blobs/{name} beside the database or up to four folders above it",
-            remedy="download the camera and LiDAR blobs of this log; the database alone holds no images",
-        )
+        expected = f"sensor_blobs/{name} beside the database or up to four folders above it"
+        remedy = "download the camera and LiDAR blobs of this log; the database alone holds no images"
+        raise InputError("sensor blobs of the log were not found", where=where, expected=expected, remedy=remedy)
     if scene and scene not in opened.scenes():
-        raise UsageError(
-            "the log has no such scene", where=where, got=scene, expected=", ".join(opened.scenes()[:12]) or "no scenes"
-        )
+        what = "the log has no such scene"
+        raise UsageError(what, where=where, got=scene, expected=", ".join(opened.scenes()[:12]) or "no scenes")
     every = list(opened.clouds(scene))
     first, end = options.frames or (0, len(every))
     chosen = every[first:end]
@@ -573,13 +518,10 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     if len(clouds) < len(placed):
         without = [token.hex() for token, cloud in placed.items() if cloud is None]
         if not options.skip_missing:
-            raise InputError(
-                "point cloud has no vehicle pose",
-                where=f"{where}: lidar_pc {without[0]}.ego_pose_token",
-                expected="a token of ego_pose",
-                got=f"{len(without)} of {len(placed)} clouds have none",
-                remedy="choose frames with --frames FIRST:END, or add --skip-missing",
-            )
+            what, where = "point cloud has no vehicle pose", f"{where}: lidar_pc {without[0]}.ego_pose_token"
+            got = f"{len(without)} of {len(placed)} clouds have none"
+            remedy = "choose frames with --frames FIRST:END, or add --skip-missing"
+            raise InputError(what, where=where, expected="a token of ego_pose", got=got, remedy=remedy)
         notes.append(f"{len(without)} clouds without a vehicle pose were left out")
     lacking = [cloud.file for cloud in clouds if not cloud.file.is_file()]
     if lacking:
@@ -613,12 +555,9 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
 def _refuse_missing(what: str, missing: Sequence[Path], total: int, options: ImportOptions) -> None:
     """Refuse a log of which files are missing, unless that is allowed."""
     if missing and not options.skip_missing:
-        raise InputError(
-            f"file of a {what} is missing",
-            where=str(missing[0]),
-            got=f"{len(missing)} of {total} are missing",
-            remedy="download the log's sensor blobs, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        what = f"file of a {what} is missing"
+        remedy = "download the log's sensor blobs, choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError(what, where=str(missing[0]), got=f"{len(missing)} of {total} are missing", remedy=remedy)
 
 
 def _moments(
@@ -633,21 +572,14 @@ def _moments(
     inner = [group for group, full in zip(groups[1:-1], complete[1:-1], strict=True) if not full]
     if inner and not options.skip_missing:
         absent = sorted(set(names) - {shot.channel for shot in inner[0]})
-        raise InputError(
-            "a moment lacks images of some cameras",
-            where=f"{where}: image at {inner[0][0].time_us}",
-            got=f"no {', '.join(absent)}; {len(inner)} such moments",
-            expected="every chosen camera",
-            remedy="choose cameras with --cameras, or add --skip-missing",
-        )
+        what, where = "a moment lacks images of some cameras", f"{where}: image at {inner[0][0].time_us}"
+        got = f"no {', '.join(absent)}; {len(inner)} such moments"
+        remedy = "choose cameras with --cameras, or add --skip-missing"
+        raise InputError(what, where=where, got=got, expected="every chosen camera", remedy=remedy)
     if not kept:
-        raise InputError(
-            "no moment has images of all cameras",
-            where=where,
-            got=f"{len(shots)} images",
-            expected=", ".join(names),
-            remedy="choose cameras with --cameras, or other frames with --frames",
-        )
+        what = "no moment has images of all cameras"
+        remedy = "choose cameras with --cameras, or other frames with --frames"
+        raise InputError(what, where=where, got=f"{len(shots)} images", expected=", ".join(names), remedy=remedy)
     cut = len(groups) - len(kept)
     return kept, [f"{cut} moments without images of all cameras were left out"] if cut else []
 
@@ -663,13 +595,10 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list
     for name, found in by_camera.items():
         for shot, following in itertools.pairwise(found):
             if shot.time_us == following.time_us:
-                raise InputError(
-                    "two images of one camera have the same time",
-                    where=f"{where}: image at {shot.time_us}",
-                    expected="a row for every image",
-                    got=f"{name}: {shot.file.name} and {following.file.name}",
-                    remedy="are rows of the table doubled? copy the file again",
-                )
+                what, where = "two images of one camera have the same time", f"{where}: image at {shot.time_us}"
+                got = f"{name}: {shot.file.name} and {following.file.name}"
+                remedy = "are rows of the table doubled? copy the file again"
+                raise InputError(what, where=where, expected="a row for every image", got=got, remedy=remedy)
     leading = max(by_camera.values(), key=len)
     if not leading:
         return []
@@ -699,13 +628,9 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
     ego = mended_path(_ego_path(plan, start_us, str(opened.path)), options, found)
     first = ego.pose_at(0.0)
     if first is None:
-        raise InputError(
-            "vehicle poses do not cover the log",
-            where=f"{opened.path}: ego_pose",
-            expected=f"a pose at {start_us} us",
-            got=f"{len(plan.ego_us)} poses near it",
-            remedy="are pose and cloud times both in microseconds?",
-        )
+        what, where = "vehicle poses do not cover the log", f"{opened.path}: ego_pose"
+        expected, remedy = f"a pose at {start_us} us", "are pose and cloud times both in microseconds?"
+        raise InputError(what, where=where, expected=expected, got=f"{len(plan.ego_us)} poses near it", remedy=remedy)
     world_from_source = world_from_first(first)
     ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
     fits = {CAMERAS[channel]: _fit(camera, options) for channel, camera in plan.cameras.items()}
@@ -765,12 +690,9 @@ def _read_tracks(
 def _ego_path(plan: _NuplanPlan, start_us: int, where: str) -> EgoPath:
     """The vehicle in the log's world and the scene's clock."""
     if not len(plan.ego_us):
-        raise InputError(
-            "no vehicle poses at the time of the clouds",
-            where=f"{where}: ego_pose.timestamp",
-            expected="microseconds, as lidar_pc.timestamp",
-            remedy="are the two in different units?",
-        )
+        what, where = "no vehicle poses at the time of the clouds", f"{where}: ego_pose.timestamp"
+        expected = "microseconds, as lidar_pc.timestamp"
+        raise InputError(what, where=where, expected=expected, remedy="are the two in different units?")
     return EgoPath(seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
 
 

@@ -38,26 +38,18 @@ from numpy.typing import NDArray
 from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
-from mudg.formats.importers import common, drive_log, layout
-from mudg.formats.importers.box_tracks import BoxTracks
+from mudg.formats.importers import common, drive_log
 from mudg.formats.importers.clouds import read_float_rows
-from mudg.formats.importers.common import ImportOptions, unit_intensity
-from mudg.formats.importers.drive_log import DriveLog, ImageRecord, SweepRecord
-from mudg.formats.importers.layout import LogFiles
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table, unit_intensity
+from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
 from mudg.formats.unknown_fields import note_unknown
 
 # nuScenes sensors: cameras from their intrinsics, and ``LIDAR_TOP`` files with the time of every point ----------------
-
-
 LICENCE: Final = "CC BY-NC-SA 4.0 and the nuScenes terms of use (Motional; attribution, non-commercial, share-alike)"
-CAMERAS: Final[Mapping[str, str]] = {
-    "CAM_FRONT": "front",
-    "CAM_FRONT_LEFT": "front_left",
-    "CAM_FRONT_RIGHT": "front_right",
-    "CAM_BACK": "back",
-    "CAM_BACK_LEFT": "back_left",
-    "CAM_BACK_RIGHT": "back_right",
-}
+CAMERAS: Final[Mapping[str, str]] = name_table(
+    """front: CAM_FRONT; front_left: CAM_FRONT_LEFT; front_right: CAM_FRONT_RIGHT; back: CAM_BACK;
+    back_left: CAM_BACK_LEFT; back_right: CAM_BACK_RIGHT"""
+)
 SENSOR: Final = "lidar_top"
 TURN_PERIOD_S: Final = 0.05
 BEAMS: Final = 32
@@ -75,12 +67,8 @@ def camera_from_intrinsics(name: str, size: tuple[int, int], intrinsics: Any, wh
         raise InputError("intrinsics are not numbers", where=where, got=str(error)) from error
     off = k[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]] - [0, 0, 0, 0, 1] if k.shape == (3, 3) else np.array([np.nan])
     if not np.isfinite(k).all() or not (np.abs(off) < 1e-6).all():
-        raise InputError(
-            "intrinsics are malformed",
-            where=where,
-            expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]",
-            got=str(intrinsics)[:120],
-        )
+        what = "intrinsics are malformed"
+        raise InputError(what, where=where, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", got=str(intrinsics)[:120])
     return Camera(name, *size, k[0, 0], k[1, 1], k[0, 2] + 0.5, k[1, 2] + 0.5)
 
 
@@ -88,20 +76,13 @@ def read_scan(path: Path) -> SweepPoints:
     """A ``LIDAR_TOP`` file: float32 rows x, y, z, intensity (0..255), ring; LiDAR axes x right, y forward, z up.
 
     Returns of the recording vehicle are dropped, and beams without a return, which are counted; intensity becomes 0..1.
-
-    Raises:
-        InputError: cut off, not finite, or rings that no 32-beam sensor has.
-    """
+    Raises InputError: cut off, not finite, or rings that no 32-beam sensor has."""
     rows, returns = read_float_rows(path, 5, "sweep")
     rings = rows[returns, 4]
     if len(rings) and ((rings < 0) | (rings >= BEAMS) | (rings != np.round(rings))).any():
-        raise InputError(
-            "fifth value of the points is no ring number",
-            where=str(path),
-            expected=f"whole numbers 0 to {BEAMS - 1}",
-            got=f"{rings.min():g} to {rings.max():g}",
-            remedy="is this a file of another sensor or format?",
-        )
+        what, got = "fifth value of the points is no ring number", f"{rings.min():g} to {rings.max():g}"
+        remedy = "is this a file of another sensor or format?"
+        raise InputError(what, where=str(path), expected=f"whole numbers 0 to {BEAMS - 1}", got=got, remedy=remedy)
     dt_s = point_times(rows[:, :3], rows[:, 4])
     own = np.ones(len(rows), bool)
     for axis, (low, high) in enumerate(_OWN_VEHICLE_M):
@@ -132,8 +113,6 @@ def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray
 # The tables of the full release are large (``sample_data.json`` and ``ego_pose.json`` hold 2.6 million records each).
 # What an import needs of them is one scene, so records are found by the value of one field while the file passes
 # through a buffer of a few megabytes; only matching records become Python objects.
-
-
 _BUFFER_BYTES: Final = 1 << 22
 _MAX_RECORD_BYTES: Final = 1 << 20
 _FLAT_RECORD: Final = rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}'
@@ -156,36 +135,16 @@ OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     ),
     "sample.json": frozenset({"token", "timestamp", "scene_token", "next", "prev"}),
     "sample_annotation.json": frozenset(
-        {
-            "token",
-            "sample_token",
-            "instance_token",
-            "attribute_tokens",
-            "visibility_token",
-            "translation",
-            "size",
-            "rotation",
-            "num_lidar_pts",
-            "num_radar_pts",
-            "next",
-            "prev",
-        }
+        (
+            "token sample_token instance_token attribute_tokens visibility_token translation size rotation "
+            "num_lidar_pts num_radar_pts next prev"
+        ).split()
     ),
     "sample_data.json": frozenset(
-        {
-            "token",
-            "sample_token",
-            "ego_pose_token",
-            "calibrated_sensor_token",
-            "filename",
-            "fileformat",
-            "width",
-            "height",
-            "timestamp",
-            "is_key_frame",
-            "next",
-            "prev",
-        }
+        (
+            "token sample_token ego_pose_token calibrated_sensor_token filename fileformat width height "
+            "timestamp is_key_frame next prev"
+        ).split()
     ),
     "scene.json": frozenset(
         {"token", "name", "description", "log_token", "nbr_samples", "first_sample_token", "last_sample_token"}
@@ -199,11 +158,8 @@ Row = dict[str, Any]
 
 
 def iter_records(path: Path, *, buffer_bytes: int = _BUFFER_BYTES) -> Iterator[Row]:
-    """Every record of a table, in file order. The file is read in pieces; one record is an object at a time.
-
-    Raises:
-        InputError: not a JSON array of flat objects, a record over 1 MiB, or the file is cut off.
-    """
+    """Every record of a table, in file order. The file is read in pieces; one record is an object at a time. Raises
+    InputError: not a JSON array of flat objects, a record over 1 MiB, or the file is cut off."""
     with _open(path) as file:
         buffer, offset, first = _start_of_array(file, path, buffer_bytes), 0, True
         position = buffer.index(b"[") + 1
@@ -232,11 +188,8 @@ def find_records(
 
     Records that do not match are not parsed: the field is looked for in the bytes, and the record around a hit is cut
     out and parsed strictly. Where that fails (braces inside texts) every record is parsed instead. The file's first and
-    last character are checked, so that a cut-off table is noticed. ``values`` are tokens: texts without escapes.
-
-    Raises:
-        InputError: no JSON array, a matching record that is malformed, or the file is cut off.
-    """
+    last character are checked, so that a cut-off table is noticed. ``values`` are tokens: texts without escapes. Raises
+    InputError: no JSON array, a matching record that is malformed, or the file is cut off."""
     found = 0
     try:
         for record in _search(path, field, values, buffer_bytes):
@@ -290,9 +243,8 @@ def _no_constant(name: str) -> Any:
 
 def _open(path: Path) -> BinaryIO:
     if not path.exists():
-        raise InputError(
-            "table is missing", where=str(path), remedy="unpack the release's metadata archive, which holds all tables"
-        )
+        what = "table is missing"
+        raise InputError(what, where=str(path), remedy="unpack the release's metadata archive, which holds all tables")
     return store.open_file(path)
 
 
@@ -300,13 +252,8 @@ def _start_of_array(file: BinaryIO, path: Path, buffer_bytes: int) -> bytes:
     """The first piece of the file, to its opening bracket at least."""
     start = file.read(buffer_bytes)
     if start.lstrip()[:1] != b"[":
-        raise InputError(
-            "table does not start as a JSON array",
-            where=str(path),
-            expected="[ {...}, ... ]",
-            got=repr(start[:20]) if start else "an empty file",
-            remedy="copy the table again",
-        )
+        what, got = "table does not start as a JSON array", repr(start[:20]) if start else "an empty file"
+        raise InputError(what, where=str(path), expected="[ {...}, ... ]", got=got, remedy="copy the table again")
     return start
 
 
@@ -316,12 +263,8 @@ def _cut_off(path: Path) -> InputError:
 
 
 def _no_records(path: Path, place: int, got: bytes) -> InputError:
-    return InputError(
-        "table is not an array of records",
-        where=f"{path}: byte {place}",
-        got=repr(got[:20]),
-        expected="flat records {...} of less than 1 MiB between commas",
-    )
+    what, expected = "table is not an array of records", "flat records {...} of less than 1 MiB between commas"
+    return InputError(what, where=f"{path}: byte {place}", got=repr(got[:20]), expected=expected)
 
 
 # --- rows -----------------------------------------------------------------------------------------
@@ -356,12 +299,8 @@ def _is_number(value: Any) -> bool:
 
 
 def _bad_field(row: Row, key: str, where: str, expected: str) -> InputError:
-    return InputError(
-        f"field {key!r} is missing or malformed",
-        where=f"{where}: record {row.get('token', '?')!r}",
-        expected=expected,
-        got=repr(row.get(key))[:120],
-    )
+    what, where = f"field {key!r} is missing or malformed", f"{where}: record {row.get('token', '?')!r}"
+    return InputError(what, where=where, expected=expected, got=repr(row.get(key))[:120])
 
 
 class TokenTable:
@@ -380,13 +319,8 @@ class TokenTable:
     def record(self, token: Any, where: str) -> Row:
         """The record of a token; ``where`` says who refers to it."""
         if not isinstance(token, str) or token not in self.rows:
-            raise InputError(
-                "a token points nowhere",
-                where=where,
-                got=repr(token),
-                expected=f"a record of {self.where}",
-                remedy="are the tables of one release, and complete?",
-            )
+            what, remedy = "a token points nowhere", "are the tables of one release, and complete?"
+            raise InputError(what, where=where, got=repr(token), expected=f"a record of {self.where}", remedy=remedy)
         return self.rows[token]
 
     def get(self, row: Row, key: str, where: str) -> Row:
@@ -395,8 +329,6 @@ class TokenTable:
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 
 LIDAR: Final = "LIDAR_TOP"
@@ -405,31 +337,18 @@ MAX_GAP_S: Final = 1.1
 MICROSECONDS: Final = 10**6
 _MAX_BEFORE_SCENE_S: Final = 1.0
 
-LABELS: Final[Mapping[str, str]] = {
-    "animal": "animal",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.personal_mobility": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-    "human.pedestrian.stroller": "stroller",
-    "human.pedestrian.wheelchair": "wheelchair",
-    "movable_object.barrier": "barrier",
-    "movable_object.debris": "debris",
-    "movable_object.pushable_pullable": "pushable",
-    "movable_object.trafficcone": "traffic_cone",
-    "static_object.bicycle_rack": "bicycle_rack",
-    "vehicle.bicycle": "bicycle",
-    "vehicle.bus.bendy": "bus",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.car": "car",
-    "vehicle.construction": "construction_vehicle",
-    "vehicle.emergency.ambulance": "van",
-    "vehicle.emergency.police": "car",
-    "vehicle.motorcycle": "motorcycle",
-    "vehicle.trailer": "trailer",
-    "vehicle.truck": "truck",
-}
+LABELS: Final[Mapping[str, str]] = name_table(
+    """animal: animal;
+    pedestrian: human.pedestrian.adult, human.pedestrian.child, human.pedestrian.construction_worker,
+        human.pedestrian.personal_mobility, human.pedestrian.police_officer;
+    stroller: human.pedestrian.stroller; wheelchair: human.pedestrian.wheelchair;
+    barrier: movable_object.barrier; debris: movable_object.debris;
+    pushable: movable_object.pushable_pullable; traffic_cone: movable_object.trafficcone;
+    bicycle_rack: static_object.bicycle_rack; bicycle: vehicle.bicycle;
+    bus: vehicle.bus.bendy, vehicle.bus.rigid; car: vehicle.car, vehicle.emergency.police;
+    construction_vehicle: vehicle.construction; van: vehicle.emergency.ambulance;
+    motorcycle: vehicle.motorcycle; trailer: vehicle.trailer; truck: vehicle.truck"""
+)
 """The release's categories -> labels."""
 _RIDDEN: Final[Mapping[str, str]] = {"bicycle": "cyclist", "motorcycle": "motorcyclist"}
 _WITH_RIDER: Final = "cycle.with_rider"
@@ -442,29 +361,24 @@ def looks_like_nuscenes(source: Path) -> bool:
 
 def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import one scene of a nuScenes release into the scene directory ``out``; see the module text for what is read.
+    Raises UsageError: the release holds several scenes and none was chosen, or there is no such scene or camera.
+    InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
 
     Args:
         source: the release's root, or its table folder.
         options: ``sequence`` names the scene (``scene-0061``, or ``v1.0-mini/scene-0061`` where several releases lie
             side by side); ``frames`` counts images of the first chosen camera; ``cameras`` by either name, all six by
             default.
-
-    Raises:
-        UsageError: the release holds several scenes and none was chosen, or there is no such scene or camera.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
     if not source.is_dir():
         raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")
-    layout.refuse_untwist(options, "nuScenes", str(source))
+    common.refuse_untwist(options, "nuScenes", str(source))
     releases = _releases(source)
     if not releases:
-        raise InputError(
-            "no nuScenes tables found",
-            where=str(source),
-            got=layout.folder_contents(source),
-            expected="v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json",
-            remedy="give the folder that holds v1.0-*, samples and sweeps",
-        )
+        what = "no nuScenes tables found"
+        expected = "v1.0-mini, v1.0-trainval or v1.0-test with scene.json and sample_data.json"
+        remedy = "give the folder that holds v1.0-*, samples and sweeps"
+        raise InputError(what, where=str(source), got=common.folder_contents(source), expected=expected, remedy=remedy)
     return drive_log.write_log(read_log(releases, options), out, options)
 
 
@@ -515,8 +429,8 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
         sensor = sensors.get(calibration, "sensor_token", calibrations.where)
         channel_of[row["token"]] = text(sensor, "channel", sensors.where)
     there = {raw: name for raw, name in CAMERAS.items() if raw in channel_of.values()}
-    chosen = {there[raw]: raw for raw in layout.chosen_cameras(there, options, where, tuple(CAMERAS))}
-    layout.refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
+    chosen = {there[raw]: raw for raw in common.chosen_cameras(there, options, where, tuple(CAMERAS))}
+    common.refuse_missing_cameras(there.values(), CAMERAS.values(), options, where)
     used = [row for row in data.rows.values() if channel_of[row["token"]] in (*chosen.values(), LIDAR)]
     _check_times(used, samples, data.where)
     used.sort(key=lambda row: row["timestamp"])
@@ -555,7 +469,7 @@ def _choose_scene(releases: Sequence[Path], options: ImportOptions) -> tuple[Pat
             if wanted in ("", name, row.get("token")):
                 found.append((folder, row))
     # the same scene may lie in two releases: the smaller one is quicker
-    return layout.the_only(found[:1] if wanted else found, names, options, releases[0].parent, "scene")
+    return common.the_only(found[:1] if wanted else found, names, options, releases[0].parent, "scene")
 
 
 def _samples_in_order(folder: Path, scene: Row) -> dict[str, int]:
@@ -574,13 +488,9 @@ def _samples_in_order(folder: Path, scene: Row) -> dict[str, int]:
     common.check_epoch(values, MICROSECONDS, f"{samples.where}: timestamp")
     if (np.diff(values) <= 0).any():
         late = list(stamps)[int(np.flatnonzero(np.diff(values) <= 0)[0]) + 1]
-        raise InputError(
-            "time stamps of key frames do not increase along the scene",
-            where=f"{samples.where}: record {late!r}",
-            got=f"{stamps[late]} after a later one",
-            expected="microseconds, increasing from one key frame to the next",
-            remedy="copy the table again",
-        )
+        what, where = "time stamps of key frames do not increase along the scene", f"{samples.where}: record {late!r}"
+        got, expected = f"{stamps[late]} after a later one", "microseconds, increasing from one key frame to the next"
+        raise InputError(what, where=where, got=got, expected=expected, remedy="copy the table again")
     return stamps
 
 
@@ -591,12 +501,9 @@ def _check_times(rows: Sequence[Row], samples: Mapping[str, int], where: str) ->
     first, last = min(samples.values()), max(samples.values())
     beside = np.maximum(first - stamps, stamps - last) / MICROSECONDS
     if len(beside) and beside.max() > _MAX_BEFORE_SCENE_S:
-        raise InputError(
-            "an image or sweep lies outside its scene's time",
-            where=f"{where}: record {rows[int(beside.argmax())]['token']!r}",
-            got=f"{beside.max():.3f} s away from the key frames",
-            expected="microseconds since 1970, within the scene",
-        )
+        where = f"{where}: record {rows[int(beside.argmax())]['token']!r}"
+        got, expected = f"{beside.max():.3f} s away from the key frames", "microseconds since 1970, within the scene"
+        raise InputError("an image or sweep lies outside its scene's time", where=where, got=got, expected=expected)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -620,7 +527,7 @@ class _RowReader:
         return self.map_from_ego(row) @ _pose(calibration, self.calibrations.where)
 
     def file(self, row: Row) -> Path:
-        return layout.path_inside(self.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
+        return common.path_inside(self.root, row.get("filename"), f"{self.where}: record {row['token']!r}")
 
     def image(self, row: Row, camera: str) -> ImageRecord:
         return ImageRecord(camera, self.time_s(row), self.map_from_sensor(row), self.file(row))

@@ -43,12 +43,13 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, transform_points, yaw_matrix
 from mudg.base.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
-from mudg.formats.importers import layout
-from mudg.formats.importers.box_tracks import BoxTracks
+from mudg.formats.importers import common
 from mudg.formats.importers.common import (
     ImportOptions,
+    LogFiles,
     finite_columns,
     mended_path,
+    name_table,
     origin_note,
     pose_from_quaternion,
     pose_near,
@@ -59,9 +60,8 @@ from mudg.formats.importers.common import (
     unit_intensity,
     world_from_first,
 )
-from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, Tracks, write_scene
+from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, Tracks, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
-from mudg.formats.importers.layout import LogFiles
 from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
 
 # pandas frame -------------------------------------------------------------------------------------
@@ -71,8 +71,6 @@ from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
 # The forms of pandas 0.2x, 1.x and 2.x are understood: a data frame is a manager of blocks, each block an array of
 # several columns and the places of these columns. Extension types (categories, text arrays of pandas 3) are refused by
 # name.
-
-
 _MANAGERS: Final = ("pandas.core.internals.managers.BlockManager", "pandas.core.internals.BlockManager")
 MAX_COLUMNS: Final = 1000
 _NEW_BLOCK: Final = "pandas.core.internals.blocks.new_block"
@@ -112,11 +110,8 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
 
 
 def read_frame(path: Path) -> dict[str, NDArray[Any]]:
-    """Columns of a pickled, gzipped data frame (``.pkl.gz``; plain ``.pkl`` too), by their names.
-
-    Raises:
-        InputError: missing, cut off, not a data frame, or it asks for something that is not plain data.
-    """
+    """Columns of a pickled, gzipped data frame (``.pkl.gz``; plain ``.pkl`` too), by their names. Raises InputError:
+    missing, cut off, not a data frame, or it asks for something that is not plain data."""
     content = store.read_bytes(path)
     if content[:2] == b"\x1f\x8b":
         content = gunzip(content, str(path))
@@ -124,11 +119,7 @@ def read_frame(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def gunzip(content: bytes, where: str) -> bytes:
-    """Unpack gzip, not beyond ``MAX_BYTES``.
-
-    Raises:
-        InputError: cut off, damaged, or larger than that.
-    """
+    """Unpack gzip, not beyond ``MAX_BYTES``. Raises InputError: cut off, damaged, or larger than that."""
     unpacker = zlib.decompressobj(wbits=31)
     try:
         unpacked = unpacker.decompress(content, MAX_BYTES + 1)
@@ -137,9 +128,8 @@ def gunzip(content: bytes, where: str) -> bytes:
     if len(unpacked) > MAX_BYTES:
         raise InputError("gzip file unpacks to too much", where=where, expected=f"<= {MAX_BYTES} bytes")
     if not unpacker.eof:
-        raise InputError(
-            "gzip file is cut off", where=where, got=f"{len(content)} bytes, no end", remedy="copy the file again"
-        )
+        what = "gzip file is cut off"
+        raise InputError(what, where=where, got=f"{len(content)} bytes, no end", remedy="copy the file again")
     return unpacked
 
 
@@ -149,13 +139,11 @@ def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     try:
         return _columns_pandas_frame(value)
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        raise InputError(
-            "pickle is not a plain data frame",
-            where=where,
-            expected="a table of numbers and texts as pandas 0.2x to 2.x writes it",
-            got=f"{type(error).__name__}: {error}"[:200],
-            remedy="read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2",
-        ) from error
+        what = "pickle is not a plain data frame"
+        expected = "a table of numbers and texts as pandas 0.2x to 2.x writes it"
+        got = f"{type(error).__name__}: {error}"[:200]
+        remedy = "read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2"
+        raise InputError(what, where=where, expected=expected, got=got, remedy=remedy) from error
 
 
 def _columns_pandas_frame(frame: Any) -> dict[str, NDArray[Any]]:
@@ -210,8 +198,6 @@ def _array(value: Any) -> NDArray[Any]:
 
 
 # classes that people gave to PandaSet's points: ``annotations/semseg`` -> train ids of ``base/palette.py`` ------------
-
-
 CLASS_OF: Final[dict[str, str]] = {
     "Smoke": "",
     "Exhaust": "",
@@ -261,27 +247,22 @@ fit."""
 
 
 class PointClasses:
-    """The class tables of the chosen frames.
+    """The class tables of the chosen frames. Raises InputError: a frame has no table though others have one, or
+    ``classes.json`` is missing or malformed.
 
     Args:
         folder: ``annotations/semseg``. Without any table there no point has a class.
         frames: numbers of the chosen frames.
         options: ``skip_missing`` allows frames without a table.
-
-    Raises:
-        InputError: a frame has no table though others have one, or ``classes.json`` is missing or malformed.
     """
 
     def __init__(self, folder: Path, frames: Sequence[int], options: ImportOptions) -> None:
-        self._files: dict[int, Path] = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
+        self._files: dict[int, Path] = common.numbered_files(folder, (".pkl.gz", ".pkl"))
         lacks = [number for number in frames if number not in self._files]
         if self._files and lacks and not options.skip_missing:
-            raise InputError(
-                "a frame has no classes of points",
-                where=str(folder),
-                expected=f"{lacks[0]:02d}.pkl.gz",
-                remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing",
-            )
+            what = "a frame has no classes of points"
+            remedy = "copy it, choose frames with --frames FIRST:END, or add --skip-missing"
+            raise InputError(what, where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz", remedy=remedy)
         self._names = _names(folder / "classes.json") if self._files else {}
         unknown = sorted(set(self._names.values()) - set(CLASS_OF))
         self.notes = (
@@ -299,13 +280,9 @@ class PointClasses:
         note_unknown("annotations/semseg/*.pkl.gz", table, frozenset({"class"}))
         numbers = finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
         if len(numbers) != points:
-            raise InputError(
-                "classes do not fit the points",
-                where=f"{path}: class",
-                got=f"{len(numbers)} rows",
-                expected=f"{points} rows, one for each point of the frame's cloud",
-                remedy="is the file of another frame or sequence?",
-            )
+            what, expected = "classes do not fit the points", f"{points} rows, one for each point of the frame's cloud"
+            remedy = "is the file of another frame or sequence?"
+            raise InputError(what, where=f"{path}: class", got=f"{len(numbers)} rows", expected=expected, remedy=remedy)
         return self._train_ids(numbers, path)
 
     def _train_ids(self, numbers: NDArray[np.int64], path: Path) -> NDArray[np.uint8]:
@@ -325,66 +302,35 @@ def train_id(name: str) -> int:
 def _names(path: Path) -> Mapping[int, str]:
     """Number -> name of the data set's classes."""
     if not path.is_file():
-        raise InputError(
-            "table of class names is missing",
-            where=str(path),
-            expected='{"1": "Smoke", ...}',
-            remedy="copy annotations/semseg/classes.json, or leave out annotations/semseg",
-        )
+        where, remedy = str(path), "copy annotations/semseg/classes.json, or leave out annotations/semseg"
+        raise InputError("table of class names is missing", where=where, expected='{"1": "Smoke", ...}', remedy=remedy)
     values: Any = store.read_json(path)
     if not isinstance(values, dict) or not all(str(key).isdigit() and isinstance(values[key], str) for key in values):
-        raise InputError(
-            "table of class names is malformed", where=str(path), expected='{"1": "Smoke", ...}', got=str(values)[:80]
-        )
+        what = "table of class names is malformed"
+        raise InputError(what, where=str(path), expected='{"1": "Smoke", ...}', got=str(values)[:80])
     return {int(key): name for key, name in values.items()}
 
 
 # importer -----------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 LICENCE: Final = "CC BY 4.0 (PandaSet: Hesai and Scale AI; attribution)"
-CAMERAS: Final = {
-    "front_camera": "front",
-    "front_left_camera": "front_left",
-    "front_right_camera": "front_right",
-    "left_camera": "left",
-    "right_camera": "right",
-    "back_camera": "back",
-}
+CAMERAS: Final = name_table(
+    """front: front_camera; front_left: front_left_camera; front_right: front_right_camera; left: left_camera;
+    right: right_camera; back: back_camera"""
+)
 SENSORS: Final = {0: "pandar64", 1: "pandar_gt"}
 OFFSET_FROM_FRONT_CAMERA_M: Final = {0: (-0.044, 0.0, 0.039), 1: (0.562, 0.0, -0.263)}
 """Places of the LiDARs from the front camera's centre: forward, left, up. Source: the data set's static calibration."""
-LABELS: Final = {
-    "Car": "car",
-    "Pickup Truck": "truck",
-    "Medium-sized Truck": "truck",
-    "Semi-truck": "truck",
-    "Towed Object": "trailer",
-    "Motorcycle": "motorcycle",
-    "Motorized Scooter": "motorcycle",
-    "Bicycle": "bicycle",
-    "Bus": "bus",
-    "Train": "train",
-    "Trolley": "tram",
-    "Tram / Subway": "tram",
-    "Emergency Vehicle": "vehicle",
-    "Pedestrian": "pedestrian",
-    "Pedestrian with Object": "pedestrian",
-    "Personal Mobility Device": "personal_mobility_device",
-    "Other Vehicle - Construction Vehicle": "vehicle",
-    "Other Vehicle - Uncommon": "vehicle",
-    "Other Vehicle - Pedicab": "pedicab",
-    "Animals - Bird": "animal",
-    "Animals - Other": "animal",
-    "Pylons": "pylon",
-    "Road Barriers": "barrier",
-    "Cones": "traffic_cone",
-    "Signs": "sign",
-    "Construction Signs": "sign",
-    "Temporary Construction Barriers": "barrier",
-    "Rolling Containers": "container",
-}
+LABELS: Final = name_table(
+    """car: Car; truck: Pickup Truck, Medium-sized Truck, Semi-truck; trailer: Towed Object;
+    motorcycle: Motorcycle, Motorized Scooter; bicycle: Bicycle; bus: Bus; train: Train;
+    tram: Trolley, Tram / Subway;
+    vehicle: Emergency Vehicle, Other Vehicle - Construction Vehicle, Other Vehicle - Uncommon;
+    pedestrian: Pedestrian, Pedestrian with Object; personal_mobility_device: Personal Mobility Device;
+    pedicab: Other Vehicle - Pedicab; animal: Animals - Bird, Animals - Other; pylon: Pylons;
+    barrier: Road Barriers, Temporary Construction Barriers; traffic_cone: Cones;
+    sign: Signs, Construction Signs; container: Rolling Containers"""
+)
 """The data set's classes -> labels; pickup trucks count as trucks, as in Cityscapes."""
 FRONT_CAMERA_M: Final = (0.86, -0.07, 1.80)
 """Place of the front camera on the vehicle where its poses are missing; from published poses of sequence 002."""
@@ -397,17 +343,8 @@ MAX_POINT_DELAY_S: Final = 0.25
 MAX_CAMERA_DELAY_S: Final = 1.0
 _MIN_BOX_POINTS: Final = 5
 _POINT_COLUMNS: Final = ("x", "y", "z", "i", "t", "d")
-_CUBOID_COLUMNS: Final = (
-    "uuid",
-    "label",
-    "yaw",
-    "stationary",
-    "position.x",
-    "position.y",
-    "position.z",
-    "dimensions.x",
-    "dimensions.y",
-    "dimensions.z",
+_CUBOID_COLUMNS: Final = tuple(
+    "uuid label yaw stationary position.x position.y position.z dimensions.x dimensions.y dimensions.z".split()
 )
 _POINTS, _CUBOIDS, _POSES = "lidar/*.pkl.gz", "annotations/cuboids/*.pkl.gz", "poses.json"
 OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
@@ -461,25 +398,23 @@ def _sequences(source: Path) -> list[str]:
 
 
 def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one PandaSet sequence into the scene directory ``out``; see the module text for what is understood.
+    """Import one PandaSet sequence into the scene directory ``out``; see the module text for what is understood. Raises
+    UsageError: the folder holds several sequences and none was chosen, or an option does not apply. InputError:
+    something is missing, malformed or contradictory; nothing is left at ``out``.
 
     Args:
         source: a sequence's folder, or the folder of sequences with ``options.sequence``.
         out: destination.
         options: ``frames``, ``cameras`` (default all six), ``sequence``, ``skip_missing``, ``test_every``,
             ``resolution`` and ``workers`` are used; ``poses``, ``boxes`` and ``untwist`` are refused.
-
-    Raises:
-        UsageError: the folder holds several sequences and none was chosen, or an option does not apply.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
     """
-    layout.refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
+    common.refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
     folder = _chosen_sequence(source, options)
     cameras = {name: CAMERAS[name] for name in CAMERAS if (folder / "camera" / name).is_dir()}
-    chosen = layout.chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
-    images = {name: layout.numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
-    clouds = layout.numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
-    frames = layout.complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
+    chosen = common.chosen_cameras(cameras, options, str(folder), tuple(CAMERAS))
+    images = {name: common.numbered_files(folder / "camera" / name, (".jpg", ".jpeg", ".png")) for name in chosen}
+    clouds = common.numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
+    frames = common.complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
     notes: list[str] = []
     motion = _Motion.read(folder, frames, chosen, options, notes)
     fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
@@ -542,27 +477,19 @@ def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
         return source
     sequences = _sequences(source)
     if not sequences and not options.sequence:
-        raise InputError(
-            "no PandaSet sequence found",
-            where=str(source),
-            got=layout.folder_contents(source),
-            expected="lidar/poses.json and camera/front_camera and so on",
-        )
+        what, expected = "no PandaSet sequence found", "lidar/poses.json and camera/front_camera and so on"
+        raise InputError(what, where=str(source), got=common.folder_contents(source), expected=expected)
     matching = [name for name in sequences if options.sequence in ("", name)]
-    return source / layout.the_only(matching, sequences, options, source, "sequence")
+    return source / common.the_only(matching, sequences, options, source, "sequence")
 
 
 def _cuboid_files(folder: Path, frames: Sequence[int], options: ImportOptions) -> dict[int, Path]:
     """Cuboid tables by frame number; none at all is allowed, gaps are not."""
-    cuboids = layout.numbered_files(folder, (".pkl.gz", ".pkl"))
+    cuboids = common.numbered_files(folder, (".pkl.gz", ".pkl"))
     lacks = [number for number in frames if number not in cuboids]
     if cuboids and lacks and not options.skip_missing:
-        raise InputError(
-            "a frame has no boxes",
-            where=str(folder),
-            expected=f"{lacks[0]:02d}.pkl.gz",
-            remedy="copy it, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        remedy = "copy it, choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError("a frame has no boxes", where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz", remedy=remedy)
     return cuboids
 
 
@@ -622,13 +549,10 @@ class _Motion:
             times = _times(stamps, frames)
             late = np.abs(times - raw_s)
             if late.max() > MAX_CAMERA_DELAY_S:
-                raise InputError(
-                    "camera and LiDAR do not share a clock",
-                    where=f"{stamps}: entry {frames[int(late.argmax())]}",
-                    expected=f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json",
-                    got=f"{late.max():.3f} s apart",
-                    remedy="are the times in seconds, and of this sequence?",
-                )
+                what, where = "camera and LiDAR do not share a clock", f"{stamps}: entry {frames[int(late.argmax())]}"
+                expected = f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json"
+                remedy = "are the times in seconds, and of this sequence?"
+                raise InputError(what, where=where, expected=expected, got=f"{late.max():.3f} s apart", remedy=remedy)
             stamped_s = seconds(times, "s", str(stamps), start_s)
             camera_s[name] = stamped_s + EXPOSURE_S
             given = world_from_source @ _poses(here / "poses.json", frames)
@@ -681,13 +605,9 @@ def _entries(path: Path, frames: Sequence[int]) -> list[Any]:
     values = store.read_json(path)
     if not isinstance(values, list) or len(values) <= frames[-1]:
         got = f"{len(values)} entries" if isinstance(values, list) else type(values).__name__
-        raise InputError(
-            "list does not cover the frames",
-            where=str(path),
-            got=got,
-            expected=f"a list with an entry per frame, at least {frames[-1] + 1}",
-            remedy="is the file cut off, or of another sequence?",
-        )
+        expected = f"a list with an entry per frame, at least {frames[-1] + 1}"
+        remedy = "is the file cut off, or of another sequence?"
+        raise InputError("list does not cover the frames", where=str(path), got=got, expected=expected, remedy=remedy)
     return [values[n] for n in frames]
 
 
@@ -698,13 +618,8 @@ def _times(path: Path, frames: Sequence[int]) -> NDArray[np.float64]:
     times = np.array(values, np.float64)
     seconds(times, "s", str(path))
     if times[0] > 1e11:
-        raise InputError(
-            "timestamps are in another unit than expected",
-            where=str(path),
-            expected="seconds of the epoch",
-            got=f"{times[0]:.6g}",
-            remedy="divide them by 1000 or 1000000",
-        )
+        what, remedy = "timestamps are in another unit than expected", "divide them by 1000 or 1000000"
+        raise InputError(what, where=str(path), expected="seconds of the epoch", got=f"{times[0]:.6g}", remedy=remedy)
     return times
 
 
@@ -770,13 +685,11 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
     columns = {name: finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
     late_s = columns["t"] - frame_s
     if len(late_s) and np.abs(late_s).max() > MAX_POINT_DELAY_S:
-        raise InputError(
-            "points do not belong to their frame's time",
-            where=f"{path}: t",
-            expected=f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})",
-            got=f"{columns['t'].min():.6g} to {columns['t'].max():.6g}",
-            remedy="is the file of another frame or sequence?",
-        )
+        what = "points do not belong to their frame's time"
+        expected = f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})"
+        got = f"{columns['t'].min():.6g} to {columns['t'].max():.6g}"
+        remedy = "is the file of another frame or sequence?"
+        raise InputError(what, where=f"{path}: t", expected=expected, got=got, remedy=remedy)
     if not np.isin(columns["d"], list(SENSORS)).all():
         raise InputError("a point is of a LiDAR that does not exist", where=f"{path}: d", expected="0 or 1")
     turning = late_s[columns["d"] == 0]

@@ -18,9 +18,9 @@ from mudg.base import log, store
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, yaw_matrix, yaw_of
 from mudg.base.types import Camera, SweepPoints, Track
-from mudg.formats.importers.box_tracks import BoxTracks, box_size
 from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import blend_motion, rigid_pose, rigid_rotation, unit_intensity
+from mudg.formats.importers.drive_log import BoxTracks, box_size
 from mudg.formats.unknown_fields import note_unknown
 
 # scans --------------------------------------------------------------------------------------------
@@ -29,8 +29,6 @@ from mudg.formats.unknown_fields import note_unknown
 #
 # The sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured
 # a / 2 pi turns later.
-
-
 SENSOR: Final = "velodyne"
 TURN_PERIOD_S: Final = 0.1
 _TURN_STEPS: Final = 36
@@ -38,10 +36,7 @@ _TURN_STEPS: Final = 36
 
 def read_scan(path: Path) -> SweepPoints:
     """A velodyne scan: float32 rows x, y, z, reflectance (0..1). Beams without a return are left out and counted.
-
-    Raises:
-        InputError: cut off, values that are not finite, or a reflectance outside of 0..1.
-    """
+    Raises InputError: cut off, values that are not finite, or a reflectance outside of 0..1."""
     rows, returns = read_float_rows(path, 4)
     rows = rows[returns]
     dt_s = np.zeros(len(rows), np.float32)
@@ -83,27 +78,12 @@ def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s
 #
 # KITTI counts pixels from the centre of the top-left pixel; this package from its corner. So 0.5 is added to the
 # principal point here, once.
-
-
 PIXEL_CENTRE_PX = 0.5
 _NUMBERED = tuple(
     f"{name}_{number:02d}" for name in ("S", "K", "D", "R", "T", "S_rect", "R_rect", "P_rect") for number in range(4)
 )
 _TEXT = frozenset(
-    {
-        "P0",
-        "P1",
-        "P2",
-        "P3",
-        "R0_rect",
-        "R_rect",
-        "Tr",
-        "Tr_velo_to_cam",
-        "Tr_velo_cam",
-        "Tr_imu_to_velo",
-        "Tr_imu_velo",
-        "calib_time",
-    }
+    "P0 P1 P2 P3 R0_rect R_rect Tr Tr_velo_to_cam Tr_velo_cam Tr_imu_to_velo Tr_imu_velo calib_time".split()
 )
 _OFFICIAL: Mapping[str, frozenset[str]] = {
     "calib_cam_to_cam.txt": frozenset({"calib_time", "corner_dist", *_NUMBERED}),
@@ -147,42 +127,28 @@ class KittiCalibration:
 
     def _projection(self, number: int) -> Matrix:
         if number not in self.projections:
-            raise InputError(
-                f"calibration does not tell camera {number}",
-                where=self.source,
-                got=", ".join(f"P{n}" for n in self.projections) or "no projection matrices",
-            )
+            got = ", ".join(f"P{n}" for n in self.projections) or "no projection matrices"
+            raise InputError(f"calibration does not tell camera {number}", where=self.source, got=got)
         return self.projections[number]
 
 
 def pinhole_camera(projection: Matrix, name: str, size: tuple[int, int], where: str) -> Camera:
-    """The rectified pinhole camera of a KITTI projection matrix.
+    """The rectified pinhole camera of a KITTI projection matrix. Raises InputError: skew, another last row than 0 0 1,
+    or a focal length that is not positive.
 
     Args:
         projection: f64[3, 4]; pixels are counted from the centre of the top-left one.
         name: of the camera in the scene.
         size: width and height in pixels.
         where: for messages.
-
-    Raises:
-        InputError: skew, another last row than 0 0 1, or a focal length that is not positive.
     """
     if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
-        raise InputError(
-            "projection matrix is not of a rectified pinhole camera",
-            where=where,
-            expected="no skew, last row 0 0 1",
-            got=str(projection[:, :3].tolist()),
-        )
+        what = "projection matrix is not of a rectified pinhole camera"
+        raise InputError(what, where=where, expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()))
     fx, fy, cx, cy = (float(projection[index]) for index in ((0, 0), (1, 1), (0, 2), (1, 2)))
     if fx <= 0 or fy <= 0:
-        raise InputError(
-            "focal length is not positive",
-            where=where,
-            expected="pixels, about 700 for KITTI",
-            got=f"fx={fx:g}, fy={fy:g}",
-            remedy="check the calibration file",
-        )
+        what, expected, got = "focal length is not positive", "pixels, about 700 for KITTI", f"fx={fx:g}, fy={fy:g}"
+        raise InputError(what, where=where, expected=expected, got=got, remedy="check the calibration file")
     return Camera(name, *size, fx, fy, cx + PIXEL_CENTRE_PX, cy + PIXEL_CENTRE_PX)
 
 
@@ -202,9 +168,8 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
         except ValueError:
             continue
         if not np.isfinite(numbers).all():
-            raise InputError(
-                "calibration holds a value that is not finite", where=f"{path}: {match[1]}", got=match[2][:80]
-            )
+            what = "calibration holds a value that is not finite"
+            raise InputError(what, where=f"{path}: {match[1]}", got=match[2][:80])
         table[match[1]] = numbers
     return table
 
@@ -212,28 +177,17 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
 def table_entry(
     table: Mapping[str, NDArray[np.float64]], keys: tuple[str, ...], shape: tuple[int, ...], where: object
 ) -> Matrix:
-    """The first entry of ``keys`` that the table has, as an array of ``shape``.
-
-    Raises:
-        InputError: there is none of them, or it has another number of values.
-    """
+    """The first entry of ``keys`` that the table has, as an array of ``shape``. Raises InputError: there is none of
+    them, or it has another number of values."""
     key = next((key for key in keys if key in table), None)
     if key is None:
-        raise InputError(
-            f"calibration lacks {keys[0]}",
-            where=str(where),
-            expected=" or ".join(keys),
-            got=", ".join(table) or "no entries",
-            remedy="use the calibration file that belongs to this recording",
-        )
+        what, expected = f"calibration lacks {keys[0]}", " or ".join(keys)
+        remedy = "use the calibration file that belongs to this recording"
+        raise InputError(what, where=str(where), expected=expected, got=", ".join(table) or "no entries", remedy=remedy)
     if table[key].size != np.prod(shape):
-        raise InputError(
-            "calibration entry has the wrong number of values",
-            where=f"{where}: {key}",
-            expected=f"{np.prod(shape)} numbers",
-            got=f"{table[key].size}",
-            remedy="is the file cut off?",
-        )
+        what, where = "calibration entry has the wrong number of values", f"{where}: {key}"
+        expected = f"{np.prod(shape)} numbers"
+        raise InputError(what, where=where, expected=expected, got=f"{table[key].size}", remedy="is the file cut off?")
     return table[key].reshape(shape)
 
 
@@ -274,8 +228,6 @@ def _pose_file(path: Path) -> Matrix:
 
 
 # poses --------------------------------------------------------------------------------------------
-
-
 Matrix = NDArray[np.float64]
 EARTH_RADIUS_M = 6378137.0
 _OXTS_VALUES = 30
@@ -294,17 +246,12 @@ def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDA
     except ValueError as error:
         raise InputError(f"{what}: a value is not a number", where=where, got=line.strip()[:80]) from error
     if len(numbers) not in counts:
-        raise InputError(
-            f"{what}: wrong number of values",
-            where=where,
-            expected=" or ".join(str(c) for c in counts),
-            got=str(len(numbers)),
-            remedy="is the file cut off, or of another format?",
-        )
+        what, expected = f"{what}: wrong number of values", " or ".join(str(c) for c in counts)
+        remedy = "is the file cut off, or of another format?"
+        raise InputError(what, where=where, expected=expected, got=str(len(numbers)), remedy=remedy)
     if not np.isfinite(numbers).all():
-        raise InputError(
-            f"{what}: a value is not finite", where=where, got=line.strip()[:80], expected="finite numbers"
-        )
+        what = f"{what}: a value is not finite"
+        raise InputError(what, where=where, got=line.strip()[:80], expected="finite numbers")
     return numbers
 
 
@@ -340,9 +287,8 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
             )
     else:
         expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)"
-        raise InputError(
-            "pose file does not cover the frames", where=str(path), got=f"{count} lines", expected=expected
-        )
+        what = "pose file does not cover the frames"
+        raise InputError(what, where=str(path), got=f"{count} lines", expected=expected)
     sensor = "velo" if widths == {13} else "cam0"
     return {n: rigid_pose(row.reshape(3, 4), f"{path}: pose of frame {n}") for n, row in poses.items()}, sensor
 
@@ -399,14 +345,11 @@ def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, 
     """Seconds by number: plain seconds, or ``2011-09-26 13:02:25.964389445`` (nanoseconds kept; seconds of the epoch).
 
     Line k is number k, and an empty line a number without a stamp. A file without empty lines that is too short for
-    that, but has just one line per recorded file, counts those instead.
+    that, but has just one line per recorded file, counts those instead. Raises InputError: no times, or too few.
 
     Args:
         numbers: of the recorded files, increasing.
         last: the highest number that is needed.
-
-    Raises:
-        InputError: no times, or too few.
     """
     lines = read_lines(path)
     stamps = {number: _stamp(line, f"{path}: line {number + 1}") for number, line in lines.items()}
@@ -419,13 +362,9 @@ def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, 
             " or not"
         )
         return dict(zip(numbers, stamps.values(), strict=True))
-    raise InputError(
-        "timestamps do not cover the frames",
-        where=str(path),
-        got=f"{count} lines, {len(numbers)} files",
-        expected=f"at least {last + 1} lines (line k = frame k, empty where it is missing), or one per file",
-        remedy="is the file cut off?",
-    )
+    what, got = "timestamps do not cover the frames", f"{count} lines, {len(numbers)} files"
+    expected = f"at least {last + 1} lines (line k = frame k, empty where it is missing), or one per file"
+    raise InputError(what, where=str(path), got=got, expected=expected, remedy="is the file cut off?")
 
 
 def _stamp(line: str, where: str) -> float:
@@ -443,8 +382,6 @@ def _stamp(line: str, where: str) -> float:
 #
 # KITTI boxes: tracking and object label text, raw-data tracklets; all become boxes in the velodyne frame per frame
 # number.
-
-
 MAX_TRACKLET_BYTES = 256 * 1024 * 1024
 LABELS = frozenset(
     ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")
@@ -452,23 +389,10 @@ LABELS = frozenset(
 """Classes of the benchmarks, in lower case."""
 _TRACKLET = frozenset({"objectType", "h", "w", "l", "first_frame", "poses", "finished"})
 _TRACKLET_POSE = frozenset(
-    {
-        "tx",
-        "ty",
-        "tz",
-        "rx",
-        "ry",
-        "rz",
-        "state",
-        "occlusion",
-        "occlusion_kf",
-        "truncation",
-        "amt_occlusion",
-        "amt_occlusion_kf",
-        "amt_border_l",
-        "amt_border_r",
-        "amt_border_kf",
-    }
+    (
+        "tx ty tz rx ry rz state occlusion occlusion_kf truncation amt_occlusion amt_occlusion_kf "
+        "amt_border_l amt_border_r amt_border_kf"
+    ).split()
 )
 """Fields of the data set's tracklets, read or not."""
 
@@ -504,15 +428,13 @@ def rect0_from_box(bottom_centre_m: Sequence[float], height_m: float, rotation_y
 
 
 def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
-    """Boxes of a tracking label file (17 columns and optionally a score), or of an object label file.
+    """Boxes of a tracking label file (17 columns and optionally a score), or of an object label file. Raises
+    InputError: another number of columns, values that are no finite numbers, or a size that makes no sense.
 
     Args:
         path: label text. ``DontCare`` regions are left out.
         rect0_from_velo: boxes are given in rectified camera 0 and returned in the velodyne frame, f64[4, 4].
         frame: frame number for an object label file (15 columns and optionally a score); None for a tracking file.
-
-    Raises:
-        InputError: another number of columns, values that are no finite numbers, or a size that makes no sense.
     """
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
@@ -520,13 +442,9 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
     for index, line in read_lines(path).items():
         columns, where = line.split(), f"{path}: line {index + 1}"
         if len(columns) - skip not in (15, 16):
-            raise InputError(
-                "label line has the wrong number of columns",
-                where=where,
-                got=str(len(columns)),
-                expected=f"{15 + skip} (or {16 + skip} with a score)",
-                remedy="is this a tracking or an object label file?",
-            )
+            what, expected = "label line has the wrong number of columns", f"{15 + skip} (or {16 + skip} with a score)"
+            remedy = "is this a tracking or an object label file?"
+            raise InputError(what, where=where, got=str(len(columns)), expected=expected, remedy=remedy)
         if columns[skip] == "DontCare":
             continue
         try:
@@ -549,11 +467,8 @@ def read_tracklets(path: Path) -> list[KittiBox]:
     if len(content) > MAX_TRACKLET_BYTES:
         raise InputError("tracklet file is too large", where=str(path), got=f"{len(content)} bytes")
     if b"<!ENTITY" in content:
-        raise InputError(
-            "tracklet file declares XML entities, which no KITTI file does",
-            where=str(path),
-            remedy="use the file from the data set",
-        )
+        what = "tracklet file declares XML entities, which no KITTI file does"
+        raise InputError(what, where=str(path), remedy="use the file from the data set")
     try:
         root = ElementTree.fromstring(content)  # noqa: S314 - entities are refused above, the size is bounded
     except ElementTree.ParseError as error:

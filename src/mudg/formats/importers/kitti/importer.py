@@ -36,8 +36,16 @@ from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Source, Track
-from mudg.formats.importers import layout
-from mudg.formats.importers.common import ImportOptions, has_pose, mended_path, origin_note, pose_near, seconds
+from mudg.formats.importers import common
+from mudg.formats.importers.common import (
+    ImportOptions,
+    LogFiles,
+    has_pose,
+    mended_path,
+    origin_note,
+    pose_near,
+    seconds,
+)
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
 from mudg.formats.importers.kitti import LICENCE
@@ -52,7 +60,6 @@ from mudg.formats.importers.kitti.files import (
     read_scan,
     untwist_scan,
 )
-from mudg.formats.importers.layout import LogFiles
 
 Matrix = NDArray[np.float64]
 FRAME_PERIOD_S: Final = 0.1
@@ -120,12 +127,9 @@ def looks_like_kitti(source: Path) -> bool:
 
 
 def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a KITTI recording into the scene directory ``out``; see the module text for what is understood.
-
-    Raises:
-        UsageError: the folder holds several recordings and none was chosen.
-        InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
-    """
+    """Import a KITTI recording into the scene directory ``out``; see the module text for what is understood. Raises
+    UsageError: the folder holds several recordings and none was chosen. InputError: something is missing, malformed or
+    contradictory; nothing is left at ``out``."""
     if not source.is_dir():
         raise InputError("KITTI folder does not exist", where=str(source), expected="a folder")
     files = find_files(source, options)
@@ -199,17 +203,17 @@ def find_files(source: Path, options: ImportOptions) -> KittiFiles:
     for folder in CAMERA_NAMES:
         short = folder.replace("_0", "_")
         for candidate in (source / folder / "data", source / folder / sequence, source / short / sequence):
-            found = layout.numbered_files(candidate, (".png", ".jpg", ".jpeg"))
+            found = common.numbered_files(candidate, (".png", ".jpg", ".jpeg"))
             if found:
                 images[folder] = found
                 break
     if not images:
         _refuse_without_images(source, options)
     usual = "image_02" if "image_02" in images else next(iter(images))
-    chosen = layout.chosen_cameras({folder: CAMERA_NAMES[folder] for folder in images}, options, str(source), (usual,))
+    chosen = common.chosen_cameras({folder: CAMERA_NAMES[folder] for folder in images}, options, str(source), (usual,))
     scans: dict[int, Path] = {}
     for candidate in (source / "velodyne_points" / "data", source / "velodyne" / sequence):
-        scans = scans or layout.numbered_files(candidate, (".bin",))
+        scans = scans or common.numbered_files(candidate, (".bin",))
     wanted = {CAMERA_NAMES[folder]: images[folder] for folder in chosen}
     return KittiFiles(wanted, {CAMERA_NAMES[folder]: int(folder[-1]) for folder in chosen}, scans, source, single)
 
@@ -218,19 +222,11 @@ def _refuse_without_images(source: Path, options: ImportOptions) -> None:
     folders = (path for name in ("image_02", "image_2") for path in (source / name).glob("*/"))
     sequences = sorted(path.name for path in folders if path.name != "data")
     if sequences:
-        raise UsageError(
-            "the folder holds several sequences",
-            where=str(source),
-            expected="--sequence with one of " + ", ".join(sequences[:12]),
-            got=options.sequence or "none chosen",
-        )
-    raise InputError(
-        "no KITTI images found",
-        where=str(source),
-        got=layout.folder_contents(source),
-        expected="image_02/data, image_02 or image_2 with numbered PNG files",
-        remedy="give the folder of one drive, sequence or training set",
-    )
+        what, expected = "the folder holds several sequences", "--sequence with one of " + ", ".join(sequences[:12])
+        raise UsageError(what, where=str(source), expected=expected, got=options.sequence or "none chosen")
+    what, expected = "no KITTI images found", "image_02/data, image_02 or image_2 with numbered PNG files"
+    remedy = "give the folder of one drive, sequence or training set"
+    raise InputError(what, where=str(source), got=common.folder_contents(source), expected=expected, remedy=remedy)
 
 
 def _choose_frames(files: KittiFiles, stamps: Mapping[str, Mapping[int, float]], options: ImportOptions) -> list[int]:
@@ -240,7 +236,7 @@ def _choose_frames(files: KittiFiles, stamps: Mapping[str, Mapping[int, float]],
     streams = {**files.images, **({SENSOR: files.scans} if files.scans else {})}
     recorded = set().union(*streams.values())
     stamped = {f"timestamps of {name}": recorded - (set(streams[name]) - set(times)) for name, times in stamps.items()}
-    frames = layout.complete_frames({**streams, **stamped}, options, str(files.folder), "kitti")
+    frames = common.complete_frames({**streams, **stamped}, options, str(files.folder), "kitti")
     if not files.scans:
         log.warn("kitti: no scans found: the scene has images only, and there is nothing to fuse")
     return frames
@@ -253,12 +249,9 @@ def _single_frame(files: KittiFiles, options: ImportOptions) -> int:
     if options.frames is not None:
         numbers = [n for n in numbers if options.frames[0] <= n < options.frames[1]]
     if len(numbers) != 1:
-        raise UsageError(
-            "an object-benchmark folder holds unrelated frames; a scene is one of them",
-            where=str(files.folder),
-            expected="--sequence with one frame number, e.g. 000008",
-            got=f"{len(numbers)} frames: {layout.number_ranges(numbers)}",
-        )
+        what, where = "an object-benchmark folder holds unrelated frames; a scene is one of them", str(files.folder)
+        got = f"{len(numbers)} frames: {common.number_ranges(numbers)}"
+        raise UsageError(what, where=where, expected="--sequence with one frame number, e.g. 000008", got=got)
     if files.scans and numbers[0] not in files.scans:
         raise InputError("frame has no scan", where=str(files.folder / "velodyne"), expected=f"{numbers[0]:06d}.bin")
     return numbers[0]
@@ -266,7 +259,7 @@ def _single_frame(files: KittiFiles, options: ImportOptions) -> int:
 
 def _find_calibration(files: KittiFiles, frames: Sequence[int], options: ImportOptions) -> KittiCalibration:
     folder = files.folder
-    path = layout.first_file(
+    path = common.first_file(
         folder / "calib.txt",
         *([folder / "calib" / f"{frames[0]:06d}.txt"] if files.single else []),
         *([folder / "calib" / f"{options.sequence}.txt"] if options.sequence else []),
@@ -278,12 +271,9 @@ def _find_calibration(files: KittiFiles, frames: Sequence[int], options: ImportO
         if (day / "calib_cam_to_cam.txt").is_file():
             log.info(f"kitti: calibration from {day}/calib_*.txt")
             return read_calibration_day(day)
-    raise InputError(
-        "no calibration found",
-        where=str(folder),
-        expected="calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up",
-        remedy="download the day's calibration archive and unpack it beside the drive",
-    )
+    expected = "calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up"
+    remedy = "download the day's calibration archive and unpack it beside the drive"
+    raise InputError("no calibration found", where=str(folder), expected=expected, remedy=remedy)
 
 
 # --- time and motion ------------------------------------------------------------------------------
@@ -291,17 +281,17 @@ def _find_calibration(files: KittiFiles, frames: Sequence[int], options: ImportO
 
 def _read_stamps(files: KittiFiles, options: ImportOptions) -> dict[str, dict[int, float]]:
     """The source's times in seconds by camera or LiDAR and frame; nothing where a camera has none."""
-    common = files.folder / "times.txt"
+    shared = files.folder / "times.txt"
     folders = {name: next(path.parent for path in found.values()) for name, found in files.images.items()}
     paths = {
-        name: layout.first_file(folder.parent / "timestamps.txt", folder / "timestamps.txt", common)
+        name: common.first_file(folder.parent / "timestamps.txt", folder / "timestamps.txt", shared)
         for name, folder in folders.items()
     }
     if files.single or None in paths.values():
         return {}
     streams = dict(files.images)
     if files.scans:
-        paths[SENSOR] = layout.first_file(files.folder / "velodyne_points" / "timestamps.txt", common, *paths.values())
+        paths[SENSOR] = common.first_file(files.folder / "velodyne_points" / "timestamps.txt", shared, *paths.values())
         streams[SENSOR] = files.scans
     first, end = options.frames or (0, 2**63)
     stamps = {}
@@ -344,7 +334,7 @@ def _with_poses(recording: _Recording, motion: _VeloMotion, options: ImportOptio
         motion.velo_at(clock.scan_s[lost[0]])  # says what is wrong
         raise InputError("no frame has a vehicle pose", where=str(recording.files.folder))
     if lost:
-        log.warn(f"kitti: left out frames without a vehicle pose: {layout.number_ranges(lost)}")
+        log.warn(f"kitti: left out frames without a vehicle pose: {common.number_ranges(lost)}")
     return placed
 
 
@@ -359,12 +349,9 @@ def _find_motion(recording: _Recording, options: ImportOptions, notes: list[str]
         ego_from_velo, untwist = np.eye(4), options.untwist == "yes"
     else:
         if calibration.velo_from_imu is None:
-            raise InputError(
-                "calibration does not tell where the IMU is",
-                where=calibration.source,
-                expected="calib_imu_to_velo.txt or Tr_imu_to_velo",
-                remedy="add it, or give a pose file with --poses",
-            )
+            what, where = "calibration does not tell where the IMU is", calibration.source
+            expected = "calib_imu_to_velo.txt or Tr_imu_to_velo"
+            raise InputError(what, where=where, expected=expected, remedy="add it, or give a pose file with --poses")
         log.info(f"kitti: poses from GPS/IMU packets in {packets}")
         notes.append("poses from GPS/IMU packets")
         ego = _ego_from_packets(packets, frames, recording.clock, options)
@@ -383,16 +370,13 @@ def _ego_from_file(recording: _Recording, options: ImportOptions, notes: list[st
     frames, folder = recording.frames, recording.files.folder
     names = ("poses_velo.txt", "poses.txt", "poses_cam0.txt")
     found = [parent / name for parent in (folder, folder / "derived") for name in names]
-    path = options.poses or layout.first_file(*found, *_odometry_poses(folder))
+    path = options.poses or common.first_file(*found, *_odometry_poses(folder))
     if path is None and len(frames) == 1:
         return EgoPath(np.array([recording.clock.scan_s[frames[0]]]), np.eye(4)[None])
     if path is None:
-        raise InputError(
-            "no vehicle poses found",
-            where=str(folder),
-            expected="oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE",
-            remedy="without poses the frames of a moving vehicle cannot be put into one world",
-        )
+        expected = "oxts/data, poses.txt, derived/poses_velo.txt or --poses FILE"
+        remedy = "without poses the frames of a moving vehicle cannot be put into one world"
+        raise InputError("no vehicle poses found", where=str(folder), expected=expected, remedy=remedy)
     log.info(f"kitti: poses from {path}")
     notes.append(f"poses from {path.name}")
     poses, sensor = kitti_poses.read_pose_file(path, frames)
@@ -409,12 +393,8 @@ def _known(frames: Sequence[int], there: Container[int], what: str, path: Path, 
     """The frames that are ``there``; lost ones are refused unless frames may be left out."""
     missing = [n for n in frames if n not in there]
     if missing and (not options.skip_missing or len(missing) == len(frames)):
-        raise InputError(
-            what,
-            where=str(path),
-            got=f"nothing for frames {layout.number_ranges(missing)}",
-            remedy="copy them, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        where, remedy = str(path), "copy them, choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError(what, where=where, got=f"nothing for frames {common.number_ranges(missing)}", remedy=remedy)
     return [n for n in frames if n in there]
 
 
@@ -425,7 +405,7 @@ def _find_packets(files: KittiFiles, options: ImportOptions) -> Path | None:
     folder = files.folder / "oxts" / "data"
     if folder.is_dir():
         return folder
-    return layout.first_file(files.folder / "oxts" / f"{options.sequence}.txt") if options.sequence else None
+    return common.first_file(files.folder / "oxts" / f"{options.sequence}.txt") if options.sequence else None
 
 
 def _odometry_poses(source: Path) -> tuple[Path, ...]:
@@ -461,7 +441,7 @@ def _find_tracks(
     if options.boxes is not None and not options.boxes.is_file():
         raise InputError("box file does not exist", where=str(options.boxes))
     object_label = here / "label_2" / f"{frames[0]:06d}.txt"
-    found = options.boxes or layout.first_file(
+    found = options.boxes or common.first_file(
         here / "tracklet_labels.xml",
         here / "label_02.txt",
         *([here / "label_02" / f"{options.sequence}.txt"] if options.sequence else []),

@@ -32,13 +32,20 @@ from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import transform_points, yaw_matrix, yaw_of
 from mudg.base.types import EgoPath, Scene, Source
-from mudg.formats.importers.common import ImportOptions, seconds
+from mudg.formats.importers.common import (
+    ImportOptions,
+    LogFiles,
+    chosen_cameras,
+    folder_contents,
+    refuse_options,
+    seconds,
+    the_only,
+)
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images
-from mudg.formats.importers.layout import LogFiles, chosen_cameras, folder_contents, refuse_options, the_only
 from mudg.formats.importers.waymo import records as tracks
 from mudg.formats.importers.waymo import sensors
-from mudg.formats.importers.waymo.parquet import REQUIRED, ParquetLog
+from mudg.formats.importers.waymo.logs import REQUIRED, ParquetLog, TfrecordLog
 from mudg.formats.importers.waymo.records import (
     CAMERAS,
     TOP,
@@ -50,7 +57,6 @@ from mudg.formats.importers.waymo.records import (
     TimedBoxes,
     WaymoLog,
 )
-from mudg.formats.importers.waymo.tfrecord import TfrecordLog
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
 DOUBTFUL_PROJECTION_PX: Final = 30.0
@@ -73,16 +79,14 @@ def looks_like_waymo(source: Path) -> bool:
 
 
 def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a Waymo log into the scene directory ``out``; see the module text for what is understood.
+    """Import a Waymo log into the scene directory ``out``; see the module text for what is understood. Raises
+    UsageError: several logs and none was chosen, or an option that this format cannot honour. InputError: something is
+    missing, damaged or contradictory; nothing is left at ``out``.
 
     Args:
         source: a TFRecord file, a folder of them, or a folder with the component folders of format 2.
         out: scene directory to make.
         options: ``sequence`` chooses a log where there are several, by its name or a part of it.
-
-    Raises:
-        UsageError: several logs and none was chosen, or an option that this format cannot honour.
-        InputError: something is missing, damaged or contradictory; nothing is left at ``out``.
     """
     _refuse_options(options)
     waymo = open_log(source, options)
@@ -122,13 +126,9 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
 def _refuse_options(options: ImportOptions) -> None:
     refuse_options(options, "Waymo", "poses", "boxes")
     if options.untwist == "no":
-        raise UsageError(
-            "Waymo scans cannot be left twisted",
-            where="--untwist",
-            got="no",
-            remedy="leave it out",
-            expected="auto or yes: points carry the pose they were measured at",
-        )
+        what = "Waymo scans cannot be left twisted"
+        expected = "auto or yes: points carry the pose they were measured at"
+        raise UsageError(what, where="--untwist", got="no", remedy="leave it out", expected=expected)
 
 
 def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
@@ -141,11 +141,8 @@ def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
 
 
 def open_log(source: Path, options: ImportOptions) -> WaymoLog:
-    """The log that ``source`` and ``options.sequence`` name, its facts read and checked.
-
-    Raises:
-        UsageError: there are several, and none or more than one was meant. InputError: there is none, or it is damaged.
-    """
+    """The log that ``source`` and ``options.sequence`` name, its facts read and checked. Raises UsageError: there are
+    several, and none or more than one was meant. InputError: there is none, or it is damaged."""
     record, segment = _find(source, options)
     return TfrecordLog(record, options.frames) if record is not None else ParquetLog(source, segment, options.frames)
 
@@ -159,12 +156,8 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path | None, str]:
     records = {path.stem: path for path in sorted(source.glob(f"*{_SUFFIX}"))}
     segments = records or sorted({path.stem for name in REQUIRED for path in (source / name).glob("*.parquet")})
     if not segments:
-        raise InputError(
-            "no Waymo log found",
-            where=str(source),
-            got=folder_contents(source),
-            expected=f"*{_SUFFIX} files, or component folders: {', '.join(REQUIRED)}",
-        )
+        expected = f"*{_SUFFIX} files, or component folders: {', '.join(REQUIRED)}"
+        raise InputError("no Waymo log found", where=str(source), got=folder_contents(source), expected=expected)
     matching = [name for name in segments if name == options.sequence] or [n for n in segments if options.sequence in n]
     name = the_only(matching, matching or list(segments), options, source, "log")
     return records.get(name), name
@@ -174,23 +167,15 @@ def _chosen_cameras(waymo: WaymoLog, options: ImportOptions, source: Path) -> li
     recorded = {name for frame in waymo.frames for name in frame.shots}
     there = {name: name for name in CAMERAS.values() if name in recorded}
     if not there:
-        raise InputError(
-            "the log has no images",
-            where=str(source),
-            expected="images of the cameras",
-            got=f"{len(waymo.frames)} frames with poses and boxes only",
-            remedy="take the files with camera and LiDAR data",
-        )
+        what, got = "the log has no images", f"{len(waymo.frames)} frames with poses and boxes only"
+        remedy = "take the files with camera and LiDAR data"
+        raise InputError(what, where=str(source), expected="images of the cameras", got=got, remedy=remedy)
     chosen = chosen_cameras(there, options, str(source), tuple(there))
     lacking = [name for name in chosen if name not in waymo.cameras]
     if lacking:
-        raise InputError(
-            "cameras have images and no calibration",
-            where=str(source),
-            got=", ".join(lacking),
-            expected=", ".join(waymo.cameras) or "a calibration for each",
-            remedy="choose others with --cameras",
-        )
+        what, got = "cameras have images and no calibration", ", ".join(lacking)
+        expected = ", ".join(waymo.cameras) or "a calibration for each"
+        raise InputError(what, where=str(source), got=got, expected=expected, remedy="choose others with --cameras")
     return chosen
 
 
@@ -201,29 +186,20 @@ def _usable_frames(waymo: WaymoLog, options: ImportOptions) -> tuple[list[FrameR
     lasers = sorted({name for frame in waymo.frames for name in frame.lasers})
     without = [name for name in lasers if name not in waymo.lasers]
     if without:
-        raise InputError(
-            "LiDARs have scans and no calibration",
-            where=waymo.frames[0].where,
-            got=", ".join(without),
-            expected=", ".join(waymo.lasers) or "a calibration for each",
-        )
+        what, expected = "LiDARs have scans and no calibration", ", ".join(waymo.lasers) or "a calibration for each"
+        raise InputError(what, where=waymo.frames[0].where, got=", ".join(without), expected=expected)
     complete, missing = [], []
     for frame in waymo.frames:
         lack = sorted(cameras - set(frame.shots)) + [f"LiDAR {name}" for name in lasers if name not in frame.lasers]
         (missing if lack else complete).append((frame, lack))
     if missing and not options.skip_missing:
         frame, lack = missing[0]
-        raise InputError(
-            "frame lacks images or scans",
-            where=frame.where,
-            got=f"no {', '.join(lack)}" + (f"; {len(missing)} frames in all" if len(missing) > 1 else ""),
-            expected="what the other frames have",
-            remedy="choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        got = f"no {', '.join(lack)}" + (f"; {len(missing)} frames in all" if len(missing) > 1 else "")
+        expected, remedy = "what the other frames have", "choose frames with --frames FIRST:END, or add --skip-missing"
+        raise InputError("frame lacks images or scans", where=frame.where, got=got, expected=expected, remedy=remedy)
     if not complete:
-        raise InputError(
-            "no frame is complete", where=waymo.frames[0].where, got=f"the first has no {', '.join(missing[0][1])}"
-        )
+        what = "no frame is complete"
+        raise InputError(what, where=waymo.frames[0].where, got=f"the first has no {', '.join(missing[0][1])}")
     notes = [f"Waymo Open Dataset, {waymo.form}" + (f"; {waymo.conditions}" if waymo.conditions else "")]
     if missing:
         notes.append(

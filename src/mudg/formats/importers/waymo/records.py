@@ -7,8 +7,9 @@ car. The data set's camera frame is x forward, y left, z up.
 
 from __future__ import annotations
 
+import struct
 import zlib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Final, Literal, Protocol
 
@@ -18,9 +19,9 @@ from numpy.typing import NDArray
 from mudg.base.errors import InputError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Track
-from mudg.formats.importers.box_tracks import BoxTracks
 from mudg.formats.importers.common import rigid_pose
-from mudg.formats.importers.waymo.messages import MATRIX_FLOAT, MATRIX_INT, Message, parse_message
+from mudg.formats.importers.drive_log import BoxTracks
+from mudg.formats.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 Numbers = Sequence[float] | NDArray[np.float64]
@@ -65,12 +66,9 @@ class LaserCalibration:
         """Inclination of every row of a range image, f64[rows] radians; the top row looks highest."""
         if self.inclinations:
             if len(self.inclinations) != rows:
-                raise InputError(
-                    "range image does not have a row for every beam",
-                    where=where,
-                    expected=f"{len(self.inclinations)} rows (calibration of LiDAR {self.name})",
-                    got=f"{rows} rows",
-                )
+                what = "range image does not have a row for every beam"
+                expected = f"{len(self.inclinations)} rows (calibration of LiDAR {self.name})"
+                raise InputError(what, where=where, expected=expected, got=f"{rows} rows")
             return np.array(self.inclinations)[::-1]
         step = (self.inclination_max - self.inclination_min) / rows
         return self.inclination_max - (np.arange(rows, dtype=np.float64) + 0.5) * step
@@ -186,11 +184,8 @@ class WaymoLog(Protocol):
 
 
 def transform_of(values: Numbers, where: str) -> Matrix:
-    """A rigid 4x4 from its sixteen numbers, row by row.
-
-    Raises:
-        InputError: another count of numbers, or no rigid motion.
-    """
+    """A rigid 4x4 from its sixteen numbers, row by row. Raises InputError: another count of numbers, or no rigid
+    motion."""
     if len(values) != 16:
         raise InputError("transform is incomplete", where=where, expected="16 numbers", got=str(len(values)))
     return rigid_pose(np.asarray(values, np.float64).reshape(4, 4), where)
@@ -199,11 +194,8 @@ def transform_of(values: Numbers, where: str) -> Matrix:
 def camera_of(
     name: str, intrinsic: Sequence[float], extrinsic: Numbers, image: tuple[int, int, int], where: str
 ) -> CameraCalibration:
-    """A calibration from its numbers; ``image`` is width, height and the direction of the shutter.
-
-    Raises:
-        InputError: intrinsics that are not nine finite numbers, or no rigid extrinsics.
-    """
+    """A calibration from its numbers; ``image`` is width, height and the direction of the shutter. Raises InputError:
+    intrinsics that are not nine finite numbers, or no rigid extrinsics."""
     where, values = f"{where}: calibration of camera {name}", tuple(float(value) for value in intrinsic)
     if len(values) != 9 or not np.isfinite(values).all():
         raise InputError("intrinsics are incomplete", where=where, expected="9 finite numbers", got=str(values))
@@ -213,11 +205,8 @@ def camera_of(
 def laser_of(
     name: str, beams: Sequence[float], limits: tuple[float, float], extrinsic: Numbers, where: str
 ) -> LaserCalibration:
-    """A calibration from its numbers: inclinations of the beams, or none and their limits, in radians.
-
-    Raises:
-        InputError: inclinations that are not finite or not in order, or no rigid extrinsics.
-    """
+    """A calibration from its numbers: inclinations of the beams, or none and their limits, in radians. Raises
+    InputError: inclinations that are not finite or not in order, or no rigid extrinsics."""
     where, beams = f"{where}: calibration of LiDAR {name}", tuple(float(value) for value in beams)
     if not np.isfinite(beams or limits).all() or not (beams or limits[0] < limits[1]):
         raise InputError("beam inclinations make no sense", where=where, expected="radians", got=str(beams or limits))
@@ -225,29 +214,20 @@ def laser_of(
 
 
 def box_of(box_id: str, number: int, values: Sequence[float], where: str) -> WaymoBox:
-    """A box from the number of its class and x, y, z, length, width, height, heading.
-
-    Raises:
-        InputError: numbers that are not finite, or a size that is not positive.
-    """
+    """A box from the number of its class and x, y, z, length, width, height, heading. Raises InputError: numbers that
+    are not finite, or a size that is not positive."""
     x, y, z, length, width, height, heading = (float(value) for value in values)
     if not np.isfinite(values).all() or min(length, width, height) <= 0:
-        raise InputError(
-            "box makes no sense",
-            where=f"{where}: box {box_id}",
-            expected="finite numbers, positive length, width and height",
-            got=f"centre {(x, y, z)}, size {(length, width, height)}, heading {heading}",
-        )
+        expected = "finite numbers, positive length, width and height"
+        got = f"centre {(x, y, z)}, size {(length, width, height)}, heading {heading}"
+        raise InputError("box makes no sense", where=f"{where}: box {box_id}", expected=expected, got=got)
     return WaymoBox(box_id, LABELS.get(number, "unknown"), (x, y, z), (length, width, height), heading)
 
 
 def by_name(shots: Iterable[tuple[str, CameraShot]], timestamp_us: int, where: str) -> dict[str, CameraShot]:
     """The images of one frame by camera, their clock compared with the frame's: seconds and microseconds of one epoch.
-
-    Raises:
-        InputError: two images of one camera; times that are not finite, contradict each other, or are more than a
-            second off.
-    """
+    Raises InputError: two images of one camera; times that are not finite, contradict each other, or are more than a
+    second off."""
     found: dict[str, CameraShot] = {}
     for name, shot in shots:
         here = f"{where}: image of camera {name}"
@@ -255,20 +235,15 @@ def by_name(shots: Iterable[tuple[str, CameraShot]], timestamp_us: int, where: s
             raise InputError("frame has two images of one camera", where=here)
         times = (shot.pose_time_s, *((shot.trigger_s, shot.done_s) if shot.done_s else ()))
         if not max(abs(time - timestamp_us / 1e6) for time in times) <= MAX_CLOCK_GAP_S:
-            raise InputError(
-                "image and frame are not of one time",
-                where=here,
-                expected=f"seconds within {MAX_CLOCK_GAP_S} s of the frame's {timestamp_us} microseconds",
-                got=", ".join(f"{time!r}" for time in times),
-                remedy="are the units seconds (images) and microseconds (frames)?",
-            )
+            what = "image and frame are not of one time"
+            expected = f"seconds within {MAX_CLOCK_GAP_S} s of the frame's {timestamp_us} microseconds"
+            got = ", ".join(f"{time!r}" for time in times)
+            remedy = "are the units seconds (images) and microseconds (frames)?"
+            raise InputError(what, where=here, expected=expected, got=got, remedy=remedy)
         if shot.done_s and not 0 <= shot.shutter_s <= shot.done_s - shot.trigger_s < MAX_CLOCK_GAP_S:
-            raise InputError(
-                "exposure times contradict each other",
-                where=here,
-                expected="0 <= shutter <= readout end - trigger, seconds",
-                got=f"shutter {shot.shutter_s:g}, trigger to readout end {shot.done_s - shot.trigger_s:g}",
-            )
+            what = "exposure times contradict each other"
+            got = f"shutter {shot.shutter_s:g}, trigger to readout end {shot.done_s - shot.trigger_s:g}"
+            raise InputError(what, where=here, expected="0 <= shutter <= readout end - trigger, seconds", got=got)
         found[name] = shot
     return found
 
@@ -284,11 +259,8 @@ def each_once(lasers: Sequence[str], where: str) -> tuple[str, ...]:
 
 
 def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, where: str) -> NDArray[Any]:
-    """A zlib-packed matrix message as an array [H, W, channels].
-
-    Raises:
-        InputError: damaged, too large, or of another shape.
-    """
+    """A zlib-packed matrix message as an array [H, W, channels]. Raises InputError: damaged, too large, or of another
+    shape."""
     unpacker = zlib.decompressobj()
     try:
         content = unpacker.decompress(packed, MAX_UNPACKED_BYTES)
@@ -296,12 +268,8 @@ def unpack_matrix(packed: bytes | memoryview, message: Message, channels: int, w
         raise InputError("range image cannot be unpacked", where=where, got=str(error)) from error
     if not unpacker.eof:
         cut_off = not unpacker.unconsumed_tail
-        raise InputError(
-            "range image is cut off" if cut_off else "range image unpacks to more than any has",
-            where=where,
-            expected=f"at most {MAX_UNPACKED_BYTES} bytes",
-            got=f"{len(content)} bytes",
-        )
+        what = "range image is cut off" if cut_off else "range image unpacks to more than any has"
+        raise InputError(what, where=where, expected=f"at most {MAX_UNPACKED_BYTES} bytes", got=f"{len(content)} bytes")
     values = parse_message(content, message, where)
     return shaped(values["data"], values.get("shape", {}).get("dims", ()), channels, where)
 
@@ -310,12 +278,8 @@ def shaped(data: NDArray[Any], dims: Sequence[int] | NDArray[np.integer], channe
     """``data`` [H * W * channels] as [H, W, channels], if its declared shape says so."""
     shape = tuple(int(n) for n in dims)
     if len(shape) != 3 or min(shape) < 1 or shape[2] != channels or int(np.prod(shape)) != len(data):
-        raise InputError(
-            "range image has the wrong shape",
-            where=where,
-            expected=f"[rows, columns, {channels}], as many values as that",
-            got=f"{list(shape)} with {len(data)} values",
-        )
+        what, expected = "range image has the wrong shape", f"[rows, columns, {channels}], as many values as that"
+        raise InputError(what, where=where, expected=expected, got=f"{list(shape)} with {len(data)} values")
     return data.reshape(shape)
 
 
@@ -337,8 +301,6 @@ def int_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[
 # points holds where its object was when the LiDAR passed it; a description of the data set speaks of the frame's start
 # instead. So the log is asked: under which of the ``Moment`` do most points near fast objects lie inside their boxes?
 # Each box is then carried, with its object's own speed, to the moment that all of the frame's points are given for.
-
-
 Moment = Literal["seen", "start", "pose"]
 """A box holds when the LiDAR looked at its object, at the frame's timestamp, or at the moment of the frame's pose."""
 
@@ -376,30 +338,20 @@ def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
 
     A track begins with the first image of its first frame and ends with the last image of its last one: some hundredths
     of a second are added to either end with the object's velocity, or else images at the ends would lack the object.
-
-    Raises:
-        InputError: a box without an id, two boxes of one id in a frame, a class that changes, or length and width are
-            swapped.
-    """
+    Raises InputError: a box without an id, two boxes of one id in a frame, a class that changes, or length and width
+    are swapped."""
     tracks = BoxTracks(frames[0].where if frames else "", {})
     labels: dict[str, str] = {}
     for frame in frames:
         seen: set[str] = set()
         for box, late in zip(frame.boxes, frame.late_s, strict=True):
             if not box.id or box.id in seen:
-                raise InputError(
-                    "frame has two boxes of one object" if box.id else "box has no id",
-                    where=frame.where,
-                    got=repr(box.id),
-                )
+                what = "frame has two boxes of one object" if box.id else "box has no id"
+                raise InputError(what, where=frame.where, got=repr(box.id))
             seen.add(box.id)
             if labels.setdefault(box.id, box.label) != box.label:
-                raise InputError(
-                    "the class of an object changes",
-                    where=f"{frame.where}: object {box.id}",
-                    expected=labels[box.id],
-                    got=box.label,
-                )
+                what = "the class of an object changes"
+                raise InputError(what, where=f"{frame.where}: object {box.id}", expected=labels[box.id], got=box.label)
             # a track's name begins with no sign, as the data set's random ids may
             name = box.id if box.id[0].isalnum() else f"t{box.id}"
             pose = frame.world_from_vehicle @ yaw_matrix(box.heading, box.centre)
@@ -481,3 +433,267 @@ def velocities(frames: Sequence[TimedBoxes]) -> list[dict[str, NDArray[np.float6
             speeds[box_id] = way / span if span > 0 else np.zeros(3)
         found.append(speeds)
     return found
+
+
+# Reading protocol-buffer messages by a table of the fields that are wanted; no generated code.
+
+
+Kind = Literal["int", "float", "double", "bytes", "text", "message", "doubles", "floats", "ints", "messages"]
+
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+_WIRE: Final[Mapping[Kind, int]] = {
+    "int": _VARINT,
+    "ints": _VARINT,
+    "double": _FIXED64,
+    "doubles": _FIXED64,
+    "float": _FIXED32,
+    "floats": _FIXED32,
+    "bytes": _BYTES,
+    "text": _BYTES,
+    "message": _BYTES,
+    "messages": _BYTES,
+}
+_DTYPE: Final[Mapping[Kind, str]] = {"doubles": "<f8", "floats": "<f4"}
+_MAX_FIELDS: Final = 4_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """A field to keep: its name, what it holds, and for messages their description. Plural kinds are repeated."""
+
+    name: str
+    kind: Kind
+    message: Message | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """A message description: its name, for errors; field number -> field; and numbers of the data set's fields that are
+    not kept."""
+
+    name: str
+    fields: Mapping[int, Field]
+    passed: frozenset[int] = frozenset()
+
+
+def parse_message(data: bytes | memoryview, message: Message, where: str) -> dict[str, Any]:
+    """The wanted fields of a message. Raises InputError: cut off, a wire type that does not fit, or text that is not
+    UTF-8.
+
+    Args:
+        data: the encoded message.
+        message: what to keep.
+        where: file and record, for errors.
+
+    Returns:
+        Field name -> value. Missing fields are left out, but repeated ones are always there: lists of dictionaries, or
+        arrays f64, f32 or i64 [n]. Bytes are ``memoryview``. The last one wins where a single field stands twice.
+    """
+    reader = _MessageReader(data, message, where)
+    values: dict[str, Any] = {}
+    parts: dict[int, list[Any]] = {
+        n: [] for n, f in message.fields.items() if f.kind in ("doubles", "floats", "ints", "messages")
+    }
+    for start, number, wire, raw in reader.fields():
+        field = message.fields.get(number)
+        if field is None:
+            if number not in message.passed:
+                note_unknown(f"{message.name} messages", (f"field {number}",), frozenset())
+            continue
+        packed = wire == _BYTES and field.kind in ("doubles", "floats", "ints")
+        if wire != _WIRE[field.kind] and not packed:
+            expected = _WIRE[field.kind]
+            raise reader.broken(start, f"field {field.name} ({number}) has wire type {wire}, not {expected}")
+        value = reader.decode(field, raw, packed, start)
+        if number in parts:
+            parts[number].append(value)
+        else:
+            values[field.name] = value
+    for number, found in parts.items():
+        field = message.fields[number]
+        values[field.name] = found if field.kind == "messages" else _concatenated(field.kind, found)
+    return values
+
+
+class _MessageReader:
+    """The fields of one message; what is wrong is said with its name and the byte."""
+
+    def __init__(self, data: bytes | memoryview, message: Message, where: str) -> None:
+        self._view, self._message, self._where = memoryview(data), message, where
+        self._place = 0
+
+    def broken(self, place: int, got: str) -> InputError:
+        where = f"{self._where}: {self._message.name}, byte {place}"
+        expected = "a protocol-buffer message of the Waymo Open Dataset"
+        remedy = "is this a file of another data set, or of the motion data?"
+        return InputError("message cannot be decoded", where=where, expected=expected, got=got, remedy=remedy)
+
+    def fields(self) -> Iterator[tuple[int, int, int, Any]]:
+        """Place, number, wire type and raw value (an int, or a view) of every field."""
+        seen = 0
+        while self._place < len(self._view):
+            start, key = self._place, self._varint()
+            seen += 1
+            if key >> 3 == 0 or seen > _MAX_FIELDS:
+                raise self.broken(start, "field number 0" if key >> 3 == 0 else f"more than {_MAX_FIELDS} fields")
+            yield start, key >> 3, key & 7, self._value(key & 7)
+
+    def _varint(self) -> int:
+        start, value, shift = self._place, 0, 0
+        for place in range(start, len(self._view)):
+            byte = self._view[place]
+            value |= (byte & 0x7F) << shift
+            if byte < 0x80:
+                self._place = place + 1
+                return value & 0xFFFFFFFFFFFFFFFF
+            shift += 7
+            if shift > 63:
+                raise self.broken(start, "a number of more than ten bytes")
+        raise self.broken(start, "it ends inside a number")
+
+    def _value(self, wire: int) -> Any:
+        if wire == _VARINT:
+            return self._varint()
+        if wire not in (_BYTES, _FIXED32, _FIXED64):
+            raise self.broken(self._place, f"wire type {wire}")
+        length = self._varint() if wire == _BYTES else 4 if wire == _FIXED32 else 8
+        left = len(self._view) - self._place
+        if length > left:
+            raise self.broken(self._place, f"a field of {length} bytes where {left} are left")
+        self._place += length
+        return self._view[self._place - length : self._place]
+
+    def decode(self, field: Field, raw: Any, packed: bool, start: int) -> Any:
+        """The value of a field from its raw one."""
+        if field.message is not None:
+            return parse_message(raw, field.message, self._where)
+        if field.kind in _DTYPE:
+            size = np.dtype(_DTYPE[field.kind]).itemsize
+            if len(raw) % size:
+                raise self.broken(start, f"field {field.name} holds {len(raw)} bytes, no multiple of {size}")
+            return np.frombuffer(raw, _DTYPE[field.kind])
+        if field.kind == "ints" and packed:
+            return unpack_varints(raw, f"{self._where}: {self._message.name}.{field.name}")
+        if field.kind in ("int", "ints"):
+            value = raw - (1 << 64) if raw >= 1 << 63 else raw
+            return np.array([value]) if field.kind == "ints" else value
+        if field.kind == "text":
+            try:
+                return bytes(raw).decode("utf-8")
+            except UnicodeDecodeError as error:
+                raise self.broken(start, f"field {field.name} is no text") from error
+        return raw if field.kind == "bytes" else struct.unpack("<d" if field.kind == "double" else "<f", raw)[0]
+
+
+def _concatenated(kind: Kind, found: list[NDArray[Any]]) -> NDArray[Any]:
+    if len(found) == 1:
+        return found[0]
+    return np.concatenate(found) if found else np.zeros(0, _DTYPE.get(kind, np.int64))
+
+
+def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
+    """A row of varints, all at once: i64[n]; negative numbers take ten bytes each. Raises InputError: the last number
+    is cut off, or one is longer than ten bytes."""
+    codes = np.frombuffer(data, np.uint8)
+    if len(codes) == 0:
+        return np.zeros(0, np.int64)
+    last = np.flatnonzero(codes < 0x80)
+    if len(last) == 0 or last[-1] != len(codes) - 1:
+        raise InputError("packed numbers are cut off", where=where)
+    first = np.r_[0, last[:-1] + 1]
+    lengths = last - first + 1
+    if lengths.max() > 10:
+        raise InputError("a packed number has more than ten bytes", where=where)
+    if lengths.max() == 1:
+        return codes.astype(np.int64)
+    shift = (np.arange(len(codes)) - np.repeat(first, lengths)).astype(np.uint64) * np.uint64(7)
+    return np.add.reduceat((codes & np.uint8(0x7F)).astype(np.uint64) << shift, first).view(np.int64)
+
+
+# --- the messages of the data set -----------------------------------------------------------------
+
+
+def _message(title: str, /, *passed: int, **fields: tuple[Any, ...]) -> Message:
+    """A description from fields by name: number, kind and, for messages, their description. ``passed``: numbers of
+    official fields that are not kept."""
+    return Message(title, {number: Field(field, *kind) for field, (number, *kind) in fields.items()}, frozenset(passed))
+
+
+_TRANSFORM = _message("Transform", values=(1, "doubles"))
+_CAMERA_CALIBRATION = _message(
+    "CameraCalibration",
+    name=(1, "int"),
+    intrinsic=(2, "doubles"),
+    extrinsic=(3, "message", _TRANSFORM),
+    width=(4, "int"),
+    height=(5, "int"),
+    direction=(6, "int"),
+)
+_LASER_CALIBRATION = _message(
+    "LaserCalibration",
+    name=(1, "int"),
+    inclinations=(2, "doubles"),
+    inclination_min=(3, "double"),
+    inclination_max=(4, "double"),
+    extrinsic=(5, "message", _TRANSFORM),
+)
+_STATS = _message("Stats", 1, 5, time_of_day=(2, "text"), location=(3, "text"), weather=(4, "text"))
+CONTEXT: Final = _message(
+    "Context",
+    name=(1, "text"),
+    cameras=(2, "messages", _CAMERA_CALIBRATION),
+    lasers=(3, "messages", _LASER_CALIBRATION),
+    stats=(4, "message", _STATS),
+)
+_VELOCITY = _message(
+    "Velocity",
+    v_x=(1, "float"),
+    v_y=(2, "float"),
+    v_z=(3, "float"),
+    w_x=(4, "double"),
+    w_y=(5, "double"),
+    w_z=(6, "double"),
+)
+_PANOPTIC = _message("CameraSegmentationLabel", 3, 4, 5, divisor=(1, "int"), png=(2, "bytes"))
+_CAMERA_IMAGE = _message(
+    "CameraImage",
+    name=(1, "int"),
+    image=(2, "bytes"),
+    pose=(3, "message", _TRANSFORM),
+    velocity=(4, "message", _VELOCITY),
+    pose_time_s=(5, "double"),
+    shutter_s=(6, "double"),
+    trigger_s=(7, "double"),
+    done_s=(8, "double"),
+    panoptic=(10, "message", _PANOPTIC),
+)
+_RANGE_IMAGE = _message("RangeImage", 1, 5, 6, ranges=(2, "bytes"), projections=(3, "bytes"), poses=(4, "bytes"))
+_LASER = _message("Laser", name=(1, "int"), return1=(2, "message", _RANGE_IMAGE), return2=(3, "message", _RANGE_IMAGE))
+_BOX = _message(
+    "Box",
+    x=(1, "double"),
+    y=(2, "double"),
+    z=(3, "double"),
+    width=(4, "double"),
+    length=(5, "double"),
+    height=(6, "double"),
+    heading=(7, "double"),
+)
+_LABEL = _message("Label", 2, 5, 6, 7, 8, 9, 10, 11, 12, 13, box=(1, "message", _BOX), type=(3, "int"), id=(4, "text"))
+FRAME: Final = _message(
+    "Frame",
+    7,
+    8,
+    9,
+    10,
+    11,
+    context=(1, "bytes"),
+    timestamp_us=(2, "int"),
+    pose=(3, "message", _TRANSFORM),
+    images=(4, "messages", _CAMERA_IMAGE),
+    lasers=(5, "messages", _LASER),
+    labels=(6, "messages", _LABEL),
+)
+_SHAPE = _message("MatrixShape", dims=(1, "ints"))
+MATRIX_FLOAT: Final = _message("MatrixFloat", data=(1, "floats"), shape=(2, "message", _SHAPE))
+MATRIX_INT: Final = _message("MatrixInt32", data=(1, "ints"), shape=(2, "message", _SHAPE))

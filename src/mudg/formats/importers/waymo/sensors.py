@@ -101,11 +101,7 @@ def points_of_scan(
 
     Where pixels have poses of their own (top LiDAR), a point is carried from where the vehicle was when it was measured
     to where the vehicle was at the frame's pose. The other LiDARs are recorded as if all was measured at the frame's
-    pose.
-
-    Raises:
-        InputError: shapes that contradict each other, or values that are not finite.
-    """
+    pose. Raises InputError: shapes that contradict each other, or values that are not finite."""
     shape = scan.returns[0].shape[:2]
     if any(image.shape[:2] != shape for image in (*scan.returns, *scan.projections)) or (
         scan.poses is not None and scan.poses.shape[:2] != shape
@@ -121,11 +117,9 @@ def points_of_scan(
         pixel = np.flatnonzero(image[..., 0].reshape(-1) > 0)
         values = image.reshape(-1, image.shape[2])[pixel, :2]
         if not np.isfinite(values).all():
-            raise InputError(
-                "range image holds values that are not finite",
-                where=f"{where}: return {index + 1}",
-                got=f"{int((~np.isfinite(values).all(1)).sum())} of {len(values)} points",
-            )
+            what = "range image holds values that are not finite"
+            got = f"{int((~np.isfinite(values).all(1)).sum())} of {len(values)} points"
+            raise InputError(what, where=f"{where}: return {index + 1}", got=got)
         row, column = np.divmod(pixel, columns)
         reach = values[:, 0].astype(np.float64)
         flat = reach * np.cos(inclination)[row]
@@ -294,24 +288,17 @@ def vehicle_from_cam(calibration: CameraCalibration) -> Matrix:
 
 
 def panoptic_ids(label: records.Panoptic, camera: Camera, where: str) -> NDArray[np.int32]:
-    """Values of a panoptic label, i32[H, W]: class * divisor + instance.
-
-    Raises:
-        InputError: no 16-bit PNG of the camera's size, or no divisor.
-    """
+    """Values of a panoptic label, i32[H, W]: class * divisor + instance. Raises InputError: no 16-bit PNG of the
+    camera's size, or no divisor."""
     if label.divisor < 1:
-        raise InputError(
-            "panoptic label has no divisor", where=where, expected="a positive number", got=str(label.divisor)
-        )
+        what = "panoptic label has no divisor"
+        raise InputError(what, where=where, expected="a positive number", got=str(label.divisor))
     try:
         with Image.open(io.BytesIO(label.png), formats=("PNG",)) as image:
             if image.size != (camera.width, camera.height) or not image.mode.startswith("I"):
-                raise InputError(
-                    "panoptic label is not a 16-bit image of its camera's size",
-                    where=where,
-                    expected=f"{camera.width}x{camera.height}, 16 bits",
-                    got=f"{image.width}x{image.height}, mode {image.mode}",
-                )
+                what = "panoptic label is not a 16-bit image of its camera's size"
+                got = f"{image.width}x{image.height}, mode {image.mode}"
+                raise InputError(what, where=where, expected=f"{camera.width}x{camera.height}, 16 bits", got=got)
             return np.array(image).astype(np.int32)
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise InputError("panoptic label cannot be decoded (is it cut off?)", where=where, got=str(error)) from error
