@@ -51,43 +51,26 @@ from mudg.formats.unknown_fields import note_unknown
 Matrix = NDArray[np.float64]
 
 LICENCE: Final = "CC BY-NC-SA 4.0 (Argoverse 2: Wilson et al.; attribution, non-commercial, share-alike)"
-RING_CAMERAS: Final = tuple(
-    (
-        "ring_front_center ring_front_left ring_front_right ring_side_left ring_side_right ring_rear_left "
-        "ring_rear_right"
-    ).split()
-)
 CAMERAS: Final[Mapping[str, str]] = name_table(
     """front: ring_front_center; front_left: ring_front_left; front_right: ring_front_right;
     side_left: ring_side_left; side_right: ring_side_right; rear_left: ring_rear_left;
     rear_right: ring_rear_right; stereo_left: stereo_front_left; stereo_right: stereo_front_right"""
 )
+RING_CAMERAS: Final = tuple(name for name in CAMERAS if name.startswith("ring"))
 SENSOR: Final = "lidar"
-_UPPER: Final = "up_lidar"
-_LOWER: Final = "down_lidar"
+_UPPER, _LOWER = "up_lidar", "down_lidar"
 NANOSECONDS: Final = 10**9
 _POSE_SLACK_S: Final = 0.02
 _MAX_OFFSET_NS: Final = 500_000_000
 _POSE: Final = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_SIZE: Final = ("length_m", "width_m", "height_m")
 SWEEPS: Final = "sensors/lidar/*.feather"
 OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     "city_SE3_egovehicle.feather": frozenset({"timestamp_ns", *_POSE}),
     "egovehicle_SE3_sensor.feather": frozenset({"sensor_name", *_POSE}),
-    "intrinsics.feather": frozenset(
-        {"sensor_name", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px"}
-    ),
+    "intrinsics.feather": frozenset("sensor_name fx_px fy_px cx_px cy_px k1 k2 k3 width_px height_px".split()),
     "annotations.feather": frozenset(
-        {
-            "timestamp_ns",
-            "track_uuid",
-            "category",
-            "length_m",
-            "width_m",
-            "height_m",
-            *_POSE,
-            "num_interior_pts",
-            "log_id",
-        }
+        ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE, "num_interior_pts", "log_id")
     ),
     SWEEPS: frozenset({"x", "y", "z", "intensity", "laser_number", "offset_ns"}),
 }
@@ -170,10 +153,7 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
     if not stamps:
         raise InputError("the log has no images", where=str(image_folder))
     zero_ns = min(stamps)
-    ego_file, mount_file = (
-        folder / "city_SE3_egovehicle.feather",
-        folder / "calibration" / "egovehicle_SE3_sensor.feather",
-    )
+    ego_file, mount_file = folder / "city_SE3_egovehicle.feather", folder / "calibration/egovehicle_SE3_sensor.feather"
     notes: list[str] = []
     mounts, ego = read_mounts(mount_file), common.mended_path(read_ego(ego_file, zero_ns), options, notes)
     if options.skip_missing:
@@ -192,17 +172,16 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
     upper = _of_sensor(mounts, _UPPER, mount_file) if scans else np.eye(4)
     places = [pose[:3, 3] for name, pose in mounts.items() if name in (_UPPER, _LOWER)]
     sweeps = [
-        SweepRecord(
-            SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, partial(read_sweep, path, upper, places)
-        )
+        SweepRecord(SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, read)
         for t, path in scans.items()
+        for read in [partial(read_sweep, path, upper, places)]
     ]
     notes += [] if sweeps else ["no LiDAR sweeps in the log"]
     tracks, track_notes = read_tracks(folder / "annotations.feather", ego, zero_ns, skip_missing=options.skip_missing)
     cameras = read_cameras(folder / "calibration" / "intrinsics.feather", chosen)
     source = Source("argoverse2", LICENCE, None, (*notes, *track_notes))
     name = folder.resolve().name
-    return DriveLog(name, cameras, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
+    return DriveLog(name, cameras, images, sweeps, tracks, ego, source, where)
 
 
 def _files_by_time(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
@@ -301,10 +280,9 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = 
     where = str(path)
     if not path.is_file():
         return [], ["no annotations in this log: everything counts as static"]
-    names = ("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *_POSE)
-    columns = read_feather(path, names)
+    columns = read_feather(path, ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE))
     stamps, poses = _stamps(columns, where), _poses(columns, where)
-    sizes = finite_columns(columns, ("length_m", "width_m", "height_m"), where)
+    sizes = finite_columns(columns, _SIZE, where)
     map_from_ego = {
         int(t): common.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where)
         for t in set(stamps)
@@ -314,12 +292,9 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = 
     for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
         if int(stamp) not in map_from_ego:
             continue
-        label = tracks.label_of(str(columns["category"][row]))
-        length, width, height = sizes[row].tolist()
-        time_s = (int(stamp) - zero_ns) / NANOSECONDS
-        track = str(columns["track_uuid"][row])
-        pose = map_from_ego[int(stamp)] @ pose
-        tracks.add(track, label, time_s, (length, width, height), pose, where=f"{where}: row {row}")
+        label, track = tracks.label_of(str(columns["category"][row])), str(columns["track_uuid"][row])
+        time_s, pose = (int(stamp) - zero_ns) / NANOSECONDS, map_from_ego[int(stamp)] @ pose
+        tracks.add(track, label, time_s, tuple(sizes[row].tolist()), pose, where=f"{where}: row {row}")
     return tracks.tracks()
 
 
@@ -336,9 +311,7 @@ def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()
     xyz_ego = finite_columns(columns, ("x", "y", "z"), where)
     intensity = unit_intensity(finite_columns(columns, ("intensity",), where)[:, 0], 255, where)
     offset_ns = columns["offset_ns"]
-    if offset_ns.dtype.kind not in "iu" or (
-        len(offset_ns) and int(np.abs(offset_ns.astype(np.int64)).max()) > _MAX_OFFSET_NS
-    ):
+    if offset_ns.dtype.kind not in "iu" or (np.abs(offset_ns.astype(np.int64)) > _MAX_OFFSET_NS).any():
         what, where = "point times are no nanoseconds of one turn", f"{where}: offset_ns"
         expected = "whole nanoseconds since the sweep's time, under half a second"
         raise InputError(what, where=where, expected=expected, got=f"{offset_ns.dtype}, up to {offset_ns.max():g}")

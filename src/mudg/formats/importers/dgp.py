@@ -45,7 +45,7 @@ from mudg.formats.importers.common import (
     the_only,
 )
 from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
-from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
+from mudg.formats.unknown_fields import Known, known, note_unknown, note_unknown_within
 from mudg.scene.clouds import is_return
 
 Matrix = NDArray[np.float64]
@@ -55,66 +55,34 @@ MICROSECONDS: Final = 10**6
 _YEAR_2100_US: Final = 4_102_444_800 * MICROSECONDS
 _EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _BOXES_3D: Final = "1"
-_POSE: Final[Known] = {"translation": dict.fromkeys("xyz"), "rotation": dict.fromkeys(("qw", "qx", "qy", "qz"))}
-_ID: Final[Known] = dict.fromkeys(("log", "name", "timestamp", "index"))
-_SCENE: Final[Known] = {
-    **dict.fromkeys(
-        ("name", "description", "log", "metadata", "creation_date", "ontologies", "agent_ontologies", "statistics")
-    ),
-    "samples": {**dict.fromkeys(("datum_keys", "calibration_key", "metadata")), "id": _ID},
-    "data": {
-        **dict.fromkeys(("key", "next_key", "prev_key")),
-        "id": _ID,
-        "datum": {
-            "file_datum": None,
-            "radar_point_cloud": None,
-            "image": {
-                **dict.fromkeys(("filename", "height", "width", "channels", "annotations", "metadata")),
-                "pose": _POSE,
-            },
-            "point_cloud": {
-                **dict.fromkeys(("filename", "annotations", "metadata", "point_format", "point_fields")),
-                "pose": _POSE,
-            },
-        },
-    },
-}
-_LENS: Final = (
-    "fx",
-    "fy",
-    "cx",
-    "cy",
-    "skew",
-    "fov",
-    "fisheye",
-    *(f"k{number}" for number in range(1, 7)),
-    "p1",
-    "p2",
-    "s1",
-    "s2",
-    "s3",
-    "s4",
-    "taux",
-    "tauy",
-    "alpha",
-    "beta",
-    "w",
-    "xi",
-    "equirectangular",
+_POSE: Final = known("", translation=known("x y z"), rotation=known("qw qx qy qz"))
+_ID: Final = known("log name timestamp index")
+_LENS: Final = known(
+    "fx fy cx cy skew fov fisheye k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 taux tauy alpha beta w xi equirectangular"
+)
+_DATUM: Final = known(
+    "file_datum radar_point_cloud",
+    image=known("filename height width channels annotations metadata", pose=_POSE),
+    point_cloud=known("filename annotations metadata point_format point_fields", pose=_POSE),
 )
 _CHANNELS: Final = frozenset(
     "X Y Z INTENSITY R G B RING NORMAL_X NORMAL_Y NORMAL_Z CLASS_ID INSTANCE_ID TIMESTAMP".split()
 )
 OFFICIAL: Final[Mapping[str, Known]] = {
-    "scene_*.json": _SCENE,
-    "calibration/*.json": {"names": None, "intrinsics": dict.fromkeys(_LENS), "extrinsics": _POSE},
-    "ontology/*.json": {"items": dict.fromkeys(("name", "id", "color", "isthing", "supercategory"))},
-    "bounding_box_3d/*.json": {
-        "annotations": {
-            **dict.fromkeys(("class_id", "instance_id", "attributes", "num_points")),
-            "box": {**dict.fromkeys(("width", "length", "height", "occlusion", "truncation")), "pose": _POSE},
-        }
-    },
+    "scene_*.json": known(
+        "name description log metadata creation_date ontologies agent_ontologies statistics",
+        samples=known("datum_keys calibration_key metadata", id=_ID),
+        data=known("key next_key prev_key", id=_ID, datum=_DATUM),
+    ),
+    "calibration/*.json": known("names", intrinsics=_LENS, extrinsics=_POSE),
+    "ontology/*.json": known("", items=known("name id color isthing supercategory")),
+    "bounding_box_3d/*.json": known(
+        "",
+        annotations=known(
+            "class_id instance_id attributes num_points",
+            box=known("width length height occlusion truncation", pose=_POSE),
+        ),
+    ),
 }
 """Kinds of files -> their fields, read or not; what is in metadata and attributes is free. Source: the format's
 published messages."""
@@ -175,7 +143,7 @@ def files_of_dgp(source: Path, options: ImportOptions) -> LogFiles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Datum:
-    """One image or cloud: its record, kind (``image`` or ``point_cloud``), sensor, calibration, stamp, pose."""
+    """One image or cloud; ``kind``: ``image`` or ``point_cloud``."""
 
     kind: str
     sensor: str
@@ -224,7 +192,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
     ordered = {name: cameras[name] for name in chosen}
     source = Source("dgp", LICENCE, None, (*notes, *track_notes))
     name = folder.resolve().name
-    return DriveLog(name, ordered, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
+    return DriveLog(name, ordered, images, sweeps, tracks, ego, source, where)
 
 
 def _json(path: Path, kind: str) -> Any:
@@ -348,10 +316,8 @@ def _read_tracks(
             if item["class_id"] not in names:
                 what, got = "box has a class that the ontology lacks", str(item["class_id"])
                 raise InputError(what, where=where, got=got, expected=", ".join(str(number) for number in names))
-            box = item["box"]
-            size = box["length"], box["width"], box["height"]
-            label = tracks.label_of(names[item["class_id"]])
-            pose = datum.map_from_sensor @ _pose(box["pose"], where)
+            box, label = item["box"], tracks.label_of(names[item["class_id"]])
+            size, pose = (box["length"], box["width"], box["height"]), datum.map_from_sensor @ _pose(box["pose"], where)
             tracks.add(str(item["instance_id"]), label, time_s, size, pose, where=where)
     return tracks.tracks()
 

@@ -554,17 +554,7 @@ def _drive(recording: _OpenRecording, options: ImportOptions) -> DriveLog:
     )
     cameras = {name: one.recorded for name, one in optics.items()}
     return DriveLog(
-        str(recording.reader.sequence_id),
-        cameras,
-        names[chosen[0]],
-        images,
-        sweeps,
-        tracks,
-        ego,
-        source,
-        where,
-        optics,
-        box_times="own",
+        str(recording.reader.sequence_id), cameras, images, sweeps, tracks, ego, source, where, optics, box_times="own"
     )
 
 
