@@ -45,6 +45,7 @@ from mudg.base.geometry import from_rotation_translation, invert, transform_poin
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common
+from mudg.formats.importers import kitti_files as kitti_poses
 from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import (
     ImportOptions,
@@ -61,8 +62,7 @@ from mudg.formats.importers.common import (
 )
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes, image_size
-from mudg.formats.importers.kitti import files as kitti_poses
-from mudg.formats.importers.kitti.files import (
+from mudg.formats.importers.kitti_files import (
     SENSOR,
     line_numbers,
     pinhole_camera,
