@@ -33,17 +33,7 @@ from mudg.base.geometry import invert
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common, drive_log
 from mudg.formats.importers.clouds import npz_arrays
-from mudg.formats.importers.common import (
-    ImportOptions,
-    LogFiles,
-    chosen_cameras,
-    folder_contents,
-    name_table,
-    path_inside,
-    record_fields,
-    refuse_untwist,
-    the_only,
-)
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
 from mudg.formats.unknown_fields import Known, known, note_unknown, note_unknown_within
 from mudg.scene.clouds import is_return
@@ -111,7 +101,7 @@ def import_dgp(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("DGP folder does not exist", where=str(source), expected="a folder")
-    refuse_untwist(options, "DGP", str(source))
+    common.refuse_untwist(options, "DGP", str(source))
     return drive_log.write_log(read_log(_choose_scene(source, options), options), out, options)
 
 
@@ -127,10 +117,10 @@ def _choose_scene(source: Path, options: ImportOptions) -> Path:
     scenes = _scenes(source)
     if not scenes:
         expected = "scene_<hash>.json beside a calibration folder, here or in sub-folders"
-        raise InputError("no DGP scene found", where=str(source), got=folder_contents(source), expected=expected)
+        raise InputError("no DGP scene found", where=str(source), got=common.folder_contents(source), expected=expected)
     matching = [p for p in scenes if options.sequence in ("", p.parent.resolve().name, p.stem, p.name)]
     names = [f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes]
-    return the_only(matching, names, options, source, "scene")
+    return common.the_only(matching, names, options, source, "scene")
 
 
 def files_of_dgp(source: Path, options: ImportOptions) -> LogFiles:
@@ -159,11 +149,13 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
     folder, where = scene_file.parent, str(scene_file)
     log.info(f"dgp: {scene_file}")
     scene = _json(scene_file, "scene_*.json")
-    with record_fields("scene record is incomplete", where, "the fields of a DGP scene"):
+    with common.record_fields("scene record is incomplete", where, "the fields of a DGP scene"):
         data = _read_data(scene, where)
         calibrations = {key: _read_calibration(folder, key) for key in sorted({d.calibration for d in data})}
         names = {d.sensor: d.sensor.lower() for d in data if d.kind == "image"}
-        chosen = {names[raw]: raw for raw in chosen_cameras(dict(sorted(names.items())), options, where, tuple(names))}
+        chosen = {
+            names[raw]: raw for raw in common.chosen_cameras(dict(sorted(names.items())), options, where, tuple(names))
+        }
         clouds = [d for d in data if d.kind == "point_cloud"]
         used = [d for d in data if d.kind == "image" and d.sensor in chosen.values()] + clouds
         ticks_per_second, notes = _clock(used, where)
@@ -175,7 +167,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
         images, sweeps = [], []
         cameras: dict[str, Camera] = {}
         for datum in used:
-            path = path_inside(folder, datum.record.get("filename"), datum.where)
+            path = common.path_inside(folder, datum.record.get("filename"), datum.where)
             if datum.kind == "image":
                 name = names[datum.sensor]
                 _add_camera(cameras, calibrations[datum.calibration], name, datum)
@@ -270,7 +262,7 @@ class _DgpCalibration:
 
 
 def _read_calibration(folder: Path, key: str) -> _DgpCalibration:
-    path = path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
+    path = common.path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
     record = _json(path, "calibration/*.json")
     names = [str(name) for name in record["names"]]
     if not len(names) == len(record["extrinsics"]) == len(record["intrinsics"]):
@@ -310,7 +302,7 @@ def _read_tracks(
     for datum, time_s, name in zip(clouds, times_s, files, strict=True):
         if not name:
             continue
-        path = path_inside(folder, name, datum.where)
+        path = common.path_inside(folder, name, datum.where)
         for index, item in enumerate(_json(path, "bounding_box_3d/*.json")["annotations"]):
             where = f"{path}: annotations[{index}]"
             if item["class_id"] not in names:
@@ -324,7 +316,7 @@ def _read_tracks(
 
 def _class_names(folder: Path, scene: Mapping[str, Any]) -> dict[int, str]:
     key = scene["ontologies"].get(_BOXES_3D)
-    path = path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
+    path = common.path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
     return {int(item["id"]): str(item["name"]) for item in _json(path, "ontology/*.json")["items"]}
 
 

@@ -33,16 +33,8 @@ from mudg.base.geometry import (
     transform_points,
 )
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View, foreign_name
-from mudg.formats.importers.common import (
-    ImportOptions,
-    check_motion,
-    for_each,
-    gap_problem,
-    holdout_split,
-    nearest_index,
-    origin_note,
-    world_from_first,
-)
+from mudg.formats.importers import common
+from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.images import ImageFit, Lens, fit_images, image_notes
 from mudg.scene import motion
 from mudg.scene.clouds import FLOAT32_SPACING_M, at_sensor, float32_spacing_m
@@ -151,7 +143,7 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
         for fit in content.fits.values():
             writer.add_camera(fit.camera)
         title, total, workers = f"importing {dataset}", content.total, options.workers
-        for_each(content.items, convert, title=title, total=total, workers=workers, name=content.item_name)
+        common.for_each(content.items, convert, title=title, total=total, workers=workers, name=content.item_name)
         tracks, notes = content.tracks()
         tracks, turned = turned_back(tracks)
         notes = [*notes, *turned, *_row_notes(rows)]
@@ -163,7 +155,7 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
         groups: dict[int, list[str]] = {}
         for moment, frame_id in sorted(moments):
             groups.setdefault(moment, []).append(frame_id)
-        writer.set_split(holdout_split(list(groups.values()), options.test_every))
+        writer.set_split(common.holdout_split(list(groups.values()), options.test_every))
         return writer.finish()
 
 
@@ -272,7 +264,7 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     brought to the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep counts as one moment,
     without point times, and boxes stay as drawn. Raises UsageError: no frame lies in the chosen range. InputError: a
     file is missing or damaged; poses, times and units contradict each other. Nothing is left at ``out``."""
-    check_motion(drive.ego, drive.where)
+    common.check_motion(drive.ego, drive.where)
     chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
     records = sorted(chosen, key=lambda record: record.time_s)
     start_s, end_s = records[0].time_s, records[-1].time_s
@@ -282,13 +274,13 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
         numbers[record] = counts[record.sensor]
         counts[record.sensor] += 1
     ego = _ego_between(drive.ego, start_s, end_s, drive.where)
-    world_from_map = world_from_first(ego.world_from_ego[0])
+    world_from_map = common.world_from_first(ego.world_from_ego[0])
     optics = {name: drive.optics.get(name, CameraOptics(camera)) for name, camera in drive.cameras.items()}
     fits = {name: fit_images(drive.cameras[name], options, one.lens) for name, one in optics.items()}
     labels = {name: {} if one.ego is None else {"ego": fits[name].ids(one.ego)} for name, one in optics.items()}
     within = (start_s - REACH_S, end_s + REACH_S)
     seen = BoxTimes([track for track in drive.tracks if clip_track(track, *within) is not None])
-    notes = [*drive.source.notes, *image_notes(fits), origin_note(ego.world_from_ego[0])]
+    notes = [*drive.source.notes, *image_notes(fits), common.origin_note(ego.world_from_ego[0])]
     if options.untwist == "no":
         notes.append("sweeps count as moments: point times are left out")
     if options.frames is not None:
@@ -341,7 +333,7 @@ def _choose_frames(drive: DriveLog, options: ImportOptions) -> dict[Record, int]
         expected = f"frames 0 to {len(reference_s) - 1} ({len(reference_s)} images of {reference})"
         raise UsageError("no frame lies in the chosen range", where="--frames", got=f"{first}:{end}", expected=expected)
     records = [*drive.images, *drive.sweeps]
-    nearest = nearest_index(reference_s, np.array([record.time_s for record in records])).tolist()
+    nearest = common.nearest_index(reference_s, np.array([record.time_s for record in records])).tolist()
     return {record: number for record, number in zip(records, nearest, strict=True) if first <= number < end}
 
 
@@ -372,7 +364,7 @@ def _outside_gaps(chosen: dict[Record, int], drive: DriveLog, options: ImportOpt
     record, gap = next(iter(guessed.items()))
     left = {record: number for record, number in chosen.items() if record not in guessed}
     if not options.skip_missing or not any(isinstance(record, ImageRecord) for record in left):
-        raise gap_problem(gap, record.time_s, _place(record))
+        raise common.gap_problem(gap, record.time_s, _place(record))
     log.warn(f"left out {len(guessed)} images and sweeps in gaps of the vehicle's path; the first: {gap}")
     return left
 

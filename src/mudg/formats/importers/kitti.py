@@ -37,15 +37,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Source, Track
 from mudg.formats.importers import common, kitti_files
-from mudg.formats.importers.common import (
-    ImportOptions,
-    LogFiles,
-    has_pose,
-    mended_path,
-    origin_note,
-    pose_near,
-    seconds,
-)
+from mudg.formats.importers.common import ImportOptions, LogFiles
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import fit_images, image_notes, image_size
 from mudg.formats.importers.kitti_files import SENSOR, TURN_PERIOD_S, KittiCalibration, read_scan, untwist_scan
@@ -103,7 +95,7 @@ class _VeloMotion:
 
     def velo_at(self, time_s: float) -> Matrix:
         """World from velodyne, f64[4, 4]."""
-        return pose_near(self.ego, time_s) @ self.ego_from_velo
+        return common.pose_near(self.ego, time_s) @ self.ego_from_velo
 
 
 def looks_like_kitti(source: Path) -> bool:
@@ -290,7 +282,7 @@ def _make_clock(
         return _Clock(dict.fromkeys(files.images, assumed), assumed, 0.0, False)
     chosen = {name: {n: times[n] for n in frames} for name, times in stamps.items()}
     for stream, times in chosen.items():
-        seconds(list(times.values()), "s", f"{files.folder}: {stream}")
+        common.seconds(list(times.values()), "s", f"{files.folder}: {stream}")
     scan_s = chosen.get(SENSOR, next(iter(chosen.values())))
     start_s = scan_s[frames[0]]
     since_start = {name: {n: t - start_s for n, t in times.items()} for name, times in chosen.items()}
@@ -303,7 +295,7 @@ def _with_poses(recording: _Recording, motion: _VeloMotion, options: ImportOptio
     placed = []
     for n in recording.frames:
         times = [*(found[n] for found in clock.image_s.values()), clock.scan_s[n] - reach_s, clock.scan_s[n] + reach_s]
-        if not options.skip_missing or all(has_pose(motion.ego, time_s) for time_s in times):
+        if not options.skip_missing or all(common.has_pose(motion.ego, time_s) for time_s in times):
             placed.append(n)
     lost = sorted({*recording.frames} - {*placed})
     if not placed:
@@ -334,7 +326,7 @@ def _find_motion(recording: _Recording, options: ImportOptions, notes: list[str]
         raw_scans = any(path.parent.name == "data" for path in files.scans.values())
         ego_from_velo = invert(calibration.velo_from_imu)
         untwist = options.untwist == "yes" or (options.untwist == "auto" and raw_scans)
-    ego = mended_path(ego, options, notes)
+    ego = common.mended_path(ego, options, notes)
     untwist = untwist and len(frames) > 1
     if untwist:
         notes.append("scans untwisted: counter-clockwise turn of 0.1 s, forward at the scan's time")
@@ -361,7 +353,7 @@ def _ego_from_file(recording: _Recording, options: ImportOptions, notes: list[st
     if sensor == "cam0":
         rect0_from_velo = recording.calibration.rect0_from_velo
         stacked = invert(rect0_from_velo) @ stacked @ rect0_from_velo
-    notes.append(origin_note(stacked[0]))
+    notes.append(common.origin_note(stacked[0]))
     return EgoPath(np.array([recording.clock.scan_s[n] for n in known]), invert(stacked[0]) @ stacked)
 
 

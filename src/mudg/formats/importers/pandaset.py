@@ -44,22 +44,7 @@ from mudg.base.geometry import from_rotation_translation, invert, transform_poin
 from mudg.base.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
 from mudg.formats.importers import common
-from mudg.formats.importers.common import (
-    ImportOptions,
-    LogFiles,
-    finite_columns,
-    mended_path,
-    name_table,
-    origin_note,
-    pose_from_quaternion,
-    pose_near,
-    record_fields,
-    require_columns,
-    returns_of,
-    seconds,
-    unit_intensity,
-    world_from_first,
-)
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, Tracks, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
 from mudg.formats.unknown_fields import known, note_unknown, note_unknown_within
@@ -230,9 +215,9 @@ class PointClasses:
         if path is None:
             return None
         table = read_frame(path)
-        require_columns(("class",), table, path)
+        common.require_columns(("class",), table, path)
         note_unknown("annotations/semseg/*.pkl.gz", table, frozenset({"class"}))
-        numbers = finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
+        numbers = common.finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
         if len(numbers) != points:
             what, expected = "classes do not fit the points", f"{points} rows, one for each point of the frame's cloud"
             remedy = "is the file of another frame or sequence?"
@@ -466,10 +451,10 @@ class _Motion:
         raw_s = _times(file, known)
         start_s = float(raw_s[first])
         forward = _poses(folder / "lidar" / "poses.json", known) @ yaw_matrix(np.pi / 2)
-        world_from_source = world_from_first(forward[first])
-        notes.append(origin_note(forward[first]))
-        path = EgoPath(seconds(raw_s, "s", str(file), start_s), world_from_source @ forward)
-        path = mended_path(path, options, notes)
+        world_from_source = common.world_from_first(forward[first])
+        notes.append(common.origin_note(forward[first]))
+        path = EgoPath(common.seconds(raw_s, "s", str(file), start_s), world_from_source @ forward)
+        path = common.mended_path(path, options, notes)
         raw_s = raw_s[[number - known[0] for number in frames]]
         needed = dict.fromkeys((*cameras, "front_camera"))
         camera_s, world_from_cam = {}, {}
@@ -485,7 +470,7 @@ class _Motion:
                 expected = f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json"
                 remedy = "are the times in seconds, and of this sequence?"
                 raise InputError(what, where=where, expected=expected, got=f"{late.max():.3f} s apart", remedy=remedy)
-            stamped_s = seconds(times, "s", str(stamps), start_s)
+            stamped_s = common.seconds(times, "s", str(stamps), start_s)
             camera_s[name] = stamped_s + EXPOSURE_S
             timed = zip(stamped_s, world_from_source @ _poses(here / "poses.json", frames), strict=True)
             world_from_cam[name] = np.stack(
@@ -511,7 +496,7 @@ class _Motion:
 
 def pose_on_path(path: EgoPath, time_s: float) -> Matrix:
     """The vehicle's pose f64[4, 4]; beyond an end of the path it goes on as it did there."""
-    return pose_near(path, time_s, MAX_CAMERA_DELAY_S + abs(POSE_S), "lidar/poses.json")
+    return common.pose_near(path, time_s, MAX_CAMERA_DELAY_S + abs(POSE_S), "lidar/poses.json")
 
 
 def _lidar_places(
@@ -542,7 +527,7 @@ def _times(path: Path, frames: Sequence[int]) -> NDArray[np.float64]:
     if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
         raise InputError("timestamps are not numbers", where=str(path), got=str(values)[:80])
     times = np.array(values, np.float64)
-    seconds(times, "s", str(path))
+    common.seconds(times, "s", str(path))
     if times[0] > 1e11:
         what, remedy = "timestamps are in another unit than expected", "divide them by 1000 or 1000000"
         raise InputError(what, where=str(path), expected="seconds of the epoch", got=f"{times[0]:.6g}", remedy=remedy)
@@ -553,9 +538,11 @@ def _poses(path: Path, frames: Sequence[int]) -> Matrix:
     poses = []
     for number, entry in zip(frames, _entries(path, frames), strict=True):
         where = f"{path}: entry {number}"
-        with record_fields("pose is incomplete", where, "position x y z (metres) and heading w x y z (quaternion)"):
+        with common.record_fields(
+            "pose is incomplete", where, "position x y z (metres) and heading w x y z (quaternion)"
+        ):
             heading = [entry["heading"][key] for key in "wxyz"]
-            poses.append(pose_from_quaternion(heading, [entry["position"][key] for key in "xyz"], where))
+            poses.append(common.pose_from_quaternion(heading, [entry["position"][key] for key in "xyz"], where))
         note_unknown_within(_POSES, entry, _POSE_FIELDS)
     return np.stack(poses)
 
@@ -563,7 +550,7 @@ def _poses(path: Path, frames: Sequence[int]) -> Matrix:
 def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageFit:
     path = folder / "intrinsics.json"
     values = store.read_json(path)
-    with record_fields("intrinsics are incomplete", path, "fx fy cx cy"):
+    with common.record_fields("intrinsics are incomplete", path, "fx fy cx cy"):
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
         note_unknown(path.name, values, OFFICIAL[path.name])
     # the data set counts pixels from the centre of the top-left one, as OpenCV does
@@ -575,7 +562,7 @@ def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageF
 
 def _columns(path: Path, names: Sequence[str], kind: str) -> dict[str, NDArray[Any]]:
     frame = read_frame(path)
-    require_columns(names, frame, path)
+    common.require_columns(names, frame, path)
     note_unknown(kind, frame, OFFICIAL[kind])
     return frame
 
@@ -605,10 +592,10 @@ class _Cloud:
 def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
     frame_s = float(motion.raw_s[index])
     frame = _columns(path, _POINT_COLUMNS, _POINTS)
-    returns = returns_of(frame, path)
+    returns = common.returns_of(frame, path)
     without = {d: int((frame["d"][~returns] == d).sum()) for d in SENSORS}
     frame = {name: values[returns] for name, values in frame.items()}
-    columns = {name: finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
+    columns = {name: common.finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
     late_s = columns["t"] - frame_s
     if len(late_s) and np.abs(late_s).max() > MAX_POINT_DELAY_S:
         what = "points do not belong to their frame's time"
@@ -621,7 +608,7 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
     turning = late_s[columns["d"] == 0]
     middle_s = float(turning.min() + turning.max()) / 2 if len(turning) else 0.0
     time_s, xyz = frame_s - motion.start_s + middle_s, np.stack([columns[axis] for axis in "xyz"], 1)
-    intensity = unit_intensity(columns["i"], 255, f"{path}: i")
+    intensity = common.unit_intensity(columns["i"], 255, f"{path}: i")
     return _Cloud(time_s, xyz, intensity, late_s - middle_s, columns["d"], returns, without)
 
 
@@ -630,14 +617,16 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
 
 def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
     frame = _columns(path, _CUBOID_COLUMNS, _CUBOIDS)
-    centre = finite_columns(frame, ("position.x", "position.y", "position.z"), path)
-    sizes = finite_columns(frame, ("dimensions.y", "dimensions.x", "dimensions.z"), path)  # length, width, height
-    yaw = finite_columns(frame, ("yaw",), path)[:, 0]
+    centre = common.finite_columns(frame, ("position.x", "position.y", "position.z"), path)
+    sizes = common.finite_columns(
+        frame, ("dimensions.y", "dimensions.x", "dimensions.z"), path
+    )  # length, width, height
+    yaw = common.finite_columns(frame, ("yaw",), path)[:, 0]
     sensor = np.full(len(yaw), -1.0)
     if "cuboids.sensor_id" in frame:
         ids = frame["cuboids.sensor_id"]
         ids = np.where(np.array([one is None or one != one for one in ids], bool), -1, ids)
-        sensor = finite_columns({"cuboids.sensor_id": ids}, ("cuboids.sensor_id",), path)[:, 0]
+        sensor = common.finite_columns({"cuboids.sensor_id": ids}, ("cuboids.sensor_id",), path)[:, 0]
     siblings = frame.get("cuboids.sibling_id", np.full(len(yaw), "", object))
     when = _MeasuringTimes(cloud, motion)
     rows = []
