@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from mudg.base.types import Camera, Condition, View
-from mudg.diffusion import files as mdm_files
+from mudg.diffusion import model_files
 from mudg.diffusion.requests import SampleRequest
 
 
@@ -48,7 +48,7 @@ def main() -> None:
     parser.add_argument("--profile", action="store_true", help="also where the time of a clip goes (bfloat16)")
     options = parser.parse_args()
     torch.set_num_threads(1)
-    model = mdm_files.load(options.model)
+    model = model_files.load(options.model)
     height = (
         max(1, round((model.config.area_px / 1.5) ** 0.5 / model.config.pixel_multiple)) * model.config.pixel_multiple
     )

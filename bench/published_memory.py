@@ -2,14 +2,14 @@
 
     python bench/published_memory.py
 
-Prints the table of docs/published.md. Gigabytes are 10^9 bytes; see `mudg/diffusion/training/memory_plan.py` for what
+Prints the table of docs/published.md. Gigabytes are 10^9 bytes; see `mudg/diffusion/memory_plan.py` for what
 is counted.
 """
 
 import sys
 
-from mudg.diffusion.published.model import PublishedConfig
-from mudg.diffusion.training import memory_plan
+from mudg.diffusion import memory_plan
+from mudg.diffusion.published import PublishedConfig
 
 CUTS = (
     ("all at once", 6),

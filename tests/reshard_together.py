@@ -9,8 +9,7 @@ from pathlib import Path
 import torch
 from torch import nn
 
-from mudg.diffusion.training.parallel import Ranks, Spread, gathered, join_processes
-from mudg.diffusion.training.state import TrainingState
+from mudg.diffusion.parallel import Ranks, Spread, TrainingState, gathered, join_processes
 
 
 class ToyBlocks(nn.Module):

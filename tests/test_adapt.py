@@ -25,13 +25,10 @@ from mudg.base import palette, store
 from mudg.base.errors import InputError, UsageError
 from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
-from mudg.diffusion import adapt, files
-from mudg.diffusion import adapt as adapt_clips
-from mudg.diffusion import adapt as adapt_lessons
-from mudg.diffusion.clips import shards
-from mudg.diffusion.clips.from_city import HELD_OUT
-from mudg.diffusion.extended import extended
-from mudg.diffusion.settings.adapt import AdaptConfig
+from mudg.diffusion import adapt, clips, model_files
+from mudg.diffusion.city_clips import HELD_OUT
+from mudg.diffusion.models import extended
+from mudg.diffusion.settings import AdaptConfig
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians.storage import load_model
@@ -60,9 +57,9 @@ def log(tmp_path_factory):
         out=root / "fit",
         settings=fit_config(method="street_gaussians", iterations=30, start__gaussians=8000),
     ).run()
-    before = files.load("embedded-tiny")
+    before = model_files.load("embedded-tiny")
     grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1), area_px=SIZE[0] * SIZE[1])
-    files.save(extended(before, grown), root / "tiny", "", {})
+    model_files.save(extended(before, grown), root / "tiny", "", {})
     return root
 
 
@@ -106,7 +103,7 @@ def result(log, tmp_path_factory):
 def test_lessons_show_some_frames_and_ask_for_others(log):
     scene = read_scene(log / "scene")
     held_out = {f.id for f in scene.frames_in("test")}
-    found = {lesson.name: lesson for lesson in adapt_lessons.lessons_of(scene, settings(log))}
+    found = {lesson.name: lesson for lesson in adapt.lessons_of(scene, settings(log))}
     assert set(found) == {"shift+1", "gap0", "gap1"}
     for lesson in found.values():
         asked = {name for _, ids in lesson.truth for name in ids}
@@ -120,7 +117,7 @@ def test_lessons_show_some_frames_and_ask_for_others(log):
 
 def test_a_block_is_learned_or_scored_never_both(log):
     scene, config = read_scene(log / "scene"), settings(log)
-    plan = adapt_clips.plan_clips(adapt_lessons.lessons_of(scene, config), config)
+    plan = adapt.plan_clips(adapt.lessons_of(scene, config), config)
     learned = {name for number, _, ids in plan if number < HELD_OUT for name in ids}
     scored = {name for number, _, ids in plan if number >= HELD_OUT for name in ids}
     assert learned and scored and not learned & scored
@@ -130,8 +127,8 @@ def test_a_block_is_learned_or_scored_never_both(log):
 def test_a_photograph_carried_nowhere_is_itself(log):
     scene = read_scene(log / "scene")
     frame = scene.frames[3]
-    photo = adapt_lessons.Photo(frame.view, read_image(scene, frame), None)
-    carried = adapt_lessons.carried(photo, frame.view, load_model(log / "fit"), 10_000)
+    photo = adapt.Photo(frame.view, read_image(scene, frame), None)
+    carried = adapt.carried(photo, frame.view, load_model(log / "fit"), 10_000)
     assert np.abs(carried.rgb.astype(int) - photo.rgb).mean() < 1.0
     assert np.array_equal(carried.view.world_from_cam, photo.view.world_from_cam)
 
@@ -139,9 +136,9 @@ def test_a_photograph_carried_nowhere_is_itself(log):
 def test_a_photograph_carried_aside_is_nearer_to_the_truth_there(log):
     scene = read_scene(log / "scene")
     frame = scene.frames[3]
-    target = adapt_lessons.moved_view(scene, frame.view, 1.0)
-    photo = adapt_lessons.Photo(frame.view, read_image(scene, frame), None)
-    carried = adapt_lessons.carried(photo, target, load_model(log / "fit"), 10_000)
+    target = adapt.moved_view(scene, frame.view, 1.0)
+    photo = adapt.Photo(frame.view, read_image(scene, frame), None)
+    carried = adapt.carried(photo, target, load_model(log / "fit"), 10_000)
     truth = CityWorld.from_source(scene.source).render(target).rgb * 255
     assert np.abs(carried.rgb - truth).mean() < 0.8 * np.abs(photo.rgb - truth).mean()
 
@@ -151,16 +148,16 @@ def test_a_photograph_carried_aside_is_nearer_to_the_truth_there(log):
 
 def test_truth_is_photographs_measured_depth_and_the_models_own_guesses(log, tmp_path):
     config = settings(log)
-    model = files.load(config.model)
+    model = model_files.load(config.model)
     learnt, lessons = adapt._open_log(config, model, log / "scene", log / "fuse", log / "fit")
     lesson = lessons[0]
-    folder = adapt_lessons.fit_lesson(config, learnt, lesson, tmp_path / lesson.name, fit_scene)
-    clip = adapt_clips.ClipMaker(config, learnt, lesson, model, folder).make(lesson.truth[0][1], 0)
+    folder = adapt.fit_lesson(config, learnt, lesson, tmp_path / lesson.name, fit_scene)
+    clip = adapt.ClipMaker(config, learnt, lesson, model, folder).make(lesson.truth[0][1], 0)
     scene = read_scene(log / "scene")
     photo = read_image(scene, next(f for f in scene.frames if f.id == lesson.truth[0][1][0]))
-    small = torch.from_numpy(adapt_clips.resize_area(photo, learnt.width_px, learnt.height_px)).permute(2, 0, 1) / 255
+    small = torch.from_numpy(adapt.resize_area(photo, learnt.width_px, learnt.height_px)).permute(2, 0, 1) / 255
     assert torch.allclose(clip.rgb[0], small.float())
-    measured, known = adapt_clips.measured_depth(scene, clip.condition.views[0])
+    measured, known = adapt.measured_depth(scene, clip.condition.views[0])
     assert known.any() and np.array_equal(clip.depth[0, 0].numpy()[known], measured[known])
     assert clip.condition.renders is not None and clip.fine is not None
     assert int(clip.semantics.max()) < palette.UNLABELLED  # classes are the model's own everywhere
@@ -171,8 +168,8 @@ def test_truth_is_photographs_measured_depth_and_the_models_own_guesses(log, tmp
 
 def test_the_model_is_ready_and_the_record_says_what_was_gained(log, result):
     record = store.read_json(result / "adapt.json")
-    model = files.load(result / "model")
-    before = files.load(log / "tiny")
+    model = model_files.load(result / "model")
+    before = model_files.load(log / "tiny")
     assert model.config == before.config
     gain = record["after"]["psnr"] - record["before"]["psnr"]
     assert record["adapted"] == (gain >= adapt.LEAST_GAIN_DB)
@@ -217,7 +214,7 @@ def test_held_out_frames_are_never_read(log, result, tmp_path):
 
 
 def test_an_interrupted_adaptation_continues_to_the_same_model(log, result, tmp_path, monkeypatch):
-    write, made = shards.write_shard, []
+    write, made = clips.write_shard, []
 
     def stop_after_two(folder, number, arrays):
         write(folder, number, arrays)
@@ -225,10 +222,10 @@ def test_an_interrupted_adaptation_continues_to_the_same_model(log, result, tmp_
         if len(made) == 2:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(adapt_clips, "write_shard", stop_after_two)
+    monkeypatch.setattr(adapt, "write_shard", stop_after_two)
     with pytest.raises(KeyboardInterrupt):
         adapted(log, tmp_path / "out")
-    monkeypatch.setattr(adapt_clips, "write_shard", write)
+    monkeypatch.setattr(adapt, "write_shard", write)
     again = adapted(log, tmp_path / "out")
     assert weights_of(again) == weights_of(result / "model")
 
@@ -242,9 +239,9 @@ def short_log(tmp_path_factory):
     Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     few = fit_config(method="street_gaussians", iterations=4, start__gaussians=1000)
     Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit", settings=few).run()
-    before = files.load("embedded-tiny")
+    before = model_files.load("embedded-tiny")
     grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1), area_px=size[0] * size[1])
-    files.save(extended(before, grown), root / "tiny", "", {})
+    model_files.save(extended(before, grown), root / "tiny", "", {})
     return root
 
 

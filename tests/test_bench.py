@@ -12,8 +12,7 @@ from mudg.base.errors import MudgError, UsageError
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import metrics
-from mudg.diffusion import files
-from mudg.diffusion.clips import from_city
+from mudg.diffusion import city_clips, model_files
 from mudg.diffusion.model import MDM, MDMConfig
 from mudg.networks.codec import CodecConfig
 
@@ -65,11 +64,11 @@ def test_flicker_is_relative_to_the_truth_and_leaves_movers_out():
 
 
 def test_reported_and_development_cities_differ():
-    assert not set(from_city.REPORTED) & set(from_city.DEVELOPMENT)
-    assert min(from_city.REPORTED + from_city.DEVELOPMENT) >= from_city.HELD_OUT
-    rules = from_city.CityClipRules()
-    for number in (from_city.REPORTED[0], from_city.DEVELOPMENT[0]):
-        assert from_city.city_config(rules, number) == from_city.city_config(replace(rules, seed=7), number)
+    assert not set(city_clips.REPORTED) & set(city_clips.DEVELOPMENT)
+    assert min(city_clips.REPORTED + city_clips.DEVELOPMENT) >= city_clips.HELD_OUT
+    rules = city_clips.CityClipRules()
+    for number in (city_clips.REPORTED[0], city_clips.DEVELOPMENT[0]):
+        assert city_clips.city_config(rules, number) == city_clips.city_config(replace(rules, seed=7), number)
 
 
 def test_what_reads_no_model_takes_none(tmp_path, monkeypatch):
@@ -85,7 +84,7 @@ def test_what_reads_no_model_takes_none(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_the_command_measures_a_model(tmp_path):
-    files.save(MDM(SMALL), tmp_path / "model", "card", {})
+    model_files.save(MDM(SMALL), tmp_path / "model", "card", {})
     config = BenchConfig(model=str(tmp_path / "model"), cities="development", count=1, steps=(1,), precision="float32")
     out = bench.run("mdm", config, tmp_path / "out")
     content = json.loads((out / "bench.json").read_text())

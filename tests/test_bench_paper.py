@@ -26,9 +26,9 @@ from mudg.city import logs as city_logs
 from mudg.city.config import CityConfig
 from mudg.core import trajectory
 from mudg.core.feature_distances import frechet_distance, kernel_distance
-from mudg.diffusion import files as mdm_files
+from mudg.diffusion import model_files
 from mudg.diffusion.model import MDM
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.view_settings import ScoreConfig
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
@@ -537,7 +537,7 @@ def test_an_interrupted_table_goes_on(tmp_path, monkeypatch):
 def filled(tmp_path_factory):
     torch.manual_seed(0)
     model = tmp_path_factory.mktemp("model") / "model"
-    mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), model, "a model of tests", {})
+    model_files.save(MDM(dataclasses.replace(SMALL, renders=True)), model, "a model of tests", {})
     config = BenchConfig(
         logs=2,
         iterations=20,

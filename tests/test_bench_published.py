@@ -21,11 +21,11 @@ from mudg.benchmarks.rows import LONGER, method_fit, shift_rows
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.city.config import CityConfig
 from mudg.city.logs import LogRules
-from mudg.diffusion.clips.condition import ConditionRules
-from mudg.diffusion.clips.inputs import ConditionSources, conditions_of
-from mudg.diffusion.published import model as published_files
-from mudg.diffusion.published.video_unet import VideoUNet
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion import published
+from mudg.diffusion.condition import ConditionRules
+from mudg.diffusion.inputs import ConditionSources, conditions_of
+from mudg.diffusion.published_network import VideoUNet
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import recorded_images
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
@@ -350,7 +350,7 @@ def sources(scene, tmp_path_factory):
 def test_a_part_that_is_switched_off_does_not_reach_a_published_type_network(
     weights, sources, parts, points, tokens, frame
 ):
-    model = published_files.load(weights[0])
+    model = published.load(weights[0])
     views, *all_sources = sources
 
     def latents(given):

@@ -24,10 +24,9 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.city.world import CityWorld
 from mudg.core import calibration, lidar
 from mudg.core.fusion import STATIC
-from mudg.diffusion import files as mdm_files
+from mudg.diffusion import model_files
 from mudg.diffusion.model import MDM
-from mudg.diffusion.settings.adapt import AdaptConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.settings import AdaptConfig, SynthesizeConfig
 from mudg.editing import render
 from mudg.editing.view_settings import RenderConfig
 from mudg.formats import ingest
@@ -157,7 +156,7 @@ def model(tmp_path_factory):
     """A small model that uses renders."""
     folder = tmp_path_factory.mktemp("model") / "model"
     torch.manual_seed(0)
-    mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), folder, "a model of tests", {})
+    model_files.save(MDM(dataclasses.replace(SMALL, renders=True)), folder, "a model of tests", {})
     return str(folder)
 
 
@@ -523,7 +522,7 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
     use = job.use("adapted", chain)
     assert (use.sees, use.model) == ("renders", model) and "too short to adapt to, 1 clip" in use.note
     plain = str(tmp_path / "plain")
-    mdm_files.save(MDM(SMALL), tmp_path / "plain", "a model without renders", {})
+    model_files.save(MDM(SMALL), tmp_path / "plain", "a model without renders", {})
     use = dataclasses.replace(job, config=BenchConfig(model=plain)).use("adapted", chain)
     assert (use.sees, use.model) == ("points", plain) and "does not use renders" in use.note
     assert job.use("points", chain) == real.DiffusionUse("points", model)

@@ -19,8 +19,7 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
 from mudg.city.logs import LogRules
 from mudg.city.world import CityWorld
-from mudg.diffusion import files as mdm_files
-from mudg.diffusion.clips import from_city
+from mudg.diffusion import city_clips, model_files
 from mudg.diffusion.model import MDM
 from mudg.gaussians.methods import METHODS, PUBLISHED
 from mudg.scene.observations import list_observation_sets, read_observations
@@ -37,7 +36,9 @@ def test_lists_are_apart_from_each_other_and_from_all_training_cities():
     assert (len(development), len(reported)) == (4, 8)
     assert not set(development) & set(reported)
     trained = {seeds.key(0, city, "city") & 0x7FFFFFFF for city in range(5000)}
-    scored = {from_city.city_config(from_city.CityClipRules(), c).seed for of in from_city.LISTS.values() for c in of}
+    scored = {
+        city_clips.city_config(city_clips.CityClipRules(), c).seed for of in city_clips.LISTS.values() for c in of
+    }
     assert not (trained | scored) & set(development + reported)
 
 
@@ -253,7 +254,7 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
 def test_fits_under_virtual_views_go_on_with_the_one_on_recorded_views(made, tmp_path):
     out, config = made
     torch.manual_seed(0)
-    mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), tmp_path / "model", "a model of tests", {})
+    model_files.save(MDM(dataclasses.replace(SMALL, renders=True)), tmp_path / "model", "a model of tests", {})
     log = out / str(city_logs.DEVELOPMENT[0])
     variants = ("louder=virtual.color_weight:2", "flat=sh_degree:1")
     shift.run(

@@ -17,7 +17,7 @@ from mudg.base.errors import InputError
 from mudg.base.types import Photo
 from mudg.core.calibration import match_cameras
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.diffusion.clips.condition import ConditionRules, build_conditions
+from mudg.diffusion.condition import ConditionRules, build_conditions
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians import fit
 from mudg.gaussians.rendering import render_view

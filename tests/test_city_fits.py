@@ -12,13 +12,8 @@ from mudg import native
 from mudg.base.errors import UsageError
 from mudg.base.types import SweepPoints
 from mudg.core import metrics
-from mudg.diffusion import files
-from mudg.diffusion.clips import from_city
-from mudg.diffusion.clips import shards as clip_shards
-from mudg.diffusion.clips.from_city import CityClipRules
-from mudg.diffusion.training import clips as city_fits
-from mudg.diffusion.training import clips as learn_clips
-from mudg.diffusion.training import models as learn_models
+from mudg.diffusion import city_clips, clips, learn_clips, model_files, models
+from mudg.diffusion.city_clips import CityClipRules
 from mudg.scene.labels import read_label
 from mudg.scene.part import write_photos
 from mudg.scene.read import read_image, read_points, read_scene
@@ -31,9 +26,9 @@ RULES = CityClipRules(width=48, height=32, window=2, clips=2, fitted=True)
 @pytest.mark.parametrize("realism", [pytest.param("plain", marks=pytest.mark.slow), "varied"])
 def test_the_scene_of_a_log_holds_what_its_clips_may_know(tmp_path, realism):
     rules = CityClipRules(width=48, height=32, window=2, clips=2, fitted=True, realism=realism)
-    log = from_city.make_log(rules, 3, 5)
-    images = from_city.given_images(rules, 3, log)
-    sweeps = city_fits.placed_sweeps(log)
+    log = city_clips.make_log(rules, 3, 5)
+    images = city_clips.given_images(rules, 3, log)
+    sweeps = city_clips.placed_sweeps(log)
     write_photos(tmp_path / "scene", log.world.source(), log.world.ego_path(), log.tracks(), images, sweeps)
     scene = read_scene(tmp_path / "scene")
     assert len(scene.frames) == len(images)
@@ -62,38 +57,38 @@ def test_a_model_that_uses_no_renders_needs_no_fits(tmp_path):
 
 
 def test_only_cities_with_renders_add_renders_and_a_finisher(tmp_path):
-    from_cities, _ = learn_models.starting_model(tiny(tmp_path))
+    from_cities, _ = models.starting_model(tiny(tmp_path))
     assert from_cities.config.renders and from_cities.finisher is not None
-    model, _ = learn_models.starting_model(tiny(tmp_path, scenes=("log",)))
+    model, _ = models.starting_model(tiny(tmp_path, scenes=("log",)))
     assert not model.config.renders and model.finisher is None
-    files.save(model, tmp_path / "plain", "", {})
-    files.save(from_cities, tmp_path / "rendered", "", {})
+    model_files.save(model, tmp_path / "plain", "", {})
+    model_files.save(from_cities, tmp_path / "rendered", "", {})
     on_a_log = tiny(tmp_path, scenes=("log",), start=str(tmp_path / "plain"))
-    assert learn_models.starting_model(on_a_log)[1] == set()
-    kept, fresh = learn_models.starting_model(with_settings(on_a_log, start=str(tmp_path / "rendered")))
+    assert models.starting_model(on_a_log)[1] == set()
+    kept, fresh = models.starting_model(with_settings(on_a_log, start=str(tmp_path / "rendered")))
     assert kept.config == from_cities.config and not fresh
-    grown, fresh = learn_models.starting_model(tiny(tmp_path, start=str(tmp_path / "plain")))
+    grown, fresh = models.starting_model(tiny(tmp_path, start=str(tmp_path / "plain")))
     assert grown.config == from_cities.config and fresh == {"finisher"}
 
 
 def test_without_patches_a_finisher_keeps_its_weights(tmp_path):
-    model, fresh = learn_models.starting_model(tiny(tmp_path))
-    learn_models.hold_finisher(model, fresh, patches=True)
+    model, fresh = models.starting_model(tiny(tmp_path))
+    models.hold_finisher(model, fresh, patches=True)
     assert all(p.requires_grad for p in model.finisher.parameters())
     with pytest.raises(UsageError, match="no patches"):
-        learn_models.hold_finisher(model, fresh, patches=False)
-    learn_models.hold_finisher(model, set(), patches=False)
+        models.hold_finisher(model, fresh, patches=False)
+    models.hold_finisher(model, set(), patches=False)
     assert not any(p.requires_grad for p in model.finisher.parameters())
     assert all(p.requires_grad for p in model.net.parameters())
 
 
 def test_steps_of_fits_are_drawn_from_their_range(tmp_path):
     rules = replace(RULES, fit_steps=(400, 1000))
-    steps = [city_fits.steps_of(rules, city) for city in range(60)]
+    steps = [city_clips.steps_of(rules, city) for city in range(60)]
     assert 400 <= min(steps) < 450 and 950 < max(steps) < 1000
-    assert city_fits.steps_of(rules, from_city.HELD_OUT) == 700
-    assert city_fits.steps_of(replace(rules, fit_steps=(50, 50)), 3) == 50
-    assert [city_fits.steps_of(RULES, city) for city in range(3)] == [117, 116, 113]  # as before there was a setting
+    assert city_clips.steps_of(rules, city_clips.HELD_OUT) == 700
+    assert city_clips.steps_of(replace(rules, fit_steps=(50, 50)), 3) == 50
+    assert [city_clips.steps_of(RULES, city) for city in range(3)] == [117, 116, 113]  # as before there was a setting
     config = with_settings(tiny(tmp_path), fit_steps=(400, 1000), log_frames=24, side_cameras=0.7)
     made = learn_clips.clip_rules(config)
     assert (made.fit_steps, made.log_frames, made.side_cameras) == ((400, 1000), 24, 0.7)
@@ -103,11 +98,11 @@ def test_steps_of_fits_are_drawn_from_their_range(tmp_path):
 def test_a_city_is_fitted_and_learnt_from(tmp_path):
     """From the generator over a short fit to a trained model with finisher; the renders resemble what they show."""
     rules = replace(RULES, fit_steps=(60, 100))
-    for city in (0, from_city.HELD_OUT):
-        assert city_fits.write_fitted_city(rules, city, tmp_path / "clips") == (
-            2 if city == 0 else len(from_city.shifts_of(RULES, city))
+    for city in (0, city_clips.HELD_OUT):
+        assert city_clips.write_fitted_city(rules, city, tmp_path / "clips") == (
+            2 if city == 0 else len(city_clips.shifts_of(RULES, city))
         )
-    shifted = clip_shards.read_clip(tmp_path / "clips", 0, 0, [0, 1])
+    shifted = clips.read_clip(tmp_path / "clips", 0, 0, [0, 1])
     shown = shifted.condition.renders
     assert shifted.fine is not None and shifted.fine.clip.condition.renders is not None
     assert float(metrics.psnr(shown.color, shifted.rgb)) > 12
@@ -117,7 +112,7 @@ def test_a_city_is_fitted_and_learnt_from(tmp_path):
     assert float(((shown.depth - shifted.depth).abs() / shifted.depth)[solid].median()) < 0.3
     config = tiny(tmp_path / "clips", cities=1, first_cities=1, window=2, steps=2, batch_frames=2, seed=0)
     made = Learn(out=tmp_path / "run", settings=config).run()
-    model = files.load(made)
+    model = model_files.load(made)
     assert model.finisher is not None and model.config.renders
     assert "fine_rgb" in (tmp_path / "run" / "log.jsonl").read_text()
     assert json.loads((made / "model.json").read_text())["facts"]["held_out"]["clips"] > 0

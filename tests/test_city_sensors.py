@@ -32,8 +32,8 @@ from mudg.city.sensors import (
     with_look,
 )
 from mudg.city.world import CityWorld
-from mudg.diffusion.clips import from_city, varied
-from mudg.diffusion.clips.from_city import CityLog, record_with_faults
+from mudg.diffusion import city_clips
+from mudg.diffusion.city_clips import CityLog, record_with_faults
 
 needs_native = pytest.mark.skipif(native.library() is None, reason="the native library is not built")
 
@@ -84,11 +84,11 @@ def test_contrast_is_the_slope_about_the_middle() -> None:
 
 
 def test_varied_clips_stay_in_the_free_space() -> None:
-    rules = from_city.CityClipRules(realism="varied")
-    margins = [from_city.city_config(rules, city).shift_margin_m for city in range(40)]
+    rules = city_clips.CityClipRules(realism="varied")
+    margins = [city_clips.city_config(rules, city).shift_margin_m for city in range(40)]
     assert 0.3 < np.mean(np.array(margins) < 4) < 0.65
     for city, margin in enumerate(margins):
-        assert max(abs(s) for s in from_city.shifts_of(rules, city)) <= margin
+        assert max(abs(s) for s in city_clips.shifts_of(rules, city)) <= margin
 
 
 def test_noise_has_the_stated_size_and_follows_the_key() -> None:
@@ -235,7 +235,7 @@ def test_the_image_of_a_view_fits_it_and_the_truth_is_exact(small: CityConfig) -
     assert np.allclose(log.recorded[2].view.world_from_cam, claimed.world_from_cam)
     assert np.array_equal(log.truth(view).rgb_u8, log.recorded[2].rgb)  # no noise or blur was asked for
     assert np.array_equal(log.truth(view).depth, log.world.render(view).depth)
-    sideways = from_city.shifted_view(log.world, view, 1.0)
+    sideways = city_clips.shifted_view(log.world, view, 1.0)
     step = log.claimed(sideways).center_world - claimed.center_world
     assert np.linalg.norm(step) == pytest.approx(1.0, abs=1e-9)
 
@@ -255,19 +255,19 @@ def test_without_faults_the_log_is_the_exact_one(small: CityConfig) -> None:
 
 
 def test_varied_cities_follow_from_seed_and_number_alone() -> None:
-    rules = from_city.CityClipRules(realism="varied")
-    late = [(from_city.city_config(rules, c), from_city.sensors_of(rules, c)) for c in (7, 3)]
-    early = [(from_city.city_config(rules, c), from_city.sensors_of(rules, c)) for c in (3, 7)]
+    rules = city_clips.CityClipRules(realism="varied")
+    late = [(city_clips.city_config(rules, c), city_clips.sensors_of(rules, c)) for c in (7, 3)]
+    early = [(city_clips.city_config(rules, c), city_clips.sensors_of(rules, c)) for c in (3, 7)]
     assert late == early[::-1]
     assert late[0] != late[1]
     other = replace(rules, seed=1)
-    assert from_city.city_config(other, 3) != early[0][0]
+    assert city_clips.city_config(other, 3) != early[0][0]
 
 
 def test_the_distribution_covers_what_it_says() -> None:
-    rules = from_city.CityClipRules(realism="varied")
-    configs = [from_city.city_config(rules, city) for city in range(200)]
-    sensors = [from_city.sensors_of(rules, city) for city in range(200)]
+    rules = city_clips.CityClipRules(realism="varied")
+    configs = [city_clips.city_config(rules, city) for city in range(200)]
+    sensors = [city_clips.sensors_of(rules, city) for city in range(200)]
     lens = [2 * math.degrees(math.atan(c.width / 2 / _focal(c))) for c in configs]
     assert 30 <= min(lens) < 42
     assert 105 < max(lens) <= 120.01
@@ -292,48 +292,48 @@ def _focal(config: CityConfig) -> float:
 
 
 def test_sizes_have_one_area_and_go_round() -> None:
-    rules = from_city.CityClipRules(realism="varied")
-    sizes = [from_city.size_of(rules, city) for city in range(10)]
+    rules = city_clips.CityClipRules(realism="varied")
+    sizes = [city_clips.size_of(rules, city) for city in range(10)]
     assert sizes[:5] == sizes[5:]
     assert sizes[0] == (192, 128)
     for width, height in sizes:
         assert width % 16 == 0
         assert height % 16 == 0
         assert 0.85 < width * height / (192 * 128) < 1.1
-    assert varied.sized(192, 128, 4) == (272, 80)
-    assert from_city.size_of(replace(rules, published=True), 4) == (192, 128)
-    assert from_city.size_of(rules, from_city.HELD_OUT + 4) == (192, 128)
+    assert city_clips.sized(192, 128, 4) == (272, 80)
+    assert city_clips.size_of(replace(rules, published=True), 4) == (192, 128)
+    assert city_clips.size_of(rules, city_clips.HELD_OUT + 4) == (192, 128)
 
 
 def test_cities_for_scoring_and_plain_cities_know_nothing_of_it() -> None:
-    plain, rules = from_city.CityClipRules(), from_city.CityClipRules(realism="varied")
-    for city in (from_city.HELD_OUT, from_city.HELD_OUT + 101):
-        assert from_city.city_config(plain, city) == from_city.city_config(rules, city)
-        assert from_city.sensors_of(rules, city) == SensorFaults()
-    config = from_city.city_config(plain, 3)
+    plain, rules = city_clips.CityClipRules(), city_clips.CityClipRules(realism="varied")
+    for city in (city_clips.HELD_OUT, city_clips.HELD_OUT + 101):
+        assert city_clips.city_config(plain, city) == city_clips.city_config(rules, city)
+        assert city_clips.sensors_of(rules, city) == SensorFaults()
+    config = city_clips.city_config(plain, 3)
     assert config.overhead == 0
     assert config.skies == "plain"
 
 
 def test_mixed_cities_are_varied_and_plain_by_turns_and_have_all_sizes_of_both() -> None:
-    mixed, rules = from_city.CityClipRules(realism="mixed"), from_city.CityClipRules(realism="varied")
-    kinds = [from_city.is_varied(mixed, city) for city in range(20)]
+    mixed, rules = city_clips.CityClipRules(realism="mixed"), city_clips.CityClipRules(realism="varied")
+    kinds = [city_clips.is_varied(mixed, city) for city in range(20)]
     assert kinds == [True] * 5 + [False] * 5 + [True] * 5 + [False] * 5
-    assert not from_city.is_varied(mixed, from_city.HELD_OUT)
+    assert not city_clips.is_varied(mixed, city_clips.HELD_OUT)
     for city in range(10):
-        assert from_city.size_of(mixed, city) == from_city.size_of(rules, city)
-        config, fine = from_city.city_config(mixed, city), from_city.fine_of(mixed, city)
-        assert (config.width, config.height) == tuple(fine * side for side in from_city.size_of(mixed, city))
-    assert from_city.city_config(mixed, 3) == from_city.city_config(rules, 3)
-    assert from_city.city_config(mixed, 8).skies == "plain" and from_city.sensors_of(mixed, 8) == SensorFaults()
+        assert city_clips.size_of(mixed, city) == city_clips.size_of(rules, city)
+        config, fine = city_clips.city_config(mixed, city), city_clips.fine_of(mixed, city)
+        assert (config.width, config.height) == tuple(fine * side for side in city_clips.size_of(mixed, city))
+    assert city_clips.city_config(mixed, 3) == city_clips.city_config(rules, 3)
+    assert city_clips.city_config(mixed, 8).skies == "plain" and city_clips.sensors_of(mixed, 8) == SensorFaults()
 
 
 def test_the_share_of_cities_with_three_cameras_changes_nothing_else() -> None:
     for realism in ("varied", "plain"):
-        rules = from_city.CityClipRules(realism=realism)
-        drawn = [from_city.city_config(rules, city) for city in range(40)]
+        rules = city_clips.CityClipRules(realism=realism)
+        drawn = [city_clips.city_config(rules, city) for city in range(40)]
         for share, cameras in ((0.0, 1), (1.0, 3)):
-            others = [from_city.city_config(replace(rules, side_cameras=share), city) for city in range(40)]
+            others = [city_clips.city_config(replace(rules, side_cameras=share), city) for city in range(40)]
             assert {len(config.cameras) for config in others} == {cameras}
             assert [replace(config, cameras=("front",)) for config in others] == [
                 replace(config, cameras=("front",)) for config in drawn
@@ -342,19 +342,19 @@ def test_the_share_of_cities_with_three_cameras_changes_nothing_else() -> None:
 
 
 def test_clips_of_longer_logs_begin_anywhere_but_at_the_ends() -> None:
-    rules = from_city.CityClipRules(log_frames=24)
-    starts = {from_city.start_of(rules, city, number) for city in range(20) for number in range(6)}
+    rules = city_clips.CityClipRules(log_frames=24)
+    starts = {city_clips.start_of(rules, city, number) for city in range(20) for number in range(6)}
     assert starts == set(range(2, 24 - 2 - 8 + 1))
-    for short in (from_city.CityClipRules(), from_city.CityClipRules(window=16)):
-        assert {from_city.start_of(short, city, number) for city in range(9) for number in range(6)} == {2}
+    for short in (city_clips.CityClipRules(), city_clips.CityClipRules(window=16)):
+        assert {city_clips.start_of(short, city, number) for city in range(9) for number in range(6)} == {2}
         assert short.frames == max(12, 2 + short.window)
 
 
 @needs_native
 def test_varied_clips_are_reproducible() -> None:
-    rules = from_city.CityClipRules(width=48, height=32, window=1, clips=1, realism="varied", fine=1)
-    first, again = (from_city.make_clips(rules, 4) for _ in range(2))
-    assert first[0].rgb.shape[-2:] == from_city.size_of(rules, 4)[::-1]
+    rules = city_clips.CityClipRules(width=48, height=32, window=1, clips=1, realism="varied", fine=1)
+    first, again = (city_clips.make_clips(rules, 4) for _ in range(2))
+    assert first[0].rgb.shape[-2:] == city_clips.size_of(rules, 4)[::-1]
     for a, b in zip(first, again, strict=True):
         assert np.array_equal(a.rgb.numpy(), b.rgb.numpy())
         assert np.array_equal(a.condition.color.numpy(), b.condition.color.numpy())
@@ -410,7 +410,7 @@ def test_cities_with_overhead_have_more_above_and_nothing_in_the_way() -> None:
                 if amount and truth.sky.any():
                     brightest.append(truth.rgb[truth.sky].mean())
                 for shift_m in (-4.0, 4.0):
-                    assert world.render(from_city.shifted_view(world, view, shift_m)).depth.min() > 0.5
+                    assert world.render(city_clips.shifted_view(world, view, shift_m)).depth.min() > 0.5
     assert np.mean(more) > np.mean(less) + 0.1
     assert max(brightest) > 0.9
     assert max(brightest) - min(brightest) > 0.2

@@ -10,12 +10,10 @@ from mudg.base.errors import InputError
 from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, SweepPoints, Track, View
 from mudg.core import project as visible
 from mudg.core.fusion import SweepShots
-from mudg.diffusion.clips import condition as clips
-from mudg.diffusion.clips import from_city
-from mudg.diffusion.clips import inputs as near_points
-from mudg.diffusion.clips import shards as clip_shards
-from mudg.diffusion.clips.condition import ConditionRules, WarpSource, build_conditions
-from mudg.diffusion.clips.inputs import ConditionSources, conditions_of
+from mudg.diffusion import city_clips, clips, inputs
+from mudg.diffusion import condition as conditions
+from mudg.diffusion.condition import ConditionRules, WarpSource, build_conditions
+from mudg.diffusion.inputs import ConditionSources, conditions_of
 
 CAMERA = Camera("front", 48, 32, 40.0, 40.0, 24.0, 16.0)
 RULES = ConditionRules(48, 32, occluder_m=0.0)
@@ -54,13 +52,13 @@ def test_warp_of_a_plane_is_exact():
     recorded, target = view_at(), view_at(y=1.5)
     source = WarpSource(
         recorded,
-        clips.image_tensor(image_of_wall(recorded, 10.0)),
+        conditions.image_tensor(image_of_wall(recorded, 10.0)),
         torch.full((32, 48), 10.0),
         torch.zeros(32, 48) > 0,
         torch.zeros(32, 48, dtype=torch.uint8),
     )
-    rgb, _, found = clips.warp(target, torch.full((32, 48), 10.0), source, source.depth, 0.08)
-    truth = clips.image_tensor(image_of_wall(target, 10.0))
+    rgb, _, found = conditions.warp(target, torch.full((32, 48), 10.0), source, source.depth, 0.08)
+    truth = conditions.image_tensor(image_of_wall(target, 10.0))
     assert float(found.float().mean()) > 0.85
     assert float((rgb - truth).abs()[:, found].max()) < 0.01
 
@@ -68,7 +66,7 @@ def test_warp_of_a_plane_is_exact():
 def test_warp_moves_left_when_the_camera_moves_left():
     """At depth Z a shift s to the left moves content f s / Z pixels to the right in the new image."""
     recorded, target = view_at(), view_at(y=1.0)
-    x, _, _ = clips.carry(target, torch.full((1, 32, 48), 10.0), recorded)
+    x, _, _ = conditions.carry(target, torch.full((1, 32, 48), 10.0), recorded)
     assert float((x[0, 0] - (torch.arange(48) + 0.5)).mean()) == pytest.approx(-40.0 * 1.0 / 10.0)
 
 
@@ -78,8 +76,8 @@ def test_hidden_pixels_are_not_taken():
     surface = torch.full((32, 48), 10.0)
     surface[:, 20:28] = 4.0  # something near stands there in the recorded image
     source = WarpSource(recorded, rgb, surface, surface < 0, torch.zeros(32, 48, dtype=torch.uint8))
-    _, _, found = clips.warp(target, torch.full((32, 48), 10.0), source, surface, 0.08)
-    x, _, _ = clips.carry(target, torch.full((1, 32, 48), 10.0), recorded)
+    _, _, found = conditions.warp(target, torch.full((32, 48), 10.0), source, surface, 0.08)
+    x, _, _ = conditions.carry(target, torch.full((1, 32, 48), 10.0), recorded)
     behind = (x[0] > 20.5) & (x[0] < 27.5)
     assert bool(behind.any())
     assert not bool(found[behind].any())
@@ -107,18 +105,18 @@ def test_condition_of_a_wall():
     assert not bool(valid[:4].any())
     assert torch.allclose(condition.depth[0, 0][valid], torch.tensor(12.0), atol=1e-4)
     assert torch.allclose(condition.depth, torch.full_like(condition.depth, 12.0), atol=1e-3)
-    truth = clips.image_tensor(image_of_wall(target, 12.0))
+    truth = conditions.image_tensor(image_of_wall(target, 12.0))
     warped = condition.warped[0, 0]
     assert float((condition.color[0] - truth).abs()[:, warped].max()) < 0.02
     assert bool(warped[:4, 10:38].all())
-    assert torch.equal(condition.reference, clips.image_tensor(recorded[1].rgb))
+    assert torch.equal(condition.reference, conditions.image_tensor(recorded[1].rgb))
 
 
 def test_backdrop_of_the_recorded_view_is_the_image():
     cloud = FusedCloud(wall(12.0, stripes), {})
     recorded = [Photo(view_at(), image_of_wall(view_at(), 12.0))]
     condition = build_conditions(cloud, [], [view_at()], recorded, RULES)[0]
-    assert torch.allclose(condition.backdrop[0], clips.image_tensor(recorded[0].rgb), atol=1e-5)
+    assert torch.allclose(condition.backdrop[0], conditions.image_tensor(recorded[0].rgb), atol=1e-5)
 
 
 @pytest.mark.parametrize("fine", [0, 2])
@@ -189,7 +187,7 @@ def test_sizes_follow_the_rules_and_mixed_image_sizes_work():
     recorded = [Photo(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
     condition = build_conditions(cloud, [], [view_at(y=0.5, camera=big)], recorded, RULES)[0]
     assert condition.views[0].camera.width == 48
-    truth = clips.image_tensor(image_of_wall(view_at(y=0.5), 12.0))
+    truth = conditions.image_tensor(image_of_wall(view_at(y=0.5), 12.0))
     warped = condition.warped[0, 0]
     assert float((condition.color[0] - truth).abs()[:, warped].mean()) < 0.02
 
@@ -200,12 +198,12 @@ def test_fine_grid_gives_the_same_geometry_and_cleaner_colour():
     recorded = [Photo(view_at(camera=big), image_of_wall(view_at(camera=big), 12.0))]
     target = view_at(y=0.5, camera=big)
     plain = build_conditions(cloud, [], [target], recorded, RULES)[0]
-    small, fine = clips.build_conditions(cloud, [], [target], recorded, replace(RULES, fine_width=96, fine_height=64))
+    small, fine = build_conditions(cloud, [], [target], recorded, replace(RULES, fine_width=96, fine_height=64))
     assert fine.color.shape[-2:] == (64, 96)
     assert small.color.shape == plain.color.shape
     assert torch.equal(small.depth, plain.depth)
     assert torch.equal(small.valid, plain.valid)
-    truth = clips.image_tensor(image_of_wall(target, 12.0))
+    truth = conditions.image_tensor(image_of_wall(target, 12.0))
     truth = torch.nn.functional.interpolate(truth[None], size=(32, 48), mode="area")[0]
     both = plain.warped[0, 0] & small.warped[0, 0]
     error = [float((c.color[0] - truth).abs()[:, both].mean()) for c in (small, plain)]
@@ -236,9 +234,9 @@ def some_clip(frames=3, height=16, width=24):
 
 def test_shards_give_back_what_was_packed(tmp_path):
     clip = some_clip()
-    clip_shards.write_shard(tmp_path, 3, clip_shards.pack_clips([replace(clip, shift_m=1.5), clip]))
-    assert clip_shards.clips_in(tmp_path, 3) == 2
-    first, second = clip_shards.read_clip(tmp_path, 3, 0, [0, 2]), clip_shards.read_clip(tmp_path, 3, 1, [1, 2])
+    clips.write_shard(tmp_path, 3, clips.pack_clips([replace(clip, shift_m=1.5), clip]))
+    assert clips.clips_in(tmp_path, 3) == 2
+    first, second = clips.read_clip(tmp_path, 3, 0, [0, 2]), clips.read_clip(tmp_path, 3, 1, [1, 2])
     assert (first.shift_m, second.shift_m) == (1.5, 0.0)
     assert torch.allclose(first.rgb, clip.rgb[[0, 2]], atol=0.5 / 255 + 1e-6)
     assert torch.allclose(second.condition.color, clip.condition.color[[1, 2]], atol=0.5 / 255 + 1e-6)
@@ -247,7 +245,7 @@ def test_shards_give_back_what_was_packed(tmp_path):
     assert torch.equal(first.semantics, clip.semantics[[0, 2]])
     known = clip.depth_valid[[0, 2]]
     assert torch.allclose(first.depth[known], clip.depth[[0, 2]][known], rtol=1e-3)
-    assert bool((first.depth[~known] == clip_shards.FAR_M).all())
+    assert bool((first.depth[~known] == clips.FAR_M).all())
     for view, original in zip(first.condition.views, (clip.condition.views[0], clip.condition.views[2])):
         assert np.array_equal(view.world_from_cam, original.world_from_cam)
         assert replace(view.camera, name="front") == original.camera
@@ -255,35 +253,35 @@ def test_shards_give_back_what_was_packed(tmp_path):
 
 def test_missing_shard_is_named(tmp_path):
     with pytest.raises(InputError, match="city_0000007"):
-        clip_shards.read_clip(tmp_path, 7, 0, [0])
+        clips.read_clip(tmp_path, 7, 0, [0])
 
 
 def test_variation_treats_truth_and_condition_alike(tmp_path):
     clip = some_clip()
     same = replace(clip, condition=replace(clip.condition, color=clip.rgb, backdrop=clip.rgb))
-    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([replace(same, shift_m=2.0)]))
-    read = clip_shards.read_clip(tmp_path, 0, 0, [0, 1, 2])
+    clips.write_shard(tmp_path, 0, clips.pack_clips([replace(same, shift_m=2.0)]))
+    read = clips.read_clip(tmp_path, 0, 0, [0, 1, 2])
     flips = set()
     for seed in range(6):
-        varied = clip_shards.vary(read, np.random.default_rng(seed))
+        varied = clips.vary(read, np.random.default_rng(seed))
         assert float((varied.rgb - varied.condition.color).abs().mean()) < 0.04
         assert torch.equal(varied.semantics.flip(-1), read.semantics) or torch.equal(varied.semantics, read.semantics)
         flips.add(varied.shift_m)
-        again = clip_shards.vary(read, np.random.default_rng(seed))
+        again = clips.vary(read, np.random.default_rng(seed))
         assert torch.equal(varied.rgb, again.rgb)
     assert flips == {2.0, -2.0}
 
 
 def test_city_clips_are_a_function_of_seed_and_number():
     from mudg import native
-    from mudg.diffusion.clips import from_city
-    from mudg.diffusion.clips.from_city import CityClipRules
+    from mudg.diffusion import city_clips
+    from mudg.diffusion.city_clips import CityClipRules
 
     if native.library() is None:
         pytest.skip("the native library is not built")
     rules = CityClipRules(width=48, height=32, window=1, clips=1)
-    first, again, other = (from_city.make_clips(rules, city) for city in (5, 5, 6))
-    assert [clip.shift_m for clip in first] == list(from_city.shifts_of(rules, 5)) and len(first) == 1
+    first, again, other = (city_clips.make_clips(rules, city) for city in (5, 5, 6))
+    assert [clip.shift_m for clip in first] == list(city_clips.shifts_of(rules, 5)) and len(first) == 1
     for name in ("rgb", "depth", "semantics"):
         assert torch.equal(getattr(first[0], name), getattr(again[0], name)), name
     assert torch.equal(first[0].condition.color, again[0].condition.color)
@@ -295,7 +293,7 @@ def test_city_clips_are_a_function_of_seed_and_number():
 
 
 def test_held_out_cities_have_the_stated_shifts():
-    from mudg.diffusion.clips.from_city import HELD_OUT, CityClipRules, shifts_of
+    from mudg.diffusion.city_clips import HELD_OUT, CityClipRules, shifts_of
 
     rules = CityClipRules()
     assert shifts_of(rules, HELD_OUT) == (2.0, -3.0, 4.0, 0.0)
@@ -321,14 +319,14 @@ def one_wall_per_sweep(times, track=None):
         points = SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.zeros(len(xyz), np.float32))
         image = np.full((32, 48, 3), 40 * number + 20, np.uint8)
         sweeps.append(SweepShots(time_s, np.eye(4), points, [Photo(view_at(time_s=time_s), image)]))
-    return near_points.NearSweeps(tuple(times), sweeps.__getitem__, (), 0.1)
+    return inputs.NearSweeps(tuple(times), sweeps.__getitem__, (), 0.1)
 
 
 def test_points_of_two_frames_before_and_after_are_shown():
     near = one_wall_per_sweep([0.1 * n for n in range(6)])
     assert near.numbers_at(0.3) == (1, 2, 3, 4, 5)
     assert near.numbers_at(0.0) == (0, 1, 2) and near.numbers_at(9.0) == (3, 4, 5)
-    condition = near_points.near_condition(near, [view_at(time_s=0.0), view_at(time_s=0.5)], RULES)
+    condition = inputs.near_condition(near, [view_at(time_s=0.0), view_at(time_s=0.5)], RULES)
     shades = [
         set((condition.color[t][:, condition.valid[t, 0]] * 255).round().int().flatten().tolist()) for t in (0, 1)
     ]
@@ -336,22 +334,22 @@ def test_points_of_two_frames_before_and_after_are_shown():
     assert not bool(condition.color[:, :, ~condition.valid[0, 0] & ~condition.valid[1, 0]].any())
     assert bool((condition.depth == RULES.far_m).all()) and not bool(condition.warped.any())
     assert bool((condition.semantics == 255).all()) and not bool(condition.reference.any())
-    late = near_points.near_condition(near, [view_at(time_s=0.0)], RULES, 0.5)
+    late = inputs.near_condition(near, [view_at(time_s=0.0)], RULES, 0.5)
     assert torch.equal(late.color[0], condition.color[1]) and late.views[0].time_s == 0.0
 
 
 def test_half_of_the_clips_on_the_path_have_points_of_other_frames():
     near = one_wall_per_sweep([0.0, 0.1])
-    drawn = [near_points.simulated_lateness_s(near, np.random.default_rng(seed)) for seed in range(400)]
+    drawn = [inputs.simulated_lateness_s(near, np.random.default_rng(seed)) for seed in range(400)]
     assert {round(value, 6) for value in drawn} == {0.0, 0.4, -0.4}
     assert 0.4 < np.mean(np.array(drawn) == 0.0) < 0.6
 
 
 @pytest.mark.slow
 def test_city_clips_with_the_condition_of_freevs():
-    rules = from_city.CityClipRules(48, 32, window=1, clips=1, near_points=True)
-    clips_of = from_city.make_clips(rules, 7)
-    full = from_city.make_clips(replace(rules, near_points=False), 7)
+    rules = city_clips.CityClipRules(48, 32, window=1, clips=1, near_points=True)
+    clips_of = city_clips.make_clips(rules, 7)
+    full = city_clips.make_clips(replace(rules, near_points=False), 7)
     for near, whole in zip(clips_of, full, strict=True):
         assert torch.equal(near.rgb, whole.rgb)
         assert not bool(near.condition.warped.any()) and near.condition.renders is None

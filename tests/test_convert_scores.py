@@ -15,7 +15,7 @@ from test_score_metrics import lpips_state
 from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
-from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.diffusion.settings import ConvertConfig
 from mudg.editing.view_settings import ScoreConfig
 from mudg.networks import i3d, inception
 from mudg.scoring import converted

@@ -24,8 +24,7 @@ from mudg.base.types import Camera
 from mudg.baselines.emernerf.field import Budget
 from mudg.baselines.emernerf.fit import load_field, save_field
 from mudg.core.table import Table
-from mudg.diffusion import files as mdm_files
-from mudg.diffusion.published import model as published_files
+from mudg.diffusion import model_files, published
 from mudg.gaussians.appearance import RECORDED_COLOR, Appearance
 from mudg.gaussians.storage import StartFit, all_classes, kind_of, load_appearance, save_appearance, save_model
 from mudg.labels import street_net
@@ -138,16 +137,16 @@ def copied(source: Path, folder: Path) -> Path:
 
 
 def read_all_of(folder: Path) -> None:
-    for read in (mdm_files.facts, mdm_files.uses_renders, published_files.is_published):
+    for read in (model_files.facts, model_files.uses_renders, published.is_published):
         ends_in_words(lambda read=read: read(folder))
 
 
 READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "appearance": (saved_appearance, load_appearance),
     "radiance field": (saved_field, load_field),
-    "diffusion model": (lambda folder: copied(mdm_files.EMBEDDED["embedded-tiny"], folder), mdm_files.load),
-    "diffusion model's facts": (lambda folder: copied(mdm_files.EMBEDDED["embedded-tiny"], folder), read_all_of),
-    "published model": (lambda folder: copied(write_tiny(folder), folder), published_files.load),
+    "diffusion model": (lambda folder: copied(model_files.EMBEDDED["embedded-tiny"], folder), model_files.load),
+    "diffusion model's facts": (lambda folder: copied(model_files.EMBEDDED["embedded-tiny"], folder), read_all_of),
+    "published model": (lambda folder: copied(write_tiny(folder), folder), published.load),
     "segmenter": (lambda folder: copied(street_net.EMBEDDED, folder), street_net.load),
 }
 

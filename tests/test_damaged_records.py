@@ -22,8 +22,8 @@ from test_report import finished_run
 from mudg.base import checkpoint, store
 from mudg.base.config import result_settings
 from mudg.base.types import FusedCloud, PointCloud
-from mudg.diffusion.published import convert
-from mudg.diffusion.training.score import plot_losses
+from mudg.diffusion import convert
+from mudg.diffusion.score import plot_losses
 from mudg.editing import edit
 from mudg.editing.runs import RunParts
 from mudg.gaussians.storage import StartFit

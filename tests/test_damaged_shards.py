@@ -12,7 +12,7 @@ from safetensors.numpy import load, save
 from toy_clips import tiny, write_clips
 
 from mudg.base.errors import InputError
-from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion import clips as clip_shards
 from mudg.steps.learn import Learn
 
 Arrays = dict[str, np.ndarray]

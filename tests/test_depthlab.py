@@ -24,7 +24,7 @@ from torch import Tensor
 from toy_scene import ToyStreet
 
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
-from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.diffusion.settings import ConvertConfig
 from mudg.labels.depth import depthlab
 from mudg.labels.depth import depthlab as conversion
 from mudg.labels.depth.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare

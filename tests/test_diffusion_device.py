@@ -23,18 +23,13 @@ from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Condition
 from mudg.core.depth import fit_depth
-from mudg.diffusion import files, learn
+from mudg.diffusion import convert, learn, memory_plan, model_files, parallel, published
 from mudg.diffusion import views as loading
 from mudg.diffusion.model import MDM
-from mudg.diffusion.published import convert
-from mudg.diffusion.published import model as published_files
-from mudg.diffusion.published.model import WorkSplit
+from mudg.diffusion.models import model_config
+from mudg.diffusion.published import WorkSplit
 from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, generated_and_finished
-from mudg.diffusion.settings.convert import ConvertConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.diffusion.training import memory_plan as precision
-from mudg.diffusion.training import parallel
-from mudg.diffusion.training.models import model_config
+from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
 from mudg.labels import street_net
 from mudg.labels.depth.inputs import DepthInput
 from mudg.labels.depth.networks import Preparation, TransformersDepth
@@ -206,7 +201,7 @@ def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path, monkeypatch):
         monkeypatch.setattr(learn, "draw_clips", draw)
         made = Learn(out=tmp_path / "there", settings=there).run()
     assert losses_in(tmp_path / "there") == pytest.approx(losses_in(tmp_path / "here"), rel=1e-5)
-    a, b = (files.load(folder).state_dict() for folder in (here, made))
+    a, b = (model_files.load(folder).state_dict() for folder in (here, made))
     assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 2e-3  # kept in 16 bits
     assert store.read_json(tmp_path / "there" / "metrics.json")["average"]["psnr"] == pytest.approx(
         store.read_json(tmp_path / "here" / "metrics.json")["average"]["psnr"], abs=0.02
@@ -224,7 +219,7 @@ def test_a_published_type_model_learns_on_a_device(tmp_path):
     with pretend_device():
         there = Learn(out=tmp_path / "there", settings=with_settings(config, device="pretend")).run()
     assert losses_in(tmp_path / "there") == pytest.approx(losses_in(tmp_path / "here"), rel=1e-5)
-    a, b = (published_files.load(folder).state_dict() for folder in (here, there))
+    a, b = (published.load(folder).state_dict() for folder in (here, there))
     assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 1e-3
 
 
@@ -241,7 +236,7 @@ def street(tmp_path_factory):
 
 @pytest.mark.slow
 def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
-    files.save(small, tmp_path / "model", "", {})
+    model_files.save(small, tmp_path / "model", "", {})
     config = SynthesizeConfig(
         shifts_m=(1.0, -1.0), model=str(tmp_path / "model"), steps=2, device="cpu", precision="float32", processes=1
     )
@@ -397,7 +392,7 @@ def test_annotate_on_a_device_writes_the_same_labels(street, tmp_path):
 
 def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    files.save(small, tmp_path / "model", "", {})
+    model_files.save(small, tmp_path / "model", "", {})
     for device, error in (("cuda", ResourceError), ("mps:1", ResourceError), ("tpu", UsageError)):
         config = SynthesizeConfig(model=str(tmp_path / "model"), device=device)
         with pytest.raises(error, match="--device"):
@@ -436,10 +431,10 @@ def test_the_number_format_follows_the_device(monkeypatch):
     card, apple = torch.device("cuda", 0), torch.device("mps", 0)
     for capability, half, narrow in (((8, 0), torch.bfloat16, torch.bfloat16), ((7, 5), None, torch.float16)):
         monkeypatch.setattr(torch.cuda, "get_device_capability", lambda _, found=capability: found)
-        assert precision.half_format("auto", card) == half
-        assert precision.half_format("auto", card, float16=True) == narrow
-        assert precision.choose_bf16("bfloat16", card) and not precision.choose_bf16("float32", card)
-    assert not precision.choose_bf16("auto", apple)
+        assert memory_plan.half_format("auto", card) == half
+        assert memory_plan.half_format("auto", card, float16=True) == narrow
+        assert memory_plan.choose_bf16("bfloat16", card) and not memory_plan.choose_bf16("float32", card)
+    assert not memory_plan.choose_bf16("auto", apple)
     assert "diffusion model: bfloat16 (cuda:0 has bfloat16)" in said
     assert "diffusion model: float16 (cuda:0 has no bfloat16)" in said
     assert said[-1] == "diffusion model: float32 (on mps:0)"

@@ -15,11 +15,11 @@ from mudg.base.types import FusedCloud, Photo, RenderPlanes
 from mudg.benchmarks.chain import Chain, repair_settings
 from mudg.benchmarks.rows import Row
 from mudg.benchmarks.settings import BenchConfig
+from mudg.diffusion import condition as conditions
 from mudg.diffusion import views
-from mudg.diffusion.clips import condition as clips
-from mudg.diffusion.clips.condition import ConditionRules
-from mudg.diffusion.clips.inputs import ConditionSources, conditions_of
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.condition import ConditionRules
+from mudg.diffusion.inputs import ConditionSources, conditions_of
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.methods import METHODS
 from mudg.gaussians.recipes import recipe_of
 from mudg.gaussians.settings import FitConfig
@@ -55,7 +55,7 @@ def test_a_repair_sees_the_render_and_one_photograph_and_nothing_measured(fine):
         )
         assert bool((condition.semantics == 2).all())
     small = conditions_of(replace(given, rules=ConditionRules(48, 32)), "repair", [view], {})[0]
-    assert torch.allclose(small.backdrop[0], clips.image_tensor(image), atol=1e-5)
+    assert torch.allclose(small.backdrop[0], conditions.image_tensor(image), atol=1e-5)
     elsewhere = FusedCloud(replace(given.cloud.static, xyz=given.cloud.static.xyz + 500), {})
     without_points = replace(given, cloud=elsewhere, rules=ConditionRules(48, 32))
     assert torch.equal(conditions_of(without_points, "repair", [view], {})[0].color, small.color)

@@ -58,7 +58,7 @@ def made(folder: Path, *, offset_s: float = 0.03) -> DriveLog:
     ]
     ego = EgoPath(np.arange(-20, 80) * 0.01, np.stack([place(0.01 * n) for n in range(-20, 80)]))
     source = Source("made", "none")
-    return DriveLog("log", cameras, "a", images[::-1], sweeps[::-1], [], ego, source, str(folder))
+    return DriveLog("log", cameras, images[::-1], sweeps[::-1], [], ego, source, str(folder))
 
 
 def test_nearest_index_gives_ties_to_the_earlier() -> None:
@@ -117,7 +117,7 @@ def test_ranges_beyond_the_log_and_cameras_without_images_are_refused(tmp_path: 
     assert "0 to 5" in caught.value.expected
     with pytest.raises(InputError, match="no images") as lacking:
         write_log(
-            replace(drive, images=[i for i in drive.images if i.camera != "c"]), tmp_path / "out", ImportOptions()
+            replace(drive, images=[i for i in drive.images if i.sensor != "c"]), tmp_path / "out", ImportOptions()
         )
     assert lacking.value.got == "c"
     twice = replace(drive, images=[*drive.images, drive.images[0]])

@@ -12,16 +12,12 @@ from torch.nn import functional
 from toy_clips import made_up_clip, with_patch
 
 from mudg.base.errors import UsageError
-from mudg.diffusion import files
-from mudg.diffusion import finisher as finishing
 from mudg.diffusion import model as mdm
-from mudg.diffusion import requests as diffusion
-from mudg.diffusion.finisher import Finisher, Made, finish_in_tiles, with_detail
-from mudg.diffusion.model import BatchPart, LossSettings
-from mudg.diffusion.network import ConditionPixels, Refined
+from mudg.diffusion import model_files, network, requests
+from mudg.diffusion.model import BatchPart, LossSettings, Stacked
+from mudg.diffusion.models import draw_weights
+from mudg.diffusion.network import ConditionPixels, Finisher, Made, Refined, finish_in_tiles, with_detail
 from mudg.diffusion.requests import SampleRequest
-from mudg.diffusion.stacked import Stacked
-from mudg.diffusion.training.models import draw_weights
 
 FINISHING = replace(TINY, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
 
@@ -64,11 +60,11 @@ def biases(finisher):
 
 @drawn(strategies.integers(1, 3000), strategies.integers(1, 700))
 def test_spans_cover_the_length_without_overlap(length, longest):
-    found = finishing.spans(length, longest)
+    found = network.spans(length, longest)
     assert [first for first, _ in found] == [0, *(last for _, last in found[:-1])]
     assert found[-1][1] == length
-    assert all(first < last and first % finishing.STRIDE_PX == 0 for first, last in found)
-    assert max(last - first for first, last in found) <= max(longest, finishing.STRIDE_PX) + finishing.STRIDE_PX
+    assert all(first < last and first % network.STRIDE_PX == 0 for first, last in found)
+    assert max(last - first for first, last in found) <= max(longest, network.STRIDE_PX) + network.STRIDE_PX
 
 
 @pytest.mark.parametrize(
@@ -112,7 +108,7 @@ def test_memory_is_that_of_a_tile(monkeypatch):
         finisher, "forward", lambda made, given, *rest: (seen.append(given.color.shape), forward(made, given, *rest))[1]
     )
     finish_in_tiles(finisher, some_made(24, 32), some_pixels(150, 202), 40)
-    longest = 40 + 2 * finisher.margin_px + 2 * finishing.STRIDE_PX
+    longest = 40 + 2 * finisher.margin_px + 2 * network.STRIDE_PX
     assert len(seen) == 4 * 6
     assert all(max(shape[-2:]) <= longest for shape in seen)
 
@@ -179,7 +175,7 @@ def test_an_unknown_class_takes_no_share():
     done = finisher(made, replace(given, ids=unknown, backdrop_ids=unknown, render_ids=unknown), 2, torch.ones(2))
     share = float(torch.tensor([2.0, 0, -2, 0]).softmax(0)[0])
     assert torch.allclose(done.shares.sum(1), torch.full((2, 16, 16), share), atol=1e-5)
-    assert bool(torch.isfinite(finishing.class_scores(done)).all())
+    assert bool(torch.isfinite(network.class_scores(done)).all())
 
 
 def test_a_finisher_needs_renders_and_a_refiner():
@@ -222,7 +218,7 @@ def test_the_finisher_starts_from_the_stated_error_not_from_the_confidence():
     done = model.finish(doubted, fine)
     stated = functional.interpolate(clip.log_error, size=(32, 48), mode="bilinear", align_corners=False)
     assert torch.allclose(done.confidence, torch.exp(-stated.exp() / 2 / mdm.TRUSTED_ERROR), atol=1e-4)
-    assert torch.equal(diffusion.depth_agreement(done.depth, fine), torch.ones_like(done.depth))
+    assert torch.equal(requests.depth_agreement(done.depth, fine), torch.ones_like(done.depth))
 
 
 # training -----------------------------------------------------------------------------------------
@@ -291,7 +287,7 @@ def test_a_patch_is_finished_from_its_own_part_of_its_own_clip(monkeypatch, row,
     def finished(made, given, frames, scale):
         seen.append((made, scale))
         whole = torch.ones_like(made.log_error)
-        return finishing.Finished(made.rgb, made.depth_code, made.ids[:, None], whole, made.log_error)
+        return network.Finished(made.rgb, made.depth_code, made.ids[:, None], whole, made.log_error)
 
     encoded = model.encode_condition([clip.condition for clip in clips])
     encoded = replace(encoded, pixels=replace(encoded.pixels, color=of_clips))
@@ -315,7 +311,7 @@ def test_refining_the_surroundings_of_a_patch_is_as_good_as_refining_its_image(r
     """With the shipped weights, and half of the condition noise: losses of the whole image, put together from what
     `refine` and `enlarged` make of it. One cell beside the place, the colour's would be 0.04 to 0.12 of their value
     apart."""
-    model, frames, generator = files.load("embedded"), 4, torch.Generator().manual_seed(row)
+    model, frames, generator = model_files.load("embedded"), 4, torch.Generator().manual_seed(row)
     clip = with_patch(made_up_clip(3, 192, 128), row, column, side, scale=2)
     clip = replace(clip, fine=replace(clip.fine, clip=replace(clip.fine.clip, rgb=clip.fine.clip.rgb * 0.9)))
     encoded, truth, settings = (
@@ -330,7 +326,7 @@ def test_refining_the_surroundings_of_a_patch_is_as_good_as_refining_its_image(r
         made = whole.enlarged((256, 384), (2 * row, 2 * (row + side)), (2 * column, 2 * (column + side)))
         given = model._pixels_of(Stacked.of([clip.fine.clip.condition]))
         done = model.finisher(made, given, frames, torch.full((frames,), 2.0))
-        as_refined = Refined(done.rgb, done.depth_code, finishing.class_scores(done), done.log_error)
+        as_refined = Refined(done.rgb, done.depth_code, network.class_scores(done), done.log_error)
         expected = model._pixel_terms(as_refined, model.pixel_truth([clip.fine.clip]), settings, "fine")
     for name, value in expected.items():
         assert float(terms[name]) == pytest.approx(float(value), rel=1.5e-3, abs=1e-5), name

@@ -10,7 +10,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.metrics import Pair
-from mudg.diffusion import files
+from mudg.diffusion import model_files
 from mudg.gaussians.perception import perception_of
 from mudg.gaussians.settings import VirtualConfig
 from mudg.networks.featnets import CodecFeatures, PerceptualDistance
@@ -28,7 +28,7 @@ def test_gradient_of_the_loss():
 
 
 def test_the_loss_is_the_scorers_distance_where_all_is_certain():
-    codec = CodecFeatures(files.load("embedded").codec)
+    codec = CodecFeatures(model_files.load("embedded").codec)
     render, truth = random(5, 3, 24, 32).float(), random(6, 3, 24, 32).float()
     loss = perception_of(VirtualConfig(perception="codec"))(render, truth, torch.ones(1, 24, 32))
     pair = Pair(

@@ -14,7 +14,7 @@ from test_score_metrics import lpips_state
 from toy_published import TINY, tiny_checkpoint
 
 from mudg.base import store
-from mudg.diffusion.published import model as published_files
+from mudg.diffusion import published
 from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.steps.settings.presets import PRESETS
 
@@ -64,7 +64,7 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
     done(mudg("fuse log/scene --out log/fuse"))
 
     done(mudg("convert 512-mdm-checkpoint.ckpt --to models/start --dtype bfloat16", TOY))
-    start = published_files.load(tmp_path / "models" / "start")
+    start = published.load(tmp_path / "models" / "start")
     assert (start.config.width, start.config.height) == (512, 320) and start.config.net == TINY.net
 
     training = (
@@ -79,7 +79,7 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
             " --out two"
         )
     )
-    one, two = (published_files.load(tmp_path / name / "model") for name in ("one", "two"))
+    one, two = (published.load(tmp_path / name / "model") for name in ("one", "two"))
     assert ((one.config.width, one.config.height), (two.config.width, two.config.height)) == ((32, 32), (36, 32))
     kept, before, after = (
         two.temporal_parameters("transformers"),

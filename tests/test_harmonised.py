@@ -26,15 +26,14 @@ from mudg.core.edit import Motion
 from mudg.core.weather import DriveFacts
 from mudg.core.weather.gbuffer import Surroundings
 from mudg.core.weather.light import SRGB
-from mudg.diffusion import files
-from mudg.diffusion.clips import condition as clip_parts
-from mudg.diffusion.clips.condition import ConditionRules, build_conditions, image_tensor
-from mudg.diffusion.clips.inputs import ConditionSources, InWeather, conditions_of
+from mudg.diffusion import condition as clip_parts
+from mudg.diffusion import model_files
+from mudg.diffusion.condition import ConditionRules, build_conditions, image_tensor
+from mudg.diffusion.inputs import ConditionSources, InWeather, conditions_of
 from mudg.diffusion.model import MDM, MDMConfig
-from mudg.diffusion.published.model import PublishedMDM
+from mudg.diffusion.published import PublishedMDM
 from mudg.diffusion.requests import SampleRequest, StartClip
-from mudg.diffusion.settings.harmonize import HarmonizeConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
 from mudg.diffusion.views import recorded_images
 from mudg.editing import harmonised
 from mudg.editing.harmonised import Touched, corrected, guarded, pasted, soft_edge
@@ -273,7 +272,7 @@ def run(tmp_path_factory) -> Path:
     config = fit_config(method="street_gaussians", iterations=40, start__gaussians=900, densify__max_gaussians=1500)
     Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
     torch.manual_seed(0)
-    files.save(MDM(SMALL), root / "model", "", {})
+    model_files.save(MDM(SMALL), root / "model", "", {})
     return root
 
 
@@ -288,7 +287,7 @@ def views_of(folder: Path, name: str = "front_recorded") -> list[Observation]:
 
 
 def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
-    model = files.load(str(run / "model"))
+    model = model_files.load(str(run / "model"))
     views = [view_at(time_s=0.1 * n) for n in range(2)]
     photos = [Photo(view, image_of_wall(view, 12.0)) for view in views]
     condition = build_conditions(FusedCloud(wall(12.0, stripes), {}), [], views, photos, RULES)[0]

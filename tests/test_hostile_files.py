@@ -24,7 +24,7 @@ from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, MudgError
 from mudg.base.plain_yaml import DEEPEST, LARGEST_BYTES, parse_yaml
-from mudg.diffusion.training.scene_list import read_list
+from mudg.diffusion.shard_sources import read_list
 from mudg.editing.script import parse_edits
 from mudg.formats.settings import IngestConfig
 from mudg.steps.ingest import Ingest

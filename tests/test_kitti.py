@@ -16,9 +16,9 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import Scene, View
 from mudg.formats.importers import IMPORTERS
+from mudg.formats.importers import kitti_files as kitti_boxes
 from mudg.formats.importers.common import ImportOptions, holdout_split, parse_frame_range
-from mudg.formats.importers.kitti import files as kitti_boxes
-from mudg.formats.importers.kitti.files import read_calibration_day, read_calibration_text, read_timestamps
+from mudg.formats.importers.kitti_files import read_calibration_day, read_calibration_text, read_timestamps
 from mudg.scene.read import read_image, read_points
 
 

@@ -14,7 +14,7 @@ from mudg.base.types import Camera, Condition, Trajectory, View
 from mudg.core import metrics
 from mudg.core.metrics import Pair
 from mudg.diffusion import synthesize
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing import render
 from mudg.networks import featnets
 from mudg.networks.codec import CodecConfig, PatchCodec

@@ -9,12 +9,9 @@ from toy_clips import WINDOW, tiny, with_settings, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.diffusion import files, learn
-from mudg.diffusion.clips import from_city
-from mudg.diffusion.clips import shards as clip_shards
+from mudg.diffusion import city_clips, learn, learn_clips, model_files, score
+from mudg.diffusion import clips as clip_shards
 from mudg.diffusion.requests import GeneratedClip
-from mudg.diffusion.training import clips as learn_clips
-from mudg.diffusion.training import score as learn_score
 from mudg.steps.learn import Learn
 
 
@@ -30,7 +27,7 @@ def whole(clips, tmp_path_factory):
 
 
 def weights(folder):
-    return files.load(folder).state_dict()
+    return model_files.load(folder).state_dict()
 
 
 def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, whole, tmp_path, monkeypatch):
@@ -146,10 +143,10 @@ def test_clips_that_never_come_are_an_error(tmp_path):
 
 
 def test_perfect_samples_score_perfectly(clips):
-    clip = clip_shards.read_clip(clips, from_city.HELD_OUT, 0, range(WINDOW))
+    clip = clip_shards.read_clip(clips, city_clips.HELD_OUT, 0, range(WINDOW))
     depth = clip.depth.clamp(max=100.0)
     sample = GeneratedClip(clip.rgb, depth, clip.semantics, torch.ones_like(depth), {})
-    row, counts = learn_score.score_clip(clip, sample)
+    row, counts = score.score_clip(clip, sample)
     assert row["psnr"] == float("inf")
     assert row["abs_rel"] == pytest.approx(0.0, abs=1e-6)
     assert row["sharpness"] == pytest.approx(1.0)
@@ -160,6 +157,6 @@ def test_perfect_samples_score_perfectly(clips):
 
 def test_confidence_score_ranks():
     error = torch.linspace(0, 1, 1000)
-    assert learn_score._auc(1 - error, error) > 0.99
-    assert learn_score._auc(error, error) < 0.01
-    assert learn_score._auc(torch.ones(1000), error) == pytest.approx(0.5)
+    assert score._auc(1 - error, error) > 0.99
+    assert score._auc(error, error) < 0.01
+    assert score._auc(torch.ones(1000), error) == pytest.approx(0.5)

@@ -19,7 +19,7 @@ from toy_clips import HEIGHT, WIDTH, WINDOW, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import UsageError
-from mudg.diffusion.training.parallel import Ranks, mesh_shape
+from mudg.diffusion.parallel import Ranks, mesh_shape
 
 pytestmark = pytest.mark.slow
 SAME = 1e-6

@@ -12,11 +12,10 @@ from toy_clips import WINDOW, tiny, write_clips
 from mudg.base import checkpoint
 from mudg.base.config import load
 from mudg.base.errors import InputError, ResourceError, UsageError
-from mudg.diffusion import files, learn
+from mudg.diffusion import learn, model_files, models
 from mudg.diffusion.model import MDM, MDMConfig
-from mudg.diffusion.settings.learn import LearnConfig, LearnData, LearnNetwork
-from mudg.diffusion.training import models as learn_models
-from mudg.diffusion.training.state import TrainingState
+from mudg.diffusion.parallel import TrainingState
+from mudg.diffusion.settings import LearnConfig, LearnData, LearnNetwork
 from mudg.steps.learn import Learn
 
 
@@ -52,10 +51,10 @@ def unrefined(tmp_path_factory):
             area_px=192 * 128,
         )
     )
-    learn_models.draw_weights(model.net, 3, "weights")
-    learn_models.draw_weights(model.codec, 3, "codec")
+    models.draw_weights(model.net, 3, "weights")
+    models.draw_weights(model.codec, 3, "codec")
     folder = tmp_path_factory.mktemp("unrefined") / "model"
-    files.save(model, folder, "card", {})
+    model_files.save(model, folder, "card", {})
     return folder
 
 
@@ -63,11 +62,11 @@ def test_the_second_stage_takes_over_everything_at_another_size(large_clips, sta
     config = tiny(
         large_clips, start=str(stage_one), steps=1, width=96, height=64, frozen="temporal_transformers", average_decay=0
     )
-    begun, fresh = learn_models.starting_model(config)
-    before, start = files.load(stage_one).state_dict(), begun.state_dict()
+    begun, fresh = models.starting_model(config)
+    before, start = model_files.load(stage_one).state_dict(), begun.state_dict()
     assert not fresh
     assert all(torch.equal(before[name], start[name]) for name in before)
-    after = files.load(Learn(out=tmp_path / "two", settings=config).run()).state_dict()
+    after = model_files.load(Learn(out=tmp_path / "two", settings=config).run()).state_dict()
     kept = {name for name in before if name.startswith("codec.") or ".temporal." in name}
     assert kept > {n for n in before if n.startswith("codec.")}
     assert all(torch.equal(before[name], after[name]) for name in kept)
@@ -83,18 +82,18 @@ def test_the_modality_embedding_survives_a_change_of_stage(stage_one, unrefined,
             config = LearnConfig(start=str(folder), data=LearnData(clips=str(clips), window=WINDOW))
         else:
             config = tiny(clips, start=str(folder), **changes)
-        label = files.load(folder).net.label.state_dict()
-        begun, _ = learn_models.starting_model(config)
+        label = model_files.load(folder).net.label.state_dict()
+        begun, _ = models.starting_model(config)
         assert all(torch.equal(value, begun.net.label.state_dict()[name]) for name, value in label.items())
         assert not torch.equal(label["0.weight"], begun.net.time.state_dict()["0.weight"])
 
 
 def test_frozen_layers_need_some_to_freeze(clips):
-    model = MDM(learn_models.model_config(tiny(clips, temporal_attention=(False, False))))
+    model = MDM(models.model_config(tiny(clips, temporal_attention=(False, False))))
     with pytest.raises(UsageError, match="nothing to freeze"):
-        learn_models.freeze(model, "temporal_transformers")
-    other = MDM(learn_models.model_config(tiny(clips)))
-    count = learn_models.freeze(other, "temporal_layers")
+        models.freeze(model, "temporal_transformers")
+    other = MDM(models.model_config(tiny(clips)))
+    count = models.freeze(other, "temporal_layers")
     frozen = {n for n, p in other.net.named_parameters() if not p.requires_grad}
     assert frozen == {n for n, _ in other.net.named_parameters() if ".temporal." in n}
     assert count == sum(p.numel() for n, p in other.net.named_parameters() if n in frozen)
@@ -102,8 +101,8 @@ def test_frozen_layers_need_some_to_freeze(clips):
 
 def test_an_embedded_kind_of_network_need_not_be_described_again(unrefined, clips, tmp_path):
     config = replace(tiny(clips, start=str(unrefined), steps=2, log_every=1, augment=False), network=LearnNetwork())
-    model = files.load(Learn(out=tmp_path / "run", settings=config).run())
-    assert model.config == replace(files.load(unrefined).config, area_px=48 * 32)
+    model = model_files.load(Learn(out=tmp_path / "run", settings=config).run())
+    assert model.config == replace(model_files.load(unrefined).config, area_px=48 * 32)
 
 
 def test_constant_rate_and_averages(clips):
@@ -129,7 +128,7 @@ def test_moments_of_another_model_are_refused(clips, stage_one, tmp_path):
     """A checkpoint whose tensors do not fit is named, not half loaded."""
     saved = checkpoint.latest(stage_one.parent / "steps")
     assert saved is not None
-    model = MDM(learn_models.model_config(tiny(clips, widths=(16, 64))))
+    model = MDM(models.model_config(tiny(clips, widths=(16, 64))))
     trained = model.trained_part()
     state = TrainingState(trained, torch.optim.AdamW(trained.parameters()), None)
     with pytest.raises(checkpoint.IntegrityError, match="does not fit"):
@@ -145,16 +144,16 @@ def recipes(facts):
             yield from recipes(value)
 
 
-@pytest.mark.parametrize("name", sorted(files.EMBEDDED))
+@pytest.mark.parametrize("name", sorted(model_files.EMBEDDED))
 def test_the_recipes_of_the_shipped_models_are_settings_files(name, tmp_path):
-    found = list(recipes(files.facts(name)))
+    found = list(recipes(model_files.facts(name)))
     assert found
     for recipe in found:
         (tmp_path / "recipe.yaml").write_text(yaml.safe_dump(recipe))
         config = load(LearnConfig, None, tmp_path / "recipe.yaml")
         assert config.steps == recipe["steps"] and config.data.cities == recipe["data"]["cities"]
-    network = learn_models.model_config(config)
-    assert network.widths == files.load(name).config.widths
+    network = models.model_config(config)
+    assert network.widths == model_files.load(name).config.widths
 
 
 def test_the_recipe_in_the_manual_is_a_settings_file(tmp_path):
@@ -165,8 +164,8 @@ def test_the_recipe_in_the_manual_is_a_settings_file(tmp_path):
 
 
 def test_a_step_has_clips_of_one_size() -> None:
-    from mudg.diffusion.settings.learn import LearnConfig, LearnData
-    from mudg.diffusion.training import clips as learn_clips
+    from mudg.diffusion import learn_clips
+    from mudg.diffusion.settings import LearnConfig, LearnData
 
     config = LearnConfig(data=LearnData(realism="varied"))
     sizes = learn_clips.sizes_of_cities(config)
@@ -182,7 +181,7 @@ def test_a_step_has_clips_of_one_size() -> None:
 
 
 def test_the_condition_of_freevs_is_made_of_cities_without_renders():
-    from mudg.diffusion.training import clips as learn_clips
+    from mudg.diffusion import learn_clips
 
     config = learn.check(LearnConfig(data=LearnData(condition="freevs")))
     rules = learn_clips.clip_rules(config)

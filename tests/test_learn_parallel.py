@@ -15,13 +15,9 @@ from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
-from mudg.diffusion import files
+from mudg.diffusion import learn_clips, model_files, models, parallel
 from mudg.diffusion.model import MDM, BatchPart, LossSettings
-from mudg.diffusion.training import clips as learn_clips
-from mudg.diffusion.training import models as learn_models
-from mudg.diffusion.training import parallel as learn_parallel
-from mudg.diffusion.training.parallel import Ranks
-from mudg.diffusion.training.state import TrainingState, read_rows
+from mudg.diffusion.parallel import Ranks, TrainingState, read_rows
 from mudg.steps.learn import Learn
 
 SAME = 2e-6
@@ -88,7 +84,7 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
     off = {step: abs(one[step] - other[step]) / one[step] for step in (3, 4, 5, 6)}
     print(f"largest relative difference of a step's loss: {max(off.values()):.1e}")
     assert max(off.values()) < SAME, off
-    first, second = (files.load(folder).state_dict() for folder in (tmp_path / "whole" / "model", parts))
+    first, second = (model_files.load(folder).state_dict() for folder in (tmp_path / "whole" / "model", parts))
     for name in first:  # stored in half precision
         torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
 
@@ -141,7 +137,7 @@ def test_torchrun_trains(clips, tmp_path):
     command = torchrun(clips, tmp_path / "out")
     done = subprocess.run(command, env=environment(), capture_output=True, text=True, timeout=600)
     assert done.returncode == 0, done.stderr
-    assert files.load(tmp_path / "out" / "model").config.widths == (16, 32)
+    assert model_files.load(tmp_path / "out" / "model").config.widths == (16, 32)
 
 
 @pytest.mark.slow
@@ -182,8 +178,8 @@ def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
 
 
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips):
-    model = MDM(learn_models.model_config(tiny(clips)))
-    learn_models.draw_weights(model.net, 0, "weights")
+    model = MDM(models.model_config(tiny(clips)))
+    models.draw_weights(model.net, 0, "weights")
     settings = tiny(clips)
     rules = LossSettings(learn_clips.class_weights(clips, range(2), 0.5), refined_share=0.5, reference_dropout=0.2)
 
@@ -232,8 +228,8 @@ def test_rows_of_any_cut_are_put_together(tmp_path):
 
 def test_a_term_that_is_not_finite_is_named():
     with pytest.raises(NumericsError, match=r"depth term of the network(.|\n)*step 4"):
-        learn_parallel.agreed_terms(ALONE, {"rgb": 1.0, "depth": float("nan")}, 1, 4, "network")
-    assert learn_parallel.agreed_terms(ALONE, {"rgb": 3.0}, 2, 4, "network") == ({"rgb": 1.5}, False)
+        parallel.agreed_terms(ALONE, {"rgb": 1.0, "depth": float("nan")}, 1, 4, "network")
+    assert parallel.agreed_terms(ALONE, {"rgb": 3.0}, 2, 4, "network") == ({"rgb": 1.5}, False)
 
 
 def test_blocks_are_what_repeats():
@@ -241,4 +237,4 @@ def test_blocks_are_what_repeats():
         nn.Sequential(nn.Linear(2, 2), nn.ModuleList([nn.Sequential(nn.Linear(2, 2))])) for _ in range(3)
     )
     part = nn.Sequential(nn.Linear(2, 2), nn.ModuleList([nn.ModuleList([first, second]), nn.Linear(2, 2), outer]))
-    assert [id(m) for m in learn_parallel.blocks(part)] == [id(first), id(second), id(outer)]
+    assert [id(m) for m in parallel.blocks(part)] == [id(first), id(second), id(outer)]

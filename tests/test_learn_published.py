@@ -17,19 +17,13 @@ from toy_scene import ToyStreet
 from mudg.base import crop, palette
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition, SparseDepth
-from mudg.diffusion import learn
-from mudg.diffusion.clips import from_city, from_log
-from mudg.diffusion.clips import shards as clip_shards
-from mudg.diffusion.clips.condition import ConditionRules, build_conditions, filled_depth
-from mudg.diffusion.clips.from_log import LogClipRules, LogSource
+from mudg.diffusion import city_clips, convert, learn, learn_clips, log_clips, models, published
+from mudg.diffusion import clips as clip_shards
+from mudg.diffusion.condition import ConditionRules, build_conditions, filled_depth
+from mudg.diffusion.log_clips import LogClipRules, LogSource
 from mudg.diffusion.model import BatchPart, LossSettings
-from mudg.diffusion.published import convert
-from mudg.diffusion.published import model as published_files
-from mudg.diffusion.published.model import PAPER_DROPOUT, ContextDropout, PublishedMDM
-from mudg.diffusion.settings.learn import LearnConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.diffusion.training import clips as learn_clips
-from mudg.diffusion.training import models as learn_models
+from mudg.diffusion.published import PAPER_DROPOUT, ContextDropout, PublishedMDM
+from mudg.diffusion.settings import LearnConfig, SynthesizeConfig
 from mudg.diffusion.views import recorded_images
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_scene
@@ -74,12 +68,12 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
     config = published_settings(
         one, large, width=36, height=32, frozen="temporal_transformers", steps=1, batch_frames=4
     )
-    begun, fresh = learn_models.starting_model(config)
-    first, start = (published_files.load(folder).state_dict() for folder in (converted, one))
+    begun, fresh = models.starting_model(config)
+    first, start = (published.load(folder).state_dict() for folder in (converted, one))
     assert not fresh
     assert all(torch.equal(value, start[name]) for name, value in begun.state_dict().items())  # the modality label too
     two = Learn(out=tmp_path / "two", settings=config).run()
-    last = published_files.load(two)
+    last = published.load(two)
     end = last.state_dict()
     trained = {name for name in first if name.startswith(("net.", "image_tokens."))}
     temporal = begun.temporal_parameters("transformers")
@@ -90,7 +84,7 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
         assert not torch.equal(state["net.label.0.weight"], first["net.label.0.weight"])
         assert not torch.equal(state["net.label.0.weight"], state["net.time.0.weight"])
     assert (last.config.width, last.config.height) == (36, 32)
-    assert torch.equal(last.schedule.scale, published_files.load(converted).schedule.scale)
+    assert torch.equal(last.schedule.scale, published.load(converted).schedule.scale)
     assert (two / "MODEL_CARD.md").read_text().rstrip().endswith(convert.LICENCE)
     assert json.loads((two.parent / "metrics.json").read_text())["clips"] == 1
     view = SynthesizeConfig(shifts_m=(1.0,), model=str(two), steps=1, guidance=1.0, precision="float32")
@@ -104,7 +98,7 @@ def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
 def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
     """With dropout inside the network on; terms too, and they have the same names in every part."""
     settings = published_settings(converted, clips)
-    model, _ = learn_models.starting_model(settings)
+    model, _ = models.starting_model(settings)
     model.trained_part().train()
 
     @torch.no_grad()
@@ -126,7 +120,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
 
 def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
     settings = published_settings(converted, clips)
-    model, _ = learn_models.starting_model(settings)
+    model, _ = models.starting_model(settings)
     drawn = [corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 4, 4, "batch")]
     nothing = [
         replace(clip, depth_valid=torch.zeros_like(clip.depth_valid), semantics=torch.full_like(clip.semantics, 255))
@@ -167,7 +161,7 @@ def test_two_processes_give_the_losses_of_one(converted, clips, tmp_path):
     off = {step: abs(one[step] - other[step]) / one[step] for step in (1, 2, 3)}
     print(f"largest relative difference of a step's loss: {max(off.values()):.1e}")
     assert max(off.values()) < SAME, off
-    first, second = (published_files.load(tmp_path / name / "model").state_dict() for name in ("one", "both"))
+    first, second = (published.load(tmp_path / name / "model").state_dict() for name in ("one", "both"))
     for name in first:
         torch.testing.assert_close(first[name], second[name], rtol=2e-3, atol=2e-5)
 
@@ -201,7 +195,7 @@ def test_what_goes_without_the_reference(converted, clips, share, frame, matters
     """Left out of tokens and frame, another reference image changes nothing; left out of the tokens alone, frame 0
     still shows it."""
     settings = published_settings(converted, clips)
-    model, _ = learn_models.starting_model(settings)
+    model, _ = models.starting_model(settings)
     (clip,) = (corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 1, 4, "batch"))
     other = replace(clip, condition=replace(clip.condition, reference=1 - clip.condition.reference))
     rules = LossSettings(None, 1.0, share, frame_dropout=frame)
@@ -213,7 +207,7 @@ def test_what_goes_without_the_reference(converted, clips, share, frame, matters
 
 def test_the_scope_of_dropout_changes_no_clip_that_keeps_its_reference(converted, clips):
     settings = published_settings(converted, clips)
-    model, _ = learn_models.starting_model(settings)
+    model, _ = models.starting_model(settings)
     (clip,) = (corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 1, 4, "batch"))
     with torch.no_grad():
         losses = {
@@ -257,10 +251,10 @@ def test_what_does_not_fit_is_refused_in_words(converted, clips, tmp_path):
 def test_clips_of_logs_show_points_alone(street, tmp_path):
     """The condition is the one that `synthesize` builds for the published model, and survives the disk."""
     rules = LogClipRules(width=48, height=32, window=4, stride=4, held_out_every=0, published=True)
-    log = from_log.OpenLog(LogSource(street / "scene", street / "fuse"), rules)
-    window = from_log.log_windows(log.scene, rules)[0]
+    log = log_clips.OpenLog(LogSource(street / "scene", street / "fuse"), rules)
+    window = log_clips.log_windows(log.scene, rules)[0]
     held = replace(window, held_out=True)  # all points are kept
-    clip = from_log.make_clip(log, held, 0)
+    clip = log_clips.make_clip(log, held, 0)
     recorded = recorded_images(log.scene, SynthesizeConfig(given_classes=False))
     views = [log.frame(name).view for name in window.frames]
     conditions = ConditionRules(48, 32, 72, 48, published=True)
@@ -287,7 +281,7 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
         if not torch.equal((v := clip_shards.vary(read, np.random.default_rng(n))).depth, read.depth)
     )
     assert torch.equal(seen.condition.measured.depth, given.measured.depth.flip(-1))
-    thinner = from_log.make_clip(log, window, 0)
+    thinner = log_clips.make_clip(log, window, 0)
     assert not torch.equal(thinner.condition.depth, clip.condition.depth)  # to train on: a share of the points
 
 
@@ -300,17 +294,17 @@ def test_filling_takes_the_nearest_measured_depth():
 def test_a_folder_of_clips_is_known_by_its_condition(street, tmp_path):
     sources = [LogSource(street / "scene", street / "fuse")]
     rules = LogClipRules(width=48, height=32, window=4)
-    from_log.claim_folder(tmp_path, rules, sources)
-    assert "published" not in json.loads((tmp_path / from_log.INDEX).read_text())["rules"]
+    log_clips.claim_folder(tmp_path, rules, sources)
+    assert "published" not in json.loads((tmp_path / log_clips.INDEX).read_text())["rules"]
     with pytest.raises(UsageError, match="other logs or settings"):
-        from_log.claim_folder(tmp_path, replace(rules, published=True), sources)
+        log_clips.claim_folder(tmp_path, replace(rules, published=True), sources)
 
 
 def test_clips_of_cities_show_points_alone_and_are_as_long_as_asked():
-    rules = from_city.CityClipRules(width=48, height=32, window=16, clips=1, published=True)
-    assert rules.frames == 18 and from_city.CityClipRules().frames == from_city.FRAMES
-    log = from_city.make_log(replace(rules, width=24, height=16), 0, rules.frames)
-    (clip,) = from_city.make_clips(replace(rules, width=24, height=16), 0, log)
+    rules = city_clips.CityClipRules(width=48, height=32, window=16, clips=1, published=True)
+    assert rules.frames == 18 and city_clips.CityClipRules().frames == city_clips.FRAMES
+    log = city_clips.make_log(replace(rules, width=24, height=16), 0, rules.frames)
+    (clip,) = city_clips.make_clips(replace(rules, width=24, height=16), 0, log)
     condition = clip.condition
     assert len(clip.rgb) == 16 and condition.warped is None
     sky = (clip.semantics == palette.ID["sky"])[:, None]
@@ -333,7 +327,7 @@ def test_a_published_model_goes_on_learning_on_a_log(converted, street, tmp_path
         converted, "", scenes=(source,), stride=4, held_out_every=0, width=32, height=32, steps=1, batch_frames=4
     )
     made = Learn(out=tmp_path / "run", settings=config).run()
-    index = json.loads((tmp_path / "run" / "clips" / from_log.INDEX).read_text())["rules"]
+    index = json.loads((tmp_path / "run" / "clips" / log_clips.INDEX).read_text())["rules"]
     assert (index["width"], index["height"], index["published"]) == (32, 32, True)
     assert "the first image as condition" in (made / "MODEL_CARD.md").read_text()
     assert read_scene(street / "scene").cameras["front"].width == 72

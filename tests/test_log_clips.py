@@ -13,16 +13,11 @@ from toy_scene import ToyStreet
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Source, View
 from mudg.core import losses
-from mudg.diffusion import adapt as lessons
-from mudg.diffusion.clips import from_log
-from mudg.diffusion.clips import shards as clip_shards
-from mudg.diffusion.clips.from_city import HELD_OUT
-from mudg.diffusion.clips.from_log import LogClipRules, LogSource
+from mudg.diffusion import adapt, clips, learn_clips, log_clips, models
+from mudg.diffusion.city_clips import HELD_OUT
+from mudg.diffusion.log_clips import LogClipRules, LogSource
 from mudg.diffusion.model import MDM
-from mudg.diffusion.settings.adapt import AdaptConfig
-from mudg.diffusion.settings.learn import LearnConfig
-from mudg.diffusion.training import clips as learn_clips
-from mudg.diffusion.training import models as learn_models
+from mudg.diffusion.settings import AdaptConfig, LearnConfig
 from mudg.scene.labels import photographs, read_label
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
@@ -71,18 +66,18 @@ def log(tmp_path_factory):
 
 def test_windows_to_score_share_no_moment_with_those_to_train_on(log):
     scene = read_scene(log[1].scene)
-    found = from_log.log_windows(scene, RULES)
+    found = log_clips.log_windows(scene, RULES)
     held = {name for w in found if w.held_out for name in w.frames}
     trained = {name for w in found if not w.held_out for name in w.frames}
     assert held and trained and not held & trained
     assert "front/000004" not in held | trained  # the scene holds it out
     assert all(len(w.frames) == 3 for w in found)
-    everything = from_log.log_windows(scene, LogClipRules(48, 24, window=3, stride=2, held_out_every=0))
+    everything = log_clips.log_windows(scene, LogClipRules(48, 24, window=3, stride=2, held_out_every=0))
     assert [w.frames[0] for w in everything] == [f"front/{n:06d}" for n in (0, 2, 5, 7, 9, 11, 13)]
     with pytest.raises(InputError, match="too short"):
-        from_log.log_windows(scene, LogClipRules(48, 24, window=30))
+        log_clips.log_windows(scene, LogClipRules(48, 24, window=30))
     with pytest.raises(InputError, match="too short to hold out"):
-        from_log.plan_shards([log[1]], LogClipRules(48, 24, window=12, stride=1, held_out_every=2), HELD_OUT)
+        log_clips.plan_shards([log[1]], LogClipRules(48, 24, window=12, stride=1, held_out_every=2), HELD_OUT)
 
 
 def test_images_that_an_edit_rendered_in_part_are_no_photographs(log):
@@ -91,17 +86,17 @@ def test_images_that_an_edit_rendered_in_part_are_no_photographs(log):
     edited = replace(one, labels={**one.labels, "rendered": next(iter(one.labels.values()))})
     changed = replace(scene, frames=tuple(edited if f is one else f for f in scene.frames))
     assert {f.id for f in scene.frames_in("train")} - {f.id for f in photographs(changed)} == {"front/000006"}
-    assert all("front/000006" not in w.frames for w in from_log.log_windows(changed, RULES))
-    assert any("front/000006" in w.frames for w in from_log.log_windows(scene, RULES))
-    names = lambda of: {f.id for block in lessons.blocks_of(of, AdaptConfig()) for f in block}  # noqa: E731
+    assert all("front/000006" not in w.frames for w in log_clips.log_windows(changed, RULES))
+    assert any("front/000006" in w.frames for w in log_clips.log_windows(scene, RULES))
+    names = lambda of: {f.id for block in adapt.blocks_of(of, AdaptConfig()) for f in block}  # noqa: E731
     assert names(scene) - names(changed) == {"front/000006"}
 
 
 def test_truth_is_what_was_recorded(measured):
     street, source = measured
-    opened = from_log.OpenLog(source, replace(RULES, width=120, height=60))
-    window = next(w for w in from_log.log_windows(opened.scene, RULES) if not w.held_out)
-    clip = from_log.make_clip(opened, window, 0)
+    opened = log_clips.OpenLog(source, replace(RULES, width=120, height=60))
+    window = next(w for w in log_clips.log_windows(opened.scene, RULES) if not w.held_out)
+    clip = log_clips.make_clip(opened, window, 0)
     for number, view in enumerate(clip.condition.views):
         _, ids, depth = street.image(view)  # exact, at the clip's size
         known = clip.depth_valid[number, 0].numpy()
@@ -112,8 +107,8 @@ def test_truth_is_what_was_recorded(measured):
         assert 0.1 < solid.mean() < 1.0
         assert (clip.depth[number, 0].numpy()[known & ~np.isfinite(depth)] >= 100).mean() > 0.9
         assert (clip.semantics[number].numpy() == ids).mean() > 0.97
-    arrays = clip_shards.pack_clips([clip], gaps=True)
-    unknown = (arrays["flags"] & clip_shards.FLAG_DEPTH_UNKNOWN) > 0
+    arrays = clips.pack_clips([clip], gaps=True)
+    unknown = (arrays["flags"] & clips.FLAG_DEPTH_UNKNOWN) > 0
     assert np.array_equal(unknown[0], ~clip.depth_valid[:, 0].numpy())
     assert float(arrays["depth"][0][unknown[0]].max()) <= 100  # filled, not far away
 
@@ -123,12 +118,12 @@ def test_a_view_never_sees_its_own_image(log, tmp_path):
     _, source = log
     scene = read_scene(source.scene)
     rules = replace(RULES, farthest=1)  # neighbours' images are given
-    opened = from_log.OpenLog(source, rules)
-    window = next(w for w in from_log.log_windows(scene, rules) if not w.held_out)
+    opened = log_clips.OpenLog(source, rules)
+    window = next(w for w in log_clips.log_windows(scene, rules) if not w.held_out)
     painted = window.frames[1]
     rewritten(scene, tmp_path / "scene", black=painted)
-    other = from_log.OpenLog(LogSource(tmp_path / "scene", source.fused), rules)
-    clip, again = (from_log.make_clip(x, window, 0) for x in (opened, other))
+    other = log_clips.OpenLog(LogSource(tmp_path / "scene", source.fused), rules)
+    clip, again = (log_clips.make_clip(x, window, 0) for x in (opened, other))
     assert torch.equal(clip.condition.color[1], again.condition.color[1])
     assert torch.equal(clip.condition.backdrop[1], again.condition.backdrop[1])
     assert not torch.equal(clip.condition.color, again.condition.color)  # its neighbours do see it
@@ -137,11 +132,11 @@ def test_a_view_never_sees_its_own_image(log, tmp_path):
 
 
 def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
-    opened = from_log.OpenLog(measured[1], replace(RULES, width=64, height=32))
-    window = from_log.log_windows(opened.scene, RULES)[0]
-    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([from_log.make_clip(opened, window, 0)], gaps=True))
-    model = MDM(learn_models.model_config(tiny(tmp_path, width=64, height=32, window=3)))
-    clip = clip_shards.read_clip(tmp_path, 0, 0, range(3))
+    opened = log_clips.OpenLog(measured[1], replace(RULES, width=64, height=32))
+    window = log_clips.log_windows(opened.scene, RULES)[0]
+    clips.write_shard(tmp_path, 0, clips.pack_clips([log_clips.make_clip(opened, window, 0)], gaps=True))
+    model = MDM(models.model_config(tiny(tmp_path, width=64, height=32, window=3)))
+    clip = clips.read_clip(tmp_path, 0, 0, range(3))
     assert not bool(clip.depth_valid.all())
 
     def term(depth, known):
@@ -153,7 +148,7 @@ def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
 
     assert term(torch.tensor(3.0), clip.depth_valid) == term(torch.tensor(90.0), clip.depth_valid)
     assert term(torch.tensor(3.0), ~clip.depth_valid) != term(torch.tensor(90.0), ~clip.depth_valid)
-    mirrored = clip_shards.vary(clip, np.random.Generator(np.random.PCG64(1)))
+    mirrored = clips.vary(clip, np.random.Generator(np.random.PCG64(1)))
     flipped = not torch.equal(mirrored.depth, clip.depth)
     wanted = clip.depth_valid.flip(-1) if flipped else clip.depth_valid
     assert torch.equal(mirrored.depth_valid, wanted)
@@ -190,7 +185,7 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     facts = json.loads((made / "model.json").read_text())["facts"]
     assert facts["recipe"]["data"]["scenes"] == [str(run)]
     with pytest.raises(UsageError, match="other logs or settings"):
-        from_log.claim_folder(made.parent / "clips", RULES, [log[1]])
+        log_clips.claim_folder(made.parent / "clips", RULES, [log[1]])
     with pytest.raises(InputError, match="no scene with a fused cloud"):
         Learn(out=tmp_path / "none", settings=tiny("", start=str(first), scenes=(str(tmp_path),))).run()
 
@@ -228,10 +223,10 @@ def test_annotated_depth_is_learned_with_its_confidence(annotated, tmp_path, pub
     """Exact depth where the sweep measured, labelled depth elsewhere; none of the bonnet's."""
     street, source = annotated
     rules = LogClipRules(120, 60, window=3, held_out_every=0, published=published)
-    opened, alone = from_log.OpenLog(source, rules), from_log.OpenLog(source, replace(rules, depth="sweep"))
-    window = from_log.log_windows(opened.scene, rules)[0]
-    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([from_log.make_clip(opened, window, 0)], gaps=True))
-    clip, sweep = clip_shards.read_clip(tmp_path, 0, 0, range(3)), from_log.make_clip(alone, window, 0)
+    opened, alone = log_clips.OpenLog(source, rules), log_clips.OpenLog(source, replace(rules, depth="sweep"))
+    window = log_clips.log_windows(opened.scene, rules)[0]
+    clips.write_shard(tmp_path, 0, clips.pack_clips([log_clips.make_clip(opened, window, 0)], gaps=True))
+    clip, sweep = clips.read_clip(tmp_path, 0, 0, range(3)), log_clips.make_clip(alone, window, 0)
     assert sweep.depth_confidence is None and 0.05 < float(sweep.depth_valid.float().mean()) < 0.8
     measured = sweep.depth_valid
     assert torch.allclose(clip.depth[measured], sweep.depth[measured], rtol=1e-3)
@@ -248,11 +243,9 @@ def test_annotated_depth_is_learned_with_its_confidence(annotated, tmp_path, pub
         bonnet = ~measured[number, 0] & (torch.arange(60)[:, None] >= 54)
         assert bool(bonnet.any()) and not bool(clip.depth_weight[number, 0][bonnet].any())
         sky = torch.from_numpy(~np.isfinite(exact)) & ~measured[number, 0]
-        assert bool((clip.depth[number, 0][sky & (column > 0.1)] == clip_shards.FAR_M).all())
+        assert bool((clip.depth[number, 0][sky & (column > 0.1)] == clips.FAR_M).all())
     turned = next(
-        v
-        for n in range(20)
-        if not torch.equal((v := clip_shards.vary(clip, np.random.default_rng(n))).depth, clip.depth)
+        v for n in range(20) if not torch.equal((v := clips.vary(clip, np.random.default_rng(n))).depth, clip.depth)
     )
     assert torch.equal(turned.depth_weight, clip.depth_weight.flip(-1))
 
@@ -260,9 +253,9 @@ def test_annotated_depth_is_learned_with_its_confidence(annotated, tmp_path, pub
 def test_the_weight_of_depth_scales_its_loss(annotated):
     """Both kinds of model: the error at a pixel counts as much as its depth is to be believed."""
     rules = LogClipRules(64, 32, window=3, held_out_every=0)
-    opened = from_log.OpenLog(annotated[1], rules)
-    clip = from_log.make_clip(opened, from_log.log_windows(opened.scene, rules)[0], 0)
-    model = MDM(learn_models.model_config(tiny(Path(), width=64, height=32, window=3)))
+    opened = log_clips.OpenLog(annotated[1], rules)
+    clip = log_clips.make_clip(opened, log_clips.log_windows(opened.scene, rules)[0], 0)
+    model = MDM(models.model_config(tiny(Path(), width=64, height=32, window=3)))
 
     def term(confidence):
         truth = model.pixel_truth([replace(clip, depth_confidence=torch.full_like(clip.depth, confidence))])

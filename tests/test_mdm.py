@@ -9,10 +9,8 @@ import torch
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.types import Camera, Clip, Condition, View
 from mudg.core import noise
-from mudg.diffusion import extended as extending
-from mudg.diffusion import files, network
 from mudg.diffusion import model as mdm
-from mudg.diffusion import requests as diffusion
+from mudg.diffusion import model_files, models, network, requests
 from mudg.diffusion.model import MDM, BatchPart, LossSettings, MDMConfig
 from mudg.diffusion.requests import SampleRequest
 from mudg.networks import codec
@@ -97,15 +95,15 @@ def test_sample_shapes_ranges_and_determinism():
 
 def test_a_model_with_a_new_refiner_has_the_same_denoiser_and_codec():
     small = randomised(PLAIN)
-    big = extending.extended(small, TINY)
+    big = models.extended(small, TINY)
     state = big.state_dict()
     assert all(torch.equal(value, state[name]) for name, value in small.state_dict().items())
     assert any(name.startswith("refiner.") for name in state)
     refined = randomised(TINY)
-    again = extending.extended(refined, replace(TINY, area_px=100)).state_dict()
+    again = models.extended(refined, replace(TINY, area_px=100)).state_dict()
     assert all(torch.equal(value, again[name]) for name, value in refined.state_dict().items())
     with pytest.raises(UsageError, match="another kind"):
-        extending.extended(small, replace(TINY, widths=(16, 32)))
+        models.extended(small, replace(TINY, widths=(16, 32)))
 
 
 def test_given_classes_are_copied_where_they_are_known():
@@ -229,19 +227,19 @@ def test_loss_has_gradients_everywhere():
 def test_measured_depth_is_taken():
     condition = some_condition(frames=1)
     depth = torch.full((1, 1, 16, 24), 120.0)
-    settled = diffusion.settle_depth(depth, condition, 100.0)
+    settled = requests.settle_depth(depth, condition, 100.0)
     assert torch.equal(settled[condition.valid], condition.depth[condition.valid])
     assert bool((settled[~condition.valid] == 100.0).all())
 
 
-@pytest.mark.parametrize("name", sorted(files.EMBEDDED))
+@pytest.mark.parametrize("name", sorted(model_files.EMBEDDED))
 def test_the_shipped_models_load(name):
-    model = files.load(name)
+    model = model_files.load(name)
     assert model.config.window == 8
-    parts = list(files.EMBEDDED[name].glob("*.safetensors"))
+    parts = list(model_files.EMBEDDED[name].glob("*.safetensors"))
     assert all(f.stat().st_size < 16 * 1024 * 1024 for f in parts)
     assert sum(f.stat().st_size for f in parts) < (8 if "tiny" in name else 40) * 1024 * 1024
-    assert files.facts(name)["held_out"]["clips"] >= 12
+    assert model_files.facts(name)["held_out"]["clips"] >= 12
     assert model.config.renders == (name == "embedded") and (model.finisher is not None) == model.config.renders
 
 
@@ -267,12 +265,12 @@ def test_a_setting_that_the_sampler_does_not_take_is_refused():
 
 def test_depth_that_contradicts_a_measurement_costs_confidence():
     condition = some_condition(frames=1)
-    same = diffusion.depth_agreement(condition.depth, condition)
+    same = requests.depth_agreement(condition.depth, condition)
     assert torch.allclose(same, torch.ones_like(same))
     valid = torch.zeros_like(condition.valid)
     valid[..., 8, 12] = True
     alone = replace(condition, valid=valid)
-    off = diffusion.depth_agreement(condition.depth * 1.5, alone)
+    off = requests.depth_agreement(condition.depth * 1.5, alone)
     assert float(off[0, 0, 8, 12]) == pytest.approx(max(0.2, 1.5**-5), rel=1e-4)
     assert float(off[0, 0, 6, 10]) == pytest.approx(float(off[0, 0, 8, 12]))
     assert float(off[0, 0, 0, 0]) == 1.0
@@ -281,17 +279,17 @@ def test_depth_that_contradicts_a_measurement_costs_confidence():
 def test_confidence_falls_with_change_and_distance():
     seen = torch.zeros(1, 1, 8, 16)
     seen[..., :8] = 1
-    still = diffusion.confidence_of(seen, torch.zeros_like(seen), 2)
+    still = requests.confidence_of(seen, torch.zeros_like(seen), 2)
     assert float(still[0, 0, 0, 0]) == pytest.approx(1.0)
     assert float(still[0, 0, 0, -1]) == pytest.approx(0.35)
-    moving = diffusion.confidence_of(seen, torch.full_like(seen, 0.5), 2)
+    moving = requests.confidence_of(seen, torch.full_like(seen, 0.5), 2)
     assert bool((moving < still).all())
 
 
 def test_save_and_load_are_inverse(tmp_path):
     model = randomised(TINY)
-    files.save(model, tmp_path / "m", "a card", {"note": 1})
-    loaded = files.load(tmp_path / "m")
+    model_files.save(model, tmp_path / "m", "a card", {"note": 1})
+    loaded = model_files.load(tmp_path / "m")
     assert loaded.config == model.config
     for name, value in model.state_dict().items():
         assert torch.allclose(loaded.state_dict()[name], value, rtol=1e-3, atol=1e-4), name
@@ -299,22 +297,22 @@ def test_save_and_load_are_inverse(tmp_path):
 
 
 def test_damaged_and_foreign_models_are_refused(tmp_path):
-    files.save(randomised(TINY), tmp_path / "m", "", {})
+    model_files.save(randomised(TINY), tmp_path / "m", "", {})
     weights = next((tmp_path / "m").glob("*.safetensors"))
     content = bytearray(weights.read_bytes())
     content[-1] ^= 1
     weights.write_bytes(bytes(content))
     with pytest.raises(IntegrityError, match="altered"):
-        files.load(tmp_path / "m")
+        model_files.load(tmp_path / "m")
     with pytest.raises(InputError, match="no diffusion model"):
-        files.load(tmp_path / "nothing")
+        model_files.load(tmp_path / "nothing")
 
 
 def test_configuration_is_strict():
     values = asdict(TINY)
-    assert files.config_from_dict(values) == TINY
+    assert model_files.config_from_dict(values) == TINY
     with pytest.raises(InputError, match="patches"):
-        files.config_from_dict({**values, "patches": 3})
+        model_files.config_from_dict({**values, "patches": 3})
     for change in ({"blocks": (1,)}, {"widths": (16, 20)}):
         with pytest.raises(UsageError):
             replace(TINY, **change)
@@ -322,14 +320,14 @@ def test_configuration_is_strict():
 
 def test_models_of_variants_that_were_taken_out_are_refused_in_words():
     """What the shipped models say of themselves is accepted, every other value of a former field is not."""
-    former = files.FORMER_FIELDS
+    former = model_files.FORMER_FIELDS
     values = {**asdict(TINY), **former["top"], "codec": {**asdict(TINY.codec), **former["codec"]}}
-    assert files.config_from_dict(values) == TINY
+    assert model_files.config_from_dict(values) == TINY
     for name in former["top"]:
         with pytest.raises(InputError, match=f"no longer has[^$]*{name}"):
-            files.config_from_dict({**values, name: "other"})
+            model_files.config_from_dict({**values, name: "other"})
     with pytest.raises(InputError, match="no longer has[^$]*semantics_code"):
-        files.config_from_dict({**values, "codec": {**values["codec"], "semantics_code": "palette"}})
+        model_files.config_from_dict({**values, "codec": {**values["codec"], "semantics_code": "palette"}})
 
 
 def test_wrong_requests_are_refused():
@@ -344,11 +342,11 @@ def test_wrong_requests_are_refused():
 
 def test_image_size_keeps_aspect_and_area():
     area = 128 * 192
-    assert diffusion.sized_to_area(area, 480 / 320, 16) == (192, 128)
-    assert diffusion.sized_to_area(area, 1920 / 1280, 16) == (192, 128)
-    width, height = diffusion.sized_to_area(area, 1242 / 375, 16)
+    assert requests.sized_to_area(area, 480 / 320, 16) == (192, 128)
+    assert requests.sized_to_area(area, 1920 / 1280, 16) == (192, 128)
+    width, height = requests.sized_to_area(area, 1242 / 375, 16)
     assert width % 16 == height % 16 == 0
     assert abs(width / height / (1242 / 375) - 1) < 0.1
     assert abs(width * height / area - 1) < 0.3
-    assert diffusion.sized_to_width(100, 480 / 320, 16) == (96, 64)
+    assert requests.sized_to_width(100, 480 / 320, 16) == (96, 64)
     assert MDM(TINY).image_size(480, 320) == (192, 128)

@@ -18,8 +18,8 @@ from test_gallery import run_of
 from toy_clips import tiny
 
 from mudg import app
-from mudg.diffusion.settings.learn import LearnConfig
-from mudg.diffusion.training import clips as learn_clips
+from mudg.diffusion import learn_clips
+from mudg.diffusion.settings import LearnConfig
 from mudg.viewer import gallery
 
 NOBODY = 65534

@@ -28,11 +28,9 @@ from mudg.benchmarks import run as bench
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city.config import CityConfig
 from mudg.core import trajectory
-from mudg.diffusion import files
+from mudg.diffusion import convert, model_files
 from mudg.diffusion.model import MDM, MDMConfig
-from mudg.diffusion.published import convert
-from mudg.diffusion.settings.convert import ConvertConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
 from mudg.editing.view_settings import RenderConfig, ScoreConfig
 from mudg.fleet.listed import run_listed
 from mudg.fleet.plan import Entry
@@ -205,7 +203,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     config = fit_config(method="street_gaussians", iterations=2, start__gaussians=200)
     given["fitted"] = Fit(scene=given["scene"], fused=given["fused"], out=root / "fitted", settings=config).run()
     torch.manual_seed(0)
-    files.save(MDM(SMALL), root / "model", "", {})
+    model_files.save(MDM(SMALL), root / "model", "", {})
     given["model"] = root / "model"
     given["city"] = Ingest(
         log=ingest.CITY, out=root / "city", settings=IngestConfig(city=CITY, contact_sheet=False)
@@ -405,7 +403,7 @@ HISTORY = {"learn": {"loss.png"}}
 
 @pytest.fixture
 def quick_bench(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A measurement that only writes some files."""
+    """A measurement that only writes some model_files."""
 
     def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
         for number in range(4):

@@ -17,16 +17,20 @@ from mudg.base.records import parse_dataclass
 from mudg.base.store import read_safetensors
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
-from mudg.diffusion.published import convert
-from mudg.diffusion.published import model as files
-from mudg.diffusion.published import model as published
-from mudg.diffusion.published.kl_vae import LATENT_SCALE, Autoencoder, AutoencoderConfig, nearest_class
-from mudg.diffusion.published.model import PublishedConfig, WorkSplit
-from mudg.diffusion.published.video_unet import Resampler, ResamplerConfig, VideoUNet, VideoUNetConfig
+from mudg.diffusion import convert, memory_plan, published
+from mudg.diffusion.published import PublishedConfig, WorkSplit
+from mudg.diffusion.published_network import (
+    LATENT_SCALE,
+    Autoencoder,
+    AutoencoderConfig,
+    Resampler,
+    ResamplerConfig,
+    VideoUNet,
+    VideoUNetConfig,
+    nearest_class,
+)
 from mudg.diffusion.requests import SampleRequest
-from mudg.diffusion.settings.convert import ConvertConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.diffusion.training import memory_plan
+from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
 from mudg.diffusion.views import recorded_at_pose, recorded_images
 from mudg.networks import clip
 from mudg.networks.clip import ImageTower, TextTower, TowerConfig
@@ -440,7 +444,7 @@ def test_shares_of_modalities_and_missing_context(model):
     assert float((no_text & no_reference).float().mean()) == pytest.approx(0.05, abs=0.015)
 
 
-# files, command, memory ---------------------------------------------------------------------------
+# published, command, memory ---------------------------------------------------------------------------
 
 
 def test_configuration_is_strict():
@@ -503,7 +507,7 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
 
 def test_the_released_resizing(street):
     """Colours by the nearest pixel, depth bilinearly with its zeros mixed in; nothing is filled."""
-    from mudg.diffusion.clips.condition import ConditionRules, build_conditions
+    from mudg.diffusion.condition import ConditionRules, build_conditions
     from mudg.scene.clouds import read_fused
     from mudg.scene.read import read_scene
 
@@ -546,7 +550,7 @@ def test_short_trajectories_are_refused_in_words(street, tmp_path):
 
 
 def test_models_come_back_as_they_were(street, model):
-    loaded = files.load(street / "model")
+    loaded = published.load(street / "model")
     condition = some_condition()
     loaded.text.copy_(model.text)
     assert torch.equal(loaded.sample(condition, SampleRequest(2)).rgb, model.sample(condition, SampleRequest(2)).rgb)

@@ -16,8 +16,8 @@ from mudg.base.types import Photo
 from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
-from mudg.diffusion.clips.condition import ConditionRules, build_conditions
-from mudg.diffusion.published.model import PublishedLatents
+from mudg.diffusion.condition import ConditionRules, build_conditions
+from mudg.diffusion.published import PublishedLatents
 from mudg.diffusion.requests import SampleRequest
 from mudg.formats.settings import IngestConfig
 from mudg.scene.clouds import read_fused

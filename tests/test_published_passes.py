@@ -11,13 +11,11 @@ from test_published import some_condition
 from toy_published import tiny_model
 
 from mudg.base.errors import UsageError
-from mudg.diffusion import views
-from mudg.diffusion.published.kl_vae import Decoder, Encoder
-from mudg.diffusion.published.model import PublishedConfig, PublishedMDM, WorkSplit
-from mudg.diffusion.published.video_unet import Attention, Resampler, VideoUNet
+from mudg.diffusion import memory_plan, views
+from mudg.diffusion.published import PublishedConfig, PublishedMDM, WorkSplit
+from mudg.diffusion.published_network import Attention, Decoder, Encoder, Resampler, VideoUNet
 from mudg.diffusion.requests import SampleRequest
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.diffusion.training import memory_plan
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.networks.clip import ImageTower
 
 

@@ -15,14 +15,13 @@ from mudg import native
 from mudg.base import palette
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, FusedCloud, Photo, PointCloud, RenderPlanes, Track
-from mudg.diffusion import files, stacked
+from mudg.diffusion import city_clips, clips, model_files
+from mudg.diffusion import condition as conditions
 from mudg.diffusion import model as mdm
-from mudg.diffusion.clips import condition as clips
-from mudg.diffusion.clips import from_city
-from mudg.diffusion.clips import shards as clip_shards
-from mudg.diffusion.clips.condition import build_conditions
-from mudg.diffusion.clips.from_city import CityClipRules
-from mudg.diffusion.extended import extended
+from mudg.diffusion import model as stacked
+from mudg.diffusion.city_clips import CityClipRules
+from mudg.diffusion.condition import build_conditions
+from mudg.diffusion.models import extended
 from mudg.diffusion.requests import SampleRequest
 
 NOTHING = FusedCloud(PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world"), {})
@@ -204,7 +203,7 @@ def test_ground_that_no_image_shows_is_level():
 
 
 def test_below_the_horizon_follows_the_camera():
-    level = clips.below_horizon(view_at(), 0.1)
+    level = conditions.below_horizon(view_at(), 0.1)
     rows = (torch.arange(32) + 0.5 - 16) / 40
     expected = rows[:, None] > 0.1 * torch.hypot(torch.tensor(1.0), (torch.arange(48) + 0.5 - 24)[None] / 40)
     assert torch.equal(level, expected)
@@ -212,13 +211,13 @@ def test_below_the_horizon_follows_the_camera():
     turned = upside_down.world_from_cam.copy()
     turned[:3, :2] *= -1
     upside_down = replace(upside_down, world_from_cam=turned)
-    assert torch.equal(clips.below_horizon(upside_down, 0.1), expected.flip(0))
+    assert torch.equal(conditions.below_horizon(upside_down, 0.1), expected.flip(0))
 
 
 def test_images_are_warped_by_rendered_depth():
     """No point at all: only the render knows that the wall stands at 12 m, here and where the image was recorded."""
     target, recorded = view_at(y=1.5), [Photo(view_at(), image_of_wall(view_at(), 12.0))]
-    truth = clips.image_tensor(image_of_wall(target, 12.0))
+    truth = conditions.image_tensor(image_of_wall(target, 12.0))
     made = build_conditions(NOTHING, [], [target], recorded, RULES, render_at=lambda view: flat_render(view, 12.0))[0]
     found = made.warped[0, 0]
     assert float(found.float().mean()) > 0.8
@@ -294,9 +293,9 @@ def same_planes(read, planes, frames):
 def test_shards_give_back_renders_and_patches(tmp_path):
     first, second = (with_patch(made_up_clip(n), row=4 + n, column=7 + 2 * n, scale=2) for n in (0, 1))
     bare = replace(second, condition=replace(second.condition, renders=None))
-    clip_shards.write_shard(tmp_path, 0, clip_shards.pack_clips([first, bare]))
+    clips.write_shard(tmp_path, 0, clips.pack_clips([first, bare]))
     frames = [1, 3]
-    read, other = (clip_shards.read_clip(tmp_path, 0, n, frames) for n in (0, 1))
+    read, other = (clips.read_clip(tmp_path, 0, n, frames) for n in (0, 1))
     same_planes(read.condition.renders, first.condition.renders, frames)
     assert other.condition.renders is None
     for found, clip in ((read, first), (other, second)):
@@ -311,8 +310,8 @@ def test_shards_give_back_renders_and_patches(tmp_path):
         assert torch.equal(found.fine.clip.condition.valid, clip.fine.clip.condition.valid[frames])
         assert found.fine.clip.condition.views[0].camera.width == 24
         assert found.fine.clip.fine is None
-    clip_shards.write_shard(tmp_path, 1, clip_shards.pack_clips([replace(bare, fine=None)]))
-    plain = clip_shards.read_clip(tmp_path, 1, 0, frames)
+    clips.write_shard(tmp_path, 1, clips.pack_clips([replace(bare, fine=None)]))
+    plain = clips.read_clip(tmp_path, 1, 0, frames)
     assert plain.fine is None and plain.condition.renders is None
 
 
@@ -330,7 +329,7 @@ def test_clip_and_patch_are_varied_in_the_same_way():
     clip = with_patch(replace(plain, condition=given, shift_m=2.0), row=6, column=10)
     seen = set()
     for seed in range(60):
-        made = clip_shards.vary(clip, np.random.default_rng(seed))
+        made = clips.vary(clip, np.random.default_rng(seed))
         fine, part = made.fine, made.fine.clip
         mirrored = made.shift_m < 0
         assert fine.column == (48 - 10 - 12 if mirrored else 10) and fine.row == 6
@@ -359,7 +358,7 @@ def test_a_mirrored_render_is_the_mirror_image():
     clip = replace(made_up_clip(0), shift_m=1.0)
     full = torch.full_like(clip.condition.valid, 3, dtype=torch.uint8)
     clip = replace(clip, condition=replace(clip.condition, semantics=full, backdrop_semantics=full))
-    made = [clip_shards.vary(clip, np.random.default_rng(seed)) for seed in range(12)]
+    made = [clips.vary(clip, np.random.default_rng(seed)) for seed in range(12)]
     turned = [m for m in made if m.shift_m < 0 and m.condition.renders is not None]
     assert turned
     for one in turned:
@@ -371,11 +370,11 @@ def test_a_mirrored_render_is_the_mirror_image():
 def test_patches_of_all_scales_have_one_side(size, side):
     from test_clips import some_clip
 
-    assert from_city.patch_side(size) == side
+    assert city_clips.patch_side(size) == side
     for scale in (2, 3, 4):
         full = some_clip(1, size[1] * scale, size[0] * scale)
         full = replace(full, condition=replace(full.condition, semantics=None))
-        found = from_city.cut_patch(full, scale, side, np.random.default_rng(scale))
+        found = city_clips.cut_patch(full, scale, side, np.random.default_rng(scale))
         assert found.clip.rgb.shape[-2:] == (side, side) and found.scale == scale
         top, left = found.row * scale, found.column * scale
         assert top + side <= size[1] * scale and left + side <= size[0] * scale
@@ -392,19 +391,19 @@ def test_clips_of_a_fitted_city_show_its_full_size_in_their_patches():
     if native.library() is None:
         pytest.skip("the native library is not built")
     rules = CityClipRules(width=48, height=32, window=1, clips=2, fitted=True)
-    scales = {city: from_city.fine_of(rules, city) for city in range(40)}
+    scales = {city: city_clips.fine_of(rules, city) for city in range(40)}
     assert set(scales.values()) == {2, 3, 4}
-    assert from_city.fine_of(rules, from_city.HELD_OUT) == rules.fine
+    assert city_clips.fine_of(rules, city_clips.HELD_OUT) == rules.fine
     city = next(number for number, scale in scales.items() if scale == 3)
-    log = from_city.make_log(rules, city, rules.frames)
+    log = city_clips.make_log(rules, city, rules.frames)
     front = next(view for view in log.world.frame_views("front"))
     assert (front.camera.width, front.camera.height) == (144, 96)
-    made = from_city.make_clips(rules, city, log, flat_render)
+    made = city_clips.make_clips(rules, city, log, flat_render)
     for number, clip in enumerate(made):
         fine = clip.fine
         assert (fine.scale, *fine.clip.rgb.shape[-2:]) == (3, 60, 60)
-        view = from_city.shifted_view(
-            log.world, log.world.frame_views("front")[from_city.start_of(rules, city, number)], clip.shift_m
+        view = city_clips.shifted_view(
+            log.world, log.world.frame_views("front")[city_clips.start_of(rules, city, number)], clip.shift_m
         )
         truth = torch.from_numpy(log.truth(view).rgb).permute(2, 0, 1).float()
         rows, columns = (slice(3 * start, 3 * start + 60) for start in (fine.row, fine.column))
@@ -417,11 +416,11 @@ def test_images_of_held_out_moments_are_not_given():
     if native.library() is None:
         pytest.skip("the native library is not built")
     rules = CityClipRules(width=48, height=32, window=1, clips=1, fitted=True)
-    log = from_city.make_log(rules, from_city.HELD_OUT, 9)
+    log = city_clips.make_log(rules, city_clips.HELD_OUT, 9)
     times = sorted({photo.view.time_s for photo in log.recorded})
-    given = {photo.view.time_s for photo in from_city.given_images(rules, from_city.HELD_OUT, log)}
+    given = {photo.view.time_s for photo in city_clips.given_images(rules, city_clips.HELD_OUT, log)}
     assert set(times) - given == {times[4], times[8]}
-    assert from_city.given_images(replace(rules, fitted=False), from_city.HELD_OUT, log) == log.recorded
+    assert city_clips.given_images(replace(rules, fitted=False), city_clips.HELD_OUT, log) == log.recorded
 
 
 # the model ----------------------------------------------------------------------------------------
@@ -503,17 +502,17 @@ def test_renders_are_not_given_up_again():
 
 def test_models_described_before_there_were_renders_load():
     values = asdict(TINY)
-    for name in files.LATER_FIELDS:
+    for name in model_files.LATER_FIELDS:
         del values[name]
-    assert files.config_from_dict(values) == TINY
-    assert files.config_from_dict(asdict(WITH_RENDERS)) == WITH_RENDERS
+    assert model_files.config_from_dict(values) == TINY
+    assert model_files.config_from_dict(asdict(WITH_RENDERS)) == WITH_RENDERS
     with pytest.raises(InputError):
-        files.config_from_dict({**values, "later": 1})
+        model_files.config_from_dict({**values, "later": 1})
 
 
 def test_a_model_with_renders_comes_back(tmp_path):
     model = randomised(WITH_RENDERS)
-    files.save(model, tmp_path / "m", "", {})
-    loaded = files.load(tmp_path / "m")
+    model_files.save(model, tmp_path / "m", "", {})
+    loaded = model_files.load(tmp_path / "m")
     assert loaded.config == WITH_RENDERS
     assert torch.allclose(loaded.finisher.leave.weight, model.finisher.leave.weight, rtol=1e-3, atol=1e-4)

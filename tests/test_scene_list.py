@@ -15,10 +15,17 @@ from mudg.base import config as configuration
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.location import Location
-from mudg.diffusion import learn
-from mudg.diffusion.clips.sources import FolderOfShards, ShardCache, StreamedShards
-from mudg.diffusion.training import clips as learn_clips
-from mudg.diffusion.training.scene_list import ListedScene, ListedShards, SceneList, is_list, read_list
+from mudg.diffusion import learn, learn_clips
+from mudg.diffusion.shard_sources import (
+    FolderOfShards,
+    ListedScene,
+    ListedShards,
+    SceneList,
+    ShardCache,
+    StreamedShards,
+    is_list,
+    read_list,
+)
 from mudg.steps.learn import Learn
 
 
@@ -235,26 +242,25 @@ def test_reading_ahead_brings_what_will_be_drawn(address, tmp_path):
 
 def test_a_listed_log_is_cut_when_it_is_drawn(tmp_path, monkeypatch):
     """Made once; how many clips there are is not counted again."""
-    from mudg.diffusion.clips import from_log
-    from mudg.diffusion.training import scene_list
+    from mudg.diffusion import log_clips, shard_sources
 
     calls = collections.Counter()
-    windows = [from_log.LogWindow("front", ("a",), False)] * 3
-    monkeypatch.setattr(scene_list.from_log, "log_source", lambda text: from_log.LogSource(tmp_path, tmp_path))
-    monkeypatch.setattr(scene_list.store, "digest", lambda path: "content")
-    monkeypatch.setattr(scene_list, "read_scene", lambda path: calls.update(["scene"]))
-    monkeypatch.setattr(scene_list.from_log, "log_windows", lambda scene, rules: windows)
+    windows = [log_clips.LogWindow("front", ("a",), False)] * 3
+    monkeypatch.setattr(shard_sources.log_clips, "log_source", lambda text: log_clips.LogSource(tmp_path, tmp_path))
+    monkeypatch.setattr(shard_sources.store, "digest", lambda path: "content")
+    monkeypatch.setattr(shard_sources, "read_scene", lambda path: calls.update(["scene"]))
+    monkeypatch.setattr(shard_sources.log_clips, "log_windows", lambda scene, rules: windows)
 
     def write_log(source, rules, chosen, folder):
         calls.update(["write"])
         for number, _ in chosen:
             store.atomic_write(folder / f"city_{number:07d}.safetensors", b"x")
 
-    monkeypatch.setattr(scene_list.from_log, "write_log", write_log)
+    monkeypatch.setattr(shard_sources.log_clips, "write_log", write_log)
     scenes = SceneList([ListedScene(path="log=fused")], {}, 0, "list")
 
     def make() -> ListedShards:
-        return ListedShards(scenes, ShardCache(tmp_path / "cache", 10**9), from_log.LogClipRules(48, 32), 0.0)
+        return ListedShards(scenes, ShardCache(tmp_path / "cache", 10**9), log_clips.LogClipRules(48, 32), 0.0)
 
     shards = make()
     assert len(shards.opened(0).shards) == 3 and calls == {"scene": 1}

@@ -21,7 +21,7 @@ from mudg.city.world import CityWorld
 from mudg.core import losses as perceptual
 from mudg.core import metrics
 from mudg.core.metrics import Pair
-from mudg.diffusion import files
+from mudg.diffusion import model_files
 from mudg.editing.view_settings import ScoreConfig
 from mudg.networks.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance, lpips_shapes
 from mudg.scoring import score
@@ -50,7 +50,7 @@ def pictures():
 
 @pytest.fixture(scope="module")
 def distance():
-    perceptual_of = PerceptualDistance(CodecFeatures(files.load("embedded").codec))
+    perceptual_of = PerceptualDistance(CodecFeatures(model_files.load("embedded").codec))
     return lambda made, truth, mask=None: perceptual_of(pair(rgb=made, truth_rgb=truth, mask=mask))
 
 

@@ -13,11 +13,11 @@ from mudg.base import palette, scratch
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, View
 from mudg.core import trajectory
-from mudg.diffusion import files, synthesize
-from mudg.diffusion.clips import condition, stacked
-from mudg.diffusion.extended import extended
+from mudg.diffusion import condition, model_files, synthesize
+from mudg.diffusion import condition as stacked
 from mudg.diffusion.model import MDM, MDMConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.models import extended
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import PreparedImages, ViewMaker, add_detail, windows
 from mudg.gaussians import fit
 from mudg.gaussians.rendering import FAR_M, render_condition, render_planes
@@ -54,7 +54,7 @@ def world(tmp_path_factory):
             area_px=192 * 128,
         )
     )
-    files.save(model, root / "model", "", {})
+    model_files.save(model, root / "model", "", {})
     config = SynthesizeConfig(
         cameras=("front",),
         shifts_m=(1.0,),
@@ -287,9 +287,9 @@ def fitted(world, tmp_path_factory):
     folder = tmp_path_factory.mktemp("fitted")
     settings = fit_config(method="street_gaussians", iterations=4, start__gaussians=900)
     scene = Fit(scene=root / "scene", fused=root / "fused", out=folder / "fit", settings=settings).run()
-    before = files.load(root / "model")
+    before = model_files.load(root / "model")
     grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1))
-    files.save(extended(before, grown), folder / "model", "", {})
+    model_files.save(extended(before, grown), folder / "model", "", {})
     return scene, folder / "model"
 
 

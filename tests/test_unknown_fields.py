@@ -295,7 +295,7 @@ def test_parts_of_real_logs_hold_no_unknown_field(
     calibration text."""
     pytest.importorskip("pyarrow")
     from mudg.formats.importers import argoverse2
-    from mudg.formats.importers.kitti.files import read_calibration_text, read_label_text
+    from mudg.formats.importers.kitti_files import read_calibration_text, read_label_text
     from mudg.formats.importers.waymo.logs import OFFICIAL, ParquetTable, TfrecordLog
 
     av2, waymo, tracking = (shared_data(name) for name in ("av2_two_sweeps", "waymo_frame", "kitti_tracking_0001"))

@@ -18,10 +18,10 @@ from toy_published import TINY, dynamicrafter_checkpoint, scale_table, tiny_chec
 from mudg import app
 from mudg.base import weights
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
-from mudg.diffusion.published import convert
-from mudg.diffusion.published import model as published_files
-from mudg.diffusion.published.model import PublishedConfig
-from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.diffusion import convert
+from mudg.diffusion import published as published_files
+from mudg.diffusion.published import PublishedConfig
+from mudg.diffusion.settings import ConvertConfig
 
 CONFIG = ConvertConfig(resolution="320x512")
 ENTER = "model.diffusion_model.input_blocks.0.0.weight"

@@ -10,9 +10,9 @@ import numpy as np
 import torch
 
 from mudg.base.types import Camera, Clip, Condition, FinePatch, RenderPlanes, View
-from mudg.diffusion.clips import shards as clip_shards
-from mudg.diffusion.clips.from_city import HELD_OUT
-from mudg.diffusion.settings.learn import LearnCodec, LearnConfig
+from mudg.diffusion import clips as clip_shards
+from mudg.diffusion.city_clips import HELD_OUT
+from mudg.diffusion.settings import LearnCodec, LearnConfig
 
 WIDTH, HEIGHT, WINDOW = 48, 32, 4
 

@@ -8,12 +8,10 @@ from toy_clips import with_settings
 
 from mudg.base import weights
 from mudg.core.noise import ScheduleConfig
-from mudg.diffusion.published import convert
-from mudg.diffusion.published.kl_vae import AutoencoderConfig
-from mudg.diffusion.published.model import PublishedConfig, PublishedMDM
-from mudg.diffusion.published.video_unet import ResamplerConfig, VideoUNetConfig
-from mudg.diffusion.settings.convert import ConvertConfig
-from mudg.diffusion.settings.learn import LearnConfig
+from mudg.diffusion import convert
+from mudg.diffusion.published import PublishedConfig, PublishedMDM
+from mudg.diffusion.published_network import AutoencoderConfig, ResamplerConfig, VideoUNetConfig
+from mudg.diffusion.settings import ConvertConfig, LearnConfig
 from mudg.networks.clip import TowerConfig
 
 TINY = PublishedConfig(

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 from shared import SMALL_PUBLISHED, device_of, drawn_model, finish, flags, generator_of, measured
 
-from mudg.diffusion.published.model import PublishedConfig
+from mudg.diffusion.published import PublishedConfig
 
 MODALITIES = 3
 STEPS = (50, 20, 8, 4)

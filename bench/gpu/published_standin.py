@@ -33,20 +33,16 @@ from mudg.core import metrics
 from mudg.core.metrics import Pair
 from mudg.core.noise import ScheduleConfig
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
-from mudg.diffusion import files as mdm_files
-from mudg.diffusion.clips import from_city
-from mudg.diffusion.clips import shards as clip_shards
-from mudg.diffusion.published import model as published_files
-from mudg.diffusion.published.kl_vae import AutoencoderConfig
-from mudg.diffusion.published.model import GUIDANCE, PublishedConfig, PublishedLatents, PublishedMDM, WorkSplit
-from mudg.diffusion.published.video_unet import ResamplerConfig, VideoUNetConfig
+from mudg.diffusion import city_clips, model_files, published, score
+from mudg.diffusion import clips as clip_shards
+from mudg.diffusion.published import GUIDANCE, PublishedConfig, PublishedLatents, PublishedMDM, WorkSplit
+from mudg.diffusion.published_network import AutoencoderConfig, ResamplerConfig, VideoUNetConfig
 from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
-from mudg.diffusion.training import score as learn_score
 from mudg.networks.clip import TowerConfig
 from mudg.networks.codec import MODALITIES
 from mudg.networks.featnets import CodecFeatures, PerceptualDistance
 
-RULES = from_city.CityClipRules(width=96, height=64, window=8, clips=4, published=True)
+RULES = city_clips.CityClipRules(width=96, height=64, window=8, clips=4, published=True)
 CONFIG = PublishedConfig(
     net=VideoUNetConfig(
         channels_in=48,
@@ -270,8 +266,8 @@ def trained(
     if not (work / "codec").is_dir():
         train_codec(model, clips, options.codec_steps)
         tensors = {name: value.cpu() for name, value in model.state_dict().items()}
-        published_files.save(work / "codec", config, tensors, {}, "An autoencoder of a stand-in.\n")
-    model = published_files.load(work / "codec", device, torch.float32)
+        published.save(work / "codec", config, tensors, {}, "An autoencoder of a stand-in.\n")
+    model = published.load(work / "codec", device, torch.float32)
     for value in (*model.parameters(), *model.buffers()):
         value.data = value.data.clone()  # out of the mapped files: training writes in place
     model.requires_grad_(False)
@@ -314,7 +310,7 @@ def generated_with(model: PublishedMDM, clips: Sequence[Clip], how: Sampling) ->
 def scores_of(clips: Sequence[Clip], made: Sequence[GeneratedClip], distance: PerceptualDistance) -> dict[str, float]:
     """Mean scores of generated clips; classes are pooled."""
     rows, matrices = zip(
-        *(learn_score.score_clip(clip, sample) for clip, sample in zip(clips, made, strict=True)), strict=True
+        *(score.score_clip(clip, sample) for clip, sample in zip(clips, made, strict=True)), strict=True
     )
     frames = (
         (a, b) for clip, sample in zip(clips, made, strict=True) for a, b in zip(sample.rgb, clip.rgb, strict=True)
@@ -364,12 +360,12 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
     for name, full, small in (("steps", 20_000, 4), ("codec_steps", 5000, 2), ("cities", 400, 1)):
         setattr(options, name, getattr(options, name) or (small if options.small else full))
     rules, config = (SMALL_RULES, SMALL_CONFIG) if options.small else (RULES, CONFIG)
-    seen, unseen = range(options.cities), from_city.REPORTED[: 1 if options.small else None]
+    seen, unseen = range(options.cities), city_clips.REPORTED[: 1 if options.small else None]
     (work / "clips").mkdir(parents=True, exist_ok=True)
-    from_city.write_missing(rules, [*seen, *unseen], work / "clips")
+    city_clips.write_missing(rules, [*seen, *unseen], work / "clips")
     model = trained(options, config, every_clip(work / "clips", seen, rules.window), device)
     clips = every_clip(work / "clips", unseen, rules.window)[: options.clips]
-    distance = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec))
+    distance = PerceptualDistance(CodecFeatures(model_files.load("embedded").codec))
     rows, strips = list[dict[str, Any]](), list[NDArray[np.uint8]]()
     for how in GRID[: options.rows]:
         made = generated_with(model, clips, how)

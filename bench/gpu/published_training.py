@@ -19,7 +19,7 @@ import torch
 from shared import SMALL_PUBLISHED, device_of, drawn_model, finish, flags, generator_of, measured
 
 from mudg.base import seeds
-from mudg.diffusion.published.model import PublishedConfig, PublishedLatents, PublishedMDM
+from mudg.diffusion.published import PublishedConfig, PublishedLatents, PublishedMDM
 
 MODALITIES = ("rgb", "depth", "semantics")
 

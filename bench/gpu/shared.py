@@ -18,10 +18,9 @@ from mudg.base import seeds, store
 from mudg.base.devices import choose_device
 from mudg.base.versions import environment
 from mudg.core.noise import ScheduleConfig
-from mudg.diffusion.published.kl_vae import AutoencoderConfig
-from mudg.diffusion.published.model import PublishedConfig, PublishedMDM
-from mudg.diffusion.published.video_unet import ResamplerConfig, VideoUNetConfig
-from mudg.diffusion.training import memory_plan
+from mudg.diffusion import memory_plan
+from mudg.diffusion.published import PublishedConfig, PublishedMDM
+from mudg.diffusion.published_network import AutoencoderConfig, ResamplerConfig, VideoUNetConfig
 from mudg.networks.clip import TowerConfig
 
 SMALL_PUBLISHED = PublishedConfig(

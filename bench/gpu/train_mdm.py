@@ -19,8 +19,8 @@ from typing import Any
 from shared import device_of, finish, flags, work_folder
 
 from mudg.base import config as configuration
-from mudg.diffusion import files
-from mudg.diffusion.settings.learn import LearnCodec, LearnConfig
+from mudg.diffusion import model_files
+from mudg.diffusion.settings import LearnCodec, LearnConfig
 from mudg.steps.learn import Learn
 
 NO_LONGER = ("textures",)
@@ -32,7 +32,7 @@ def recipe(steps: int, textures: str, device: str, workers: int) -> LearnConfig:
 
     The recipe itself has none: its clips were made before.
     """
-    given = dict(files.facts("embedded")["recipe"])
+    given = dict(model_files.facts("embedded")["recipe"])
     given["data"] = {name: value for name, value in given["data"].items() if name not in NO_LONGER}
     config = configuration.load(LearnConfig, None, None, {**given, "steps": steps})
     return replace(
@@ -92,12 +92,14 @@ def main(words: Sequence[str] | None = None) -> dict[str, Any]:
     began = time.perf_counter()
     model = Learn(out=work_folder(options) / "learned", settings=config).run()
     seconds = time.perf_counter() - began
-    after, before = files.facts(model)["held_out"], files.facts("embedded")["held_out"]
+    after, before = model_files.facts(model)["held_out"], model_files.facts("embedded")["held_out"]
     rows = [{"what": "training", "steps": config.steps, "seconds": seconds, "seconds per step": seconds / config.steps}]
     rows += [
         {"what": name, "held_out": json.dumps(scores)} for name, scores in (("shipped", before), ("trained", after))
     ]
-    return finish(options, device, rows, {"shipped": files.digest("embedded"), "trained": files.digest(model)})
+    return finish(
+        options, device, rows, {"shipped": model_files.digest("embedded"), "trained": model_files.digest(model)}
+    )
 
 
 if __name__ == "__main__":

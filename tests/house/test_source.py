@@ -213,7 +213,7 @@ CONNECTS = {
 CONNECTING = {
     "base/location.py": {"fsspec", "ssl"},
     "fleet/engines.py": {"ray", "submitit"},
-    "diffusion/training/parallel.py": {"torch.distributed"},
+    "diffusion/parallel.py": {"torch.distributed"},
     "viewer/server.py": {"http"},
     "viewer/view.py": {"http"},
 }
@@ -358,7 +358,7 @@ def test_outputs_are_kept_apart_from_inputs(package_dir: Path) -> None:
         compared = [
             call.lineno for call, function in calls(tree) if function.endswith(("refuse_overlap", "_refuse_overlap"))
         ]
-        if len(compared) < len(opened) and name not in ("benchmarks/poses.py", "diffusion/training/clips.py"):
+        if len(compared) < len(opened) and name not in ("benchmarks/poses.py", "diffusion/city_clips.py"):
             problems.append(f"{name}:{opened[0]}: RunDir.open without refuse_overlap")
     refuse(problems)
 

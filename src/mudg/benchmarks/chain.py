@@ -23,7 +23,7 @@ from mudg.base.types import Trajectory
 from mudg.benchmarks.loop import run_step
 from mudg.benchmarks.rows import EXACT, FILL, LONGER, REPAIRED, Row, usual_fit
 from mudg.benchmarks.settings import BenchConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.view_settings import RenderConfig
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import read_fused

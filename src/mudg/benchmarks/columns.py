@@ -29,7 +29,7 @@ from mudg.benchmarks.truth import Target, Targets, read_targets
 from mudg.core import metrics
 from mudg.core.lidar import DEPTH_LIMIT_M
 from mudg.core.pictures import class_colors, depth_colors, error_image, resize_nearest, resize_rgb, to_bytes
-from mudg.diffusion import files as mdm_files
+from mudg.diffusion import model_files
 from mudg.formats.exporters.video import jpeg_bytes
 from mudg.networks.featnets import CodecFeatures, PerceptualDistance
 from mudg.scene.observations import list_observation_sets, read_observations
@@ -258,7 +258,7 @@ COLUMNS: Final[dict[str, Column]] = {
 @functools.cache
 def shipped_features(device: torch.device | None = None) -> CodecFeatures:
     """The network behind perceptual distances, the shipped codec, loaded once per process and device."""
-    return CodecFeatures(mdm_files.load("embedded").codec).to(device or torch.device("cpu"))
+    return CodecFeatures(model_files.load("embedded").codec).to(device or torch.device("cpu"))
 
 
 class ScoreTargets(Output):

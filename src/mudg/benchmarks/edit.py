@@ -55,7 +55,7 @@ from mudg.core.edit import Motion
 from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.raster.rasterize import rasterize
 from mudg.core.view_metrics import SAME
-from mudg.diffusion.settings.harmonize import HarmonizeConfig
+from mudg.diffusion.settings import HarmonizeConfig
 from mudg.editing.assets import complete_asset, write_asset
 from mudg.editing.carried import EditedDrive, carry_out
 from mudg.editing.harmonised import repairing

@@ -15,16 +15,13 @@ from mudg.base import log
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import metrics
-from mudg.diffusion import files as mdm_files
-from mudg.diffusion.clips import from_city
-from mudg.diffusion.clips.condition import ConditionRules, WarpSource, build_conditions
-from mudg.diffusion.clips.from_city import CityClipRules
+from mudg.diffusion import city_clips, model_files, score
+from mudg.diffusion.city_clips import CityClipRules, fit_city
+from mudg.diffusion.condition import ConditionRules, WarpSource, build_conditions
+from mudg.diffusion.memory_plan import choose_bf16
 from mudg.diffusion.model import MDM
 from mudg.diffusion.requests import SampleRequest, generated
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.diffusion.training import score as learn_score
-from mudg.diffusion.training.clips import fit_city
-from mudg.diffusion.training.memory_plan import choose_bf16
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import windows
 
 SEAM_FRAMES, SEAM_SHIFT_M = 26, 3.0
@@ -36,23 +33,28 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     bf16 = choose_bf16(config.precision, device)
     request = SampleRequest(1, config.seed, sampler=config.sampler, eta=config.eta, bf16=bf16)
     MDM.check_request(request)
-    model = mdm_files.load(config.model).to(device)
-    cities = from_city.LISTS[config.cities][: config.count]
+    model = model_files.load(config.model).to(device)
+    cities = city_clips.LISTS[config.cities][: config.count]
     rules = CityClipRules(window=model.config.window, fitted=model.config.renders)
-    from_city.write_missing(rules, cities, out / "clips", fit_city if rules.fitted else None)
-    result: dict[str, Any] = {"cities": list(cities), "model": mdm_files.digest(config.model), "bf16": bf16, "rows": []}
+    city_clips.write_missing(rules, cities, out / "clips", fit_city if rules.fitted else None)
+    result: dict[str, Any] = {
+        "cities": list(cities),
+        "model": model_files.digest(config.model),
+        "bf16": bf16,
+        "rows": [],
+    }
     lines = [f"# Diffusion model on {len(cities)} held-out cities ({config.cities} list), exact truth", ""]
     with log.task("scoring", 2 * len(config.steps)) as bar:
         for given in (True, False):
             for steps in config.steps:
                 picture = out / f"steps_{steps}_{'classes' if given else 'plain'}.png"
                 started = time.perf_counter()
-                scores = learn_score.score(
+                scores = score.score(
                     model,
                     cities,
                     out / "clips",
                     replace(request, steps=steps),
-                    prepare=None if given else learn_score.without_classes,
+                    prepare=None if given else score.without_classes,
                     picture=picture,
                 )
                 seconds = (time.perf_counter() - started) / scores["clips"]
@@ -63,7 +65,7 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
                     f"## {title}, {seconds:.1f} s per clip with its scoring",
                     "",
                     "```",
-                    learn_score.table(scores),
+                    score.table(scores),
                     "```",
                     "",
                 ]
@@ -88,10 +90,10 @@ def seam(model: MDM, config: BenchConfig, request: SampleRequest) -> dict[str, A
     them by default, with the sampler of the request. Returned per place: the mean of (change made / change of the
     truth) over pairs of frames; and the pairs themselves.
     """
-    city, usual = from_city.LISTS[config.cities][0], SynthesizeConfig()
+    city, usual = city_clips.LISTS[config.cities][0], SynthesizeConfig()
     rules = CityClipRules(window=model.config.window)
-    record = from_city.make_log(rules, city, frames=SEAM_FRAMES)
-    views = [from_city.shifted_view(record.world, v, SEAM_SHIFT_M) for v in record.world.frame_views("front")]
+    record = city_clips.make_log(rules, city, frames=SEAM_FRAMES)
+    views = [city_clips.shifted_view(record.world, v, SEAM_SHIFT_M) for v in record.world.frame_views("front")]
     small = [view.resized(rules.width, rules.height) for view in views]
     truths = [record.world.render(view) for view in small]
     sizes = (rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)

@@ -40,7 +40,7 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import standard_error, virtual_fits_of
 from mudg.benchmarks.views import TRUTH, Views, of_log, score_settings
 from mudg.core.metrics import METRICS
-from mudg.diffusion import files as mdm_files
+from mudg.diffusion import model_files
 from mudg.editing.view_settings import ScoreConfig
 from mudg.gaussians.methods import METHODS
 from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, compared, distances
@@ -144,14 +144,14 @@ def run(
     read = {f"log {log.name}": log.source for log in logs if not isinstance(log, ListedCity)}
     weights = _weights_of(config.score)
     refuse_overlap(
-        out, {"model": mdm_files.folder_of(config.model), "freevs-model": config.freevs_model, **read, **weights}
+        out, {"model": model_files.folder_of(config.model), "freevs-model": config.freevs_model, **read, **weights}
     )
     digests = {name: store.digest(Path(path)) for name, path in weights.items()}  # before any work: one may be missing
-    digests |= {"freevs_model": mdm_files.digest(config.freevs_model)} if config.freevs_model else {}
+    digests |= {"freevs_model": model_files.digest(config.freevs_model)} if config.freevs_model else {}
     refuse_foreign(out, PAGES, lambda doc: doc["bench"] == "paper" and doc["table"]["name"] == table.name)
     generates = [row.changes for row in rows if METHODS[row.method].made_by == "synthesize" and not row.left_out]
     refuse_unfit(config, preset, rows, [replace(generator_of(config), **changes) for changes in generates])
-    measured, renders = score_settings(config, table), mdm_files.uses_renders(config.model)
+    measured, renders = score_settings(config, table), model_files.uses_renders(config.model)
     fill = Row(FILL, ANCHORS[FILL])
     jobs = [
         PaperLog(log, out / log.name, table, (fill, *rows), config, of_log(measured, log.name), renders, overwrite)
@@ -162,7 +162,7 @@ def run(
         "missing_scenes": missing_scenes(table, logs),
         "iterations": config.iterations,
         "seed": config.seed,
-        "model": mdm_files.digest(config.model),
+        "model": model_files.digest(config.model),
         "renders": renders,
         "videos": config.videos,
         "score": configuration.result_settings(measured),

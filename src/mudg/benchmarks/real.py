@@ -48,9 +48,9 @@ from mudg.benchmarks.rows import BASE, FILL, Row, Sees, chain_settings, generato
 from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import virtual_fits_of
 from mudg.benchmarks.truth import MakeTargets, read_targets
-from mudg.diffusion import files as mdm_files
+from mudg.diffusion import model_files
 from mudg.diffusion.adapt import why_not
-from mudg.diffusion.settings.adapt import AdaptConfig
+from mudg.diffusion.settings import AdaptConfig
 from mudg.editing import render
 from mudg.editing.view_settings import RenderConfig
 from mudg.scene.part import write_part
@@ -109,13 +109,13 @@ def run(
     """
     rows, protocols, logs, out = real_rows(config, preset), protocols_of(config.protocols), names_of(sources), Path(out)
     refuse_overlap(
-        out, {"model": mdm_files.folder_of(config.model), **{f"log {name}": path for name, path in logs.items()}}
+        out, {"model": model_files.folder_of(config.model), **{f"log {name}": path for name, path in logs.items()}}
     )
     refuse_foreign(out, PAGES, lambda document: document["bench"] == "real")
     generates = any(row.sees and row.fit is None for row in rows)
     refuse_unfit(config, preset, rows, [generator_of(config)] * generates)
     training = replace(adaptation or AdaptConfig(), model=config.model, processes=1, seed=config.seed)
-    if mdm_files.uses_renders(config.model):  # no other model is adapted
+    if model_files.uses_renders(config.model):  # no other model is adapted
         training = replace(training, precision=config.precision)
     scenes = {name: imported(config, path, out / name / "scene", overwrite) for name, path in logs.items()}
     jobs = [
@@ -136,7 +136,7 @@ def run(
         "protocols": list(config.protocols),
         "iterations": config.iterations,
         "seed": config.seed,
-        "model": mdm_files.digest(config.model),
+        "model": model_files.digest(config.model),
         "shown_cameras": list(config.shown),
         "resolution": config.resolution,
         "frames": config.frames,
@@ -308,7 +308,7 @@ class SplitJob:
         model = self.config.model
         if sees == "points":
             return DiffusionUse("points", model)
-        if not mdm_files.uses_renders(model):
+        if not model_files.uses_renders(model):
             return DiffusionUse("points", model, "the model does not use renders, so it sees points alone")
         if sees == "renders":
             return DiffusionUse("renders", model)

@@ -12,10 +12,9 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.plain_yaml import parse_yaml
 from mudg.benchmarks.papers import PaperTable
 from mudg.benchmarks.settings import BenchConfig, bench_preset
-from mudg.diffusion import files as mdm_files
-from mudg.diffusion import views
-from mudg.diffusion.published.model import is_published
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion import model_files, views
+from mudg.diffusion.published import is_published
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.methods import METHODS, PUBLISHED
 from mudg.gaussians.recipes import recipe_of
 from mudg.gaussians.settings import FitConfig
@@ -177,7 +176,7 @@ def refuse_unfit(
     """
     fits = [row.fit for row in rows if row.fit is not None]
     virtual = [fit for fit in fits if {"virtual", "repaired"} & set(METHODS[fit.method].supervision)]
-    renders = mdm_files.uses_renders(config.model)
+    renders = model_files.uses_renders(config.model)
     if any(fit.method == REPAIRED for fit in fits) and not renders:
         raise UsageError(
             f"{REPAIRED} repairs renders, and this diffusion model uses none",
@@ -292,7 +291,7 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
         changes: dict[str, dict[str, Any]] = {"freevs": {"condition": "freevs", "model": freevs}}
         if freevs and is_published(config.model):  # the row's own model is a small one, which samples in its own way
             changes["freevs"] |= {name: getattr(SynthesizeConfig(), name) for name in SAMPLING}
-        if not mdm_files.uses_renders(config.model):
+        if not model_files.uses_renders(config.model):
             changes[REPAIRED] = {"model": ""}
         control = Row(LONGER, f"{LONGER_TITLE} ({LONGER})", BASE)
         rows = [

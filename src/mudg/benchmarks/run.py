@@ -31,8 +31,8 @@ from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.benchmarks import edit, edit_runs, mdm, paper, poses, real, shift
 from mudg.benchmarks.rows import changed_settings, flag_of, generator_of
 from mudg.benchmarks.settings import BenchConfig, bench_preset
-from mudg.diffusion import files as mdm_files
-from mudg.diffusion.published.model import is_published
+from mudg.diffusion import model_files
+from mudg.diffusion.published import is_published
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.pipeline import refuse_missing
 from mudg.steps.settings.presets import PresetName
@@ -131,8 +131,8 @@ def run(
         )
     if name == SHIFT:
         return shift.run(config, out, preset=preset, overwrite=overwrite)
-    inputs = {"model": mdm_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
-    refuse_overlap(out, {"model": mdm_files.folder_of(config.model) if inputs else ""})
+    inputs = {"model": model_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
+    refuse_overlap(out, {"model": model_files.folder_of(config.model) if inputs else ""})
     choose_device(config.device, "benchmark", NETWORK_KINDS)  # refused before anything is written
     directory = RunDir.open(out, VerbOutput(f"bench {name}", 1, _FILES), result_settings(config), inputs, overwrite)
     if directory.complete:

@@ -38,7 +38,7 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.views import Views, score_settings
 from mudg.city import logs as city_logs
 from mudg.city.logs import STANDARD, LogRules
-from mudg.diffusion import files as mdm_files
+from mudg.diffusion import model_files
 from mudg.steps.settings.presets import PresetName
 
 SHIFTED: Final = "shifted"
@@ -134,7 +134,7 @@ def run(
             settings. Whatever a verb raises.
     """
     rows, out = shift_rows(config, preset), Path(out)
-    refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
+    refuse_overlap(out, {"model": model_files.folder_of(config.model)})
     refuse_foreign(
         out,
         _PAGES,
@@ -143,7 +143,7 @@ def run(
     )
     shifts = {RECORDED: [0.0], **{f"{d:g}": [d, -d] for d in distances_m}}
     places = [PaperPlace(name=name, title="", shifts_m=shifts_m) for name, shifts_m in shifts.items()]
-    table, renders = PaperTable(name="shift", places=places, columns=[]), mdm_files.uses_renders(config.model)
+    table, renders = PaperTable(name="shift", places=places, columns=[]), model_files.uses_renders(config.model)
     jobs = [
         ShiftLog(
             log,
@@ -164,7 +164,7 @@ def run(
         "list": config.list,
         "iterations": config.iterations,
         "seed": config.seed,
-        "model": mdm_files.digest(config.model),
+        "model": model_files.digest(config.model),
         "renders": renders,
         "frames": rules.frames,
         "size_px": [rules.width, rules.height],

@@ -21,7 +21,7 @@ from mudg.benchmarks.papers import RECORDED, PaperTable
 from mudg.benchmarks.places import ListedCity, Log, first_camera, make_scene
 from mudg.benchmarks.rows import EXACT, FILL, Row, generator_of
 from mudg.benchmarks.settings import BenchConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing import render
 from mudg.editing.view_settings import RenderConfig, ScoreConfig
 from mudg.gaussians.methods import METHODS

@@ -1,8 +1,8 @@
 """adapt: the diffusion model, trained for a few steps on the log that it is going to work on.
 
-Read from `PlannedAdaptation`: short fits to what the lessons of the log show (`diffusion/adapt.py`), clips of them
-(`diffusion/adapt.py`), some steps of the `learn` verb, and the comparison on blocks of frames that were kept for it.
-Frames that the scene holds out are never read.
+Read from `PlannedAdaptation`: short fits to what the lessons of the log show, clips of them, some steps of
+the `learn` verb, and the comparison on blocks of frames that were kept for it. Frames that the scene holds out are
+never read.
 
     OUT/model/            the model to use: adapted, or the one started from if that is as good (same layout as
                           `learn`'s)
@@ -29,18 +29,16 @@ from mudg.base.processes import one_torch_thread, run_in_processes
 from mudg.base.types import Clip, Condition, Frame, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.pictures import resize_area, resize_nearest
-from mudg.diffusion import files as mdm_files
-from mudg.diffusion.clips.condition import ConditionRules, WarpSource, build_conditions, image_tensor, warp
-from mudg.diffusion.clips.from_city import HELD_OUT, PATCH_PX, cut_patch
-from mudg.diffusion.clips.from_log import measured_depth
-from mudg.diffusion.clips.shards import pack_clips, shard_path, write_shard
+from mudg.diffusion import model_files, score
+from mudg.diffusion.city_clips import HELD_OUT, PATCH_PX, cut_patch
+from mudg.diffusion.clips import pack_clips, shard_path, write_shard
+from mudg.diffusion.condition import ConditionRules, WarpSource, build_conditions, image_tensor, warp
+from mudg.diffusion.log_clips import measured_depth
+from mudg.diffusion.memory_plan import choose_bf16
 from mudg.diffusion.model import MDM
+from mudg.diffusion.models import model_of_window
 from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, generated_and_finished
-from mudg.diffusion.settings.adapt import AdaptConfig
-from mudg.diffusion.settings.learn import LearnCompute, LearnConfig, LearnData, LearnOptimizer, LearnScore
-from mudg.diffusion.training import score as learn_score
-from mudg.diffusion.training.memory_plan import choose_bf16
-from mudg.diffusion.training.models import model_of_window
+from mudg.diffusion.settings import AdaptConfig, LearnCompute, LearnConfig, LearnData, LearnOptimizer, LearnScore
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import short_fit
@@ -252,7 +250,7 @@ def make_lesson(
     with native.one_thread(), one_torch_thread():
         folder = fit_lesson(config, log, lesson, work / lesson.name, fit_scene)
         device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
-        model = model_of_window(mdm_files.load(config.model), config.block).to(device)
+        model = model_of_window(model_files.load(config.model), config.block).to(device)
         maker = ClipMaker(config, log, lesson, model, folder)
         for number, _, frames in missing:
             write_shard(work / CLIPS, number, pack_clips([maker.make(frames, number)]))
@@ -344,8 +342,8 @@ class PlannedAdaptation:
         Raises:
             InputError: the log is too short, inputs malformed. UsageError: a model that does not use renders.
         """
-        model = mdm_files.load(config.model)
-        if not mdm_files.uses_renders(config.model):
+        model = model_files.load(config.model)
+        if not model_files.uses_renders(config.model):
             raise UsageError(
                 "this model was not trained with renders of a fitted scene",
                 where="--model",
@@ -393,9 +391,9 @@ class PlannedAdaptation:
     def write_model(self, adapted: Path, work: Path, out: Path) -> dict[str, Any]:
         """Write the better one of the model as it was and as it was adapted; returns a summary."""
         record = _choose(self.config, model_of_window(self.model, self.config.block), self.clips, work, out)
-        chosen = mdm_files.load(adapted) if record["adapted"] else self.model
-        facts = {**mdm_files.facts(self.config.model), "adapted": record}
-        mdm_files.save(
+        chosen = model_files.load(adapted) if record["adapted"] else self.model
+        facts = {**model_files.facts(self.config.model), "adapted": record}
+        model_files.save(
             model_of_window(chosen, self.model.config.window), out / "model", _card(self.config, record), facts
         )
         store.write_json(out / "adapt.json", record)
@@ -463,7 +461,7 @@ def _choose(config: AdaptConfig, base: MDM, plan: Plan, work: Path, out: Path) -
     device = torch.device(config.device)
     request = SampleRequest(SCORED_STEPS, config.seed, bf16=choose_bf16(config.precision, device))
     found = {
-        "before": learn_score.score(base.to(device), kept, work / CLIPS, request, picture=out / "before.png"),
+        "before": score.score(base.to(device), kept, work / CLIPS, request, picture=out / "before.png"),
         "after": store.read_json(work / "learn" / "metrics.json"),
     }
     picture = work / "learn" / "samples" / f"{config.steps:07d}.png"

@@ -1,8 +1,7 @@
 """learn: train a multi-modal diffusion model on generated cities or recorded logs, on one process or many.
 
-Read from `run`: make the clips, train the latent codec (`diffusion/training/models.py`), train the denoising network,
-score, export. The training loop is in full view in `_train_network`; from the disk to the loss it goes through
-`diffusion/clips/shards.py` (`read_clip`), `diffusion/training/clips.py` (`draw_clips`) and `diffusion/model.py`
+Read from `train`: open the clips, train the latent codec (`models.py`), train the denoising network, score, export. The
+training loop is in full view in `_train_network`; from the disk to the loss it goes through `clips.py` and `model.py`
 (`MDM.loss`). Every draw is a function of (seed, step) and of a clip's place in the step's batch, so a run that was
 interrupted and continued equals one that was not: bit for bit at a fixed number of threads and processes, up to
 rounding if the number of processes or the layout changed meanwhile.
@@ -37,22 +36,16 @@ from mudg.base.errors import ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.base.processes import Interruption
 from mudg.base.run_folder import RunDir, VerbOutput
-from mudg.diffusion import files as mdm_files
-from mudg.diffusion.clips import from_log
-from mudg.diffusion.clips.shards import ShardSource
+from mudg.diffusion import learn_clips, log_clips, model_files, models, parallel, score
+from mudg.diffusion.clips import ShardSource
+from mudg.diffusion.learn_clips import class_weights, draw_clips
+from mudg.diffusion.memory_plan import choose_bf16
 from mudg.diffusion.model import MDM, BatchPart, LossSettings
+from mudg.diffusion.models import Model, draw_weights, freeze, hold_finisher, rebuilt, starting_model
+from mudg.diffusion.parallel import SAME_SIGNAL_S, Ranks, Spread, TrainingState, agreed_terms, mean_of
 from mudg.diffusion.requests import SampleRequest
-from mudg.diffusion.settings.learn import LearnConfig
-from mudg.diffusion.training import clips as learn_clips
-from mudg.diffusion.training import models as learn_codec
-from mudg.diffusion.training import parallel
-from mudg.diffusion.training import score as learn_score
-from mudg.diffusion.training.clips import class_weights, draw_clips
-from mudg.diffusion.training.memory_plan import choose_bf16
-from mudg.diffusion.training.models import Model, draw_weights, freeze, hold_finisher, kind_of, starting_model
-from mudg.diffusion.training.parallel import SAME_SIGNAL_S, Ranks, Spread, agreed_terms
-from mudg.diffusion.training.scene_list import ListedShards, is_list, read_list
-from mudg.diffusion.training.state import TrainingState, mean_of
+from mudg.diffusion.settings import LearnConfig
+from mudg.diffusion.shard_sources import ListedShards, is_list, read_list
 
 
 def check(config: LearnConfig) -> LearnConfig:
@@ -121,7 +114,7 @@ def train(config: LearnConfig, out: Path, output: VerbOutput, open_work: Callabl
 
 def inputs_of(config: LearnConfig) -> dict[str, str]:
     """Digests of what a training starts from and learns from."""
-    inputs = {"start": mdm_files.digest(config.start)} if config.start else {}
+    inputs = {"start": model_files.digest(config.start)} if config.start else {}
     if is_list(config.data.scenes):
         inputs["list of scenes"] = hashlib.sha256(Location.of(config.data.scenes[0]).load()).hexdigest()
     for number, source in enumerate(_sources(config)):
@@ -129,14 +122,14 @@ def inputs_of(config: LearnConfig) -> dict[str, str]:
     return inputs
 
 
-def _sources(config: LearnConfig) -> list[from_log.LogSource]:
-    return [] if is_list(config.data.scenes) else [from_log.log_source(text) for text in config.data.scenes]
+def _sources(config: LearnConfig) -> list[log_clips.LogSource]:
+    return [] if is_list(config.data.scenes) else [log_clips.log_source(text) for text in config.data.scenes]
 
 
 def files_read(config: LearnConfig, out: Path, overwrite: bool) -> dict[str, Path | str | None]:
     """What is read, by names for messages. Clips may lie in `out` where they do by default, unless a result there is to
     be replaced."""
-    read: dict[str, Path | str | None] = {"start": mdm_files.folder_of(config.start) if config.start else ""}
+    read: dict[str, Path | str | None] = {"start": model_files.folder_of(config.start) if config.start else ""}
     for number, source in enumerate(_sources(config)):
         read |= {f"scene {number}": source.scene, f"fused {number}": source.fused}
     if is_list(config.data.scenes):
@@ -151,7 +144,7 @@ def files_read(config: LearnConfig, out: Path, overwrite: bool) -> dict[str, Pat
 def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
     """Clips, codec, network, scores. From logs, `config` is rewritten in terms of shards: `given` is what the user
     said."""
-    out, given, kind = directory.path, config, kind_of(model)
+    out, given = directory.path, config
     bf16 = choose_bf16(config.precision, ranks.device)
     folder: Path | ShardSource = Path(config.data.clips) if config.data.clips else out / "clips"
     about_data = ""
@@ -162,7 +155,7 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         config, folder = learn_clips.open_streamed(config, out, model.config.pixel_multiple, model.points_alone)
         about_data = learn_clips.describe_list(config, folder) if isinstance(folder, ListedShards) else ""
     elif isinstance(folder, Path) and config.data.scenes:
-        sources = [from_log.log_source(text) for text in config.data.scenes]
+        sources = [log_clips.log_source(text) for text in config.data.scenes]
         rules = learn_clips.log_rules(config, sources, model.config.pixel_multiple, model.points_alone)
         counts = ranks.leader_does(partial(learn_clips.make_log_clips, given, rules, folder))
         config = learn_clips.for_logs(config, rules, *counts)
@@ -173,10 +166,8 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         config = learn_clips.of_one_size(config)
     with making:
         if "codec" in fresh and isinstance(model, MDM):
-            ranks.leader_does(
-                lambda: learn_codec.train_codec(model.codec, config, directory, folder, bf16, ranks.device)
-            )
-            learn_codec.load_trained_codec(model.codec, out, ranks)
+            ranks.leader_does(lambda: models.train_codec(model.codec, config, directory, folder, bf16, ranks.device))
+            models.load_trained_codec(model.codec, out, ranks)
             draw_weights(model.net, config.seed, "weights")
         for name in ("refiner", "finisher"):
             part = getattr(model, name, None)
@@ -189,19 +180,19 @@ def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir
         weights = _train_network(model, config, directory, folder, bf16, ranks)
 
     def finish() -> None:
-        made = kind.rebuilt(model, weights)
+        made = rebuilt(model, weights)
         if isinstance(made, MDM) and made.refiner is not None and config.loss.class_balance:
             made.refiner.take_back(_class_weights(config, folder))
         request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
-        scores = learn_score.score(made, learn_clips.scored_shards(config, folder), folder, request)
+        scores = score.score(made, learn_clips.scored_shards(config, folder), folder, request)
         store.write_json(out / "metrics.json", scores)
         facts: dict[str, Any] = {"recipe": to_dict(given), "held_out": scores}
         if config.start:
-            facts["continued_from"] = mdm_files.facts(config.start)
-        kind.save(made, out / "model", kind.card(made, config, scores, about_data), facts)
+            facts["continued_from"] = model_files.facts(config.start)
+        models.save(made, out / "model", models.model_card(made, config, scores, about_data), facts)
         shutil.rmtree(out / learn_clips.CACHE, ignore_errors=True)
         directory.finish({"held_out": scores["average"]})
-        log.info(*learn_score.table(scores).splitlines())
+        log.info(*score.table(scores).splitlines())
 
     ranks.leader_does(finish)
 
@@ -371,7 +362,7 @@ def _picture(run_dir: RunDir, step: int) -> Path:
 def _record(run_dir: RunDir, board: Any, step: int, values: dict[str, float]) -> None:
     """A line of the log, the loss curve, and the same for TensorBoard if it is wanted."""
     run_dir.log(step=step, **values)
-    learn_score.plot_losses(run_dir.path / "log.jsonl", run_dir.path / "loss.png")
+    score.plot_losses(run_dir.path / "log.jsonl", run_dir.path / "loss.png")
     if board is not None:
         for name, value in values.items():
             board.add_scalar(f"learn/{name}", value, step)
@@ -393,9 +384,9 @@ def _score_watched(
     step: int,
 ) -> None:
     """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
-    made = kind_of(model).rebuilt(model, weights)
+    made = rebuilt(model, weights)
     shards = learn_clips.scored_shards(config, folder)[: config.score.watched]
     request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
-    scores = learn_score.score(made, shards, folder, request, picture=_picture(run_dir, step))
+    scores = score.score(made, shards, folder, request, picture=_picture(run_dir, step))
     run_dir.log(step=step, held_out=scores["average"])
-    log.info(f"step {step}", *learn_score.table(scores).splitlines())
+    log.info(f"step {step}", *score.table(scores).splitlines())

@@ -1,8 +1,8 @@
 """The multi-modal diffusion model: from a sparse, projected point cloud to dense colour, depth and semantic video.
 
 Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to
-do, `encode_condition`, `loss` and `sample`. The network and the step from latents to pixels are in
-`models.mdm.network`, reading and writing in `models.mdm.files`.
+do, `encode_condition`, `loss` and `sample`. The networks are in `network.py`, reading and
+writing in `model_files.py`.
 
 The network's input is, per latent cell, [noisy latents of all modalities | colour condition | depth condition |
 backdrop | masks of what was seen | classes of the condition]. It states the clean latents of all modalities at once,
@@ -26,12 +26,24 @@ from torch.nn import functional
 from mudg.base import palette, scratch, seeds
 from mudg.base.crop import cropped
 from mudg.base.errors import UsageError
-from mudg.base.types import Clip, Condition, FinePatch
+from mudg.base.types import Clip, Condition, FinePatch, RenderPlanes
 from mudg.core import losses, noise
 from mudg.core.depth import align_depth
 from mudg.core.noise import Schedule
-from mudg.diffusion.finisher import Finisher, Made, class_scores, finish_in_tiles
-from mudg.diffusion.network import ConditionPixels, MDMConfig, PixelTruth, Refined, Refiner, TemporalAttention, UNet
+from mudg.diffusion.network import (
+    ConditionPixels,
+    Finisher,
+    Made,
+    MDMConfig,
+    PixelTruth,
+    Refined,
+    Refiner,
+    TemporalAttention,
+    UNet,
+    class_scores,
+    finish_in_tiles,
+    shares,
+)
 from mudg.diffusion.requests import (
     GeneratedClip,
     SampleRequest,
@@ -45,7 +57,6 @@ from mudg.diffusion.requests import (
     sized_to_area,
     sized_to_width,
 )
-from mudg.diffusion.stacked import Stacked, cell_means, cell_shares
 from mudg.networks.codec import CLASSES, MODALITIES, Decoded, Modality, PatchCodec, code_to_depth, semantic_shares
 
 SKY = palette.ID["sky"]
@@ -424,7 +435,7 @@ class MDM(nn.Module):
         return spans[0], spans[1]
 
     def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
-        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `models.mdm.network`)."""
+        """Pixels from latents [N,C,h,w] of all modalities and the condition (see `network.py`)."""
         if self.refiner is None:
             raise UsageError("this model has no refiner", where="MDM.refine")
         return self.refiner(self.codec, latents, given, frames)
@@ -600,3 +611,57 @@ def _around(start_px: int, side_px: int, factor: int, count: int) -> slice:
 def _expected_error(log_error: Tensor) -> Tensor:
     """Expected absolute error of colour in [0, 1] from the logarithm of that of codes in [-1, 1]."""
     return log_error.clamp(-6, 1).exp() / 2
+
+
+# batches of conditions ----------------------------------------------------------------------------
+
+
+NO_RENDER = -1.0
+"""Coverage that stands for: there is no render."""
+
+
+@dataclass(frozen=True)
+class Stacked:
+    """The tensors of conditions of one shape [B,T,..]; what a condition lacks is filled in: none warped, its own colour
+    as backdrop, unknown classes, no render. Masks are f32."""
+
+    color: Tensor
+    depth: Tensor
+    valid: Tensor
+    warped: Tensor
+    backdrop: Tensor
+    ids: Tensor
+    backdrop_ids: Tensor
+    renders: RenderPlanes
+
+    @classmethod
+    def of(cls, batch: Sequence[Condition]) -> Stacked:
+        """Of conditions of one shape."""
+        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
+        renders = [_no_render(c) if c.renders is None else c.renders for c in batch]
+        return cls(
+            *(torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth")),
+            torch.stack([c.valid for c in batch]).float(),
+            torch.stack([torch.zeros_like(c.valid) if c.warped is None else c.warped for c in batch]).float(),
+            torch.stack([c.color if c.backdrop is None else c.backdrop for c in batch]),
+            torch.stack([unknown if c.semantics is None else c.semantics for c in batch]),
+            torch.stack([unknown if c.backdrop_semantics is None else c.backdrop_semantics for c in batch]),
+            RenderPlanes(*(torch.stack([getattr(r, f.name) for r in renders]) for f in fields(RenderPlanes))),
+        )
+
+
+def cell_means(mask: Tensor, factor: int) -> Tensor:
+    """Mean over the pixels of each cell, f32[B,T,1,H,W] -> f32[B,T,1,h,w]."""
+    return functional.avg_pool2d(mask.flatten(0, 1), factor).unflatten(0, mask.shape[:2])
+
+
+def cell_shares(ids: Tensor) -> Tensor:
+    """Share of each class in each cell, u8[B,T,1,H,W] -> f32[B,T,19,h,w]."""
+    return shares(ids.flatten(0, 1)).unflatten(0, ids.shape[:2])
+
+
+def _no_render(condition: Condition) -> RenderPlanes:
+    """The planes that stand for: there is no render."""
+    nothing = torch.zeros_like(condition.depth)
+    unknown = torch.full_like(condition.valid, palette.UNLABELLED, dtype=torch.uint8)
+    return RenderPlanes(condition.color, condition.depth, nothing + NO_RENDER, nothing, unknown)

@@ -1,6 +1,6 @@
 """The interface that the two diffusion models share: requests, generated clips, and their confidence.
 
-`MDM` (`diffusion/model.py`) and `PublishedMDM` (`diffusion/published/model.py`) have the same methods: `check_request`,
+`MDM` (`diffusion/model.py`) and `PublishedMDM` (`diffusion/published.py`) have the same methods: `check_request`,
 `check_clip`, `image_size`, and `sample`, which makes a `GeneratedClip` from a condition and a `SampleRequest`, both on
 the model's device.
 

@@ -34,18 +34,20 @@ from mudg.core import trajectory
 from mudg.core.fusion import SweepShots
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.core.raster.cpu import release_memory
-from mudg.diffusion import views as loading
-from mudg.diffusion.clips.condition import ConditionRules, VacatedAt
-from mudg.diffusion.clips.inputs import ConditionSources, InWeather, NearSweeps
+from mudg.diffusion.condition import ConditionRules, VacatedAt
+from mudg.diffusion.inputs import ConditionSources, InWeather, NearSweeps
 from mudg.diffusion.requests import GeneratedClip
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import (
     COLOR_ALONE,
     EDITED_IMAGES_PER_VIEW,
     FREEVS,
     SOURCE,
+    DiffusionModel,
     PreparedImages,
     ViewMaker,
+    half_of,
+    load_any,
     recorded_images,
     windows,
 )
@@ -120,10 +122,10 @@ def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, work:
     names = [path.name for path in paths]
     if len(set(names)) < len(names):
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
-    loading.half_of(config)  # said before other processes begin
+    half_of(config)  # said before other processes begin
     started = time.monotonic()
     processes = config.processes or usual_processes(config, paths)
-    model = loading.load_any(config) if processes == 1 else None  # several processes load one each
+    model = load_any(config) if processes == 1 else None  # several processes load one each
     try:
         frames = _run_jobs([(config, given, work.path, path, model) for path in paths], names, processes)
     finally:
@@ -189,14 +191,14 @@ def without_classes(cloud: FusedCloud) -> FusedCloud:
 
 
 def make_trajectory(
-    config: SynthesizeConfig, given: JobInputs, out: Path, path: Trajectory, model: loading.DiffusionModel | None = None
+    config: SynthesizeConfig, given: JobInputs, out: Path, path: Trajectory, model: DiffusionModel | None = None
 ) -> int:
     """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one. `model`:
     that of the configuration, if it is in memory already."""
     folder = out / path.name
     if (folder / "observations.json").is_file():
         return len(path)
-    model = model or loading.load_any(config)
+    model = model or load_any(config)
     maker = _view_maker(config, given, path, model, out)
     spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
     state = folder / "state"
@@ -243,7 +245,7 @@ _recorded_again = functools.lru_cache(maxsize=1)(recorded_drive)
 
 
 def _view_maker(
-    config: SynthesizeConfig, given: JobInputs, path: Trajectory, model: loading.DiffusionModel, scratch: Path
+    config: SynthesizeConfig, given: JobInputs, path: Trajectory, model: DiffusionModel, scratch: Path
 ) -> ViewMaker:
     """What makes the views of one trajectory; ``scratch``: a folder for what is large."""
     drive = _recorded_again(config, given) if given.edited is None else given.edited(config, given)

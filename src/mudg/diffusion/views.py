@@ -21,17 +21,14 @@ from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Condition, Frame, Observation, Photo, Scene, View
 from mudg.core.raster.cpu import release_memory
-from mudg.diffusion import files as mdm_files
-from mudg.diffusion.clips.condition import WarpSource
-from mudg.diffusion.clips.inputs import ConditionParts, ConditionSources, conditions_of
-from mudg.diffusion.clips.stacked import KeptImages
+from mudg.diffusion import memory_plan, model_files, published
+from mudg.diffusion.condition import KeptImages, WarpSource
+from mudg.diffusion.inputs import ConditionParts, ConditionSources, conditions_of
+from mudg.diffusion.memory_plan import half_format
 from mudg.diffusion.model import MDM
-from mudg.diffusion.published import model as published_files
-from mudg.diffusion.published.model import PublishedMDM, WorkSplit
+from mudg.diffusion.published import PublishedMDM, WorkSplit, is_published
 from mudg.diffusion.requests import GeneratedClip, SampleRequest, StartClip, generated, generated_and_finished
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.diffusion.training import memory_plan
-from mudg.diffusion.training.memory_plan import half_format
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.networks.codec import Modality
 from mudg.scene.labels import read_label, read_trusted_classes
 from mudg.scene.read import read_image
@@ -66,23 +63,23 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
         )
     config = replace(config, device=str(device))
     half_of(config)
-    published = published_files.is_published(config.model)
-    (PublishedMDM if published else MDM).check_request(request_of(config))
-    if published and fitted and not weather:
+    full_size = is_published(config.model)
+    (PublishedMDM if full_size else MDM).check_request(request_of(config))
+    if full_size and fitted and not weather:
         raise UsageError(
             "a published-type model uses a fitted scene for weather and light of --edits only",
             where="--fitted",
             remedy="leave it out",
         )
     repairs = config.condition == "repair"
-    if repairs and not (fitted or published):
+    if repairs and not (fitted or full_size):
         raise UsageError(
             "this condition is made of renders of a fitted scene",
             where="--condition",
             got="repair",
             remedy="give the folder of a finished fit as --fitted",
         )
-    if published and config.condition in ("freevs", "repair"):
+    if full_size and config.condition in ("freevs", "repair"):
         raise UsageError(
             "a published-type model does not know this condition",
             where="--condition",
@@ -98,14 +95,14 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
             got="--fitted: renders are left out of such a condition",
             remedy="leave out --condition or --fitted",
         )
-    if published and config.offload and device.type == "cpu":
+    if full_size and config.offload and device.type == "cpu":
         raise UsageError(
             "the image tower is on the CPU already",
             where="--offload",
             got="--device cpu",
             remedy="leave one of them out",
         )
-    if published:
+    if full_size:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
     for flag, given in (
         ("memory-budget-gb", config.memory_budget_gb),
@@ -116,7 +113,7 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
             raise UsageError(
                 "this setting applies to published-type models only", where=f"--{flag}", remedy="leave it out"
             )
-    model = mdm_files.load(config.model)  # fails now rather than in every process
+    model = model_files.load(config.model)  # fails now rather than in every process
     if fitted and not model.config.renders:
         raise UsageError(
             "this model was not trained with renders of a fitted scene",
@@ -146,7 +143,7 @@ def half_of(config: SynthesizeConfig) -> torch.dtype | None:
     """The half precision that a configuration's model computes in, None for float32. Published-type models bear
     float16."""
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
-    return half_format(config.precision, device, float16=published_files.is_published(config.model))
+    return half_format(config.precision, device, float16=is_published(config.model))
 
 
 def load_any(config: SynthesizeConfig) -> DiffusionModel:
@@ -159,8 +156,8 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
         ResourceError: it does not fit however it is cut, or no such device.
     """
     device = choose_device(config.device, "diffusion model", NETWORK_KINDS)
-    if not published_files.is_published(config.model):
-        return mdm_files.load(config.model).to(device)
+    if not is_published(config.model):
+        return model_files.load(config.model).to(device)
     if config.steps < FEW_STEPS:
         log.warn(
             f"synthesize: the published model was trained for 50 denoising steps, but --steps is {config.steps}"
@@ -168,7 +165,7 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
         )
     half = half_of(config)
     dtype = None if device.type == "cpu" else half or torch.float32
-    model = published_files.load(Path(config.model), dtype=dtype)
+    model = published.load(Path(config.model), dtype=dtype)
     model.split = WorkSplit(frames_at_once=1, offload=config.offload)
     budget_gb = config.memory_budget_gb or _free_gb(device)
     if budget_gb:

@@ -7,8 +7,8 @@ import functools
 
 from mudg.base.errors import UsageError
 from mudg.base.types import Scene
-from mudg.diffusion.published.model import is_published
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.published import is_published
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.synthesize import Drive, JobInputs
 from mudg.diffusion.views import FREEVS, recorded_images
 from mudg.editing import weathered

@@ -32,14 +32,22 @@ from mudg.base import log
 from mudg.base.errors import UsageError
 from mudg.base.palette import DYNAMIC_IDS
 from mudg.base.types import FusedCloud, Observation, Photo, Scene, Track, Trajectory, View
-from mudg.diffusion import views as loading
-from mudg.diffusion.clips.condition import GROUND_IDS, ConditionRules, WarpSource, determined
-from mudg.diffusion.clips.inputs import ConditionSources, InWeather, conditions_of
-from mudg.diffusion.published.model import is_published, window_of
+from mudg.diffusion.condition import GROUND_IDS, ConditionRules, WarpSource, determined
+from mudg.diffusion.inputs import ConditionSources, InWeather, conditions_of
+from mudg.diffusion.published import is_published, window_of
 from mudg.diffusion.requests import StartClip, generated
-from mudg.diffusion.settings.harmonize import HarmonizeConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.diffusion.views import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_at_pose, recorded_images, windows
+from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
+from mudg.diffusion.views import (
+    EDITED_IMAGES_PER_VIEW,
+    ViewMaker,
+    check_config,
+    half_of,
+    load_any,
+    recorded_at_pose,
+    recorded_images,
+    request_of,
+    windows,
+)
 from mudg.editing.carried import EditedDrive
 from mudg.editing.plan import EditPlan
 from mudg.editing.recorded import (
@@ -238,9 +246,9 @@ class Harmoniser:
         self, sources: EditedSources, config: HarmonizeConfig, size: tuple[int, int], device: str = "auto"
     ) -> None:
         """``size``: width and height of the views."""
-        self._settings = loading.check_config(settings_of(config, device), fitted=not is_published(config.model))
+        self._settings = check_config(settings_of(config, device), fitted=not is_published(config.model))
         self._sources, self._config = sources, config
-        model = loading.load_any(self._settings)
+        model = load_any(self._settings)
         self.window, overlap = model.config.window, PUBLISHED_OVERLAP if model.points_alone else OVERLAP
         self._overlap = min(overlap, self.window - 1)
         width, height = model.image_size(*size, 0)
@@ -389,9 +397,9 @@ class WeatherHarmoniser:
         device: str = "auto",
     ) -> None:
         """``size``: width and height of the views."""
-        settings = loading.check_config(settings_of(config, device), fitted=False)
-        self._model = loading.load_any(settings)
-        self._request = loading.request_of(settings, loading.half_of(settings) == torch.bfloat16)
+        settings = check_config(settings_of(config, device), fitted=False)
+        self._model = load_any(settings)
+        self._request = request_of(settings, half_of(settings) == torch.bfloat16)
         width, height = self._model.image_size(*size, 0)
         rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=True)
         self._given = ConditionSources(

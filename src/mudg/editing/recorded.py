@@ -26,7 +26,7 @@ from mudg.core import lidar
 from mudg.core.edit import HeightMap, Motion
 from mudg.core.pictures import to_bytes
 from mudg.core.weather.lidar import SOFT, sweep_in_weather
-from mudg.diffusion.clips.condition import Vacated, VacatedAt, ray_directions
+from mudg.diffusion.condition import Vacated, VacatedAt, ray_directions
 from mudg.editing.apply import edited_cloud, edited_scene
 from mudg.editing.carried import carry_out, opener
 from mudg.editing.model import GROUND_CLASSES

@@ -27,7 +27,7 @@ from mudg.baselines.emernerf.fit import load_field, observe
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.place import drawing_device
-from mudg.diffusion.clips.inputs import InWeather
+from mudg.diffusion.inputs import InWeather
 from mudg.editing.apply import scene_seen_by
 from mudg.editing.carried import FACT, EditedDrive, carry_out
 from mudg.editing.harmonised import (

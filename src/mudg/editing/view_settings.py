@@ -7,7 +7,7 @@ from typing import Any, ClassVar, Literal
 
 from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
-from mudg.diffusion.settings.harmonize import HarmonizeConfig
+from mudg.diffusion.settings import HarmonizeConfig
 
 
 @settings

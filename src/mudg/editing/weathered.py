@@ -17,7 +17,7 @@ from mudg.base.weather_settings import Conditions
 from mudg.core import trajectory
 from mudg.core.weather import ShownView, drive_facts, edited_view
 from mudg.core.weather.light import curve_of
-from mudg.diffusion.clips.inputs import InWeather
+from mudg.diffusion.inputs import InWeather
 
 WITNESSES: Final = 8
 """Recorded views by which the light of a drive is estimated, spread over cameras and time."""

@@ -39,9 +39,8 @@ from mudg.exporting.settings import ExportConfig
 from mudg.formats import ncore as ncore_package
 from mudg.formats.exporters import ncore, ros2
 from mudg.formats.exporters.cameras import colmap_files, nerfstudio_files, picture_names, pictures
-from mudg.formats.exporters.foxglove import DIALECT, FoxgloveMessages
-from mudg.formats.exporters.log_records import LogRecords
-from mudg.formats.exporters.mcap import McapBlocks
+from mudg.formats.exporters.foxglove import FoxgloveMessages
+from mudg.formats.exporters.log_records import LogRecords, mcap_writer, write_mcap
 from mudg.formats.exporters.rerun_file import package, write_rerun
 from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene, logit, unit
 from mudg.formats.splats.formats import FORMATS, WriteRequest, file_from_world, losses
@@ -93,6 +92,8 @@ def refuse_missing(name: str) -> None:
         package()
     elif name == "ncore":
         ncore_package.package()
+    elif name in ("mcap", "ros2"):
+        mcap_writer()
 
 
 def write_log(name: str, told: Told, out: Path) -> dict[str, int]:
@@ -101,7 +102,7 @@ def write_log(name: str, told: Told, out: Path) -> dict[str, int]:
         title = told.records.scene.id if told.records is not None else "scene"
         write_rerun(out, told.records, told.splats, title)
     elif told.records is not None:
-        store.write_blocks(out, McapBlocks(FoxgloveMessages(told.records), f"mudg {version()}", DIALECT))
+        write_mcap(out, FoxgloveMessages(told.records))
     size = out.stat().st_size
     log.info(f"export: {told.summary}, {size / 1e6:.2f} MB")
     return {"bytes": size}
@@ -117,10 +118,9 @@ def write_messages(name: str, records: LogRecords, out: Path) -> dict[str, Any]:
 
 def _bag(records: LogRecords, folder: Path) -> tuple[Path, dict[str, int]]:
     """A bag of ROS 2: its largest file, and what to say of it."""
-    blocks = McapBlocks(ros2.Ros2Messages(records), f"mudg {version()}", ros2.dialect())
-    store.write_blocks(folder / ros2.FILE, blocks)
-    store.atomic_write(folder / ros2.METADATA, ros2.metadata(blocks.topics, blocks.span))
-    return folder / ros2.FILE, {"messages": sum(number for _, number in blocks.topics.values())}
+    topics, span = write_mcap(folder / ros2.FILE, ros2.Ros2Messages(records))
+    store.atomic_write(folder / ros2.METADATA, ros2.metadata(topics, span))
+    return folder / ros2.FILE, {"messages": sum(number for _, number in topics.values())}
 
 
 def _recording(records: LogRecords, folder: Path) -> tuple[Path, dict[str, int]]:

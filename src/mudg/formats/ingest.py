@@ -8,12 +8,13 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from mudg import native
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.run_folder import RunDir, run_state
 from mudg.base.types import Scene
 from mudg.formats.importers import RECOGNISERS, files_of, import_log, known_formats
-from mudg.formats.importers.common import ImportOptions, parse_frame_range, parse_resolution, processors
+from mudg.formats.importers.common import ImportOptions, parse_frame_range, parse_resolution
 from mudg.formats.settings import IngestConfig
 from mudg.scene import check, contact_sheet
 from mudg.scene import check as scene_check
@@ -137,7 +138,7 @@ def import_options(config: IngestConfig) -> ImportOptions:
         untwist=config.untwist,
         test_every=config.test_every,
         resolution=parse_resolution(config.resolution),
-        workers=config.workers or processors(),
+        workers=config.workers or native.default_threads(),
     )
 
 

@@ -18,6 +18,12 @@ from mudg.base.errors import short
 Known = Mapping[str, "Known | None"]
 """Field -> fields of the records in it, or None: it holds no records, or what is in it is free."""
 
+
+def known(names: str, **inner: Known) -> Known:
+    """Fields by their names, of which ``inner`` hold records."""
+    return {**dict.fromkeys(names.split()), **inner}
+
+
 _MOST_NAMES: Final = 8
 _MOST_LETTERS: Final = 60
 _MOST_COLLECTED: Final = 1000
@@ -69,9 +75,8 @@ def _collect(kind: str, names: Iterable[str]) -> None:
 def listed(names: Iterable[str]) -> str:
     """Names of a foreign file for a message: the first eight, 60 letters each, control characters escaped."""
     every = [f"'{short(name, _MOST_LETTERS)}'" for name in names]
-    return ", ".join(every[:_MOST_NAMES]) + (
-        f" and {len(every) - _MOST_NAMES} more" if len(every) > _MOST_NAMES else ""
-    )
+    more = f" and {len(every) - _MOST_NAMES} more" if len(every) > _MOST_NAMES else ""
+    return ", ".join(every[:_MOST_NAMES]) + more
 
 
 def sentence(names: Iterable[str], kind: str) -> str:

@@ -31,7 +31,7 @@ from mudg.core import metrics, project, view_metrics
 from mudg.core.losses import LPIPS_EPSILON
 from mudg.core.metrics import ViewFacts
 from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
-from mudg.diffusion import files as mdm_files
+from mudg.diffusion import model_files
 from mudg.editing.view_settings import ScoreConfig
 from mudg.gaussians.perception import lpips_network
 from mudg.networks.featnets import WHOLE_PIXELS, CodecFeatures, LpipsTrunk, PerceptualDistance
@@ -131,7 +131,7 @@ def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
         return found
     device = choose_device(config.device, "networks of the scores")
     if config.perceptual_views:
-        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec), device=device)
+        found["perceptual"] = PerceptualDistance(CodecFeatures(model_files.load("embedded").codec), device=device)
     for flag, (row, trunk) in LPIPS_FILES.items():
         if getattr(config, flag):
             network = lpips_network(getattr(config, flag), trunk, config.lpips_input)

@@ -18,7 +18,7 @@ from mudg.steps.step import SCENE, Flag
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
     from mudg.diffusion.adapt import PlannedAdaptation
-    from mudg.diffusion.settings.adapt import AdaptConfig
+    from mudg.diffusion.settings import AdaptConfig
     from mudg.gaussians.settings import FitConfig
 
 
@@ -66,12 +66,12 @@ class Adapt(Output):
         return replace(self, settings=replace(self.settings, device=str(device)))
 
     def reads(self) -> dict[str, Path | str | None]:
-        from mudg.diffusion.files import folder_of
+        from mudg.diffusion.model_files import folder_of
 
         return super().reads() | {"model": folder_of(self.settings.model)}
 
     def inputs(self) -> dict[str, str]:
-        from mudg.diffusion.files import digest
+        from mudg.diffusion.model_files import digest
 
         return super().inputs() | {"model": digest(self.settings.model)}
 

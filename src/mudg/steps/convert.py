@@ -11,7 +11,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.steps.step import Flag, Step
 
 if TYPE_CHECKING:
-    from mudg.diffusion.settings.convert import ConvertConfig
+    from mudg.diffusion.settings import ConvertConfig
 
 
 class Convert(Step):
@@ -38,13 +38,13 @@ class Convert(Step):
     settings: ConvertConfig
 
     def act(self) -> Path:
-        from mudg.diffusion.published import convert
+        from mudg.diffusion import convert
 
         return convert.run(self.settings, self.checkpoint, self.to, self._conversion, overwrite=self.overwrite)
 
     def _conversion(self, to: Path) -> tuple[Callable[[], None], int]:
         """What converts this checkpoint to a folder, and the address space that it may take."""
-        from mudg.diffusion.published import convert
+        from mudg.diffusion import convert
         from mudg.labels.depth import depthlab
         from mudg.scoring.converted import convert_weights
 

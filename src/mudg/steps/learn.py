@@ -10,7 +10,7 @@ from mudg.steps.engine import opened
 from mudg.steps.outputs import Output
 
 if TYPE_CHECKING:
-    from mudg.diffusion.settings.learn import LearnConfig
+    from mudg.diffusion.settings import LearnConfig
 
 
 class Learn(Output):

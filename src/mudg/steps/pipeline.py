@@ -19,7 +19,7 @@ from mudg.base.memory import Meter, Usage, folder_bytes, in_words
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.versions import environment, version
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.adapt import Adapt
 from mudg.steps.annotate import Annotate
@@ -141,8 +141,8 @@ def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--s
     Args:
         flag: what names the diffusion model on this command line.
     """
-    from mudg.diffusion.files import read_description
-    from mudg.diffusion.published.model import is_published
+    from mudg.diffusion.model_files import read_description
+    from mudg.diffusion.published import is_published
 
     if generator.model == NO_MODEL:
         raise UsageError(
@@ -171,7 +171,7 @@ def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--s
 def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
     """UsageError where the chain would write into, over or around what it reads. Its own scene is no such case: with a
     scene as source it writes none."""
-    from mudg.diffusion.files import folder_of
+    from mudg.diffusion.model_files import folder_of
 
     refuse_overlap(
         out,
@@ -257,7 +257,7 @@ def _diffusion_of(config: RunConfig, scene: Path) -> _DiffusionUse:
     Raises:
         UsageError: adaptation is asked for, but the model cannot be adapted or the log is too short.
     """
-    from mudg.diffusion.files import uses_renders
+    from mudg.diffusion.model_files import uses_renders
 
     renders = uses_renders(config.synthesize.model)
     if config.adaptation == "off" or (config.adaptation == "auto" and not renders):

@@ -65,7 +65,7 @@ class RenderViews(Output):
         read = self.digests({"scene": self.scene, "model": self.model, "edits": self.edits})
         if not self.settings.harmonize.on:
             return read
-        from mudg.diffusion.files import digest
+        from mudg.diffusion.model_files import digest
 
         return read | self.digests({"fused": self.fused}) | {"diffusion": digest(self.settings.harmonize.model)}
 

@@ -13,7 +13,7 @@ from mudg.steps.outputs import Output
 from mudg.steps.step import FILE_YAML, SCENE, Flag
 
 if TYPE_CHECKING:
-    from mudg.diffusion.settings.synthesize import SynthesizeConfig
+    from mudg.diffusion.settings import SynthesizeConfig
 
 
 class Synthesize(Output):
@@ -61,12 +61,12 @@ class Synthesize(Output):
         return replace(self, settings=check_config(self.settings, renders, weather=weather))
 
     def reads(self) -> dict[str, Path | str | None]:
-        from mudg.diffusion.files import folder_of
+        from mudg.diffusion.model_files import folder_of
 
         return super().reads() | {"model": folder_of(self.settings.model)}
 
     def inputs(self) -> dict[str, str]:
-        from mudg.diffusion.files import digest
+        from mudg.diffusion.model_files import digest
 
         first = self.digests({"scene": self.scene, "fused": self.fused})
         return (

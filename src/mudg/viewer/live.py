@@ -23,7 +23,7 @@ from mudg.base.records import Number, StrictRecord
 from mudg.base.types import Camera, FusedCloud, Observation, Scene, View
 from mudg.core.edit import Motion
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
-from mudg.diffusion.clips.inputs import InWeather
+from mudg.diffusion.inputs import InWeather
 from mudg.editing.apply import left_behind, street_left
 from mudg.editing.carried import FACT, EditedDrive, carry_out
 from mudg.editing.model import motion_of

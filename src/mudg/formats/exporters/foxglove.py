@@ -1,6 +1,5 @@
-"""A driving log as messages that Foxglove shows: JSON with the names of Foxglove's schemas, in an MCAP file.
-
-Neither protobuf nor another package is needed; pictures and points are base64 inside.
+"""A driving log as messages that Foxglove shows: JSON with the names of Foxglove's schemas; pictures and points are
+base64 inside.
 
     /tf  /ego  /objects  /camera/NAME/image  /camera/NAME/calibration  /lidar/NAME  /points (fused, once)
 """
@@ -9,8 +8,7 @@ from __future__ import annotations
 
 import base64
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -18,8 +16,15 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.types import Frame, Sweep, View
-from mudg.formats.exporters.log_records import BOX_LIFE_S, NANO, LogRecords, above, box_color, picture_format
-from mudg.formats.exporters.mcap import McapDialect, McapMessage
+from mudg.formats.exporters.log_records import (
+    BOX_LIFE_S,
+    NANO,
+    LogMessage,
+    LogMessages,
+    above,
+    box_color,
+    picture_format,
+)
 
 _NUMBER: Final = {"type": "number"}
 _TEXT: Final = {"type": "string"}
@@ -91,88 +96,71 @@ SCHEMAS: Final[Mapping[str, dict[str, Any]]] = {
     "foxglove.SceneUpdate": _record(deletions=_list(_record(timestamp=_TIME, id=_TEXT)), entities=_list(_ENTITY)),
 }
 
-DIALECT: Final = McapDialect(
-    "", "jsonschema", "json", {name: json.dumps({"title": name, **schema}) for name, schema in SCHEMAS.items()}
-)
-"""How these messages stand in a file."""
 
+class FoxgloveMessages(LogMessages):
+    """The messages of a log for Foxglove."""
 
-# -- messages --------------------------------------------------------------------------------------
+    schema_encoding, message_encoding = "jsonschema", "json"
 
-
-@dataclass(frozen=True, slots=True)
-class _JsonMessage:
-    """One message before it is made: its topic, the name of its schema, seconds on the log's clock, and what makes its
-    value."""
-
-    topic: str
-    schema: str
-    time_s: float
-    value: Callable[[], dict[str, Any]]
-
-    def content(self) -> bytes:
-        """The bytes of the message."""
-        return json.dumps(self.value(), separators=(",", ":"), allow_nan=False).encode()
-
-
-class FoxgloveMessages:
-    """The messages of a log in order of time."""
-
-    def __init__(self, records: LogRecords) -> None:
-        self._log, self._scene = records, records.scene
-
-    def __iter__(self) -> Iterator[McapMessage]:
-        found = [*self._of_cameras(), *self._of_sweeps(), *self._of_objects()]
+    def __iter__(self) -> Iterator[LogMessage]:
+        messages = [*self._of_cameras(), *self._of_sweeps(), *self._of_objects()]
         if self._log.fused is not None:
-            found.append(_JsonMessage("/points", "foxglove.PointCloud", self._log.start_s, self._fused_points))
-        for one in sorted(found, key=lambda message: (message.time_s, message.topic)):
-            yield McapMessage(one.topic, one.schema, self._log.nanoseconds(one.time_s), one.content)
+            messages.append(LogMessage("/points", "foxglove.PointCloud", self._log.start_s, self._fused_points))
+        return iter(sorted(messages, key=lambda message: (message.time_s, message.topic)))
+
+    def schema(self, name: str) -> str:
+        """The text of a schema."""
+        return json.dumps({"title": name, **SCHEMAS[name]})
+
+    def content(self, message: LogMessage) -> bytes:
+        """The bytes of a message."""
+        return json.dumps(message.value(), separators=(",", ":"), allow_nan=False).encode()
 
     def _stamp(self, time_s: float) -> dict[str, int]:
-        nanoseconds = self._log.nanoseconds(time_s)
+        nanoseconds = self.nanoseconds(time_s)
         return {"sec": nanoseconds // NANO, "nsec": nanoseconds % NANO}
 
-    def _of_cameras(self) -> Iterator[_JsonMessage]:
+    def _of_cameras(self) -> Iterator[LogMessage]:
         for frame in self._scene.frames:
             name, view = frame.view.camera.name, frame.view
-            yield _JsonMessage(
+            yield LogMessage(
                 "/tf",
                 "foxglove.FrameTransforms",
                 view.time_s,
                 lambda v=view: self._transforms(v.time_s, [(f"camera/{v.camera.name}", v.world_from_cam)]),
             )
-            yield _JsonMessage(
+            yield LogMessage(
                 f"/camera/{name}/calibration",
                 "foxglove.CameraCalibration",
                 view.time_s,
                 lambda v=view: self._calibration(v),
             )
-            yield _JsonMessage(
+            yield LogMessage(
                 f"/camera/{name}/image", "foxglove.CompressedImage", view.time_s, lambda f=frame: self._image(f)
             )
 
-    def _of_sweeps(self) -> Iterator[_JsonMessage]:
+    def _of_sweeps(self) -> Iterator[LogMessage]:
         for sweep in self._scene.sweeps:
             place = [(f"lidar/{sweep.sensor}", sweep.world_from_lidar)]
-            yield _JsonMessage(
+            yield LogMessage(
                 "/tf", "foxglove.FrameTransforms", sweep.time_s, lambda s=sweep, p=place: self._transforms(s.time_s, p)
             )
-            yield _JsonMessage(
+            yield LogMessage(
                 f"/lidar/{sweep.sensor}", "foxglove.PointCloud", sweep.time_s, lambda s=sweep: self._sweep(s)
             )
 
-    def _of_objects(self) -> Iterator[_JsonMessage]:
+    def _of_objects(self) -> Iterator[LogMessage]:
         for moment in self._log.moments():
-            yield _JsonMessage("/objects", "foxglove.SceneUpdate", moment, lambda t=moment: self._boxes(t))
+            yield LogMessage("/objects", "foxglove.SceneUpdate", moment, lambda t=moment: self._boxes(t))
             pose = self._scene.ego.pose_at(moment)
             if pose is not None:
-                yield _JsonMessage(
+                yield LogMessage(
                     "/ego",
                     "foxglove.PoseInFrame",
                     moment,
                     lambda t=moment, p=pose: {"timestamp": self._stamp(t), "frame_id": "world", "pose": _pose(p)},
                 )
-                yield _JsonMessage(
+                yield LogMessage(
                     "/tf",
                     "foxglove.FrameTransforms",
                     moment,

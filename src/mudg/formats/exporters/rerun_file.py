@@ -45,7 +45,7 @@ def package() -> Any:
     except ImportError as error:
         raise ResourceError(
             "rerun files are written with the package rerun-sdk, which is not installed",
-            remedy="pip install 'mudg[rerun]', or export mcap, which needs no package",
+            remedy="pip install 'mudg[rerun]'",
         ) from error
 
 

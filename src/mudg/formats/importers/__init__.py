@@ -80,7 +80,7 @@ def _functions(name: str) -> tuple[Recogniser, Importer, Finder]:
 
             return looks_like_custom, import_custom, _whole_source
         case "kitti":
-            from mudg.formats.importers.kitti.importer import files_of_kitti, import_kitti, looks_like_kitti
+            from mudg.formats.importers.kitti import files_of_kitti, import_kitti, looks_like_kitti
 
             return looks_like_kitti, import_kitti, files_of_kitti
         case _:

@@ -29,65 +29,33 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common, drive_log
-from mudg.formats.importers.common import (
-    Columns,
-    ImportOptions,
-    LogFiles,
-    arrow_files,
-    chosen_cameras,
-    finite_columns,
-    folder_contents,
-    name_table,
-    refuse_missing_cameras,
-    refuse_untwist,
-    require_columns,
-    returns_of,
-    the_only,
-    unit_intensity,
-)
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
 from mudg.formats.unknown_fields import note_unknown
 
 Matrix = NDArray[np.float64]
 
 LICENCE: Final = "CC BY-NC-SA 4.0 (Argoverse 2: Wilson et al.; attribution, non-commercial, share-alike)"
-RING_CAMERAS: Final = tuple(
-    (
-        "ring_front_center ring_front_left ring_front_right ring_side_left ring_side_right ring_rear_left "
-        "ring_rear_right"
-    ).split()
-)
 CAMERAS: Final[Mapping[str, str]] = name_table(
     """front: ring_front_center; front_left: ring_front_left; front_right: ring_front_right;
     side_left: ring_side_left; side_right: ring_side_right; rear_left: ring_rear_left;
     rear_right: ring_rear_right; stereo_left: stereo_front_left; stereo_right: stereo_front_right"""
 )
+RING_CAMERAS: Final = tuple(name for name in CAMERAS if name.startswith("ring"))
 SENSOR: Final = "lidar"
-_UPPER: Final = "up_lidar"
-_LOWER: Final = "down_lidar"
+_UPPER, _LOWER = "up_lidar", "down_lidar"
 NANOSECONDS: Final = 10**9
 _POSE_SLACK_S: Final = 0.02
 _MAX_OFFSET_NS: Final = 500_000_000
 _POSE: Final = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
+_SIZE: Final = ("length_m", "width_m", "height_m")
 SWEEPS: Final = "sensors/lidar/*.feather"
 OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     "city_SE3_egovehicle.feather": frozenset({"timestamp_ns", *_POSE}),
     "egovehicle_SE3_sensor.feather": frozenset({"sensor_name", *_POSE}),
-    "intrinsics.feather": frozenset(
-        {"sensor_name", "fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px"}
-    ),
+    "intrinsics.feather": frozenset("sensor_name fx_px fy_px cx_px cy_px k1 k2 k3 width_px height_px".split()),
     "annotations.feather": frozenset(
-        {
-            "timestamp_ns",
-            "track_uuid",
-            "category",
-            "length_m",
-            "width_m",
-            "height_m",
-            *_POSE,
-            "num_interior_pts",
-            "log_id",
-        }
+        ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE, "num_interior_pts", "log_id")
     ),
     SWEEPS: frozenset({"x", "y", "z", "intensity", "laser_number", "offset_ns"}),
 }
@@ -123,7 +91,7 @@ def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("Argoverse 2 folder does not exist", where=str(source), expected="a folder")
-    refuse_untwist(options, "Argoverse 2", str(source))
+    common.refuse_untwist(options, "Argoverse 2", str(source))
     return drive_log.write_log(read_log(_choose_log(source, options), options), out, options)
 
 
@@ -142,9 +110,9 @@ def _choose_log(source: Path, options: ImportOptions) -> Path:
         what = "no Argoverse 2 log found"
         expected = "city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders"
         remedy = "give the folder of one log of the sensor data set"
-        raise InputError(what, where=str(source), got=folder_contents(source), expected=expected, remedy=remedy)
+        raise InputError(what, where=str(source), got=common.folder_contents(source), expected=expected, remedy=remedy)
     matching = [path for path in logs if path.resolve().name.startswith(options.sequence)]
-    return the_only(matching, [path.name for path in logs], options, source, "log")
+    return common.the_only(matching, [path.name for path in logs], options, source, "log")
 
 
 def files_of_argoverse2(source: Path, options: ImportOptions) -> LogFiles:
@@ -162,18 +130,15 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
         expected = "folders ring_front_center, ring_front_left, ... with images named by nanoseconds"
         remedy = "download the sensor data set's camera archives, too; a scene is made of images"
         raise InputError("the log has no images", where=str(image_folder), expected=expected, remedy=remedy)
-    refuse_missing_cameras(there.values(), (CAMERAS[raw] for raw in RING_CAMERAS), options, image_folder)
-    chosen = {there[raw]: raw for raw in chosen_cameras(there, options, where, RING_CAMERAS)}
+    common.refuse_missing_cameras(there.values(), (CAMERAS[raw] for raw in RING_CAMERAS), options, image_folder)
+    chosen = {there[raw]: raw for raw in common.chosen_cameras(there, options, where, RING_CAMERAS)}
     files = {name: _files_by_time(image_folder / raw, (".jpg", ".jpeg", ".png")) for name, raw in chosen.items()}
     scans = _files_by_time(sweep_folder, (".feather",)) if sweep_folder.is_dir() else {}
     stamps = [stamp for found in (*files.values(), scans) for stamp in found]
     if not stamps:
         raise InputError("the log has no images", where=str(image_folder))
     zero_ns = min(stamps)
-    ego_file, mount_file = (
-        folder / "city_SE3_egovehicle.feather",
-        folder / "calibration" / "egovehicle_SE3_sensor.feather",
-    )
+    ego_file, mount_file = folder / "city_SE3_egovehicle.feather", folder / "calibration/egovehicle_SE3_sensor.feather"
     notes: list[str] = []
     mounts, ego = read_mounts(mount_file), common.mended_path(read_ego(ego_file, zero_ns), options, notes)
     if options.skip_missing:
@@ -192,17 +157,16 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
     upper = _of_sensor(mounts, _UPPER, mount_file) if scans else np.eye(4)
     places = [pose[:3, 3] for name, pose in mounts.items() if name in (_UPPER, _LOWER)]
     sweeps = [
-        SweepRecord(
-            SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, partial(read_sweep, path, upper, places)
-        )
+        SweepRecord(SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, read)
         for t, path in scans.items()
+        for read in [partial(read_sweep, path, upper, places)]
     ]
     notes += [] if sweeps else ["no LiDAR sweeps in the log"]
     tracks, track_notes = read_tracks(folder / "annotations.feather", ego, zero_ns, skip_missing=options.skip_missing)
     cameras = read_cameras(folder / "calibration" / "intrinsics.feather", chosen)
     source = Source("argoverse2", LICENCE, None, (*notes, *track_notes))
     name = folder.resolve().name
-    return DriveLog(name, cameras, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
+    return DriveLog(name, cameras, images, sweeps, tracks, ego, source, where)
 
 
 def _files_by_time(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
@@ -225,16 +189,16 @@ def _with_poses(files: Mapping[int, Path], ego: EgoPath, zero_ns: int, sensor: s
 # --- tables ---------------------------------------------------------------------------------------
 
 
-def read_feather(path: Path, columns: Sequence[str]) -> Columns:
+def read_feather(path: Path, columns: Sequence[str]) -> common.Columns:
     """Named columns of a Feather (Arrow IPC) file as arrays of one length. Raises ResourceError: pyarrow is not
     installed. InputError: missing, cut off, without one of the columns, or with empty values."""
-    with arrow_files(path):
+    with common.arrow_files(path):
         import pyarrow.feather
 
         if not path.is_file():
             raise InputError("file not found", where=str(path), remedy="is the log complete?")
         table = pyarrow.feather.read_table(str(path), memory_map=False)
-        require_columns(columns, table.schema.names, path)
+        common.require_columns(columns, table.schema.names, path)
         kind = path.name if path.name in OFFICIAL else SWEEPS
         note_unknown(kind, table.schema.names, OFFICIAL[kind])
         empty = [name for name in columns if table.column(name).null_count]
@@ -243,7 +207,7 @@ def read_feather(path: Path, columns: Sequence[str]) -> Columns:
         return {name: table.column(name).to_numpy() for name in columns}
 
 
-def _stamps(columns: Columns, where: str) -> NDArray[np.int64]:
+def _stamps(columns: common.Columns, where: str) -> NDArray[np.int64]:
     stamps = columns["timestamp_ns"]
     if stamps.dtype.kind not in "iu":
         raise InputError("time stamps are not whole numbers", where=f"{where}: timestamp_ns", got=str(stamps.dtype))
@@ -252,8 +216,8 @@ def _stamps(columns: Columns, where: str) -> NDArray[np.int64]:
     return stamps
 
 
-def _poses(columns: Columns, where: str) -> list[Matrix]:
-    rows = finite_columns(columns, _POSE, where)
+def _poses(columns: common.Columns, where: str) -> list[Matrix]:
+    rows = common.finite_columns(columns, _POSE, where)
     return [common.pose_from_quaternion(row[:4], row[4:], f"{where}: row {index}") for index, row in enumerate(rows)]
 
 
@@ -286,7 +250,9 @@ def read_cameras(path: Path, chosen: Mapping[str, str]) -> dict[str, Camera]:
     where = str(path)
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
     columns = read_feather(path, ("sensor_name", *names))
-    rows = dict(zip(map(str, columns["sensor_name"]), finite_columns(columns, names, where).tolist(), strict=True))
+    rows = dict(
+        zip(map(str, columns["sensor_name"]), common.finite_columns(columns, names, where).tolist(), strict=True)
+    )
     cameras = {}
     for name, raw in chosen.items():
         fx, fy, cx, cy, k1, k2, k3, width, height = _of_sensor(rows, raw, where)
@@ -301,10 +267,9 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = 
     where = str(path)
     if not path.is_file():
         return [], ["no annotations in this log: everything counts as static"]
-    names = ("timestamp_ns", "track_uuid", "category", "length_m", "width_m", "height_m", *_POSE)
-    columns = read_feather(path, names)
+    columns = read_feather(path, ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE))
     stamps, poses = _stamps(columns, where), _poses(columns, where)
-    sizes = finite_columns(columns, ("length_m", "width_m", "height_m"), where)
+    sizes = common.finite_columns(columns, _SIZE, where)
     map_from_ego = {
         int(t): common.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where)
         for t in set(stamps)
@@ -314,12 +279,9 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = 
     for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
         if int(stamp) not in map_from_ego:
             continue
-        label = tracks.label_of(str(columns["category"][row]))
-        length, width, height = sizes[row].tolist()
-        time_s = (int(stamp) - zero_ns) / NANOSECONDS
-        track = str(columns["track_uuid"][row])
-        pose = map_from_ego[int(stamp)] @ pose
-        tracks.add(track, label, time_s, (length, width, height), pose, where=f"{where}: row {row}")
+        label, track = tracks.label_of(str(columns["category"][row])), str(columns["track_uuid"][row])
+        time_s, pose = (int(stamp) - zero_ns) / NANOSECONDS, map_from_ego[int(stamp)] @ pose
+        tracks.add(track, label, time_s, tuple(sizes[row].tolist()), pose, where=f"{where}: row {row}")
     return tracks.tracks()
 
 
@@ -331,14 +293,12 @@ def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()
     turn."""
     where = str(path)
     columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
-    returns = returns_of(columns, where, places)
+    returns = common.returns_of(columns, where, places)
     columns = {name: values[returns] for name, values in columns.items()}
-    xyz_ego = finite_columns(columns, ("x", "y", "z"), where)
-    intensity = unit_intensity(finite_columns(columns, ("intensity",), where)[:, 0], 255, where)
+    xyz_ego = common.finite_columns(columns, ("x", "y", "z"), where)
+    intensity = common.unit_intensity(common.finite_columns(columns, ("intensity",), where)[:, 0], 255, where)
     offset_ns = columns["offset_ns"]
-    if offset_ns.dtype.kind not in "iu" or (
-        len(offset_ns) and int(np.abs(offset_ns.astype(np.int64)).max()) > _MAX_OFFSET_NS
-    ):
+    if offset_ns.dtype.kind not in "iu" or (np.abs(offset_ns.astype(np.int64)) > _MAX_OFFSET_NS).any():
         what, where = "point times are no nanoseconds of one turn", f"{where}: offset_ns"
         expected = "whole nanoseconds since the sweep's time, under half a second"
         raise InputError(what, where=where, expected=expected, got=f"{offset_ns.dtype}, up to {offset_ns.max():g}")

@@ -47,10 +47,7 @@ Fields = Mapping[str, NDArray]
 @dataclass(frozen=True, slots=True, eq=False)
 class Cloud:
     """Points as a file has them: ``xyz`` f64[N, 3], and every other named field of one number a point, ``fields`` [N]
-    each.
-
-    Beams without a return (``scene.returns.is_return``) are left out; ``missing`` counts them.
-    """
+    each. Beams without a return (``scene.clouds.is_return``) are left out; ``missing`` counts them."""
 
     xyz: NDArray[np.float64]
     fields: Fields
@@ -86,18 +83,7 @@ def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
 
 
 # --- PCD ------------------------------------------------------------------------------------------
-_PCD_TYPES: Final = {
-    ("F", 4): "<f4",
-    ("F", 8): "<f8",
-    ("I", 1): "<i1",
-    ("I", 2): "<i2",
-    ("I", 4): "<i4",
-    ("I", 8): "<i8",
-    ("U", 1): "<u1",
-    ("U", 2): "<u2",
-    ("U", 4): "<u4",
-    ("U", 8): "<u8",
-}
+_PCD_TYPES: Final = {(name[0].upper(), int(name[1])): f"<{name}" for name in "f4 f8 i1 i2 i4 i8 u1 u2 u4 u8".split()}
 _PCD_KEYS: Final = ("VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA")
 
 
@@ -378,21 +364,12 @@ def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
         raise InputError("array is of a version that is not read", where=where, got=str(version))
     try:
         shape, fortran, dtype = readers[version](handle)
-    except (
-        tokenize.TokenError,
-        SyntaxError,
-        RecursionError,
-        MemoryError,
-    ) as error:  # of the parser that numpy hands the header to
+    except (tokenize.TokenError, SyntaxError, RecursionError, MemoryError) as error:  # of numpy's parser
         what = "array's header makes no sense"
         raise InputError(what, where=where, got=str(error)[:120], remedy="copy the file again") from error
     length = math.prod(shape) * dtype.itemsize
-    if (
-        dtype.hasobject
-        or dtype.kind not in "fiub"
-        or length > min(size, MAX_POINTS * 24)
-        or handle.tell() + length != size
-    ):
+    plain = not dtype.hasobject and dtype.kind in "fiub"
+    if not plain or length > min(size, MAX_POINTS * 24) or handle.tell() + length != size:
         what, got = "array is not plain numbers of the declared size", f"{dtype} {shape} in {size} bytes"
         raise InputError(what, where=where, got=got, remedy="save it with numpy.savez from an array of numbers")
     content = handle.read(length)
@@ -400,10 +377,6 @@ def read_npy(handle: IO[bytes], size: int, where: str) -> NDArray:
     return np.frombuffer(content, dtype).reshape(shape, order="F" if fortran else "C")
 
 
-READERS: Final[dict[str, Callable[[bytes, str], dict[str, NDArray]]]] = {
-    ".pcd": read_pcd,
-    ".ply": read_ply,
-    ".bin": read_bin,
-    ".npz": read_npz,
-}
+READERS: Final[dict[str, Callable[[bytes, str], dict[str, NDArray]]]]
+READERS = {".pcd": read_pcd, ".ply": read_ply, ".bin": read_bin, ".npz": read_npz}
 """Suffix -> reader of its bytes; fields by name."""

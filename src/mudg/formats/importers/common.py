@@ -1,12 +1,5 @@
 """What importers share: work over items in parallel, units of time, poses that must be rigid, and the vehicle's path.
 
-A typical importer reads what is small, checks it, and hands the rest to the writer item by item::
-
-    times_s = seconds(raw_times, "us", where)                     # refuses milliseconds called microseconds
-    fits = {name: fit_images(camera, options, lens) for ...}      # images.py: rectified and resized in one place
-    content = SceneContent(name, source, fits, items, convert, item_name, ego)
-    return write_scene(content, out, options)                     # drive_log.py
-
 The scene is the same for any number of workers: frames and sweeps are ordered by time when all are there.
 """
 
@@ -49,29 +42,30 @@ def name_table(text: str) -> dict[str, str]:
 
 
 # columns ------------------------------------------------------------------------------------------
-#
-# Foreign tables and records: columns that must be there, numbers that must be finite, and the pyarrow package behind
-# some files.
 Columns = Mapping[str, NDArray[Any]]
 _ROUNDING: Final = 1e-3
 
 
 def require_columns(names: Iterable[str], there: Iterable[str], where: object) -> None:
     """Refuse a table that lacks one of ``names``."""
-    there, names = list(there), list(names)
-    if not set(names) <= set(there):
+    there, names = set(there), list(names)
+    if not there.issuperset(names):
         got = ", ".join(sorted(there)[:40]) or "no columns"
         remedy = "is this a file of another data set, version or kind?"
         raise InputError("table lacks columns", where=str(where), got=got, expected=", ".join(names), remedy=remedy)
 
 
+def _number_columns(columns: Columns, names: Sequence[str], where: object) -> NDArray[np.float64]:
+    try:
+        return np.stack([columns[name].astype(np.float64) for name in names], 1)
+    except (TypeError, ValueError) as error:
+        where = f"{where}: {', '.join(names)}"
+        raise InputError("column does not hold numbers", where=where, got=str(error)[:120]) from error
+
+
 def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDArray[np.float64]:
     """Columns as f64[n, k]. Raises InputError: no numbers, or not all finite."""
-    where = f"{where}: {', '.join(names)}"
-    try:
-        table = np.stack([columns[name].astype(np.float64) for name in names], 1)
-    except (TypeError, ValueError) as error:
-        raise InputError("column does not hold numbers", where=where, got=str(error)[:120]) from error
+    table, where = _number_columns(columns, names, where), f"{where}: {', '.join(names)}"
     bad = ~np.isfinite(table).all(1)
     if bad.any():
         got = f"{int(bad.sum())} of {len(table)} rows, first {int(np.flatnonzero(bad)[0])}"
@@ -91,12 +85,8 @@ def unit_intensity(values: NDArray[Any], largest: float, where: object, remedy: 
 
 
 def returns_of(columns: Columns, where: object, places: Iterable[NDArray[np.float64]] = ()) -> NDArray[np.bool_]:
-    """Rows of a cloud's columns x, y, z that are returns of a beam: by their numbers, and not at one of the sensors'
-    ``places``."""
-    try:
-        xyz = np.stack([columns[axis].astype(np.float64) for axis in "xyz"], 1)
-    except (TypeError, ValueError) as error:
-        raise InputError("column does not hold numbers", where=f"{where}: x, y, z", got=str(error)[:120]) from error
+    """Rows of a cloud's columns x, y, z that are returns of a beam, and not at one of the sensors' ``places``."""
+    xyz = _number_columns(columns, ("x", "y", "z"), where)
     return is_return(xyz) & ~near_places(xyz, places)
 
 
@@ -126,8 +116,6 @@ def arrow_files(path: Path) -> Iterator[None]:
 
 
 # options ------------------------------------------------------------------------------------------
-#
-# What a user may choose when importing a log; every importer reads the same options and says which it cannot honour.
 Resolution = int | tuple[int, int]
 """Longest side in pixels, or width and height."""
 
@@ -187,12 +175,8 @@ def parse_resolution(text: str) -> Resolution | None:
 
 
 def holdout_split(frame_ids_by_time: list[list[str]], test_every: int) -> dict[str, Literal["train", "test"]]:
-    """Every ``test_every``-th moment (4, 8, 12, ... for 4; never the first) is held out, all cameras together.
-
-    Args:
-        frame_ids_by_time: ids of the frames of each moment, in time order.
-        test_every: 0 holds out none.
-    """
+    """Every ``test_every``-th moment (4, 8, 12, ... for 4; never the first; 0: none) is held out, all cameras together.
+    ``frame_ids_by_time``: ids of the frames of each moment, in time order."""
     return {
         frame_id: "test" if test_every > 0 and index > 0 and index % test_every == 0 else "train"
         for index, frame_ids in enumerate(frame_ids_by_time)
@@ -226,11 +210,6 @@ _MAX_LOG_S: Final = 4 * 3600.0
 # --- work over frames -----------------------------------------------------------------------------
 
 
-def processors() -> int:
-    """Processors this process may use; MUDG_THREADS says otherwise."""
-    return native.default_threads()
-
-
 def for_each(
     items: Iterable[Item],
     work: Callable[[Item], None],
@@ -245,21 +224,16 @@ def for_each(
     Args:
         items: read lazily, by the calling thread: a generator over the records of a large file is fine.
         work: called once per item, from several threads if ``workers`` > 1.
-        title: of the progress bar.
         total: number of items; None = ``len(items)``, or unknown for a generator.
         workers: threads; 1 = no threads, 0 = as many as there are processors to use.
         name: what an item is called, put before the place of an error.
 
-    Returns:
-        Number of items.
-
-    Raises:
-        The error of the earliest failed item, its ``where`` completed by the item's name. No item is started after one
-        failed; those under way are waited for.
+    Returns the number of items. Raises the error of the earliest failed item, its ``where`` completed by the item's
+    name. No item is started after one failed; those under way are waited for.
     """
     if total is None:
         total = len(items) if isinstance(items, Sequence) else 0
-    workers = workers or processors()
+    workers = workers or native.default_threads()
     done = 0
     with log.task(title, total) as bar:
         if workers == 1:
@@ -302,16 +276,9 @@ def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]
         with foreign_numbers():
             work(item)
     except MudgError as error:
-        called = name(item)
-        if called in error.where:
+        if (called := name(item)) in error.where:
             raise
-        raise type(error)(
-            error.what,
-            where=f"{called}: {error.where}" if error.where else called,
-            expected=error.expected,
-            got=error.got,
-            remedy=error.remedy,
-        ) from error
+        raise error.located(f"{called}: {error.where}" if error.where else called) from error
 
 
 # --- time -----------------------------------------------------------------------------------------
@@ -359,8 +326,7 @@ def check_epoch(stamps: NDArray[np.integer], per_second: int, where: str) -> Non
 
 
 def nearest_index(sorted_times_s: NDArray[Any], times_s: NDArray[Any]) -> NDArray[np.intp]:
-    """Index into increasing ``sorted_times_s`` f64[n] of the nearest for each of ``times_s`` f64[m]; halfway goes to
-    the earlier."""
+    """Index of the nearest of increasing times f64[n] for each of ``times_s`` f64[m]; halfway goes to the earlier."""
     return np.searchsorted((sorted_times_s[1:] + sorted_times_s[:-1]) / 2, times_s)
 
 
@@ -376,17 +342,15 @@ def rigid_pose(matrix: ArrayLike, where: str) -> Matrix:
     if not np.isfinite(numbers).all():
         raise InputError("pose holds values that are not finite", where=where)
     if len(numbers) == 4 and np.abs(numbers[3] - [0, 0, 0, 1]).max() > POSE_TOLERANCE:
-        got = numbers[3].tolist()
-        transposed = np.abs(numbers[:3, 3]).max() < POSE_TOLERANCE
+        transposed, what = np.abs(numbers[:3, 3]).max() < POSE_TOLERANCE, "pose does not end in the row 0 0 0 1"
         remedy = "it looks transposed: write it row by row" if transposed else "write it row by row"
-        raise InputError("pose does not end in the row 0 0 0 1", where=where, got=str(got), remedy=remedy)
+        raise InputError(what, where=where, got=str(numbers[3].tolist()), remedy=remedy)
     return from_rotation_translation(rigid_rotation(numbers[:3, :3], where), numbers[:3, 3])
 
 
 def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
     """The rotation nearest to f64[3, 3] numbers that were rounded; see ``rigid_pose``."""
     u, stretch, vt = np.linalg.svd(matrix)
-    handed = float(np.linalg.det(u @ vt))
     if stretch[0] - stretch[2] <= POSE_TOLERANCE * stretch[0] and abs(stretch[1] - 1) > POSE_TOLERANCE:
         expected = "a rotation (scale 1)"
         remedy = "divide the rotation part by its scale; are the translations in metres?"
@@ -395,7 +359,7 @@ def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
         what, got = "pose is not a rigid motion", f"stretches {', '.join(f'{s:.4g}' for s in stretch)}"
         remedy = "is it row-major, without shear or scale?"
         raise InputError(what, where=where, expected="an orthonormal rotation part", got=got, remedy=remedy)
-    if handed < 0:
+    if np.linalg.det(u @ vt) < 0:
         got = "a reflection (determinant -1)"
         remedy = "one axis is mirrored: x forward, y left, z up for vehicles; x right, y down, z forward for cameras"
         raise InputError("pose is left-handed", where=where, expected="determinant +1", got=got, remedy=remedy)
@@ -431,21 +395,14 @@ def pose_near(
     first = time_s < ego.times_s[0]
     beyond = float(ego.times_s[0] - time_s if first else time_s - ego.times_s[-1])
     if beyond > max_beyond_s:
-        raise InputError(
-            "vehicle poses do not cover the images and scans",
-            where=where,
-            got=f"{beyond:.2f} s outside",
-            expected="poses from the first to the last frame",
-            remedy=(
-                "are the clocks the same? is the file cut off, or of another log? --skip-missing leaves such"
-                " records out"
-            ),
-        )
+        what, expected = "vehicle poses do not cover the images and scans", "poses from the first to the last frame"
+        remedy = "are the clocks the same? is the file cut off, or of another log?"
+        remedy += " --skip-missing leaves such records out"
+        raise InputError(what, where=where, got=f"{beyond:.2f} s outside", expected=expected, remedy=remedy)
     if len(ego.times_s) == 1:
         return ego.world_from_ego[0]
     near, far = (0, 1) if first else (-1, -2)
-    step = float(abs(ego.times_s[far] - ego.times_s[near]))
-    if beyond > step:
+    if beyond > abs(ego.times_s[far] - ego.times_s[near]):
         return ego.world_from_ego[near]
     # mirror the motion of the neighbouring interval: the pose at "beyond" before the end, turned around
     back = pose_at(ego.times_s, ego.world_from_ego, float(ego.times_s[near]) + (beyond if first else -beyond))
@@ -470,37 +427,23 @@ def has_pose(ego: EgoPath, time_s: float, max_beyond_s: float = MAX_EXTRAPOLATIO
 
 
 def mended_path(ego: EgoPath, options: ImportOptions, notes: list[str]) -> EgoPath:
-    """The vehicle's path with headings that flip by 180 degrees turned back and, if that is asked for, its gaps
-    bridged.
-
-    Args:
-        options: ``bridge_gaps`` is used.
-        notes: what was done is added.
-    """
+    """The vehicle's path with headings that flip by 180 degrees turned back and, with ``options.bridge_gaps``, its gaps
+    bridged; what was done is added to ``notes``."""
     poses, turned = motion.unflipped(ego.times_s, ego.world_from_ego, motion.MOST_TURN_RAD_S)
     if len(turned):
-        ego = EgoPath(ego.times_s, poses)
-        notes.append(
-            f"the vehicle's heading flips by 180 degrees at {ego.times_s[turned[0]]:.3f} s: {len(turned)} of"
-            f" {len(poses)} poses were turned back"
-        )
-    found = motion.gaps(ego.times_s, ego.world_from_ego) if options.bridge_gaps else []
-    if found:
-        longest = max(found, key=lambda gap: gap.moved_m)
-        notes.append(f"{len(found)} gaps of the vehicle's path are bridged by curves, the longest: {longest}")
+        ego, count = EgoPath(ego.times_s, poses), f"{len(turned)} of {len(poses)} poses were turned back"
+        notes.append(f"the vehicle's heading flips by 180 degrees at {ego.times_s[turned[0]]:.3f} s: {count}")
+    if gaps := motion.gaps(ego.times_s, ego.world_from_ego) if options.bridge_gaps else []:
+        longest = max(gaps, key=lambda gap: gap.moved_m)
+        notes.append(f"{len(gaps)} gaps of the vehicle's path are bridged by curves, the longest: {longest}")
         ego = motion.bridged(ego)
     return ego
 
 
 def origin_note(map_from_ego: Matrix) -> str:
-    """A note that says where the scene's world lies in the data set's: its origin is the first vehicle pose, subtracted
-    in float64."""
-    x, y, z = (float(value) for value in map_from_ego[:3, 3])
-    turn = yaw_of(map_from_ego)
-    return (
-        f"the world's origin is ({x:.3f}, {y:.3f}, {z:.3f}) m in the data set's world, its x axis turned by"
-        f" {turn:.6f} rad"
-    )
+    """A note that says where the scene's world lies in the data set's."""
+    place, turn = ", ".join(f"{value:.3f}" for value in map_from_ego[:3, 3]), f"{yaw_of(map_from_ego):.6f} rad"
+    return f"the world's origin is ({place}) m in the data set's world, its x axis turned by {turn}"
 
 
 def world_from_first(map_from_ego: Matrix) -> Matrix:
@@ -517,8 +460,7 @@ def ego_path(stamps_s: Sequence[float], poses: Sequence[Matrix]) -> EgoPath:
 
 
 def check_motion(ego: EgoPath, where: str) -> None:
-    """Refuse a vehicle that drives impossibly fast or lies on its side or slides: units or the order of values are
-    wrong then."""
+    """Refuse a vehicle that drives impossibly fast, lies on its side or slides: units or orders of values are wrong."""
     upright = float(np.median(ego.world_from_ego[:, 2, 2]))
     if upright < _LEAST_UPRIGHT:
         what, got = "the vehicle does not stand upright", f"its z axis rises by {upright:.2f} per metre"
@@ -558,12 +500,8 @@ def deskew(
     Args:
         xyz: f32[N, 3] metres, each in the sensor's frame at its own time.
         dt_s: f32[N], that time less ``time_s``.
-        world_from_lidar: the sensor's pose f64[4, 4] at a time; asked at 33 moments, points in between are blended
-            linearly.
-        time_s: the moment wanted.
-
-    Returns:
-        f32[N, 3] in the sensor's frame at ``time_s``.
+        world_from_lidar: the sensor's pose f64[4, 4] at a time; asked at 33 moments, between which points are blended.
+        time_s: the moment wanted, whose sensor frame the points returned have.
     """
     if len(xyz) == 0 or not dt_s.any():
         return xyz
@@ -596,21 +534,13 @@ def blend_motion(
     return out
 
 
-# Finding the files of a log: numbered files, frames that are whole, cameras that were asked for, options that do not
-
-
-Item = TypeVar("Item")
+# --- finding the files of a log -------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
 class LogFiles:
-    """What identifies the log that was chosen from a folder of many.
-
-    Args:
-        files: files, and folders that count with everything in them.
-        entries: folders too large for that, of which only their own times count: these change when a file comes or
-            goes.
-    """
+    """What identifies the log that was chosen from a folder of many: ``files``, and folders that count with everything
+    in them; ``entries``: folders too large for that, which count by their own times."""
 
     files: tuple[Path, ...]
     entries: tuple[Path, ...] = ()
@@ -618,35 +548,21 @@ class LogFiles:
 
 def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     """Files called by a frame number, in order: ``0000000012.png`` with suffix ``.png``, ``07.pkl.gz`` with
-    ``.pkl.gz``.
-
-    A folder that does not exist holds none.
-    """
-    if not folder.is_dir():
-        return {}
-    found = {}
-    for path in folder.iterdir():
+    ``.pkl.gz``; none where there is no folder."""
+    files = {}
+    for path in folder.iterdir() if folder.is_dir() else ():
         stem, dot, rest = path.name.partition(".")
         if stem.isascii() and stem.isdigit() and dot + rest.lower() in suffixes:
-            found[int(stem)] = path
-    return dict(sorted(found.items()))
+            files[int(stem)] = path
+    return dict(sorted(files.items()))
 
 
-def complete_frames(
-    streams: Mapping[str, Iterable[int]], options: ImportOptions, where: str, title: str, optional: Iterable[int] = ()
-) -> list[int]:
-    """Frame numbers to import: those that every stream has, within ``options.frames``. Raises InputError: a stream
-    lacks frames that others have (unless ``skip_missing``), or nothing is left.
-
-    Args:
-        streams: name of a camera or LiDAR -> its frame numbers.
-        options: ``frames`` and ``skip_missing`` are used.
-        where: the log, for messages.
-        title: the format's name, for messages.
-        optional: frames that may be missing from every stream without a warning (documented gaps).
-    """
+def complete_frames(streams: Mapping[str, Iterable[int]], options: ImportOptions, where: str, title: str) -> list[int]:
+    """Frame numbers to import: those that every stream (name of a camera or LiDAR -> its frame numbers) has, within
+    ``options.frames``. Raises InputError: a stream lacks frames that others have (unless ``skip_missing``), or nothing
+    is left."""
     numbers = {name: set(found) for name, found in streams.items()}
-    everything = set().union(*numbers.values()) - set(optional)
+    everything = set().union(*numbers.values())
     if options.frames is not None:
         everything = {n for n in everything if options.frames[0] <= n < options.frames[1]}
     missing = {name: sorted(everything - found) for name, found in numbers.items() if everything - found}
@@ -657,8 +573,7 @@ def complete_frames(
         raise InputError(what, where=where, expected="every camera and LiDAR for every frame", got=gaps, remedy=remedy)
     if missing:
         log.warn(f"{title}: left out incomplete frames: {gaps}")
-    for lacks in missing.values():
-        everything -= set(lacks)
+    everything = everything.difference(*missing.values())
     if not everything:
         expected = "numbered images" + (f" in {options.frames[0]}:{options.frames[1]}" if options.frames else "")
         got = ", ".join(f"{name}: {number_ranges(sorted(found))}" for name, found in numbers.items()) or "nothing"
@@ -670,12 +585,7 @@ def number_ranges(numbers: Sequence[int]) -> str:
     """Increasing frame numbers as text: three or more in a row as first and last, a long list cut short."""
     if not numbers:
         return "none"
-    runs: list[list[int]] = []
-    for number in numbers:
-        if runs and number == runs[-1][-1] + 1:
-            runs[-1].append(number)
-        else:
-            runs.append([number])
+    runs = np.split(numbers, np.flatnonzero(np.diff(numbers) != 1) + 1)
     ranges = [f"{run[0]} to {run[-1]}" if len(run) > 2 else ", ".join(map(str, run)) for run in runs]
     return ", ".join(ranges[:8]) + (f", ... ({len(numbers)} in all)" if len(ranges) > 8 else "")
 
@@ -695,9 +605,7 @@ def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOpti
 
     Args:
         matching: logs that fit it; all of them where none was chosen.
-        names: of all logs that are there, for the message.
-        options: ``sequence`` is used.
-        where: folder that holds them.
+        names: of all logs that are there, for the message; ``where``: folder that holds them.
         kind: what one is called: log, scene, drive, sequence.
     """
     if len(matching) == 1:
@@ -714,8 +622,6 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
 
     Args:
         available: the data set's name -> the name in the scene; either may be asked for.
-        options: ``cameras`` is used.
-        where: the log, for messages.
         usual: the data set's names taken when none is asked for; those that are not there are left out.
     """
     by_scene_name = {ours: theirs for theirs, ours in available.items()}
@@ -734,13 +640,8 @@ def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: 
 
 
 def refuse_missing_cameras(there: Iterable[str], usual: Iterable[str], options: ImportOptions, where: object) -> None:
-    """Refuse a log that lacks cameras of its data set, unless cameras were chosen or ``skip_missing`` says otherwise.
-
-    Args:
-        there, usual: the cameras' names in the scene.
-        options: ``cameras`` and ``skip_missing`` are used.
-        where: the log, for messages.
-    """
+    """Refuse a log whose cameras ``there`` lack some of the ``usual`` ones (names in the scene), unless cameras were
+    chosen or ``skip_missing`` says otherwise."""
     there, usual = list(there), list(usual)
     absent = [name for name in usual if name not in there]
     if absent and not options.cameras and not options.skip_missing:
@@ -750,8 +651,7 @@ def refuse_missing_cameras(there: Iterable[str], usual: Iterable[str], options: 
 
 
 def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
-    """Refuse options of other formats that were set here: better than to do something else than asked. Raises
-    UsageError: one of ``names`` differs from its default."""
+    """Refuse options of other formats: one of ``names`` that differs from its default is a UsageError."""
     default = ImportOptions()
     for name in names:
         if getattr(options, name) != getattr(default, name):
@@ -760,8 +660,7 @@ def refuse_options(options: ImportOptions, title: str, *names: str) -> None:
 
 
 def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
-    """Refuse ``--untwist yes``, ``--poses`` and ``--boxes`` for a data set that brings its own and compensates its
-    sweeps."""
+    """Refuse ``--untwist yes``, ``--poses``, ``--boxes`` for a data set with poses, boxes and compensated sweeps."""
     if options.untwist == "yes":
         what = f"sweeps of {dataset} are already compensated for the vehicle's motion"
         raise UsageError(what, where=where, got="--untwist yes", remedy="leave --untwist out")
@@ -770,8 +669,8 @@ def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
 
 def path_inside(root: Path, name: Any, where: str) -> Path:
     """A file below ``root`` from a name in a foreign table; absolute names and ``..`` are refused."""
-    problem = ref_problem(name)
-    if problem is not None:
-        what = f"file name {problem}"
-        raise InputError(what, where=where, got=repr(name)[:120], expected="a relative path inside the log")
+    if (problem := ref_problem(name)) is not None:
+        raise InputError(
+            f"file name {problem}", where=where, got=repr(name)[:120], expected="a relative path inside the log"
+        )
     return root / name

@@ -21,19 +21,7 @@ from mudg.base.records import Number, StrictRecord, checked_by, named_by, parse_
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, SweepPoints, Track, View
 from mudg.formats.importers import common
 from mudg.formats.importers.clouds import Cloud, read_cloud
-from mudg.formats.importers.common import (
-    UNITS_PER_SECOND,
-    ImportOptions,
-    chosen_cameras,
-    deskew,
-    has_pose,
-    holdout_split,
-    mended_path,
-    nearest_index,
-    pose_near,
-    refuse_options,
-    unit_intensity,
-)
+from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import Lens, brown_conrady, equidistant, fit_images, image_notes
 from mudg.scene import check as scene_check
@@ -425,9 +413,9 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import a log in the neutral layout into the scene directory ``out``. Raises UsageError: an option that this
     format does not have, or a camera that the log does not have. InputError: something is missing, malformed or
     contradictory; nothing is left at ``out``."""
-    refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
+    common.refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
     read, notes = read_log(source), []
-    read = replace(read, ego=mended_path(read.ego, options, notes))
+    read = replace(read, ego=common.mended_path(read.ego, options, notes))
     content = _chosen(read, options)
     fits = {name: fit_images(c.camera, options, c.lens) for name, c in content.cameras.items()}
     images, sweeps = _numbered(content.images), _numbered(content.sweeps)
@@ -465,7 +453,7 @@ def _moments(images: Sequence[LogItem]) -> dict[LogItem, int]:
     if not images:
         return {}
     clock = np.array([image.time_s for image in images if image.sensor == images[0].sensor])
-    numbers = nearest_index(clock, np.array([image.time_s for image in images]))
+    numbers = common.nearest_index(clock, np.array([image.time_s for image in images]))
     return dict(zip(images, numbers.tolist(), strict=True))
 
 
@@ -473,7 +461,7 @@ def _chosen(content: CustomLog, options: ImportOptions) -> CustomLog:
     """The cameras, frames and files asked for. ``frames`` counts images of the first of them in the log's order; the
     rest goes by time."""
     there = {name: name for name in content.cameras}
-    names = chosen_cameras(there, options, str(content.root / INDEX), tuple(there))
+    names = common.chosen_cameras(there, options, str(content.root / INDEX), tuple(there))
     images = [image for image in content.images if image.sensor in names]
     sweeps = list(content.sweeps)
     if options.frames is not None:
@@ -497,7 +485,7 @@ def _usable(content: CustomLog, records: list[LogItem]) -> list[LogItem]:
     found = [record for record in records if (content.root / record.file.path).is_file()]
     if len(found) < len(records):
         log.warn(f"custom: left out {len(records) - len(found)} records whose {records[0].kind} is missing")
-    placed = [r for r in found if r.world_from_sensor is not None or has_pose(content.ego, r.time_s)]
+    placed = [r for r in found if r.world_from_sensor is not None or common.has_pose(content.ego, r.time_s)]
     if len(placed) < len(found):
         times = [r.time_s for r in found if r not in placed]
         log.warn(
@@ -530,7 +518,7 @@ def pose_of(ego: EgoPath, record: LogItem) -> NDArray[np.float64]:
     """World-from-sensor f64[4, 4] of an image or cloud: its own, else by the vehicle's path."""
     if record.world_from_sensor is not None:
         return record.world_from_sensor
-    return pose_near(ego, record.time_s) @ record.ego_from_sensor
+    return common.pose_near(ego, record.time_s) @ record.ego_from_sensor
 
 
 def refuse_grey(path: Path) -> None:
@@ -564,9 +552,9 @@ def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> Sw
         raise InputError(what, where=f"{content.root / INDEX}: lidars.{sweep.sensor}", expected=expected, remedy=remedy)
 
     def world_from_lidar(time_s: float) -> NDArray[np.float64]:
-        return pose_near(content.ego, time_s) @ sweep.ego_from_sensor
+        return common.pose_near(content.ego, time_s) @ sweep.ego_from_sensor
 
-    return replace(points, xyz=deskew(points.xyz, points.dt_s, world_from_lidar, sweep.time_s))
+    return replace(points, xyz=common.deskew(points.xyz, points.dt_s, world_from_lidar, sweep.time_s))
 
 
 def _field(cloud: Cloud, name: str, what: str, path: Path, remedy: str = "") -> NDArray[Any]:
@@ -584,7 +572,7 @@ def _intensity(cloud: Cloud, lidar: LogLidar, name: str, path: Path) -> NDArray[
     remedy = f"name the field in log.json: lidars.{name}.intensity_field; an empty text if there is none"
     values = _field(cloud, lidar.intensity_field, "intensity", path, remedy)
     remedy = f"give the largest possible value in log.json: lidars.{name}.intensity_max (often 255)"
-    return unit_intensity(np.nan_to_num(values.astype(np.float64)), lidar.intensity_max, path, remedy)
+    return common.unit_intensity(np.nan_to_num(values.astype(np.float64)), lidar.intensity_max, path, remedy)
 
 
 def _delays(cloud: Cloud, sweep: LogItem, content: CustomLog, path: Path) -> NDArray[np.float32]:
@@ -592,7 +580,7 @@ def _delays(cloud: Cloud, sweep: LogItem, content: CustomLog, path: Path) -> NDA
     lidar, clock = content.lidars[sweep.sensor], content.clock
     if not lidar.time_field or lidar.time_unit is None:
         return np.zeros(len(cloud.xyz), np.float32)
-    values, per_second = _field(cloud, lidar.time_field, "times", path), UNITS_PER_SECOND[lidar.time_unit]
+    values, per_second = _field(cloud, lidar.time_field, "times", path), common.UNITS_PER_SECOND[lidar.time_unit]
     if lidar.time_from == "log":
         # whole numbers are subtracted before they are scaled: nanoseconds of the epoch keep their digits
         values = values.astype(np.int64) if values.dtype.kind == "u" else values
@@ -682,7 +670,7 @@ def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple
     groups: dict[int, list[str]] = {}
     for record, moment in _moments(list(frames)).items():
         groups.setdefault(moment, []).append(frames[record].id)
-    split = holdout_split([groups[moment] for moment in sorted(groups)], ImportOptions().test_every)
+    split = common.holdout_split([groups[moment] for moment in sorted(groups)], ImportOptions().test_every)
     cameras = {name: camera.camera for name, camera in content.cameras.items()}
     scene = Scene(
         content.name,

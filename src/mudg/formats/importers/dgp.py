@@ -33,19 +33,9 @@ from mudg.base.geometry import invert
 from mudg.base.types import Camera, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common, drive_log
 from mudg.formats.importers.clouds import npz_arrays
-from mudg.formats.importers.common import (
-    ImportOptions,
-    LogFiles,
-    chosen_cameras,
-    folder_contents,
-    name_table,
-    path_inside,
-    record_fields,
-    refuse_untwist,
-    the_only,
-)
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, DriveLog, ImageRecord, SweepRecord
-from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
+from mudg.formats.unknown_fields import Known, known, note_unknown, note_unknown_within
 from mudg.scene.clouds import is_return
 
 Matrix = NDArray[np.float64]
@@ -55,66 +45,34 @@ MICROSECONDS: Final = 10**6
 _YEAR_2100_US: Final = 4_102_444_800 * MICROSECONDS
 _EPOCH: Final = datetime.datetime(1970, 1, 1, tzinfo=datetime.UTC)
 _BOXES_3D: Final = "1"
-_POSE: Final[Known] = {"translation": dict.fromkeys("xyz"), "rotation": dict.fromkeys(("qw", "qx", "qy", "qz"))}
-_ID: Final[Known] = dict.fromkeys(("log", "name", "timestamp", "index"))
-_SCENE: Final[Known] = {
-    **dict.fromkeys(
-        ("name", "description", "log", "metadata", "creation_date", "ontologies", "agent_ontologies", "statistics")
-    ),
-    "samples": {**dict.fromkeys(("datum_keys", "calibration_key", "metadata")), "id": _ID},
-    "data": {
-        **dict.fromkeys(("key", "next_key", "prev_key")),
-        "id": _ID,
-        "datum": {
-            "file_datum": None,
-            "radar_point_cloud": None,
-            "image": {
-                **dict.fromkeys(("filename", "height", "width", "channels", "annotations", "metadata")),
-                "pose": _POSE,
-            },
-            "point_cloud": {
-                **dict.fromkeys(("filename", "annotations", "metadata", "point_format", "point_fields")),
-                "pose": _POSE,
-            },
-        },
-    },
-}
-_LENS: Final = (
-    "fx",
-    "fy",
-    "cx",
-    "cy",
-    "skew",
-    "fov",
-    "fisheye",
-    *(f"k{number}" for number in range(1, 7)),
-    "p1",
-    "p2",
-    "s1",
-    "s2",
-    "s3",
-    "s4",
-    "taux",
-    "tauy",
-    "alpha",
-    "beta",
-    "w",
-    "xi",
-    "equirectangular",
+_POSE: Final = known("", translation=known("x y z"), rotation=known("qw qx qy qz"))
+_ID: Final = known("log name timestamp index")
+_LENS: Final = known(
+    "fx fy cx cy skew fov fisheye k1 k2 k3 k4 k5 k6 p1 p2 s1 s2 s3 s4 taux tauy alpha beta w xi equirectangular"
+)
+_DATUM: Final = known(
+    "file_datum radar_point_cloud",
+    image=known("filename height width channels annotations metadata", pose=_POSE),
+    point_cloud=known("filename annotations metadata point_format point_fields", pose=_POSE),
 )
 _CHANNELS: Final = frozenset(
     "X Y Z INTENSITY R G B RING NORMAL_X NORMAL_Y NORMAL_Z CLASS_ID INSTANCE_ID TIMESTAMP".split()
 )
 OFFICIAL: Final[Mapping[str, Known]] = {
-    "scene_*.json": _SCENE,
-    "calibration/*.json": {"names": None, "intrinsics": dict.fromkeys(_LENS), "extrinsics": _POSE},
-    "ontology/*.json": {"items": dict.fromkeys(("name", "id", "color", "isthing", "supercategory"))},
-    "bounding_box_3d/*.json": {
-        "annotations": {
-            **dict.fromkeys(("class_id", "instance_id", "attributes", "num_points")),
-            "box": {**dict.fromkeys(("width", "length", "height", "occlusion", "truncation")), "pose": _POSE},
-        }
-    },
+    "scene_*.json": known(
+        "name description log metadata creation_date ontologies agent_ontologies statistics",
+        samples=known("datum_keys calibration_key metadata", id=_ID),
+        data=known("key next_key prev_key", id=_ID, datum=_DATUM),
+    ),
+    "calibration/*.json": known("names", intrinsics=_LENS, extrinsics=_POSE),
+    "ontology/*.json": known("", items=known("name id color isthing supercategory")),
+    "bounding_box_3d/*.json": known(
+        "",
+        annotations=known(
+            "class_id instance_id attributes num_points",
+            box=known("width length height occlusion truncation", pose=_POSE),
+        ),
+    ),
 }
 """Kinds of files -> their fields, read or not; what is in metadata and attributes is free. Source: the format's
 published messages."""
@@ -143,7 +101,7 @@ def import_dgp(source: Path, out: Path, options: ImportOptions) -> Scene:
     """
     if not source.is_dir():
         raise InputError("DGP folder does not exist", where=str(source), expected="a folder")
-    refuse_untwist(options, "DGP", str(source))
+    common.refuse_untwist(options, "DGP", str(source))
     return drive_log.write_log(read_log(_choose_scene(source, options), options), out, options)
 
 
@@ -159,10 +117,10 @@ def _choose_scene(source: Path, options: ImportOptions) -> Path:
     scenes = _scenes(source)
     if not scenes:
         expected = "scene_<hash>.json beside a calibration folder, here or in sub-folders"
-        raise InputError("no DGP scene found", where=str(source), got=folder_contents(source), expected=expected)
+        raise InputError("no DGP scene found", where=str(source), got=common.folder_contents(source), expected=expected)
     matching = [p for p in scenes if options.sequence in ("", p.parent.resolve().name, p.stem, p.name)]
     names = [f"{p.parent.resolve().name} ({p.name[:14]}...)" for p in scenes]
-    return the_only(matching, names, options, source, "scene")
+    return common.the_only(matching, names, options, source, "scene")
 
 
 def files_of_dgp(source: Path, options: ImportOptions) -> LogFiles:
@@ -175,7 +133,7 @@ def files_of_dgp(source: Path, options: ImportOptions) -> LogFiles:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Datum:
-    """One image or cloud: its record, kind (``image`` or ``point_cloud``), sensor, calibration, stamp, pose."""
+    """One image or cloud; ``kind``: ``image`` or ``point_cloud``."""
 
     kind: str
     sensor: str
@@ -191,11 +149,13 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
     folder, where = scene_file.parent, str(scene_file)
     log.info(f"dgp: {scene_file}")
     scene = _json(scene_file, "scene_*.json")
-    with record_fields("scene record is incomplete", where, "the fields of a DGP scene"):
+    with common.record_fields("scene record is incomplete", where, "the fields of a DGP scene"):
         data = _read_data(scene, where)
         calibrations = {key: _read_calibration(folder, key) for key in sorted({d.calibration for d in data})}
         names = {d.sensor: d.sensor.lower() for d in data if d.kind == "image"}
-        chosen = {names[raw]: raw for raw in chosen_cameras(dict(sorted(names.items())), options, where, tuple(names))}
+        chosen = {
+            names[raw]: raw for raw in common.chosen_cameras(dict(sorted(names.items())), options, where, tuple(names))
+        }
         clouds = [d for d in data if d.kind == "point_cloud"]
         used = [d for d in data if d.kind == "image" and d.sensor in chosen.values()] + clouds
         ticks_per_second, notes = _clock(used, where)
@@ -207,7 +167,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
         images, sweeps = [], []
         cameras: dict[str, Camera] = {}
         for datum in used:
-            path = path_inside(folder, datum.record.get("filename"), datum.where)
+            path = common.path_inside(folder, datum.record.get("filename"), datum.where)
             if datum.kind == "image":
                 name = names[datum.sensor]
                 _add_camera(cameras, calibrations[datum.calibration], name, datum)
@@ -224,7 +184,7 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
     ordered = {name: cameras[name] for name in chosen}
     source = Source("dgp", LICENCE, None, (*notes, *track_notes))
     name = folder.resolve().name
-    return DriveLog(name, ordered, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
+    return DriveLog(name, ordered, images, sweeps, tracks, ego, source, where)
 
 
 def _json(path: Path, kind: str) -> Any:
@@ -302,7 +262,7 @@ class _DgpCalibration:
 
 
 def _read_calibration(folder: Path, key: str) -> _DgpCalibration:
-    path = path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
+    path = common.path_inside(folder, f"calibration/{key}.json", f"{folder}: calibration key")
     record = _json(path, "calibration/*.json")
     names = [str(name) for name in record["names"]]
     if not len(names) == len(record["extrinsics"]) == len(record["intrinsics"]):
@@ -342,23 +302,21 @@ def _read_tracks(
     for datum, time_s, name in zip(clouds, times_s, files, strict=True):
         if not name:
             continue
-        path = path_inside(folder, name, datum.where)
+        path = common.path_inside(folder, name, datum.where)
         for index, item in enumerate(_json(path, "bounding_box_3d/*.json")["annotations"]):
             where = f"{path}: annotations[{index}]"
             if item["class_id"] not in names:
                 what, got = "box has a class that the ontology lacks", str(item["class_id"])
                 raise InputError(what, where=where, got=got, expected=", ".join(str(number) for number in names))
-            box = item["box"]
-            size = box["length"], box["width"], box["height"]
-            label = tracks.label_of(names[item["class_id"]])
-            pose = datum.map_from_sensor @ _pose(box["pose"], where)
+            box, label = item["box"], tracks.label_of(names[item["class_id"]])
+            size, pose = (box["length"], box["width"], box["height"]), datum.map_from_sensor @ _pose(box["pose"], where)
             tracks.add(str(item["instance_id"]), label, time_s, size, pose, where=where)
     return tracks.tracks()
 
 
 def _class_names(folder: Path, scene: Mapping[str, Any]) -> dict[int, str]:
     key = scene["ontologies"].get(_BOXES_3D)
-    path = path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
+    path = common.path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
     return {int(item["id"]): str(item["name"]) for item in _json(path, "ontology/*.json")["items"]}
 
 

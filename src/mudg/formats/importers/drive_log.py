@@ -13,6 +13,7 @@ held-out split go by this number.
 from __future__ import annotations
 
 from array import array
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -32,16 +33,8 @@ from mudg.base.geometry import (
     transform_points,
 )
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View, foreign_name
-from mudg.formats.importers.common import (
-    ImportOptions,
-    check_motion,
-    for_each,
-    gap_problem,
-    holdout_split,
-    nearest_index,
-    origin_note,
-    world_from_first,
-)
+from mudg.formats.importers import common
+from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.images import ImageFit, Lens, fit_images, image_notes
 from mudg.scene import motion
 from mudg.scene.clouds import FLOAT32_SPACING_M, at_sensor, float32_spacing_m
@@ -60,27 +53,20 @@ _EGO_MARGIN_S: Final = 0.6
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SceneImage:
-    """One image on its way into a scene.
-
-    Args:
-        camera: its name in the scene.
-        number: of its frame; the id becomes ``<camera>/<number>``.
-        time_s: seconds of the scene's clock.
-        world_from_cam: f64[4, 4].
-        image: path or bytes of the recorded file.
-        where: for errors; empty = the path.
-        labels: see ``SceneWriter.add_label``; in the scene's size.
-        moment: images of one moment are held out together; None = the number.
-    """
+    """One image on its way into a scene, as ``<camera>/<number>``. Images of one ``moment`` are held out together."""
 
     camera: str
     number: int
     time_s: float
+    """Of the scene's clock."""
     world_from_cam: Matrix
     image: Path | bytes
     where: str = ""
+    """For errors; empty = the path."""
     labels: Mapping[str, NDArray[Any]] = field(default_factory=dict)
+    """See ``SceneWriter.add_label``; in the scene's size."""
     moment: int | None = None
+    """None = the number."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -134,8 +120,7 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
     types.foreign_name(content.name, f"{dataset}: name of the log")
     moments: list[tuple[int, str]] = []
     rows: dict[str, list[tuple[int, int, float]]] = {}
-    """Sensor -> of each sweep, rows without a return, all rows, and how far apart float32 numbers are at its farthest
-    point."""
+    """Sensor -> rows without return, all rows, and how far apart float32 numbers are at the farthest point, a sweep."""
 
     def convert(item: Item) -> None:
         for part in content.convert(item):
@@ -157,12 +142,10 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
     with SceneWriter(out, content.name, content.source) as writer:
         for fit in content.fits.values():
             writer.add_camera(fit.camera)
-        title = f"importing {dataset}"
-        for_each(
-            content.items, convert, title=title, total=content.total, workers=options.workers, name=content.item_name
-        )
-        found, notes = content.tracks()
-        tracks, turned = turned_back(found)
+        title, total, workers = f"importing {dataset}", content.total, options.workers
+        common.for_each(content.items, convert, title=title, total=total, workers=workers, name=content.item_name)
+        tracks, notes = content.tracks()
+        tracks, turned = turned_back(tracks)
         notes = [*notes, *turned, *_row_notes(rows)]
         _log_notes(dataset, notes)
         writer.add_notes(notes)
@@ -172,7 +155,7 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
         groups: dict[int, list[str]] = {}
         for moment, frame_id in sorted(moments):
             groups.setdefault(moment, []).append(frame_id)
-        writer.set_split(holdout_split(list(groups.values()), options.test_every))
+        writer.set_split(common.holdout_split(list(groups.values()), options.test_every))
         return writer.finish()
 
 
@@ -193,16 +176,11 @@ def _row_notes(rows: Mapping[str, Sequence[tuple[int, int, float]]]) -> list[str
     for sensor, counts in sorted(rows.items()):
         without, total = sum(one[0] for one in counts), sum(one[1] for one in counts)
         if without:
-            notes.append(
-                f"{sensor}: {without} of {total} points ({without / total:.1%}) mark beams without a return and were"
-                " left out"
-            )
-        spacing_m = max(one[2] for one in counts)
-        if spacing_m > FLOAT32_SPACING_M:
-            log.warn(
-                f"{sensor}: points reach so far from the sensor that float32 rounds them to {spacing_m * 1e3:.3g} mm; "
-                "are they in the sensor's frame?"
-            )
+            share = f"{without} of {total} points ({without / total:.1%})"
+            notes.append(f"{sensor}: {share} mark beams without a return and were left out")
+        if (spacing_m := max(one[2] for one in counts)) > FLOAT32_SPACING_M:
+            far = f"points reach so far from the sensor that float32 rounds them to {spacing_m * 1e3:.3g} mm"
+            log.warn(f"{sensor}: {far}; are they in the sensor's frame?")
     return notes
 
 
@@ -216,12 +194,12 @@ def _log_notes(dataset: str, notes: Iterable[str]) -> None:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageRecord:
-    """One recorded image: ``map_from_cam`` f64[4, 4] at its own time. ``read``: its bytes, where it is no file of its
-    own; ``place`` names it then, for errors, and ``path`` is the file that holds it."""
+    """One recorded image, its pose f64[4, 4] at its own time. ``read``: its bytes, where it is no file of its own;
+    ``place`` names it then, for errors, and ``path`` is the file that holds it."""
 
-    camera: str
+    sensor: str
     time_s: float
-    map_from_cam: Matrix
+    map_from_sensor: Matrix
     path: Path
     read: Callable[[], bytes] | None = None
     place: str = ""
@@ -229,15 +207,17 @@ class ImageRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SweepRecord:
-    """One LiDAR sweep: ``map_from_lidar`` f64[4, 4] at its time; ``read`` loads the points when they are wanted.
-    ``place`` as above."""
+    """One LiDAR sweep, as ``ImageRecord``; ``read`` loads the points when they are wanted."""
 
     sensor: str
     time_s: float
-    map_from_lidar: Matrix
+    map_from_sensor: Matrix
     path: Path
     read: Callable[[], SweepPoints]
     place: str = ""
+
+
+Record = ImageRecord | SweepRecord
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -256,12 +236,9 @@ class DriveLog:
 
     Args:
         name: name of the log; becomes the scene's id.
-        cameras: by scene name, in the order of the scene.
-        reference: the camera that counts frames.
+        cameras: by scene name, in the order of the scene; the first one counts frames.
         images, sweeps: in any order; times in seconds on one clock.
-        tracks: boxes in the map's frame.
-        ego: the vehicle's path in the map's frame.
-        source: data set, licence and notes.
+        tracks, ego: boxes and the vehicle's path in the map's frame.
         where: folder, for messages.
         optics: by scene name; cameras that are not named are rectified.
         box_times: ``sweeps``: keys of tracks are the times of the sweeps in which people saw the boxes; ``own``: the
@@ -270,7 +247,6 @@ class DriveLog:
 
     name: str
     cameras: Mapping[str, Camera]
-    reference: str
     images: Sequence[ImageRecord]
     sweeps: Sequence[SweepRecord]
     tracks: Sequence[Track]
@@ -288,44 +264,47 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     brought to the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep counts as one moment,
     without point times, and boxes stay as drawn. Raises UsageError: no frame lies in the chosen range. InputError: a
     file is missing or damaged; poses, times and units contradict each other. Nothing is left at ``out``."""
-    check_motion(drive.ego, drive.where)
+    common.check_motion(drive.ego, drive.where)
     chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
-    records = sorted((*chosen.images, *chosen.sweeps), key=lambda record: record.time_s)
+    records = sorted(chosen, key=lambda record: record.time_s)
     start_s, end_s = records[0].time_s, records[-1].time_s
-    numbers = _numbers_in_time_order(records)
+    counts: Counter[str] = Counter()
+    numbers: dict[Record, int] = {}
+    for record in records:
+        numbers[record] = counts[record.sensor]
+        counts[record.sensor] += 1
     ego = _ego_between(drive.ego, start_s, end_s, drive.where)
-    world_from_map = world_from_first(ego.world_from_ego[0])
+    world_from_map = common.world_from_first(ego.world_from_ego[0])
     optics = {name: drive.optics.get(name, CameraOptics(camera)) for name, camera in drive.cameras.items()}
     fits = {name: fit_images(drive.cameras[name], options, one.lens) for name, one in optics.items()}
     labels = {name: {} if one.ego is None else {"ego": fits[name].ids(one.ego)} for name, one in optics.items()}
     within = (start_s - REACH_S, end_s + REACH_S)
     seen = BoxTimes([track for track in drive.tracks if clip_track(track, *within) is not None])
-    notes = [*drive.source.notes, *image_notes(fits), origin_note(ego.world_from_ego[0])]
+    notes = [*drive.source.notes, *image_notes(fits), common.origin_note(ego.world_from_ego[0])]
     if options.untwist == "no":
         notes.append("sweeps count as moments: point times are left out")
     if options.frames is not None:
-        notes.append(f"frames {options.frames[0]} to {options.frames[1] - 1} of camera {drive.reference}")
+        notes.append(f"frames {options.frames[0]} to {options.frames[1] - 1} of camera {next(iter(drive.cameras))}")
 
-    def convert(record: ImageRecord | SweepRecord) -> Iterable[SceneImage | SceneSweep]:
-        time_s, where = record.time_s - start_s, _place(record)
+    def convert(record: Record) -> Iterable[SceneImage | SceneSweep]:
+        sensor, number, time_s, where = record.sensor, numbers[record], record.time_s - start_s, _place(record)
+        pose = world_from_map @ record.map_from_sensor
         if isinstance(record, ImageRecord):
-            pose, moment = world_from_map @ record.map_from_cam, chosen.images[record]
             image = record.path if record.read is None else record.read()
-            yield SceneImage(record.camera, numbers[record], time_s, pose, image, where, labels[record.camera], moment)
+            yield SceneImage(sensor, number, time_s, pose, image, where, labels[sensor], chosen[record])
             return
         points = record.read()
         if options.untwist == "no":
             points = replace(points, dt_s=np.zeros_like(points.dt_s))
         if drive.box_times == "sweeps":
-            seen.observe(record.time_s, record.map_from_lidar, points)
-        pose = world_from_map @ record.map_from_lidar
-        yield SceneSweep(record.sensor, numbers[record], time_s, pose, points, where)
+            seen.observe(record.time_s, record.map_from_sensor, points)
+        yield SceneSweep(sensor, number, time_s, pose, points, where)
 
     def tracks() -> Tracks:
-        kept = [clip_track(reach_images(track), start_s, end_s) for track in seen.at_sweep_times()]
+        clipped = [clip_track(reach_images(track), start_s, end_s) for track in seen.at_sweep_times()]
         return [
             replace(t, times_s=t.times_s - start_s, world_from_object=world_from_map @ t.world_from_object)
-            for t in kept
+            for t in clipped
             if t is not None
         ], ()
 
@@ -335,91 +314,66 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     return write_scene(content, out, options)
 
 
-def _place(record: ImageRecord | SweepRecord) -> str:
+def _place(record: Record) -> str:
     return record.place or str(record.path)
 
 
-def _sensor_of(record: ImageRecord | SweepRecord) -> str:
-    return record.camera if isinstance(record, ImageRecord) else record.sensor
-
-
-def _numbers_in_time_order(records: Sequence[ImageRecord | SweepRecord]) -> dict[ImageRecord | SweepRecord, int]:
-    """Number of each record, counted per sensor from 0."""
-    counts: dict[str, int] = {}
-    numbers = {}
-    for record in records:
-        numbers[record] = counts.get(_sensor_of(record), 0)
-        counts[_sensor_of(record)] = numbers[record] + 1
-    return numbers
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Chosen:
-    """Images -> the frame number each belongs to; and sweeps."""
-
-    images: Mapping[ImageRecord, int]
-    sweeps: Sequence[SweepRecord]
-
-
-def _choose_frames(drive: DriveLog, options: ImportOptions) -> _Chosen:
+def _choose_frames(drive: DriveLog, options: ImportOptions) -> dict[Record, int]:
+    """The chosen images and sweeps -> the frame number each belongs to."""
     check_sensor_times(drive)
-    lacking = [name for name in drive.cameras if not any(image.camera == name for image in drive.images)]
+    lacking = [name for name in drive.cameras if not any(image.sensor == name for image in drive.images)]
     if lacking:
         what, got = "a camera has no images in this log", ", ".join(lacking)
         remedy = "unpack the archives with its images, or choose others with --cameras"
         raise InputError(what, where=drive.where, got=got, expected="images of every chosen camera", remedy=remedy)
-    reference_s = np.sort([image.time_s for image in drive.images if image.camera == drive.reference])
+    reference = next(iter(drive.cameras))
+    reference_s = np.sort([image.time_s for image in drive.images if image.sensor == reference])
     first, end = options.frames if options.frames is not None else (0, len(reference_s))
     if first >= len(reference_s):
-        expected = f"frames 0 to {len(reference_s) - 1} ({len(reference_s)} images of {drive.reference})"
+        expected = f"frames 0 to {len(reference_s) - 1} ({len(reference_s)} images of {reference})"
         raise UsageError("no frame lies in the chosen range", where="--frames", got=f"{first}:{end}", expected=expected)
-
-    def numbered(records: Sequence[Any]) -> list[tuple[Any, int]]:
-        nearest = nearest_index(reference_s, np.array([record.time_s for record in records])).tolist()
-        return [(record, n) for record, n in zip(records, nearest, strict=True) if first <= n < end]
-
-    return _Chosen(dict(numbered(drive.images)), [sweep for sweep, _ in numbered(drive.sweeps)])
+    records = [*drive.images, *drive.sweeps]
+    nearest = common.nearest_index(reference_s, np.array([record.time_s for record in records])).tolist()
+    return {record: number for record, number in zip(records, nearest, strict=True) if first <= number < end}
 
 
-def _without_missing(chosen: _Chosen, options: ImportOptions) -> _Chosen:
+def _without_missing(chosen: dict[Record, int], options: ImportOptions) -> dict[Record, int]:
     """Refuse files that are not there, or leave them out and say so."""
-    absent = {record: record.path for record in (*chosen.images, *chosen.sweeps) if not record.path.is_file()}
+    absent = {record: record.path for record in chosen if not record.path.is_file()}
     if not absent:
         return chosen
     by_sensor: dict[str, list[Path]] = {}
     for record, path in absent.items():
-        by_sensor.setdefault(_sensor_of(record), []).append(path)
+        by_sensor.setdefault(record.sensor, []).append(path)
     lacks = "; ".join(f"{sensor} lacks {len(paths)} (first: {paths[0].name})" for sensor, paths in by_sensor.items())
-    if not options.skip_missing or not set(chosen.images) - set(absent):
+    left = {record: number for record, number in chosen.items() if record not in absent}
+    if not options.skip_missing or not any(isinstance(record, ImageRecord) for record in left):
         what = "files that the log names are missing"
-        expected = f"all {len(chosen.images) + len(chosen.sweeps)} images and sweeps of the chosen frames"
+        expected = f"all {len(chosen)} images and sweeps of the chosen frames"
         remedy = "unpack the missing archives, choose frames with --frames FIRST:END, or add --skip-missing"
         raise InputError(what, where=str(next(iter(absent.values()))), got=lacks, expected=expected, remedy=remedy)
     log.warn(f"left out files that are missing: {lacks}")
-    images = {image: number for image, number in chosen.images.items() if image not in absent}
-    return _Chosen(images, [sweep for sweep in chosen.sweeps if sweep not in absent])
+    return left
 
 
-def _outside_gaps(chosen: _Chosen, drive: DriveLog, options: ImportOptions) -> _Chosen:
+def _outside_gaps(chosen: dict[Record, int], drive: DriveLog, options: ImportOptions) -> dict[Record, int]:
     """Refuse records in gaps of the vehicle's path, or leave them out and say so."""
-    guessed = {
-        record: gap for record in (*chosen.images, *chosen.sweeps) if (gap := motion.gap_at(drive.ego, record.time_s))
-    }
+    guessed = {record: gap for record in chosen if (gap := motion.gap_at(drive.ego, record.time_s))}
     if not guessed:
         return chosen
     record, gap = next(iter(guessed.items()))
-    if not options.skip_missing or not set(chosen.images) - set(guessed):
-        raise gap_problem(gap, record.time_s, _place(record))
+    left = {record: number for record, number in chosen.items() if record not in guessed}
+    if not options.skip_missing or not any(isinstance(record, ImageRecord) for record in left):
+        raise common.gap_problem(gap, record.time_s, _place(record))
     log.warn(f"left out {len(guessed)} images and sweeps in gaps of the vehicle's path; the first: {gap}")
-    images = {image: number for image, number in chosen.images.items() if image not in guessed}
-    return _Chosen(images, [sweep for sweep in chosen.sweeps if sweep not in guessed])
+    return left
 
 
 def check_sensor_times(drive: DriveLog) -> None:
     """Refuse two images or sweeps of one sensor at one time."""
     times: dict[str, list[float]] = {}
     for record in (*drive.images, *drive.sweeps):
-        times.setdefault(_sensor_of(record), []).append(record.time_s)
+        times.setdefault(record.sensor, []).append(record.time_s)
     for sensor, values in times.items():
         steps = np.diff(np.sort(values))
         if len(steps) and steps.min() <= 0:
@@ -435,12 +389,7 @@ def _ego_between(ego: EgoPath, start_s: float, end_s: float, where: str) -> EgoP
     return EgoPath(ego.times_s[inside], ego.world_from_ego[inside])
 
 
-# Boxes of many frames -> tracks: labels, plausible sizes, keys in time order, splits where a box is not seen.
-
-
-# box times ----------------------------------------------------------------------------------------
-#
-# When a box was seen: annotated boxes of moving objects are brought to their sweep's time.
+# --- when a box was seen --------------------------------------------------------------------------
 #
 # A turning sensor meets an object some time before or after the sweep's time stamp. Sweeps that are compensated for the
 # vehicle's motion still show a moving object where it was when the beams met it, and people draw its box around these
@@ -507,12 +456,12 @@ class BoxTimes:
             times = track.times_s
             late_s = np.interp(times, times[known], [self._late_s[index, key] for key in known])
             poses = track.world_from_object.copy()
-            poses[:, :3, 3] -= _velocity_box_times(times, late_s, poses[:, :3, 3]) * late_s[:, None]
+            poses[:, :3, 3] -= _track_velocity(times, late_s, poses[:, :3, 3]) * late_s[:, None]
             tracks[index] = Track(track.id, track.label, track.size_m, times, poses)
         return tracks
 
 
-def _velocity_box_times(times_s: NDArray[np.float64], late_s: NDArray[np.float64], places: Matrix) -> Matrix:
+def _track_velocity(times_s: NDArray[np.float64], late_s: NDArray[np.float64], places: Matrix) -> Matrix:
     """Velocity at each key, f64[T, 3] m/s: a place filed under t was taken at t + late.
 
     Steps that these delays nearly cancel (an object crosses the seam where the turn begins) tell no velocity and are
@@ -558,8 +507,7 @@ def clip_track(track: Track, start_s: float, end_s: float) -> Track | None:
     return Track(track.id, track.label, track.size_m, track.times_s[first:last], track.world_from_object[first:last])
 
 
-# box tracks ---------------------------------------------------------------------------------------
-Matrix = NDArray[np.float64]
+# --- boxes of many frames -> tracks ---------------------------------------------------------------
 MAX_GAP_S: Final = 0.55
 """A moving object that is not seen for longer than this is split: interpolating across would invent its path."""
 MAX_SIDE_M: Final = 100.0
@@ -588,7 +536,7 @@ def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, f
 
 
 @dataclass(slots=True)
-class _Member:
+class _BoxedObject:
     labels: dict[str, int] = field(default_factory=dict)
     rows: array = field(default_factory=lambda: array("d"))
     standing: bool = False
@@ -606,11 +554,11 @@ class BoxTracks:
 
     def __init__(self, where: str, labels: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
         self._where, self._labels, self._max_gap_s = where, labels, max_gap_s
-        self._members: dict[str, _Member] = {}
+        self._boxeds: dict[str, _BoxedObject] = {}
         self._unknown: dict[str, int] = {}
 
     def __len__(self) -> int:
-        return len(self._members)
+        return len(self._boxeds)
 
     def label_of(self, category: str) -> str:
         """The label of a class of the data set; classes that are not known are counted. InputError for a name above 200
@@ -637,21 +585,19 @@ class BoxTracks:
         Args:
             track: the object's id, the same in all frames.
             label: its label (``label_of``). The track takes its commonest one.
-            time_s: when, seconds of the scene's clock.
             size_m: length, width, height.
             world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
-            standing: the data set says that the object does not move in the whole log. It must say so with every box of
-                the object.
+            standing: the data set says with every box of the object that it does not move in the whole log.
             late_s: how long after ``time_s`` the box was measured (a turning LiDAR reaches it at its own time). The
                 track's key stands at ``time_s``, moved there with the object's velocity.
             where: file and record, for messages.
         """
         foreign_name(track, f"{where or self._where}: id of an object")
         size = box_size(*size_m, where=where or f"{self._where}: object {track} ({label})")
-        member = self._members.setdefault(track, _Member())
-        member.labels[label] = member.labels.get(label, 0) + 1
-        member.standing = standing and (member.standing or not member.rows)
-        member.rows.extend((time_s, late_s, *size, *world_from_box[:3].ravel().tolist()))
+        boxed = self._boxeds.setdefault(track, _BoxedObject())
+        boxed.labels[label] = boxed.labels.get(label, 0) + 1
+        boxed.standing = standing and (boxed.standing or not boxed.rows)
+        boxed.rows.extend((time_s, late_s, *size, *world_from_box[:3].ravel().tolist()))
 
     def tracks(
         self, speeds: Speeds | None = None, images_s: Mapping[float, tuple[float, float]] | None = None
@@ -669,8 +615,8 @@ class BoxTracks:
         """
         tracks: list[Track] = []
         split = 0
-        for name, member in self._members.items():
-            rows = np.frombuffer(member.rows, np.float64).reshape(-1, _ROW)
+        for name, boxed in self._boxeds.items():
+            rows = np.frombuffer(boxed.rows, np.float64).reshape(-1, _ROW)
             rows = rows[np.argsort(rows[:, 0], kind="stable")]
             times = rows[:, 0]
             if (np.diff(times) <= 0).any():
@@ -678,10 +624,10 @@ class BoxTracks:
                 what, where = "an object has two boxes at one moment", f"{self._where}: object {name}"
                 raise InputError(what, where=where, got=f"time {at:.3f} s of the log", remedy="are two logs mixed?")
             size = np.median(rows[:, 2:5], axis=0)
-            label = max(member.labels, key=lambda name: member.labels[name])
+            label = max(boxed.labels, key=lambda name: boxed.labels[name])
             poses = np.tile(np.eye(4), (len(rows), 1, 1))
             poses[:, :3] = rows[:, 5:].reshape(-1, 3, 4)
-            if member.standing:
+            if boxed.standing:
                 poses, _ = motion.unflipped(times, poses, motion.MOST_TURN_RAD_S)
                 ends = _ends(times, images_s)
                 tracks.append(Track(name, label, size, ends, np.stack([_mean_pose(poses)] * len(ends))))
@@ -698,15 +644,13 @@ class BoxTracks:
                 tracks.append(Track(f"{name}.{part}" if part else name, label, size, *keys))
         check_sides(tracks, self._where)
         tracks.sort(key=lambda track: float(track.times_s[0]))
-        return tracks, self._notes(split)
-
-    def _notes(self, split: int) -> list[str]:
         notes = []
         if split:
             notes.append(f"{split} tracks are not seen for more than {self._max_gap_s:g} s and were split there")
         if self._unknown:
-            notes.append(unknown_classes(self._unknown))
-        return notes
+            some = ", ".join(f"{label!r} ({count} boxes)" for label, count in sorted(self._unknown.items())[:8])
+            notes.append(f"classes that are not known here keep their names: {some}")
+        return tracks, notes
 
 
 def turned_back(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
@@ -722,28 +666,17 @@ def turned_back(tracks: Sequence[Track]) -> tuple[list[Track], list[str]]:
     return mended, [f"headings that flip by 180 degrees were turned back: {some}"] if names else []
 
 
-def unknown_classes(counts: Mapping[str, int]) -> str:
-    """A note about classes of boxes that the format does not document, by their number of boxes."""
-    some = ", ".join(f"{label!r} ({count} boxes)" for label, count in sorted(counts.items())[:8])
-    return f"classes that are not known here keep their names: {some}"
-
-
 def check_sides(tracks: Sequence[Track], where: str) -> None:
     """Refuse a log in which most vehicles are wider than long: length and width were read in the wrong order."""
     vehicles = [track for track in tracks if track.label in LONGER_THAN_WIDE]
     wide = [track for track in vehicles if track.size_m[1] > track.size_m[0]]
     if vehicles and 2 * len(wide) > len(vehicles):
         length, width, _ = wide[0].size_m
-        raise InputError(
-            "length and width of boxes are swapped",
-            where=where,
-            expected="vehicles longer than wide",
-            got=(
-                f"{len(wide)} of {len(vehicles)} are wider than long, e.g. {wide[0].label} {wide[0].id}: "
-                f"{length:.2f} m long, {width:.2f} m wide"
-            ),
-            remedy="check the order in which the sizes were written",
-        )
+        what, expected = "length and width of boxes are swapped", "vehicles longer than wide"
+        got = f"{len(wide)} of {len(vehicles)} are wider than long, e.g. {wide[0].label} {wide[0].id}: "
+        got += f"{length:.2f} m long, {width:.2f} m wide"
+        remedy = "check the order in which the sizes were written"
+        raise InputError(what, where=where, expected=expected, got=got, remedy=remedy)
 
 
 def neighbour_speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:

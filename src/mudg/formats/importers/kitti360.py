@@ -45,24 +45,12 @@ from mudg.base.geometry import from_rotation_translation, invert, transform_poin
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common
+from mudg.formats.importers import kitti_files as kitti_poses
 from mudg.formats.importers.clouds import read_float_rows
-from mudg.formats.importers.common import (
-    ImportOptions,
-    LogFiles,
-    deskew,
-    mended_path,
-    name_table,
-    origin_note,
-    pose_near,
-    rigid_pose,
-    rigid_rotation,
-    seconds,
-    world_from_first,
-)
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes, image_size
-from mudg.formats.importers.kitti import files as kitti_poses
-from mudg.formats.importers.kitti.files import (
+from mudg.formats.importers.kitti_files import (
     SENSOR,
     line_numbers,
     pinhole_camera,
@@ -75,29 +63,14 @@ from mudg.scene.motion import GAP_M
 
 # boxes --------------------------------------------------------------------------------------------
 #
-# KITTI-360 bounding primitives: ``data_3d_bboxes/*/<drive>.xml``, OpenCV-style matrices in XML, boxes in the world.
-#
-# An object's ``transform`` maps its ``vertices`` (a unit cube for the classes read here) to the world and holds the
-# size as scale. Static objects have ``timestamp`` -1 and a window of frames; objects that move have one entry per
-# frame.
-#
-# The files hold a hundred thousand objects of all classes; they are read in pieces and only the classes of ``LABEL_OF``
-# are kept.
-LABEL_OF_ID: Final = {
-    13: "car",
-    14: "truck",
-    34: "bus",
-    16: "caravan",
-    15: "trailer",
-    33: "train",
-    17: "motorcycle",
-    18: "bicycle",
-    19: "person",
-    20: "rider",
-    36: "unknown vehicle",
-}
-"""The annotation tool's class numbers (``semanticId``) of what can move. Source: the data set's label table
-(kittiId)."""
+# ``data_3d_bboxes/*/<drive>.xml``: OpenCV-style matrices in XML, boxes in the world. An object's ``transform`` maps its
+# ``vertices`` (a unit cube for the classes read here) to the world and holds the size as scale. Static objects have
+# ``timestamp`` -1 and a window of frames; objects that move have one entry per frame. A file holds a hundred thousand
+# objects of all classes; it is read in pieces and only the classes of ``LABEL_OF`` are taken.
+_IDS: Final = """car: 13; truck: 14; trailer: 15; caravan: 16; motorcycle: 17; bicycle: 18; person: 19; rider: 20;
+    train: 33; bus: 34; unknown vehicle: 36"""
+LABEL_OF_ID: Final = {int(number): name for number, name in name_table(_IDS).items()}
+"""The annotation tool's class numbers (``semanticId``) of what can move. Source: the label table (kittiId)."""
 LABEL_OF: Final = name_table(
     """car: car; truck: truck; bus: bus; caravan: caravan; trailer: trailer; train: train;
     motorcycle: motorcycle; bicycle: bicycle; pedestrian: person, pedestrian; cyclist: rider;
@@ -257,11 +230,8 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
 def _shape(
     transform: Matrix, vertices: Matrix, label: str, where: str
 ) -> tuple[tuple[float, float, float], Matrix] | None:
-    """Size and pose of the box, or None if it is sheared.
-
-    The axis that stands upright becomes z. Of the others, the first becomes x, for vehicles the longer one: which of
-    them the annotation tool called x does not matter for the box.
-    """
+    """Size and pose of the box, or None if it is sheared. The axis that stands upright becomes z. Of the others, the
+    first becomes x, for vehicles the longer one: which of them the annotation tool called x does not matter."""
     if transform.shape != (4, 4) or vertices.shape[1] != 3 or np.abs(transform[3] - [0, 0, 0, 1]).max() > 1e-6:
         got = f"transform {transform.shape} ending {transform[-1].tolist()}, vertices {vertices.shape}"
         raise InputError("box is not a 4x4 transform of 3-D vertices", where=where, got=got)
@@ -287,48 +257,33 @@ def _shape(
 
 # calib --------------------------------------------------------------------------------------------
 #
-# KITTI-360 calibration: rectified perspective cameras, fisheye cameras (model of Mei), LiDARs, all on the vehicle.
-#
-# The data set's vehicle frame is that of the GPS/IMU: x forward, y right, z down. The ego frame here is the same point
-# with y to the left and z up.
+# Rectified cameras, fisheyes (model of Mei) and LiDARs, all on the vehicle. The data set's vehicle frame is that
+# of the GPS/IMU: x forward, y right, z down. The ego frame here is the same point, y to the left and z up.
 IMU_FROM_EGO: Final = np.diag([1.0, -1.0, -1.0, 1.0])
 FISHEYES: Final = ("image_02", "image_03")
 FISHEYE_VIEW_DEG: Final = 90.0
 _FISHEYE_VALUES: Final = ("image_width", "image_height", "xi", "k1", "k2", "p1", "p2", "gamma1", "gamma2", "u0", "v0")
-_FISHEYE: Final = frozenset(
-    {
-        *_FISHEYE_VALUES,
-        "model_type",
-        "camera_name",
-        "mirror_parameters",
-        "distortion_parameters",
-        "projection_parameters",
-    }
+_FISHEYE: Final = frozenset(_FISHEYE_VALUES).union(
+    "model_type camera_name mirror_parameters distortion_parameters projection_parameters".split()
 )
 """Entries of the data set's fisheye calibrations."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kitti360Calibration:
-    """What is fixed on the vehicle.
-
-    Args:
-        folder: where it was read.
-        ego_from_camera: ``image_00`` .. ``image_03`` -> f64[4, 4]; perspective cameras as rectified.
-        ego_from_velo: f64[4, 4].
-        velo_from_sick: f64[4, 4], or None if the file is not there.
-        imu_from_rect0: the data set's vehicle frame from rectified camera 0, f64[4, 4].
-    """
+    """What is fixed on the vehicle; poses are f64[4, 4]."""
 
     folder: Path
     ego_from_camera: dict[str, Matrix]
+    """``image_00`` .. ``image_03`` -> pose; perspective cameras as rectified."""
     ego_from_velo: Matrix
     velo_from_sick: Matrix | None
+    """None if the file is not there."""
     imu_from_rect0: Matrix
+    """The data set's vehicle frame from rectified camera 0."""
 
     def fit(self, camera: str, name: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
-        """How images of ``camera`` (``image_02``), of ``size`` (width, height), become images of the scene's
-        ``name``."""
+        """How images of ``camera`` (``image_02``), of ``size`` (width, height), become those of the scene's."""
         if camera in FISHEYES:
             return self._fit_fisheye(camera, name, size, options)
         path = self.folder / "perspective.txt"
@@ -350,11 +305,10 @@ class Kitti360Calibration:
             length = np.sqrt(1 + (xy**2).sum(1))
             return distort(xy / (1 + xi * length)[:, None])
 
-        recorded = Camera(
-            name, *size, values["gamma1"], values["gamma2"], values["u0"] + 0.5, values["v0"] + 0.5, (xi, *bend)
-        )
+        fx, fy, cx, cy = values["gamma1"], values["gamma2"], values["u0"] + 0.5, values["v0"] + 0.5
+        recorded = Camera(name, *size, fx, fy, cx, cy, (xi, *bend))
         # the focal length at the lens' centre, so that nothing is lost or made up there
-        focal = values["gamma1"] / (1 + xi)
+        focal = fx / (1 + xi)
         side = max(16, round(2 * focal * np.tan(np.deg2rad(FISHEYE_VIEW_DEG / 2))))
         target = replace(recorded, width=side, height=side, fx=focal, fy=focal, cx=side / 2, cy=side / 2)
         return fit_images(recorded, options, lens, target)
@@ -365,7 +319,7 @@ def read_calibration(folder: Path) -> Kitti360Calibration:
     path = folder / "calib_cam_to_pose.txt"
     table = read_number_table(path)
     imu_from_camera = {
-        name: rigid_pose(table_entry(table, (name,), (3, 4), path), f"{path}: {name}")
+        name: common.rigid_pose(table_entry(table, (name,), (3, 4), path), f"{path}: {name}")
         for name in ("image_00", "image_01", "image_02", "image_03")
         if name == "image_00" or name in table
     }
@@ -375,22 +329,17 @@ def read_calibration(folder: Path) -> Kitti360Calibration:
     for name in ("image_00", "image_01"):
         if name in imu_from_camera:
             where = f"{perspective}: R_rect_{name[-2:]}"
-            rectify = rigid_rotation(table_entry(numbers, (f"R_rect_{name[-2:]}",), (3, 3), perspective), where)
+            rectify = common.rigid_rotation(table_entry(numbers, (f"R_rect_{name[-2:]}",), (3, 3), perspective), where)
             imu_from_camera[name] = imu_from_camera[name] @ from_rotation_translation(rectify.T, np.zeros(3))
-    sick = folder / "calib_sick_to_velo.txt"
-    ego_from_imu = invert(IMU_FROM_EGO)
-    return Kitti360Calibration(
-        folder,
-        {name: ego_from_imu @ pose for name, pose in imu_from_camera.items()},
-        ego_from_imu @ imu_from_velo,
-        _rigid_file(sick) if sick.is_file() else None,
-        imu_from_camera["image_00"],
-    )
+    sick, ego_from_imu = folder / "calib_sick_to_velo.txt", invert(IMU_FROM_EGO)
+    ego_from_camera = {name: ego_from_imu @ pose for name, pose in imu_from_camera.items()}
+    velo_from_sick, rect0 = _rigid_file(sick) if sick.is_file() else None, imu_from_camera["image_00"]
+    return Kitti360Calibration(folder, ego_from_camera, ego_from_imu @ imu_from_velo, velo_from_sick, rect0)
 
 
 def _rigid_file(path: Path) -> Matrix:
     numbers = line_numbers(store.read_text(path).replace("\n", " "), (12,), str(path), "calibration")
-    return rigid_pose(numbers.reshape(3, 4), str(path))
+    return common.rigid_pose(numbers.reshape(3, 4), str(path))
 
 
 def _check_size(size: tuple[int, int], declared: tuple[int, int], where: str) -> None:
@@ -433,30 +382,8 @@ USUAL: Final = ("image_00", "image_01")
 SICK: Final = "sick"
 FRAME_PERIOD_S: Final = 0.1
 _SICK_REACH_S: Final = 0.055
-_TRAIN_IDS: Final = {
-    7: 0,
-    8: 1,
-    11: 2,
-    12: 3,
-    13: 4,
-    17: 5,
-    19: 6,
-    20: 7,
-    21: 8,
-    22: 9,
-    23: 10,
-    24: 11,
-    25: 12,
-    26: 13,
-    27: 14,
-    28: 15,
-    31: 16,
-    32: 17,
-    33: 18,
-    34: 2,
-    35: 4,
-    37: 5,
-}
+_TRAIN_IDS: Final = dict(zip((7, 8, 11, 12, 13, 17, *range(19, 29), 31, 32, 33), range(19), strict=True))
+_TRAIN_IDS.update({34: 2, 35: 4, 37: 5})
 """The data set's class ids -> Cityscapes train ids (garage = building, gate = fence, small pole = pole); others
 unlabelled."""
 _LAST_ID: Final = 44
@@ -485,8 +412,7 @@ class _Folders:
 
 
 def looks_like_kitti360(source: Path) -> bool:
-    """Whether ``source`` is the data set's folder (``data_2d_raw`` and ``calibration`` in it), or a drive's in
-    ``data_2d_raw``."""
+    """Whether ``source`` is the data set's folder, or a drive's in its ``data_2d_raw``."""
     if not source.is_dir():
         return False
     root = source.absolute().parent.parent if source.absolute().parent.name == "data_2d_raw" else source
@@ -500,9 +426,8 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     Args:
         source: the data set's folder, or ``data_2d_raw/<drive>`` in it.
-        out: destination.
         options: ``sequence`` is the drive (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the
-            stereo pair; all others are used too.
+            stereo pair.
     """
     folders = _find(source, options)
     calibration = read_calibration(folders.root / "calibration")
@@ -515,15 +440,18 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     clock = _clock(folders, streams, notes)
     poses = _find_poses(folders, options)
     notes.append(f"poses from {poses.name}")
-    ego = mended_path(_read_motion(poses, calibration, clock), options, notes)
+    ego = common.mended_path(_read_motion(poses, calibration, clock), options, notes)
     placed = {name: [n for n in found if _has_pose(ego, clock[n])] for name, found in streams.items()}
     frames = common.complete_frames(placed, options, str(folders.root), "kitti360")
-    notes += _without_pose(streams.values(), placed.values(), options)
+    begin, end = options.frames or (0, 2**63)
+    lost = {n for found in streams.values() for n in found if begin <= n < end}.difference(*placed.values())
+    if lost:
+        notes.append(f"frames without a pose or time stamp were left out: {common.number_ranges(sorted(lost))}")
     start_s = float(clock[frames[0]])
-    first = pose_near(ego, clock[frames[0]])
-    world_from_source = world_from_first(first)
-    notes.append(origin_note(first))
-    scene_s = seconds(clock[frames], "s", f"{folders.root}: timestamps of {folders.drive}", start_s)
+    first = common.pose_near(ego, clock[frames[0]])
+    world_from_source = common.world_from_first(first)
+    notes.append(common.origin_note(first))
+    scene_s = common.seconds(clock[frames], "s", f"{folders.root}: timestamps of {folders.drive}", start_s)
     ego = EgoPath(ego.times_s - start_s, world_from_source @ ego.world_from_ego)
     fits = {CAMERAS[n]: calibration.fit(n, CAMERAS[n], image_size(images[n][frames[0]]), options) for n in chosen}
     untwist = bool(scans) and options.untwist != "no"
@@ -538,7 +466,7 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     def convert(index: int) -> Iterable[SceneImage | SceneSweep]:
         number, time_s = frames[index], float(scene_s[index])
-        world_from_ego = pose_near(ego, time_s)
+        world_from_ego = common.pose_near(ego, time_s)
         for name in chosen:
             world_from_cam = world_from_ego @ calibration.ego_from_camera[name]
             path, labels = images[name][number], _labels(folders, name, number, fits[CAMERAS[name]])
@@ -553,16 +481,10 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
             yield from sick.sweeps(index, time_s)
 
     origin = Source("kitti360", LICENCE, None, tuple(notes))
-    path = EgoPath(scene_s, np.stack([pose_near(ego, float(time_s)) for time_s in scene_s]))
+    path = EgoPath(scene_s, np.stack([common.pose_near(ego, float(time_s)) for time_s in scene_s]))
+    items = range(len(frames))
     content = SceneContent(
-        folders.drive,
-        origin,
-        fits,
-        range(len(frames)),
-        convert,
-        lambda index: f"frame {frames[index]}",
-        path,
-        tracks=lambda: (tracks, ()),
+        folders.drive, origin, fits, items, convert, lambda n: f"frame {frames[n]}", path, lambda: (tracks, ())
     )
     return write_scene(content, out, options)
 
@@ -591,15 +513,6 @@ def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
     return LogFiles(tuple(part for part in parts if part.exists()))
 
 
-def _without_pose(
-    streams: Iterable[Iterable[int]], placed: Iterable[Iterable[int]], options: ImportOptions
-) -> list[str]:
-    """A note about the frames within ``options.frames`` that some stream has and none could place."""
-    first, end = options.frames or (0, 2**63)
-    lost = {n for found in streams for n in found if first <= n < end}.difference(*placed)
-    return [f"frames without a pose or time stamp were left out: {common.number_ranges(sorted(lost))}"] if lost else []
-
-
 # --- time and motion ------------------------------------------------------------------------------
 
 
@@ -617,7 +530,7 @@ def _clock(folders: _Folders, streams: Mapping[str, Mapping[int, Path]], notes: 
 
 
 def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.float64]:
-    """Seconds by number, f64[last + 1] or more; NaN where there is no stamp. See ``read_timestamps``."""
+    """Seconds by number, f64[last + 1] or more; NaN where there is no stamp."""
     stamps = kitti_poses.read_timestamps(path, list(files), last)
     times = np.full(max(last, *stamps, 0) + 1, np.nan)
     times[list(stamps)] = list(stamps.values())
@@ -645,7 +558,7 @@ def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np
             raise InputError(what, where=where, got=f"{row[0]:g}", remedy="is the file of another kind?")
         before = number
         if number < len(clock) and np.isfinite(clock[number]):
-            pose = rigid_pose(row[1:].reshape(-1, 4), where)
+            pose = common.rigid_pose(row[1:].reshape(-1, 4), where)
             numbers.append(number)
             poses.append(pose @ (invert(calibration.imu_from_rect0) if len(row) == 17 else np.eye(4)))
     if not poses:
@@ -659,8 +572,7 @@ def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np
 
 
 def _has_pose(ego: EgoPath, time_s: float) -> bool:
-    """Whether there is a pose at a time, or the vehicle moved less than ``GAP_M`` between the poses around it. NaN:
-    no."""
+    """Whether there is a pose at a time (not NaN), or the vehicle moved less than ``GAP_M`` between those around it."""
     if not np.isfinite(time_s):
         return False
     after = int(np.searchsorted(ego.times_s, time_s))
@@ -676,7 +588,7 @@ def _untwisted(points: SweepPoints, ego: EgoPath, calibration: Kitti360Calibrati
     """A scan as seen at its frame's moment: a point at azimuth a was measured a / 2 pi turns before it."""
     azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
     dt_s = (-azimuth / (2 * np.pi) * FRAME_PERIOD_S).astype(np.float32)
-    xyz = deskew(points.xyz, dt_s, lambda t: pose_near(ego, t) @ calibration.ego_from_velo, time_s)
+    xyz = common.deskew(points.xyz, dt_s, lambda t: common.pose_near(ego, t) @ calibration.ego_from_velo, time_s)
     return replace(points, xyz=xyz, dt_s=dt_s)
 
 
@@ -708,7 +620,7 @@ class _SickLines:
 
     def sweeps(self, index: int, time_s: float) -> Iterable[SceneSweep]:
         """The lines within half a frame of frame ``index`` as one sweep, brought to that moment; none without lines."""
-        pose = pose_near(self.ego, time_s) @ self.ego_from_sick
+        pose = common.pose_near(self.ego, time_s) @ self.ego_from_sick
         parts, delays, no_returns = [], [], 0
         for number in np.flatnonzero(np.abs(self.times_s - time_s) < _SICK_REACH_S):
             late = float(self.times_s[number] - time_s)
@@ -717,7 +629,9 @@ class _SickLines:
                 continue
             line, without = _read_line(self.files[int(number)])
             no_returns += without
-            parts.append(transform_points(invert(pose) @ pose_near(self.ego, time_s + late) @ self.ego_from_sick, line))
+            parts.append(
+                transform_points(invert(pose) @ common.pose_near(self.ego, time_s + late) @ self.ego_from_sick, line)
+            )
             delays.append(np.full(len(line), late, np.float32))
         xyz = np.concatenate(parts or [np.zeros((0, 3), np.float32)])
         if len(xyz):
@@ -726,8 +640,7 @@ class _SickLines:
 
 
 def _read_line(path: Path) -> tuple[NDArray[np.float32], int]:
-    """One SICK line f32[N, 3]: pairs of float32 in the scanner's plane (source: the data set's reader); and its beams
-    without a return."""
+    """One SICK line f32[N, 3] from pairs in the scanner's plane (as the data set's reader); beams without return."""
     pairs, returns = read_float_rows(path, 2, "SICK line", axes=2)
     pairs = pairs[returns]
     return np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1), int((~returns).sum())
@@ -772,8 +685,7 @@ def _grey(path: Path) -> NDArray[Any]:
 def _read_tracks(
     folders: _Folders, options: ImportOptions, time_of: Mapping[int, float], world_from_source: Matrix, notes: list[str]
 ) -> list[Track]:
-    """Tracks within the imported frames: moving boxes at their frames, standing ones over the window they were drawn
-    in."""
+    """Tracks within the imported frames: moving boxes at their frames, standing ones over their windows."""
     path = options.boxes or common.first_file(*folders.boxes())
     if path is None:
         notes.append("no boxes found: everything counts as static")

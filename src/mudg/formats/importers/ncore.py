@@ -30,20 +30,8 @@ from mudg.base.errors import InputError, MudgError
 from mudg.base.geometry import all_rigid, from_rotation_translation
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
-from mudg.formats.importers.common import (
-    POSE_TOLERANCE,
-    ImportOptions,
-    LogFiles,
-    chosen_cameras,
-    ego_path,
-    folder_contents,
-    path_inside,
-    record_fields,
-    refuse_options,
-    rigid_pose,
-    seconds,
-    the_only,
-)
+from mudg.formats.importers import common
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, CameraOptics, DriveLog, ImageRecord, SweepRecord, write_log
 from mudg.formats.importers.images import Lens
 from mudg.formats.ncore import (
@@ -63,7 +51,7 @@ from mudg.formats.ncore import (
     package,
     rotation_of,
 )
-from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
+from mudg.formats.unknown_fields import known, note_unknown, note_unknown_within
 from mudg.scene import motion
 
 # container ----------------------------------------------------------------------------------------
@@ -88,9 +76,7 @@ _CONTAINER_BYTES: Final = 72
 _MOST_LZ4: Final = 256
 _BLOSC_HEADER: Final = struct.Struct("<4B3I")
 _KINDS: Final = "biufS"
-COMPONENTS: Final = frozenset(
-    {"poses", "intrinsics", "masks", "cameras", "lidars", "radars", "cuboids", "point_clouds", "camera_labels"}
-)
+COMPONENTS: Final = frozenset("poses intrinsics masks cameras lidars radars cuboids point_clouds camera_labels".split())
 """Components of the format, read or not."""
 
 
@@ -131,7 +117,7 @@ def check_store(path: Path) -> None:
     if METADATA not in members:
         what, expected = "NCore store has no metadata", "a store that was finished"
         raise InputError(what, where=where, expected=expected, remedy="was the program that wrote it stopped?")
-    with record_fields("NCore metadata make no sense", where, "groups and arrays of zarr 2"):
+    with common.record_fields("NCore metadata make no sense", where, "groups and arrays of zarr 2"):
         metadata = _cbor(_unpacked(members[METADATA].read(), where), where)["metadata"]
         chunks = _chunk_sizes(members)
         groups = dict.fromkeys(name.partition("/")[0] for name in metadata if "/" in name)
@@ -162,7 +148,7 @@ def _members_of_tar(path: Path) -> dict[str, _StoredMember]:
     if offset + length > size - _BLOCK:
         what, got, remedy = "index lies outside of the file", f"{length} bytes from {offset} on", "copy the file again"
         raise InputError(what, where=where, expected=f"at most {size - _BLOCK} bytes", got=got, remedy=remedy)
-    with record_fields("index makes no sense", where, "names, offsets and sizes of members"):
+    with common.record_fields("index makes no sense", where, "names, offsets and sizes of members"):
         table = _cbor(_unpacked(_StoredMember(path, offset, length).read(), where), where)
         names, offsets, sizes = table["items"], table["offset_datas"], table["sizes"]
         if not len(names) == len(offsets) == len(sizes):
@@ -173,9 +159,7 @@ def _members_of_tar(path: Path) -> dict[str, _StoredMember]:
                 what, where = "member lies outside of the file", f"{path}: {str(name)[:80]}"
                 expected, got = f"at most {size} bytes", f"{count} bytes from {begin} on"[:120]
                 raise InputError(what, where=where, expected=expected, got=got, remedy="copy the file again")
-        return {
-            name: _StoredMember(path, begin, count) for name, begin, count in zip(names, offsets, sizes, strict=True)
-        }
+        return {name: _StoredMember(path, *place) for name, *place in zip(names, offsets, sizes, strict=True)}
 
 
 def _whole(value: Any) -> bool:
@@ -203,21 +187,13 @@ def _unpacked(packed: bytes, where: str) -> bytes:
 def _cbor(content: bytes, where: str) -> Any:
     import cbor2
 
-    heads = len(content) - len(
-        content.translate(None, _CONTAINERS)
-    )  # as many lists and maps at most: a byte makes an object
+    # as many lists and maps at most: a byte makes an object
+    heads = len(content) - len(content.translate(None, _CONTAINERS))
     memory.require(_CONTAINER_BYTES * heads + 8 * len(content), f"reading {where}", "a machine with more memory")
+    damage = cbor2.CBORError, ValueError, TypeError, OverflowError, RecursionError, MemoryError
     try:
         found = cbor2.loads(content)
-    except (
-        cbor2.CBORError,
-        ValueError,
-        TypeError,
-        OverflowError,
-        RecursionError,
-        MemoryError,
-        UnicodeDecodeError,
-    ) as error:
+    except damage as error:
         what = "metadata are damaged"
         raise InputError(what, where=where, got=str(error)[:120], remedy="copy the file again") from error
     if not isinstance(found, dict):
@@ -293,28 +269,18 @@ def _blosc_size(chunk: _StoredMember, where: str) -> int:
 
 # importer -----------------------------------------------------------------------------------------
 Record = TypeVar("Record", ImageRecord, SweepRecord)
-_LIST: Final[Known] = {
-    **dict.fromkeys(("sequence_id", "sequence_timestamp_interval_us", "generic_meta_data", "version")),
-    "component_stores": dict.fromkeys(("path", "md5", "components")),
-}
+_LIST: Final = known(
+    "sequence_id sequence_timestamp_interval_us generic_meta_data version",
+    component_stores=known("path md5 components"),
+)
 """Fields of the list of a recording's stores."""
 UNKNOWN_LICENCE: Final = "not stated in the recording: see where it comes from"
-LABELS: Final[Mapping[str, str]] = {
-    "automobile": "car",
-    "heavy_truck": "truck",
-    "train_or_tram_car": "tram",
-    "other_vehicle": "vehicle",
-    "person": "pedestrian",
-    **{
-        name: name
-        for name in tuple(
-            (
-                "vehicle car van truck bus trailer tram train pedestrian cyclist rider bicycle motorcycle stroller "
-                "animal protruding_object"
-            ).split()
-        )
-    },
-}
+LABELS: Final[Mapping[str, str]] = name_table(
+    """car: automobile, car; truck: heavy_truck, truck; tram: train_or_tram_car, tram; vehicle: other_vehicle, vehicle;
+    pedestrian: person, pedestrian; van: van; bus: bus; trailer: trailer; train: train; cyclist: cyclist; rider: rider;
+    bicycle: bicycle; motorcycle: motorcycle; stroller: stroller; animal: animal;
+    protruding_object: protruding_object"""
+)
 """Classes of NVIDIA's recordings and of this program -> labels."""
 _EXACT: Final = 1e-7
 """Errors of rotations that are left as they are."""
@@ -343,7 +309,7 @@ def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
         source: a folder of stores, one of them, or the ``.json`` that lists them.
         options: ``sequence`` names the recording where a folder holds several (its beginning is enough).
     """
-    refuse_options(options, "NCore", "poses", "boxes", "bridge_gaps")
+    common.refuse_options(options, "NCore", "poses", "boxes", "bridge_gaps")
     package()
     stores = _choose(source, options)
     for path in stores:
@@ -388,23 +354,21 @@ def _is_list(path: Path) -> bool:
 
 def _listed(path: Path) -> list[Path]:
     """The stores that a ``.json`` names."""
-    with record_fields("list of stores makes no sense", path, "component_stores with a path each"):
+    with common.record_fields("list of stores makes no sense", path, "component_stores with a path each"):
         content = store.read_json(path)
         note_unknown_within(path.name, content, _LIST)
         names = [one["path"] for one in content["component_stores"]]
-        return [
-            path_inside(path.parent, name, f"{path}: component_stores[{index}]") for index, name in enumerate(names)
-        ]
+        return [common.path_inside(path.parent, name, f"{path}: component_stores[{n}]") for n, name in enumerate(names)]
 
 
 def _choose(source: Path, options: ImportOptions) -> tuple[Path, ...]:
     found = _recordings(source)
     if not found or not all(found.values()):
         expected = f"files NAME{MARK}.zarr.itar, or folders NAME{MARK}.zarr"
-        got = folder_contents(source) if source.is_dir() else "no such file"
+        got = common.folder_contents(source) if source.is_dir() else "no such file"
         raise InputError("no NCore recording found", where=str(source), expected=expected, got=got)
     matching = [stores for name, stores in found.items() if name.startswith(options.sequence)]
-    chosen = tuple(the_only(matching, list(found), options, source, "recording"))
+    chosen = tuple(common.the_only(matching, list(found), options, source, "recording"))
     for path in chosen:
         if not path.exists():
             what = "a store of the recording is missing"
@@ -441,11 +405,9 @@ class _OpenRecording:
             return np.tile(np.eye(4), (len(times_us), 1, 1))
         with foreign_reader(f"{where}: pose of {frame}"):
             found = np.asarray(self.graph.evaluate_poses(frame, WORLD, times_us), np.float64)
-        return (
-            found
-            if all_rigid(found, _EXACT)
-            else np.stack([rigid_pose(pose, f"{where}: pose of {frame}") for pose in found])
-        )
+        if all_rigid(found, _EXACT):
+            return found
+        return np.stack([common.rigid_pose(pose, f"{where}: pose of {frame}") for pose in found])
 
     def at_points(self, frame: str, times_us: Times, where: str) -> Matrix:
         """As ``world_from`` at the many times of points: exact at every key and every millisecond, and between those as
@@ -466,15 +428,10 @@ def _opened(stores: tuple[Path, ...], where: str) -> Iterator[_OpenRecording]:
     try:
         with foreign_reader(where):
             of = {
-                name: reader.open_component_readers(getattr(v4, name).Reader)
-                for name in tuple(
-                    (
-                        "PosesComponent IntrinsicsComponent MasksComponent CuboidsComponent CameraSensorComponent "
-                        "LidarSensorComponent"
-                    ).split()
-                )
+                name: reader.open_component_readers(getattr(v4, f"{name}Component").Reader)
+                for name in "Poses Intrinsics Masks Cuboids CameraSensor LidarSensor".split()
             }
-            poses = _single(of["PosesComponent"], "poses", where)
+            poses = _single(of["Poses"], "poses", where)
             fixed, moving = list(poses.get_static_poses()), list(poses.get_dynamic_poses())
         for (source, target), found in (
             *((pair, pose[None]) for pair, pose in fixed),
@@ -490,28 +447,23 @@ def _opened(stores: tuple[Path, ...], where: str) -> Iterator[_OpenRecording]:
             )
             graph = package().transformations.PoseGraphInterpolator(edges)
         file = stores[0] if stores[0].is_file() else stores[0] / METADATA
-        yield _OpenRecording(
-            reader,
-            poses,
-            _single(of["IntrinsicsComponent"], "intrinsics", where),
-            _perhaps(of["MasksComponent"]),
-            _perhaps(of["CuboidsComponent"]),
-            of["CameraSensorComponent"],
-            of["LidarSensorComponent"],
-            graph,
-            knots,
-            where,
-            file,
+        intrinsics = _single(of["Intrinsics"], "intrinsics", where)
+        masks, cuboids, cameras, lidars = (
+            _perhaps(of["Masks"]),
+            _perhaps(of["Cuboids"]),
+            of["CameraSensor"],
+            of["LidarSensor"],
         )
+        yield _OpenRecording(reader, poses, intrinsics, masks, cuboids, cameras, lidars, graph, knots, where, file)
     finally:
         close(reader)
 
 
 def _refuse_bent(poses: Matrix, where: str) -> None:
     """Refuse poses that are no rigid motions; the package would make rotations of them."""
-    if poses.ndim != 3 or not all_rigid(poses, POSE_TOLERANCE):
+    if poses.ndim != 3 or not all_rigid(poses, common.POSE_TOLERANCE):
         for index, pose in enumerate(poses):
-            rigid_pose(pose, f"{where}: key {index}")
+            common.rigid_pose(pose, f"{where}: key {index}")
 
 
 def _perhaps(found: Mapping[str, Any]) -> Any:
@@ -533,7 +485,7 @@ def _drive(recording: _OpenRecording, options: ImportOptions) -> DriveLog:
     where = recording.where
     log.info(f"ncore: {recording.reader.sequence_id} in {where}")
     names = _scene_names(recording.cameras)
-    chosen = chosen_cameras(names, options, where, list(names))
+    chosen = common.chosen_cameras(names, options, where, list(names))
     spans = {camera: _spans(recording.cameras[camera], f"{where}: camera {camera}") for camera in chosen}
     turns = {lidar: _spans(reader, f"{where}: LiDAR {lidar}") for lidar, reader in recording.lidars.items()}
     zero_us = min(int(found.min()) for found in (*spans.values(), *turns.values()) if len(found))
@@ -546,26 +498,10 @@ def _drive(recording: _OpenRecording, options: ImportOptions) -> DriveLog:
     images, sweeps = _outside_gaps(images, ego, options), _outside_gaps(sweeps, ego, options)
     tracks, track_notes = _tracks(recording, zero_us)
     about = _about(recording)
-    source = Source(
-        about.get("dataset", "ncore"),
-        about.get("licence", UNKNOWN_LICENCE),
-        None,
-        (*notes, *([] if sweeps else ["no LiDAR sweeps in the recording"]), *track_notes),
-    )
-    cameras = {name: one.recorded for name, one in optics.items()}
-    return DriveLog(
-        str(recording.reader.sequence_id),
-        cameras,
-        names[chosen[0]],
-        images,
-        sweeps,
-        tracks,
-        ego,
-        source,
-        where,
-        optics,
-        box_times="own",
-    )
+    notes += [*([] if sweeps else ["no LiDAR sweeps in the recording"]), *track_notes]
+    source = Source(about.get("dataset", "ncore"), about.get("licence", UNKNOWN_LICENCE), None, tuple(notes))
+    cameras, name = {name: one.recorded for name, one in optics.items()}, str(recording.reader.sequence_id)
+    return DriveLog(name, cameras, images, sweeps, tracks, ego, source, where, optics, box_times="own")
 
 
 def _scene_names(sensors: Iterable[str], taken: Collection[str] = ()) -> dict[str, str]:
@@ -589,7 +525,7 @@ def _about(recording: _OpenRecording) -> dict[str, str]:
 
 def _spans(reader: Any, where: str) -> Times:
     """First and last microsecond of every frame of a sensor, i64[N, 2]."""
-    with record_fields("frames of a sensor have no times", where, "frames_timestamps_us: begin and end of each"):
+    with common.record_fields("frames of a sensor have no times", where, "frames_timestamps_us: begin and end of each"):
         spans = np.asarray(reader.frames_timestamps_us, np.uint64).reshape(-1, 2)
         if (spans > 2**62).any():
             raise InputError("time stamp is no time in microseconds", where=where, got=str(int(spans.max())))
@@ -597,7 +533,7 @@ def _spans(reader: Any, where: str) -> Times:
     if (spans[:, 1] < spans[:, 0]).any() or (len(spans) and spans.max() - spans.min() > _MOST_SPAN_US):
         what, expected = "times of frames make no sense", "microseconds of one recording, begin before end"
         raise InputError(what, where=where, expected=expected, got=f"{spans.min()} to {spans.max()}")
-    seconds(spans[:, 1], "us", where)
+    common.seconds(spans[:, 1], "us", where)
     return spans
 
 
@@ -620,9 +556,8 @@ def _optics(recording: _OpenRecording, camera: str, name: str, spans: Times, not
         raise InputError(what, where=where, got=f"{exposure_us:g} us", expected="at most a second")
     recorded = Camera(name, width, height, fx, fy, cx, cy, readout_s=exposure_us / MICRO)
     if exposure_us:
-        notes.append(
-            f"camera {name}: {model.shutter_type.name.lower().replace('_', ' ')} shutter; a view is that of the middle"
-        )
+        shutter = model.shutter_type.name.lower().replace("_", " ")
+        notes.append(f"camera {name}: {shutter} shutter; a view is that of the middle")
     return CameraOptics(recorded, None if plain else _lens(model, recorded), _mask(recording, camera, recorded))
 
 
@@ -635,10 +570,9 @@ def _lens(model: Any, camera: Camera) -> Lens:
 
     def lens(xy: NDArray[np.float64]) -> NDArray[np.float64]:
         rays = np.column_stack([xy, np.ones(len(xy))])
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
         with foreign_reader(f"camera {camera.name}"):
-            points = projection.camera_rays_to_image_points(
-                rays / np.linalg.norm(rays, axis=1, keepdims=True)
-            ).image_points
+            points = projection.camera_rays_to_image_points(rays).image_points
         return (np.asarray(points, np.float64) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
 
     return lens
@@ -662,17 +596,12 @@ def _mask(recording: _OpenRecording, camera: str, recorded: Camera) -> NDArray[n
 def _images(recording: _OpenRecording, camera: str, name: str, spans: Times, zero_us: int) -> list[ImageRecord]:
     where = f"{recording.where}: camera {camera}"
     poses = recording.world_from(camera, spans.sum(1) // 2, where)
-    return [
-        ImageRecord(
-            name,
-            (int(begin) + int(end) - 2 * zero_us) / (2 * MICRO),
-            pose,
-            recording.file,
-            partial(_picture, recording.cameras[camera], int(end), f"{where}: frame {end}"),
-            f"{where}: frame {end}",
-        )
-        for (begin, end), pose in zip(spans, poses, strict=True)
-    ]
+    records = []
+    for (begin, end), pose in zip(spans.tolist(), poses, strict=True):
+        time_s, place = (begin + end - 2 * zero_us) / (2 * MICRO), f"{where}: frame {end}"
+        read = partial(_picture, recording.cameras[camera], end, place)
+        records.append(ImageRecord(name, time_s, pose, recording.file, read, place))
+    return records
 
 
 def _picture(reader: Any, frame: int, where: str) -> bytes:
@@ -690,19 +619,13 @@ def _picture(reader: Any, frame: int, where: str) -> bytes:
 
 def _sweeps(recording: _OpenRecording, lidar: str, name: str, spans: Times, zero_us: int) -> list[SweepRecord]:
     reader, where = recording.lidars[lidar], f"{recording.where}: LiDAR {lidar}"
-    at = np.array([_moment(reader, int(begin), int(end), f"{where}: frame {end}") for begin, end in spans], np.int64)
-    poses = recording.world_from(lidar, at, where)
-    return [
-        SweepRecord(
-            name,
-            (int(moment) - zero_us) / MICRO,
-            pose,
-            recording.file,
-            partial(_points, recording, lidar, int(end), int(moment), pose, f"{where}: frame {end}"),
-            f"{where}: frame {end}",
-        )
-        for (_, end), moment, pose in zip(spans, at, poses, strict=True)
-    ]
+    at = np.array([_moment(reader, *span, f"{where}: frame {span[1]}") for span in spans.tolist()], np.int64)
+    poses, records = recording.world_from(lidar, at, where), []
+    for end, moment, pose in zip(spans[:, 1].tolist(), at.tolist(), poses, strict=True):
+        place = f"{where}: frame {end}"
+        read = partial(_points, recording, lidar, end, moment, pose, place)
+        records.append(SweepRecord(name, (moment - zero_us) / MICRO, pose, recording.file, read, place))
+    return records
 
 
 def _moment(reader: Any, begin: int, end: int, where: str) -> int:
@@ -726,12 +649,8 @@ def _points(
         )
         begin, end = (int(time) for time in reader.get_frame_timestamps_us(frame))
         classes = _classes(reader, frame, len(ray))
-    if (
-        ray.shape != (len(times), 3)
-        or distance.ndim != 2
-        or distance.shape[1] != len(ray)
-        or intensity.shape != distance.shape
-    ):
+    pairs = ray.shape == (len(times), 3) and distance.ndim == 2 and distance.shape[1] == len(ray)
+    if not pairs or intensity.shape != distance.shape:
         what = "rays and returns of a sweep do not pair up"
         raise InputError(what, where=where, got=f"{ray.shape}, {times.shape}, {distance.shape}, {intensity.shape}")
     if len(times) and not begin <= times.min() <= times.max() <= end:
@@ -759,12 +678,8 @@ def _classes(reader: Any, frame: int, count: int) -> NDArray[np.uint8] | None:
     if not reader.has_frame_generic_data(frame, POINT_CLASSES):
         return None
     classes = np.asarray(reader.get_frame_generic_data(frame, POINT_CLASSES))
-    known = (
-        classes.dtype == np.uint8
-        and classes.shape == (count,)
-        and ((classes < len(CLASSES)) | (classes == UNLABELLED)).all()
-    )
-    return classes if known else None
+    fits = classes.dtype == np.uint8 and classes.shape == (count,)
+    return classes if fits and ((classes < len(CLASSES)) | (classes == UNLABELLED)).all() else None
 
 
 # --- vehicle and objects --------------------------------------------------------------------------
@@ -775,12 +690,11 @@ def _ego(recording: _OpenRecording, zero_us: int, moments: Times) -> EgoPath:
     frames."""
     where = f"{recording.where}: poses of {RIG}"
     with foreign_reader(where):
-        keys = {
-            pair: found for pair, found in recording.poses.get_dynamic_poses() if pair in ((RIG, WORLD), (WORLD, RIG))
-        }
-    times = np.concatenate([found[1].astype(np.int64) for found in keys.values()]) if keys else np.unique(moments)
+        moving = dict(recording.poses.get_dynamic_poses())
+    keys = [moving[pair][1].astype(np.int64) for pair in moving if {*pair} == {RIG, WORLD}]
+    times = np.concatenate(keys) if keys else np.unique(moments)
     poses = recording.world_from(RIG, times, where)
-    return ego_path([(int(at) - zero_us) / MICRO for at in times], list(poses))
+    return common.ego_path([(int(at) - zero_us) / MICRO for at in times], list(poses))
 
 
 def _outside_gaps(records: list[Record], ego: EgoPath, options: ImportOptions) -> list[Record]:
@@ -824,11 +738,5 @@ def _add(tracks: BoxTracks, box: Any, world_from_frame: Matrix, zero_us: int, wh
     if not np.isfinite(values).all():
         raise InputError("box is not finite", where=where, got=str(values.tolist())[:120])
     pose = world_from_frame @ from_rotation_translation(rotation_of(box.bbox3.rot), values[:3])
-    tracks.add(
-        box.track_id,
-        tracks.label_of(box.class_id),
-        (box.timestamp_us - zero_us) / MICRO,
-        box.bbox3.dim,
-        pose,
-        where=where,
-    )
+    label, time_s = tracks.label_of(box.class_id), (box.timestamp_us - zero_us) / MICRO
+    tracks.add(box.track_id, label, time_s, box.bbox3.dim, pose, where=where)

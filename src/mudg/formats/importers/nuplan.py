@@ -35,27 +35,9 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, yaw_matrix
 from mudg.base.plain_pickle import NUMPY_MAKERS, Maker, as_list, read_pickle
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, foreign_name
+from mudg.formats.importers import common
 from mudg.formats.importers.clouds import read_cloud
-from mudg.formats.importers.common import (
-    ImportOptions,
-    LogFiles,
-    chosen_cameras,
-    folder_contents,
-    has_pose,
-    mended_path,
-    name_table,
-    nearest_index,
-    origin_note,
-    path_inside,
-    pose_from_quaternion,
-    pose_near,
-    refuse_options,
-    require_columns,
-    seconds,
-    the_only,
-    unit_intensity,
-    world_from_first,
-)
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, brown_conrady, fit_images, image_notes
 from mudg.formats.unknown_fields import note_unknown
@@ -64,8 +46,7 @@ from mudg.scene.schema import ref_problem
 
 # database -----------------------------------------------------------------------------------------
 #
-# nuPlan log files: one SQLite database per log, opened read-only, the schema checked before the first question.
-#
+# One SQLite database per log, opened read-only, the schema checked before the first question.
 # Names of tables and columns are literal here. Nothing from the file becomes part of a query, a path outside the sensor
 # blobs, or code: calibration columns are pickles, read by ``plain_pickle``.
 SCHEMA: Final[Mapping[str, tuple[str, ...]]] = {
@@ -112,8 +93,7 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
 
 @dataclass(frozen=True, slots=True)
 class NuplanCamera:
-    """One camera: name in the data set, place on the vehicle f64[4, 4], fx fy cx cy, lens k1 k2 p1 p2 k3, width,
-    height."""
+    """One camera: place on the vehicle f64[4, 4], fx fy cx cy, lens k1 k2 p1 p2 k3, width and height."""
 
     channel: str
     ego_from_cam: Matrix
@@ -124,8 +104,7 @@ class NuplanCamera:
 
 @dataclass(frozen=True, slots=True)
 class NuplanCloud:
-    """One point cloud: its token, file, time (us), world-from-lidar f64[4, 4] in the log's world, and where the log's
-    LiDARs sit in the cloud's frame, f64[3] each."""
+    """One point cloud, posed f64[4, 4] in the log's world; ``places``: of the LiDARs in the cloud's frame, f64[3]."""
 
     token: bytes
     file: Path
@@ -153,16 +132,15 @@ class NuplanLog:
 
     def check(self) -> None:
         """Refuse a database that is not a nuPlan log."""
-        tables = {
-            str(name): str(sql) for name, sql in self.rows("SELECT name, sql FROM sqlite_master WHERE type = 'table'")
-        }
+        rows = self.rows("SELECT name, sql FROM sqlite_master WHERE type = 'table'")
+        tables = {str(name): str(sql) for name, sql in rows}
         for table, columns in SCHEMA.items():
             if table not in tables or tables[table].upper().startswith("CREATE VIRTUAL"):
                 what, got = f"database has no table {table!r}", ", ".join(sorted(tables)) or "no tables"
                 remedy = "is it a nuPlan log (v1.1)?"
                 raise InputError(what, where=str(self.path), expected=", ".join(SCHEMA), got=got, remedy=remedy)
             there = [str(row[1]) for row in self.rows(f"PRAGMA table_info({table})")]
-            require_columns(columns, there, f"{self.path}: {table}")
+            common.require_columns(columns, there, f"{self.path}: {table}")
             note_unknown(f"the table {table}", there, OFFICIAL[table].union(columns))
         note_unknown("the database", [name for name in tables if not name.startswith("sqlite_")], frozenset(OFFICIAL))
 
@@ -190,14 +168,10 @@ class NuplanLog:
             if skewed or min(matrix[0, 0], matrix[1, 1]) <= 0:
                 what, where, got = "intrinsics are not of a pinhole camera", f"{where}.intrinsic", str(matrix.tolist())
                 raise InputError(what, where=where, got=got, expected="[[fx, 0, cx], [0, fy, cy], [0, 0, 1]] in pixels")
-            width, height = (_whole(values[index], f"{where}.{name}") for index, name in ((4, "width"), (5, "height")))
-            found[token_of(token, f"{where}.token")] = NuplanCamera(
-                channel,
-                self._pose(values[0], values[1], where),
-                (float(matrix[0, 0]), float(matrix[1, 1]), float(matrix[0, 2]), float(matrix[1, 2])),
-                tuple(self._numbers(values[3], f"{where}.distortion", None)),
-                (width, height),
-            )
+            size = _whole(values[4], f"{where}.width"), _whole(values[5], f"{where}.height")
+            intrinsics = tuple(matrix[[0, 1, 0, 1], [0, 1, 2, 2]].tolist())
+            pose, lens = self._pose(*values[:2], where), tuple(self._numbers(values[3], f"{where}.distortion", None))
+            found[token_of(token, f"{where}.token")] = NuplanCamera(channel, pose, intrinsics, lens, size)
         return found
 
     def lidars(self) -> dict[bytes, Matrix]:
@@ -232,7 +206,7 @@ class NuplanLog:
                 raise InputError("point cloud is of a LiDAR that is not there", where=where, got=lidar.hex())
             mount = ego_from_lidar[lidar]
             places = tuple((invert(mount) @ other)[:3, 3] for other in ego_from_lidar.values())
-            path, time_us = path_inside(blobs, file, where), self._time(time_us, "lidar_pc")
+            path, time_us = common.path_inside(blobs, file, where), self._time(time_us, "lidar_pc")
             return NuplanCloud(token, path, time_us, self._ego(pose, where) @ mount, places)
         return None
 
@@ -240,8 +214,8 @@ class NuplanLog:
         """Times (us) and poses f64[n, 4, 4] of the vehicle from ``first_us`` to ``last_us``; doubled times once."""
         times, poses = [], []
         for time_us, *pose in self.rows(
-            "SELECT timestamp, x, y, z, qw, qx, qy, qz FROM ego_pose WHERE timestamp BETWEEN ? AND ? ORDER BY"
-            " timestamp",
+            "SELECT timestamp, x, y, z, qw, qx, qy, qz FROM ego_pose "
+            "WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
             (first_us, last_us),
         ):
             time_us = self._time(time_us, "ego_pose")
@@ -253,20 +227,17 @@ class NuplanLog:
     def images(self, first_us: int, last_us: int, blobs: Path) -> Iterator[tuple[bytes, Path, int]]:
         """Camera token, file below ``blobs``, and time (us), in order of time."""
         for camera, file, time_us in self.rows(
-            "SELECT camera_token, filename_jpg, timestamp FROM image WHERE timestamp BETWEEN ? AND ? ORDER BY"
-            " timestamp",
+            "SELECT camera_token, filename_jpg, timestamp FROM image "
+            "WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
             (first_us, last_us),
         ):
             time_us = self._time(time_us, "image")
             where = f"{self.path}: image at {time_us}"
-            yield token_of(camera, f"{where}: camera_token"), path_inside(blobs, file, where), time_us
+            yield token_of(camera, f"{where}: camera_token"), common.path_inside(blobs, file, where), time_us
 
     def boxes(self, first_us: int, last_us: int) -> Iterator[tuple[bytes, str, str, tuple[float, ...]]]:
         """Cloud, track, class, and x y z yaw length width height (metres, radians, the log's world) of all boxes of a
-        span.
-
-        One pass over the table: the databases need not have an index of boxes by cloud.
-        """
+        span. One pass over the table: the databases need not have an index of boxes by cloud."""
         for cloud, track, label, *numbers in self.rows(
             "SELECT p.token, b.track_token, c.name, b.x, b.y, b.z, b.yaw, b.length, b.width, b.height FROM lidar_pc AS"
             " p JOIN lidar_box AS b ON b.lidar_pc_token = p.token LEFT JOIN track AS t ON t.token = b.track_token LEFT"
@@ -283,20 +254,19 @@ class NuplanLog:
 
     def scenes(self) -> list[str]:
         """Names of the scenes (pieces of up to 20 s)."""
-        return [
-            text_of(name, f"{self.path}: scene.name") for (name,) in self.rows("SELECT name FROM scene ORDER BY name")
-        ]
+        rows = self.rows("SELECT name FROM scene ORDER BY name")
+        return [text_of(name, f"{self.path}: scene.name") for (name,) in rows]
 
     def _time(self, value: Any, table: str) -> int:
         return _whole(value, f"{self.path}: {table}.timestamp")
 
     def _ego(self, row: list[Any], where: str) -> Matrix:
         x, y, z, *wxyz = (_finite(number, where) for number in row)
-        return pose_from_quaternion(wxyz, (x, y, z), where)
+        return common.pose_from_quaternion(wxyz, (x, y, z), where)
 
     def _pose(self, translation: Any, rotation: Any, where: str) -> Matrix:
         xyz = self._numbers(translation, f"{where}.translation", 3)
-        return pose_from_quaternion(self._numbers(rotation, f"{where}.rotation", 4), xyz, where)
+        return common.pose_from_quaternion(self._numbers(rotation, f"{where}.rotation", 4), xyz, where)
 
     def _numbers(self, blob: Any, where: str, count: int | None) -> list[float]:
         """Numbers of a pickled list, or list of lists, row by row."""
@@ -391,8 +361,7 @@ _SQLITE: Final = b"SQLite format 3\0"
 
 
 def looks_like_nuplan(source: Path) -> bool:
-    """Whether ``source`` is a log database, or a folder that holds some (also as ``splits/*`` or
-    ``nuplan-v1.1/splits/*``)."""
+    """Whether ``source`` is a log database, or a folder that holds some."""
     if source.is_file():
         return _is_database(source)
     return source.is_dir() and any(_is_database(path) for path in _databases(source)[:1])
@@ -417,11 +386,10 @@ def import_nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     Args:
         source: the log's ``.db`` file, or a folder of such files.
-        out: destination.
         options: ``sequence`` is the log's name (where ``source`` is a folder), a scene's name, or ``LOG/SCENE``.
-            ``cameras`` default to all eight. ``poses``, ``boxes`` and ``untwist`` are refused; all others are used.
+            ``cameras`` default to all eight. ``poses``, ``boxes`` and ``untwist`` are refused.
     """
-    refuse_options(options, "nuPlan", "poses", "boxes", "untwist")
+    common.refuse_options(options, "nuPlan", "poses", "boxes", "untwist")
     path, scene = _find(source, options)
     with open_log(path) as opened:
         return write_scene(_content(opened, _plan(opened, scene, options), options), out, options)
@@ -439,13 +407,17 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
     databases = {path.stem: path for path in _databases(source)}
     if not databases:
         what = "no nuPlan log found"
-        raise InputError(what, where=str(source), expected="*.db here or in splits/*", got=folder_contents(source))
+        raise InputError(
+            what, where=str(source), expected="*.db here or in splits/*", got=common.folder_contents(source)
+        )
     log_name, _, scene = options.sequence.partition("/")
     if log_name in databases:
         return databases[log_name], scene
     if len(databases) == 1 and not scene:
         return next(iter(databases.values())), log_name
-    return databases[the_only([] if log_name else list(databases), list(databases), options, source, "log")], scene
+    return databases[
+        common.the_only([] if log_name else list(databases), list(databases), options, source, "log")
+    ], scene
 
 
 def files_of_nuplan(source: Path, options: ImportOptions) -> LogFiles:
@@ -475,16 +447,8 @@ class _Shot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _NuplanPlan:
-    """Files, times and poses of an import, before anything large is read.
-
-    Args:
-        name: the scene's id.
-        cameras: channel -> camera, the chosen ones.
-        clouds: in order of time.
-        moments: images of one moment, in order of time.
-        ego_us, world_from_ego: the vehicle over the whole span, in the log's world.
-        notes: for the scene's source.
-    """
+    """Files, times and poses of an import, before anything large is read: the chosen ``cameras`` by channel, ``clouds``
+    and ``moments`` (images of one) in order of time, and the vehicle over the whole span, in the log's world."""
 
     name: str
     cameras: Mapping[str, NuplanCamera]
@@ -510,7 +474,7 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     chosen = every[first:end]
     if not chosen:
         raise InputError("no clouds to import", where=where, expected=f"frames 0 to {len(every)}", got=f"{first}:{end}")
-    seconds(np.array([time_us for _, time_us in chosen]), "us", f"{where}: lidar_pc.timestamp", chosen[0][1])
+    common.seconds(np.array([time_us for _, time_us in chosen]), "us", f"{where}: lidar_pc.timestamp", chosen[0][1])
     notes = [f"clouds {first} to {first + len(chosen) - 1} of {scene or 'the log'}"]
     lidars = opened.lidars()
     placed = {token: opened.cloud(token, lidars, blobs) for token, _ in chosen}
@@ -531,7 +495,7 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     by_token = opened.cameras()
     folders = {camera.channel for camera in by_token.values() if (blobs / name / camera.channel).is_dir()}
     available = {channel: ours for channel, ours in CAMERAS.items() if channel in folders}
-    names = chosen_cameras(available, options, f"{where}: camera", tuple(CAMERAS))
+    names = common.chosen_cameras(available, options, f"{where}: camera", tuple(CAMERAS))
     cameras = {camera.channel: camera for camera in by_token.values()}
     span = (chosen[0][1] - _REACH_US, chosen[-1][1] + _REACH_US)
     shots = [
@@ -541,19 +505,12 @@ def _plan(opened: NuplanLog, scene: str, options: ImportOptions) -> _NuplanPlan:
     ]
     moments, moment_notes = _moments(shots, names, options, where)
     ego_us, poses = opened.ego_poses(span[0] - _MARGIN_US, span[1] + _MARGIN_US)
-    return _NuplanPlan(
-        f"{name}_{scene}" if scene else name,
-        {channel: cameras[channel] for channel in names},
-        clouds,
-        moments,
-        ego_us,
-        poses,
-        (*notes, *moment_notes),
-    )
+    name, chosen_cameras = f"{name}_{scene}" if scene else name, {channel: cameras[channel] for channel in names}
+    return _NuplanPlan(name, chosen_cameras, clouds, moments, ego_us, poses, (*notes, *moment_notes))
 
 
 def _refuse_missing(what: str, missing: Sequence[Path], total: int, options: ImportOptions) -> None:
-    """Refuse a log of which files are missing, unless that is allowed."""
+    """Refuse missing files, unless that is allowed."""
     if missing and not options.skip_missing:
         what = f"file of a {what} is missing"
         remedy = "download the log's sensor blobs, choose frames with --frames FIRST:END, or add --skip-missing"
@@ -608,9 +565,9 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list
     alone = []
     for found in by_camera.values():
         times = np.array([shot.time_us for shot in found], np.int64)
-        late = times - beats[nearest_index(beats, times)]
+        late = times - beats[common.nearest_index(beats, times)]
         usual = float(np.median(late[np.abs(late) <= half_us])) if (np.abs(late) <= half_us).any() else 0.0
-        for shot, index in zip(found, nearest_index(beats, times - usual), strict=True):
+        for shot, index in zip(found, common.nearest_index(beats, times - usual), strict=True):
             taken = any(other.channel == shot.channel for other in groups[int(index)])
             if taken or abs(shot.time_us - usual - beats[index]) >= half_us:
                 alone.append([shot])
@@ -625,17 +582,17 @@ def _by_moment(shots: Sequence[_Shot], names: Sequence[str], where: str) -> list
 def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> SceneContent[Any]:
     start_us = plan.clouds[0].time_us if plan.clouds else plan.moments[0][0].time_us
     found: list[str] = []
-    ego = mended_path(_ego_path(plan, start_us, str(opened.path)), options, found)
+    ego = common.mended_path(_ego_path(plan, start_us, str(opened.path)), options, found)
     first = ego.pose_at(0.0)
     if first is None:
         what, where = "vehicle poses do not cover the log", f"{opened.path}: ego_pose"
         expected, remedy = f"a pose at {start_us} us", "are pose and cloud times both in microseconds?"
         raise InputError(what, where=where, expected=expected, got=f"{len(plan.ego_us)} poses near it", remedy=remedy)
-    world_from_source = world_from_first(first)
+    world_from_source = common.world_from_first(first)
     ego = EgoPath(ego.times_s, world_from_source @ ego.world_from_ego)
     fits = {CAMERAS[channel]: _fit(camera, options) for channel, camera in plan.cameras.items()}
     tracks, track_notes = _read_tracks(opened, plan, start_us, world_from_source)
-    notes = [*plan.notes, *found, *image_notes(fits), origin_note(first)]
+    notes = [*plan.notes, *found, *image_notes(fits), common.origin_note(first)]
     notes.append(f"image poses {IMAGE_DELAY_US / 1e6:.4f} s after the time stamps: the middle of the read-out")
 
     def taken_s(shot: _Shot) -> float:
@@ -644,24 +601,19 @@ def _content(opened: NuplanLog, plan: _NuplanPlan, options: ImportOptions) -> Sc
     def convert(item: tuple[int, NuplanCloud | Sequence[_Shot]]) -> Iterable[SceneImage | SceneSweep]:
         index, what = item
         if isinstance(what, NuplanCloud):
-            time_s, path = (what.time_us - start_us) / 1e6, what.file
-            yield SceneSweep(
-                SENSOR,
-                index,
-                time_s,
-                world_from_source @ what.world_from_lidar,
-                _read_points(path, what.places),
-                str(path),
-            )
+            time_s, pose = (what.time_us - start_us) / 1e6, world_from_source @ what.world_from_lidar
+            yield SceneSweep(SENSOR, index, time_s, pose, _read_points(what.file, what.places), str(what.file))
             return
         for shot in what:
             time_s = taken_s(shot)
-            world_from_cam = pose_near(ego, time_s, where=str(shot.file)) @ plan.cameras[shot.channel].ego_from_cam
+            world_from_cam = (
+                common.pose_near(ego, time_s, where=str(shot.file)) @ plan.cameras[shot.channel].ego_from_cam
+            )
             yield SceneImage(CAMERAS[shot.channel], index, time_s, world_from_cam, shot.file, str(shot.file))
 
     moments = list(enumerate(plan.moments))
     if options.skip_missing:
-        moments = [one for one in moments if all(has_pose(ego, taken_s(shot)) for shot in one[1])]
+        moments = [one for one in moments if all(common.has_pose(ego, taken_s(shot)) for shot in one[1])]
         if len(moments) < len(plan.moments):
             notes.append(f"{len(plan.moments) - len(moments)} moments without a vehicle pose were left out")
     items = [*enumerate(plan.clouds), *moments]
@@ -693,7 +645,7 @@ def _ego_path(plan: _NuplanPlan, start_us: int, where: str) -> EgoPath:
         what, where = "no vehicle poses at the time of the clouds", f"{where}: ego_pose.timestamp"
         expected = "microseconds, as lidar_pc.timestamp"
         raise InputError(what, where=where, expected=expected, remedy="are the two in different units?")
-    return EgoPath(seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
+    return EgoPath(common.seconds(plan.ego_us, "us", f"{where}: ego_pose.timestamp", start_us), plan.world_from_ego)
 
 
 def _fit(camera: NuplanCamera, options: ImportOptions) -> ImageFit:
@@ -709,6 +661,9 @@ def _read_points(path: Path, places: Sequence[Matrix]) -> SweepPoints:
     cloud = read_cloud(path)
     intensity = cloud.fields.get("intensity", np.zeros(len(cloud.xyz)))
     returns = ~near_places(cloud.xyz, places)
-    xyz, grey = cloud.xyz[returns].astype(np.float32), unit_intensity(intensity[returns], 255, f"{path}: intensity")
+    xyz, grey = (
+        cloud.xyz[returns].astype(np.float32),
+        common.unit_intensity(intensity[returns], 255, f"{path}: intensity"),
+    )
     no_returns = cloud.missing + int((~returns).sum())
     return SweepPoints(xyz, grey, np.zeros(len(xyz), np.float32), no_returns=no_returns)

@@ -453,7 +453,7 @@ def read_log(releases: Sequence[Path], options: ImportOptions) -> DriveLog:
         notes.append("no LiDAR sweeps in the tables")
     ego = common.ego_path([reader.time_s(r) for r in used], [reader.map_from_ego(r) for r in used])
     source = Source("nuscenes", LICENCE, None, (f"release {folder.name}, {scene['name']}", *notes))
-    return DriveLog(str(scene["name"]), cameras, next(iter(chosen)), images, sweeps, tracks, ego, source, where)
+    return DriveLog(str(scene["name"]), cameras, images, sweeps, tracks, ego, source, where)
 
 
 def _choose_scene(releases: Sequence[Path], options: ImportOptions) -> tuple[Path, Row]:

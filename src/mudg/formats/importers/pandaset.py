@@ -44,25 +44,10 @@ from mudg.base.geometry import from_rotation_translation, invert, transform_poin
 from mudg.base.plain_pickle import MAX_BYTES, NUMPY_MAKERS, Array, Maker, Name, PickledObject, read_pickle
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
 from mudg.formats.importers import common
-from mudg.formats.importers.common import (
-    ImportOptions,
-    LogFiles,
-    finite_columns,
-    mended_path,
-    name_table,
-    origin_note,
-    pose_from_quaternion,
-    pose_near,
-    record_fields,
-    require_columns,
-    returns_of,
-    seconds,
-    unit_intensity,
-    world_from_first,
-)
+from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, Tracks, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
-from mudg.formats.unknown_fields import Known, note_unknown, note_unknown_within
+from mudg.formats.unknown_fields import known, note_unknown, note_unknown_within
 
 # pandas frame -------------------------------------------------------------------------------------
 #
@@ -110,8 +95,8 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
 
 
 def read_frame(path: Path) -> dict[str, NDArray[Any]]:
-    """Columns of a pickled, gzipped data frame (``.pkl.gz``; plain ``.pkl`` too), by their names. Raises InputError:
-    missing, cut off, not a data frame, or it asks for something that is not plain data."""
+    """Columns of a pickled data frame, gzipped or not, by their names. Raises InputError: missing, cut off, not a data
+    frame, or it asks for something that is not plain data."""
     content = store.read_bytes(path)
     if content[:2] == b"\x1f\x8b":
         content = gunzip(content, str(path))
@@ -198,77 +183,31 @@ def _array(value: Any) -> NDArray[Any]:
 
 
 # classes that people gave to PandaSet's points: ``annotations/semseg`` -> train ids of ``base/palette.py`` ------------
-CLASS_OF: Final[dict[str, str]] = {
-    "Smoke": "",
-    "Exhaust": "",
-    "Spray or rain": "",  # no surface
-    "Reflection": "",  # a ghost: nothing is there
-    "Vegetation": "vegetation",
-    "Ground": "terrain",  # unpaved ground
-    "Road": "road",
-    "Lane Line Marking": "road",
-    "Stop Line Marking": "road",
-    "Other Road Marking": "road",
-    "Sidewalk": "sidewalk",
-    "Driveway": "",  # crosses the sidewalk and is driven on: people label it either way
-    "Car": "car",
-    "Pickup Truck": "truck",  # by definition of Cityscapes, as their boxes here
-    "Medium-sized Truck": "truck",
-    "Semi-truck": "truck",
-    "Towed Object": "",  # trailers behind cars have no class of their own
-    "Motorcycle": "motorcycle",
-    "Motorized Scooter": "motorcycle",
-    "Other Vehicle - Construction Vehicle": "truck",
-    "Other Vehicle - Uncommon": "",
-    "Other Vehicle - Pedicab": "",
-    "Emergency Vehicle": "",  # cars and trucks
-    "Bus": "bus",
-    "Personal Mobility Device": "",
-    "Bicycle": "bicycle",
-    "Train": "train",
-    "Trolley": "train",
-    "Tram / Subway": "train",
-    "Pedestrian": "person",
-    "Pedestrian with Object": "person",
-    "Animals - Bird": "",
-    "Animals - Other": "",
-    "Pylons": "",
-    "Cones": "",
-    "Rolling Containers": "",
-    "Road Barriers": "",
-    "Temporary Construction Barriers": "",  # walls, fences and guard rails
-    "Signs": "traffic sign",
-    "Construction Signs": "traffic sign",
-    "Building": "building",
-    "Other Static Object": "",  # poles, traffic lights, walls, fences and more
-}
-"""The data set's classes -> classes of ``palette.CLASSES``; empty = unlabelled, because no class or several would
-fit."""
+CLASS_OF: Final[dict[str, str]] = name_table(
+    """vegetation: Vegetation; terrain: Ground; road: Road, Lane Line Marking, Stop Line Marking, Other Road Marking;
+    sidewalk: Sidewalk; car: Car; truck: Pickup Truck, Medium-sized Truck, Semi-truck,
+        Other Vehicle - Construction Vehicle;
+    motorcycle: Motorcycle, Motorized Scooter; bus: Bus; bicycle: Bicycle; train: Train, Trolley, Tram / Subway;
+    person: Pedestrian, Pedestrian with Object; traffic sign: Signs, Construction Signs; building: Building;
+    : Smoke, Exhaust, Spray or rain, Reflection, Driveway, Towed Object, Other Vehicle - Uncommon,
+        Other Vehicle - Pedicab, Emergency Vehicle, Personal Mobility Device, Animals - Bird, Animals - Other, Pylons,
+        Cones, Rolling Containers, Road Barriers, Temporary Construction Barriers, Other Static Object"""
+)
+"""The data set's classes -> classes of ``palette.CLASSES``; empty = unlabelled: none fits (smoke, ghosts, trailers), or
+several would (driveways are labelled either way; emergency vehicles are cars and trucks; barriers are walls, fences and
+guard rails). Ground is unpaved. Pickup trucks are trucks by definition of Cityscapes, as their boxes here."""
 
 
 class PointClasses:
-    """The class tables of the chosen frames. Raises InputError: a frame has no table though others have one, or
-    ``classes.json`` is missing or malformed.
-
-    Args:
-        folder: ``annotations/semseg``. Without any table there no point has a class.
-        frames: numbers of the chosen frames.
-        options: ``skip_missing`` allows frames without a table.
-    """
+    """The class tables of the chosen frames in ``annotations/semseg``; without any no point has a class. Raises
+    InputError: a frame has no table though others have one, or ``classes.json`` is missing or malformed."""
 
     def __init__(self, folder: Path, frames: Sequence[int], options: ImportOptions) -> None:
-        self._files: dict[int, Path] = common.numbered_files(folder, (".pkl.gz", ".pkl"))
-        lacks = [number for number in frames if number not in self._files]
-        if self._files and lacks and not options.skip_missing:
-            what = "a frame has no classes of points"
-            remedy = "copy it, choose frames with --frames FIRST:END, or add --skip-missing"
-            raise InputError(what, where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz", remedy=remedy)
+        self._files = _tables(folder, frames, options, "classes of points")
         self._names = _names(folder / "classes.json") if self._files else {}
         unknown = sorted(set(self._names.values()) - set(CLASS_OF))
-        self.notes = (
-            [f"classes of points that are not known here are unlabelled: {', '.join(unknown[:8])}"] if unknown else []
-        )
-        """Sentences about the tables, for people."""
+        some = ", ".join(unknown[:8])
+        self.notes = [f"classes of points that are not known here are unlabelled: {some}"] if unknown else []
 
     def of(self, frame: int, points: int) -> NDArray[np.uint8] | None:
         """Train ids u8[points] of a frame's cloud, 255 where unlabelled; None for a frame without a table."""
@@ -276,22 +215,32 @@ class PointClasses:
         if path is None:
             return None
         table = read_frame(path)
-        require_columns(("class",), table, path)
+        common.require_columns(("class",), table, path)
         note_unknown("annotations/semseg/*.pkl.gz", table, frozenset({"class"}))
-        numbers = finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
+        numbers = common.finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
         if len(numbers) != points:
             what, expected = "classes do not fit the points", f"{points} rows, one for each point of the frame's cloud"
             remedy = "is the file of another frame or sequence?"
             raise InputError(what, where=f"{path}: class", got=f"{len(numbers)} rows", expected=expected, remedy=remedy)
-        return self._train_ids(numbers, path)
-
-    def _train_ids(self, numbers: NDArray[np.int64], path: Path) -> NDArray[np.uint8]:
         present, where = np.unique(numbers, return_inverse=True)
         strange = [int(number) for number in present if int(number) not in self._names]
         if strange:
             log.warn(f"pandaset: {path}: classes {strange[:8]} are not in classes.json; their points are unlabelled")
         ids = [train_id(self._names.get(int(number), "")) for number in present]
         return np.array(ids, np.uint8)[where]
+
+
+def _tables(folder: Path, frames: Sequence[int], options: ImportOptions, what: str) -> dict[int, Path]:
+    """Tables by frame number; none at all is allowed, gaps are not."""
+    tables = common.numbered_files(folder, (".pkl.gz", ".pkl"))
+    lacks = [number for number in frames if number not in tables]
+    if tables and lacks and not options.skip_missing:
+        expected, remedy = (
+            f"{lacks[0]:02d}.pkl.gz",
+            "copy it, choose frames with --frames FIRST:END, or add --skip-missing",
+        )
+        raise InputError(f"a frame has no {what}", where=str(folder), expected=expected, remedy=remedy)
+    return tables
 
 
 def train_id(name: str) -> int:
@@ -349,22 +298,13 @@ _CUBOID_COLUMNS: Final = tuple(
 _POINTS, _CUBOIDS, _POSES = "lidar/*.pkl.gz", "annotations/cuboids/*.pkl.gz", "poses.json"
 OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     _POINTS: frozenset(_POINT_COLUMNS),
-    _CUBOIDS: frozenset(
-        {
-            *_CUBOID_COLUMNS,
-            "camera_used",
-            "attributes.object_motion",
-            "attributes.rider_status",
-            "attributes.pedestrian_behavior",
-            "attributes.pedestrian_age",
-            "cuboids.sibling_id",
-            "cuboids.sensor_id",
-        }
+    _CUBOIDS: frozenset((*_CUBOID_COLUMNS, "camera_used", "cuboids.sibling_id", "cuboids.sensor_id")).union(
+        f"attributes.{name}" for name in ("object_motion", "rider_status", "pedestrian_behavior", "pedestrian_age")
     ),
     "intrinsics.json": frozenset({"fx", "fy", "cx", "cy"}),
 }
 """Kinds of files -> their fields, read or not."""
-_POSE_FIELDS: Final[Known] = {"heading": dict.fromkeys("wxyz"), "position": dict.fromkeys("xyz")}
+_POSE_FIELDS: Final = known("", heading=known("w x y z"), position=known("x y z"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -404,9 +344,7 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
 
     Args:
         source: a sequence's folder, or the folder of sequences with ``options.sequence``.
-        out: destination.
-        options: ``frames``, ``cameras`` (default all six), ``sequence``, ``skip_missing``, ``test_every``,
-            ``resolution`` and ``workers`` are used; ``poses``, ``boxes`` and ``untwist`` are refused.
+        options: ``cameras`` default to all six; ``poses``, ``boxes`` and ``untwist`` are refused.
     """
     common.refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
     folder = _chosen_sequence(source, options)
@@ -418,13 +356,10 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
     notes: list[str] = []
     motion = _Motion.read(folder, frames, chosen, options, notes)
     fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
-    cuboids = _cuboid_files(folder / "annotations" / "cuboids", frames, options)
+    cuboids = _tables(folder / "annotations" / "cuboids", frames, options, "boxes")
     classes = PointClasses(folder / "annotations" / "semseg", frames, options)
-    notes += [
-        f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here",
-        *image_notes(fits),
-        *classes.notes,
-    ]
+    notes.append(f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here")
+    notes += [*image_notes(fits), *classes.notes]
     if "front_camera" not in motion.world_from_cam:
         notes.append("front camera's poses are missing: the LiDARs' places are those of sequence 002")
     if not cuboids:
@@ -438,12 +373,12 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
             time_s, pose = float(motion.camera_s[name][index]), motion.world_from_cam[name][index]
             yield SceneImage(cameras[name], index, time_s, pose, images[name][number])
         cloud = _read_points(clouds[number], motion, index)
-        given = classes.of(number, len(cloud.returns))
-        given = None if given is None else given[cloud.returns]
+        train_ids = classes.of(number, len(cloud.returns))
+        train_ids = None if train_ids is None else train_ids[cloud.returns]
         for d, sensor in SENSORS.items():
             if d == 0 or (cloud.d == d).any():
                 pose = motion.world_from_lidar(d, cloud.time_s)
-                sweep = cloud.of_sensor(d, invert(pose) @ motion.world_from_source, given)
+                sweep = cloud.of_sensor(d, invert(pose) @ motion.world_from_source, train_ids)
                 yield SceneSweep(sensor, index, cloud.time_s, pose, sweep, str(clouds[number]))
         taken_s = [float(motion.camera_s[name][index]) for name in chosen]
         images_s[cloud.time_s] = min(taken_s), max(taken_s)
@@ -451,22 +386,14 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
             boxes[index] = _read_cuboids(cuboids[number], cloud, motion)
 
     def tracks() -> Tracks:
-        found = BoxTracks(str(folder / "annotations" / "cuboids"), LABELS)
-        box_notes = _add_boxes(found, boxes)
-        made, track_notes = found.tracks(images_s=images_s)
-        return made, [*box_notes, *track_notes]
+        collected = BoxTracks(str(folder / "annotations" / "cuboids"), LABELS)
+        box_notes = _add_boxes(collected, boxes)
+        result, track_notes = collected.tracks(images_s=images_s)
+        return result, [*box_notes, *track_notes]
 
-    origin, numbers = Source("pandaset", LICENCE, None, tuple(notes)), range(len(frames))
-    content = SceneContent(
-        folder.resolve().name,
-        origin,
-        fits,
-        numbers,
-        convert,
-        lambda index: f"frame {frames[index]}",
-        motion.ego(),
-        tracks,
-    )
+    origin, name = Source("pandaset", LICENCE, None, tuple(notes)), folder.resolve().name
+    path, numbers = motion.ego(), range(len(frames))
+    content = SceneContent(name, origin, fits, numbers, convert, lambda n: f"frame {frames[n]}", path, tracks)
     return write_scene(content, out, options)
 
 
@@ -481,16 +408,6 @@ def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
         raise InputError(what, where=str(source), got=common.folder_contents(source), expected=expected)
     matching = [name for name in sequences if options.sequence in ("", name)]
     return source / common.the_only(matching, sequences, options, source, "sequence")
-
-
-def _cuboid_files(folder: Path, frames: Sequence[int], options: ImportOptions) -> dict[int, Path]:
-    """Cuboid tables by frame number; none at all is allowed, gaps are not."""
-    cuboids = common.numbered_files(folder, (".pkl.gz", ".pkl"))
-    lacks = [number for number in frames if number not in cuboids]
-    if cuboids and lacks and not options.skip_missing:
-        remedy = "copy it, choose frames with --frames FIRST:END, or add --skip-missing"
-        raise InputError("a frame has no boxes", where=str(folder), expected=f"{lacks[0]:02d}.pkl.gz", remedy=remedy)
-    return cuboids
 
 
 def files_of_pandaset(source: Path, options: ImportOptions) -> LogFiles:
@@ -534,10 +451,10 @@ class _Motion:
         raw_s = _times(file, known)
         start_s = float(raw_s[first])
         forward = _poses(folder / "lidar" / "poses.json", known) @ yaw_matrix(np.pi / 2)
-        world_from_source = world_from_first(forward[first])
-        notes.append(origin_note(forward[first]))
-        path = EgoPath(seconds(raw_s, "s", str(file), start_s), world_from_source @ forward)
-        path = mended_path(path, options, notes)
+        world_from_source = common.world_from_first(forward[first])
+        notes.append(common.origin_note(forward[first]))
+        path = EgoPath(common.seconds(raw_s, "s", str(file), start_s), world_from_source @ forward)
+        path = common.mended_path(path, options, notes)
         raw_s = raw_s[[number - known[0] for number in frames]]
         needed = dict.fromkeys((*cameras, "front_camera"))
         camera_s, world_from_cam = {}, {}
@@ -553,14 +470,11 @@ class _Motion:
                 expected = f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json"
                 remedy = "are the times in seconds, and of this sequence?"
                 raise InputError(what, where=where, expected=expected, got=f"{late.max():.3f} s apart", remedy=remedy)
-            stamped_s = seconds(times, "s", str(stamps), start_s)
+            stamped_s = common.seconds(times, "s", str(stamps), start_s)
             camera_s[name] = stamped_s + EXPOSURE_S
-            given = world_from_source @ _poses(here / "poses.json", frames)
+            timed = zip(stamped_s, world_from_source @ _poses(here / "poses.json", frames), strict=True)
             world_from_cam[name] = np.stack(
-                [
-                    pose_on_path(path, time_s + POSE_S) @ invert(pose_on_path(path, time_s)) @ pose
-                    for time_s, pose in zip(stamped_s, given, strict=True)
-                ]
+                [pose_on_path(path, t + POSE_S) @ invert(pose_on_path(path, t)) @ pose for t, pose in timed]
             )
         places = _lidar_places(path, camera_s.get("front_camera"), world_from_cam.get("front_camera"))
         return cls(world_from_source, raw_s, start_s, camera_s, world_from_cam, path, places)
@@ -582,7 +496,7 @@ class _Motion:
 
 def pose_on_path(path: EgoPath, time_s: float) -> Matrix:
     """The vehicle's pose f64[4, 4]; beyond an end of the path it goes on as it did there."""
-    return pose_near(path, time_s, MAX_CAMERA_DELAY_S + abs(POSE_S), "lidar/poses.json")
+    return common.pose_near(path, time_s, MAX_CAMERA_DELAY_S + abs(POSE_S), "lidar/poses.json")
 
 
 def _lidar_places(
@@ -591,11 +505,8 @@ def _lidar_places(
     """Where the LiDARs sit on the vehicle: median place of the front camera, plus the static calibration."""
     camera = np.array(FRONT_CAMERA_M)
     if times_s is not None and world_from_cam is not None:
-        where_s = times_s - EXPOSURE_S + POSE_S
-        seen = [
-            transform_points(invert(pose_on_path(path, time_s)), pose[None, :3, 3])[0]
-            for time_s, pose in zip(where_s, world_from_cam, strict=True)
-        ]
+        timed = zip(times_s - EXPOSURE_S + POSE_S, world_from_cam, strict=True)
+        seen = [transform_points(invert(pose_on_path(path, t)), pose[None, :3, 3])[0] for t, pose in timed]
         camera = np.median(seen, axis=0)
     return {d: camera + np.array(offset) for d, offset in OFFSET_FROM_FRONT_CAMERA_M.items()}
 
@@ -616,7 +527,7 @@ def _times(path: Path, frames: Sequence[int]) -> NDArray[np.float64]:
     if not all(isinstance(value, int | float) and not isinstance(value, bool) for value in values):
         raise InputError("timestamps are not numbers", where=str(path), got=str(values)[:80])
     times = np.array(values, np.float64)
-    seconds(times, "s", str(path))
+    common.seconds(times, "s", str(path))
     if times[0] > 1e11:
         what, remedy = "timestamps are in another unit than expected", "divide them by 1000 or 1000000"
         raise InputError(what, where=str(path), expected="seconds of the epoch", got=f"{times[0]:.6g}", remedy=remedy)
@@ -627,9 +538,11 @@ def _poses(path: Path, frames: Sequence[int]) -> Matrix:
     poses = []
     for number, entry in zip(frames, _entries(path, frames), strict=True):
         where = f"{path}: entry {number}"
-        with record_fields("pose is incomplete", where, "position x y z (metres) and heading w x y z (quaternion)"):
+        with common.record_fields(
+            "pose is incomplete", where, "position x y z (metres) and heading w x y z (quaternion)"
+        ):
             heading = [entry["heading"][key] for key in "wxyz"]
-            poses.append(pose_from_quaternion(heading, [entry["position"][key] for key in "xyz"], where))
+            poses.append(common.pose_from_quaternion(heading, [entry["position"][key] for key in "xyz"], where))
         note_unknown_within(_POSES, entry, _POSE_FIELDS)
     return np.stack(poses)
 
@@ -637,7 +550,7 @@ def _poses(path: Path, frames: Sequence[int]) -> Matrix:
 def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageFit:
     path = folder / "intrinsics.json"
     values = store.read_json(path)
-    with record_fields("intrinsics are incomplete", path, "fx fy cx cy"):
+    with common.record_fields("intrinsics are incomplete", path, "fx fy cx cy"):
         fx, fy, cx, cy = (float(values[key]) for key in ("fx", "fy", "cx", "cy"))
         note_unknown(path.name, values, OFFICIAL[path.name])
     # the data set counts pixels from the centre of the top-left one, as OpenCV does
@@ -649,7 +562,7 @@ def _fit(folder: Path, name: str, image: Path, options: ImportOptions) -> ImageF
 
 def _columns(path: Path, names: Sequence[str], kind: str) -> dict[str, NDArray[Any]]:
     frame = read_frame(path)
-    require_columns(names, frame, path)
+    common.require_columns(names, frame, path)
     note_unknown(kind, frame, OFFICIAL[kind])
     return frame
 
@@ -657,8 +570,8 @@ def _columns(path: Path, names: Sequence[str], kind: str) -> dict[str, NDArray[A
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cloud:
     """One cloud: ``xyz`` f64[N, 3] in the data set's world, ``intensity`` 0..1, ``dt_s`` seconds from ``time_s`` (of
-    the scene's clock, the middle of the turn), ``d`` 0 or 1. Beams without a return are left out: ``returns`` bool[M]
-    says which rows of the file are none, and ``without`` how many of them each LiDAR has."""
+    the scene's clock, the middle of the turn), ``d`` 0 or 1. Rows of the file without a return, where ``returns``
+    bool[M] is False, are left out; each LiDAR has ``without`` of them."""
 
     time_s: float
     xyz: Matrix
@@ -679,10 +592,10 @@ class _Cloud:
 def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
     frame_s = float(motion.raw_s[index])
     frame = _columns(path, _POINT_COLUMNS, _POINTS)
-    returns = returns_of(frame, path)
+    returns = common.returns_of(frame, path)
     without = {d: int((frame["d"][~returns] == d).sum()) for d in SENSORS}
     frame = {name: values[returns] for name, values in frame.items()}
-    columns = {name: finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
+    columns = {name: common.finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
     late_s = columns["t"] - frame_s
     if len(late_s) and np.abs(late_s).max() > MAX_POINT_DELAY_S:
         what = "points do not belong to their frame's time"
@@ -694,11 +607,9 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
         raise InputError("a point is of a LiDAR that does not exist", where=f"{path}: d", expected="0 or 1")
     turning = late_s[columns["d"] == 0]
     middle_s = float(turning.min() + turning.max()) / 2 if len(turning) else 0.0
-    xyz = np.stack([columns[axis] for axis in "xyz"], 1)
-    intensity = unit_intensity(columns["i"], 255, f"{path}: i")
-    return _Cloud(
-        frame_s - motion.start_s + middle_s, xyz, intensity, late_s - middle_s, columns["d"], returns, without
-    )
+    time_s, xyz = frame_s - motion.start_s + middle_s, np.stack([columns[axis] for axis in "xyz"], 1)
+    intensity = common.unit_intensity(columns["i"], 255, f"{path}: i")
+    return _Cloud(time_s, xyz, intensity, late_s - middle_s, columns["d"], returns, without)
 
 
 # --- boxes ----------------------------------------------------------------------------------------
@@ -706,13 +617,16 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
 
 def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
     frame = _columns(path, _CUBOID_COLUMNS, _CUBOIDS)
-    centre = finite_columns(frame, ("position.x", "position.y", "position.z"), path)
-    sizes = finite_columns(frame, ("dimensions.y", "dimensions.x", "dimensions.z"), path)  # length, width, height
-    yaw = finite_columns(frame, ("yaw",), path)[:, 0]
+    centre = common.finite_columns(frame, ("position.x", "position.y", "position.z"), path)
+    sizes = common.finite_columns(
+        frame, ("dimensions.y", "dimensions.x", "dimensions.z"), path
+    )  # length, width, height
+    yaw = common.finite_columns(frame, ("yaw",), path)[:, 0]
     sensor = np.full(len(yaw), -1.0)
     if "cuboids.sensor_id" in frame:
-        given = np.where(_missing(frame["cuboids.sensor_id"]), -1, frame["cuboids.sensor_id"])
-        sensor = finite_columns({"cuboids.sensor_id": given}, ("cuboids.sensor_id",), path)[:, 0]
+        ids = frame["cuboids.sensor_id"]
+        ids = np.where(np.array([one is None or one != one for one in ids], bool), -1, ids)
+        sensor = common.finite_columns({"cuboids.sensor_id": ids}, ("cuboids.sensor_id",), path)[:, 0]
     siblings = frame.get("cuboids.sibling_id", np.full(len(yaw), "", object))
     when = _MeasuringTimes(cloud, motion)
     rows = []
@@ -726,11 +640,6 @@ def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
         world_from_box = motion.world_from_source @ box
         rows.append(_Cuboid(uuid, label, cloud.time_s, late_s, size, world_from_box, standing, of, sibling))
     return rows
-
-
-def _missing(column: NDArray[Any]) -> NDArray[np.bool_]:
-    """Where a column has no value: None or NaN."""
-    return np.array([value is None or value != value for value in column], bool)
 
 
 class _MeasuringTimes:
@@ -781,7 +690,6 @@ def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> lis
             doubled += name in kept
             kept.setdefault(name, box)
         for name, box in kept.items():
-            tracks.add(
-                name, tracks.label_of(box.label), box.time_s, box.size_m, box.world_from_box, box.standing, box.late_s
-            )
+            label, pose = tracks.label_of(box.label), box.world_from_box
+            tracks.add(name, label, box.time_s, box.size_m, pose, box.standing, box.late_s)
     return [f"{doubled} boxes are second boxes of an object for the other LiDAR and were left out"] if doubled else []

@@ -7,8 +7,7 @@ from typing import Any, Literal
 
 from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
-from mudg.diffusion.settings.adapt import AdaptConfig
-from mudg.diffusion.settings.synthesize import SynthesizeConfig
+from mudg.diffusion.settings import AdaptConfig, SynthesizeConfig
 from mudg.editing.view_settings import RenderConfig, ScoreConfig
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians.settings import FitConfig

@@ -32,15 +32,8 @@ from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import transform_points, yaw_matrix, yaw_of
 from mudg.base.types import EgoPath, Scene, Source
-from mudg.formats.importers.common import (
-    ImportOptions,
-    LogFiles,
-    chosen_cameras,
-    folder_contents,
-    refuse_options,
-    seconds,
-    the_only,
-)
+from mudg.formats.importers import common
+from mudg.formats.importers.common import ImportOptions, LogFiles
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
 from mudg.formats.importers.images import ImageFit, fit_images
 from mudg.formats.importers.waymo import records as tracks
@@ -124,7 +117,7 @@ def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
 
 
 def _refuse_options(options: ImportOptions) -> None:
-    refuse_options(options, "Waymo", "poses", "boxes")
+    common.refuse_options(options, "Waymo", "poses", "boxes")
     if options.untwist == "no":
         what = "Waymo scans cannot be left twisted"
         expected = "auto or yes: points carry the pose they were measured at"
@@ -157,9 +150,9 @@ def _find(source: Path, options: ImportOptions) -> tuple[Path | None, str]:
     segments = records or sorted({path.stem for name in REQUIRED for path in (source / name).glob("*.parquet")})
     if not segments:
         expected = f"*{_SUFFIX} files, or component folders: {', '.join(REQUIRED)}"
-        raise InputError("no Waymo log found", where=str(source), got=folder_contents(source), expected=expected)
+        raise InputError("no Waymo log found", where=str(source), got=common.folder_contents(source), expected=expected)
     matching = [name for name in segments if name == options.sequence] or [n for n in segments if options.sequence in n]
-    name = the_only(matching, matching or list(segments), options, source, "log")
+    name = common.the_only(matching, matching or list(segments), options, source, "log")
     return records.get(name), name
 
 
@@ -170,7 +163,7 @@ def _chosen_cameras(waymo: WaymoLog, options: ImportOptions, source: Path) -> li
         what, got = "the log has no images", f"{len(waymo.frames)} frames with poses and boxes only"
         remedy = "take the files with camera and LiDAR data"
         raise InputError(what, where=str(source), expected="images of the cameras", got=got, remedy=remedy)
-    chosen = chosen_cameras(there, options, str(source), tuple(there))
+    chosen = common.chosen_cameras(there, options, str(source), tuple(there))
     lacking = [name for name in chosen if name not in waymo.cameras]
     if lacking:
         what, got = "cameras have images and no calibration", ", ".join(lacking)
@@ -276,7 +269,7 @@ def _plan(
 ) -> _Plan:
     first = frames[0]
     start_us = first.timestamp_us
-    seconds([f.timestamp_us for f in frames], "us", f"{waymo.name}, from frame {first.number}", start_us)
+    common.seconds([f.timestamp_us for f in frames], "us", f"{waymo.name}, from frame {first.number}", start_us)
     place = first.global_from_vehicle[:3, 3]
     yaw = yaw_of(first.global_from_vehicle)
     world_from_global = yaw_matrix(-yaw)

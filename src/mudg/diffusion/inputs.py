@@ -24,7 +24,7 @@ from mudg.core import weather
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.core.project import ProjectedPoints
 from mudg.core.weather import DriveFacts, ShownView
-from mudg.diffusion.clips.condition import ConditionRules, RenderAt, VacatedAt, WarpSource, build_conditions
+from mudg.diffusion.condition import ConditionRules, RenderAt, VacatedAt, WarpSource, build_conditions
 
 # near points --------------------------------------------------------------------------------------
 #

@@ -26,7 +26,7 @@ from mudg.base import log
 from mudg.base.devices import SAME_CODE
 from mudg.base.errors import UsageError
 from mudg.base.types import Camera, Condition, View
-from mudg.diffusion.published.model import PublishedConfig, PublishedMDM, WorkSplit
+from mudg.diffusion.published import PublishedConfig, PublishedMDM, WorkSplit
 from mudg.diffusion.requests import SampleRequest
 from mudg.networks.clip import TEXT_TOKENS
 

@@ -25,8 +25,6 @@ from mudg.formats.unknown_fields import note_unknown
 
 # scans --------------------------------------------------------------------------------------------
 #
-# KITTI velodyne scans: reading, and how the sensor turns while the vehicle drives.
-#
 # The sensor turns counter-clockwise in 0.1 s and faces forward at the scan's time, so a point at azimuth a was measured
 # a / 2 pi turns later.
 SENSOR: Final = "velodyne"
@@ -46,23 +44,14 @@ def read_scan(path: Path) -> SweepPoints:
 
 
 def azimuth_delay_s(azimuth_rad: float | NDArray[np.floating]) -> float | NDArray[np.floating]:
-    """When the sensor looks to ``azimuth_rad`` (counter-clockwise from forward, -pi..pi), seconds after looking
-    forward."""
+    """Seconds from looking forward to looking to ``azimuth_rad`` (counter-clockwise from forward, -pi..pi)."""
     return azimuth_rad / (2 * np.pi) * TURN_PERIOD_S
 
 
 def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s: float) -> SweepPoints:
-    """Bring the points of a turning sensor to one moment; see the module text for the timing.
-
-    Args:
-        points: as measured.
-        velo_at: world-from-velodyne f64[4, 4] at a time; asked at 37 moments of the turn, points in between are
-            blended.
-        time_s: the scan's time.
-
-    Returns:
-        Points in the sensor's frame at ``time_s``, with the seconds after it at which they were measured.
-    """
+    """Bring the points of a turning sensor to one moment, ``time_s``: points in the sensor's frame then, with the
+    seconds after it at which they were measured. ``velo_at``: world-from-velodyne f64[4, 4] at a time; asked at 37
+    moments of the turn, between which points are blended."""
     azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
     dt_s = np.asarray(azimuth_delay_s(azimuth), np.float32)
     velo_from_world = invert(velo_at(time_s))
@@ -74,11 +63,9 @@ def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s
 
 # calib --------------------------------------------------------------------------------------------
 #
-# KITTI calibration text, both forms: the object/tracking/odometry ``calib.txt`` and the three files of a raw-data day.
-#
 # KITTI counts pixels from the centre of the top-left pixel; this package from its corner. So 0.5 is added to the
 # principal point here, once.
-PIXEL_CENTRE_PX = 0.5
+PIXEL_CENTRE_PX: Final = 0.5
 _NUMBERED = tuple(
     f"{name}_{number:02d}" for name in ("S", "K", "D", "R", "T", "S_rect", "R_rect", "P_rect") for number in range(4)
 )
@@ -98,18 +85,13 @@ drive."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiCalibration:
-    """Calibration of one recording.
-
-    Args:
-        projections: camera number -> P f64[3, 4]: pixels from rectified camera 0.
-        rect0_from_velo: rectified camera 0 from velodyne, f64[4, 4].
-        velo_from_imu: velodyne from IMU f64[4, 4], or None if the source does not say.
-        source: the files read, for messages.
-    """
+    """Calibration of one recording; poses are f64[4, 4]."""
 
     projections: dict[int, Matrix]
+    """Camera number -> P f64[3, 4]: pixels from rectified camera 0."""
     rect0_from_velo: Matrix
     velo_from_imu: Matrix | None
+    """None if the source does not say."""
     source: str
 
     def camera(self, number: int, name: str, width: int, height: int) -> Camera:
@@ -133,15 +115,8 @@ class KittiCalibration:
 
 
 def pinhole_camera(projection: Matrix, name: str, size: tuple[int, int], where: str) -> Camera:
-    """The rectified pinhole camera of a KITTI projection matrix. Raises InputError: skew, another last row than 0 0 1,
-    or a focal length that is not positive.
-
-    Args:
-        projection: f64[3, 4]; pixels are counted from the centre of the top-left one.
-        name: of the camera in the scene.
-        size: width and height in pixels.
-        where: for messages.
-    """
+    """The rectified pinhole camera of a KITTI projection matrix f64[3, 4], whose pixels are counted from the centre of
+    the top-left one. Raises InputError: skew, another last row than 0 0 1, or a focal length that is not positive."""
     if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
         what = "projection matrix is not of a rectified pinhole camera"
         raise InputError(what, where=where, expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()))
@@ -256,15 +231,11 @@ def line_numbers(line: str, counts: Sequence[int], where: str, what: str) -> NDA
 
 
 def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, Matrix], str]:
-    """Poses by frame number, and which sensor they are of.
+    """Poses f64[4, 4] by frame number, and which sensor they are of: ``cam0`` or ``velo``.
 
     Two forms are told apart by the numbers in a line: 12 = KITTI odometry, row-major 3x4 of rectified camera 0, line k
     for frame number k (or, in a file that has just one line per frame, for the k-th frame); 13 = frame number, then
-    row-major 3x4 of the velodyne in a z-up world. An empty line is a frame without a pose.
-
-    Returns:
-        Poses f64[4, 4] by frame number, and ``"cam0"`` or ``"velo"``.
-    """
+    row-major 3x4 of the velodyne in a z-up world. An empty line is a frame without a pose."""
     lines = read_lines(path)
     if not lines:
         raise InputError("pose file is empty", where=str(path), expected="one pose a line")
@@ -281,10 +252,8 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
     elif len(rows) == count == len(frame_numbers):
         poses = dict(zip(frame_numbers, rows.values(), strict=True))
         if frame_numbers[-1] - frame_numbers[0] >= count:
-            log.warn(
-                f"kitti: {path} has a line for each of the {count} frames: line k is taken for the k-th of them, gaps"
-                " or not"
-            )
+            lines = f"{path} has a line for each of the {count} frames"
+            log.warn(f"kitti: {lines}: line k is taken for the k-th of them, gaps or not")
     else:
         expected = f"{len(frame_numbers)} (one per frame) or at least {max(frame_numbers) + 1} (one per frame number)"
         what = "pose file does not cover the frames"
@@ -294,12 +263,8 @@ def read_pose_file(path: Path, frame_numbers: Sequence[int]) -> tuple[dict[int, 
 
 
 def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.float64]]:
-    """GPS/IMU packets f64[30] by frame number, from the first to the last of ``frames``; empty files and lines are
-    missing packets.
-
-    Args:
-        path: a folder with one file per frame (raw data), or one file with a line per frame (tracking).
-    """
+    """GPS/IMU packets f64[30] by frame number, from the first to the last of ``frames``: from a folder with a file per
+    frame (raw data), or one file with a line per frame (tracking). Empty files and lines are missing packets."""
     if path.is_dir():
         found = {int(file.stem): file for file in path.iterdir() if file.stem.isdigit() and file.suffix == ".txt"}
         wheres = {n: str(file) for n, file in sorted(found.items()) if frames[0] <= n <= frames[-1]}
@@ -325,12 +290,8 @@ def poses_from_packets(packets: NDArray[np.float64], where: str) -> Matrix:
     east = scale * EARTH_RADIUS_M * longitude
     north = scale * EARTH_RADIUS_M * np.log(np.tan(np.pi / 4 + latitude / 2))
     positions = np.stack([east, north, packets[:, 2]], 1)
-    poses = np.stack(
-        [
-            from_rotation_translation(_roll_pitch_yaw(*packet[3:6]), position - positions[0])
-            for packet, position in zip(packets, positions, strict=True)
-        ]
-    )
+    moved = zip(packets, positions - positions[0], strict=True)
+    poses = np.stack([from_rotation_translation(_roll_pitch_yaw(*packet[3:6]), place) for packet, place in moved])
     return yaw_matrix(-yaw_of(poses[0])) @ poses
 
 
@@ -357,10 +318,8 @@ def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, 
     if count > last:
         return stamps
     if len(stamps) == max(stamps, default=-1) + 1 == len(numbers) > 0:
-        log.warn(
-            f"kitti: {path} has a line for each of the {len(numbers)} files: line k is taken for the k-th of them, gaps"
-            " or not"
-        )
+        lines = f"{path} has a line for each of the {len(numbers)} files"
+        log.warn(f"kitti: {lines}: line k is taken for the k-th of them, gaps or not")
         return dict(zip(numbers, stamps.values(), strict=True))
     what, got = "timestamps do not cover the frames", f"{count} lines, {len(numbers)} files"
     expected = f"at least {last + 1} lines (line k = frame k, empty where it is missing), or one per file"
@@ -379,11 +338,8 @@ def _stamp(line: str, where: str) -> float:
 
 
 # boxes --------------------------------------------------------------------------------------------
-#
-# KITTI boxes: tracking and object label text, raw-data tracklets; all become boxes in the velodyne frame per frame
-# number.
-MAX_TRACKLET_BYTES = 256 * 1024 * 1024
-LABELS = frozenset(
+MAX_TRACKLET_BYTES: Final = 256 * 1024 * 1024
+LABELS: Final = frozenset(
     ("car", "van", "truck", "pedestrian", "person_sitting", "person (sitting)", "person", "cyclist", "tram", "misc")
 )
 """Classes of the benchmarks, in lower case."""
@@ -399,23 +355,19 @@ _TRACKLET_POSE = frozenset(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiBox:
-    """One annotated box.
-
-    Args:
-        frame: frame number.
-        track: track number; object labels count lines.
-        label: lower-case class, e.g. ``car``.
-        size_m: length, width, height.
-        sensor_from_box: box frame (x forward, y left, z up, origin in the centre) to the velodyne, f64[4, 4].
-        box2d_px: annotated rectangle (left, top, right, bottom) in KITTI's pixels, or None.
-    """
+    """One annotated box."""
 
     frame: int
     track: int
+    """Track number; object labels count lines."""
     label: str
+    """Lower-case class, e.g. ``car``."""
     size_m: tuple[float, float, float]
+    """Length, width, height."""
     sensor_from_box: Matrix
+    """Box frame (x forward, y left, z up, origin in the centre) to the velodyne, f64[4, 4]."""
     box2d_px: tuple[float, float, float, float] | None = None
+    """Annotated rectangle (left, top, right, bottom) in KITTI's pixels."""
 
 
 def rect0_from_box(bottom_centre_m: Sequence[float], height_m: float, rotation_y: float) -> Matrix:
@@ -428,14 +380,9 @@ def rect0_from_box(bottom_centre_m: Sequence[float], height_m: float, rotation_y
 
 
 def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
-    """Boxes of a tracking label file (17 columns and optionally a score), or of an object label file. Raises
-    InputError: another number of columns, values that are no finite numbers, or a size that makes no sense.
-
-    Args:
-        path: label text. ``DontCare`` regions are left out.
-        rect0_from_velo: boxes are given in rectified camera 0 and returned in the velodyne frame, f64[4, 4].
-        frame: frame number for an object label file (15 columns and optionally a score); None for a tracking file.
-    """
+    """Boxes of a tracking label file (17 columns and optionally a score), or, with the number of its ``frame``, of an
+    object label file (15). They are given in rectified camera 0; ``DontCare`` regions are left out. Raises InputError:
+    another number of columns, values that are no finite numbers, or a size that makes no sense."""
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
     skip = 2 if frame is None else 0
@@ -507,22 +454,15 @@ def build_tracks(
     where: str,
     velo_at: Callable[[float], Matrix] | None = None,
 ) -> tuple[list[Track], list[str]]:
-    """Tracks in the world from boxes per frame, in the order of their numbers.
-
-    Boxes of frames that are not imported are left out. A track that is not seen for longer than
-    ``box_tracks.MAX_GAP_S`` is split into ``7``, ``7.1``, ... The size is the median over the track.
+    """Tracks in the world from boxes per frame, in the order of their numbers, and notes (splits, boxes left out).
 
     Args:
-        boxes: in any order.
+        boxes: in any order; those of frames that are not imported are left out.
         world_from_velo: pose of the velodyne f64[4, 4] by frame number.
         times_s: time of the scan by frame number, seconds.
-        where: the file the boxes come from, for messages.
         velo_at: pose of the velodyne at any time, when boxes were drawn into scans that were still twisted: each box
             then belongs to the moment its azimuth was measured, and is moved to the scan's time with the track's
             velocity.
-
-    Returns:
-        The tracks, and notes for people (splits, boxes left out).
     """
     collected = BoxTracks(where, {label: label for label in LABELS})
     delays_s: dict[tuple[str, float], float] = {}

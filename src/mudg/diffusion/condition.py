@@ -20,9 +20,10 @@ Training clips are made of these in `from_city.py` and `from_log.py`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import TYPE_CHECKING, Any, Protocol
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -36,11 +37,6 @@ from mudg.base.errors import InputError
 from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, SparseDepth, Track, View
 from mudg.core.pictures import resize_area, to_bytes
 from mudg.core.project import ProjectConfig, ProjectedPoints, project_sparse
-from mudg.diffusion.clips.stacked import KeptImages, stacked
-
-if TYPE_CHECKING:
-    from mudg.base.types import RenderPlanes
-
 
 # vacated ------------------------------------------------------------------------------------------
 #
@@ -757,3 +753,44 @@ def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:
         return torch.full((height, width), palette.UNLABELLED, dtype=torch.uint8)
     own = torch.from_numpy(recorded.semantics.astype(np.uint8))
     return functional.interpolate(own[None, None], size=(height, width), mode="nearest-exact")[0, 0]
+
+
+# planes of all views, in memory or in files -------------------------------------------------------
+
+
+LARGE_PIXELS = 2_500_000
+"""Planes of more pixels lie in files where there is a folder for them."""
+
+
+class KeptImages(dict[int, "WarpSource"]):
+    """Recorded images that were prepared for warping, by their numbers.
+
+    Args:
+        folder: where large conditions are kept while they are used, in files without names; None: in memory.
+    """
+
+    def __init__(self, folder: Path | None = None) -> None:
+        super().__init__()
+        self.folder = folder
+
+
+def stacked(rows: Iterable[Sequence[Tensor]], count: int, folder: Path | None) -> list[Tensor]:
+    """``torch.stack`` of every column of ``count`` rows, of which only one is in memory besides.
+
+    Args:
+        rows: planes ``[..., H, W]`` of one view each. folder: where large ones are put into files; None: all stay in
+            memory.
+    """
+    stacks: list[Tensor] = []
+    for number, row in enumerate(rows):
+        stacks = stacks or [_empty((count, *x.shape), x.dtype, folder) for x in row]
+        for stack, x in zip(stacks, row, strict=True):
+            stack[number] = x
+        scratch.rest_mapped()
+    return stacks
+
+
+def _empty(shape: tuple[int, ...], dtype: torch.dtype, folder: Path | None) -> Tensor:
+    if folder is None or shape[-2] * shape[-1] <= LARGE_PIXELS:
+        return torch.empty(shape, dtype=dtype)
+    return torch.from_numpy(scratch.mapped_array(folder, shape, torch.empty(0, dtype=dtype).numpy().dtype))

@@ -5,11 +5,9 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
-import math
 import os
-import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,78 +15,19 @@ import torch
 from torch import Tensor
 
 from mudg.base import log, seeds, store
-from mudg.base.config import result_settings
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.base.processes import calls_beside, run_in_processes
-from mudg.base.run_folder import RunDir
-from mudg.base.types import Clip, RenderPlanes, View
-from mudg.diffusion.clips import from_city, from_log
-from mudg.diffusion.clips import shards as clip_shards
-from mudg.diffusion.clips.condition import RenderAt
-from mudg.diffusion.clips.from_city import CityClipRules, CityLog
-from mudg.diffusion.clips.from_log import LogClipRules, LogSource, LogWindow
-from mudg.diffusion.clips.shards import ShardSource
-from mudg.diffusion.clips.sources import ShardCache, StreamedShards
+from mudg.base.types import Clip
+from mudg.diffusion import city_clips, log_clips
+from mudg.diffusion import clips as clip_shards
+from mudg.diffusion.clips import ShardSource
+from mudg.diffusion.log_clips import LogClipRules, LogSource, LogWindow
 from mudg.diffusion.requests import sized_to_area
-from mudg.diffusion.settings.learn import LearnConfig
-from mudg.diffusion.training.scene_list import ListedShards, is_list, read_list
-from mudg.gaussians import fit
-from mudg.gaussians.rendering import render_planes
-from mudg.gaussians.schedule import short_fit
+from mudg.diffusion.settings import LearnConfig
+from mudg.diffusion.shard_sources import ListedShards, ShardCache, StreamedShards, is_list, read_list
 from mudg.networks.codec import CLASSES
-from mudg.scene.clouds import write_fused
-from mudg.scene.part import PlacedSweep, write_photos
 from mudg.scene.read import read_scene
-
-# city fits ----------------------------------------------------------------------------------------
-#
-# Short fits to generated cities, whose renders become part of the conditions that the diffusion model is trained on.
-
-
-def write_fitted_city(rules: CityClipRules, city: int, folder: Path) -> int:
-    """Make one city's clips with renders of a fit and write its shard; returns the number of clips. For a process of
-    its own."""
-    return from_city.write_city(rules, city, folder, fit_city)
-
-
-def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
-    """Fit a scene to the images that the clips of a city may know; returns what it shows at a view."""
-    steps = steps_of(rules, city)
-    width = from_city.size_of(rules, city)[0]
-    images = from_city.given_images(rules, city, log)
-    config = short_fit(steps, width, images[0].view.camera.width, seed=city)
-    with tempfile.TemporaryDirectory() as text:
-        folder = Path(text)
-        write_photos(
-            folder / "scene", log.world.source(), log.world.ego_path(), log.tracks(), images, placed_sweeps(log)
-        )
-        write_fused(folder / "fused", log.cloud, {})
-        work = RunDir.open(folder / "fit", fit.OUTPUT, result_settings(config), {})
-        fit.write_fit(config, fit.FitInputs(folder / "scene", folder / "fused"), work)
-        model = fit.load_model(work.path)
-
-    def render_at(view: View) -> RenderPlanes:
-        return render_planes(model, view)
-
-    return render_at
-
-
-def steps_of(rules: CityClipRules, city: int) -> int:
-    """Steps of a city's fit, drawn from `rules.fit_steps`, because renders of logs are of different quality, too."""
-    fewest, most = rules.fit_steps
-    if city >= from_city.HELD_OUT or fewest == most:
-        return (fewest + most) // 2
-    return int(seeds.numpy_rng(rules.seed, city, "fit").integers(fewest, most))
-
-
-def placed_sweeps(log: CityLog) -> Iterator[PlacedSweep]:
-    """The sweeps of a generated log; a second one at the same time comes from a second sensor."""
-    last_s = -math.inf
-    for sweep in log.sweeps:
-        yield "lidar_second" if sweep.time_s == last_s else "lidar", sweep.time_s, sweep.world_from_lidar, sweep.points
-        last_s = sweep.time_s
-
 
 # clips --------------------------------------------------------------------------------------------
 
@@ -99,7 +38,7 @@ CACHE = "cache"
 
 def held_out_cities(config: LearnConfig) -> list[int]:
     """Numbers of the shards used for scoring only."""
-    return [from_city.HELD_OUT + n for n in range(config.data.held_out)]
+    return [city_clips.HELD_OUT + n for n in range(config.data.held_out)]
 
 
 def cities_in_use(config: LearnConfig, step: int) -> range:
@@ -118,10 +57,10 @@ def cities_in_use(config: LearnConfig, step: int) -> range:
 # cities -------------------------------------------------------------------------------------------
 
 
-def clip_rules(config: LearnConfig, points_alone: bool = False) -> from_city.CityClipRules:
+def clip_rules(config: LearnConfig, points_alone: bool = False) -> city_clips.CityClipRules:
     """Rules for the generator; `points_alone`: the published system's condition."""
     data = config.data
-    return from_city.CityClipRules(
+    return city_clips.CityClipRules(
         data.width,
         data.height,
         data.window,
@@ -161,7 +100,7 @@ def making_clips(
             "training clips cannot be written here", where=str(folder), remedy="choose another --data.clips"
         )
     log.info(f"learn: {len(missing)} cities to generate into {folder}, {config.compute.workers} processes")
-    make = write_fitted_city if rules.fitted else from_city.write_city
+    make = city_clips.write_fitted_city if rules.fitted else city_clips.write_city
     return calls_beside(make, [(rules, n, folder) for n in missing], config.compute.workers)
 
 
@@ -227,9 +166,9 @@ def _log_rules(config: LearnConfig, size: tuple[int, int], held_out_every: int, 
 
 def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tuple[int, int]:
     """Make the missing clips of all logs; returns how many there are to train on and to score."""
-    sources = [from_log.log_source(text) for text in config.data.scenes]
-    rows = from_log.plan_shards(sources, rules, from_city.HELD_OUT)
-    from_log.claim_folder(folder, rules, sources)
+    sources = [log_clips.log_source(text) for text in config.data.scenes]
+    rows = log_clips.plan_shards(sources, rules, city_clips.HELD_OUT)
+    log_clips.claim_folder(folder, rules, sources)
     jobs: list[tuple[LogSource, LogClipRules, list[tuple[int, LogWindow]], Path]] = []
     for source in dict.fromkeys(sources):
         windows = [(number, window) for number, owner, window in rows if owner == source]
@@ -237,10 +176,10 @@ def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tu
     with log.task("clips of logs", len(jobs)) as bar:
         if config.compute.workers < 2 or len(jobs) == 1:
             for job in jobs:
-                from_log.write_log(*job)
+                log_clips.write_log(*job)
                 bar.advance()
         else:
-            for _ in run_in_processes(from_log.write_log, jobs, config.compute.workers):
+            for _ in run_in_processes(log_clips.write_log, jobs, config.compute.workers):
                 bar.advance()
     scored = sum(window.held_out for _, _, window in rows)
     return len(rows) - scored, scored
@@ -377,7 +316,7 @@ def sizes_of_cities(config: LearnConfig) -> list[tuple[int, int]]:
     if config.data.realism == "plain" or config.data.scenes:
         return [(config.data.width, config.data.height)]
     rules = clip_rules(config)
-    return [from_city.size_of(rules, city) for city in range(from_city.SIZES)]
+    return [city_clips.size_of(rules, city) for city in range(city_clips.SIZES)]
 
 
 def _of_same_size(city: int, first: int, sizes: list[tuple[int, int]], cities: range) -> int:

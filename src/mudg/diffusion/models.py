@@ -2,14 +2,14 @@
 
 The loop (draws, layouts, checkpoints, averages) uses three methods that both models have: `loss(clips, part,
 settings)`, also as `forward`; `trained_part()`, the modules that change; `temporal_parameters(which)`, those that a
-later stage may freeze. All else is a row of `KINDS`. A new kind of model is a class with these methods and a row here.
+later stage may freeze. Clips for the published-type model show points alone, as it was trained.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,22 +17,20 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import log, palette, seeds
+from mudg.base import html, log, palette, seeds
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Clip
 from mudg.core import losses
-from mudg.diffusion import files as mdm_files
-from mudg.diffusion.clips.shards import ShardSource
-from mudg.diffusion.extended import extended, same_denoiser
-from mudg.diffusion.model import MDM, MDMConfig
-from mudg.diffusion.published.model import PublishedMDM, is_published
-from mudg.diffusion.settings.learn import LearnConfig
-from mudg.diffusion.training import published as learn_published
-from mudg.diffusion.training import score as learn_score
-from mudg.diffusion.training.clips import draw_clips
-from mudg.diffusion.training.parallel import Ranks, agreed_terms
-from mudg.diffusion.training.state import TrainingState, mean_of, newest_checkpoint, read_rows
+from mudg.diffusion import model_files, published
+from mudg.diffusion.clips import ShardSource
+from mudg.diffusion.learn_clips import draw_clips
+from mudg.diffusion.model import MDM
+from mudg.diffusion.network import MDMConfig
+from mudg.diffusion.parallel import Ranks, TrainingState, agreed_terms, mean_of, newest_checkpoint, read_rows
+from mudg.diffusion.published import PublishedMDM, WorkSplit, is_published
+from mudg.diffusion.score import table
+from mudg.diffusion.settings import LearnConfig
 from mudg.networks.codec import Modality, PatchCodec
 
 Model = MDM | PublishedMDM
@@ -40,46 +38,81 @@ PATCH = 2
 """Side of the squares of latent pixels that the network processes as one cell."""
 
 
-@dataclass(frozen=True)
-class ModelKind:
-    """How one class of models is saved, described and rebuilt.
+def rebuilt(model: Model, weights: Mapping[str, Tensor]) -> Model:
+    """A model where it was trained, ready for use, whose trained part has these weights. A published-type one shares
+    memory with what it is made of: it is large, and scoring it on a CPU would take longer than training it on a GPU."""
+    fixed = {name: value for name, value in model.state_dict().items() if name not in weights}
+    if isinstance(model, MDM):
+        made = MDM(model.config)
+        made.load_state_dict({**fixed, **weights})
+        return made.to(model.device).eval()
+    with torch.device("meta"):
+        made = PublishedMDM(model.config)
+    made.load_state_dict({**fixed, **{n: value.to(model.device) for n, value in weights.items()}}, assign=True)
+    made.requires_grad_(False)
+    made.adopt_scale()
+    made.split = model.split
+    return made.eval()
 
-    save    (model, folder, card, facts)
-    card    (model, settings, scores, sentence on the training data) -> text of the model card
-    rebuilt (model, weights of its trained part) -> a model with these, ready for use
+
+def save(model: Model, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
+    """Write the folder that `synthesize --model` and a further `learn --start` read. Published-type weights are in
+    float32; the terms of the model that was continued from are handed on."""
+    if isinstance(model, MDM):
+        model_files.save(model, folder, card, facts)
+        return
+    before = facts.get("continued_from", {})
+    handed_on = {name: before[name] for name in ("licence", "caption", "base_scale") if name in before}
+    licence = f"\n## Licence\n\n{handed_on['licence']}\n" if "licence" in handed_on else ""
+    tensors = {name: value.cpu() for name, value in model.state_dict().items()}
+    published.save(folder, model.config, tensors, {**facts, **handed_on}, card + licence)
+
+
+def model_card(model: Model, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
+    """Text that travels with the weights: what the model is, how it was made, what it can and cannot do.
+
+    `data` says what it was trained on; empty = generated cities.
     """
-
-    save: Callable[[Any, Path, str, Mapping[str, Any]], None]
-    card: Callable[[Any, LearnConfig, Mapping[str, Any], str], str]
-    rebuilt: Callable[[Any, Mapping[str, Tensor]], Any]
-
-
-def mdm_rebuilt(model: MDM, weights: Mapping[str, Tensor]) -> MDM:
-    """A copy of a model where it was trained, ready for use, whose trained part has these weights."""
-    made = MDM(model.config)
-    frozen = {name: value for name, value in model.state_dict().items() if name not in weights}
-    made.load_state_dict({**frozen, **weights})
-    return made.to(model.device).eval()
-
-
-KINDS: dict[type[nn.Module], ModelKind] = {
-    MDM: ModelKind(mdm_files.save, learn_score.model_card, mdm_rebuilt),
-    PublishedMDM: ModelKind(learn_published.save, learn_published.card, learn_published.rebuilt),
-}
-
-
-def kind_of(model: nn.Module) -> ModelKind:
-    """The row of a model; UsageError if it cannot be trained."""
-    if type(model) not in KINDS:
-        raise UsageError(
-            "this kind of model cannot be trained here",
-            got=type(model).__name__,
-            expected=", ".join(kind.__name__ for kind in KINDS),
-        )
-    return KINDS[type(model)]
+    small = isinstance(model, MDM)
+    own: dict[str, Any] = {"window": model.config.window}
+    if small:
+        own = {"refines": model.refiner is not None, "parameters": sum(p.numel() for p in model.parameters())}
+    return html.render_text(
+        "mdm_card.md.j2" if small else "published_card.md.j2",
+        data=data,
+        config=config,
+        clips=config.data,
+        rules=config.optimizer,
+        scores=scores,
+        table=table(scores),
+        **own,
+    )
 
 
 # start --------------------------------------------------------------------------------------------
+
+
+def _published_start(config: LearnConfig) -> PublishedMDM:
+    """The published-type model of `config.start` in float32, to be trained at the configured size; nothing of it is
+    drawn anew. UsageError: clips of another length than the image tokens are made for, or of a size that does not fit
+    the strides."""
+    model = published.load(Path(config.start), dtype=torch.float32)
+    frames = model.config.window
+    if config.data.window != frames or config.optimizer.full_window_share < 1:
+        raise UsageError(
+            "a published-type model needs clips of exactly the length of its image tokens",
+            where="--data.window, --optimizer.full-window-share",
+            expected=f"{frames} frames in all steps",
+            got=f"{config.data.window} frames in {config.optimizer.full_window_share:.0%} of the steps",
+            remedy=f"--data.window {frames} --optimizer.full-window-share 1",
+        )
+    model.check_size(config.data.height, config.data.width)
+    with torch.no_grad():  # out of the mapped files: training writes in place
+        for value in (*model.parameters(), *model.buffers()):
+            value.data = value.data.clone()
+    model.config = replace(model.config, width=config.data.width, height=config.data.height)
+    model.split = WorkSplit(frames_at_once=1)
+    return model
 
 
 def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
@@ -104,8 +137,8 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
                 where="--start",
                 remedy="leave out the settings of the group network",
             )
-        return learn_published.starting_model(config), set()
-    before = mdm_files.load(config.start)
+        return _published_start(config), set()
+    before = model_files.load(config.start)
     if before.config.window != config.data.window:
         log.info(
             f"learn: training on clips of {config.data.window} frames; --start was trained on clips of"
@@ -317,3 +350,58 @@ def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Genera
     }
     loss = parts["rgb"] + parts["depth"] + 0.1 * parts["semantics"]
     return loss, {name: float(part.detach()) for name, part in parts.items()}
+
+
+# models that go on from an earlier, plainer one ---------------------------------------------------
+
+
+def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
+    """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the size trained
+    at."""
+    plain = {
+        "refine_widths": (),
+        "refine_blocks": (),
+        "finish_widths": (),
+        "finish_blocks": (),
+        "renders": False,
+        "area_px": 0,
+    }
+    without = lambda config: replace(config, **plain)  # noqa: E731
+    return without(one) == without(other)
+
+
+def extended(before: MDM, config: MDMConfig) -> MDM:
+    """A model of `config` with the weights of `before`; a refiner is taken over if `before` has one of the same shape.
+    For continuing the training of an earlier, plainer model. What new inputs weigh is 0, so they change nothing at
+    first.
+
+    Raises:
+        UsageError: the two differ in more than the refiner, the use of renders and the size trained at.
+    """
+    if not same_denoiser(before.config, config) or (before.config.renders and not config.renders):
+        raise UsageError(
+            "the model to continue from is of another kind",
+            expected=str(config),
+            got=str(before.config),
+            remedy="give its widths, blocks, attention, patch, window and renders",
+        )
+    model = MDM(config)
+    state = model.state_dict()
+    for name, old in before.state_dict().items():
+        if name in state and state[name].shape == old.shape:
+            state[name] = old
+        elif name in state and name.removesuffix(".weight").removesuffix(".bias") in _WIDENED:
+            state[name] = _widened(old, state[name], zero=name.startswith(_WIDENED[:2]))
+    model.load_state_dict(state)
+    return model
+
+
+_WIDENED = ("net.enter", "refiner.enter", "net.leave", "refiner.leave")
+"""Layers that have further inputs or outputs, behind the others, in a model that uses renders."""
+
+
+def _widened(old: Tensor, new: Tensor, zero: bool) -> Tensor:
+    """A larger tensor with `old` in its first places, and in the others those of `new`, or 0."""
+    made = torch.zeros_like(new) if zero else new.clone()
+    made[tuple(slice(size) for size in old.shape)] = old
+    return made

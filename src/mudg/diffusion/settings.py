@@ -1,4 +1,4 @@
-"""Settings of ``mudg learn``."""
+"""Settings of ``mudg synthesize``, ``adapt``, ``convert`` and ``learn``, and of harmonising edited views."""
 
 from __future__ import annotations
 
@@ -7,6 +7,210 @@ from typing import Annotated, Any, ClassVar, Literal
 
 from mudg.base.config import Limits, setting, settings
 from mudg.base.devices import DeviceName
+
+#  -------------------------------------------------------------------------------------------------
+#
+# Settings of ``mudg synthesize``.
+
+
+@settings
+class SynthesizeConfig:
+    """Generate dense RGB, depth and semantics on laterally shifted trajectories with the diffusion model."""
+
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "samples": ("condition", 1),
+        "label_confidence": ("align_depth", 0.5),
+        "held_out_images": ("precision", False),
+    }
+
+    cameras: tuple[str, ...] = ("front",)
+    """Cameras for which shifted views are made (empty = the first camera). A name that the scene lacks is an error."""
+    shifts_m: tuple[float, ...] = (2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
+    """Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path."""
+    paths: tuple[str, ...] = ()
+    """Further paths by name: up+1, lane+0.1, speed-0.1, ..., as for render."""
+    model: str = "embedded"
+    """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn
+    or convert."""
+    steps: int = setting(default=2, ge=1, le=1000)
+    """Denoising steps. More add texture and agree less with the truth pixel by pixel. Use 50 for published-type
+    models."""
+    sampler: Literal["ddim", "dpm_solver"] = "ddim"
+    """Sampler of the diffusion model. ddim: first order, with fresh noise between steps. dpm_solver: second order and
+    deterministic, for many steps. Both cost one network pass per step."""
+    eta: float | None = setting(default=None, ge=0, le=1)
+    """Sampler ddim: noise added between steps, from 0 (deterministic) to 1 (as much as the reverse process has) (not
+    given: 1)."""
+    condition: Literal["full", "reference", "points", "concat", "freevs", "repair"] = "full"
+    """Which parts of the model's condition are given, to measure what each brings. reference: the nearest recorded
+    image alone. points: LiDAR points alone. concat: both, without images warped by depth (published-type models: the
+    image in frame 0, not in the image tokens). The shipped models were trained on whole conditions. freevs: the
+    condition of FreeVS, for models learned with `--data.condition freevs`; gives colour alone. repair: renders of
+    `--fitted` and the nearest recorded image, without points; gives colour alone."""
+    given_classes: bool = True
+    """Use the classes of labelled points and recorded images in the model's condition, if the scene has labels."""
+    align_depth: bool = True
+    """Align generated depth to the LiDAR points in the same view (one scale and one shift per frame)."""
+    overlap: int = setting(default=2, ge=0)
+    """Frames that a window of the model shares with the previous window; they are kept, so that the video continues
+    smoothly. Published-type models: 8."""
+    width_px: int = setting(default=0, ge=0)
+    """Image width in pixels at which the model works (0 = about the area it was trained at, in the camera's aspect
+    ratio)."""
+    full_size: bool = True
+    """Write views at the camera's size: by the model's finisher, or, where it has none, with detail restored from
+    warped recorded images. Off: at the size the model works at."""
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
+    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
+    elsewhere (published-type models on older CUDA devices: float16). float16: published-type models on CUDA devices, as
+    in the release."""
+    device: DeviceName = "auto"
+    """Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
+    processes: int = setting(default=0, ge=0)
+    """Number of trajectories made at the same time, with one thread each (0 = one per core; one for published-type
+    models, and where the diffusion model is not on the CPU)."""
+    guidance: float | None = setting(default=None, ge=1)
+    """Published-type models: scale of classifier-free guidance; 1 = none, which halves the work (not given: 7.5)."""
+    guidance_rescale: float | None = setting(default=None, ge=0, le=1)
+    """Published-type models: guidance rescale, 0 (off) to 1; limits overexposure by guidance (not given: 0.7)."""
+    memory_budget_gb: float = setting(default=0.0, ge=0)
+    """Published-type models: memory in GB; the work is split to fit into it (0 = what is free on a CUDA device;
+    elsewhere do not split). The result stays the same."""
+    offload: bool = False
+    """Published-type models: keep the image tower (1.3 GB in bfloat16) on the CPU except while it reads a reference.
+    Done without being asked where a memory budget needs it."""
+    compiled: bool = False
+    """Published-type models: compile the denoising network (torch.compile). The first step then takes minutes, further
+    ones less."""
+    seed: int = 0
+    """Seed of the noise."""
+
+
+#  -------------------------------------------------------------------------------------------------
+#
+# Settings of harmonising: what a diffusion model may change in the views of an edited scene.
+
+
+@settings
+class HarmonizeConfig:
+    """Where and how far a diffusion model changes the views of an edited scene."""
+
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "weather_any_model": ("seed", False),
+        "changed_above": ("seed", 4 / 255),
+        "feather_px": ("seed", 3),
+        "images_per_view": ("seed", 24),
+        "keep_classes": ("seed", True),
+    }
+
+    on: bool = False
+    """Let the diffusion model repair what an edit script changed. Needs the fused clouds."""
+    model: str = "embedded"
+    """Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn
+    or convert. Published-type models make views from noise: they take strengths of 0 and 1, and paths of at least 16
+    frames."""
+    steps: int = setting(default=2, ge=1, le=1000)
+    """Denoising steps. Use 50 for published-type models."""
+    uncovered: float = setting(default=1.0, ge=0, le=1)
+    """How far the model may leave the render where something stood before, its shadow included: share of the noise
+    schedule, 0 (it stays) to 1."""
+    objects: float = setting(default=0.0, ge=0, le=1)
+    """The same for objects that were moved or put in, and their shadows; 0 leaves all of them as rendered."""
+    weather: float = setting(default=0.0, ge=0, le=1)
+    """The same for every pixel of a view in other weather or light; 0 leaves it as the formulas of the edit make it.
+    For published-type models alone, whose points and reference are edited."""
+    seed: int = 0
+    """Seed of the noise."""
+    precision: Literal["auto", "float32", "bfloat16", "float16"] = "auto"
+    """Number format of the diffusion model, as for synthesize."""
+
+
+#  -------------------------------------------------------------------------------------------------
+#
+# Settings of ``mudg adapt``.
+
+
+@settings
+class AdaptConfig:
+    """Adapt the diffusion model to a recorded log: train it for a few steps on the log's own photographs, seen from
+    where other photographs of the log were taken or might have been taken."""
+
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "cameras_left_out": ("block", []),
+        "augment": ("precision", True),
+        "label_confidence": ("precision", 0.5),
+    }
+
+    model: str = "embedded"
+    """Diffusion model to start from: "embedded", shipped with the package, or a model folder written by learn. It must
+    use renders."""
+    cameras: tuple[str, ...] = ("front",)
+    """Cameras whose photographs are learned (empty = the first camera)."""
+    shifts_m: tuple[float, ...] = (2.5, -2.5)
+    """Lateral shifts in metres of the made-up drives beside the recorded path, from which the model learns to generate
+    the photographs."""
+    gaps: bool = True
+    """Also learn to generate photographs from those of other times: half of the log is left out of a fit, then the
+    other half."""
+    block: int = setting(default=4, ge=1)
+    """Frames per training clip, and consecutive frames left out together."""
+    held_out_every: int = setting(default=4, ge=2)
+    """Every n-th block of frames is kept for comparing the adapted model with the one it started from."""
+    fit_iterations: int = setting(default=150, ge=1)
+    """Optimisation steps of each of the fits that the clips are made with."""
+    steps: int = setting(default=40, ge=1)
+    """Training steps."""
+    batch_frames: int = setting(default=16, ge=1)
+    """Frames per training step."""
+    lr: float = setting(default=1e-4, gt=0)
+    """Largest learning rate."""
+    trained: Literal["all", "refiner"] = "all"
+    """Parts that are trained. refiner: refiner and finisher only."""
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32
+    elsewhere."""
+    device: DeviceName = "auto"
+    """Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps."""
+    processes: int = setting(default=0, ge=0)
+    """Number of fits made at the same time, with one thread each (0 = one per core; at most four where the diffusion
+    model is not on the CPU). The result does not depend on it."""
+    threads: int = setting(default=0, ge=0)
+    """Threads of the training (0 = one per core). Results are repeatable for the same number of threads."""
+    seed: int = 0
+    """Seed of all random numbers; the same seed gives the same result."""
+
+
+#  -------------------------------------------------------------------------------------------------
+#
+# Settings of ``mudg convert``.
+
+
+@settings
+class ConvertConfig:
+    """Convert a published checkpoint to a model folder."""
+
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"shard_mb": ("memory_gb", 1024)}
+
+    network: Literal["diffusion", "inception", "i3d", "dinov2", "clip", "lpips", "lpips-vgg", "lpips-squeeze"] = (
+        "diffusion"
+    )
+    """What the checkpoint holds: a diffusion model, or a network of the scores (docs/scores.md). The other settings
+    apply to diffusion models only."""
+    resolution: Literal["auto", "320x512", "576x1024"] = "auto"
+    """Image height x width that the checkpoint was trained at. auto: from 512 or 1024 in the file's name."""
+    dtype: Literal["keep", "float32", "float16", "bfloat16"] = "keep"
+    """Number format of the written weights. keep: as in the checkpoint. bfloat16 halves the size of float32 weights."""
+    towers: str = ""
+    """OpenCLIP ViT-H/14 weights, for a checkpoint that lacks them (empty = the checkpoint has its own)."""
+    memory_gb: float = setting(default=0.0, ge=0)
+    """Limit, in GB, of the address space of the process that reads the checkpoint, beyond the program's own (0 =
+    derived from the file's size). Raise it if the conversion runs out of memory."""
+
+
+#  -------------------------------------------------------------------------------------------------
+#
+# Settings of ``mudg learn``.
+
 
 BelowOne = Annotated[float, Limits(ge=0, lt=1)]
 

@@ -13,18 +13,17 @@ import torch
 from PIL import Image, ImageDraw
 from torch import Tensor
 
-from mudg.base import html, palette, store
+from mudg.base import palette, store
 from mudg.base.records import understood
 from mudg.base.types import Clip
 from mudg.core import metrics
 from mudg.core.metrics import TrueFrame, flicker
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
-from mudg.diffusion.clips import shards as clip_shards
-from mudg.diffusion.clips.condition import filled_depth
+from mudg.diffusion import clips
+from mudg.diffusion.condition import filled_depth
 from mudg.diffusion.model import MDM
-from mudg.diffusion.published.model import PublishedMDM
+from mudg.diffusion.published import PublishedMDM
 from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated
-from mudg.diffusion.settings.learn import LearnConfig
 
 SKY = palette.ID["sky"]
 SCORES = (
@@ -52,7 +51,7 @@ SCORES = (
 def score(
     model: MDM | PublishedMDM,
     cities: Sequence[int],
-    folder: Path | clip_shards.ShardSource,
+    folder: Path | clips.ShardSource,
     request: SampleRequest,
     *,
     prepare: Callable[[Clip], Clip] | None = None,
@@ -71,9 +70,9 @@ def score(
     counts: dict[str, Tensor] = {}
     pairs: list[tuple[Clip, GeneratedClip]] = []
     for city in cities:
-        for number in range(clip_shards.clips_in(folder, city)):
-            frames = range(min(model.config.window, clip_shards.frames_in(folder, city)))
-            clip = clip_shards.read_clip(folder, city, number, frames)
+        for number in range(clips.clips_in(folder, city)):
+            frames = range(min(model.config.window, clips.frames_in(folder, city)))
+            clip = clips.read_clip(folder, city, number, frames)
             clip = clip if prepare is None else prepare(clip)
             sample = generated(model, clip.condition, replace(request, index=city * 16 + number))
             name = "recorded" if clip.shift_m == 0 else f"{abs(clip.shift_m):.0f} m"
@@ -99,7 +98,7 @@ def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Ten
     """Scores of one clip and its class confusion i64[19,20]."""
     rgb, ids, given, points = clip.rgb, clip.semantics, clip.condition, clip.point_color
     # far depth does not count, nor does guessed depth
-    depth = torch.where(clip.depth_weight == 1, clip.depth, clip_shards.FAR_M)
+    depth = torch.where(clip.depth_weight == 1, clip.depth, clips.FAR_M)
     seen = given.valid if given.warped is None else given.valid | given.warped
     backdrop = given.color if given.backdrop is None else given.backdrop
     frames = [TrueFrame.of(*one) for one in zip(given.views, depth, ids, strict=True)]
@@ -240,25 +239,3 @@ def plot_losses(log_file: Path, path: Path, width: int = 900, height: int = 420)
         draw.text((width - 110, place(*line[-1])[1] - 14), f"{name} {line[-1][1]:.3f}", fill=color)
     draw.text((50, height - 18), f"steps, logarithmic, 50 to {last}", fill="black")
     store.write_image(path, image)
-
-
-# model card ---------------------------------------------------------------------------------------
-
-
-def model_card(model: MDM, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
-    """Text that travels with the weights: what it is, how it was made, what it can and cannot do.
-
-    `data` says what it was trained on; empty = generated cities.
-    """
-    parameters = sum(p.numel() for p in model.parameters())
-    return html.render_text(
-        "mdm_card.md.j2",
-        data=data,
-        refines=model.refiner is not None,
-        parameters=parameters,
-        config=config,
-        clips=config.data,
-        rules=config.optimizer,
-        scores=scores,
-        table=table(scores),
-    )

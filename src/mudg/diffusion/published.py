@@ -28,10 +28,11 @@ from mudg.base.types import Clip, Condition
 from mudg.core import noise
 from mudg.core.depth import DepthFit, align_depth
 from mudg.core.noise import Schedule, ScheduleConfig
-from mudg.diffusion.files import MODEL_FILE, folder_of, read_description
 from mudg.diffusion.model import BatchPart, Losses, LossSettings
-from mudg.diffusion.published.kl_vae import Autoencoder, AutoencoderConfig
-from mudg.diffusion.published.video_unet import (
+from mudg.diffusion.model_files import MODEL_FILE, folder_of, read_description
+from mudg.diffusion.published_network import (
+    Autoencoder,
+    AutoencoderConfig,
     ContextKeys,
     Resampler,
     ResamplerConfig,
@@ -610,7 +611,7 @@ def _draw_modalities(count: int, generator: torch.Generator) -> list[Modality]:
 
 # files --------------------------------------------------------------------------------------------
 #
-# Folders that hold a published-type diffusion model (see `diffusion/files.py` for what is in such a folder).
+# Folders that hold a published-type diffusion model (see `diffusion/model_files.py` for what is in such a folder).
 
 
 KIND = "published"

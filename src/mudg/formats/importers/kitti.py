@@ -36,61 +36,38 @@ from mudg.base import log
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
 from mudg.base.types import EgoPath, Scene, Source, Track
-from mudg.formats.importers import common
-from mudg.formats.importers.common import (
-    ImportOptions,
-    LogFiles,
-    has_pose,
-    mended_path,
-    origin_note,
-    pose_near,
-    seconds,
-)
+from mudg.formats.importers import common, kitti_files
+from mudg.formats.importers.common import ImportOptions, LogFiles
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
-from mudg.formats.importers.images import ImageFit, fit_images, image_notes, image_size
-from mudg.formats.importers.kitti import LICENCE
-from mudg.formats.importers.kitti import files as kitti_boxes
-from mudg.formats.importers.kitti import files as kitti_poses
-from mudg.formats.importers.kitti.files import (
-    SENSOR,
-    TURN_PERIOD_S,
-    KittiCalibration,
-    read_calibration_day,
-    read_calibration_text,
-    read_scan,
-    untwist_scan,
-)
+from mudg.formats.importers.images import fit_images, image_notes, image_size
+from mudg.formats.importers.kitti_files import SENSOR, TURN_PERIOD_S, KittiCalibration, read_scan, untwist_scan
 
 Matrix = NDArray[np.float64]
+LICENCE: Final = "CC BY-NC-SA 3.0 (KITTI: Geiger, Lenz, Stiller, Urtasun; attribution, non-commercial, share-alike)"
 FRAME_PERIOD_S: Final = 0.1
 CAMERA_NAMES: Final = {"image_02": "front", "image_03": "front_stereo", "image_00": "grey", "image_01": "grey_stereo"}
 
 
 @dataclass(frozen=True, slots=True)
 class KittiFiles:
-    """What was found where.
-
-    Args:
-        images: scene camera name -> frame number -> file.
-        numbers: scene camera name -> KITTI camera number.
-        scans: frame number -> file; may be empty.
-        folder: the recording's folder; its ``derived`` is searched, too.
-        single: one frame of the object benchmark, without a clock or motion.
-    """
+    """The files of one recording."""
 
     images: Mapping[str, Mapping[int, Path]]
+    """Scene camera name -> frame number -> file."""
     numbers: Mapping[str, int]
+    """Scene camera name -> KITTI camera number."""
     scans: Mapping[int, Path]
+    """Frame number -> file; may be empty."""
     folder: Path
+    """Its ``derived`` is searched, too."""
     single: bool
+    """One frame of the object benchmark, without a clock or motion."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Clock:
-    """Seconds since the first frame: ``image_s`` by camera and frame, ``scan_s`` by frame.
-
-    ``start_s`` is the source's time of the first frame; ``measured`` says whether there are time stamps at all.
-    """
+    """Seconds since the first frame, which is ``start_s`` in the source: ``image_s`` by camera and frame, ``scan_s`` by
+    frame; ``measured``: whether there are time stamps at all."""
 
     image_s: Mapping[str, Mapping[int, float]]
     scan_s: Mapping[int, float]
@@ -117,8 +94,8 @@ class _VeloMotion:
     untwist: bool
 
     def velo_at(self, time_s: float) -> Matrix:
-        """World-from-velodyne at a time, f64[4, 4]."""
-        return pose_near(self.ego, time_s) @ self.ego_from_velo
+        """World from velodyne, f64[4, 4]."""
+        return common.pose_near(self.ego, time_s) @ self.ego_from_velo
 
 
 def looks_like_kitti(source: Path) -> bool:
@@ -147,7 +124,10 @@ def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
     notes += track_notes
     if frames != list(range(len(frames))):
         notes.append(f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here")
-    fits = _fit_cameras(recording, options)
+    fits = {}
+    for name, paths in files.images.items():
+        camera = calibration.camera(files.numbers[name], name, *image_size(paths[frames[0]]))
+        fits[name] = fit_images(camera, options)
 
     def convert(index: int) -> Iterable[SceneImage | SceneSweep]:
         number = frames[index]
@@ -161,15 +141,9 @@ def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
             yield SceneSweep(SENSOR, index, time_s, world_from_velo[number], points, str(path))
 
     origin = Source("kitti", LICENCE, None, (*notes, *image_notes(fits)))
+    name, items = source.resolve().name, range(len(frames))
     content = SceneContent(
-        source.resolve().name,
-        origin,
-        fits,
-        range(len(frames)),
-        convert,
-        lambda index: f"frame {frames[index]}",
-        motion.ego,
-        tracks=lambda: (tracks, ()),
+        name, origin, fits, items, convert, lambda n: f"frame {frames[n]}", motion.ego, lambda: (tracks, ())
     )
     return write_scene(content, out, options)
 
@@ -177,26 +151,21 @@ def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
 def files_of_kitti(source: Path, options: ImportOptions) -> LogFiles:
     """The folder, with the calibration and poses beside it; of a folder with many sequences or frames only what is
     chosen."""
-    beside = [*source.parent.glob("calib_*.txt"), *_odometry_poses(source)]
-    beside = [path for path in beside if path.is_file()]
-    wanted = options.sequence
-    number = int(wanted) if wanted.isdigit() else -1
-    chosen = [
-        path
-        for path in (sorted(source.glob("*/*")) if wanted else ())
-        if path.stem == wanted or (path.stem.isdigit() and int(path.stem) == number)
-    ]
+    beside = sorted(p for p in (*source.parent.glob("calib_*.txt"), *_odometry_poses(source)) if p.is_file())
+    wanted, number = options.sequence, int(options.sequence) if options.sequence.isdigit() else -1
+    paths = sorted(source.glob("*/*")) if wanted else ()
+    chosen = [p for p in paths if p.stem == wanted or (p.stem.isdigit() and int(p.stem) == number)]
     if not chosen:
-        return LogFiles((source, *sorted(beside)))
+        return LogFiles((source, *beside))
     here = [path for path in sorted(source.iterdir()) if path.is_file() or path.name == "derived"]
-    return LogFiles((*chosen, *here, *sorted(beside)))
+    return LogFiles((*chosen, *here, *beside))
 
 
 # --- finding files --------------------------------------------------------------------------------
 
 
 def find_files(source: Path, options: ImportOptions) -> KittiFiles:
-    """Find images and scans of one recording below ``source``."""
+    """Images and scans of one recording below ``source``."""
     single = (source / "image_2").is_dir() and (source / "calib").is_dir() and not (source / "times.txt").is_file()
     sequence = "" if single else options.sequence
     images: dict[str, dict[int, Path]] = {}
@@ -266,11 +235,11 @@ def _find_calibration(files: KittiFiles, frames: Sequence[int], options: ImportO
     )
     if path is not None:
         log.info(f"kitti: calibration from {path}")
-        return read_calibration_text(path)
+        return kitti_files.read_calibration_text(path)
     for day in (folder, folder.parent):
         if (day / "calib_cam_to_cam.txt").is_file():
             log.info(f"kitti: calibration from {day}/calib_*.txt")
-            return read_calibration_day(day)
+            return kitti_files.read_calibration_day(day)
     expected = "calib.txt, or calib_cam_to_cam.txt and calib_velo_to_cam.txt here or one folder up"
     remedy = "download the day's calibration archive and unpack it beside the drive"
     raise InputError("no calibration found", where=str(folder), expected=expected, remedy=remedy)
@@ -298,7 +267,7 @@ def _read_stamps(files: KittiFiles, options: ImportOptions) -> dict[str, dict[in
     for name, path in paths.items():
         wanted = [n for n in streams[name] if first <= n < end]
         if path is not None:
-            stamps[name] = kitti_poses.read_timestamps(path, list(streams[name]), max(wanted, default=-1))
+            stamps[name] = kitti_files.read_timestamps(path, list(streams[name]), max(wanted, default=-1))
     return stamps
 
 
@@ -313,7 +282,7 @@ def _make_clock(
         return _Clock(dict.fromkeys(files.images, assumed), assumed, 0.0, False)
     chosen = {name: {n: times[n] for n in frames} for name, times in stamps.items()}
     for stream, times in chosen.items():
-        seconds(list(times.values()), "s", f"{files.folder}: {stream}")
+        common.seconds(list(times.values()), "s", f"{files.folder}: {stream}")
     scan_s = chosen.get(SENSOR, next(iter(chosen.values())))
     start_s = scan_s[frames[0]]
     since_start = {name: {n: t - start_s for n, t in times.items()} for name, times in chosen.items()}
@@ -321,13 +290,12 @@ def _make_clock(
 
 
 def _with_poses(recording: _Recording, motion: _VeloMotion, options: ImportOptions) -> list[int]:
-    """Frames whose image and scan lie where the vehicle's path is known; others are refused, or left out if that is
-    asked for."""
+    """Frames whose image and scan lie where the vehicle's path is known; others are refused, or left out."""
     clock, reach_s = recording.clock, TURN_PERIOD_S / 2 if motion.untwist else 0.0
     placed = []
     for n in recording.frames:
         times = [*(found[n] for found in clock.image_s.values()), clock.scan_s[n] - reach_s, clock.scan_s[n] + reach_s]
-        if not options.skip_missing or all(has_pose(motion.ego, time_s) for time_s in times):
+        if not options.skip_missing or all(common.has_pose(motion.ego, time_s) for time_s in times):
             placed.append(n)
     lost = sorted({*recording.frames} - {*placed})
     if not placed:
@@ -358,7 +326,7 @@ def _find_motion(recording: _Recording, options: ImportOptions, notes: list[str]
         raw_scans = any(path.parent.name == "data" for path in files.scans.values())
         ego_from_velo = invert(calibration.velo_from_imu)
         untwist = options.untwist == "yes" or (options.untwist == "auto" and raw_scans)
-    ego = mended_path(ego, options, notes)
+    ego = common.mended_path(ego, options, notes)
     untwist = untwist and len(frames) > 1
     if untwist:
         notes.append("scans untwisted: counter-clockwise turn of 0.1 s, forward at the scan's time")
@@ -379,13 +347,13 @@ def _ego_from_file(recording: _Recording, options: ImportOptions, notes: list[st
         raise InputError("no vehicle poses found", where=str(folder), expected=expected, remedy=remedy)
     log.info(f"kitti: poses from {path}")
     notes.append(f"poses from {path.name}")
-    poses, sensor = kitti_poses.read_pose_file(path, frames)
+    poses, sensor = kitti_files.read_pose_file(path, frames)
     known = _known(frames, poses, "pose file lacks frames", path, options)
     stacked = np.stack([poses[n] for n in known])
     if sensor == "cam0":
         rect0_from_velo = recording.calibration.rect0_from_velo
         stacked = invert(rect0_from_velo) @ stacked @ rect0_from_velo
-    notes.append(origin_note(stacked[0]))
+    notes.append(common.origin_note(stacked[0]))
     return EgoPath(np.array([recording.clock.scan_s[n] for n in known]), invert(stacked[0]) @ stacked)
 
 
@@ -400,11 +368,9 @@ def _known(frames: Sequence[int], there: Container[int], what: str, path: Path, 
 
 def _find_packets(files: KittiFiles, options: ImportOptions) -> Path | None:
     """GPS/IMU packets: a folder, or the sequence's file."""
-    if options.poses is not None:
-        return options.poses if options.poses.is_dir() else None
-    folder = files.folder / "oxts" / "data"
-    if folder.is_dir():
-        return folder
+    folder = options.poses or files.folder / "oxts" / "data"
+    if options.poses is not None or folder.is_dir():
+        return folder if folder.is_dir() else None
     return common.first_file(files.folder / "oxts" / f"{options.sequence}.txt") if options.sequence else None
 
 
@@ -414,18 +380,18 @@ def _odometry_poses(source: Path) -> tuple[Path, ...]:
 
 
 def _ego_from_packets(path: Path, frames: Sequence[int], clock: _Clock, options: ImportOptions) -> EgoPath:
-    packets = kitti_poses.read_packets(path, frames)
+    packets = kitti_files.read_packets(path, frames)
     _known(frames, packets, "GPS/IMU packets are missing", path, options)
     times_file = path.parent / "timestamps.txt"
     numbers = list(packets)
     if clock.measured and times_file.is_file():
-        measured = kitti_poses.read_timestamps(times_file, numbers, numbers[-1])
+        measured = kitti_files.read_timestamps(times_file, numbers, numbers[-1])
         numbers = _known(numbers, measured, "GPS/IMU packets have no timestamps", times_file, options)
         times = np.array([measured[n] for n in numbers]) - clock.start_s
     else:
         times = np.interp(numbers, frames, [clock.scan_s[n] for n in frames])
     later = np.r_[True, np.diff(np.maximum.accumulate(times)) > 0]
-    poses = kitti_poses.poses_from_packets(np.stack([packets[n] for n in numbers]), str(path))
+    poses = kitti_files.poses_from_packets(np.stack([packets[n] for n in numbers]), str(path))
     return EgoPath(times[later], poses[later])
 
 
@@ -453,19 +419,11 @@ def _find_tracks(
         return [], ["no boxes found: everything counts as static"]
     log.info(f"kitti: boxes from {found}")
     if found.suffix == ".xml":
-        boxes = kitti_boxes.read_tracklets(found)
+        boxes = kitti_files.read_tracklets(found)
     else:
         is_object = files.single and (options.boxes is not None or found == object_label)
         frame = frames[0] if is_object else None
-        boxes = kitti_boxes.read_label_text(found, recording.calibration.rect0_from_velo, frame)
+        boxes = kitti_files.read_label_text(found, recording.calibration.rect0_from_velo, frame)
     velo_at = motion.velo_at if motion.untwist else None
-    tracks, notes = kitti_boxes.build_tracks(boxes, world_from_velo, recording.clock.scan_s, str(found), velo_at)
+    tracks, notes = kitti_files.build_tracks(boxes, world_from_velo, recording.clock.scan_s, str(found), velo_at)
     return tracks, [f"boxes from {found.name}", *notes]
-
-
-def _fit_cameras(recording: _Recording, options: ImportOptions) -> dict[str, ImageFit]:
-    files, fits = recording.files, {}
-    for name, found in files.images.items():
-        size = image_size(found[recording.frames[0]])
-        fits[name] = fit_images(recording.calibration.camera(files.numbers[name], name, *size), options)
-    return fits

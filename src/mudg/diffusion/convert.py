@@ -22,9 +22,9 @@ from torch import Tensor
 from mudg.base import log, processes, store, weights
 from mudg.base.errors import InputError, UsageError
 from mudg.base.run_folder import Replacement, all_names, refuse_overlap
-from mudg.diffusion.published import model as published_files
-from mudg.diffusion.published.model import SCALE_ENTRIES, PublishedConfig, PublishedMDM
-from mudg.diffusion.settings.convert import ConvertConfig
+from mudg.diffusion import published
+from mudg.diffusion.published import SCALE_ENTRIES, PublishedConfig, PublishedMDM
+from mudg.diffusion.settings import ConvertConfig
 from mudg.networks import clip
 from mudg.networks.clip import TextTower
 
@@ -176,7 +176,7 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
         "licence": LICENCE,
     }
     dtype = DTYPES[config.dtype]
-    published_files.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=SHARD_BYTES)
+    published.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=SHARD_BYTES)
 
 
 def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:

@@ -34,8 +34,8 @@ from mudg.base.types import Clip, Condition, Frame, FusedCloud, Photo, PointClou
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import project_points, seen_pixels
-from mudg.diffusion.clips.condition import ConditionRules, WarpSource, build_conditions, filled_depth, image_tensor
-from mudg.diffusion.clips.shards import FAR_M, pack_clips, shard_path, write_shard
+from mudg.diffusion.clips import FAR_M, pack_clips, shard_path, write_shard
+from mudg.diffusion.condition import ConditionRules, WarpSource, build_conditions, filled_depth, image_tensor
 from mudg.scene.clouds import read_fused
 from mudg.scene.labels import photographs, read_label, read_trusted_classes
 from mudg.scene.read import read_image, read_points, read_scene

@@ -1,1 +1,0 @@
-"""The full-size network of the published system, under its own key names."""

@@ -1,1 +1,0 @@
-"""Settings of the verbs of this room."""

@@ -1,1 +1,0 @@
-"""Training of diffusion models on one process or many."""
