@@ -23,6 +23,7 @@ ROOMS = (
     "app",
     "benchmarks",
     "steps",
+    "sim",
     "viewer",
     "fleet",
     "scoring",

@@ -225,7 +225,8 @@ class Camera:
             raise InputError("focal lengths must be positive", where=owner, got=f"fx={self.fx}, fy={self.fy}")
         if self.readout_s < 0:
             raise InputError("readout time cannot be negative", where=owner, got=f"{self.readout_s} s")
-        if not (-self.width <= self.cx <= 2 * self.width and -self.height <= self.cy <= 2 * self.height):
+        off_x, off_y = self.width + self.fx, self.height + self.fy  # parts of an image leave it by less
+        if not (-off_x <= self.cx <= self.width + off_x and -off_y <= self.cy <= self.height + off_y):
             raise InputError("principal point is far outside the image", where=owner, got=f"cx={self.cx}, cy={self.cy}")
 
     @property

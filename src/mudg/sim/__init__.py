@@ -1,1 +1,35 @@
-"""The sensor simulator: a reconstruction answers what a camera or LiDAR would measure, wherever a planner drives."""
+"""The sensor simulator: a reconstruction answers what a camera or LiDAR would measure, wherever a planner drives.
+
+Importing this loads no torch.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest
+    from mudg.sim.optics import Fisheye, FTheta, Pinhole
+    from mudg.sim.session import CameraReply, CameraRequest, Moment, Session, Trust
+
+__all__ = [
+    "BeamTable",
+    "CameraReply",
+    "CameraRequest",
+    "FTheta",
+    "Fisheye",
+    "LidarReply",
+    "LidarRequest",
+    "Moment",
+    "Pinhole",
+    "Session",
+    "Trust",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from mudg.sim import lidar, optics, session
+
+    return next(vars(home)[name] for home in (session, lidar, optics) if name in vars(home))

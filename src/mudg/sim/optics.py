@@ -7,7 +7,7 @@ Axes are those of a camera: x right, y down, z forward; the centre of the top-le
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -22,6 +22,8 @@ MOST_PIXELS: Final = 8192 * 8192
 MOST_FACE_PX: Final = 2048
 NEWTON_STEPS: Final = 30
 CONVERGED: Final = 1e-9
+SAME_SURFACE: Final = 0.03
+"""Relative difference of depth within which neighbouring pixels show one surface."""
 FACES: Final = {
     "front": np.eye(3),
     "right": np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]),
@@ -282,9 +284,6 @@ def rays_per_radian(rays: Floats) -> float:
     return 1.0 / float(np.median(steps)) if len(steps) else 100.0
 
 
-Sampler = Callable[[NDArray, Floats], NDArray]
-
-
 def bilinear(image: NDArray[np.float32], uv: Floats) -> NDArray[np.float32]:
     """Values of an image f32[C, H, W] at pixels f64[n, 2], f32[C, n]; pixels beyond its border count as the border."""
     height, width = image.shape[-2:]
@@ -302,3 +301,29 @@ def nearest(image: NDArray, uv: Floats) -> NDArray:
     height, width = image.shape[-2:]
     column, row = (np.clip(uv[:, k].astype(np.int64), 0, size - 1) for k, size in ((0, width), (1, height)))
     return image[..., row, column]
+
+
+def surface(depth: NDArray[np.float32], uv: Floats, camera: Camera) -> tuple[Floats, NDArray[np.float32]]:
+    """Depth f64[n] at places between the pixels of f32[H, W], and how squarely the surface there faces the camera, the
+    cosine f32[n]. Where the four pixels around a place show one surface, its inverse depth is interpolated, which is
+    exact on planes; at edges the nearest pixel counts, so that no beam hangs between two surfaces."""
+    height, width = depth.shape
+    x, y = np.clip(uv[:, 0] - 0.5, 0, width - 1), np.clip(uv[:, 1] - 0.5, 0, height - 1)
+    left, top = np.minimum(x.astype(np.int64), max(width - 2, 0)), np.minimum(y.astype(np.int64), max(height - 2, 0))
+    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    u, v = x - left, y - top
+    with np.errstate(divide="ignore", invalid="ignore"):
+        corners = 1 / np.stack([depth[top, left], depth[top, right], depth[below, left], depth[below, right]]).astype(
+            float
+        )
+        weights = np.stack([(1 - u) * (1 - v), u * (1 - v), (1 - u) * v, u * v])
+        inverse = (weights * corners).sum(0)
+        one = corners.max(0) - corners.min(0) <= SAME_SURFACE * corners.max(0)
+        z = np.where(one, 1 / inverse, nearest(depth, uv).astype(np.float64))
+        # the plane through the corners: inverse depth grows by a and b per pixel
+        a, b = corners[1] - corners[0], corners[2] - corners[0]
+        px, py = uv[:, 0] - camera.cx, uv[:, 1] - camera.cy
+        normal = np.stack([a * camera.fx, b * camera.fy, inverse - a * px - b * py], -1)
+        ray = np.stack([px / camera.fx, py / camera.fy, np.ones(len(px))], -1)
+        facing = np.abs((unit(normal) * unit(ray)).sum(-1))
+    return z, np.where(one & np.isfinite(facing), facing, 0.5).astype(np.float32)

@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Literal, Self, get_args
+from typing import Any, Final, Literal, Protocol, Self, TypeVar, get_args
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
-from torch import Tensor
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
@@ -32,7 +31,7 @@ from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
 from mudg.gaussians.rendering import COVERED, RenderedCondition, raster_of, render_condition
 from mudg.gaussians.storage import load_model
 from mudg.scene.read import read_scene
-from mudg.sim.optics import Face, Optics, Pinhole, bilinear, faces_of, nearest, rays_per_radian
+from mudg.sim.optics import Face, Optics, Pinhole, bilinear, faces_of, nearest, rays_per_radian, surface
 
 Layer = Literal["rgb", "depth", "distance", "classes", "instances", "normals", "confidence", "motion"]
 LAYERS: Final[tuple[Layer, ...]] = get_args(Layer)
@@ -42,6 +41,15 @@ STRIPS: Final = 8
 """Parts of an image with a rolling shutter, each drawn at the pose of its middle row or column."""
 LARGEST_M: Final = 1e6
 Matrix = NDArray[np.float64]
+Reply = TypeVar("Reply", covariant=True)
+
+
+class Request(Protocol[Reply]):
+    """What a sensor asks of a session."""
+
+    def answer(self, session: Session) -> Reply:
+        """The measurement."""
+        ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -105,6 +113,10 @@ class CameraRequest:
             raise UsageError("no such shutter", expected=", ".join(get_args(Shutter)), got=str(self.shutter))
         if ("motion" in self.layers) != (self.motion_to is not None):
             raise UsageError("the layer motion needs a later moment, and no other one does", where="motion_to")
+
+    def answer(self, session: Session) -> CameraReply:
+        """See ``Request``."""
+        return session.picture(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -235,13 +247,13 @@ class Session:
         """Recorded pose world-from-vehicle f64[4, 4] at a time; None outside the log."""
         return None if self.scene is None else self.scene.ego.pose_at(time_s)
 
-    def render(self, requests: Iterable[CameraRequest]) -> list[CameraReply]:
-        """What the cameras see, in the order of the requests.
+    def render(self, requests: Iterable[Request[Reply]]) -> list[Reply]:
+        """What cameras and LiDARs measure, in the order of the requests.
 
         Raises:
             UsageError: an object that the scene does not have.
         """
-        return [self._picture(request) for request in requests]
+        return [request.answer(self) for request in requests]
 
     # -- a moment ----------------------------------------------------------------------------------
 
@@ -317,7 +329,8 @@ class Session:
 
     # -- a picture ---------------------------------------------------------------------------------
 
-    def _picture(self, request: CameraRequest) -> CameraReply:
+    def picture(self, request: CameraRequest) -> CameraReply:
+        """What a camera sees."""
         width, height = request.optics.width, request.optics.height
         name = request.colors_of or next(iter(self.cameras), "sim")
         rays, canvas = request.optics.rays(), Canvas(width, height)
@@ -426,8 +439,8 @@ class Canvas:
         rows, columns = np.divmod(face.pixels, where[1].stop - where[1].start)
         place, seen = (rows + where[0].start, columns + where[1].start), planes.seen
         self.rgb[:, *place] = bilinear(seen.rgb.numpy(), face.uv)
-        x, y = geometry.pinhole_ray(face.camera.intrinsics, *(np.floor(face.uv) + 0.5).T)
-        self.distance[place] = nearest(seen.depth.numpy(), face.uv) * np.sqrt(x * x + y * y + 1)
+        x, y = geometry.pinhole_ray(face.camera.intrinsics, *face.uv.T)
+        self.distance[place] = surface(seen.depth.numpy(), face.uv, face.camera)[0] * np.sqrt(x * x + y * y + 1)
         self.classes[place] = nearest(seen.semantics.numpy(), face.uv)
         self.certainty[place] = nearest(_certainty(seen), face.uv)
         if planes.instances is not None:

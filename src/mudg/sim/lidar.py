@@ -1,0 +1,208 @@
+"""A simulated LiDAR: beams through a fitted scene, sampled from pinhole views drawn along the turn.
+
+A sweep is cut into slices of its firing order. Each slice is drawn at the pose and time of its middle, so that a
+turning sensor on a moving vehicle measures what it would have measured; its beams are then placed by their own poses.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mudg.base import geometry, seeds
+from mudg.base.errors import UsageError
+from mudg.base.palette import UNLABELLED
+from mudg.base.types import SweepPoints, View
+from mudg.base.weather_settings import WeatherSettings
+from mudg.core.weather.lidar import SOFT, sweep_in_weather
+from mudg.sim.optics import faces_of, nearest, surface
+from mudg.sim.session import Moment, Session
+
+Floats = NDArray[np.float64]
+SLICES: Final = 8
+"""Parts of a turn, each drawn at the pose of its middle."""
+AXES: Final = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
+"""Rotation sensor-from-camera: a LiDAR looks along x, y is left, z up."""
+MOST_BEAMS: Final = 4_000_000
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class BeamTable:
+    """The beams of one sweep, in firing order.
+
+    Args:
+        directions: unit vectors f64[B, 3] in the sensor's frame (x forward, y left, z up). ring: u16[B], row of the
+            sensor. share: f64[B] in [0, 1], when in the sweep a beam is fired.
+        range_m: nearest and farthest distance that is measured, metres.
+    """
+
+    directions: Floats
+    ring: NDArray[np.uint16]
+    share: Floats
+    range_m: tuple[float, float] = (0.5, 120.0)
+
+    def __post_init__(self) -> None:
+        count = len(self.directions)
+        if not 0 < count <= MOST_BEAMS or self.directions.shape != (count, 3):
+            raise UsageError("no beams", where="directions", expected=f"1 to {MOST_BEAMS} rows of 3", got=str(count))
+        if self.ring.shape != (count,) or self.share.shape != (count,):
+            raise UsageError("ring and share have other lengths than the beams", expected=str(count))
+        if not np.isfinite(self.directions).all() or not ((self.share >= 0) & (self.share <= 1)).all():
+            raise UsageError("a beam is not finite, or is fired outside the sweep", where="directions, share")
+        if not 0 <= self.range_m[0] < self.range_m[1] < np.inf:
+            raise UsageError("the nearest range is not below the farthest", where="range_m", got=str(self.range_m))
+
+    @classmethod
+    def spinning(
+        cls,
+        elevations_deg: ArrayLike,
+        azimuth_step_deg: float,
+        range_m: tuple[float, float] = (0.5, 120.0),
+        clockwise: bool = True,
+    ) -> BeamTable:
+        """A sensor that turns once, from backwards to backwards.
+
+        Args:
+            elevations_deg: of the rows, degrees above the horizon. azimuth_step_deg: between firings of one row.
+        """
+        elevations = np.radians(np.asarray(elevations_deg, np.float64).reshape(-1))
+        if not (np.isfinite(azimuth_step_deg) and 0.01 <= azimuth_step_deg <= 90):
+            expected = "0.01 to 90 degrees"
+            raise UsageError("no such step", where="azimuth_step_deg", expected=expected, got=str(azimuth_step_deg))
+        columns = round(360 / azimuth_step_deg)
+        share = (np.arange(columns) + 0.5) / columns
+        azimuth = np.pi * (1 - 2 * share) * (1 if clockwise else -1)
+        level = np.cos(elevations)[None]
+        away = np.stack(
+            [
+                np.cos(azimuth)[:, None] * level,
+                np.sin(azimuth)[:, None] * level,
+                np.tile(np.sin(elevations), (columns, 1)),
+            ],
+            -1,
+        )
+        ring = np.tile(np.arange(len(elevations), dtype=np.uint16), columns)
+        return cls(away.reshape(-1, 3), ring, np.repeat(share, len(elevations)), range_m)
+
+
+@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
+class LidarRequest:
+    """A sweep that a LiDAR would take.
+
+    Args:
+        beams: what is fired. start, end: of the sweep; ``end`` None: all at one moment.
+        weather: fog and rain that take from and add to it, or None. seed: of the noise of weather.
+        focal_px: pixels per radian of the views that are sampled.
+    """
+
+    beams: BeamTable
+    start: Moment
+    end: Moment | None = None
+    weather: WeatherSettings | None = None
+    seed: int = 0
+    focal_px: float = 700.0
+
+    def answer(self, session: Session) -> LidarReply:
+        """The sweep. Beams into the sky, beyond the range or into what the recording never saw return nothing."""
+        return _sweep(session, self)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LidarReply:
+    """A simulated sweep: the beams that returned.
+
+    Args:
+        beam: i64[N], their numbers in the table. range_m: f32[N] from the sensor at the moment of the beam, metres.
+        xyz: f32[N, 3] metres, in the sensor's frame at the end of the sweep. dt_s: f32[N], seconds after the end.
+        intensity: f32[N] in [0, 1]: how well the surface faces the beam, times 0.5 (the scene knows no reflectance).
+        classes: u8[N] train ids, 255 = none. instances: u16[N], 1 + index into ``objects``, 0 = none.
+    """
+
+    beam: NDArray[np.int64]
+    range_m: NDArray[np.float32]
+    xyz: NDArray[np.float32]
+    dt_s: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    ring: NDArray[np.uint16]
+    classes: NDArray[np.uint8]
+    instances: NDArray[np.uint16]
+    objects: tuple[str, ...]
+
+
+def _sweep(session: Session, request: LidarRequest) -> LidarReply:
+    beams, start, end = request.beams, request.start, request.end or request.start
+    count = len(beams.share)
+    hits = Hits(count)
+    edges = np.linspace(0, 1, (SLICES if request.end is not None else 1) + 1)
+    for first, last in zip(edges[:-1], edges[1:], strict=True):
+        own = np.flatnonzero((beams.share >= first) & ((beams.share < last) | (last == 1)))
+        if len(own):
+            _draw(session, start.towards(end, (first + last) / 2), beams.directions[own] @ AXES, own, request, hits)
+    near, far = beams.range_m
+    with np.errstate(invalid="ignore"):
+        kept = np.flatnonzero((hits.distance >= near) & (hits.distance <= far))
+    points = (beams.directions[kept] * hits.distance[kept][:, None]).astype(np.float32)
+    intensity, classes, fog = hits.intensity[kept], hits.classes[kept], np.zeros(len(kept), bool)
+    if request.weather is not None:
+        numbers = np.arange(len(kept), dtype=np.float32)
+        seed = seeds.key(request.seed, round(end.time_s * 1e6), "simulated LiDAR")
+        clear = SweepPoints(points, intensity, numbers, classes)
+        changed, kind = sweep_in_weather(clear, request.weather, seed)
+        rows = changed.dt_s.astype(np.int64)
+        kept, points, intensity, fog = kept[rows], changed.xyz, changed.intensity, kind == SOFT
+        classes = hits.classes[kept] if changed.classes is None else changed.classes
+    share = beams.share[kept]
+    return LidarReply(
+        kept,
+        np.linalg.norm(points, axis=1),
+        points if request.end is None else _carried(points, share, start, end),
+        ((share - 1) * (end.time_s - start.time_s)).astype(np.float32),
+        intensity,
+        beams.ring[kept],
+        classes,
+        np.where(fog, 0, hits.instances[kept]).astype(np.uint16),
+        tuple(sorted(session.sizes_m())),
+    )
+
+
+class Hits:
+    """What every beam of a sweep met."""
+
+    def __init__(self, count: int) -> None:
+        self.distance = np.full(count, np.nan)
+        self.intensity = np.zeros(count, np.float32)
+        self.classes = np.full(count, UNLABELLED, np.uint8)
+        self.instances = np.zeros(count, np.uint16)
+
+
+def _draw(
+    session: Session, moment: Moment, rays: Floats, own: NDArray[np.int64], request: LidarRequest, hits: Hits
+) -> None:
+    """Draw a slice of a sweep; ``rays`` f64[n, 3] in camera axes."""
+    world_from_camera = moment.world_from_sensor @ geometry.from_rotation_translation(AXES, (0.0, 0.0, 0.0))
+    for face in faces_of(rays, request.focal_px):
+        turned = geometry.from_rotation_translation(face.cam_from_face, (0.0, 0.0, 0.0))
+        view = View(face.camera, world_from_camera @ turned, moment.time_s)
+        planes = session.pinhole(view, moment, instances=True)
+        depth, target = planes.seen.depth.numpy(), own[face.pixels]
+        z, facing = surface(depth, face.uv, face.camera)
+        x, y = geometry.pinhole_ray(face.camera.intrinsics, *face.uv.T)
+        hits.distance[target] = z * np.sqrt(x * x + y * y + 1)
+        hits.intensity[target] = 0.5 * facing
+        hits.classes[target] = nearest(planes.seen.semantics.numpy(), face.uv)
+        if planes.instances is not None:
+            hits.instances[target] = nearest(planes.instances, face.uv)
+
+
+def _carried(points: NDArray[np.float32], share: Floats, start: Moment, end: Moment) -> NDArray[np.float32]:
+    """Points f32[n, 3] in the frames of their moments, in that of the end."""
+    carried = np.empty_like(points)
+    end_from_world = geometry.invert(end.world_from_sensor)
+    for at in np.unique(share):
+        own = share == at
+        pose = geometry.interpolate_pose(start.world_from_sensor, end.world_from_sensor, float(at))
+        carried[own] = geometry.transform_points(end_from_world @ pose, points[own])
+    return carried
