@@ -22,7 +22,7 @@ from mudg.gaussians.nodes import StaticNode
 from mudg.gaussians.rendering import render_view
 from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest
 from mudg.sim.optics import Fisheye, FTheta, Pinhole, faces_of
-from mudg.sim.session import LAYERS, CameraRequest, Moment, Session
+from mudg.sim.session import LAYERS, CameraRequest, Instant, Session
 
 LOOK = geometry.invert(geometry.CAM_FROM_EGO_AXES)
 PLAIN = Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -118,7 +118,7 @@ def test_faces_show_every_ray_where_a_pinhole_camera_would() -> None:
 def test_a_plain_camera_sees_what_render_view_draws() -> None:
     model, pose = toy(), placed()
     reply = Session(model).render(
-        [CameraRequest(optics=PLAIN, start=Moment(0.5, pose), layers=("rgb", "depth", "classes"))]
+        [CameraRequest(optics=PLAIN, start=Instant(0.5, pose), layers=("rgb", "depth", "classes"))]
     )
     seen = render_view(model, View(Camera("sim", 64, 48, 50.0, 50.0, 32.0, 24.0), pose, 0.5), RasterConfig(near_m=0.2))
     layers = reply[0].layers
@@ -133,7 +133,7 @@ def test_a_wide_lens_sees_the_wall_where_it_is() -> None:
     pose = placed(z=0.5, yaw=0.2)
     layers = (
         Session(wall())
-        .render([CameraRequest(optics=optics, start=Moment(0.0, pose), layers=("rgb", "distance", "normals"))])[0]
+        .render([CameraRequest(optics=optics, start=Instant(0.0, pose), layers=("rgb", "distance", "normals"))])[0]
         .layers
     )
     rays = optics.rays() @ pose[:3, :3].T
@@ -157,17 +157,17 @@ def test_an_object_stands_where_the_caller_puts_it_and_goes_when_it_is_not_liste
     aside = recorded @ geometry.yaw_matrix(0.3, (1.0, 2.0, 0.0))
 
     def draw(objects: dict[str, np.ndarray] | None, time_s: float = 0.5) -> dict[str, np.ndarray]:
-        start = Moment(time_s, placed(), objects)
+        start = Instant(time_s, placed(), objects)
         return dict(session.render([CameraRequest(optics=PLAIN, start=start, layers=("rgb", "instances"))])[0].layers)
 
     moved = model.with_object_moved("car-1", geometry.yaw_matrix(0.3, (1.0, 2.0, 0.0)))
     other = Session(moved).render(
-        [CameraRequest(optics=PLAIN, start=Moment(0.5, placed()), layers=("rgb", "instances"))]
+        [CameraRequest(optics=PLAIN, start=Instant(0.5, placed()), layers=("rgb", "instances"))]
     )
     np.testing.assert_allclose(draw({"car-1": aside})["rgb"].astype(int), other[0].layers["rgb"].astype(int), atol=1)
     gone, without = draw({})["rgb"], Session(model.without_nodes(["car-1"]))
     assert np.array_equal(
-        gone, without.render([CameraRequest(optics=PLAIN, start=Moment(0.5, placed()))])[0].layers["rgb"]
+        gone, without.render([CameraRequest(optics=PLAIN, start=Instant(0.5, placed()))])[0].layers["rgb"]
     )
     assert np.array_equal(draw(None)["rgb"], draw({"car-1": recorded})["rgb"])
     late = draw({"car-1": recorded}, 99.0)  # long after its track ended: it is where the caller says
@@ -178,9 +178,9 @@ def test_an_object_stands_where_the_caller_puts_it_and_goes_when_it_is_not_liste
 
 def test_instances_are_the_pixels_that_change_when_an_object_goes() -> None:
     session = Session(toy())
-    request = CameraRequest(optics=PLAIN, start=Moment(0.5, placed()), layers=("rgb", "instances"))
+    request = CameraRequest(optics=PLAIN, start=Instant(0.5, placed()), layers=("rgb", "instances"))
     full = session.render([request])[0]
-    empty = session.render([replace(request, start=Moment(0.5, placed(), {}))])[0]
+    empty = session.render([replace(request, start=Instant(0.5, placed(), {}))])[0]
     changed = np.abs(full.layers["rgb"].astype(int) - empty.layers["rgb"].astype(int)).max(-1) > 20
     own = full.layers["instances"] == 1 + full.objects.index("car-1")
     assert own.any() and (own & changed).sum() > 0.9 * own.sum() and (changed & ~own).sum() < own.sum()
@@ -189,7 +189,7 @@ def test_instances_are_the_pixels_that_change_when_an_object_goes() -> None:
 def test_motion_is_where_the_surface_goes() -> None:
     """The camera drives 1 m towards the wall: a point at pixel offset p from the axis moves by p (10 / 9 - 1)."""
     request = CameraRequest(
-        optics=PLAIN, start=Moment(0.0, placed(z=0)), layers=("motion",), motion_to=Moment(0.1, placed(x=1.0, z=0))
+        optics=PLAIN, start=Instant(0.0, placed(z=0)), layers=("motion",), motion_to=Instant(0.1, placed(x=1.0, z=0))
     )
     flow = Session(wall()).render([request])[0].layers["motion"]
     u, v = np.meshgrid(np.arange(64) + 0.5 - 32, np.arange(48) + 0.5 - 24)
@@ -203,9 +203,9 @@ def test_motion_of_an_object_is_that_of_its_box() -> None:
     there = here @ geometry.yaw_matrix(0.0, (0.0, 1.0, 0.0))
     request = CameraRequest(
         optics=PLAIN,
-        start=Moment(0.5, pose, {"car-1": here}),
+        start=Instant(0.5, pose, {"car-1": here}),
         layers=("motion", "instances", "depth"),
-        motion_to=Moment(0.6, pose, {"car-1": there}),
+        motion_to=Instant(0.6, pose, {"car-1": there}),
     )
     layers = session.render([request])[0].layers
     own = layers["instances"] == 1
@@ -216,21 +216,21 @@ def test_motion_of_an_object_is_that_of_its_box() -> None:
 
 @pytest.mark.parametrize("shutter", ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"])
 def test_a_rolling_shutter_reads_every_strip_at_its_own_pose(shutter: str) -> None:
-    session, start, end = Session(wall()), Moment(0.0, placed(z=0)), Moment(0.1, placed(y=2.0, z=0))
+    session, start, end = Session(wall()), Instant(0.0, placed(z=0)), Instant(0.1, placed(y=2.0, z=0))
     rolled = session.render([CameraRequest(optics=PLAIN, start=start, end=end, shutter=shutter)])[0].layers["rgb"]  # type: ignore[arg-type]
     length = 64 if shutter.endswith(("right", "left")) else 48
     for strip in range(8):
         first, last = strip * length // 8, (strip + 1) * length // 8
         share = (first + last) / 2 / length
         share = 1 - share if shutter in ("bottom_to_top", "right_to_left") else share
-        still = session.render([CameraRequest(optics=PLAIN, start=Moment(0.1 * share, placed(y=2.0 * share, z=0)))])[0]
+        still = session.render([CameraRequest(optics=PLAIN, start=Instant(0.1 * share, placed(y=2.0 * share, z=0)))])[0]
         part = np.s_[:, first:last] if length == 64 else np.s_[first:last]
         assert np.abs(rolled[part].astype(int) - still.layers["rgb"][part].astype(int)).max() <= 1
 
 
 def test_equal_requests_get_equal_bytes() -> None:
     layers = tuple(layer for layer in LAYERS if layer != "motion")
-    request = CameraRequest(optics=PLAIN, start=Moment(0.5, placed()), layers=layers)
+    request = CameraRequest(optics=PLAIN, start=Instant(0.5, placed()), layers=layers)
     one, other = (Session(toy()).render([request, request]) for _ in range(2))
     for reply in (one[1], *other):
         assert all(one[0].layers[name].tobytes() == reply.layers[name].tobytes() for name in layers)
@@ -239,30 +239,30 @@ def test_equal_requests_get_equal_bytes() -> None:
 def test_trust_counts_what_shows_no_surface_below_the_horizon() -> None:
     """Every pixel towards the wall is determined; away from it the lower half shows nothing, the upper half is sky."""
     session = Session(wall())
-    towards = CameraRequest(optics=PLAIN, start=Moment(0.0, placed(z=0)))
+    towards = CameraRequest(optics=PLAIN, start=Instant(0.0, placed(z=0)))
     assert session.render([towards])[0].trust.determined == 1.0
-    back = session.render([CameraRequest(optics=PLAIN, start=Moment(0.0, placed(z=0, yaw=math.pi)))])[0].trust
+    back = session.render([CameraRequest(optics=PLAIN, start=Instant(0.0, placed(z=0, yaw=math.pi)))])[0].trust
     assert back.determined == 0.0 and math.isnan(back.distance_m)
 
 
 @pytest.mark.parametrize(
     ("make", "kind", "words"),
     [
-        (lambda: Moment(math.nan, np.eye(4)), UsageError, "not finite"),
-        (lambda: Moment(0.0, np.full((4, 4), math.nan)), InputError, "not rigid"),
-        (lambda: Moment(0.0, geometry.yaw_matrix(0, (1e9, 0, 0))), InputError, "farther than"),
-        (lambda: Moment(0.0, np.eye(4), {"a": np.eye(3)}), InputError, "not rigid"),
+        (lambda: Instant(math.nan, np.eye(4)), UsageError, "not finite"),
+        (lambda: Instant(0.0, np.full((4, 4), math.nan)), InputError, "not rigid"),
+        (lambda: Instant(0.0, geometry.yaw_matrix(0, (1e9, 0, 0))), InputError, "farther than"),
+        (lambda: Instant(0.0, np.eye(4), {"a": np.eye(3)}), InputError, "not rigid"),
         (
-            lambda: CameraRequest(optics=PLAIN, start=Moment(0, np.eye(4)), layers=("heat",)),
+            lambda: CameraRequest(optics=PLAIN, start=Instant(0, np.eye(4)), layers=("heat",)),
             UsageError,
             "no such layer",
         ),
         (
-            lambda: CameraRequest(optics=PLAIN, start=Moment(0, np.eye(4)), layers=("motion",)),
+            lambda: CameraRequest(optics=PLAIN, start=Instant(0, np.eye(4)), layers=("motion",)),
             UsageError,
             "later moment",
         ),
-        (lambda: CameraRequest(optics=PLAIN, start=Moment(0, np.eye(4)), shutter="up"), UsageError, "no such shutter"),
+        (lambda: CameraRequest(optics=PLAIN, start=Instant(0, np.eye(4)), shutter="up"), UsageError, "no such shutter"),
         (lambda: Pinhole(10**6, 10**6, 1, 1, 1, 1), UsageError, "image size"),
         (lambda: Pinhole(8, 8, 0.0, 1, 1, 1), UsageError, "positive"),
         (lambda: Pinhole(8, 8, 1.0, 1, 1, 1, (math.inf,)), UsageError, "not finite"),
@@ -285,7 +285,9 @@ def test_beams_measure_the_wall_while_the_vehicle_drives() -> None:
     the end of the sweep, lie on the wall."""
     beams = BeamTable.spinning(np.linspace(-20, 20, 16), 1.0, (0.5, 30.0))
     pose = lambda x: geometry.yaw_matrix(0.0, (x, 0.0, 0.0))  # noqa: E731
-    reply = sweep(Session(wall()), LidarRequest(beams=beams, start=Moment(0.0, pose(0.0)), end=Moment(0.1, pose(1.0))))
+    reply = sweep(
+        Session(wall()), LidarRequest(beams=beams, start=Instant(0.0, pose(0.0)), end=Instant(0.1, pose(1.0)))
+    )
     away = beams.directions[reply.beam]
     exact = (10 - beams.share[reply.beam]) / away[:, 0]
     central = (np.abs(exact[:, None] * away[:, 1:]) < 13).all(1)
@@ -301,7 +303,7 @@ def test_beams_measure_the_wall_while_the_vehicle_drives() -> None:
 
 def test_fog_takes_far_returns_and_adds_near_ones() -> None:
     beams = BeamTable.spinning(np.linspace(-20, 20, 16), 1.0, (0.5, 30.0))
-    at = Moment(0.0, geometry.yaw_matrix(0.0, (0.0, 0.0, 0.0)))
+    at = Instant(0.0, geometry.yaw_matrix(0.0, (0.0, 0.0, 0.0)))
     weather = WeatherSettings(fog=FogSettings(visibility_m=15))
     request = LidarRequest(beams=beams, start=at, weather=weather, seed=4)
     session = Session(wall())
@@ -315,7 +317,7 @@ def test_a_car_that_the_caller_places_is_met_by_beams() -> None:
     beams = BeamTable.spinning(np.linspace(-15, 5, 24), 0.5, (0.5, 60.0))
     at = geometry.yaw_matrix(0.0, (0.0, 0.0, 1.5))
     car = geometry.yaw_matrix(0.0, (12.0, 3.0, 0.75))
-    reply = sweep(Session(toy()), LidarRequest(beams=beams, start=Moment(0.5, at, {"car-1": car})))
+    reply = sweep(Session(toy()), LidarRequest(beams=beams, start=Instant(0.5, at, {"car-1": car})))
     own = reply.instances == 1 + reply.objects.index("car-1")
     inside = geometry.transform_points(geometry.invert(car) @ at, reply.xyz[own].astype(float))
     assert own.sum() > 10 and (np.median(np.abs(inside), 0) <= np.array(SIZE) / 2).all()

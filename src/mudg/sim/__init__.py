@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest
     from mudg.sim.optics import Fisheye, FTheta, Pinhole
-    from mudg.sim.session import CameraReply, CameraRequest, Moment, Session, Trust
+    from mudg.sim.session import CameraReply, CameraRequest, Instant, Session, Trust
 
 __all__ = [
     "BeamTable",
@@ -20,7 +20,7 @@ __all__ = [
     "Fisheye",
     "LidarReply",
     "LidarRequest",
-    "Moment",
+    "Instant",
     "Pinhole",
     "Session",
     "Trust",

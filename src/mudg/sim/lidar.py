@@ -19,7 +19,7 @@ from mudg.base.types import SweepPoints, View
 from mudg.base.weather_settings import WeatherSettings
 from mudg.core.weather.lidar import SOFT, sweep_in_weather
 from mudg.sim.optics import faces_of, nearest, surface
-from mudg.sim.session import Moment, Session
+from mudg.sim.session import Instant, Session
 
 Floats = NDArray[np.float64]
 SLICES: Final = 8
@@ -99,8 +99,8 @@ class LidarRequest:
     """
 
     beams: BeamTable
-    start: Moment
-    end: Moment | None = None
+    start: Instant
+    end: Instant | None = None
     weather: WeatherSettings | None = None
     seed: int = 0
     focal_px: float = 700.0
@@ -179,7 +179,7 @@ class Hits:
 
 
 def _draw(
-    session: Session, moment: Moment, rays: Floats, own: NDArray[np.int64], request: LidarRequest, hits: Hits
+    session: Session, moment: Instant, rays: Floats, own: NDArray[np.int64], request: LidarRequest, hits: Hits
 ) -> None:
     """Draw a slice of a sweep; ``rays`` f64[n, 3] in camera axes."""
     world_from_camera = moment.world_from_sensor @ geometry.from_rotation_translation(AXES, (0.0, 0.0, 0.0))
@@ -197,7 +197,7 @@ def _draw(
             hits.instances[target] = nearest(planes.instances, face.uv)
 
 
-def _carried(points: NDArray[np.float32], share: Floats, start: Moment, end: Moment) -> NDArray[np.float32]:
+def _carried(points: NDArray[np.float32], share: Floats, start: Instant, end: Instant) -> NDArray[np.float32]:
     """Points f32[n, 3] in the frames of their moments, in that of the end."""
     carried = np.empty_like(points)
     end_from_world = geometry.invert(end.world_from_sensor)

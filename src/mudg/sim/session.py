@@ -44,7 +44,7 @@ Matrix = NDArray[np.float64]
 Reply = TypeVar("Reply", covariant=True)
 
 
-class Request(Protocol[Reply]):
+class SensorRequest(Protocol[Reply]):
     """What a sensor asks of a session."""
 
     def answer(self, session: Session) -> Reply:
@@ -53,7 +53,7 @@ class Request(Protocol[Reply]):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Moment:
+class Instant:
     """Where a sensor and the objects are.
 
     Args:
@@ -73,7 +73,7 @@ class Moment:
             poses = {name: _pose(pose, f"objects: {name[:60]!r}") for name, pose in self.objects.items()}
             object.__setattr__(self, "objects", poses)
 
-    def towards(self, end: Moment, share: float) -> Moment:
+    def towards(self, end: Instant, share: float) -> Instant:
         """The moment at a share of the way to ``end``; objects are there that are there at both ends."""
         objects = None
         if self.objects is not None and end.objects is not None:
@@ -83,7 +83,7 @@ class Moment:
                 if name in end.objects
             }
         pose = geometry.interpolate_pose(self.world_from_sensor, end.world_from_sensor, share)
-        return Moment(self.time_s + share * (end.time_s - self.time_s), pose, objects)
+        return Instant(self.time_s + share * (end.time_s - self.time_s), pose, objects)
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -98,12 +98,12 @@ class CameraRequest:
     """
 
     optics: Optics
-    start: Moment
-    end: Moment | None = None
+    start: Instant
+    end: Instant | None = None
     shutter: Shutter = "global"
     layers: tuple[Layer, ...] = ("rgb",)
     colors_of: str = ""
-    motion_to: Moment | None = None
+    motion_to: Instant | None = None
 
     def __post_init__(self) -> None:
         unknown = [layer for layer in self.layers if layer not in LAYERS]
@@ -115,7 +115,7 @@ class CameraRequest:
             raise UsageError("the layer motion needs a later moment, and no other one does", where="motion_to")
 
     def answer(self, session: Session) -> CameraReply:
-        """See ``Request``."""
+        """See ``SensorRequest``."""
         return session.picture(self)
 
 
@@ -247,7 +247,7 @@ class Session:
         """Recorded pose world-from-vehicle f64[4, 4] at a time; None outside the log."""
         return None if self.scene is None else self.scene.ego.pose_at(time_s)
 
-    def render(self, requests: Iterable[Request[Reply]]) -> list[Reply]:
+    def render(self, requests: Iterable[SensorRequest[Reply]]) -> list[Reply]:
         """What cameras and LiDARs measure, in the order of the requests.
 
         Raises:
@@ -257,7 +257,7 @@ class Session:
 
     # -- a moment ----------------------------------------------------------------------------------
 
-    def at(self, moment: Moment) -> SceneModel:
+    def at(self, moment: Instant) -> SceneModel:
         """The scene with its objects where the moment puts them; it shares all Gaussians.
 
         Raises:
@@ -277,17 +277,17 @@ class Session:
         return self.model.with_nodes(nodes)
 
     @staticmethod
-    def _placed(node: StaticNode | RigidNode, moment: Moment) -> StaticNode | RigidNode:
+    def _placed(node: StaticNode | RigidNode, moment: Instant) -> StaticNode | RigidNode:
         if not isinstance(node, RigidNode) or moment.objects is None:
             return node
         pose = moment.objects.get(node.name)
         return Absent(node.name) if pose is None else Posed(node, pose, moment.time_s)
 
-    def poses(self, moment: Moment) -> dict[str, Matrix]:
+    def poses(self, moment: Instant) -> dict[str, Matrix]:
         """Poses of the objects that are there at a moment."""
         return self.objects(moment.time_s) if moment.objects is None else dict(moment.objects)
 
-    def pinhole(self, view: View, moment: Moment, instances: bool = False) -> Planes:
+    def pinhole(self, view: View, moment: Instant, instances: bool = False) -> Planes:
         """A pinhole view of the scene at a moment; ``view.time_s`` is that of the moment."""
         model = self.at(moment)
         raster = raster_of(model)
@@ -314,7 +314,7 @@ class Session:
             found = torch.where(own, first[which] + 1, 0).numpy().astype(np.int32)
         return Planes(seen, found)
 
-    def _reaches(self, view: View, name: str, moment: Moment) -> bool:
+    def _reaches(self, view: View, name: str, moment: Instant) -> bool:
         """Whether any corner of an object's box may lie in a view."""
         pose = self.poses(moment).get(name)
         if pose is None:
@@ -356,7 +356,7 @@ class Session:
         return CameraReply(layers, tuple(sorted(self._nodes)), self._trust(canvas, middle, world_rays))
 
     def _layer(
-        self, layer: Layer, canvas: Canvas, request: CameraRequest, rays: Matrix, middle: Moment
+        self, layer: Layer, canvas: Canvas, request: CameraRequest, rays: Matrix, middle: Instant
     ) -> NDArray[Any]:
         match layer:
             case "rgb":
@@ -376,7 +376,7 @@ class Session:
             case "motion":
                 return self._motion(canvas, request, rays, middle)
 
-    def _motion(self, canvas: Canvas, request: CameraRequest, rays: Matrix, now: Moment) -> NDArray[np.float32]:
+    def _motion(self, canvas: Canvas, request: CameraRequest, rays: Matrix, now: Instant) -> NDArray[np.float32]:
         later = request.motion_to
         flow = np.full((*canvas.distance.shape, 2), np.nan, np.float32)
         plain = request.optics.camera if isinstance(request.optics, Pinhole) else None
@@ -397,7 +397,7 @@ class Session:
         flow.reshape(-1, 2)[seen] = np.stack([u - columns - 0.5, v - rows - 0.5], 1)[seen]
         return flow
 
-    def _trust(self, canvas: Canvas, middle: Moment, world_rays: Matrix) -> Trust:
+    def _trust(self, canvas: Canvas, middle: Instant, world_rays: Matrix) -> Trust:
         solid = np.isfinite(canvas.distance)
         with np.errstate(invalid="ignore"):
             below = world_rays[..., 2] < 0
@@ -464,7 +464,7 @@ def _pose(value: ArrayLike, where: str) -> Matrix:
     return pose
 
 
-def _parts(request: CameraRequest, width: int, height: int) -> list[tuple[slice, slice, Moment]]:
+def _parts(request: CameraRequest, width: int, height: int) -> list[tuple[slice, slice, Instant]]:
     """Rows and columns that are drawn together, and the moment of each: strips where the shutter rolls."""
     start, end = request.start, request.end
     everything = (slice(0, height), slice(0, width))
