@@ -214,7 +214,7 @@ class NuplanLog:
         """Times (us) and poses f64[n, 4, 4] of the vehicle from ``first_us`` to ``last_us``; doubled times once."""
         times, poses = [], []
         for time_us, *pose in self.rows(
-            "SELECT timestamp, x, y, z, qw, qx, qy, qz FROM ego_pose WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
+            "SELECT timestamp, x, y, z, qw, qx, qy, qz FROM ego_pose WHERE timestamp BETWEEN ? AND ? ORDER BY 1",
             (first_us, last_us),
         ):
             time_us = self._time(time_us, "ego_pose")
@@ -226,7 +226,7 @@ class NuplanLog:
     def images(self, first_us: int, last_us: int, blobs: Path) -> Iterator[tuple[bytes, Path, int]]:
         """Camera token, file below ``blobs``, and time (us), in order of time."""
         for camera, file, time_us in self.rows(
-            "SELECT camera_token, filename_jpg, timestamp FROM image WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
+            "SELECT camera_token, filename_jpg, timestamp FROM image WHERE timestamp BETWEEN ? AND ? ORDER BY 3",
             (first_us, last_us),
         ):
             time_us = self._time(time_us, "image")

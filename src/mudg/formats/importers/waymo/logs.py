@@ -43,16 +43,9 @@ on."""
 # --- checksums ------------------------------------------------------------------------------------
 
 
-def _make_table() -> tuple[int, ...]:
-    table = []
-    for value in range(256):
-        for _ in range(8):
-            value = (value >> 1) ^ (_POLYNOMIAL_REFLECTED if value & 1 else 0)
-        table.append(value)
-    return tuple(table)
-
-
-_TABLE: Final = _make_table()
+_TABLE: Final = list(range(256))
+for _ in range(8):
+    _TABLE[:] = [(value >> 1) ^ (_POLYNOMIAL_REFLECTED if value & 1 else 0) for value in _TABLE]
 
 
 def crc32c(data: bytes | memoryview) -> int:
@@ -216,9 +209,8 @@ class TfrecordLog:
         context = parse_message(content, CONTEXT, where)
         self.name = str(context.get("name", "")) or self._path.stem
         cameras, lasers = _named(context["cameras"], CAMERAS), _named(context["lasers"], LASERS)
-        self.cameras: Mapping[str, records.CameraCalibration] = {
-            name: _camera(name, item, where) for name, item in cameras
-        }
+        self.cameras: Mapping[str, records.CameraCalibration]
+        self.cameras = {name: _camera(name, item, where) for name, item in cameras}
         self.lasers: Mapping[str, records.LaserCalibration] = {name: _laser(name, item, where) for name, item in lasers}
         stats = context.get("stats", {})
         self.conditions = ", ".join(stats[key] for key in ("time_of_day", "weather", "location") if stats.get(key))
@@ -286,23 +278,18 @@ def _laser(name: str, item: dict[str, Any], where: str) -> records.LaserCalibrat
 
 
 def _shot(item: dict[str, Any], where: str) -> records.CameraShot:
-    velocity = item.get("velocity")
-    return records.CameraShot(
-        records.transform_of(_sixteen(item, "pose"), f"{where}: pose"),
-        item.get("pose_time_s", 0.0),
-        None if velocity is None else np.array([velocity.get(key, 0.0) for key in records.VELOCITY]),
-        item.get("shutter_s", 0.0),
-        item.get("trigger_s", 0.0),
-        item.get("done_s", 0.0),
-    )
+    velocity, pose = item.get("velocity"), records.transform_of(_sixteen(item, "pose"), f"{where}: pose")
+    if velocity is not None:
+        velocity = np.array([velocity.get(key, 0.0) for key in records.VELOCITY])
+    times = (item.get(key, 0.0) for key in ("shutter_s", "trigger_s", "done_s"))
+    return records.CameraShot(pose, item.get("pose_time_s", 0.0), velocity, *times)
 
 
 def _frame_record(message: dict[str, Any], number: int, where: str) -> FrameRecord:
     timestamp_us = message.get("timestamp_us", 0)
     images = [(name, item) for name, item in _named(message["images"], CAMERAS) if item.get("image")]
-    shots = records.by_name(
-        ((name, _shot(item, f"{where}: image of camera {name}")) for name, item in images), timestamp_us, where
-    )
+    shots = ((name, _shot(item, f"{where}: image of camera {name}")) for name, item in images)
+    shots = records.by_name(shots, timestamp_us, where)
     lasers = records.each_once([name for name, item in _named(message["lasers"], LASERS) if _has_ranges(item)], where)
     boxes = []
     for item in message["labels"]:
@@ -324,19 +311,24 @@ def _scan(item: dict[str, Any], where: str, projections: bool) -> LaserScan:
     return LaserScan(returns, poses, found)
 
 
-# Waymo logs of format 2: a folder per component (``camera_image``, ``lidar``, ...) with one Parquet file per log.
-
-
+# --- format 2: a folder per component (``camera_image``, ``lidar``, ...) with one Parquet file per log ----------------
+#
+# Rows are read one at a time and in the order of the file, so that memory stays at one page of a column; the keys of
+# all rows are read first and tell which row belongs to which frame.
 _SEGMENT: Final = "key.segment_context_name"
 _TIME: Final = "key.frame_timestamp_micros"
 _CAMERA: Final = "key.camera_name"
 _LASER: Final = "key.laser_name"
 _OBJECT: Final = "key.laser_object_id"
 _INTRINSIC: Final = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+
+
+def _each(prefix: str, names: str) -> tuple[str, ...]:
+    return tuple(f"{prefix}{name}" for name in names.split())
+
+
 _VELOCITY: Final = tuple(f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz")
-_EXPOSURE: Final = tuple(
-    f"rolling_shutter_params.{name}" for name in ("shutter", "camera_trigger_time", "camera_readout_done_time")
-)
+_EXPOSURE: Final = _each("rolling_shutter_params.", "shutter camera_trigger_time camera_readout_done_time")
 _BOX: Final = (*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading")
 _STREAM_BYTES: Final = 1 << 20
 _TWO_RETURNS: Final = tuple(f"range_image_return{number}.{part}" for number in (1, 2) for part in ("values", "shape"))
@@ -345,52 +337,42 @@ OFFICIAL: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
     "camera_calibration": (
         "CameraCalibrationComponent",
         (
-            *(f"intrinsic.{name}" for name in _INTRINSIC),
-            "extrinsic.transform",
-            "width",
-            "height",
-            "rolling_shutter_direction",
+            *_each("intrinsic.", " ".join(_INTRINSIC)),
+            *"extrinsic.transform width height rolling_shutter_direction".split(),
         ),
     ),
     "camera_segmentation": (
         "CameraSegmentationLabelComponent",
         (
-            "panoptic_label",
-            "panoptic_label_divisor",
-            "sequence_id",
-            "num_cameras_covered",
-            *(
-                f"instance_id_to_global_id_mapping.{name}"
-                for name in ("local_instance_ids", "global_instance_ids", "is_tracked")
-            ),
+            *"panoptic_label panoptic_label_divisor sequence_id num_cameras_covered".split(),
+            *_each("instance_id_to_global_id_mapping.", "local_instance_ids global_instance_ids is_tracked"),
         ),
     ),
     "lidar": ("LiDARComponent", _TWO_RETURNS),
     "lidar_box": (
         "LiDARBoxComponent",
         (
-            "type",
             *_BOX,
-            *(f"{name}.{axis}" for name in ("speed", "acceleration") for axis in "xyz"),
+            *_each("speed.", "x y z"),
+            *_each("acceleration.", "x y z"),
+            *_each("difficulty_level.", "detection tracking"),
+            "type",
             "num_lidar_points_in_box",
             "num_top_lidar_points_in_box",
-            "difficulty_level.detection",
-            "difficulty_level.tracking",
         ),
     ),
     "lidar_calibration": (
         "LiDARCalibrationComponent",
-        ("extrinsic.transform", *(f"beam_inclination.{name}" for name in ("min", "max", "values"))),
+        ("extrinsic.transform", *_each("beam_inclination.", "min max values")),
     ),
     "lidar_camera_projection": ("LiDARCameraProjectionComponent", _TWO_RETURNS),
     "lidar_pose": ("LiDARPoseComponent", _TWO_RETURNS[:2]),
     "stats": (
         "StatsComponent",
         (
-            "time_of_day",
-            "location",
-            "weather",
-            *(f"{of}_object_counts.{part}" for of in ("lidar", "camera") for part in ("types", "counts")),
+            *"time_of_day location weather".split(),
+            *_each("lidar_object_counts.", "types counts"),
+            *_each("camera_object_counts.", "types counts"),
         ),
     ),
     "vehicle_pose": ("VehiclePoseComponent", ("world_from_vehicle.transform",)),
@@ -537,9 +519,8 @@ class ParquetLog:
         if not path.is_file():
             return None
         table, (prefix, columns) = ParquetTable(path), OFFICIAL[component]
-        note_unknown(
-            f"{component}/*.parquet", table.names, frozenset({*_KEYS, *(f"[{prefix}].{name}" for name in columns)})
-        )
+        known = frozenset((*_KEYS, *(f"[{prefix}].{name}" for name in columns)))
+        note_unknown(f"{component}/*.parquet", table.names, known)
         return table
 
     def _need(self, component: str) -> ParquetTable:
@@ -647,9 +628,8 @@ class ParquetTable:
         with arrow_files(self.path):
             if next_row > row or next_row < self._starts[group]:
                 groups = list(range(group, self._file.num_row_groups))
-                stream = self._file.iter_batches(
-                    batch_size=1, row_groups=groups, columns=list(names), use_threads=False
-                )
+                columns = list(names)
+                stream = self._file.iter_batches(batch_size=1, row_groups=groups, columns=columns, use_threads=False)
                 next_row = int(self._starts[group])
             batch = None
             while next_row <= row:
