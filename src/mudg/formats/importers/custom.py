@@ -229,11 +229,7 @@ class CustomLog:
 
 def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> CustomLog:
     """Parse ``root/log.json``. Raises InputError: the frame of the file or the vehicle's path is wrong, or ``complain``
-    raised.
-
-    Args:
-        complain: called with each problem; a record with a problem is left out.
-    """
+    raised. ``complain``: called with each problem; a record with a problem is left out."""
     where = str(root / INDEX)
     top = _parse_index(schema.parse_object(store.read_bytes(root / INDEX), where), where)
     cameras = schema.parse_table(top.cameras, f"{where}: cameras", _parse_camera, complain)

@@ -378,15 +378,8 @@ def _databases(folder: Path) -> list[Path]:
 
 
 def import_nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one nuPlan log, or one scene of it, into the scene directory ``out``; see the module text. Raises
-    UsageError: there are several logs and none was chosen, or an option does not apply. InputError: something is
-    missing, malformed or contradictory; nothing is left at ``out``.
-
-    Args:
-        source: the log's ``.db`` file, or a folder of such files.
-        options: ``sequence`` is the log's name (where ``source`` is a folder), a scene's name, or ``LOG/SCENE``.
-            ``cameras`` default to all eight. ``poses``, ``boxes`` and ``untwist`` are refused.
-    """
+    """Import one log, a ``.db`` file or one of a folder of them, or one scene of it. ``options.sequence``: the log's
+    name (where ``source`` is a folder), a scene's name, or ``LOG/SCENE``; ``cameras`` default to all eight."""
     common.refuse_options(options, "nuPlan", "poses", "boxes", "untwist")
     path, scene = _find(source, options)
     with open_log(path) as opened:

@@ -359,16 +359,9 @@ def looks_like_nuscenes(source: Path) -> bool:
 
 
 def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one scene of a nuScenes release into the scene directory ``out``; see the module text for what is read.
-    Raises UsageError: the release holds several scenes and none was chosen, or there is no such scene or camera.
-    InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
-
-    Args:
-        source: the release's root, or its table folder.
-        options: ``sequence`` names the scene (``scene-0061``, or ``v1.0-mini/scene-0061`` where several releases lie
-            side by side); ``frames`` counts images of the first chosen camera; ``cameras`` by either name, all six by
-            default.
-    """
+    """Import one scene of a release: its root, or its table folder. ``options.sequence``: the scene (``scene-0061``, or
+    ``v1.0-mini/scene-0061`` where several releases lie side by side); ``cameras`` by either name, all six by
+    default."""
     if not source.is_dir():
         raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")
     common.refuse_untwist(options, "nuScenes", str(source))

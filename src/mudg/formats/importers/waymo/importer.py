@@ -65,14 +65,8 @@ def looks_like_waymo(source: Path) -> bool:
 
 
 def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a Waymo log into the scene directory ``out``; see the module text for what is understood. Raises
-    UsageError: several logs and none was chosen, or an option that this format cannot honour. InputError: something is
-    missing, damaged or contradictory; nothing is left at ``out``.
-
-    Args:
-        source: a TFRecord file, a folder of them, or a folder with the component folders of format 2.
-        options: ``sequence`` chooses a log where there are several, by its name or a part of it.
-    """
+    """Import a TFRecord file, one of a folder of them, or a log of a folder with the component folders of format 2.
+    ``options.sequence``: a log's name or a part of it."""
     common.refuse_options(options, "Waymo", "poses", "boxes")
     if options.untwist == "no":
         what, expected = (

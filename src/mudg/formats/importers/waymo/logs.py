@@ -172,12 +172,8 @@ def _cut_off(where: str, got: str) -> InputError:
 
 class TfrecordLog:
     """A TFRecord file. Opening it reads the wanted records once, compares all their checksums and keeps what is small.
-    Raises InputError: the file or a wanted record is damaged, or no Waymo frame.
-
-    Args:
-        path: the file.
-        wanted: record numbers (first, end) to keep, or None.
-    """
+    Raises InputError: the file or a wanted record is damaged, or no Waymo frame. ``path``: the file. ``wanted``: record
+    numbers (first, end) to keep, or None."""
 
     form = "v1 TFRecord"
 
@@ -323,59 +319,48 @@ _OBJECT: Final = "key.laser_object_id"
 _INTRINSIC: Final = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
 
 
-def _each(prefix: str, names: str) -> tuple[str, ...]:
-    return tuple(f"{prefix}{name}" for name in names.split())
+def _component(title: str, names: str = "", **parts: str) -> tuple[str, tuple[str, ...]]:
+    """Title and columns of a component: plain ``names``, and those of the parts ``part.name``."""
+    inner = (f"{part}.{name}" for part, within in parts.items() for name in within.split())
+    return f"{title}Component", (*names.split(), *inner)
 
 
 _VELOCITY: Final = tuple(f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz")
-_EXPOSURE: Final = _each("rolling_shutter_params.", "shutter camera_trigger_time camera_readout_done_time")
+_EXPOSURE: Final = tuple(
+    f"rolling_shutter_params.{name}" for name in ("shutter", "camera_trigger_time", "camera_readout_done_time")
+)
 _BOX: Final = (*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading")
 _STREAM_BYTES: Final = 1 << 20
-_TWO_RETURNS: Final = tuple(f"range_image_return{number}.{part}" for number in (1, 2) for part in ("values", "shape"))
+_TWO_RETURNS: Final = {"range_image_return1": "values shape", "range_image_return2": "values shape"}
 OFFICIAL: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
-    "camera_image": ("CameraImageComponent", ("image", "pose.transform", "pose_timestamp", *_VELOCITY, *_EXPOSURE)),
-    "camera_calibration": (
-        "CameraCalibrationComponent",
-        (
-            *_each("intrinsic.", " ".join(_INTRINSIC)),
-            *"extrinsic.transform width height rolling_shutter_direction".split(),
-        ),
+    "camera_image": _component(
+        "CameraImage", " ".join(("image pose.transform pose_timestamp", *_VELOCITY, *_EXPOSURE))
     ),
-    "camera_segmentation": (
-        "CameraSegmentationLabelComponent",
-        (
-            *"panoptic_label panoptic_label_divisor sequence_id num_cameras_covered".split(),
-            *_each("instance_id_to_global_id_mapping.", "local_instance_ids global_instance_ids is_tracked"),
-        ),
+    "camera_calibration": _component(
+        "CameraCalibration",
+        "extrinsic.transform width height rolling_shutter_direction",
+        intrinsic=" ".join(_INTRINSIC),
     ),
-    "lidar": ("LiDARComponent", _TWO_RETURNS),
-    "lidar_box": (
-        "LiDARBoxComponent",
-        (
-            *_BOX,
-            *_each("speed.", "x y z"),
-            *_each("acceleration.", "x y z"),
-            *_each("difficulty_level.", "detection tracking"),
-            "type",
-            "num_lidar_points_in_box",
-            "num_top_lidar_points_in_box",
-        ),
+    "camera_segmentation": _component(
+        "CameraSegmentationLabel",
+        "panoptic_label panoptic_label_divisor sequence_id num_cameras_covered",
+        instance_id_to_global_id_mapping="local_instance_ids global_instance_ids is_tracked",
     ),
-    "lidar_calibration": (
-        "LiDARCalibrationComponent",
-        ("extrinsic.transform", *_each("beam_inclination.", "min max values")),
+    "lidar": _component("LiDAR", **_TWO_RETURNS),
+    "lidar_box": _component(
+        "LiDARBox",
+        " ".join(("type num_lidar_points_in_box num_top_lidar_points_in_box", *_BOX)),
+        speed="x y z",
+        acceleration="x y z",
+        difficulty_level="detection tracking",
     ),
-    "lidar_camera_projection": ("LiDARCameraProjectionComponent", _TWO_RETURNS),
-    "lidar_pose": ("LiDARPoseComponent", _TWO_RETURNS[:2]),
-    "stats": (
-        "StatsComponent",
-        (
-            *"time_of_day location weather".split(),
-            *_each("lidar_object_counts.", "types counts"),
-            *_each("camera_object_counts.", "types counts"),
-        ),
+    "lidar_calibration": _component("LiDARCalibration", "extrinsic.transform", beam_inclination="min max values"),
+    "lidar_camera_projection": _component("LiDARCameraProjection", **_TWO_RETURNS),
+    "lidar_pose": _component("LiDARPose", range_image_return1="values shape"),
+    "stats": _component(
+        "Stats", "time_of_day location weather", lidar_object_counts="types counts", camera_object_counts="types counts"
     ),
-    "vehicle_pose": ("VehiclePoseComponent", ("world_from_vehicle.transform",)),
+    "vehicle_pose": _component("VehiclePose", "world_from_vehicle.transform"),
 }
 """Folders that are read -> name of the component, and its columns, read or not. Source: the data set's published
 components."""
@@ -389,12 +374,8 @@ REQUIRED: Final = ("camera_image", "camera_calibration", "vehicle_pose")
 class ParquetLog:
     """One log of a format-2 folder. Opening it reads all small tables and the keys of the large ones. Raises
     InputError: a component is missing, or a table is damaged or contradictory. ResourceError: pyarrow is not installed.
-
-    Args:
-        root: folder with the component folders.
-        segment: name of the log, that of its files.
-        wanted: frames (first, end) in the order of time, or None.
-    """
+    ``root``: folder with the component folders. ``segment``: name of the log, that of its files. ``wanted``: frames
+    (first, end) in the order of time, or None."""
 
     form = "v2 Parquet"
 

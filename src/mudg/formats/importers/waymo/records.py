@@ -76,14 +76,9 @@ class LaserCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraShot:
-    """When and where an image was taken.
-
-    Args:
-        global_from_vehicle: at ``pose_time_s``, seconds of the epoch.
-        velocity: linear m/s and angular rad/s, both in the global frame, f64[6]; None if not recorded.
-        shutter_s, trigger_s, done_s: exposure of a column, start of the exposure and end of the readout; 0 if not
-            recorded.
-    """
+    """When and where an image was taken. ``global_from_vehicle``: at ``pose_time_s``, seconds of the epoch.
+    ``velocity``: linear m/s and angular rad/s, both in the global frame, f64[6]; None if not recorded. ``shutter_s``,
+    ``trigger_s``, ``done_s``: exposure of a column, start of the exposure and end of the readout; 0 if not recorded."""
 
     global_from_vehicle: Matrix
     pose_time_s: float
