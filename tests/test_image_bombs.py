@@ -18,7 +18,7 @@ from mudg.base.errors import InputError
 from mudg.base.types import Camera
 from mudg.city import photos
 from mudg.formats.importers import kitti360
-from mudg.formats.importers.waymo import sensors as waymo
+from mudg.formats.importers.waymo import importer as waymo
 from mudg.scene import labels
 from mudg.scene.observations import read_image_file
 from mudg.scene.read import check_image, decode_image

@@ -19,8 +19,9 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.city import sensors as rig
+from mudg.formats.importers.waymo import importer as sensors
 from mudg.formats.importers.waymo import logs as tfrecord
-from mudg.formats.importers.waymo import records, sensors
+from mudg.formats.importers.waymo import records
 from mudg.formats.importers.waymo import records as messages
 from mudg.formats.importers.waymo.logs import ParquetTable, TfrecordLog
 from mudg.formats.importers.waymo.records import WaymoBox

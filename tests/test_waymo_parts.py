@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, matrix_from_quaternion, yaw_matrix
+from mudg.formats.importers.waymo import importer as sensors
 from mudg.formats.importers.waymo import logs as tfrecord
 from mudg.formats.importers.waymo import records as messages
 from mudg.formats.importers.waymo import records as waymo_tracks
-from mudg.formats.importers.waymo import sensors
 from mudg.formats.importers.waymo.records import CameraShot, LaserCalibration, LaserScan, WaymoBox
 
 

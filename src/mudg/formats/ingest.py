@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,6 @@ from mudg.formats.importers import RECOGNISERS, files_of, import_log, known_form
 from mudg.formats.importers.common import ImportOptions, parse_frame_range, parse_resolution
 from mudg.formats.settings import IngestConfig
 from mudg.scene import check, contact_sheet
-from mudg.scene import check as scene_check
 from mudg.scene.read import read_scene
 from mudg.scene.write import SceneWriter
 
@@ -57,32 +56,25 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> dict
     else:
         scene = _make(kind, config, source, folder.path)
         if kind not in (CITY, _SCENE):
-            warnings = [finding for finding in scene_check.check_records(scene) if finding.level == "warning"]
-            for line in scene_check.folded(warnings, f"mudg doctor {folder.out}"):
+            warnings = [finding for finding in check.check_records(scene) if finding.level == "warning"]
+            for line in check.folded(warnings, f"mudg doctor {folder.out}"):
                 log.warn(f"ingest: {line}")
     held_out = sum(split == "test" for split in scene.split.values())
     log.info(
         f"ingest: {len(scene.frames)} images of {len(scene.cameras)} cameras, {len(scene.sweeps)} sweeps,"
         f" {len(scene.tracks)} tracked boxes; {held_out} images held out"
     )
-    summary = {
-        "frames": len(scene.frames),
-        "sweeps": len(scene.sweeps),
-        "tracks": len(scene.tracks),
-        "held_out": held_out,
-    }
+    counts = {"frames": scene.frames, "sweeps": scene.sweeps, "tracks": scene.tracks}
+    summary = {**{name: len(records) for name, records in counts.items()}, "held_out": held_out}
     if config.contact_sheet:
         sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
         log.info(f"ingest: check {folder.out / sheet.name}")
-    return {**summary, **({} if kind == CITY else _alignment(scene))}
-
-
-def _alignment(scene: Scene) -> dict[str, Any]:
-    """How the images fit the LiDAR, for the summary; a warning for a doubtful camera."""
-    found = check.camera_alignment(scene)
-    for name, one in found.items():
+    if kind == CITY:
+        return summary
+    alignment = check.camera_alignment(scene)
+    for name, one in alignment.items():
         (log.warn if one.verdict == "doubtful" else log.info)(f"ingest: {check.describe(name, one)}")
-    return {"alignment": {name: check.to_json(one) for name, one in found.items()}}
+    return {**summary, "alignment": {name: check.to_json(one) for name, one in alignment.items()}}
 
 
 _SCENE = "scene"
@@ -145,12 +137,8 @@ def import_options(config: IngestConfig) -> ImportOptions:
 def source_digest(source: Path, kind: str, config: IngestConfig) -> str:
     """What identifies a log without reading all of it: names, sizes and modification times of the files that belong to
     the chosen one; a scene's own digest. Raises UsageError: several logs and none was chosen. InputError: none is
-    there.
-
-    Args:
-        kind: format, or ``scene``.
-        config: chooses the log, where a folder holds many; files it names count, too.
-    """
+    there. ``kind``: format, or ``scene``. ``config``: chooses the log, where a folder holds many; files it names count,
+    too."""
     if kind == _SCENE:
         return store.digest(source)
     options = import_options(config)
@@ -180,27 +168,23 @@ def _walk(path: Path) -> Iterator[Path]:
 def _city(config: IngestConfig, out: Path) -> Scene:
     from mudg.city.logs import write_city
 
-    _refuse(
-        config,
-        _OF_A_LOG,
+    what, remedy = (
         "the generated city has settings of its own",
         "use --city.n-frames, --city.cameras, --city.width, ...",
     )
+    _refuse_log_settings(config, what, remedy)
     return write_city(config.city, out, test_every=config.test_every)
 
 
-_OF_A_LOG = ("frames", "cameras", "sequence", "poses", "boxes", "resolution")
-
-
-def _refuse(config: IngestConfig, names: Sequence[str], what: str, remedy: str) -> None:
-    given = [f"--{name}" for name in names if getattr(config, name)]
-    if given:
-        raise UsageError(what, where=", ".join(given), remedy=remedy)
+def _refuse_log_settings(config: IngestConfig, what: str, remedy: str) -> None:
+    names = ("frames", "cameras", "sequence", "poses", "boxes", "resolution")
+    if flags := [f"--{name}" for name in names if getattr(config, name)]:
+        raise UsageError(what, where=", ".join(flags), remedy=remedy)
 
 
 def _copy_scene(config: IngestConfig, source: Path, out: Path) -> Scene:
     """Copy a scene, every file checked; held-out frames are kept as the scene has them."""
-    _refuse(config, _OF_A_LOG, "this setting does not apply to a scene, which is copied unchanged", "leave it out")
+    _refuse_log_settings(config, "this setting does not apply to a scene, which is copied unchanged", "leave it out")
     scene = read_scene(source)
     with SceneWriter(out, scene.id, scene.source) as writer:
         writer.copy_all_but_frames(scene)

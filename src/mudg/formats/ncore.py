@@ -82,11 +82,7 @@ def rotation_of(euler_rad: tuple[float, float, float]) -> Matrix:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PoseKeys:
-    """A frame's poses over time.
-
-    Args:
-        times_us: i64[K], increasing, at least two. poses: f64[K, 4, 4], rigid.
-    """
+    """A frame's poses over time. ``times_us``: i64[K], increasing, at least two. poses: f64[K, 4, 4], rigid."""
 
     times_us: Times
     poses: Matrix

@@ -4,6 +4,9 @@ A format is one module, or a folder with ``importer.py``. It has ``import_<forma
 ``looks_like_<format>(source) -> bool`` and, where folders hold many logs, ``files_of_<format>(source, options) ->
 LogFiles``; its name in ``FORMATS`` and a case in ``_functions``. Modules are loaded when their format is first asked
 for.
+
+An importer raises UsageError where a folder holds several logs and none was chosen, or where there is no such log or
+camera; InputError where something is missing, malformed or contradictory: nothing is left at ``out`` then.
 """
 
 from __future__ import annotations
@@ -21,19 +24,9 @@ Importer = Callable[[Path, Path, ImportOptions], Scene]
 Recogniser = Callable[[Path], bool]
 Finder = Callable[[Path, ImportOptions], LogFiles]
 
-FORMATS = (
-    "kitti360",  # before kitti: a drive's folder has image_00 in both
-    "waymo",
-    "nuscenes",
-    "argoverse2",
-    "pandaset",
-    "nuplan",
-    "dgp",
-    "ncore",
-    "custom",
-    "kitti",
-)
-"""Names of the formats, in the order in which a folder is asked whether it looks like one."""
+FORMATS = tuple("kitti360 waymo nuscenes argoverse2 pandaset nuplan dgp ncore custom kitti".split())
+"""Names of the formats, in the order in which a folder is asked whether it looks like one: a drive of KITTI-360 has
+image_00 as one of KITTI."""
 
 
 def _whole_source(source: Path, _options: ImportOptions) -> LogFiles:

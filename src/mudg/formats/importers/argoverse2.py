@@ -80,15 +80,8 @@ def looks_like_argoverse2(source: Path) -> bool:
 
 
 def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one log into the scene directory ``out``; see the module text for what is read. Raises UsageError: there
-    are several logs and none was chosen, or there is no such log or camera. InputError: something is missing, malformed
-    or contradictory; nothing is left at ``out``. ResourceError: pyarrow, which reads Feather files, is not installed.
-
-    Args:
-        source: a log's folder, or a folder of logs.
-        options: ``sequence`` names the log (its beginning is enough) where there are several; ``frames`` counts images
-            of the first chosen camera; ``cameras`` by either name, the seven ring cameras by default.
-    """
+    """Import a log's folder, or one of a folder of logs. ``options.sequence``: a log's name, or its beginning;
+    ``cameras`` by either name, the seven ring cameras by default. ResourceError: pyarrow is not installed."""
     if not source.is_dir():
         raise InputError("Argoverse 2 folder does not exist", where=str(source), expected="a folder")
     common.refuse_untwist(options, "Argoverse 2", str(source))

@@ -56,11 +56,8 @@ class Cloud:
 
 def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
     """Read a cloud by the suffix of its name. Raises InputError: unknown suffix, cut off, sizes that contradict each
-    other, no coordinates, values not finite.
-
-    Args:
-        known: names of fields that the caller reads, or knows to be there, besides ``USUAL``.
-    """
+    other, no coordinates, values not finite. ``known``: names of fields that the caller reads, or knows to be there,
+    besides ``USUAL``."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         what = "point cloud format is not known"
@@ -292,12 +289,8 @@ def read_float_rows(
     path: Path, columns: int, what: str = "scan", axes: int = 3
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], and which of them are
-    returns bool[N]. Raises InputError: missing, cut off, or values of a return that are not finite.
-
-    Args:
-        what: what one file holds, for messages.
-        axes: the first so many columns are coordinates in the sensor's frame.
-    """
+    returns bool[N]. Raises InputError: missing, cut off, or values of a return that are not finite. ``what``: what one
+    file holds, for messages. ``axes``: the first so many columns are coordinates in the sensor's frame."""
     content = store.read_bytes(path)
     if len(content) % (4 * columns):
         what, got = f"{what} is cut off", f"{len(content)} bytes"

@@ -516,13 +516,9 @@ def deskew(
 def blend_motion(
     points: NDArray[np.floating], corrections: Sequence[Matrix], place: NDArray[np.floating]
 ) -> NDArray[Any]:
-    """Move each of the points [N, 3] by what lies between two of many corrections, blended linearly.
-
-    Args:
-        points: metres; computed in their type.
-        corrections: f64[4, 4] each, at least two.
-        place: [N] number of the correction, with its fraction: 2.5 is halfway between the third and the fourth.
-    """
+    """Move each of the points [N, 3] by what lies between two of many corrections, blended linearly. ``points``:
+    metres; computed in their type. ``corrections``: f64[4, 4] each, at least two. ``place``: [N] number of the
+    correction, with its fraction: 2.5 is halfway between the third and the fourth."""
     step = np.clip(place.astype(int), 0, len(corrections) - 2)
     out = np.empty_like(points)
     for index in range(len(corrections) - 1):
@@ -601,13 +597,9 @@ def folder_contents(folder: Path) -> str:
 
 
 def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOptions, where: Path, kind: str) -> Item:
-    """The one log that ``options.sequence`` means. Raises UsageError: none fits, or several do.
-
-    Args:
-        matching: logs that fit it; all of them where none was chosen.
-        names: of all logs that are there, for the message; ``where``: folder that holds them.
-        kind: what one is called: log, scene, drive, sequence.
-    """
+    """The one log that ``options.sequence`` means. Raises UsageError: none fits, or several do. ``matching``: logs that
+    fit it; all of them where none was chosen. ``names``: of all logs that are there, for the message; ``where``: folder
+    that holds them. ``kind``: what one is called: log, scene, drive, sequence."""
     if len(matching) == 1:
         return matching[0]
     listed = ", ".join(names[:12]) + (f", ... ({len(names)} in all)" if len(names) > 12 else "")
@@ -618,12 +610,9 @@ def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOpti
 
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
     """The data set's names of the cameras to import, in the order of ``available``. Raises UsageError: no such camera.
-    InputError: none of the usual ones is there.
-
-    Args:
-        available: the data set's name -> the name in the scene; either may be asked for.
-        usual: the data set's names taken when none is asked for; those that are not there are left out.
-    """
+    InputError: none of the usual ones is there. ``available``: the data set's name -> the name in the scene; either may
+    be asked for. ``usual``: the data set's names taken when none is asked for; those that are not there are left
+    out."""
     by_scene_name = {ours: theirs for theirs, ours in available.items()}
     listed = ", ".join(o if o == t else f"{o} ({t})" for t, o in available.items()) or "no cameras"
     if not options.cameras:

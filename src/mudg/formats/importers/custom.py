@@ -7,6 +7,7 @@ import io
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, NamedTuple
 
@@ -31,10 +32,9 @@ from mudg.scene.read import decode_image
 
 # schema -------------------------------------------------------------------------------------------
 #
-# ``log.json``, the index of a log in the neutral layout, as checked records. The layout is docs/custom_format.md.
-#
-# As in ``scene/schema.py``, the parser takes ``complain``: the importer raises at the first problem, ``mudg doctor``
-# collects all.
+# ``log.json``, the index of a log in the neutral layout, as checked records. The layout is docs/custom_format.md. As in
+# ``scene/schema.py``, the parser takes ``complain``: the importer raises at the first problem, ``mudg doctor`` collects
+# all.
 Matrix = NDArray[np.float64]
 INDEX: Final = "log.json"
 FORMAT: Final = "mudg-log"
@@ -102,22 +102,19 @@ class LogCameraEntry(StrictRecord):
 
 
 class LogLidar(StrictRecord):
-    """A LiDAR: where it sits, which fields of its clouds mean what, and whether its sweeps are motion-compensated.
-
-    Args:
-        intensity_field: empty = clouds have no intensities.
-        intensity_max: intensities are divided by it.
-        time_field: empty = clouds have no times; else ``time_unit`` is their unit.
-        time_from: whether times of points count from the sweep's time or on the log's clock.
-    """
+    """A LiDAR: where it sits, which fields of its clouds mean what, and whether its sweeps are motion-compensated."""
 
     ego_from_sensor: Pose = Field(alias="ego_from_lidar")
     motion_compensated: bool
     intensity_field: str = "intensity"
+    """Empty = clouds have no intensities."""
     intensity_max: Annotated[Number, Field(gt=0)] = 1.0
+    """Intensities are divided by it."""
     time_field: str = ""
+    """Empty = clouds have no times."""
     time_unit: common.TimeUnit | None = None
     time_from: Literal["sweep", "log"] = "sweep"
+    """Whether times of points count from the sweep's time or on the log's clock."""
 
 
 class EgoPoseEntry(StrictRecord):
@@ -191,8 +188,7 @@ class LogCamera:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LogItem:
-    """One image or cloud: its sensor and where that sits, seconds since the start, file, its own pose if the log gives
-    one."""
+    """One image or cloud, seconds since the start, with its own pose if the log gives one."""
 
     kind: Literal["image", "cloud"]
     sensor: str
@@ -212,10 +208,8 @@ class LogClock(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CustomLog:
-    """A parsed ``log.json``. Seconds count from the first vehicle pose; the world's origin is that pose's place.
-
-    ``origin_m`` f64[3] was taken from every position. Images and sweeps are in time order per sensor.
-    """
+    """A parsed ``log.json``. Seconds count from the first vehicle pose; the world's origin is that pose's place:
+    ``origin_m`` f64[3] was taken from every position. Images and sweeps are in time order per sensor."""
 
     root: Path
     name: str
@@ -235,11 +229,7 @@ class CustomLog:
 
 def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> CustomLog:
     """Parse ``root/log.json``. Raises InputError: the frame of the file or the vehicle's path is wrong, or ``complain``
-    raised.
-
-    Args:
-        complain: called with each problem; a record with a problem is left out.
-    """
+    raised. ``complain``: called with each problem; a record with a problem is left out."""
     where = str(root / INDEX)
     top = _parse_index(schema.parse_object(store.read_bytes(root / INDEX), where), where)
     cameras = schema.parse_table(top.cameras, f"{where}: cameras", _parse_camera, complain)
@@ -249,9 +239,8 @@ def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> Cust
         complain(InputError("the log has no cameras", where=f"{where}: cameras", expected=expected))
     if not top.ego:
         raise InputError("the log has no vehicle poses", where=f"{where}: ego", expected="at least one")
-    path = schema.parse_each(
-        top.ego, f"{where}: ego", lambda value, at: parse_record(EgoPoseEntry, value, at), schema.raise_first
-    )
+    entry = partial(parse_record, EgoPoseEntry)
+    path = schema.parse_each(top.ego, f"{where}: ego", entry, schema.raise_first)
     clock = LogClock(top.time_unit, path[0].time, common.UNITS_PER_SECOND[top.time_unit])
     poses = np.stack([entry.world_from_ego for entry in path])
     origin_m = poses[0, :3, 3].copy()
@@ -337,13 +326,8 @@ class _LogReader:
         declared: Iterable[str],
         usable: Mapping[str, LogCamera] | Mapping[str, LogLidar],
     ) -> list[LogItem]:
-        """Images or sweeps in time order per sensor; a sensor whose times are wrong is complained about and left out.
-
-        Args:
-            kind: ``images`` or ``sweeps``.
-            declared: names of all sensors of the log.
-            usable: those that were parsed; records of others are left out.
-        """
+        """``images`` or ``sweeps`` in time order per sensor; a sensor whose times are wrong is complained about and
+        left out. ``declared``: names of all sensors of the log; ``usable``: those that were parsed."""
         names = tuple(declared)
         key, item_kind = ("camera", "image") if entry_type is LogImageEntry else ("lidar", "cloud")
 
@@ -434,10 +418,8 @@ def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
             yield SceneSweep(record.sensor, number, record.time_s, pose_of(content.ego, record), points)
 
     origin = replace(content.source, notes=(*content.source.notes, *notes, *image_notes(fits)))
-    scene = SceneContent(
-        content.name, origin, fits, [*images, *sweeps], convert, _id_of, content.ego, lambda: (content.tracks, ())
-    )
-    return write_scene(scene, out, options)
+    name, items, tracks = content.name, [*images, *sweeps], lambda: (content.tracks, ())
+    return write_scene(SceneContent(name, origin, fits, items, convert, _id_of, content.ego, tracks), out, options)
 
 
 def _raise(problem: MudgError) -> None:
@@ -458,8 +440,7 @@ def _moments(images: Sequence[LogItem]) -> dict[LogItem, int]:
 
 
 def _chosen(content: CustomLog, options: ImportOptions) -> CustomLog:
-    """The cameras, frames and files asked for. ``frames`` counts images of the first of them in the log's order; the
-    rest goes by time."""
+    """The chosen cameras, frames and files. ``frames`` counts images of the log's first one; the rest goes by time."""
     there = {name: name for name in content.cameras}
     names = common.chosen_cameras(there, options, str(content.root / INDEX), tuple(there))
     images = [image for image in content.images if image.sensor in names]
@@ -488,10 +469,8 @@ def _usable(content: CustomLog, records: list[LogItem]) -> list[LogItem]:
     placed = [r for r in found if r.world_from_sensor is not None or common.has_pose(content.ego, r.time_s)]
     if len(placed) < len(found):
         times = [r.time_s for r in found if r not in placed]
-        log.warn(
-            f"custom: left out {len(times)} records of kind {records[0].kind} without a vehicle pose, from"
-            f" {min(times):.3f} to {max(times):.3f} s"
-        )
+        without = f"{len(times)} records of kind {records[0].kind} without a vehicle pose"
+        log.warn(f"custom: left out {without}, from {min(times):.3f} to {max(times):.3f} s")
     return placed
 
 
@@ -603,10 +582,8 @@ def _delays(cloud: Cloud, sweep: LogItem, content: CustomLog, path: Path) -> NDA
 
 
 def check_log(source: Path) -> list[Finding]:
-    """Everything that is wrong or odd about a log in the neutral layout, worst first; every file is read.
-
-    Problems with the same text are listed five times, the rest counted.
-    """
+    """Everything that is wrong or odd about a log in the neutral layout, worst first; every file is read. Problems with
+    the same text are listed five times, the rest counted."""
     findings: list[Finding] = []
 
     def complain(problem: MudgError) -> None:
@@ -629,20 +606,15 @@ def check_log(source: Path) -> list[Finding]:
     def check_sweep(sweep: Sweep, cloud: LogItem) -> Iterator[Finding]:
         points = read_sweep(content, cloud, ImportOptions())
         if points.no_returns:
-            rows = points.no_returns + len(points.xyz)
-            yield Finding(
-                "note",
-                f"sweep {sweep.id}",
-                f"{points.no_returns} of {rows} points mark beams without a return; ingest leaves them out",
-            )
+            marked = f"{points.no_returns} of {points.no_returns + len(points.xyz)} points mark beams without a return"
+            yield Finding("note", f"sweep {sweep.id}", f"{marked}; ingest leaves them out")
         yield from scene_check.check_points(scene, sweep, points)
 
     with log.task("checking images and sweeps", len(images) + len(sweeps)) as bar:
-        checks = [
+        for check in (
             *map(check_image, scene.frames, images),
             *map(check_sweep, scene.sweeps, sweeps),
-        ]  # nothing is read yet
-        for check in checks:
+        ):  # nothing read yet
             findings.extend(scene_check.collected(check, str(source)))
             bar.advance()
     return scene_check.worst_first(_collapsed(findings))
@@ -650,10 +622,7 @@ def check_log(source: Path) -> list[Finding]:
 
 def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple[Scene, list[LogItem], list[LogItem]]:
     """The log as a scene whose references are files of the log: nothing is copied; and the records of its frames and
-    sweeps.
-
-    Records without a pose are complained about and left out. Cameras are as recorded.
-    """
+    sweeps. Records without a pose are complained about and left out. Cameras are as recorded."""
     frames: dict[LogItem, Frame] = {}
     sweeps: dict[LogItem, Sweep] = {}
     for item in (*_numbered(content.images), *_numbered(content.sweeps)):
@@ -672,23 +641,13 @@ def as_scene(content: CustomLog, complain: Callable[[MudgError], None]) -> tuple
         groups.setdefault(moment, []).append(frames[record].id)
     split = common.holdout_split([groups[moment] for moment in sorted(groups)], ImportOptions().test_every)
     cameras = {name: camera.camera for name, camera in content.cameras.items()}
-    scene = Scene(
-        content.name,
-        str(content.root),
-        cameras,
-        tuple(frames.values()),
-        tuple(sweeps.values()),
-        content.tracks,
-        content.ego,
-        split,
-        content.source,
-    )
-    return scene, list(frames), list(sweeps)
+    name, root, tracks, ego = content.name, str(content.root), content.tracks, content.ego
+    parts = tuple(frames.values()), tuple(sweeps.values()), tracks, ego, split, content.source
+    return Scene(name, root, cameras, *parts), list(frames), list(sweeps)
 
 
 def _collapsed(findings: Iterable[Finding]) -> list[Finding]:
-    """At most ``MAX_ALIKE`` findings of one kind (the same text before the first ``;``), and how many more there
-    are."""
+    """At most ``MAX_ALIKE`` findings of one kind (the same text before the first ``;``), and how many more."""
     counts: Counter[tuple[scene_check.Level, str]] = Counter()
     kept = []
     for finding in findings:

@@ -90,15 +90,8 @@ def looks_like_dgp(source: Path) -> bool:
 
 
 def import_dgp(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one scene into the scene directory ``out``; see the module text for what is read. Raises UsageError: there
-    are several scenes and none was chosen, or there is no such scene or camera. InputError: something is missing,
-    malformed or contradictory; nothing is left at ``out``.
-
-    Args:
-        source: a scene's folder, or a folder of scenes.
-        options: ``sequence`` names the scene's folder where there are several; ``frames`` counts images of the first
-            chosen camera; ``cameras`` by either name (``CAMERA_01`` or ``camera_01``), all by default.
-    """
+    """Import a scene's folder, or one of a folder of scenes. ``options.sequence``: a scene's folder; ``cameras`` by
+    either name (``CAMERA_01`` or ``camera_01``), all by default."""
     if not source.is_dir():
         raise InputError("DGP folder does not exist", where=str(source), expected="a folder")
     common.refuse_untwist(options, "DGP", str(source))

@@ -408,11 +408,8 @@ _SAME_S: Final = 1e-3
 
 
 class BoxTimes:
-    """Mean point time of every box of every moving track, collected while sweeps pass by in any order.
-
-    Args:
-        tracks: as annotated; keys at sweep times. ``observe`` may be called from several threads, once per sweep.
-    """
+    """Mean point time of every box of every moving track, collected while sweeps pass by in any order. ``tracks``: as
+    annotated; keys at sweep times. ``observe`` may be called from several threads, once per sweep."""
 
     def __init__(self, tracks: Sequence[Track]) -> None:
         self._tracks = tuple(tracks)
@@ -543,14 +540,10 @@ class _BoxedObject:
 
 
 class BoxTracks:
-    """Collects boxes in any order, 136 bytes each; ``tracks`` puts them together.
-
-    Args:
-        where: the file or folder the boxes come from, for messages.
-        labels: the data set's class -> the label here (``car``, ``pedestrian``, ...). Other classes keep the last part
-            (after a dot) of their name in lower case, and are named once in the notes.
-        max_gap_s: an object that is not seen for longer than this is split.
-    """
+    """Collects boxes in any order, 136 bytes each; ``tracks`` puts them together. ``where``: the file or folder the
+    boxes come from, for messages. ``labels``: the data set's class -> the label here (``car``, ``pedestrian``, ...).
+    Other classes keep the last part (after a dot) of their name in lower case, and are named once in the notes.
+    ``max_gap_s``: an object that is not seen for longer than this is split."""
 
     def __init__(self, where: str, labels: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
         self._where, self._labels, self._max_gap_s = where, labels, max_gap_s
@@ -606,13 +599,10 @@ class BoxTracks:
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
-        Raises InputError: an object has two boxes at one moment; length and width are swapped.
-
-        Args:
-            speeds: how velocities are found; None = from the neighbouring boxes of a piece.
-            images_s: time of a box -> times of the first and last image that show the object; a track reaches from the
-                first image of its first box to the last one of its last. None = from box to box.
-        """
+        Raises InputError: an object has two boxes at one moment; length and width are swapped. ``speeds``: how
+        velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box -> times of the
+        first and last image that show the object; a track reaches from the first image of its first box to the last one
+        of its last. None = from box to box."""
         tracks: list[Track] = []
         split = 0
         for name, boxed in self._boxeds.items():

@@ -82,24 +82,16 @@ def equidistant(k1: float = 0, k2: float = 0, k3: float = 0, k4: float = 0) -> L
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageFit:
-    """How the recorded images of one camera become images of the scene. Safe to use from several threads.
-
-    Args:
-        camera: the scene's camera: pinhole, rectified, of the scene's size.
-        recorded: the camera as recorded: its size is that of the files.
-        note: what is done, for ``Source.notes``; empty if images are kept as they are.
-        table: where each pixel of the rectified image (recorded size) comes from; None if images are rectified already.
-    """
+    """How the recorded images of one camera become images of the scene. Safe to use from several threads."""
 
     camera: Camera
+    """The scene's: pinhole, rectified, of the scene's size."""
     recorded: Camera
+    """Its size is that of the files."""
     note: str
+    """What is done, for ``Source.notes``; empty if images are kept as they are."""
     table: _Table | None
-
-    @property
-    def keeps_bytes(self) -> bool:
-        """Whether images are taken as they are."""
-        return not self.note
+    """Where each pixel of the rectified image (recorded size) comes from; None if images are rectified already."""
 
     def image(self, image: NDArray[np.uint8] | Path | bytes, where: str = "") -> NDArray[np.uint8] | Path | bytes:
         """One recorded image as ``SceneWriter.add_frame`` wants it. Raises InputError: damaged, or not of the recorded
@@ -113,7 +105,7 @@ class ImageFit:
             ``image`` itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95
             for a JPEG, PNG for a PNG, grey for grey) for a file.
         """
-        if self.keeps_bytes:
+        if not self.note:
             return image
         if isinstance(image, np.ndarray):
             return self.pixels(image)

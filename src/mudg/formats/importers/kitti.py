@@ -104,9 +104,7 @@ def looks_like_kitti(source: Path) -> bool:
 
 
 def import_kitti(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a KITTI recording into the scene directory ``out``; see the module text for what is understood. Raises
-    UsageError: the folder holds several recordings and none was chosen. InputError: something is missing, malformed or
-    contradictory; nothing is left at ``out``."""
+    """Import one recording; see the module text for what is understood."""
     if not source.is_dir():
         raise InputError("KITTI folder does not exist", where=str(source), expected="a folder")
     files = find_files(source, options)

@@ -114,12 +114,8 @@ class Kitti360Box:
 
 def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
     """Boxes of the classes in ``LABEL_OF``, one by one. Raises InputError: missing, cut off, malformed, or it declares
-    XML entities.
-
-    Args:
-        path: the XML file.
-        left_out: filled with what is not read (``that are not cuboids``) and how often.
-    """
+    XML entities. ``path``: the XML file. ``left_out``: filled with what is not read (``that are not cuboids``) and how
+    often."""
     for number, item in enumerate(_objects(path)):
         where = f"{path}: object {number} ({item.tag})"
         if item.find("transform") is None:
@@ -420,15 +416,8 @@ def looks_like_kitti360(source: Path) -> bool:
 
 
 def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one KITTI-360 drive into the scene directory ``out``; see the module text for what is understood. Raises
-    UsageError: there are several drives and none was chosen, or an option does not apply. InputError: something is
-    missing, malformed or contradictory; nothing is left at ``out``.
-
-    Args:
-        source: the data set's folder, or ``data_2d_raw/<drive>`` in it.
-        options: ``sequence`` is the drive (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the
-            stereo pair.
-    """
+    """Import one drive of the data set's folder, or ``data_2d_raw/<drive>`` in it. ``options.sequence``: the drive
+    (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the stereo pair."""
     folders = _find(source, options)
     calibration = read_calibration(folders.root / "calibration")
     images = {name: common.numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}

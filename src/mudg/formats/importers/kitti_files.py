@@ -307,11 +307,7 @@ def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, 
 
     Line k is number k, and an empty line a number without a stamp. A file without empty lines that is too short for
     that, but has just one line per recorded file, counts those instead. Raises InputError: no times, or too few.
-
-    Args:
-        numbers: of the recorded files, increasing.
-        last: the highest number that is needed.
-    """
+    ``numbers``: of the recorded files, increasing. ``last``: the highest number that is needed."""
     lines = read_lines(path)
     stamps = {number: _stamp(line, f"{path}: line {number + 1}") for number, line in lines.items()}
     count = len(store.read_text(path).splitlines())

@@ -301,14 +301,8 @@ def files_of_ncore(source: Path, options: ImportOptions) -> LogFiles:
 
 
 def import_ncore(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one recording into the scene directory ``out``; see the module text for what is read. Raises UsageError:
-    there are several recordings and none was chosen, or no such camera. InputError: missing, damaged or contradictory;
-    nothing is left at ``out``. ResourceError: the package is not installed.
-
-    Args:
-        source: a folder of stores, one of them, or the ``.json`` that lists them.
-        options: ``sequence`` names the recording where a folder holds several (its beginning is enough).
-    """
+    """Import a recording: a folder of stores, one of them, or the ``.json`` that lists them. ``options.sequence``: its
+    name, or the beginning of it. ResourceError: the package is not installed."""
     common.refuse_options(options, "NCore", "poses", "boxes", "bridge_gaps")
     package()
     stores = _choose(source, options)
@@ -381,11 +375,8 @@ def _choose(source: Path, options: ImportOptions) -> tuple[Path, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _OpenRecording:
-    """An open recording: the package's readers, and its tree of frames.
-
-    Args:
-        knots_us: i64[K], times of all keys of poses. where: its folder. file: a file of it.
-    """
+    """An open recording: the package's readers, and its tree of frames. ``knots_us``: i64[K], times of all keys of
+    poses. where: its folder. file: a file of it."""
 
     reader: Any
     poses: Any

@@ -214,8 +214,7 @@ class NuplanLog:
         """Times (us) and poses f64[n, 4, 4] of the vehicle from ``first_us`` to ``last_us``; doubled times once."""
         times, poses = [], []
         for time_us, *pose in self.rows(
-            "SELECT timestamp, x, y, z, qw, qx, qy, qz FROM ego_pose "
-            "WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
+            "SELECT timestamp, x, y, z, qw, qx, qy, qz FROM ego_pose WHERE timestamp BETWEEN ? AND ? ORDER BY 1",
             (first_us, last_us),
         ):
             time_us = self._time(time_us, "ego_pose")
@@ -227,8 +226,7 @@ class NuplanLog:
     def images(self, first_us: int, last_us: int, blobs: Path) -> Iterator[tuple[bytes, Path, int]]:
         """Camera token, file below ``blobs``, and time (us), in order of time."""
         for camera, file, time_us in self.rows(
-            "SELECT camera_token, filename_jpg, timestamp FROM image "
-            "WHERE timestamp BETWEEN ? AND ? ORDER BY timestamp",
+            "SELECT camera_token, filename_jpg, timestamp FROM image WHERE timestamp BETWEEN ? AND ? ORDER BY 3",
             (first_us, last_us),
         ):
             time_us = self._time(time_us, "image")
@@ -380,15 +378,8 @@ def _databases(folder: Path) -> list[Path]:
 
 
 def import_nuplan(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one nuPlan log, or one scene of it, into the scene directory ``out``; see the module text. Raises
-    UsageError: there are several logs and none was chosen, or an option does not apply. InputError: something is
-    missing, malformed or contradictory; nothing is left at ``out``.
-
-    Args:
-        source: the log's ``.db`` file, or a folder of such files.
-        options: ``sequence`` is the log's name (where ``source`` is a folder), a scene's name, or ``LOG/SCENE``.
-            ``cameras`` default to all eight. ``poses``, ``boxes`` and ``untwist`` are refused.
-    """
+    """Import one log, a ``.db`` file or one of a folder of them, or one scene of it. ``options.sequence``: the log's
+    name (where ``source`` is a folder), a scene's name, or ``LOG/SCENE``; ``cameras`` default to all eight."""
     common.refuse_options(options, "nuPlan", "poses", "boxes", "untwist")
     path, scene = _find(source, options)
     with open_log(path) as opened:

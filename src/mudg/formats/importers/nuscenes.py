@@ -60,7 +60,7 @@ _OWN_VEHICLE_M: Final = ((-1.05, 1.05), (-2.2, 3.1), (-2.2, 0.5))
 
 
 def camera_from_intrinsics(name: str, size: tuple[int, int], intrinsics: Any, where: str) -> Camera:
-    """A camera from the release's 3x3 intrinsics, whose pixel centres are whole numbers: half a pixel is added here."""
+    """A camera from 3x3 intrinsics, whose pixel centres are whole numbers: half a pixel is added here."""
     try:
         k = np.array(intrinsics, np.float64)
     except (TypeError, ValueError) as error:
@@ -108,11 +108,10 @@ def point_times(xyz: NDArray[np.float32], rings: NDArray[np.float32]) -> NDArray
 
 # tables -------------------------------------------------------------------------------------------
 #
-# The tables of a nuScenes release: JSON arrays of flat records, read one record at a time.
-#
-# The tables of the full release are large (``sample_data.json`` and ``ego_pose.json`` hold 2.6 million records each).
-# What an import needs of them is one scene, so records are found by the value of one field while the file passes
-# through a buffer of a few megabytes; only matching records become Python objects.
+# JSON arrays of flat records, read one record at a time. The tables of the full release are large (``sample_data.json``
+# and ``ego_pose.json`` hold 2.6 million records each). What an import needs of them is one scene, so records are found
+# by the value of one field while the file passes through a buffer of a few megabytes; only matching records become
+# Python objects.
 _BUFFER_BYTES: Final = 1 << 22
 _MAX_RECORD_BYTES: Final = 1 << 20
 _FLAT_RECORD: Final = rb'\{(?:[^{}"]++|"(?:[^"\\]++|\\.)*+")*+\}'
@@ -360,16 +359,9 @@ def looks_like_nuscenes(source: Path) -> bool:
 
 
 def import_nuscenes(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one scene of a nuScenes release into the scene directory ``out``; see the module text for what is read.
-    Raises UsageError: the release holds several scenes and none was chosen, or there is no such scene or camera.
-    InputError: something is missing, malformed or contradictory; nothing is left at ``out``.
-
-    Args:
-        source: the release's root, or its table folder.
-        options: ``sequence`` names the scene (``scene-0061``, or ``v1.0-mini/scene-0061`` where several releases lie
-            side by side); ``frames`` counts images of the first chosen camera; ``cameras`` by either name, all six by
-            default.
-    """
+    """Import one scene of a release: its root, or its table folder. ``options.sequence``: the scene (``scene-0061``, or
+    ``v1.0-mini/scene-0061`` where several releases lie side by side); ``cameras`` by either name, all six by
+    default."""
     if not source.is_dir():
         raise InputError("nuScenes folder does not exist", where=str(source), expected="a folder")
     common.refuse_untwist(options, "nuScenes", str(source))
@@ -570,9 +562,8 @@ def _read_tracks(folder: Path, samples: Mapping[str, int], zero_us: int) -> tupl
         width, length, height = numbers(row, "size", 3, annotations.where)  # in this order in the tables
         where = f"{annotations.where}: record {row['token']!r}"
         time_s = (samples[row["sample_token"]] - zero_us) / MICROSECONDS
-        tracks.add(
-            instance["token"], label, time_s, (length, width, height), _pose(row, annotations.where), where=where
-        )
+        pose = _pose(row, annotations.where)
+        tracks.add(instance["token"], label, time_s, (length, width, height), pose, where=where)
     return tracks.tracks()
 
 

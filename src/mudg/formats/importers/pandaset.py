@@ -338,14 +338,7 @@ def _sequences(source: Path) -> list[str]:
 
 
 def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import one PandaSet sequence into the scene directory ``out``; see the module text for what is understood. Raises
-    UsageError: the folder holds several sequences and none was chosen, or an option does not apply. InputError:
-    something is missing, malformed or contradictory; nothing is left at ``out``.
-
-    Args:
-        source: a sequence's folder, or the folder of sequences with ``options.sequence``.
-        options: ``cameras`` default to all six; ``poses``, ``boxes`` and ``untwist`` are refused.
-    """
+    """Import a sequence's folder, or the one that ``options.sequence`` names; ``cameras`` default to all six."""
     common.refuse_options(options, "PandaSet", "poses", "boxes", "untwist")
     folder = _chosen_sequence(source, options)
     cameras = {name: CAMERAS[name] for name in CAMERAS if (folder / "camera" / name).is_dir()}

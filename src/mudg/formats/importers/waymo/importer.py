@@ -20,6 +20,7 @@ is that of the image recorded with the same pose (the front camera's).
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,29 +28,21 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+from scipy.spatial.transform import Rotation
 
 from mudg.base import log
 from mudg.base.errors import InputError, UsageError
-from mudg.base.geometry import transform_points, yaw_matrix, yaw_of
-from mudg.base.types import EgoPath, Scene, Source
+from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, transform_points, yaw_matrix, yaw_of
+from mudg.base.palette import ID, UNLABELLED
+from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints
 from mudg.formats.importers import common
 from mudg.formats.importers.common import ImportOptions, LogFiles
 from mudg.formats.importers.drive_log import SceneContent, SceneImage, SceneSweep, write_scene
-from mudg.formats.importers.images import ImageFit, fit_images
-from mudg.formats.importers.waymo import records as tracks
-from mudg.formats.importers.waymo import sensors
+from mudg.formats.importers.images import ImageFit, Lens, brown_conrady, fit_images
+from mudg.formats.importers.waymo import records
 from mudg.formats.importers.waymo.logs import REQUIRED, ParquetLog, TfrecordLog
-from mudg.formats.importers.waymo.records import (
-    CAMERAS,
-    TOP,
-    FrameContent,
-    FrameRecord,
-    LaserScan,
-    Matrix,
-    Moment,
-    TimedBoxes,
-    WaymoLog,
-)
+from mudg.formats.importers.waymo.records import CAMERAS, TOP, FrameRecord, LaserCalibration, Matrix, WaymoLog
 
 LICENCE: Final = "Waymo Dataset License Agreement for Non-Commercial Use (non-commercial; attribution)"
 DOUBTFUL_PROJECTION_PX: Final = 30.0
@@ -72,56 +65,37 @@ def looks_like_waymo(source: Path) -> bool:
 
 
 def import_waymo(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a Waymo log into the scene directory ``out``; see the module text for what is understood. Raises
-    UsageError: several logs and none was chosen, or an option that this format cannot honour. InputError: something is
-    missing, damaged or contradictory; nothing is left at ``out``.
-
-    Args:
-        source: a TFRecord file, a folder of them, or a folder with the component folders of format 2.
-        out: scene directory to make.
-        options: ``sequence`` chooses a log where there are several, by its name or a part of it.
-    """
-    _refuse_options(options)
+    """Import a TFRecord file, one of a folder of them, or a log of a folder with the component folders of format 2.
+    ``options.sequence``: a log's name or a part of it."""
+    common.refuse_options(options, "Waymo", "poses", "boxes")
+    if options.untwist == "no":
+        what, expected = (
+            "Waymo scans cannot be left twisted",
+            "auto or yes: points carry the pose they were measured at",
+        )
+        raise UsageError(what, where="--untwist", got="no", remedy="leave it out", expected=expected)
     waymo = open_log(source, options)
     frames, notes = _usable_frames(waymo, options)
     cameras = _chosen_cameras(waymo, options, source)
     plan = _plan(waymo, frames, cameras, options, notes)
     moment, note = _moment_of_boxes(waymo, frames, plan)
     notes += [note] if note else []
-    found, track_notes = tracks.build_tracks([plan.timed_boxes(frame, moment) for frame in frames])
+    found, track_notes = records.build_tracks([plan.timed_boxes(frame, moment) for frame in frames])
     notes += track_notes
     check = _check_projections(waymo, frames, cameras, plan)
     notes += [check] if check else []
     numbers = {frame.number: index for index, frame in enumerate(frames)}
 
-    def items() -> Iterator[tuple[FrameRecord, FrameContent]]:
-        return ((frame, waymo.read(frame, cameras)) for frame in frames)
+    items = ((frame, waymo.read(frame, cameras)) for frame in frames)
 
-    def convert(item: tuple[FrameRecord, FrameContent]) -> Iterator[SceneImage | SceneSweep]:
+    def convert(item: tuple[FrameRecord, records.FrameContent]) -> Iterator[SceneImage | SceneSweep]:
         return _converted(plan, item[0], item[1], numbers[item[0].number])
 
     path = EgoPath(np.array([plan.pose_s(f) for f in frames]), np.stack([plan.world_from_vehicle(f) for f in frames]))
     origin = Source("waymo", LICENCE, None, tuple(notes))
-    content = SceneContent(
-        waymo.name,
-        origin,
-        plan.fits,
-        items(),
-        convert,
-        lambda item: item[0].where,
-        path,
-        lambda: (found, ()),
-        len(frames),
-    )
+    fits, tracks, total = plan.fits, lambda: (found, ()), len(frames)
+    content = SceneContent(waymo.name, origin, fits, items, convert, lambda item: item[0].where, path, tracks, total)
     return write_scene(content, out, options)
-
-
-def _refuse_options(options: ImportOptions) -> None:
-    common.refuse_options(options, "Waymo", "poses", "boxes")
-    if options.untwist == "no":
-        what = "Waymo scans cannot be left twisted"
-        expected = "auto or yes: points carry the pose they were measured at"
-        raise UsageError(what, where="--untwist", got="no", remedy="leave it out", expected=expected)
 
 
 def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
@@ -195,9 +169,8 @@ def _usable_frames(waymo: WaymoLog, options: ImportOptions) -> tuple[list[FrameR
         raise InputError(what, where=waymo.frames[0].where, got=f"the first has no {', '.join(missing[0][1])}")
     notes = [f"Waymo Open Dataset, {waymo.form}" + (f"; {waymo.conditions}" if waymo.conditions else "")]
     if missing:
-        notes.append(
-            f"frames {', '.join(str(frame.number) for frame, _ in missing[:8])} lack images or scans and were left out"
-        )
+        some = ", ".join(str(frame.number) for frame, _ in missing[:8])
+        notes.append(f"frames {some} lack images or scans and were left out")
     if not lasers:
         log.warn("waymo: no range images found: the scene has images only, and there is nothing to fuse")
         notes.append("no range images: images and boxes only")
@@ -209,21 +182,15 @@ def _usable_frames(waymo: WaymoLog, options: ImportOptions) -> tuple[list[FrameR
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Plan:
-    """What is known before the bulky parts are read.
-
-    Args:
-        world_from_global: f64[4, 4].
-        start_us: zero of the scene's clock, microseconds of the epoch.
-        turn: when the columns of the top LiDAR were measured.
-        middle_s: frame number -> seconds after the frame's timestamp to which the frame's pose belongs.
-        fits: camera name -> what happens to its images.
-    """
+    """What is known before the bulky parts are read."""
 
     waymo: WaymoLog
     world_from_global: Matrix
     start_us: int
-    turn: sensors.TurnClock
+    """Zero of the scene's clock, microseconds of the epoch."""
+    turn: TurnClock
     middle_s: Mapping[int, float]
+    """Frame number -> seconds after the frame's timestamp to which the frame's pose belongs."""
     fits: Mapping[str, ImageFit]
 
     def pose_s(self, frame: FrameRecord) -> float:
@@ -240,28 +207,29 @@ class _Plan:
 
     def taken(self, frame: FrameRecord, camera: str) -> tuple[Matrix, float]:
         """Where an image was taken (world from camera, f64[4, 4]), and when in the scene's clock."""
-        pose, time_s = sensors.middle_of_exposure(frame.shots[camera])
-        world_from_cam = self.world_from_global @ pose @ sensors.vehicle_from_cam(self.waymo.cameras[camera])
+        pose, time_s = middle_of_exposure(frame.shots[camera])
+        world_from_cam = self.world_from_global @ pose @ vehicle_from_cam(self.waymo.cameras[camera])
         return world_from_cam, time_s - self.start_us / 1e6
 
-    def timed_boxes(self, frame: FrameRecord, moment: Moment) -> TimedBoxes:
+    def timed_boxes(self, frame: FrameRecord, moment: records.Moment) -> records.TimedBoxes:
         """The frame's boxes with the times for which they hold."""
         late = np.zeros(len(frame.boxes))
         if moment == "start":
             late -= self.middle_s[frame.number]
         elif moment == "seen":
             late = self.seen_s(frame) - self.middle_s[frame.number]
-        times = [sensors.middle_of_exposure(shot)[1] - self.start_us / 1e6 for shot in frame.shots.values()]
+        times = [middle_of_exposure(shot)[1] - self.start_us / 1e6 for shot in frame.shots.values()]
         images_s = (min(times), max(times)) if times else None
-        return TimedBoxes(self.pose_s(frame), self.world_from_vehicle(frame), frame.boxes, late, frame.where, images_s)
+        return records.TimedBoxes(
+            self.pose_s(frame), self.world_from_vehicle(frame), frame.boxes, late, frame.where, images_s
+        )
 
     def seen_s(self, frame: FrameRecord) -> NDArray[np.float64]:
-        """When the top LiDAR looked at each box, seconds after the timestamp; without one, the moment of the frame's
-        pose."""
+        """When the top LiDAR looked at each box, seconds after the timestamp; without one, the moment of the pose."""
         if TOP not in frame.lasers or not frame.boxes:
             return np.full(len(frame.boxes), self.middle_s[frame.number])
         centres = np.array([box.centre for box in frame.boxes])
-        return self.turn.after_timestamp_s(sensors.turn_of_direction(centres, self.waymo.lasers[TOP]))
+        return self.turn.after_timestamp_s(turn_of_direction(centres, self.waymo.lasers[TOP]))
 
 
 def _plan(
@@ -275,45 +243,39 @@ def _plan(
     world_from_global = yaw_matrix(-yaw)
     world_from_global[:3, 3] = -(world_from_global[:3, :3] @ place)
     x, y, z = (float(v) for v in place)
-    notes.append(
-        f"the world's origin is ({x!r}, {y!r}, {z!r}) in the data set's world, its x axis turned by {yaw!r} rad"
-    )
+    place = f"({x!r}, {y!r}, {z!r})"
+    notes.append(f"the world's origin is {place} in the data set's world, its x axis turned by {yaw!r} rad")
     turn = _measure_turn(waymo, frames)
     if turn.measured:
-        notes.append(
-            f"the top LiDAR's turns begin {turn.start_s * 1e3:.1f} ms after the timestamp and take"
-            f" {turn.duration_s * 1e3:.1f} ms"
-        )
+        start, duration = f"{turn.start_s * 1e3:.1f} ms", f"{turn.duration_s * 1e3:.1f} ms"
+        notes.append(f"the top LiDAR's turns begin {start} after the timestamp and take {duration}")
     middles = {frame.number: _pose_moment(frame, turn) for frame in frames}
     assumed = sum(not exact for _, exact in middles.values())
     if assumed:
         notes.append(f"the pose of {assumed} frames is no image's: taken to belong to the middle of the LiDAR's turn")
     fits: dict[str, ImageFit] = {}
     for name in cameras:
-        camera, lens = sensors.recorded_camera(waymo.cameras[name], first.shots[name])
+        camera, lens = recorded_camera(waymo.cameras[name], first.shots[name])
         fits[name] = fit_images(camera, options, lens)
         notes += [fits[name].note] if fits[name].note else []
     rolling = sorted({waymo.cameras[name].direction for name, fit in fits.items() if fit.camera.readout_s > 0})
     if rolling:
-        ways = ", ".join(sensors.DIRECTIONS[d] if 0 <= d < len(sensors.DIRECTIONS) else f"code {d}" for d in rolling)
+        ways = ", ".join(DIRECTIONS[d] if 0 <= d < len(DIRECTIONS) else f"code {d}" for d in rolling)
         notes.append(f"shutters roll {ways}; a view is that of the middle of the exposure")
-    return _Plan(
-        waymo, world_from_global, start_us, turn, {number: value for number, (value, _) in middles.items()}, fits
-    )
+    middle_s = {number: value for number, (value, _) in middles.items()}
+    return _Plan(waymo, world_from_global, start_us, turn, middle_s, fits)
 
 
-def _pose_moment(frame: FrameRecord, turn: sensors.TurnClock) -> tuple[float, bool]:
-    """When the vehicle was at the frame's pose, in seconds after the frame's timestamp, and whether that was recorded.
-
-    An image with the same pose has its time. Without one, the middle of the LiDAR's turn is assumed.
-    """
+def _pose_moment(frame: FrameRecord, turn: TurnClock) -> tuple[float, bool]:
+    """When the vehicle was at the frame's pose, in seconds after the frame's timestamp, and whether that was recorded:
+    an image with the same pose has its time. Without one, the middle of the LiDAR's turn is assumed."""
     for shot in frame.shots.values():
         if np.abs(shot.global_from_vehicle - frame.global_from_vehicle).max() < _SAME_POSE:
             return shot.pose_time_s - frame.timestamp_us / 1e6, True
     return float(turn.after_timestamp_s(np.array(0.5))), False
 
 
-def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> sensors.TurnClock:
+def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> TurnClock:
     """The top LiDAR's timing, from the frames during which the vehicle moved most."""
     moved = [
         (float(np.linalg.norm(after.global_from_vehicle[:3, 3] - before.global_from_vehicle[:3, 3])), index + 1)
@@ -328,20 +290,20 @@ def _measure_turn(waymo: WaymoLog, frames: Sequence[FrameRecord]) -> sensors.Tur
         poses = waymo.pixel_poses(frames[index])
         if poses is not None:
             places = np.stack([path[time] for time in times])
-            found = sensors.measure_turn(poses, frames[index].timestamp_us / 1e6, times, places)
+            found = measure_turn(poses, frames[index].timestamp_us / 1e6, times, places)
             turns += [found] if found is not None else []
-    return sensors.median_clock(turns)
+    return median_clock(turns)
 
 
-def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan) -> tuple[Moment, str]:
+def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan) -> tuple[records.Moment, str]:
     """For which moment the boxes of this log hold, by the points in the boxes of its fast objects; and a note."""
     boxes = [plan.timed_boxes(frame, "pose") for frame in frames]
     fast = [
-        {box_id: v for box_id, v in speeds.items() if np.linalg.norm(v) >= tracks.FAST_M_S}
-        for speeds in tracks.velocities(boxes)
+        {box_id: v for box_id, v in speeds.items() if np.linalg.norm(v) >= records.FAST_M_S}
+        for speeds in records.velocities(boxes)
     ]
     order = sorted(range(len(frames)), key=lambda index: -len(fast[index]))[:_MOMENT_FRAMES]
-    counts = np.zeros(len(tracks.MOMENTS), np.int64)
+    counts = np.zeros(len(records.MOMENTS), np.int64)
     for index in sorted(order):
         frame = frames[index]
         if not fast[index] or TOP not in frame.lasers:
@@ -353,42 +315,42 @@ def _moment_of_boxes(waymo: WaymoLog, frames: Sequence[FrameRecord], plan: _Plan
         for box, late in zip(frame.boxes, plan.seen_s(frame), strict=True):
             if box.id in fast[index]:
                 velocity = fast[index][box.id] @ rotation
-                counts += tracks.points_inside(box, velocity, xyz, seen, float(late), plan.middle_s[frame.number])
+                counts += records.points_inside(box, velocity, xyz, seen, float(late), plan.middle_s[frame.number])
     if not counts.any():
         return ("seen" if any(TOP in frame.lasers for frame in frames) else "pose"), ""
-    moment = tracks.choose_moment(counts)
+    moment = records.choose_moment(counts)
     texts = {"seen": "when the LiDAR passes them", "start": "at the timestamp", "pose": "at the frame's pose"}
-    tallies = ", ".join(f"{count} {texts[name]}" for name, count in zip(tracks.MOMENTS, counts, strict=True))
+    tallies = ", ".join(f"{count} {texts[name]}" for name, count in zip(records.MOMENTS, counts, strict=True))
     return moment, f"boxes hold {texts[moment]} (points that lie in boxes of fast objects if they do: {tallies})"
 
 
 # --- writing --------------------------------------------------------------------------------------
 
 
-def _converted(plan: _Plan, frame: FrameRecord, content: FrameContent, index: int) -> Iterator[SceneImage | SceneSweep]:
+def _converted(
+    plan: _Plan, frame: FrameRecord, content: records.FrameContent, index: int
+) -> Iterator[SceneImage | SceneSweep]:
     for name, fit in plan.fits.items():
         where = f"{frame.where}: image of camera {name}"
         labels: dict[str, NDArray[Any]] = {}
         if name in content.panoptic:
             panoptic = content.panoptic[name]
-            ids = sensors.panoptic_ids(panoptic, fit.recorded, f"{where}: panoptic label")
-            labels = sensors.panoptic_labels(fit.ids(ids), panoptic.divisor)
+            ids = panoptic_ids(panoptic, fit.recorded, f"{where}: panoptic label")
+            labels = panoptic_labels(fit.ids(ids), panoptic.divisor)
         pose, time_s = plan.taken(frame, name)
         yield SceneImage(name, index, time_s, pose, content.images[name], where, labels)
     for name, scan in content.scans.items():
         points, where = _points(plan, frame, name, scan), f"frame {frame.number}: LiDAR {name}"
         late_s = plan.dt_s(frame, points.turn) if name == TOP else np.zeros(len(points.turn))
         pose = plan.world_from_vehicle(frame) @ plan.waymo.lasers[name].vehicle_from_lidar
-        sweep = sensors.sweep_points(points, late_s)
+        sweep = sweep_points(points, late_s)
         yield SceneSweep(f"lidar_{name}", index, plan.pose_s(frame), pose, sweep, where)
         if points.without_pose:
             log.info(f"waymo: {where}: {points.without_pose} points have no pose and were left out")
 
 
-def _points(plan: _Plan, frame: FrameRecord, name: str, scan: LaserScan) -> sensors.ScanPoints:
-    return sensors.points_of_scan(
-        scan, plan.waymo.lasers[name], frame.global_from_vehicle, f"{frame.where}: LiDAR {name}"
-    )
+def _points(plan: _Plan, frame: FrameRecord, name: str, scan: records.LaserScan) -> ScanPoints:
+    return points_of_scan(scan, plan.waymo.lasers[name], frame.global_from_vehicle, f"{frame.where}: LiDAR {name}")
 
 
 def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: Sequence[str], plan: _Plan) -> str:
@@ -396,10 +358,10 @@ def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: 
     frame = frames[0]
     if not frame.lasers:
         return ""
-    shots = {name: (waymo.cameras[name], sensors.middle_of_exposure(frame.shots[name])[0]) for name in cameras}
+    shots = {name: (waymo.cameras[name], middle_of_exposure(frame.shots[name])[0]) for name in cameras}
     errors: dict[str, list[NDArray[np.float64]]] = {}
     for name, scan in waymo.read(frame, (), projections=True).scans.items():
-        found = sensors.projection_errors(
+        found = projection_errors(
             _points(plan, frame, name, scan), scan, waymo.lasers[name], frame.global_from_vehicle, shots
         )
         for camera, off in found.items():
@@ -409,8 +371,323 @@ def _check_projections(waymo: WaymoLog, frames: Sequence[FrameRecord], cameras: 
         return ""
     texts = ", ".join(f"{camera} {median:.1f} px" for camera, median in medians.items())
     if max(medians.values()) > DOUBTFUL_PROJECTION_PX:
-        log.warn(
-            f"waymo: points do not fall where the log says they do ({texts}, median); are calibrations and poses of"
-            " this log?"
-        )
+        doubt = f"points do not fall where the log says they do ({texts}, median)"
+        log.warn(f"waymo: {doubt}; are calibrations and poses of this log?")
     return f"points fall where the log says they do, up to (median, first frame): {texts}"
+
+
+# --- sensors --------------------------------------------------------------------------------------
+#
+# A range image has a row per beam (the highest first) and a column per step of the turn. Column 0 looks backwards, the
+# middle column along the vehicle's x axis, and time runs with the columns: the sensor turns clockwise seen from above
+# (the side-left camera is triggered before the front one, the side-right one after). Azimuth is counter-clockwise in
+# the LiDAR's own frame, whose x axis may point anywhere; the heading of that frame is taken off.
+#
+# The cameras' shutters roll from left to right within some 45 ms; scenes know one pose per image. That pose is the
+# vehicle's at the moment the middle column was exposed: the recorded one, up to a few milliseconds older or newer,
+# carried on with the recorded velocity. Source: the message description and the data set's conversion.
+TURN_S: Final = 0.1
+_MIN_MOTION_M: Final = 0.3
+_MAX_FIT_ERROR_S: Final = 0.004
+_CLOCK_ERROR_S: Final = 0.0025
+_MIN_ROWS_SHARE: Final = 0.05
+MAX_POSE_SHIFT_S: Final = 0.05
+DIRECTIONS: Final = ("in an unknown direction", "downwards", "left to right", "upwards", "right to left", "not at all")
+"""How a camera reads its image, by the data set's number."""
+
+GLOBAL_SHUTTER: Final = 5
+EGO_CLASS: Final = 1
+SKY_CLASS: Final = 25
+TRAIN_IDS: Final[Mapping[int, int]] = {
+    int(number): ID[name]
+    for number, name in common.name_table(
+        """car: 2; truck: 3, 5; bus: 4; bicycle: 6; motorcycle: 7; person: 9; rider: 10, 11; pole: 15; traffic sign: 17;
+        traffic light: 18; building: 19; road: 20, 21, 22; sidewalk: 23; vegetation: 24; sky: 25"""
+    ).items()
+}
+"""Class of a camera segmentation label -> train id. A cyclist is labelled together with the bicycle; other large
+vehicles count as trucks. Without a counterpart, so unlabelled: undefined, own vehicle, trailer, bird, animal, cone,
+carried object, other ground, other things."""
+
+
+# --- range images ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScanPoints:
+    """Points of one turn in the LiDAR's frame at the frame's pose, and where each came from in the range images."""
+
+    xyz: NDArray[np.float64]
+    """f64[N, 3] metres."""
+    intensity: NDArray[np.float32]
+    """f32[N] as recorded, from 0 on without a limit."""
+    turn: NDArray[np.float64]
+    """f64[N], part of the turn (0..1) after which the point was measured."""
+    pixel: NDArray[np.int64]
+    """i64[N], index into the flattened range image; ``image`` i64[N] says which return."""
+    image: NDArray[np.int64]
+    without_pose: int
+    """Points that were left out because no pose was recorded for their pixel."""
+
+
+def points_of_scan(
+    scan: records.LaserScan, laser: LaserCalibration, global_from_vehicle: Matrix, where: str
+) -> ScanPoints:
+    """All points of a scan, first returns and then second ones.
+
+    Where pixels have poses of their own (top LiDAR), a point is carried from where the vehicle was when it was measured
+    to where the vehicle was at the frame's pose. The other LiDARs are recorded as if all was measured at the frame's
+    pose. Raises InputError: shapes that contradict each other, or values that are not finite."""
+    shape = scan.returns[0].shape[:2]
+    if any(image.shape[:2] != shape for image in (*scan.returns, *scan.projections)) or (
+        scan.poses is not None and scan.poses.shape[:2] != shape
+    ):
+        raise InputError("range images of one scan differ in size", where=where, expected=str(list(shape)))
+    rows, columns = shape
+    inclination = laser.beam_inclinations(rows, where)
+    turn = (np.arange(columns) + 0.5) / columns
+    azimuth = np.pi - 2 * np.pi * turn - heading_of(laser)
+    parts: list[tuple[NDArray, ...]] = []
+    without_pose = 0
+    for index, image in enumerate(scan.returns):
+        pixel = np.flatnonzero(image[..., 0].reshape(-1) > 0)
+        values = image.reshape(-1, image.shape[2])[pixel, :2]
+        if not np.isfinite(values).all():
+            what = "range image holds values that are not finite"
+            got = f"{int((~np.isfinite(values).all(1)).sum())} of {len(values)} points"
+            raise InputError(what, where=f"{where}: return {index + 1}", got=got)
+        row, column = np.divmod(pixel, columns)
+        reach = values[:, 0].astype(np.float64)
+        flat = reach * np.cos(inclination)[row]
+        xyz = np.stack(
+            [flat * np.cos(azimuth)[column], flat * np.sin(azimuth)[column], reach * np.sin(inclination)[row]], 1
+        )
+        if scan.poses is not None:
+            poses = scan.poses.reshape(-1, 6)[pixel]
+            known = np.isfinite(poses).all(1) & (poses != 0).any(1)
+            without_pose += int((~known).sum())
+            pixel, values, column, xyz, poses = pixel[known], values[known], column[known], xyz[known], poses[known]
+            xyz = _carried(xyz, poses.astype(np.float64), laser.vehicle_from_lidar, global_from_vehicle)
+        parts.append((xyz, values[:, 1], turn[column], pixel, np.full(len(pixel), index)))
+    xyz, intensity, turns, pixels, images = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return ScanPoints(xyz, intensity, turns, pixels, images, without_pose)
+
+
+def heading_of(laser: LaserCalibration) -> float:
+    """Angle of the LiDAR's x axis in the vehicle, radians counter-clockwise from forward."""
+    return float(np.arctan2(laser.vehicle_from_lidar[1, 0], laser.vehicle_from_lidar[0, 0]))
+
+
+def turn_of_direction(xyz_vehicle: NDArray[np.float64], laser: LaserCalibration) -> NDArray[np.float64]:
+    """Part of the turn (0..1) at which the LiDAR looks towards points f64[N, 3] of the vehicle frame."""
+    offset = xyz_vehicle[:, :2] - laser.vehicle_from_lidar[:2, 3]
+    return (0.5 - np.arctan2(offset[:, 1], offset[:, 0]) / (2 * np.pi)) % 1.0
+
+
+def _carried(
+    xyz: NDArray[np.float64], poses: NDArray[np.float64], vehicle_from_lidar: Matrix, global_from_vehicle: Matrix
+) -> NDArray[np.float64]:
+    """Points of the LiDAR's frame, each with the pose (roll, pitch, yaw, x, y, z) of its moment, to the frame's moment.
+
+    Rotations are about z, then y, then x of the vehicle. Positions are taken relative to the frame's pose first: they
+    are tens of kilometres, and their differences centimetres.
+    """
+    x, y, z = (xyz @ vehicle_from_lidar[:3, :3].T + vehicle_from_lidar[:3, 3]).T
+    (cr, cp, cy), (sr, sp, sy) = np.cos(poses[:, :3].T), np.sin(poses[:, :3].T)
+    y, z = cr * y - sr * z, sr * y + cr * z
+    x, z = cp * x + sp * z, cp * z - sp * x
+    x, y = cy * x - sy * y, sy * x + cy * y
+    moved = np.stack([x, y, z], 1) + (poses[:, 3:] - global_from_vehicle[:3, 3])
+    in_vehicle = moved @ global_from_vehicle[:3, :3]
+    return (in_vehicle - vehicle_from_lidar[:3, 3]) @ vehicle_from_lidar[:3, :3]
+
+
+def sweep_points(points: ScanPoints, dt_s: NDArray[np.float64]) -> SweepPoints:
+    """Points as a sweep holds them; tanh, as is customary, brings intensity, which has no limit, to 0..1."""
+    intensity = np.tanh(np.maximum(points.intensity.astype(np.float64), 0))
+    return SweepPoints(points.xyz.astype(np.float32), intensity.astype(np.float32), dt_s.astype(np.float32))
+
+
+# --- time -----------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class TurnClock:
+    """When the columns of the top LiDAR are measured: ``start_s`` after the frame's timestamp the turn begins, and
+    lasts ``duration_s``. ``measured``: found by comparing pixel poses with the vehicle's path; else the nominal
+    turn."""
+
+    start_s: float = 0.0
+    duration_s: float = TURN_S
+    measured: bool = False
+
+    def after_timestamp_s(self, turn: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Seconds after the frame's timestamp for parts of the turn (0..1)."""
+        return self.start_s + turn * self.duration_s
+
+
+def measure_turn(
+    poses: NDArray[np.float32], timestamp_s: float, path_times_s: NDArray[np.float64], path_xyz: NDArray[np.float64]
+) -> tuple[float, float] | None:
+    """Start (after the timestamp) and duration of a turn from where the vehicle was when each column was measured.
+
+    Args:
+        poses: f32[H, W, 6], pixel poses of the frame.
+        timestamp_s: of the frame.
+        path_times_s, path_xyz: f64[T], f64[T, 3]: places of the vehicle at known times around the frame, in time order.
+
+    Returns:
+        Seconds, or None where the vehicle moves too little, or its path does not explain the columns.
+    """
+    known = (poses != 0).any(2) & np.isfinite(poses).all(2)
+    columns = np.flatnonzero(known.sum(0) >= max(1, _MIN_ROWS_SHARE * len(known)))
+    if len(columns) < 10 or len(path_times_s) < 3:
+        return None
+    places = np.stack([poses[known[:, c], c, 3:].astype(np.float64).mean(0) for c in columns])
+    direction = path_xyz[-1] - path_xyz[0]
+    length = float(np.linalg.norm(direction))
+    if length < _MIN_MOTION_M:
+        return None
+    direction /= length
+    along_path = (path_xyz - path_xyz[0]) @ direction
+    along = (places - path_xyz[0]) @ direction
+    inside = (along >= along_path[0]) & (along <= along_path[-1])
+    if (np.diff(along_path) <= 0).any() or np.ptp(along) < _MIN_MOTION_M or inside.sum() < 10:
+        return None
+    times = np.interp(along[inside], along_path, path_times_s) - timestamp_s
+    turn = (columns[inside] + 0.5) / poses.shape[1]
+    duration, start = np.polyfit(turn, times, 1)
+    error = float(np.sqrt(np.mean((start + duration * turn - times) ** 2)))
+    if error > _MAX_FIT_ERROR_S or not 0.5 * TURN_S < abs(duration) < 2 * TURN_S:
+        return None
+    return float(start), float(duration)
+
+
+def median_clock(turns: Sequence[tuple[float, float]]) -> TurnClock:
+    """The clock of a log from the turns that could be measured.
+
+    Where they agree with the nominal turn within what the measurement can tell, and without any, it is the nominal one.
+    """
+    if not turns:
+        return TurnClock()
+    start, duration = (float(value) for value in np.median(np.array(turns), axis=0))
+    if max(abs(start), abs(start + duration - TURN_S)) <= _CLOCK_ERROR_S:
+        return TurnClock()
+    return TurnClock(start, duration, True)
+
+
+# --- cameras --------------------------------------------------------------------------------------
+
+
+def recorded_camera(calibration: records.CameraCalibration, shot: records.CameraShot) -> tuple[Camera, Lens | None]:
+    """The camera as recorded, and its lens (None where the coefficients are all zero)."""
+    fx, fy, cx, cy, *coefficients = calibration.intrinsic
+    name, width, height = calibration.name, calibration.width, calibration.height
+    readout = 0.0 if calibration.direction == GLOBAL_SHUTTER else readout_s(shot)
+    camera = Camera(name, width, height, fx, fy, cx, cy, tuple(coefficients), readout)
+    return camera, brown_conrady(*coefficients) if any(coefficients) else None
+
+
+def readout_s(shot: records.CameraShot) -> float:
+    """Time between the exposure of the first column and of the last one."""
+    return max(0.0, shot.done_s - shot.trigger_s - shot.shutter_s) if shot.done_s else 0.0
+
+
+def middle_of_exposure(shot: records.CameraShot) -> tuple[Matrix, float]:
+    """Vehicle pose f64[4, 4] in the global frame when the middle column was exposed, and this time in seconds of the
+    epoch.
+
+    Without recorded exposure times or velocity, or where the two are far apart, pose and time are those recorded.
+    """
+    middle = (shot.trigger_s + shot.done_s) / 2 if shot.done_s else shot.pose_time_s
+    late = middle - shot.pose_time_s
+    if shot.velocity is None or not shot.done_s or abs(late) > MAX_POSE_SHIFT_S:
+        return shot.global_from_vehicle, shot.pose_time_s
+    pose = shot.global_from_vehicle.copy()
+    pose[:3, :3] = Rotation.from_rotvec(shot.velocity[3:] * late).as_matrix() @ pose[:3, :3]
+    pose[:3, 3] += shot.velocity[:3] * late
+    return pose, middle
+
+
+def vehicle_from_cam(calibration: records.CameraCalibration) -> Matrix:
+    """Camera axes of this package (x right, y down, z forward) to the vehicle, f64[4, 4]."""
+    return calibration.vehicle_from_camera @ CAM_FROM_EGO_AXES.T
+
+
+def panoptic_ids(label: records.Panoptic, camera: Camera, where: str) -> NDArray[np.int32]:
+    """Values of a panoptic label, i32[H, W]: class * divisor + instance. Raises InputError: no 16-bit PNG of the
+    camera's size, or no divisor."""
+    if label.divisor < 1:
+        what = "panoptic label has no divisor"
+        raise InputError(what, where=where, expected="a positive number", got=str(label.divisor))
+    try:
+        with Image.open(io.BytesIO(label.png), formats=("PNG",)) as image:
+            if image.size != (camera.width, camera.height) or not image.mode.startswith("I"):
+                what = "panoptic label is not a 16-bit image of its camera's size"
+                got = f"{image.width}x{image.height}, mode {image.mode}"
+                raise InputError(what, where=where, expected=f"{camera.width}x{camera.height}, 16 bits", got=got)
+            return np.array(image).astype(np.int32)
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
+        raise InputError("panoptic label cannot be decoded (is it cut off?)", where=where, got=str(error)) from error
+
+
+def panoptic_labels(ids: NDArray[np.int32], divisor: int) -> dict[str, NDArray[Any]]:
+    """Labels of one image: ``semantics`` u8[H, W] train ids, ``instance`` i32[H, W], ``sky`` and ``ego`` bool[H, W].
+
+    An instance is called class * divisor + number, 0 where there is none: it means the same thing in this one image
+    only.
+    """
+    classes, numbers = np.divmod(ids, divisor)
+    table = np.full(256, UNLABELLED, np.uint8)
+    table[list(TRAIN_IDS)] = list(TRAIN_IDS.values())
+    return {
+        "semantics": table[np.clip(classes, 0, 255)],
+        "instance": np.where(numbers > 0, ids, 0).astype(np.int32),
+        "sky": classes == SKY_CLASS,
+        "ego": classes == EGO_CLASS,
+    }
+
+
+def projection_errors(
+    points: ScanPoints,
+    scan: records.LaserScan,
+    laser: LaserCalibration,
+    global_from_vehicle: Matrix,
+    cameras: Mapping[str, tuple[records.CameraCalibration, Matrix]],
+) -> dict[str, NDArray[np.float64]]:
+    """How far our projections of a scan lie from those recorded with it, in pixels of the recorded images.
+
+    The recorded ones follow the rolling shutter, ours hold for the middle column, so while the vehicle moves some
+    pixels are normal; wrong calibrations, poses or conversions show as hundreds.
+
+    Args:
+        points, scan, laser: a scan with projections, and its points.
+        global_from_vehicle: pose that the points are given for.
+        cameras: name -> calibration and the vehicle's pose in the global frame at the middle of the exposure.
+
+    Returns:
+        Camera name -> distances f64[n], for cameras with points.
+    """
+    xyz_vehicle = transform_points(laser.vehicle_from_lidar, points.xyz)
+    errors: dict[str, NDArray[np.float64]] = {}
+    for index, projections in enumerate(scan.projections):
+        chosen = points.image == index
+        recorded = projections.reshape(-1, 6)[points.pixel[chosen]]
+        for half in (recorded[:, :3], recorded[:, 3:]):
+            for number, name in records.CAMERAS.items():
+                if name not in cameras or not (here := half[:, 0] == number).any():
+                    continue
+                calibration, pose = cameras[name]
+                cam_from_vehicle = invert(pose @ vehicle_from_cam(calibration)) @ global_from_vehicle
+                uv = _recorded_pixels(calibration, transform_points(cam_from_vehicle, xyz_vehicle[chosen][here]))
+                off = np.linalg.norm(uv - (half[here, 1:] + 0.5), axis=1)
+                errors[name] = np.concatenate([errors.get(name, np.zeros(0)), off])
+    return errors
+
+
+def _recorded_pixels(calibration: records.CameraCalibration, xyz_cam: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pixels f64[N, 2] of the recorded (distorted) image; infinite behind the camera."""
+    fx, fy, cx, cy, *coefficients = calibration.intrinsic
+    z = np.where(xyz_cam[:, 2:] > 0.1, xyz_cam[:, 2:], np.nan)
+    uv = brown_conrady(*coefficients)(xyz_cam[:, :2] / z) * [fx, fy] + [cx, cy]
+    return np.where(np.isfinite(uv), uv, np.inf)

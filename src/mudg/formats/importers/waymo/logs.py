@@ -43,16 +43,9 @@ on."""
 # --- checksums ------------------------------------------------------------------------------------
 
 
-def _make_table() -> tuple[int, ...]:
-    table = []
-    for value in range(256):
-        for _ in range(8):
-            value = (value >> 1) ^ (_POLYNOMIAL_REFLECTED if value & 1 else 0)
-        table.append(value)
-    return tuple(table)
-
-
-_TABLE: Final = _make_table()
+_TABLE: Final = list(range(256))
+for _ in range(8):
+    _TABLE[:] = [(value >> 1) ^ (_POLYNOMIAL_REFLECTED if value & 1 else 0) for value in _TABLE]
 
 
 def crc32c(data: bytes | memoryview) -> int:
@@ -179,12 +172,8 @@ def _cut_off(where: str, got: str) -> InputError:
 
 class TfrecordLog:
     """A TFRecord file. Opening it reads the wanted records once, compares all their checksums and keeps what is small.
-    Raises InputError: the file or a wanted record is damaged, or no Waymo frame.
-
-    Args:
-        path: the file.
-        wanted: record numbers (first, end) to keep, or None.
-    """
+    Raises InputError: the file or a wanted record is damaged, or no Waymo frame. ``path``: the file. ``wanted``: record
+    numbers (first, end) to keep, or None."""
 
     form = "v1 TFRecord"
 
@@ -216,9 +205,8 @@ class TfrecordLog:
         context = parse_message(content, CONTEXT, where)
         self.name = str(context.get("name", "")) or self._path.stem
         cameras, lasers = _named(context["cameras"], CAMERAS), _named(context["lasers"], LASERS)
-        self.cameras: Mapping[str, records.CameraCalibration] = {
-            name: _camera(name, item, where) for name, item in cameras
-        }
+        self.cameras: Mapping[str, records.CameraCalibration]
+        self.cameras = {name: _camera(name, item, where) for name, item in cameras}
         self.lasers: Mapping[str, records.LaserCalibration] = {name: _laser(name, item, where) for name, item in lasers}
         stats = context.get("stats", {})
         self.conditions = ", ".join(stats[key] for key in ("time_of_day", "weather", "location") if stats.get(key))
@@ -286,23 +274,18 @@ def _laser(name: str, item: dict[str, Any], where: str) -> records.LaserCalibrat
 
 
 def _shot(item: dict[str, Any], where: str) -> records.CameraShot:
-    velocity = item.get("velocity")
-    return records.CameraShot(
-        records.transform_of(_sixteen(item, "pose"), f"{where}: pose"),
-        item.get("pose_time_s", 0.0),
-        None if velocity is None else np.array([velocity.get(key, 0.0) for key in records.VELOCITY]),
-        item.get("shutter_s", 0.0),
-        item.get("trigger_s", 0.0),
-        item.get("done_s", 0.0),
-    )
+    velocity, pose = item.get("velocity"), records.transform_of(_sixteen(item, "pose"), f"{where}: pose")
+    if velocity is not None:
+        velocity = np.array([velocity.get(key, 0.0) for key in records.VELOCITY])
+    times = (item.get(key, 0.0) for key in ("shutter_s", "trigger_s", "done_s"))
+    return records.CameraShot(pose, item.get("pose_time_s", 0.0), velocity, *times)
 
 
 def _frame_record(message: dict[str, Any], number: int, where: str) -> FrameRecord:
     timestamp_us = message.get("timestamp_us", 0)
     images = [(name, item) for name, item in _named(message["images"], CAMERAS) if item.get("image")]
-    shots = records.by_name(
-        ((name, _shot(item, f"{where}: image of camera {name}")) for name, item in images), timestamp_us, where
-    )
+    shots = ((name, _shot(item, f"{where}: image of camera {name}")) for name, item in images)
+    shots = records.by_name(shots, timestamp_us, where)
     lasers = records.each_once([name for name, item in _named(message["lasers"], LASERS) if _has_ranges(item)], where)
     boxes = []
     for item in message["labels"]:
@@ -324,76 +307,60 @@ def _scan(item: dict[str, Any], where: str, projections: bool) -> LaserScan:
     return LaserScan(returns, poses, found)
 
 
-# Waymo logs of format 2: a folder per component (``camera_image``, ``lidar``, ...) with one Parquet file per log.
-
-
+# --- format 2: a folder per component (``camera_image``, ``lidar``, ...) with one Parquet file per log ----------------
+#
+# Rows are read one at a time and in the order of the file, so that memory stays at one page of a column; the keys of
+# all rows are read first and tell which row belongs to which frame.
 _SEGMENT: Final = "key.segment_context_name"
 _TIME: Final = "key.frame_timestamp_micros"
 _CAMERA: Final = "key.camera_name"
 _LASER: Final = "key.laser_name"
 _OBJECT: Final = "key.laser_object_id"
 _INTRINSIC: Final = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
+
+
+def _component(title: str, names: str = "", **parts: str) -> tuple[str, tuple[str, ...]]:
+    """Title and columns of a component: plain ``names``, and those of the parts ``part.name``."""
+    inner = (f"{part}.{name}" for part, within in parts.items() for name in within.split())
+    return f"{title}Component", (*names.split(), *inner)
+
+
 _VELOCITY: Final = tuple(f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz")
 _EXPOSURE: Final = tuple(
     f"rolling_shutter_params.{name}" for name in ("shutter", "camera_trigger_time", "camera_readout_done_time")
 )
 _BOX: Final = (*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading")
 _STREAM_BYTES: Final = 1 << 20
-_TWO_RETURNS: Final = tuple(f"range_image_return{number}.{part}" for number in (1, 2) for part in ("values", "shape"))
+_TWO_RETURNS: Final = {"range_image_return1": "values shape", "range_image_return2": "values shape"}
 OFFICIAL: Final[Mapping[str, tuple[str, tuple[str, ...]]]] = {
-    "camera_image": ("CameraImageComponent", ("image", "pose.transform", "pose_timestamp", *_VELOCITY, *_EXPOSURE)),
-    "camera_calibration": (
-        "CameraCalibrationComponent",
-        (
-            *(f"intrinsic.{name}" for name in _INTRINSIC),
-            "extrinsic.transform",
-            "width",
-            "height",
-            "rolling_shutter_direction",
-        ),
+    "camera_image": _component(
+        "CameraImage", " ".join(("image pose.transform pose_timestamp", *_VELOCITY, *_EXPOSURE))
     ),
-    "camera_segmentation": (
-        "CameraSegmentationLabelComponent",
-        (
-            "panoptic_label",
-            "panoptic_label_divisor",
-            "sequence_id",
-            "num_cameras_covered",
-            *(
-                f"instance_id_to_global_id_mapping.{name}"
-                for name in ("local_instance_ids", "global_instance_ids", "is_tracked")
-            ),
-        ),
+    "camera_calibration": _component(
+        "CameraCalibration",
+        "extrinsic.transform width height rolling_shutter_direction",
+        intrinsic=" ".join(_INTRINSIC),
     ),
-    "lidar": ("LiDARComponent", _TWO_RETURNS),
-    "lidar_box": (
-        "LiDARBoxComponent",
-        (
-            "type",
-            *_BOX,
-            *(f"{name}.{axis}" for name in ("speed", "acceleration") for axis in "xyz"),
-            "num_lidar_points_in_box",
-            "num_top_lidar_points_in_box",
-            "difficulty_level.detection",
-            "difficulty_level.tracking",
-        ),
+    "camera_segmentation": _component(
+        "CameraSegmentationLabel",
+        "panoptic_label panoptic_label_divisor sequence_id num_cameras_covered",
+        instance_id_to_global_id_mapping="local_instance_ids global_instance_ids is_tracked",
     ),
-    "lidar_calibration": (
-        "LiDARCalibrationComponent",
-        ("extrinsic.transform", *(f"beam_inclination.{name}" for name in ("min", "max", "values"))),
+    "lidar": _component("LiDAR", **_TWO_RETURNS),
+    "lidar_box": _component(
+        "LiDARBox",
+        " ".join(("type num_lidar_points_in_box num_top_lidar_points_in_box", *_BOX)),
+        speed="x y z",
+        acceleration="x y z",
+        difficulty_level="detection tracking",
     ),
-    "lidar_camera_projection": ("LiDARCameraProjectionComponent", _TWO_RETURNS),
-    "lidar_pose": ("LiDARPoseComponent", _TWO_RETURNS[:2]),
-    "stats": (
-        "StatsComponent",
-        (
-            "time_of_day",
-            "location",
-            "weather",
-            *(f"{of}_object_counts.{part}" for of in ("lidar", "camera") for part in ("types", "counts")),
-        ),
+    "lidar_calibration": _component("LiDARCalibration", "extrinsic.transform", beam_inclination="min max values"),
+    "lidar_camera_projection": _component("LiDARCameraProjection", **_TWO_RETURNS),
+    "lidar_pose": _component("LiDARPose", range_image_return1="values shape"),
+    "stats": _component(
+        "Stats", "time_of_day location weather", lidar_object_counts="types counts", camera_object_counts="types counts"
     ),
-    "vehicle_pose": ("VehiclePoseComponent", ("world_from_vehicle.transform",)),
+    "vehicle_pose": _component("VehiclePose", "world_from_vehicle.transform"),
 }
 """Folders that are read -> name of the component, and its columns, read or not. Source: the data set's published
 components."""
@@ -407,12 +374,8 @@ REQUIRED: Final = ("camera_image", "camera_calibration", "vehicle_pose")
 class ParquetLog:
     """One log of a format-2 folder. Opening it reads all small tables and the keys of the large ones. Raises
     InputError: a component is missing, or a table is damaged or contradictory. ResourceError: pyarrow is not installed.
-
-    Args:
-        root: folder with the component folders.
-        segment: name of the log, that of its files.
-        wanted: frames (first, end) in the order of time, or None.
-    """
+    ``root``: folder with the component folders. ``segment``: name of the log, that of its files. ``wanted``: frames
+    (first, end) in the order of time, or None."""
 
     form = "v2 Parquet"
 
@@ -537,9 +500,8 @@ class ParquetLog:
         if not path.is_file():
             return None
         table, (prefix, columns) = ParquetTable(path), OFFICIAL[component]
-        note_unknown(
-            f"{component}/*.parquet", table.names, frozenset({*_KEYS, *(f"[{prefix}].{name}" for name in columns)})
-        )
+        known = frozenset((*_KEYS, *(f"[{prefix}].{name}" for name in columns)))
+        note_unknown(f"{component}/*.parquet", table.names, known)
         return table
 
     def _need(self, component: str) -> ParquetTable:
@@ -647,9 +609,8 @@ class ParquetTable:
         with arrow_files(self.path):
             if next_row > row or next_row < self._starts[group]:
                 groups = list(range(group, self._file.num_row_groups))
-                stream = self._file.iter_batches(
-                    batch_size=1, row_groups=groups, columns=list(names), use_threads=False
-                )
+                columns = list(names)
+                stream = self._file.iter_batches(batch_size=1, row_groups=groups, columns=columns, use_threads=False)
                 next_row = int(self._starts[group])
             batch = None
             while next_row <= row:

@@ -76,14 +76,9 @@ class LaserCalibration:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraShot:
-    """When and where an image was taken.
-
-    Args:
-        global_from_vehicle: at ``pose_time_s``, seconds of the epoch.
-        velocity: linear m/s and angular rad/s, both in the global frame, f64[6]; None if not recorded.
-        shutter_s, trigger_s, done_s: exposure of a column, start of the exposure and end of the readout; 0 if not
-            recorded.
-    """
+    """When and where an image was taken. ``global_from_vehicle``: at ``pose_time_s``, seconds of the epoch.
+    ``velocity``: linear m/s and angular rad/s, both in the global frame, f64[6]; None if not recorded. ``shutter_s``,
+    ``trigger_s``, ``done_s``: exposure of a column, start of the exposure and end of the readout; 0 if not recorded."""
 
     global_from_vehicle: Matrix
     pose_time_s: float
@@ -95,8 +90,7 @@ class CameraShot:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WaymoBox:
-    """A box in the vehicle frame of its frame: centre, (length, width, height) in metres, heading in radians about
-    z."""
+    """A box in the vehicle frame of its frame: centre, (length, width, height) in metres, heading in radians."""
 
     id: str
     label: str
@@ -107,41 +101,32 @@ class WaymoBox:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FrameRecord:
-    """The facts of a frame that fit into memory for a whole log.
-
-    Args:
-        number: place in the log, counted from 0.
-        timestamp_us: microseconds of the epoch at which the top LiDAR began its turn.
-        global_from_vehicle: the pose that boxes and compensated points refer to; not the pose at ``timestamp_us``.
-        shots: camera name -> its shot; cameras without an image are not listed.
-        lasers: names of the LiDARs with a range image.
-        where: file and record, for errors.
-    """
+    """The facts of a frame that fit into memory for a whole log."""
 
     number: int
+    """Place in the log, counted from 0."""
     timestamp_us: int
+    """Microseconds of the epoch at which the top LiDAR began its turn."""
     global_from_vehicle: Matrix
+    """The pose that boxes and compensated points refer to; not the pose at ``timestamp_us``."""
     shots: Mapping[str, CameraShot]
+    """By camera; those without an image are not listed."""
     lasers: tuple[str, ...]
+    """Names of the LiDARs with a range image."""
     boxes: tuple[WaymoBox, ...]
     where: str
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LaserScan:
-    """One turn of a LiDAR.
-
-    Args:
-        returns: range images f32[H, W, 4]: range in metres (not above 0: none), intensity, elongation, no-label flag.
-        poses: of the top LiDAR, f32[H, W, 6]: roll, pitch, yaw, x, y, z of global from vehicle when the pixel was
-            measured.
-        projections: for each return, i64[H, W, 6]: camera number, x, y of the first two images a point falls into; or
-            empty.
-    """
+    """One turn of a LiDAR."""
 
     returns: Sequence[NDArray[np.float32]]
+    """Range images f32[H, W, 4]: range in metres (not above 0: none), intensity, elongation, no-label flag."""
     poses: NDArray[np.float32] | None = None
+    """Of the top LiDAR's pixels, f32[H, W, 6]: roll, pitch, yaw, x, y, z of global from vehicle at their time."""
     projections: Sequence[NDArray[np.int64]] = ()
+    """A return's i64[H, W, 6]: camera number, x, y of the first two images a point falls into; or empty."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -295,8 +280,6 @@ def int_image(packed: bytes | memoryview, channels: int, where: str) -> NDArray[
 
 # tracks -------------------------------------------------------------------------------------------
 #
-# Boxes per frame -> tracks in the world, and the question for which moment a box holds.
-#
 # The points of a frame were measured over a tenth of a second, in which a car drives two metres. A box drawn around
 # points holds where its object was when the LiDAR passed it; a description of the data set speaks of the frame's start
 # instead. So the log is asked: under which of the ``Moment`` do most points near fast objects lie inside their boxes?
@@ -315,22 +298,17 @@ _SPEED_REACH: Final = 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TimedBoxes:
-    """The boxes of one frame.
-
-    Args:
-        time_s: moment the frame's points are given for.
-        world_from_vehicle: f64[4, 4] at this moment.
-        late_s: for each box, seconds after ``time_s`` for which it holds.
-        where: file and record, for errors.
-        images_s: times of the frame's first and last image, which need the objects where they were then.
-    """
+    """The boxes of one frame."""
 
     time_s: float
+    """Moment the frame's points are given for."""
     world_from_vehicle: Matrix
     boxes: Sequence[WaymoBox]
     late_s: NDArray[np.float64]
+    """For each box, seconds after ``time_s`` for which it holds."""
     where: str
     images_s: tuple[float, float] | None = None
+    """Times of the frame's first and last image, which need the objects where they were then."""
 
 
 def build_tracks(frames: Sequence[TimedBoxes]) -> tuple[list[Track], list[str]]:
@@ -411,15 +389,13 @@ def points_inside(
 
 
 def choose_moment(counts: NDArray[np.int64]) -> Moment:
-    """The moment under which most points lie inside their boxes, sums i64[3]; ``seen`` unless another is clearly
-    better."""
+    """The moment under which most points (i64[3]) lie inside their boxes; ``seen`` unless another is clearly better."""
     best = int(counts.argmax())
     return MOMENTS[best] if counts[best] > _CLEAR_GAIN * counts[0] else MOMENTS[0]
 
 
 def velocities(frames: Sequence[TimedBoxes]) -> list[dict[str, NDArray[np.float64]]]:
-    """Velocity of every box in the world by id, f64[3] m/s, for each frame: between the frames beside it; zero for
-    single boxes."""
+    """World velocity of every box by id, f64[3] m/s, in each frame: from the frames beside it; 0 for single boxes."""
     centres = [{box.id: (frame.world_from_vehicle @ [*box.centre, 1.0])[:3] for box in frame.boxes} for frame in frames]
     found: list[dict[str, NDArray[np.float64]]] = []
     for index, here in enumerate(centres):
@@ -435,23 +411,20 @@ def velocities(frames: Sequence[TimedBoxes]) -> list[dict[str, NDArray[np.float6
     return found
 
 
-# Reading protocol-buffer messages by a table of the fields that are wanted; no generated code.
-
-
+# --- protocol-buffer messages by a table of the fields that are wanted; no generated code -----------------------------
+#
+# A message is a row of fields, each a key (number and wire type, a varint) and a value. ``Message`` lists what to keep;
+# all else is skipped by its wire type. Values of bytes fields are views of the input: nothing large is copied.
+#
+# Source: the protocol-buffer encoding guide; the field numbers of the Waymo Open Dataset's published descriptions.
 Kind = Literal["int", "float", "double", "bytes", "text", "message", "doubles", "floats", "ints", "messages"]
 
 _VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
 _WIRE: Final[Mapping[Kind, int]] = {
-    "int": _VARINT,
-    "ints": _VARINT,
-    "double": _FIXED64,
-    "doubles": _FIXED64,
-    "float": _FIXED32,
-    "floats": _FIXED32,
-    "bytes": _BYTES,
-    "text": _BYTES,
-    "message": _BYTES,
-    "messages": _BYTES,
+    **dict.fromkeys(("int", "ints"), _VARINT),
+    **dict.fromkeys(("double", "doubles"), _FIXED64),
+    **dict.fromkeys(("float", "floats"), _FIXED32),
+    **dict.fromkeys(("bytes", "text", "message", "messages"), _BYTES),
 }
 _DTYPE: Final[Mapping[Kind, str]] = {"doubles": "<f8", "floats": "<f4"}
 _MAX_FIELDS: Final = 4_000_000
@@ -468,8 +441,7 @@ class Field:
 
 @dataclass(frozen=True, slots=True)
 class Message:
-    """A message description: its name, for errors; field number -> field; and numbers of the data set's fields that are
-    not kept."""
+    """A message description; ``passed``: numbers of the data set's fields that are not kept."""
 
     name: str
     fields: Mapping[int, Field]
@@ -510,8 +482,11 @@ def parse_message(data: bytes | memoryview, message: Message, where: str) -> dic
         else:
             values[field.name] = value
     for number, found in parts.items():
-        field = message.fields[number]
-        values[field.name] = found if field.kind == "messages" else _concatenated(field.kind, found)
+        name, kind = message.fields[number].name, message.fields[number].kind
+        if kind == "messages" or len(found) == 1:
+            values[name] = found if kind == "messages" else found[0]
+        else:
+            values[name] = np.concatenate(found) if found else np.zeros(0, _DTYPE.get(kind, np.int64))
     return values
 
 
@@ -585,12 +560,6 @@ class _MessageReader:
         return raw if field.kind == "bytes" else struct.unpack("<d" if field.kind == "double" else "<f", raw)[0]
 
 
-def _concatenated(kind: Kind, found: list[NDArray[Any]]) -> NDArray[Any]:
-    if len(found) == 1:
-        return found[0]
-    return np.concatenate(found) if found else np.zeros(0, _DTYPE.get(kind, np.int64))
-
-
 def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
     """A row of varints, all at once: i64[n]; negative numbers take ten bytes each. Raises InputError: the last number
     is cut off, or one is longer than ten bytes."""
@@ -613,87 +582,55 @@ def unpack_varints(data: bytes | memoryview, where: str) -> NDArray[np.int64]:
 # --- the messages of the data set -----------------------------------------------------------------
 
 
-def _message(title: str, /, *passed: int, **fields: tuple[Any, ...]) -> Message:
-    """A description from fields by name: number, kind and, for messages, their description. ``passed``: numbers of
-    official fields that are not kept."""
-    return Message(title, {number: Field(field, *kind) for field, (number, *kind) in fields.items()}, frozenset(passed))
+def _message(title: str, fields: str, passed: str = "", **inner: Message) -> Message:
+    """A description from ``name number kind, ...``; where the name is one of ``inner``, that is its description.
+    ``passed``: numbers of official fields that are not kept."""
+    rows = (row.split() for row in fields.split(","))
+    wanted = {int(number): Field(name, kind, inner.get(name)) for name, number, kind in rows}
+    return Message(title, wanted, frozenset(map(int, passed.split())))
 
 
-_TRANSFORM = _message("Transform", values=(1, "doubles"))
+_TRANSFORM = _message("Transform", "values 1 doubles")
 _CAMERA_CALIBRATION = _message(
     "CameraCalibration",
-    name=(1, "int"),
-    intrinsic=(2, "doubles"),
-    extrinsic=(3, "message", _TRANSFORM),
-    width=(4, "int"),
-    height=(5, "int"),
-    direction=(6, "int"),
+    "name 1 int, intrinsic 2 doubles, extrinsic 3 message, width 4 int, height 5 int, direction 6 int",
+    extrinsic=_TRANSFORM,
 )
 _LASER_CALIBRATION = _message(
     "LaserCalibration",
-    name=(1, "int"),
-    inclinations=(2, "doubles"),
-    inclination_min=(3, "double"),
-    inclination_max=(4, "double"),
-    extrinsic=(5, "message", _TRANSFORM),
+    "name 1 int, inclinations 2 doubles, inclination_min 3 double, inclination_max 4 double, extrinsic 5 message",
+    extrinsic=_TRANSFORM,
 )
-_STATS = _message("Stats", 1, 5, time_of_day=(2, "text"), location=(3, "text"), weather=(4, "text"))
 CONTEXT: Final = _message(
     "Context",
-    name=(1, "text"),
-    cameras=(2, "messages", _CAMERA_CALIBRATION),
-    lasers=(3, "messages", _LASER_CALIBRATION),
-    stats=(4, "message", _STATS),
+    "name 1 text, cameras 2 messages, lasers 3 messages, stats 4 message",
+    cameras=_CAMERA_CALIBRATION,
+    lasers=_LASER_CALIBRATION,
+    stats=_message("Stats", "time_of_day 2 text, location 3 text, weather 4 text", "1 5"),
 )
-_VELOCITY = _message(
-    "Velocity",
-    v_x=(1, "float"),
-    v_y=(2, "float"),
-    v_z=(3, "float"),
-    w_x=(4, "double"),
-    w_y=(5, "double"),
-    w_z=(6, "double"),
-)
-_PANOPTIC = _message("CameraSegmentationLabel", 3, 4, 5, divisor=(1, "int"), png=(2, "bytes"))
 _CAMERA_IMAGE = _message(
     "CameraImage",
-    name=(1, "int"),
-    image=(2, "bytes"),
-    pose=(3, "message", _TRANSFORM),
-    velocity=(4, "message", _VELOCITY),
-    pose_time_s=(5, "double"),
-    shutter_s=(6, "double"),
-    trigger_s=(7, "double"),
-    done_s=(8, "double"),
-    panoptic=(10, "message", _PANOPTIC),
+    "name 1 int, image 2 bytes, pose 3 message, velocity 4 message, pose_time_s 5 double, shutter_s 6 double, "
+    "trigger_s 7 double, done_s 8 double, panoptic 10 message",
+    pose=_TRANSFORM,
+    velocity=_message("Velocity", "v_x 1 float, v_y 2 float, v_z 3 float, w_x 4 double, w_y 5 double, w_z 6 double"),
+    panoptic=_message("CameraSegmentationLabel", "divisor 1 int, png 2 bytes", "3 4 5"),
 )
-_RANGE_IMAGE = _message("RangeImage", 1, 5, 6, ranges=(2, "bytes"), projections=(3, "bytes"), poses=(4, "bytes"))
-_LASER = _message("Laser", name=(1, "int"), return1=(2, "message", _RANGE_IMAGE), return2=(3, "message", _RANGE_IMAGE))
+_RANGE_IMAGE = _message("RangeImage", "ranges 2 bytes, projections 3 bytes, poses 4 bytes", "1 5 6")
 _BOX = _message(
-    "Box",
-    x=(1, "double"),
-    y=(2, "double"),
-    z=(3, "double"),
-    width=(4, "double"),
-    length=(5, "double"),
-    height=(6, "double"),
-    heading=(7, "double"),
+    "Box", "x 1 double, y 2 double, z 3 double, width 4 double, length 5 double, height 6 double, heading 7 double"
 )
-_LABEL = _message("Label", 2, 5, 6, 7, 8, 9, 10, 11, 12, 13, box=(1, "message", _BOX), type=(3, "int"), id=(4, "text"))
 FRAME: Final = _message(
     "Frame",
-    7,
-    8,
-    9,
-    10,
-    11,
-    context=(1, "bytes"),
-    timestamp_us=(2, "int"),
-    pose=(3, "message", _TRANSFORM),
-    images=(4, "messages", _CAMERA_IMAGE),
-    lasers=(5, "messages", _LASER),
-    labels=(6, "messages", _LABEL),
+    "context 1 bytes, timestamp_us 2 int, pose 3 message, images 4 messages, lasers 5 messages, labels 6 messages",
+    "7 8 9 10 11",
+    pose=_TRANSFORM,
+    images=_CAMERA_IMAGE,
+    lasers=_message(
+        "Laser", "name 1 int, return1 2 message, return2 3 message", return1=_RANGE_IMAGE, return2=_RANGE_IMAGE
+    ),
+    labels=_message("Label", "box 1 message, type 3 int, id 4 text", "2 5 6 7 8 9 10 11 12 13", box=_BOX),
 )
-_SHAPE = _message("MatrixShape", dims=(1, "ints"))
-MATRIX_FLOAT: Final = _message("MatrixFloat", data=(1, "floats"), shape=(2, "message", _SHAPE))
-MATRIX_INT: Final = _message("MatrixInt32", data=(1, "ints"), shape=(2, "message", _SHAPE))
+_SHAPE = _message("MatrixShape", "dims 1 ints")
+MATRIX_FLOAT: Final = _message("MatrixFloat", "data 1 floats, shape 2 message", shape=_SHAPE)
+MATRIX_INT: Final = _message("MatrixInt32", "data 1 ints, shape 2 message", shape=_SHAPE)
