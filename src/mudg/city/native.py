@@ -66,12 +66,8 @@ class CityHandle:
         got = (len(road), len(light), records.shape[1])
         expected = tuple(self._lib.mudg_city_number_counts(which) for which in range(3))
         if got != expected:
-            raise ResourceError(
-                "the native library belongs to another version of the city",
-                expected=str(got),
-                got=str(expected),
-                remedy="build it again",
-            )
+            what = "the native library belongs to another version of the city"
+            raise ResourceError(what, expected=str(got), got=str(expected), remedy="build it again")
         self._handle = self._lib.mudg_city_create(
             records.ctypes.data,
             len(records),

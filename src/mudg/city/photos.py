@@ -51,9 +51,8 @@ def draw_photos(folder: Path, seed: int) -> list[tuple[int, Pixels, float]]:
         InputError: no such folder, or a file in it cannot be read.
     """
     if not folder.is_dir():
-        raise InputError(
-            "there is no such folder of textures", where=str(folder), expected="textures/*.jpg and sky/*.hdr"
-        )
+        what = "there is no such folder of textures"
+        raise InputError(what, where=str(folder), expected="textures/*.jpg and sky/*.hdr")
     rng = seeds.numpy_rng(seed, 0, "city photographs")
     files = sorted(p for p in folder.glob("textures/*") if p.suffix.lower() in (".jpg", ".png"))
     found: list[tuple[int, Pixels, float]] = []

@@ -139,27 +139,20 @@ class CityWorld:
         """
         recipe = source.recipe
         if recipe is None or "city" not in recipe:
-            raise InputError(
-                "the scene was not generated, so there is no exact truth", where="source.recipe", got=source.dataset
-            )
+            what = "the scene was not generated, so there is no exact truth"
+            raise InputError(what, where="source.recipe", got=source.dataset)
         if recipe.get("generator_version") != GENERATOR_VERSION:
-            raise InputError(
-                "the scene was made by another version of the generator",
-                where="source.recipe.generator_version",
-                expected=str(GENERATOR_VERSION),
-                got=str(recipe.get("generator_version")),
-                remedy="generate it again",
-            )
+            what, where = "the scene was made by another version of the generator", "source.recipe.generator_version"
+            got = str(recipe.get("generator_version"))
+            raise InputError(what, where=where, expected=str(GENERATOR_VERSION), got=got, remedy="generate it again")
         if not isinstance(recipe["city"], Mapping):
-            raise InputError(
-                "the recipe of a generated city is no object", where="source.recipe.city", got=str(recipe["city"])
-            )
+            what = "the recipe of a generated city is no object"
+            raise InputError(what, where="source.recipe.city", got=str(recipe["city"]))
         try:
             return cls(build(CityConfig, recipe["city"], "source.recipe.city"))
         except UsageError as error:  # nobody asked for these settings: a file states them
-            raise InputError(
-                error.what, where=error.where, expected=error.expected, got=error.got, remedy="generate it again"
-            ) from error
+            what, remedy = error.what, "generate it again"
+            raise InputError(what, where=error.where, expected=error.expected, got=error.got, remedy=remedy) from error
 
     def rearranged(self, keys: Mapping[str, NDArray[np.float64] | None]) -> CityWorld:
         """The same world, light and shadows included, with some vehicles or people elsewhere or gone.
@@ -283,11 +276,8 @@ class CityWorld:
     def _world_from_ego(self, time_s: float) -> NDArray[np.float64]:
         pose = self._ego_path.pose_at(time_s)
         if pose is None:
-            raise UsageError(
-                "time lies outside the log",
-                expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s",
-                got=f"{time_s} s",
-            )
+            what = "time lies outside the log"
+            raise UsageError(what, expected=f"{self._ego_times[0]:.3f}..{self._ego_times[-1]:.3f} s", got=f"{time_s} s")
         return pose
 
     def _object_keys_at(self, times_s: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -295,11 +285,8 @@ class CityWorld:
         times, keys = self._key_times, self._keys
         first, last = self.span_s
         if times_s.min() < first - 1e-6 or times_s.max() > last + 1e-6:
-            raise UsageError(
-                "time lies outside the log",
-                expected=f"{first:.3f}..{last:.3f} s",
-                got=f"{times_s.min()}..{times_s.max()} s",
-            )
+            what = "time lies outside the log"
+            raise UsageError(what, expected=f"{first:.3f}..{last:.3f} s", got=f"{times_s.min()}..{times_s.max()} s")
         at = np.clip((times_s - first) * self.config.rate_hz, 0, len(times) - 1)
         nearest = np.rint(at)
         at = np.where(np.abs(at - nearest) < 1e-6 * self.config.rate_hz, nearest, at)

@@ -338,12 +338,8 @@ class Exported:
         """The parts of a source, with an edit script carried out."""
         recorded = None if parts.scene is None else read_scene(parts.scene)
         if not parts.fits and script is not None:
-            raise UsageError(
-                "an edit script is carried out on a fit",
-                where="--edits",
-                got=str(parts.scene),
-                remedy="give the folder of a run",
-            )
+            what = "an edit script is carried out on a fit"
+            raise UsageError(what, where="--edits", got=str(parts.scene), remedy="give the folder of a run")
         if not parts.fits:
             return cls(parts, None, recorded)
         model = load_model(parts.model) if recorded is None else model_of_scene(parts.model, recorded)
@@ -398,18 +394,15 @@ def write_file(config: ExportConfig, name: str, given: Exported, file: ResultFil
 def _refuse_settings(config: ExportConfig, name: str) -> None:
     moves = name in FORMATS and "motion" in FORMATS[name].carries
     if config.animated and config.time_s is not None:
-        raise UsageError(
-            "a file holds one moment or the motion", where="--animated, --time-s", remedy="leave one of them out"
-        )
+        what = "a file holds one moment or the motion"
+        raise UsageError(what, where="--animated, --time-s", remedy="leave one of them out")
     if config.animated and not moves:
         able = ", ".join(key for key, one in FORMATS.items() if "motion" in one.carries)
-        raise UsageError(
-            "this format cannot hold motion", where="--animated", got=name, expected=able, remedy="or give --time-s"
-        )
+        what = "this format cannot hold motion"
+        raise UsageError(what, where="--animated", got=name, expected=able, remedy="or give --time-s")
     if name in _ALL_MOMENTS and config.time_s is not None:
-        raise UsageError(
-            "a file of this format holds all moments", where="--time-s", got=name, remedy="leave it out, or export ply"
-        )
+        what = "a file of this format holds all moments"
+        raise UsageError(what, where="--time-s", got=name, remedy="leave it out, or export ply")
     set_here = [
         key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(ExportConfig(), key)
     ]
@@ -432,22 +425,15 @@ def _refuse_name(out: Path, name: str) -> None:
 def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
     """The scene in the axes of the format, and the moment."""
     if given.model is None:
-        raise InputError(
-            "there is no fitted scene",
-            where=str(given.parts.scene),
-            expected="a folder made by `mudg fit` or `mudg run`",
-        )
+        what = "there is no fitted scene"
+        raise InputError(what, where=str(given.parts.scene), expected="a folder made by `mudg fit` or `mudg run`")
     moment = config.time_s if config.time_s is not None else middle_s(given.model, given.log)
     scene = splat_scene(given.model, moment, config.nodes)
     whole = "motion" in FORMATS[name].carries and config.time_s is None
     if not scene.nodes or not (whole or any(node.at(moment) is not None and len(node.cloud) for node in scene.nodes)):
         asked = ", ".join(config.nodes) or "everything"
-        raise UsageError(
-            "there is nothing to export",
-            where="--nodes, --time-s",
-            got=f"{asked} at {moment:g} s",
-            remedy="choose a time at which the object is there",
-        )
+        what, got = "there is nothing to export", f"{asked} at {moment:g} s"
+        raise UsageError(what, where="--nodes, --time-s", got=got, remedy="choose a time at which the object is there")
     if config.sky == "sphere":
         scene = with_sky_sphere(scene)
     elif config.sky == "none":
@@ -518,11 +504,8 @@ def _messages(_config: ExportConfig, name: str, given: Exported, out: Path) -> d
 def recorded_scene(given: Exported) -> Scene:
     """The recorded scene of what is exported; InputError if none is known."""
     if given.log is None:
-        raise InputError(
-            "cameras belong to a scene, and none is known here",
-            where=str(given.parts.model),
-            remedy="give --scene SCENE, or a folder made by `mudg run`",
-        )
+        what, where = "cameras belong to a scene, and none is known here", str(given.parts.model)
+        raise InputError(what, where=where, remedy="give --scene SCENE, or a folder made by `mudg run`")
     if given.edited:
         log.warn(
             "export: an edit script changes boxes and the vehicle's path here; pictures and sweeps stay as recorded"

@@ -69,16 +69,11 @@ def refuse_other_settings(config: ImportConfig) -> None:
     if config.kind == "scene" and (config.label, config.length_m) != (usual.label, usual.length_m):
         raise UsageError("a scene takes no settings of objects", where="--label, --length-m", remedy="leave them out")
     if len(config.axes) == 3 and not axes.known(config.axes):
-        raise UsageError(
-            "these letters name no three axes",
-            where="--axes",
-            expected="one of L and R, one of U and D, one of F and B",
-            got=config.axes,
-        )
+        expected = "one of L and R, one of U and D, one of F and B"
+        raise UsageError("these letters name no three axes", where="--axes", expected=expected, got=config.axes)
     if config.kind == "object" and config.origin_m is not None:
-        raise UsageError(
-            "an object is centred in its box", where="--origin-m", remedy="leave it out, or add --kind scene"
-        )
+        what = "an object is centred in its box"
+        raise UsageError(what, where="--origin-m", remedy="leave it out, or add --kind scene")
 
 
 def read_file(file: Path, config: ImportConfig) -> tuple[SplatCloud, str]:
@@ -100,9 +95,8 @@ def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asse
     solid = cloud.means[cloud.opacity > SOLID]
     if len(solid) < 2:
         expected = f"opacities above {SOLID}"
-        raise InputError(
-            "the file holds no solid Gaussians", where=origin, expected=expected, got=f"{len(solid)} of them"
-        )
+        what = "the file holds no solid Gaussians"
+        raise InputError(what, where=origin, expected=expected, got=f"{len(solid)} of them")
     low, high = np.percentile(solid.astype(np.float64), [OUTSIDE, 100 - OUTSIDE], 0)
     size = np.maximum(high - low, 1e-3)
     scale = 1.0 if config.length_m is None else config.length_m / float(size[0])

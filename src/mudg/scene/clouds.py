@@ -141,9 +141,8 @@ def _read_cloud(folder: Path, entry: Mapping[str, Any], frame: str) -> PointClou
     if not path.is_file():
         raise IntegrityError("a cloud is missing", where=str(path), remedy="run `mudg fuse` again")
     if store.sha256_file(path) != entry["sha256"]:
-        raise IntegrityError(
-            "a cloud was altered after it was written", where=str(path), remedy="run `mudg fuse` again"
-        )
+        what = "a cloud was altered after it was written"
+        raise IntegrityError(what, where=str(path), remedy="run `mudg fuse` again")
     arrays = store.read_safetensors(path)
     xyz = arrays["xyz"]
     if not np.isfinite(xyz).all():

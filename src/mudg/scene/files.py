@@ -91,12 +91,9 @@ class _Manifest:
         """The content of ``ref``; IntegrityError if it differs from what was written."""
         expected = self.hashes.get(ref)
         if expected is not None and hashlib.sha256(content).hexdigest() != expected:
-            raise IntegrityError(
-                "a file differs from what was written",
-                where=f"{self.root}: {ref}",
-                expected=f"sha256 {expected[:16]}...",
-                remedy="restore the file or ingest again; delete manifest.json if you edited the scene on purpose",
-            )
+            what, where = "a file differs from what was written", f"{self.root}: {ref}"
+            remedy = "restore the file or ingest again; delete manifest.json if you edited the scene on purpose"
+            raise IntegrityError(what, where=where, expected=f"sha256 {expected[:16]}...", remedy=remedy)
         return content
 
 
@@ -157,13 +154,9 @@ class ZipFiles:
             with zipfile.ZipFile(store.regular(Path(root))) as archive:
                 infos = archive.infolist()
         except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
-            raise InputError(
-                "file is neither a scene directory nor a readable zip",
-                where=root,
-                got=str(error),
-                expected="a stored zip of a scene directory",
-                remedy="is it cut off? copy it again",
-            ) from error
+            what, expected = "file is neither a scene directory nor a readable zip", "a stored zip of a scene directory"
+            remedy = "is it cut off? copy it again"
+            raise InputError(what, where=root, got=str(error), expected=expected, remedy=remedy) from error
         entries: dict[str, _ZipEntry] = {}
         for info in infos:
             if info.is_dir():

@@ -67,13 +67,10 @@ def refuse_without_lidar(scene: Scene) -> None:
     """InputError for a scene without LiDAR sweeps: there is nothing to fuse, and no method starts without a fused
     cloud."""
     if not scene.sweeps:
-        raise InputError(
-            "the log has no LiDAR sweeps, which a fused cloud, and what starts from it, need",
-            where=scene.root,
-            expected="sweeps of at least one LiDAR",
-            got=f"{len(scene.frames)} images only",
-            remedy="give a log with LiDAR; ingest, annotate, export, and fit with emernerf work without",
-        )
+        what = "the log has no LiDAR sweeps, which a fused cloud, and what starts from it, need"
+        got = f"{len(scene.frames)} images only"
+        remedy = "give a log with LiDAR; ingest, annotate, export, and fit with emernerf work without"
+        raise InputError(what, where=scene.root, expected="sweeps of at least one LiDAR", got=got, remedy=remedy)
 
 
 def fuse_scene(scene: Scene, config: FuseConfig) -> tuple[FusedCloud, FusionReport]:

@@ -44,12 +44,8 @@ def read_label(scene: Scene, frame: Frame, name: str) -> NDArray[Any]:
     _check_label_name(name, f"{scene.root}: {frame.id}")
     ref = frame.labels.get(name)
     if ref is None:
-        raise InputError(
-            f"frame has no label {name!r}",
-            where=f"{scene.root}: {frame.id}",
-            got=", ".join(frame.labels) or "no labels",
-            remedy="run `mudg annotate`, which makes a scene with labels",
-        )
+        got, remedy = ", ".join(frame.labels) or "no labels", "run `mudg annotate`, which makes a scene with labels"
+        raise InputError(f"frame has no label {name!r}", where=f"{scene.root}: {frame.id}", got=got, remedy=remedy)
     return _decode_label(name, open_files(scene.root).read(ref.path), f"{scene.root}: {ref.path}", frame.view.camera)
 
 

@@ -55,9 +55,8 @@ class ObservationWriter:
         name = f"{len(self._records):06d}"
         if not bool(torch.isfinite(observation.rgb).all()):
             count = int((~torch.isfinite(observation.rgb)).sum())
-            raise InputError(
-                "colours of an observation are not finite", where=f"{self._out}, view {name}", got=f"{count} values"
-            )
+            what = "colours of an observation are not finite"
+            raise InputError(what, where=f"{self._out}, view {name}", got=f"{count} values")
         store.write_image(self._out / "rgb" / f"{name}.png", to_bytes(observation.rgb), compress_level=1)
         arrays = {
             "confidence": _numpy(observation.confidence[0], np.float16),
@@ -125,9 +124,8 @@ class ObservationSet:
         for name in wanted:
             if name not in arrays or arrays[name].shape != shape:
                 got = "missing" if name not in arrays else str(arrays[name].shape)
-                raise InputError(
-                    "an observation file does not fit its view", where=f"{path}: {name}", expected=str(shape), got=got
-                )
+                what = "an observation file does not fit its view"
+                raise InputError(what, where=f"{path}: {name}", expected=str(shape), got=got)
         return {name: arrays[name] for name in wanted}
 
     def __getitem__(self, index: int) -> Observation:
@@ -150,12 +148,8 @@ def read_image_file(path: Path, camera: Camera) -> NDArray[np.uint8]:
     try:
         with Image.open(io.BytesIO(content)) as image:
             if image.size != (camera.width, camera.height):
-                raise InputError(
-                    "an image has another size than its camera",
-                    where=str(path),
-                    expected=f"{camera.width}x{camera.height}",
-                    got=f"{image.size[0]}x{image.size[1]}",
-                )
+                what, expected = "an image has another size than its camera", f"{camera.width}x{camera.height}"
+                raise InputError(what, where=str(path), expected=expected, got=f"{image.size[0]}x{image.size[1]}")
             return np.asarray(image.convert("RGB"))
     except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
         raise InputError("an image cannot be decoded", where=str(path), got=str(error)) from error
@@ -173,9 +167,8 @@ def read_observations(path: Path) -> ObservationSet:
     content = store.read_json(index)
     try:
         if content["schema"] != _SCHEMA:
-            raise InputError(
-                "unknown schema version", where=str(index), expected=str(_SCHEMA), got=str(content["schema"])
-            )
+            what = "unknown schema version"
+            raise InputError(what, where=str(index), expected=str(_SCHEMA), got=str(content["schema"]))
         records = content["observations"]
         if not records:
             raise InputError("no views are listed", where=str(index))

@@ -107,13 +107,9 @@ def _opened(content: bytes, where: str, camera: Camera | None) -> Iterator[Image
     """An opened image of a kind that scenes hold; what goes wrong with it in the block becomes an InputError."""
     with _explained(content, where), Image.open(io.BytesIO(content), formats=("PNG", "JPEG")) as image:
         if camera is not None and image.size != (camera.width, camera.height):
-            raise InputError(
-                "image does not have its camera's size",
-                where=where,
-                got=f"{image.width}x{image.height}",
-                expected=f"{camera.width}x{camera.height}",
-                remedy="correct the camera's size and intrinsics, or the image",
-            )
+            what, got = "image does not have its camera's size", f"{image.width}x{image.height}"
+            remedy = "correct the camera's size and intrinsics, or the image"
+            raise InputError(what, where=where, got=got, expected=f"{camera.width}x{camera.height}", remedy=remedy)
         if max(image.size) > schema.MAX_IMAGE_SIDE_PX:
             raise InputError("image is too large", where=where, got=f"{image.width}x{image.height}")
         if image.getexif().get(_EXIF_ORIENTATION, 1) != 1:
@@ -122,13 +118,8 @@ def _opened(content: bytes, where: str, camera: Camera | None) -> Iterator[Image
         sixteen_bits = content[:4] == _PNG and content[24:25] == b"\x10"  # Pillow would drop the lower half
         if image.mode not in ("RGB", "L", "P", "RGBA") or sixteen_bits:
             got = "16 bits a channel" if sixteen_bits else f"mode {image.mode}"
-            raise InputError(
-                "image is not 8-bit RGB or grey",
-                where=where,
-                expected="8 bits a channel",
-                got=got,
-                remedy="convert it to 8-bit RGB",
-            )
+            what = "image is not 8-bit RGB or grey"
+            raise InputError(what, where=where, expected="8 bits a channel", got=got, remedy="convert it to 8-bit RGB")
         if image.mode == "RGBA" and image.getchannel("A").getextrema() != (255, 255):
             raise InputError("image has transparent pixels", where=where, expected="an opaque image")
         yield image
@@ -180,13 +171,9 @@ def checked_points(arrays: Mapping[str, NDArray[Any]], where: str) -> SweepPoint
             raise InputError(f"sweep tensor {name!r} has the wrong form", where=where, expected=expected, got=got)
         if not np.isfinite(array).all():
             bad = int((~np.isfinite(array.reshape(count, -1)).all(1)).sum())
-            raise InputError(
-                "sweep holds values that are not finite",
-                where=f"{where}: {name}",
-                got=f"{bad} of {count} points",
-                expected="finite metres",
-                remedy="drop missing returns when importing",
-            )
+            what, where = "sweep holds values that are not finite", f"{where}: {name}"
+            remedy = "drop missing returns when importing"
+            raise InputError(what, where=where, got=f"{bad} of {count} points", expected="finite metres", remedy=remedy)
     if classes is not None:
         _check_classes(classes, count, f"{where}: classes")
     return SweepPoints(arrays["xyz"], arrays["intensity"], arrays["dt_s"], classes)

@@ -380,13 +380,8 @@ def _check_format(top: dict[str, Any], name: str, where: str) -> None:
         raise InputError(f"this is not a {name} file", where=where, expected=f'"format": "{name}"', got=found)
     if top.get("schema_version") != SCHEMA_VERSION:
         remedy = "ingest the log again with this version, or use the version that wrote it"
-        raise InputError(
-            "schema version is not one this program reads",
-            where=f"{where}: schema_version",
-            expected=str(SCHEMA_VERSION),
-            got=version,
-            remedy=remedy,
-        )
+        what, where = "schema version is not one this program reads", f"{where}: schema_version"
+        raise InputError(what, where=where, expected=str(SCHEMA_VERSION), got=version, remedy=remedy)
 
 
 def repeated(names: Iterable[str]) -> list[str]:

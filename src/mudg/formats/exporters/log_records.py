@@ -150,11 +150,8 @@ def mcap_writer() -> Any:
         import mcap.writer
         import rosbags.typesys  # noqa: F401
     except ImportError as error:
-        raise ResourceError(
-            "MCAP files and bags are written with the packages mcap and rosbags, which are not installed",
-            got=str(error),
-            remedy="pip install 'mudg[ros]'",
-        ) from error
+        what = "MCAP files and bags are written with the packages mcap and rosbags, which are not installed"
+        raise ResourceError(what, got=str(error), remedy="pip install 'mudg[ros]'") from error
     return mcap.writer
 
 

@@ -311,13 +311,10 @@ def _in_order(records: list[Any], span: Any, sensor: str) -> list[Any]:
     spans = np.array([span(record) for record in ordered], np.int64).reshape(-1, 2)
     if (np.diff(spans, axis=0) <= 0).any():
         at = int(np.flatnonzero((np.diff(spans, axis=0) <= 0).any(1))[0])
-        raise InputError(
-            "two records of a sensor overlap so that neither is the earlier one",
-            where=ordered[at + 1].id,
-            expected=f"one that begins and ends after {ordered[at].id}",
-            got=f"{spans[at].tolist()} and {spans[at + 1].tolist()} us",
-            remedy=f"leave sensor {sensor} out of the scene",
-        )
+        what = "two records of a sensor overlap so that neither is the earlier one"
+        expected = f"one that begins and ends after {ordered[at].id}"
+        got, remedy = f"{spans[at].tolist()} and {spans[at + 1].tolist()} us", f"leave sensor {sensor} out of the scene"
+        raise InputError(what, where=ordered[at + 1].id, expected=expected, got=got, remedy=remedy)
     return ordered
 
 

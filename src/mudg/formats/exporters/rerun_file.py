@@ -43,10 +43,8 @@ def package() -> Any:
     try:
         return importlib.import_module("rerun")
     except ImportError as error:
-        raise ResourceError(
-            "rerun files are written with the package rerun-sdk, which is not installed",
-            remedy="pip install 'mudg[rerun]'",
-        ) from error
+        what = "rerun files are written with the package rerun-sdk, which is not installed"
+        raise ResourceError(what, remedy="pip install 'mudg[rerun]'") from error
 
 
 class RerunWriter:

@@ -76,9 +76,8 @@ def _encode(target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: i
     try:
         for index, frame in enumerate(frames):
             if frame.ndim != 3 or frame.shape[2] != 3 or frame.dtype != np.uint8:
-                raise InputError(
-                    "a video frame must be u8[H, W, 3]", where=f"frame {index}", got=f"{frame.dtype} {frame.shape}"
-                )
+                what = "a video frame must be u8[H, W, 3]"
+                raise InputError(what, where=f"frame {index}", got=f"{frame.dtype} {frame.shape}")
             if container is None:
                 size = frame.shape
                 # The index first, so that players start at once; only a file can be rewritten that way.
@@ -86,9 +85,8 @@ def _encode(target: Any, frames: Iterable[NDArray[np.uint8]], fps: float, crf: i
                 container = av.open(target, "w", format="mp4", options=options)
                 stream = _stream(container, frame.shape, fps, crf, preset)
             if frame.shape != size:
-                raise InputError(
-                    "video frames differ in size", where=f"frame {index}", expected=str(size), got=str(frame.shape)
-                )
+                what = "video frames differ in size"
+                raise InputError(what, where=f"frame {index}", expected=str(size), got=str(frame.shape))
             for packet in stream.encode(av.VideoFrame.from_ndarray(_even(frame), format="rgb24")):
                 container.mux(packet)
         if container is None or stream is None:

@@ -67,17 +67,11 @@ def to_package(scene: SplatScene, log: Scene | None, ground: HeightMap | None) -
         InputError: no drive or no ground is known, or a camera has no place on the vehicle.
     """
     if log is None or not len(log.ego.times_s):
-        raise InputError(
-            "AlpaSim replays a drive, and none is known here",
-            where=scene.name,
-            remedy="give --scene SCENE, or a folder made by `mudg run`",
-        )
+        what = "AlpaSim replays a drive, and none is known here"
+        raise InputError(what, where=scene.name, remedy="give --scene SCENE, or a folder made by `mudg run`")
     if ground is None:
-        raise InputError(
-            "AlpaSim needs the ground, and none is known here",
-            where=scene.name,
-            remedy="export a folder made by `mudg run`, whose points have classes",
-        )
+        what = "AlpaSim needs the ground, and none is known here"
+        raise InputError(what, where=scene.name, remedy="export a folder made by `mudg run`, whose points have classes")
     clock = _PackageClock(log, scene)
     rig = store.json_text(_rig(log, scene, clock)).encode()
     files = {

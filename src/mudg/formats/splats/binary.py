@@ -23,13 +23,9 @@ MAX_BYTES: Final = 8 << 30
 def part(content: bytes, start: int, size: int, what: str, where: str) -> memoryview:
     """``size`` bytes from ``start``; InputError if the content ends before."""
     if start < 0 or size < 0 or start + size > len(content):
-        raise InputError(
-            f"the file ends within {what}",
-            where=where,
-            expected=f"{start + size} bytes",
-            got=f"{len(content)} bytes",
-            remedy="it was cut off, or its header is damaged: get the file again",
-        )
+        what, expected = f"the file ends within {what}", f"{start + size} bytes"
+        remedy = "it was cut off, or its header is damaged: get the file again"
+        raise InputError(what, where=where, expected=expected, got=f"{len(content)} bytes", remedy=remedy)
     return memoryview(content)[start : start + size]
 
 
@@ -47,24 +43,16 @@ def unpacked(layout: str, content: bytes, start: int, what: str, where: str) -> 
 def refuse_count(count: int, where: str) -> None:
     """InputError for a number of Gaussians that no file holds."""
     if not 0 < count <= MAX_GAUSSIANS:
-        raise InputError(
-            "the number of Gaussians in the header is not possible",
-            where=where,
-            expected=f"1 to {MAX_GAUSSIANS}",
-            got=str(count),
-        )
+        what = "the number of Gaussians in the header is not possible"
+        raise InputError(what, where=where, expected=f"1 to {MAX_GAUSSIANS}", got=str(count))
 
 
 def refuse_bomb(count: int, content: bytes, where: str) -> None:
     """InputError for more Gaussians than a compressed file of this size holds: at most 20 a byte, hundreds of times
     what is usual."""
     if count > 20 * len(content) + 65536:
-        raise InputError(
-            "the header names more Gaussians than a file of this size can hold",
-            where=where,
-            expected=f"at most {20 * len(content) + 65536}",
-            got=str(count),
-        )
+        what = "the header names more Gaussians than a file of this size can hold"
+        raise InputError(what, where=where, expected=f"at most {20 * len(content) + 65536}", got=str(count))
 
 
 # -- compressed streams ----------------------------------------------------------------------------
@@ -96,13 +84,9 @@ class GzipStream:
         except zlib.error as error:
             raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
         if len(found) < size:
-            raise InputError(
-                f"the file ends within {what}",
-                where=self._where,
-                expected=f"{size} bytes",
-                got=f"{len(found)} bytes",
-                remedy="it was cut off, or its header is damaged: get the file again",
-            )
+            what, where = f"the file ends within {what}", self._where
+            remedy = "it was cut off, or its header is damaged: get the file again"
+            raise InputError(what, where=where, expected=f"{size} bytes", got=f"{len(found)} bytes", remedy=remedy)
         return bytes(found)
 
     def rest(self, most: int) -> bytes:
@@ -124,9 +108,8 @@ class GzipStream:
             raise InputError("the compressed content is damaged", where=self._where, got=str(error)) from error
         if more or not self._inflater.eof:
             what = "goes on after its last value" if more else "ends before its checksum"
-            raise InputError(
-                f"the compressed content {what}", where=self._where, remedy="the header does not fit the content"
-            )
+            what = f"the compressed content {what}"
+            raise InputError(what, where=self._where, remedy="the header does not fit the content")
 
 
 # -- zips ------------------------------------------------------------------------------------------
@@ -164,9 +147,8 @@ class BoundedZip:
         except (zipfile.BadZipFile, ValueError, EOFError, struct.error, NotImplementedError, OSError) as error:
             raise InputError("not a readable zip file", where=where, got=str(error)) from error
         if len(infos) > 100_000:
-            raise InputError(
-                "the zip lists too many files", where=where, expected="at most 100000", got=str(len(infos))
-            )
+            what = "the zip lists too many files"
+            raise InputError(what, where=where, expected="at most 100000", got=str(len(infos)))
         self._infos = {info.filename: info for info in infos}
 
     @property
@@ -181,9 +163,8 @@ class BoundedZip:
         if info is None:
             raise InputError("a file is missing in the zip", where=where, got=", ".join(sorted(self._infos)[:8]))
         if info.file_size > most:
-            raise InputError(
-                "a file in the zip is too large", where=where, expected=f"at most {most} bytes", got=f"{info.file_size}"
-            )
+            what = "a file in the zip is too large"
+            raise InputError(what, where=where, expected=f"at most {most} bytes", got=f"{info.file_size}")
         try:
             with self._archive.open(info) as handle:
                 content = handle.read(most + 1)
@@ -200,12 +181,8 @@ class BoundedZip:
         ) as error:
             raise InputError("a file in the zip is damaged", where=where, got=str(error)) from error
         if rest or len(content) != info.file_size:
-            raise InputError(
-                "a file in the zip has another size than listed",
-                where=where,
-                expected=str(info.file_size),
-                got=str(len(content)),
-            )
+            what = "a file in the zip has another size than listed"
+            raise InputError(what, where=where, expected=str(info.file_size), got=str(len(content)))
         return content
 
 

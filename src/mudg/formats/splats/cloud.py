@@ -284,13 +284,9 @@ def unit(quats: NDArray[np.floating], where: str) -> Floats:
     bad = ~(np.isfinite(length[:, 0]) & (length[:, 0] > 1e-12))
     if bad.any():
         row = int(bad.argmax())
-        raise InputError(
-            "a rotation is no quaternion",
-            where=f"{where}: Gaussian {row}",
-            expected="four finite numbers, not all 0",
-            got=f"{q[row].tolist()}; {int(bad.sum())} of {len(q)} are damaged",
-            remedy="take them out, or write 1, 0, 0, 0",
-        )
+        what, where = "a rotation is no quaternion", f"{where}: Gaussian {row}"
+        expected, got = "four finite numbers, not all 0", f"{q[row].tolist()}; {int(bad.sum())} of {len(q)} are damaged"
+        raise InputError(what, where=where, expected=expected, got=got, remedy="take them out, or write 1, 0, 0, 0")
     return (q / length).astype(np.float32)
 
 
@@ -316,21 +312,17 @@ def checked(cloud: SplatCloud, where: str) -> SplatCloud:
         bad = ~np.isfinite(values).all(1)
         if bad.any():
             row = int(bad.argmax())
-            raise InputError(
-                f"the {name} of a Gaussian is not finite",
-                where=f"{where}: Gaussian {row}",
-                got=f"{values[row].tolist()[:4]}; {int(bad.sum())} of {len(cloud)} are damaged",
-                remedy="take them out, for example with splat-transform --filter-nan",
-            )
+            what = f"the {name} of a Gaussian is not finite"
+            got = f"{values[row].tolist()[:4]}; {int(bad.sum())} of {len(cloud)} are damaged"
+            remedy = "take them out, for example with splat-transform --filter-nan"
+            raise InputError(what, where=f"{where}: Gaussian {row}", got=got, remedy=remedy)
     far = (np.abs(cloud.means) > LARGEST_M).any(1) | (cloud.log_scales > MOST_LOG).any(1)
     if far.any():
         row = int(far.argmax())
-        raise InputError(
-            "a Gaussian lies or reaches too far away",
-            where=f"{where}: Gaussian {row}",
-            expected=f"positions within {LARGEST_M:g} m, logarithms of sizes below {MOST_LOG:g}",
-            got=f"{cloud.means[row].tolist()}, {cloud.log_scales[row].tolist()}",
-        )
+        what = "a Gaussian lies or reaches too far away"
+        expected = f"positions within {LARGEST_M:g} m, logarithms of sizes below {MOST_LOG:g}"
+        got = f"{cloud.means[row].tolist()}, {cloud.log_scales[row].tolist()}"
+        raise InputError(what, where=f"{where}: Gaussian {row}", expected=expected, got=got)
     return replace(cloud, quats=unit(cloud.quats, where), log_scales=cloud.log_scales.clip(LEAST_LOG))
 
 

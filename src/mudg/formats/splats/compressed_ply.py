@@ -88,27 +88,17 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     file = ply.read_elements(content, where, ("chunk", "vertex", "sh"))
     chunk, vertex = file.tables.get("chunk"), file.tables.get("vertex")
     if chunk is None or vertex is None or any(name not in (vertex.dtype.names or ()) for name in _PACKED):
-        raise InputError(
-            "not a compressed PLY of Gaussians",
-            where=where,
-            expected="elements chunk and vertex with " + ", ".join(_PACKED),
-        )
+        what = "not a compressed PLY of Gaussians"
+        raise InputError(what, where=where, expected="elements chunk and vertex with " + ", ".join(_PACKED))
     if any(vertex.dtype[name].kind not in "iu" or vertex.dtype[name].itemsize != 4 for name in _PACKED):
-        raise InputError(
-            "the packed columns of a compressed PLY are no words",
-            where=where,
-            expected="uint",
-            got=str(vertex.dtype)[:200],
-        )
+        what = "the packed columns of a compressed PLY are no words"
+        raise InputError(what, where=where, expected="uint", got=str(vertex.dtype)[:200])
     words = {name: vertex[name].astype("<u4") for name in _PACKED}
     names = chunk.dtype.names or ()
     if len(chunk) != -(-len(vertex) // CHUNK) or any(name not in names for name in _BOUNDS[:12]):
-        raise InputError(
-            "the chunks of the compressed PLY do not fit its vertices",
-            where=where,
-            expected=f"{-(-len(vertex) // CHUNK)} chunks",
-            got=f"{len(chunk)}: {listed(names[:4])}, ...",
-        )
+        what = "the chunks of the compressed PLY do not fit its vertices"
+        expected = f"{-(-len(vertex) // CHUNK)} chunks"
+        raise InputError(what, where=where, expected=expected, got=f"{len(chunk)}: {listed(names[:4])}, ...")
     of_chunk = np.arange(len(vertex)) // CHUNK
     bounds = {name: chunk[name].astype(np.float64) for name in _BOUNDS if name in names}
     low, high = (np.stack([bounds[name] for name in _BOUNDS[at : at + 3]], 1) for at in (0, 3))
@@ -146,12 +136,9 @@ def _rest(table: NDArray[np.void] | None, count: int, where: str) -> Array:
         or len(rest) not in _REST
         or any(name not in names or table.dtype[name] != np.uint8 for name in rest)
     ):
-        raise InputError(
-            "the harmonics of the compressed PLY do not fit its vertices",
-            where=where,
-            expected=f"{count} rows of 9, 24 or 45 uchar",
-            got=f"{len(table)} rows of {listed(names)}",
-        )
+        what = "the harmonics of the compressed PLY do not fit its vertices"
+        expected = f"{count} rows of 9, 24 or 45 uchar"
+        raise InputError(what, where=where, expected=expected, got=f"{len(table)} rows of {listed(names)}")
     raw = ply.columns_of(table, rest)
     values = np.where(raw == 0, 0.0, np.where(raw == 255, 1.0, (raw + 0.5) / 256))
     return ply.coefficient_major(((values - 0.5) * 8).astype(np.float32)).astype(np.float64)

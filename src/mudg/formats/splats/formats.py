@@ -182,13 +182,8 @@ def format_of(content: bytes, name: str) -> str:
     if suffix == ".splat":
         return "splat"
     known = ", ".join(sorted({suffix for format_ in FORMATS.values() if format_.read for suffix in format_.suffixes}))
-    raise InputError(
-        "this is no file of Gaussians that can be read",
-        where=name,
-        expected=known,
-        got=f"it begins with {content[:8]!r}",
-        remedy=_UNREAD.get(suffix, ""),
-    )
+    what, got = "this is no file of Gaussians that can be read", f"it begins with {content[:8]!r}"
+    raise InputError(what, where=name, expected=known, got=got, remedy=_UNREAD.get(suffix, ""))
 
 
 def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCloud, str]:

@@ -286,12 +286,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
             else:
                 triangles += 1
     if not clouds:
-        raise InputError(
-            "the GLB file holds no Gaussians",
-            where=where,
-            expected=f"meshes with {EXTENSION}",
-            remedy="triangles and points cannot be imported",
-        )
+        what, expected = "the GLB file holds no Gaussians", f"meshes with {EXTENSION}"
+        raise InputError(what, where=where, expected=expected, remedy="triangles and points cannot be imported")
     if triangles:
         file.warnings[f"{triangles} meshes without Gaussians were passed over"] = None
     if file.entries(file.document, "animations"):
@@ -313,12 +309,9 @@ def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
         return cloud
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
     if not np.isfinite(scale) or scale <= 0 or geometry.rigid_problem(rigid := _without_scale(matrix, scale), 1e-3):
-        raise InputError(
-            "a node of the GLB file is mirrored or scaled unevenly",
-            where=where,
-            got=str(matrix[:3, :3].tolist()),
-            remedy="apply the scale of the node to its Gaussians in the program that wrote the file",
-        )
+        what = "a node of the GLB file is mirrored or scaled unevenly"
+        remedy = "apply the scale of the node to its Gaussians in the program that wrote the file"
+        raise InputError(what, where=where, got=str(matrix[:3, :3].tolist()), remedy=remedy)
     if scale != 1:
         logs = (cloud.log_scales + np.float32(np.log(scale))).astype(np.float32)
         cloud = checked(replace(cloud, means=cloud.means * scale, log_scales=logs), where)
@@ -342,18 +335,12 @@ class _GlbFile:
         if version != 2:
             raise InputError("this version of glTF is not read", where=where, expected="2", got=str(version))
         if size != len(content):
-            raise InputError(
-                "the GLB file has another length than it says",
-                where=where,
-                expected=f"{size} bytes",
-                got=f"{len(content)}",
-                remedy="it was cut off: get it again",
-            )
+            what, remedy = "the GLB file has another length than it says", "it was cut off: get it again"
+            raise InputError(what, where=where, expected=f"{size} bytes", got=f"{len(content)}", remedy=remedy)
         length, kind = binary.unpacked("<II", content, 12, "the first chunk", where)
         if kind != JSON_CHUNK or length > _MOST_JSON:
-            raise InputError(
-                "the first chunk of a GLB file is its JSON document", where=where, got=f"{length} bytes of {kind:#x}"
-            )
+            what = "the first chunk of a GLB file is its JSON document"
+            raise InputError(what, where=where, got=f"{length} bytes of {kind:#x}")
         text = bytes(binary.part(content, 20, length, "the JSON chunk", where))
         document = store.parse_json(text.decode("utf-8", "replace"), f"{where}: JSON")
         if not isinstance(document, dict):
@@ -390,13 +377,9 @@ class _GlbFile:
                 raise InputError(f"{name} is no list of names", where=f"{self.where}: JSON", got=repr(stated)[:60])
             unknown = [one for one in stated if one not in _READ]
             if unknown and name == "extensionsRequired":
-                raise InputError(
-                    "the GLB file needs an extension that is not read",
-                    where=f"{self.where}: JSON",
-                    got=listed(unknown),
-                    expected=", ".join(_READ),
-                    remedy="write the file without it, or as SPZ",
-                )
+                what, where = "the GLB file needs an extension that is not read", f"{self.where}: JSON"
+                remedy = "write the file without it, or as SPZ"
+                raise InputError(what, where=where, got=listed(unknown), expected=", ".join(_READ), remedy=remedy)
             self.passed.update(unknown)
 
     def of_old_transform(self, before: int) -> bool:
@@ -415,12 +398,8 @@ class _GlbFile:
         """The object that an index names."""
         found = self.entries(self.document, name)
         if type(index) is not int or not 0 <= index < len(found):
-            raise InputError(
-                f"an index names nothing in {name}",
-                where=f"{self.where}: JSON",
-                expected=f"0 to {len(found) - 1}",
-                got=repr(index)[:40],
-            )
+            what = f"an index names nothing in {name}"
+            raise InputError(what, where=f"{self.where}: JSON", expected=f"0 to {len(found) - 1}", got=repr(index)[:40])
         return found[index]
 
     def number(self, owner: dict[str, Any], name: str, default: int) -> int:
@@ -438,9 +417,8 @@ class _GlbFile:
             or len(value) != len(default)
             or any(type(v) not in (int, float) for v in value)
         ):
-            raise InputError(
-                f"{name} is no list of {len(default)} numbers", where=f"{self.where}: JSON", got=repr(value)[:60]
-            )
+            what = f"{name} is no list of {len(default)} numbers"
+            raise InputError(what, where=f"{self.where}: JSON", got=repr(value)[:60])
         try:
             made = np.array(value, np.float64)
         except OverflowError as error:
@@ -460,9 +438,8 @@ class _GlbFile:
             matrix, index, depth = waiting.pop(0)
             node = self.entry("nodes", index)
             if index in seen or depth > _DEPTH:
-                raise InputError(
-                    "the nodes of the GLB file are no tree", where=f"{self.where}: JSON", got=f"node {index} twice"
-                )
+                what = "the nodes of the GLB file are no tree"
+                raise InputError(what, where=f"{self.where}: JSON", got=f"node {index} twice")
             seen.add(index)
             self._note("nodes.", node)
             matrix = matrix @ self._matrix(node)
@@ -505,32 +482,23 @@ class _GlbFile:
         if not isinstance(attributes, dict) or not isinstance(kind, dict):
             raise InputError("a primitive has no attributes", where=f"{self.where}: JSON")
         if kind.get("kernel", "ellipse") != "ellipse":
-            raise InputError(
-                "only ellipsoids are read", where=f"{self.where}: {EXTENSION}", got=repr(kind.get("kernel"))[:40]
-            )
+            what = "only ellipsoids are read"
+            raise InputError(what, where=f"{self.where}: {EXTENSION}", got=repr(kind.get("kernel"))[:40])
         space = kind.get("colorSpace")
         if space is None:
             self.warnings["it names no colorSpace, which the standard requires: read as sRGB"] = None
         elif not isinstance(space, str) or space not in _LINEAR:
-            raise InputError(
-                "the colour space of the Gaussians is not known",
-                where=f"{self.where}: {EXTENSION}: colorSpace",
-                expected=", ".join(_LINEAR),
-                got=repr(space)[:60],
-                remedy="convert the colours to sRGB",
-            )
+            what, where = "the colour space of the Gaussians is not known", f"{self.where}: {EXTENSION}: colorSpace"
+            remedy = "convert the colours to sRGB"
+            raise InputError(what, where=where, expected=", ".join(_LINEAR), got=repr(space)[:60], remedy=remedy)
         self._note("primitives.", primitive)
         self.passed.update(f"attributes.{name}" for name in attributes if not _ATTRIBUTE.fullmatch(name))
         inner = kind.get("extensions")
         compressed = [name for name in inner if "compression" in name] if isinstance(inner, dict) else []
         if compressed:
-            raise InputError(
-                "the Gaussians of the GLB file are compressed",
-                where=f"{self.where}: {EXTENSION}",
-                got=listed(compressed),
-                expected="attributes without compression",
-                remedy="write it without, or as SPZ",
-            )
+            what, where = "the Gaussians of the GLB file are compressed", f"{self.where}: {EXTENSION}"
+            got, expected = listed(compressed), "attributes without compression"
+            raise InputError(what, where=where, got=got, expected=expected, remedy="write it without, or as SPZ")
         self.passed.update(f"{EXTENSION}.{name}" for name in kind if name not in _KIND)
         self.passed.update(f"{EXTENSION}.extensions.{name}" for name in (inner if isinstance(inner, dict) else ()))
         for name, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
@@ -540,11 +508,8 @@ class _GlbFile:
         count = len(means)
         self.total += count
         if self.total > len(self.binary):
-            raise InputError(
-                "the nodes of the GLB file repeat its Gaussians too often",
-                where=self.where,
-                got=f"{self.total} Gaussians",
-            )
+            what = "the nodes of the GLB file repeat its Gaussians too often"
+            raise InputError(what, where=self.where, got=f"{self.total} Gaussians")
         rotation = self.values(attributes, PREFIX + "ROTATION", 4, count)
         if np.abs(np.linalg.norm(rotation, axis=1) - 1).max(initial=0) > 0.05:
             self.warnings["rotations are not of length 1, as the standard requires: they were brought to it"] = None
@@ -555,9 +520,8 @@ class _GlbFile:
         logits, logs = self._logits_and_logs(opacity, scale)
         degrees = [d for d in range(4) if f"{PREFIX}SH_DEGREE_{d}_COEF_0" in attributes]
         if degrees != list(range(len(degrees))) or not degrees:
-            raise InputError(
-                "the harmonics of a primitive leave a degree out", where=f"{self.where}: JSON", got=str(degrees)
-            )
+            what = "the harmonics of a primitive leave a degree out"
+            raise InputError(what, where=f"{self.where}: JSON", got=str(degrees))
         sh = np.stack(
             [
                 self.values(attributes, f"{PREFIX}SH_DEGREE_{d}_COEF_{n}", 3, count)
@@ -589,64 +553,42 @@ class _GlbFile:
             return opacity, scale
         if (bad := (opacity < -_ROUNDING) | (opacity > 1 + _ROUNDING)).any():
             row = int(bad.argmax())
-            raise InputError(
-                "the opacity of a Gaussian is not between 0 and 1",
-                where=f"{self.where}: Gaussian {row}",
-                expected="0 to 1",
-                got=f"{opacity[row]:.4g}; {int(bad.sum())} of {len(opacity)}: they look like logits",
-                remedy="write 1 / (1 + exp(-logit)) into the file",
-            )
+            what = "the opacity of a Gaussian is not between 0 and 1"
+            got = f"{opacity[row]:.4g}; {int(bad.sum())} of {len(opacity)}: they look like logits"
+            remedy = "write 1 / (1 + exp(-logit)) into the file"
+            raise InputError(what, where=f"{self.where}: Gaussian {row}", expected="0 to 1", got=got, remedy=remedy)
         if raw:
             row = int((scale < 0).any(1).argmax())
-            raise InputError(
-                "the size of a Gaussian is negative",
-                where=f"{self.where}: Gaussian {row}",
-                expected="metres",
-                got=f"{scale[row].tolist()}: they look like logarithms",
-                remedy="write exp(scale) into the file",
-            )
+            what, where = "the size of a Gaussian is negative", f"{self.where}: Gaussian {row}"
+            got = f"{scale[row].tolist()}: they look like logarithms"
+            raise InputError(what, where=where, expected="metres", got=got, remedy="write exp(scale) into the file")
         with np.errstate(divide="ignore", invalid="ignore"):
             return logit(opacity), np.maximum(np.log(scale), LEAST_LOG)
 
     def values(self, attributes: dict[str, Any], name: str, width: int, count: int | None = None) -> Array:
         """An attribute as f64[count, width], normalised integers as numbers."""
         if name not in attributes:
-            raise InputError(
-                "an attribute of the Gaussians is missing",
-                where=self.where,
-                expected=name,
-                got=", ".join(attributes)[:160],
-            )
+            what = "an attribute of the Gaussians is missing"
+            raise InputError(what, where=self.where, expected=name, got=", ".join(attributes)[:160])
         accessor = self.entry("accessors", attributes[name])
         self._note("accessors.", accessor)
         component = accessor.get("componentType")
         if component not in _KINDS or _WIDTHS.get(str(accessor.get("type"))) != width or "sparse" in accessor:
-            raise InputError(
-                "an attribute of the Gaussians has the wrong type",
-                where=f"{self.where}: {name}",
-                expected=f"{width} numbers",
-                got=f"{accessor.get('type')} of {component}",
-            )
+            what, got = "an attribute of the Gaussians has the wrong type", f"{accessor.get('type')} of {component}"
+            raise InputError(what, where=f"{self.where}: {name}", expected=f"{width} numbers", got=got)
         rows, dtype = self.number(accessor, "count", 0), np.dtype(_KINDS[component])
         binary.refuse_count(rows, f"{self.where}: {name}")
         if count is not None and rows != count:
-            raise InputError(
-                "the attributes of the Gaussians differ in length",
-                where=f"{self.where}: {name}",
-                expected=str(count),
-                got=str(rows),
-            )
+            what = "the attributes of the Gaussians differ in length"
+            raise InputError(what, where=f"{self.where}: {name}", expected=str(count), got=str(rows))
         view = self.entry("bufferViews", accessor.get("bufferView"))
         packed = view.get("extensions")
         buffers = self.entries(self.document, "buffers")
         if view.get("buffer", 0) != 0 or packed or (buffers and "uri" in buffers[0]):
-            raise InputError(
-                "an attribute of the Gaussians lies outside the file, or is compressed",
-                where=f"{self.where}: {name}",
-                expected="the binary chunk",
-                got=f"buffer {view.get('buffer', 0)!r:.20}, extensions {listed(packed or ())}",
-                remedy="pack the file with its buffers, without compression",
-            )
+            what = "an attribute of the Gaussians lies outside the file, or is compressed"
+            got = f"buffer {view.get('buffer', 0)!r:.20}, extensions {listed(packed or ())}"
+            remedy = "pack the file with its buffers, without compression"
+            raise InputError(what, where=f"{self.where}: {name}", expected="the binary chunk", got=got, remedy=remedy)
         stride = self.number(view, "byteStride", 0) or width * dtype.itemsize
         begins, inner = self.number(view, "byteOffset", 0), self.number(accessor, "byteOffset", 0)
         size = (rows - 1) * stride + width * dtype.itemsize
@@ -655,9 +597,8 @@ class _GlbFile:
             or inner + size > self.number(view, "byteLength", 0)
             or begins + inner + size > len(self.binary)
         ):
-            raise InputError(
-                "an attribute reaches beyond the file's content", where=f"{self.where}: {name}", got=f"{size} bytes"
-            )
+            what = "an attribute reaches beyond the file's content"
+            raise InputError(what, where=f"{self.where}: {name}", got=f"{size} bytes")
         raw = np.ndarray((rows, width), dtype, self.binary, begins + inner, (stride, dtype.itemsize)).astype(np.float64)
         if dtype.kind == "f" or not accessor.get("normalized", False):
             return raw

@@ -126,12 +126,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     _refuse_columns(table, wanted, where)
     rest = sum(name.startswith("f_rest_") for name in names)
     if rest not in _REST or any(name not in names for name in _indexed("f_rest", rest)):
-        raise InputError(
-            "the number of f_rest columns fits no degree of harmonics",
-            where=where,
-            expected=", ".join(map(str, _REST)),
-            got=str(rest),
-        )
+        what = "the number of f_rest columns fits no degree of harmonics"
+        raise InputError(what, where=where, expected=", ".join(map(str, _REST)), got=str(rest))
     sh = np.concatenate(
         [
             columns_of(table, _indexed("f_dc", 3))[:, None],
@@ -195,31 +191,21 @@ def _refuse_columns(table: NDArray[Any], wanted: tuple[str, ...], where: str) ->
             if alike
             else "points or meshes cannot be imported"
         )
-        raise InputError(
-            "the PLY file holds no Gaussians" if not alike else "a column of the Gaussians is missing",
-            where=where,
-            expected=f"a property {missing[0]!r}",
-            got=listed(names),
-            remedy=remedy,
-        )
+        what = "the PLY file holds no Gaussians" if not alike else "a column of the Gaussians is missing"
+        raise InputError(what, where=where, expected=f"a property {missing[0]!r}", got=listed(names), remedy=remedy)
     whole = [name for name in wanted if name not in "xyz" and table.dtype[name].kind != "f"]
     if whole:
-        raise InputError(
-            "a column of the Gaussians holds whole numbers",
-            where=where,
-            expected=f"{whole[0]} as float",
-            got=str(table.dtype[whole[0]]),
-            remedy="write logits, logarithms of sizes, and harmonics",
-        )
+        what, expected = "a column of the Gaussians holds whole numbers", f"{whole[0]} as float"
+        remedy = "write logits, logarithms of sizes, and harmonics"
+        raise InputError(what, where=where, expected=expected, got=str(table.dtype[whole[0]]), remedy=remedy)
 
 
 def _filtered(cloud: SplatCloud, filter_m: NDArray[np.float64], where: str) -> SplatCloud:
     """Gaussians blurred by a filter f64[n] in metres (Mip-Splatting, eq. 7): sizes grow, opacities fall with the
     volume."""
     if not np.isfinite(filter_m).all():
-        raise InputError(
-            "a filter_3D is not finite", where=f"{where}: Gaussian {int((~np.isfinite(filter_m)).argmax())}"
-        )
+        what = "a filter_3D is not finite"
+        raise InputError(what, where=f"{where}: Gaussian {int((~np.isfinite(filter_m)).argmax())}")
     variance = np.exp(2 * cloud.log_scales.astype(np.float64))
     grown = variance + (filter_m**2)[:, None]
     share = np.exp(0.5 * (np.log(variance) - np.log(grown)).sum(1))
@@ -279,21 +265,17 @@ def read_elements(content: bytes, where: str, wanted: tuple[str, ...]) -> PlyFil
         lists = any(length for length, _, _ in element.columns)
         if lists and element.name in wanted:
             name = next(name for length, _, name in element.columns if length)
-            raise InputError(
-                "the Gaussians of a PLY file have lists",
-                where=f"{where}: element {element.name!r}",
-                got=f"property list {name!r}",
-                remedy="write one property for each number",
-            )
+            what, where = "the Gaussians of a PLY file have lists", f"{where}: element {element.name!r}"
+            got = f"property list {name!r}"
+            raise InputError(what, where=where, got=got, remedy="write one property for each number")
         if lists:
             place = _after_lists(content, place, element, order, where)
             continue
         try:
             dtype = np.dtype([(name, order + kind) for _, kind, name in element.columns])
         except ValueError as error:
-            raise InputError(
-                "two properties of a PLY element have one name", where=where, got=str(error)[:200]
-            ) from error
+            what = "two properties of a PLY element have one name"
+            raise InputError(what, where=where, got=str(error)[:200]) from error
         size = element.count * dtype.itemsize
         rows = binary.part(content, place, size, f"element {element.name!r}", where)
         if dtype.itemsize and element.name in wanted:
@@ -321,9 +303,8 @@ def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str
     end = content.find(b"end_header", 0, MAX_HEADER)
     line_end = content.find(b"\n", end, end + 16) if end >= 0 else -1
     if end < 0 or line_end < 0:
-        raise InputError(
-            "the header of the PLY file does not end", where=where, expected=f"end_header within {MAX_HEADER} bytes"
-        )
+        what = "the header of the PLY file does not end"
+        raise InputError(what, where=where, expected=f"end_header within {MAX_HEADER} bytes")
     order, elements, comments = "", list[_Element](), list[str]()
     for line in content[:end].decode("ascii", "replace").splitlines():
         words = line.split()
@@ -334,13 +315,8 @@ def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str
         elif words[0] == "format" and len(words) == 3:
             order = {"binary_little_endian": "<", "binary_big_endian": ">"}.get(words[1], "")
             if not order:
-                raise InputError(
-                    "this kind of PLY is not read",
-                    where=where,
-                    expected="binary_little_endian",
-                    got=words[1][:40],
-                    remedy="save it as a binary PLY",
-                )
+                what, remedy = "this kind of PLY is not read", "save it as a binary PLY"
+                raise InputError(what, where=where, expected="binary_little_endian", got=words[1][:40], remedy=remedy)
         elif words[0] == "element" and len(words) == 3 and words[2].isdecimal() and len(words[2]) < 12:
             elements.append(_Element(words[1], int(words[2]), []))
         elif words[0] == "property" and len(words) == 3 and words[1] in _TYPES and elements:
@@ -354,12 +330,9 @@ def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str
         ):
             elements[-1].columns.append((_TYPES[words[2]], _TYPES[words[3]], words[4]))
         else:
-            raise InputError(
-                "a line in the header of the PLY file is not understood",
-                where=where,
-                got=repr(line[:80]),
-                expected="format, element NAME COUNT, property TYPE NAME, or property list TYPE TYPE NAME",
-            )
+            what = "a line in the header of the PLY file is not understood"
+            expected = "format, element NAME COUNT, property TYPE NAME, or property list TYPE TYPE NAME"
+            raise InputError(what, where=where, got=repr(line[:80]), expected=expected)
     if not order or not elements:
         raise InputError("the header of the PLY file names no format or no elements", where=where)
     for element in elements:
@@ -371,13 +344,9 @@ def _parsed_header(content: bytes, where: str) -> tuple[list[_Element], list[str
 def _after_lists(content: bytes, place: int, element: _Element, order: str, where: str) -> int:
     """Where the rows of an element with lists, which stand before the Gaussians, end."""
     if element.count > MOST_LISTS:
-        raise InputError(
-            "a PLY file has too many lists before its Gaussians",
-            where=f"{where}: element {element.name!r}",
-            expected=f"at most {MOST_LISTS}",
-            got=str(element.count),
-            remedy="write the vertices first",
-        )
+        what, where = "a PLY file has too many lists before its Gaussians", f"{where}: element {element.name!r}"
+        remedy = "write the vertices first"
+        raise InputError(what, where=where, expected=f"at most {MOST_LISTS}", got=str(element.count), remedy=remedy)
     columns = [
         (struct.Struct(order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize)
         for length, kind, _ in element.columns

@@ -214,23 +214,14 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     archive = binary.BoundedZip(content, where)
     names = [name for name in archive.names if name.rpartition("/")[2] == "meta.json"]
     if not names:
-        raise InputError(
-            "the zip is no SOG file",
-            where=where,
-            expected="meta.json",
-            got=listed(archive.names) or "an empty zip",
-            remedy="of a bundle, give the PLY files within" if "bundle.json" in archive.names else "",
-        )
+        got = listed(archive.names) or "an empty zip"
+        remedy = "of a bundle, give the PLY files within" if "bundle.json" in archive.names else ""
+        raise InputError("the zip is no SOG file", where=where, expected="meta.json", got=got, remedy=remedy)
     folder = names[0].removesuffix("meta.json")
     stated = store.parse_json(archive.read(names[0], _MOST_META), f"{where}: {names[0]}")
     if isinstance(stated, dict) and stated.get("version") != 2:
-        raise InputError(
-            "this version of SOG is not read",
-            where=where,
-            expected="2",
-            got=str(stated.get("version", "1 (none stated)"))[:20],
-            remedy="convert it, for example with splat-transform",
-        )
+        got, remedy = str(stated.get("version", "1 (none stated)"))[:20], "convert it, for example with splat-transform"
+        raise InputError("this version of SOG is not read", where=where, expected="2", got=got, remedy=remedy)
     meta = parse_record(SogMeta, stated, f"{where}: {names[0]}: ")
     binary.refuse_count(meta.count, where)
     binary.refuse_bomb(meta.count, content, where)
@@ -243,12 +234,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     turn = pixels.rows(meta.quats.files[0])
     largest = turn[:, 3].astype(np.int64) - 252
     if (largest < 0).any():
-        raise InputError(
-            "a rotation names no component",
-            where=f"{where}: {meta.quats.files[0]}",
-            expected="alpha from 252 to 255",
-            got=str(int(turn[:, 3].min())),
-        )
+        what, where = "a rotation names no component", f"{where}: {meta.quats.files[0]}"
+        raise InputError(what, where=where, expected="alpha from 252 to 255", got=str(int(turn[:, 3].min())))
     quats = binary.from_smallest_three(largest, (turn[:, :3] / 255.0 * 2 - 1) / np.sqrt(2))
     scales = np.array(meta.scales.codebook)[pixels.rows(meta.scales.files[0])[:, :3]]
     first = pixels.rows(meta.sh0.files[0])
@@ -274,12 +261,8 @@ def _harmonics(stated: SogHarmonics, pixels: _Pictures, where: str) -> Array:
     palette = picture.reshape(-1, coefficients, 4)[: stated.count, :, :3]
     labels = pixels.rows(stated.files[1])[:, :2] @ np.array([1, 256])
     if len(labels) and int(labels.max()) >= stated.count:
-        raise InputError(
-            "a Gaussian names harmonics that the palette does not have",
-            where=f"{where}: {stated.files[1]}",
-            expected=f"below {stated.count}",
-            got=str(int(labels.max())),
-        )
+        what, where = "a Gaussian names harmonics that the palette does not have", f"{where}: {stated.files[1]}"
+        raise InputError(what, where=where, expected=f"below {stated.count}", got=str(int(labels.max())))
     return np.array(stated.codebook)[palette][labels]
 
 
@@ -314,12 +297,8 @@ class _Pictures:
             fits = self._count <= width * height <= 2 * self._count + (1 << 16)
         if not fits:
             wanted = f"about {self._count} pixels" if size is None else f"{size[0]}x{size[1]}"
-            raise InputError(
-                "a picture of the SOG file has an impossible size",
-                where=where,
-                expected=wanted,
-                got=f"{width}x{height}",
-            )
+            what = "a picture of the SOG file has an impossible size"
+            raise InputError(what, where=where, expected=wanted, got=f"{width}x{height}")
 
 
 def _lossy(content: bytes) -> bool:

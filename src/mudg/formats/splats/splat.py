@@ -37,21 +37,15 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         InputError: no such file, or a damaged one.
     """
     if len(content) % ROW.itemsize:
-        raise InputError(
-            "the length of a .splat file is a multiple of 32 bytes",
-            where=where,
-            got=f"{len(content)} bytes",
-            remedy="it was cut off, or is another kind of file",
-        )
+        what, got = "the length of a .splat file is a multiple of 32 bytes", f"{len(content)} bytes"
+        raise InputError(what, where=where, got=got, remedy="it was cut off, or is another kind of file")
     binary.refuse_count(len(content) // ROW.itemsize, where)
     rows = np.frombuffer(content, ROW)
     scales = rows["scales"].astype(np.float64)
     if (scales < 0).any():
-        raise InputError(
-            "the size of a Gaussian is negative",
-            where=f"{where}: Gaussian {int((scales < 0).any(1).argmax())}",
-            remedy="a .splat file holds sizes in metres, not their logarithms: write exp(scale)",
-        )
+        what = "the size of a Gaussian is negative"
+        remedy = "a .splat file holds sizes in metres, not their logarithms: write exp(scale)"
+        raise InputError(what, where=f"{where}: Gaussian {int((scales < 0).any(1).argmax())}", remedy=remedy)
     with np.errstate(divide="ignore"):
         logs = np.maximum(np.log(scales), LEAST_LOG)
     rgba = rows["rgba"] / 255

@@ -102,13 +102,11 @@ class _Header:
         """Sizes of the planes, after the header was found possible."""
         binary.refuse_count(self.count, where)
         if self.degree > 4:
-            raise InputError(
-                "harmonics of this degree are not read", where=where, expected="0 to 3", got=str(self.degree)
-            )
+            what = "harmonics of this degree are not read"
+            raise InputError(what, where=where, expected="0 to 3", got=str(self.degree))
         if self.bits > 23:
-            raise InputError(
-                "the number of fractional bits is not possible", where=where, expected="0 to 23", got=str(self.bits)
-            )
+            what = "the number of fractional bits is not possible"
+            raise InputError(what, where=where, expected="0 to 23", got=str(self.bits))
         places, rotation = (6 if self.version == 1 else 9), (4 if self.version > 2 else 3)
         harmonics = 3 * ((self.degree + 1) ** 2 - 1)
         return [size * self.count for size in (places, 1, 3, 3, rotation, harmonics)]
@@ -124,9 +122,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if content[:4] == struct.pack("<I", MAGIC):
         return _from_streams(content, where)
     if content[:2] != b"\x1f\x8b":
-        raise InputError(
-            "not an SPZ file", where=where, expected="a gzip file, or one that begins with NGSP", got=repr(content[:4])
-        )
+        what = "not an SPZ file"
+        raise InputError(what, where=where, expected="a gzip file, or one that begins with NGSP", got=repr(content[:4]))
     stream = binary.GzipStream(content, where)
     magic, *fields, _ = struct.unpack(HEADER, stream.read(struct.calcsize(HEADER), "the header"))
     if magic != MAGIC:
@@ -147,29 +144,20 @@ def _from_streams(content: bytes, where: str) -> SplatFile:
     _, *fields, streams, toc = binary.unpacked("<IIIBBBBI", content, 0, "the header", where)
     head = _Header(*fields)
     if head.version != 4:
-        raise InputError(
-            "this version of SPZ is not read",
-            where=where,
-            expected="4 without gzip, 1 to 3 within",
-            got=str(head.version),
-        )
+        what = "this version of SPZ is not read"
+        raise InputError(what, where=where, expected="4 without gzip, 1 to 3 within", got=str(head.version))
     binary.refuse_bomb(head.count, content, where)
     sizes = [size for size in head.sizes(where) if size]
     if streams != len(sizes) or toc < 32:
-        raise InputError(
-            "the header of the SPZ file does not fit its content",
-            where=where,
-            expected=f"{len(sizes)} streams",
-            got=f"{streams} streams, table at {toc}",
-        )
+        what = "the header of the SPZ file does not fit its content"
+        raise InputError(what, where=where, expected=f"{len(sizes)} streams", got=f"{streams} streams, table at {toc}")
     table = binary.numbers(content, toc, "<u8", 2 * streams, "the table of streams", where).reshape(-1, 2)
     extensions = _extensions(content[32:toc], where) if head.flags & _EXTENSIONS else {}
     package, place, planes = _zstandard("read"), toc + 16 * streams, list[bytes]()
     for name, size, (packed, raw) in zip(_PLANES, sizes, table.tolist()):
         if raw != size:
-            raise InputError(
-                f"the {name} have another size than the header says", where=where, expected=str(size), got=str(raw)
-            )
+            what = f"the {name} have another size than the header says"
+            raise InputError(what, where=where, expected=str(size), got=str(raw))
         part = binary.part(content, place, packed, f"the {name}", where)
         try:
             with package.ZstdDecompressor(max_window_size=1 << 27).stream_reader(bytes(part)) as reader:
@@ -198,13 +186,9 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
     if _AXES in extensions:
         code = int.from_bytes(extensions[_AXES], "little")
         if len(extensions[_AXES]) != 4 or code >= len(_AXES_CODES):
-            raise InputError(
-                "the axes of the SPZ file are not known",
-                where=f"{where}: extension {_AXES:#010x}",
-                expected=f"a number up to {len(_AXES_CODES) - 1}",
-                got=extensions[_AXES][:8].hex(),
-                remedy="convert it with the program that wrote it",
-            )
+            what, where = "the axes of the SPZ file are not known", f"{where}: extension {_AXES:#010x}"
+            expected, remedy = f"a number up to {len(_AXES_CODES) - 1}", "convert it with the program that wrote it"
+            raise InputError(what, where=where, expected=expected, got=extensions[_AXES][:8].hex(), remedy=remedy)
         axes = _AXES_CODES[code]
     elif head.version == 4:
         warnings.append(
@@ -236,10 +220,8 @@ def _zstandard(done: str) -> Any:
     try:
         import zstandard
     except ImportError as error:
-        raise ResourceError(
-            f"SPZ of version 4 is {done} with the package zstandard, which is not installed",
-            remedy="pip install zstandard, or use version 3 (--spz-version 3)",
-        ) from error
+        what = f"SPZ of version 4 is {done} with the package zstandard, which is not installed"
+        raise ResourceError(what, remedy="pip install zstandard, or use version 3 (--spz-version 3)") from error
     return zstandard
 
 

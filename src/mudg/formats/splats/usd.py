@@ -95,12 +95,8 @@ def to_package(
     files |= dict(more or {})
     size = sum(map(len, files.values()))
     if size > _MOST_PACKAGE - (1 << 20):
-        raise InputError(
-            "the scene is too large for a USDZ package",
-            expected="below 4 GiB",
-            got=f"{size} bytes",
-            remedy="choose some --nodes, or export usda",
-        )
+        what, expected = "the scene is too large for a USDZ package", "below 4 GiB"
+        raise InputError(what, expected=expected, got=f"{size} bytes", remedy="choose some --nodes, or export usda")
     return binary.stored_zip(files, align=64)
 
 
