@@ -10,11 +10,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["GLOO_SOCKET_IFNAME"] = "lo"
 
 import torch.distributed as dist
-from toy_clips import tiny
+from toy_clips import before_each_batch, tiny
 
 from mudg.base.errors import NumericsError, UsageError
 from mudg.base.processes import Interruption
-from mudg.diffusion import learn
 from mudg.steps.learn import Learn
 
 rank, store, clips, out = int(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4])
@@ -24,21 +23,19 @@ said = {}
 
 def run_until(step, config, folder, stopper):
     """Run on; process `stopper` alone is asked to stop during step number `step`."""
-    draw = learn.draw_clips
 
-    def stop_then(config, folder, drawn_step, count, frames, purpose, *rest):
-        if rank == stopper and purpose == "batch" and drawn_step == step - 1:
+    def stop_then(drawn_step):
+        if rank == stopper and drawn_step == step - 1:
             Interruption.requested = property(lambda self: True)
-        return draw(config, folder, drawn_step, count, frames, purpose, *rest)
 
     asked = Interruption.requested
-    learn.draw_clips = stop_then
     try:
-        Learn(out=folder, settings=config).run()
+        with before_each_batch(stop_then):
+            Learn(out=folder, settings=config).run()
     except KeyboardInterrupt:
         return True
     finally:
-        learn.draw_clips, Interruption.requested = draw, asked
+        Interruption.requested = asked
     return False
 
 

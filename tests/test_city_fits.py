@@ -6,14 +6,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from toy_clips import tiny, with_settings
 
 from mudg import native
 from mudg.base.errors import UsageError
 from mudg.base.types import SweepPoints
 from mudg.core import metrics
-from mudg.diffusion import city_clips, clips, learn_clips, model_files, models
+from mudg.diffusion import city_clips, clips, learn, model_files, models
 from mudg.diffusion.city_clips import CityClipRules
+from mudg.diffusion.model import MDM
+from mudg.diffusion.parallel import Ranks
 from mudg.scene.labels import read_label
 from mudg.scene.part import write_photos
 from mudg.scene.read import read_image, read_points, read_scene
@@ -49,11 +52,14 @@ def test_the_scene_of_a_log_holds_what_its_clips_may_know(tmp_path, realism):
     assert isinstance(first, SweepPoints)
 
 
-def test_a_model_that_uses_no_renders_needs_no_fits(tmp_path):
-    config = tiny(tmp_path)
-    assert learn_clips.clip_rules(config).fitted
-    assert not learn_clips.clip_rules(config, points_alone=True).fitted
-    assert not learn_clips.clip_rules(learn_clips.without_renders(config)).fitted
+@pytest.mark.parametrize(("renders", "wanted"), [(True, True), (False, True), (True, False)])
+def test_a_model_that_uses_no_renders_needs_no_fits(tmp_path, monkeypatch, renders, wanted):
+    config, made = tiny(tmp_path), []
+    config = replace(config, data=replace(config.data, renders=wanted))
+    model = MDM(replace(models.model_config(config), renders=renders, finish_widths=(), finish_blocks=()))
+    monkeypatch.setattr(learn, "making_clips", lambda source, rules: made.append(rules))
+    learn.open_clips(config, model, tmp_path, Ranks(0, 1, torch.device("cpu")))
+    assert made[0].fitted == (renders and wanted)
 
 
 def test_only_cities_with_renders_add_renders_and_a_finisher(tmp_path):
@@ -90,7 +96,7 @@ def test_steps_of_fits_are_drawn_from_their_range(tmp_path):
     assert city_clips.steps_of(replace(rules, fit_steps=(50, 50)), 3) == 50
     assert [city_clips.steps_of(RULES, city) for city in range(3)] == [117, 116, 113]  # as before there was a setting
     config = with_settings(tiny(tmp_path), fit_steps=(400, 1000), log_frames=24, side_cameras=0.7)
-    made = learn_clips.clip_rules(config)
+    made = learn.city_rules(config)
     assert (made.fit_steps, made.log_frames, made.side_cameras) == ((400, 1000), 24, 0.7)
 
 

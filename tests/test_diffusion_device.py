@@ -4,7 +4,6 @@ the way."""
 from __future__ import annotations
 
 import json
-import signal
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from types import SimpleNamespace
@@ -15,7 +14,7 @@ import tiny_networks
 import torch
 from pretend_device import copies, pretend_device
 from test_published import some_condition
-from toy_clips import HEIGHT, WIDTH, made_up_clip, tiny, with_settings, write_clips
+from toy_clips import HEIGHT, WIDTH, interrupted_at, made_up_clip, tiny, with_settings, write_clips
 from toy_published import TINY, published_settings, tiny_checkpoint, tiny_model, write_tiny
 from toy_scene import ToyStreet
 
@@ -23,7 +22,7 @@ from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Condition
 from mudg.core.depth import fit_depth
-from mudg.diffusion import convert, learn, memory_plan, model_files, parallel, published
+from mudg.diffusion import convert, memory_plan, model_files, parallel, published
 from mudg.diffusion import views as loading
 from mudg.diffusion.model import MDM
 from mudg.diffusion.models import model_config
@@ -182,23 +181,14 @@ def losses_in(out):
 
 
 @pytest.mark.slow
-def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path, monkeypatch):
+def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path):
     """Codec, network, refiner, finisher and scores; stopped after two steps and continued."""
     config = tiny(clips, device="cpu", log_every=1)
     here = Learn(out=tmp_path / "here", settings=config).run()
-    draw = learn.draw_clips
-
-    def stopped_by_the_user(config, folder, step, count, frames, purpose, *rest):
-        if step == 1 and purpose == "batch":
-            signal.raise_signal(signal.SIGINT)
-        return draw(config, folder, step, count, frames, purpose, *rest)
-
     with pretend_device():
         there = with_settings(config, device="pretend")
-        monkeypatch.setattr(learn, "draw_clips", stopped_by_the_user)
-        with pytest.raises(KeyboardInterrupt):
+        with interrupted_at(1), pytest.raises(KeyboardInterrupt):
             Learn(out=tmp_path / "there", settings=there).run()
-        monkeypatch.setattr(learn, "draw_clips", draw)
         made = Learn(out=tmp_path / "there", settings=there).run()
     assert losses_in(tmp_path / "there") == pytest.approx(losses_in(tmp_path / "here"), rel=1e-5)
     a, b = (model_files.load(folder).state_dict() for folder in (here, made))

@@ -1,16 +1,15 @@
 """Training: resume is invisible, schedules are what they say, bad numbers never reach the weights."""
 
 import json
-import signal
 
 import pytest
 import torch
-from toy_clips import WINDOW, tiny, with_settings, write_clips
+from toy_clips import WINDOW, interrupted_at, tiny, with_settings, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.diffusion import city_clips, learn, learn_clips, model_files, score
-from mudg.diffusion import clips as clip_shards
+from mudg.diffusion import city_clips, learn, model_files, score
+from mudg.diffusion.clips import await_shard, class_weights, read_clip
 from mudg.diffusion.requests import GeneratedClip
 from mudg.steps.learn import Learn
 
@@ -30,19 +29,10 @@ def weights(folder):
     return model_files.load(folder).state_dict()
 
 
-def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, whole, tmp_path, monkeypatch):
+def test_an_interrupted_run_saves_its_step_and_continues_bit_for_bit(clips, whole, tmp_path):
     config = tiny(clips, checkpoint_every=100)
-    draw = learn.draw_clips
-
-    def stopped_by_the_user(config, folder, step, count, frames, purpose, *rest):
-        if step == 1 and purpose == "batch":
-            signal.raise_signal(signal.SIGINT)
-        return draw(config, folder, step, count, frames, purpose, *rest)
-
-    monkeypatch.setattr(learn, "draw_clips", stopped_by_the_user)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted_at(1), pytest.raises(KeyboardInterrupt):
         Learn(out=tmp_path / "parts", settings=config).run()
-    monkeypatch.setattr(learn, "draw_clips", draw)
     saved = checkpoint.latest(tmp_path / "parts" / "steps")
     assert saved is not None and saved.step == 2  # the step that was under way was finished
     assert json.loads((tmp_path / "parts" / "run.json").read_text())["state"] == "interrupted"
@@ -81,16 +71,15 @@ def test_training_continues_from_a_model(clips, whole, tmp_path):
 
 
 def test_class_weights_lift_rare_classes(clips):
-    assert torch.equal(learn_clips.class_weights(clips, range(2), 0.0), torch.ones(19))
-    weight = learn_clips.class_weights(clips, range(2), 0.5)
+    assert torch.equal(class_weights(clips, range(2), 0.0), torch.ones(19))
+    weight = class_weights(clips, range(2), 0.5)
     assert float(weight[13]) > float(weight[0])
 
 
-def test_fewer_cities_than_training_begins_with_are_not_waited_for(clips, monkeypatch):
+def test_fewer_cities_than_training_begins_with_are_not_waited_for(clips):
     config = with_settings(tiny(clips), first_cities=40)
     assert config.data.cities < config.data.first_cities
-    monkeypatch.setattr(learn, "class_weights", lambda folder, cities, balance: cities)
-    assert learn._class_weights(config, clips) == range(config.data.cities)
+    assert learn.clips_of_cities(config, clips).weighed() == range(config.data.cities)
 
 
 def test_numbers_that_are_not_finite_are_named_and_kept_out(clips, tmp_path):
@@ -111,16 +100,17 @@ def test_learning_on_the_same_few_clips_lowers_the_loss(clips, tmp_path):
 
 
 def test_batches_depend_on_step_only(clips):
-    config = tiny(clips)
-    first, again, other = (learn.draw_clips(config, clips, step, 2, 2, "batch") for step in (7, 7, 8))
+    source = learn.clips_of_cities(tiny(clips), clips)
+    first, again, other = (source.draw(step, 2, 2, "batch") for step in (7, 7, 8))
     assert all(torch.equal(one.rgb, two.rgb) for one, two in zip(first, again, strict=True))
     assert not torch.equal(first[0].rgb, other[0].rgb)
 
 
 def test_cities_that_are_skipped_are_never_drawn(clips):
     config = with_settings(tiny(clips, cities=2, first_cities=2), skip_cities=1, augment=False)
-    allowed = [clip_shards.read_clip(clips, city, k, range(4)).rgb for city in (1, 2) for k in range(2)]
-    drawn = [clip.rgb for step in range(8) for clip in learn.draw_clips(config, clips, step, 2, 4, "batch")]
+    source = learn.clips_of_cities(config, clips)
+    allowed = [read_clip(clips, city, k, range(4)).rgb for city in (1, 2) for k in range(2)]
+    drawn = [clip.rgb for step in range(8) for clip in source.draw(step, 2, 4, "batch")]
     assert all(any(torch.equal(one, rgb) for rgb in allowed) for one in drawn)
     assert all(any(torch.equal(one, rgb) for one in drawn) for rgb in allowed)
 
@@ -131,19 +121,18 @@ def test_schedules(clips):
     assert learn.learning_rate(config, 300) == pytest.approx(1e-3)
     assert learn.learning_rate(config, 750) == pytest.approx(5e-4)
     assert learn.learning_rate(config, 999) == pytest.approx(2e-5)
-    assert learn_clips.cities_in_use(config, 0) == range(1)
-    assert learn_clips.cities_in_use(config, 600) == range(3)
-    assert learn_clips.cities_in_use(with_settings(config, skip_cities=2), 600) == range(2, 5)
+    source, later = (learn.clips_of_cities(with_settings(config, skip_cities=n), clips) for n in (0, 2))
+    assert [source.in_use(0), source.in_use(600), later.in_use(600)] == [range(1), range(3), range(2, 5)]
     assert [learn.frames_at(config, s) for s in (0, 499, 500)] == [2, 2, 4]
 
 
 def test_clips_that_never_come_are_an_error(tmp_path):
     with pytest.raises(ResourceError, match="no training clips arrived"):
-        learn_clips.await_shard(tmp_path, 1, patience_s=0.0)
+        await_shard(tmp_path, 1, patience_s=0.0)
 
 
 def test_perfect_samples_score_perfectly(clips):
-    clip = clip_shards.read_clip(clips, city_clips.HELD_OUT, 0, range(WINDOW))
+    clip = read_clip(clips, city_clips.HELD_OUT, 0, range(WINDOW))
     depth = clip.depth.clamp(max=100.0)
     sample = GeneratedClip(clip.rgb, depth, clip.semantics, torch.ones_like(depth), {})
     row, counts = score.score_clip(clip, sample)

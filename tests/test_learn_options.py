@@ -163,29 +163,24 @@ def test_the_recipe_in_the_manual_is_a_settings_file(tmp_path):
     assert config.optimizer.betas == (0.9, 0.999) and config.compute.parallel == "fsdp" and not config.data.augment
 
 
-def test_a_step_has_clips_of_one_size() -> None:
-    from mudg.diffusion import learn_clips
-    from mudg.diffusion.settings import LearnConfig, LearnData
-
+def test_a_step_has_clips_of_one_size(tmp_path) -> None:
     config = LearnConfig(data=LearnData(realism="varied"))
-    sizes = learn_clips.sizes_of_cities(config)
+    source = learn.clips_of_cities(config, tmp_path)
+    sizes = source.sizes
     assert len(set(sizes)) == 5
     for cities in (range(3), range(7), range(40), range(5, 12), range(8, 21)):
         for first in cities:
             for city in cities:
-                chosen = learn_clips._of_same_size(city, first, sizes, cities)
+                chosen = source.of_same_size(city, first, cities)
                 assert chosen in cities
                 assert sizes[chosen % 5] == sizes[first % 5]
-    assert learn_clips.sizes_of_cities(LearnConfig()) == [(192, 128)]
-    assert len(learn_clips.sizes_of_cities(learn_clips.of_one_size(config))) == 1
+    assert learn.clips_of_cities(LearnConfig(), tmp_path).sizes == [(192, 128)]
+    assert len(learn.clips_of_cities(config, tmp_path, points_alone=True).sizes) == 1
 
 
 def test_the_condition_of_freevs_is_made_of_cities_without_renders():
-    from mudg.diffusion import learn_clips
-
     config = learn.check(LearnConfig(data=LearnData(condition="freevs")))
-    rules = learn_clips.clip_rules(config)
-    assert rules.near_points and not rules.fitted
-    assert not learn_clips.clip_rules(LearnConfig()).near_points
+    assert learn.city_rules(config).near_points and not config.data.renders
+    assert not learn.city_rules(LearnConfig()).near_points
     with pytest.raises(UsageError, match="generated cities only"):
         learn.check(LearnConfig(data=LearnData(condition="freevs", scenes=("a",))))

@@ -15,7 +15,8 @@ from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
-from mudg.diffusion import learn_clips, model_files, models, parallel
+from mudg.diffusion import learn, model_files, models, parallel
+from mudg.diffusion.clips import class_weights
 from mudg.diffusion.model import MDM, BatchPart, LossSettings
 from mudg.diffusion.parallel import Ranks, TrainingState, read_rows
 from mudg.steps.learn import Learn
@@ -165,12 +166,10 @@ def test_ctrl_c_under_torchrun_saves_the_step(clips, tmp_path):
 
 
 def test_draws_do_not_depend_on_the_part_of_a_batch(clips):
-    config = tiny(clips)
-    everything = learn_clips.draw_clips(config, clips, 7, 4, 2, "batch")
+    source = learn.clips_of_cities(tiny(clips), clips)
+    everything = source.draw(7, 4, 2, "batch")
     for part in (slice(0, 1), slice(1, 3), slice(3, 4)):
-        for own, clip in zip(
-            learn_clips.draw_clips(config, clips, 7, 4, 2, "batch", part), everything[part], strict=True
-        ):
+        for own, clip in zip(source.draw(7, 4, 2, "batch", part), everything[part], strict=True):
             assert torch.equal(own.rgb, clip.rgb)
             assert torch.equal(own.condition.semantics, clip.condition.semantics)
             assert torch.equal(own.condition.reference, clip.condition.reference)
@@ -181,10 +180,10 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(clips):
     model = MDM(models.model_config(tiny(clips)))
     models.draw_weights(model.net, 0, "weights")
     settings = tiny(clips)
-    rules = LossSettings(learn_clips.class_weights(clips, range(2), 0.5), refined_share=0.5, reference_dropout=0.2)
+    rules = LossSettings(class_weights(clips, range(2), 0.5), refined_share=0.5, reference_dropout=0.2)
 
     def loss(part, step):
-        drawn = learn_clips.draw_clips(settings, clips, step, 4, 2, "batch", part)
+        drawn = learn.clips_of_cities(settings, clips).draw(step, 4, 2, "batch", part)
         return float(model(drawn, BatchPart(settings.seed, step, part.start or 0, 4), rules).total.detach())
 
     for step in range(3):

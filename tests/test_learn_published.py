@@ -17,7 +17,7 @@ from toy_scene import ToyStreet
 from mudg.base import crop, palette
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Condition, SparseDepth
-from mudg.diffusion import city_clips, convert, learn, learn_clips, log_clips, models, published
+from mudg.diffusion import city_clips, convert, learn, log_clips, models, published
 from mudg.diffusion import clips as clip_shards
 from mudg.diffusion.condition import ConditionRules, build_conditions, filled_depth
 from mudg.diffusion.log_clips import LogClipRules, LogSource
@@ -57,6 +57,10 @@ def corner(clip):
     given = clip.condition
     condition = Condition(given.views, **cut(given, "color", "depth", "valid", "reference"))
     return replace(clip, condition=condition, **cut(clip, "rgb", "depth", "depth_valid", "semantics"))
+
+
+def corners(settings, clips, *draw):
+    return [corner(clip) for clip in learn.clips_of_cities(settings, clips, points_alone=True).draw(*draw)]
 
 
 @pytest.mark.slow
@@ -103,7 +107,10 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
 
     @torch.no_grad()
     def losses(step, part):
-        drawn = [corner(clip) for clip in learn_clips.draw_clips(settings, clips, step, 2, 4, "batch", part)]
+        drawn = [
+            corner(clip)
+            for clip in learn.clips_of_cities(settings, clips, points_alone=True).draw(step, 2, 4, "batch", part)
+        ]
         return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings(None, 1.0, 0.2))
 
     for step in range(2):
@@ -121,7 +128,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
 def test_unknown_truth_has_no_part_in_the_loss(converted, clips):
     settings = published_settings(converted, clips)
     model, _ = models.starting_model(settings)
-    drawn = [corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 4, 4, "batch")]
+    drawn = corners(settings, clips, 0, 4, 4, "batch")
     nothing = [
         replace(clip, depth_valid=torch.zeros_like(clip.depth_valid), semantics=torch.full_like(clip.semantics, 255))
         for clip in drawn
@@ -196,7 +203,9 @@ def test_what_goes_without_the_reference(converted, clips, share, frame, matters
     still shows it."""
     settings = published_settings(converted, clips)
     model, _ = models.starting_model(settings)
-    (clip,) = (corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 1, 4, "batch"))
+    (clip,) = (
+        corner(clip) for clip in learn.clips_of_cities(settings, clips, points_alone=True).draw(0, 1, 4, "batch")
+    )
     other = replace(clip, condition=replace(clip.condition, reference=1 - clip.condition.reference))
     rules = LossSettings(None, 1.0, share, frame_dropout=frame)
     with torch.no_grad():
@@ -208,7 +217,9 @@ def test_what_goes_without_the_reference(converted, clips, share, frame, matters
 def test_the_scope_of_dropout_changes_no_clip_that_keeps_its_reference(converted, clips):
     settings = published_settings(converted, clips)
     model, _ = models.starting_model(settings)
-    (clip,) = (corner(clip) for clip in learn_clips.draw_clips(settings, clips, 0, 1, 4, "batch"))
+    (clip,) = (
+        corner(clip) for clip in learn.clips_of_cities(settings, clips, points_alone=True).draw(0, 1, 4, "batch")
+    )
     with torch.no_grad():
         losses = {
             (share, frame): float(
@@ -222,7 +233,7 @@ def test_the_scope_of_dropout_changes_no_clip_that_keeps_its_reference(converted
 
 def test_the_scope_of_reference_dropout_reaches_the_loss():
     rules = [
-        learn._loss_settings(with_settings(LearnConfig(), **given), torch.ones(19))
+        learn.loss_settings(with_settings(LearnConfig(), **given), torch.ones(19))
         for given in ({}, {"reference_dropout_scope": "tokens_and_frame"})
     ]
     assert [rule.frame_dropout for rule in rules] == [False, True]

@@ -13,7 +13,7 @@ from toy_scene import ToyStreet
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Source, View
 from mudg.core import losses
-from mudg.diffusion import adapt, clips, learn_clips, log_clips, models
+from mudg.diffusion import adapt, clips, learn, log_clips, models
 from mudg.diffusion.city_clips import HELD_OUT
 from mudg.diffusion.log_clips import LogClipRules, LogSource
 from mudg.diffusion.model import MDM
@@ -271,7 +271,7 @@ def test_the_weight_of_depth_scales_its_loss(annotated):
 def test_points_are_left_out_of_published_type_clips_only_where_asked():
     def least(points_alone, **data):
         config = with_settings(LearnConfig(), **data)
-        return learn_clips._log_rules(config, (64, 32), 0, points_alone).least_points
+        return learn.rules_of_size(config, (64, 32), 0, points_alone).least_points
 
     assert (least(False), least(True)) == (0.3, 1.0)
     assert least(True, least_points=0.5) == least(False, least_points=0.5) == 0.5

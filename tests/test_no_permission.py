@@ -18,7 +18,8 @@ from test_gallery import run_of
 from toy_clips import tiny
 
 from mudg import app
-from mudg.diffusion import learn_clips
+from mudg.base.errors import ResourceError
+from mudg.diffusion import learn
 from mudg.diffusion.settings import LearnConfig
 from mudg.viewer import gallery
 
@@ -126,9 +127,9 @@ def test_clips_that_cannot_be_written_are_refused_before_any_is_made(open_folder
 
     def begin() -> int:
         try:
-            with learn_clips.making_clips(config, open_folder / "clips"):
+            with learn.making_clips(learn.clips_of_cities(config, open_folder / "clips"), learn.city_rules(config)):
                 return 0
-        except learn_clips.ResourceError as error:
+        except ResourceError as error:
             return error.exit_code
 
     assert as_nobody(begin, tmp_path / "said") == 5

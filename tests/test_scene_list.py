@@ -4,18 +4,19 @@ import collections
 import json
 import os
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from toy_clips import tiny, write_clips
+from toy_clips import interrupted_at, tiny, write_clips
 
 from mudg import app
 from mudg.base import config as configuration
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.location import Location
-from mudg.diffusion import learn, learn_clips
+from mudg.diffusion import learn
 from mudg.diffusion.shard_sources import (
     FolderOfShards,
     ListedScene,
@@ -122,40 +123,31 @@ def from_list(text, **changes):
 def test_bad_scenes_are_left_out_up_to_a_limit(clips, tmp_path, capsys):
     text = listed_folder(clips, tmp_path, bad=(3,))
     (tmp_path / "scenes" / "4" / "city_0000000.safetensors").write_bytes(b"damaged")
-    config = from_list(text, bad_scenes=0.4)
 
     def opened(limit=0.4):
-        _, shards = learn_clips.open_streamed(from_list(text, bad_scenes=limit), tmp_path / "out", 8, False)
-        return shards
+        return learn.listed_clips(from_list(text, bad_scenes=limit), 8, False, tmp_path / "out")
+
+    def colors(source, steps=12):
+        return [clip.rgb for step in range(steps) for clip in source.draw(step, 2, 2, "batch")]
 
     one, knowing = opened(), opened()
-    first = [clip.rgb for step in range(12) for clip in learn_clips.draw_clips(config, one, step, 2, 2, "batch")]
-    assert {n // 100_000_000 for n in one.bad} == {3, 4}
+    first = colors(one)
+    assert {n // 100_000_000 for n in one.shards.bad} == {3, 4}
     said = capsys.readouterr().err
     assert said.count("scenes/3") >= 1 and said.count("left out") == 2
-    [learn_clips.draw_clips(config, knowing, step, 2, 2, "batch") for step in range(12)]
-    again = [clip.rgb for step in range(12) for clip in learn_clips.draw_clips(config, knowing, step, 2, 2, "batch")]
-    assert all(map(torch.equal, first, again))  # what was known before changes nothing
-    parts = [learn_clips.draw_clips(config, opened(), 5, 4, 2, "batch", slice(n, n + 1))[0].rgb for n in range(4)]
-    assert all(map(torch.equal, parts, [c.rgb for c in learn_clips.draw_clips(config, one, 5, 4, 2, "batch")]))
+    colors(knowing)
+    assert all(map(torch.equal, first, colors(knowing)))  # what was known before changes nothing
+    parts = [opened().draw(5, 4, 2, "batch", slice(n, n + 1))[0].rgb for n in range(4)]
+    assert all(map(torch.equal, parts, [c.rgb for c in one.draw(5, 4, 2, "batch")]))
     with pytest.raises(UsageError, match="too many scenes"):
-        [learn_clips.draw_clips(config, opened(0.2), step, 2, 2, "batch") for step in range(40)]
+        colors(opened(0.2), 40)
 
 
-def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path, monkeypatch):
+def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path):
     text = listed_folder(clips, tmp_path)
     Learn(out=tmp_path / "whole", settings=from_list(text)).run()
-    draw = learn.draw_clips
-
-    def stopped_by_the_user(config, folder, step, *rest):
-        if step == 1:
-            raise KeyboardInterrupt
-        return draw(config, folder, step, *rest)
-
-    monkeypatch.setattr(learn, "draw_clips", stopped_by_the_user)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted_at(0), pytest.raises(KeyboardInterrupt):
         Learn(out=tmp_path / "parts", settings=from_list(text)).run()
-    monkeypatch.setattr(learn, "draw_clips", draw)
     Learn(out=tmp_path / "parts", settings=from_list(text)).run()
     assert losses_of(tmp_path / "whole") == losses_of(tmp_path / "parts")
     names = [p.name for p in (tmp_path / "whole" / "model").glob("*.safetensors")]
@@ -226,17 +218,15 @@ def test_what_arrives_is_verified(clips, address, tmp_path):
 
 
 def test_reading_ahead_brings_what_will_be_drawn(address, tmp_path):
-    config = tiny(address.text)
     shards = StreamedShards(address, ShardCache(tmp_path, 10**9), 2)
-    with learn_clips.ReadingAhead(
-        lambda step: learn_clips.bring_shards(config, shards, step, 4, 2, [slice(0, 4)]), 2, 4
-    ) as ahead:
+    source = replace(learn.clips_of_cities(tiny(address.text), tmp_path), shards=shards)
+    with learn.ReadingAhead(lambda step: source.bring(step, 4, 2, [slice(0, 4)]), 2, 4) as ahead:
         ahead.beyond(0)
         ahead._pool.shutdown(wait=True)
         brought = len(list(tmp_path.rglob("*.safetensors")))
     assert brought >= 1
     for step in (1, 2):
-        learn_clips.draw_clips(config, shards, step, 4, 2, "batch")
+        source.draw(step, 4, 2, "batch")
     assert len(list(tmp_path.rglob("*.safetensors"))) == brought
 
 

@@ -15,10 +15,11 @@ from mudg.base.types import Camera, View
 from mudg.core import trajectory
 from mudg.diffusion import condition, model_files, synthesize
 from mudg.diffusion import condition as stacked
+from mudg.diffusion.condition import PreparedImages
 from mudg.diffusion.model import MDM, MDMConfig
 from mudg.diffusion.models import extended
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.views import PreparedImages, ViewMaker, add_detail, windows
+from mudg.diffusion.views import ViewMaker, add_detail, windows
 from mudg.gaussians import fit
 from mudg.gaussians.rendering import FAR_M, render_condition, render_planes
 from mudg.networks.codec import CodecConfig

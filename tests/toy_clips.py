@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
+import signal
+from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -10,8 +13,8 @@ import numpy as np
 import torch
 
 from mudg.base.types import Camera, Clip, Condition, FinePatch, RenderPlanes, View
-from mudg.diffusion import clips as clip_shards
 from mudg.diffusion.city_clips import HELD_OUT
+from mudg.diffusion.clips import TrainingClips, pack_clips, write_shard
 from mudg.diffusion.settings import LearnCodec, LearnConfig
 
 WIDTH, HEIGHT, WINDOW = 48, 32, 4
@@ -65,7 +68,7 @@ def write_clips(folder: Path, width: int = WIDTH, height: int = HEIGHT, *, point
         made = [with_patch(made_up_clip(number * 7 + k, width, height)) for k in range(2)]
         made = [points_alone(clip) for clip in made[: 1 if number == HELD_OUT else 2]] if points else made
         made = [replace(clip, shift_m=shift) for clip, shift in zip(made, (2.0, 0.0), strict=False)]
-        clip_shards.write_shard(folder, number, clip_shards.pack_clips(made))
+        write_shard(folder, number, pack_clips(made))
     return folder
 
 
@@ -128,3 +131,25 @@ def tiny(clips: Path | str, **changes: Any) -> LearnConfig:
         score_steps=1,
     )
     return with_settings(config, **changes)
+
+
+@contextlib.contextmanager
+def before_each_batch(act: Callable[[int], None]) -> Iterator[None]:
+    """Within, `act(step)` is called before the network's clips of a step are drawn."""
+    draw = TrainingClips.draw
+
+    def acted(self: TrainingClips, step: int, count: int, frames: int, purpose: str, *rest: Any) -> list[Clip]:
+        if purpose == "batch":
+            act(step)
+        return draw(self, step, count, frames, purpose, *rest)
+
+    TrainingClips.draw = acted
+    try:
+        yield
+    finally:
+        TrainingClips.draw = draw
+
+
+def interrupted_at(step: int) -> contextlib.AbstractContextManager[None]:
+    """Within, the user interrupts a training during this step."""
+    return before_each_batch(lambda now: signal.raise_signal(signal.SIGINT) if now == step else None)

@@ -1,4 +1,4 @@
-"""Training clips on disk: one file per generated city, read back clip by clip.
+"""Training clips on disk, one file per generated city; and which of them a training step draws (`TrainingClips`).
 
 A shard is a safetensors file with, for K clips of T frames,
 
@@ -27,7 +27,8 @@ scale).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -39,9 +40,10 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from mudg.base import seeds, store
-from mudg.base.errors import InputError
+from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.base.types import Camera, Clip, Condition, FinePatch, RenderPlanes, SparseDepth, View
+from mudg.diffusion.settings import LearnConfig
 
 Result = TypeVar("Result")
 FAR_M = 1000.0
@@ -455,3 +457,140 @@ class ClassMistakes:
         blocks = seeds.numpy_rng(seed, 0, "holes").random((1, 1, -(-height // 8), -(-width // 8))) < share
         holes = torch.from_numpy(blocks).repeat_interleave(8, -2).repeat_interleave(8, -1)[..., :height, :width]
         return torch.where(holes, torch.full_like(worse, 255), worse)
+
+
+# the clips of a training --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingClips:
+    """The clips that a training draws from, in numbered shards.
+
+    What is drawn for a clip depends on (seed, step, purpose) and the clip's place in the batch of a step: not on which
+    part of that batch is drawn here, nor on where the shards come from.
+
+    Args:
+        config: of the training. shards: their folder, or what fetches them.
+        size: width and height, as the settings come to.
+        sizes: of the clips: shard number n has the n-th, counted round. All clips of a step have that of its first.
+        numbers: of the shards to train on, of which `begin` are in use from the first step. The others join at steps
+            that are the same in every run, so that clips can still be in the making while training runs.
+        scored: shards for scoring only. about: the data in a sentence for the model card; empty = generated cities.
+    """
+
+    config: LearnConfig
+    shards: Path | ShardSource
+    size: tuple[int, int]
+    sizes: Sequence[tuple[int, int]]
+    numbers: range
+    begin: int
+    scored: Sequence[int]
+    about: str = ""
+
+    def in_use(self, step: int) -> range:
+        """Shards that training may draw from at `step`: `begin`, then linearly up to all at `all_cities_at`."""
+        share = min(1.0, step / max(1.0, self.config.data.all_cities_at * self.config.steps))
+        return self.numbers[: self.begin + int((len(self.numbers) - self.begin) * share)]
+
+    def draw(self, step: int, count: int, frames: int, purpose: str, part: slice | None = None) -> list[Clip]:
+        """The clips of a `part` of a step's batch of `count`: random shards, clips and runs of consecutive frames,
+        varied (see `vary`)."""
+        read, drawn = self.reader(step, count, frames, purpose), []
+        for place in range(count)[part or slice(None)]:
+            clip = read(place)
+            if self.config.data.augment:
+                clip = vary(clip, seeds.numpy_rng(self.config.seed, step, f"{purpose}, clip {place}"))
+            drawn.append(clip)
+        return drawn
+
+    def reader(self, step: int, count: int, frames: int, purpose: str) -> Callable[[int], Clip]:
+        """What reads the clip of a place in the batch."""
+        picks = self._picks(step, count, frames, purpose)
+        return lambda place: self.read(*picks[place], self.sizes[picks[place][0] % len(self.sizes)])
+
+    def read(self, shard: int, number: int, frames: range, size: tuple[int, int]) -> Clip:
+        """Some frames of a clip; InputError if it has another size."""
+        clip = read_clip(self.shards, shard, number, frames)
+        if clip.rgb.shape[-2:] != size[::-1]:
+            raise InputError(
+                "the training clips have another size",
+                where=str(shard_path(self.shards, shard)) if isinstance(self.shards, Path) else f"shard {shard}",
+                expected=f"{size[0]}x{size[1]}",
+                got=f"{clip.rgb.shape[-1]}x{clip.rgb.shape[-2]}",
+                remedy="choose another --data.clips",
+            )
+        return clip
+
+    def _picks(self, step: int, count: int, frames: int, purpose: str) -> list[tuple[int, int, range]]:
+        """Shard, clip and frames for every place of a batch."""
+        rng, picks = seeds.numpy_rng(self.config.seed, step, purpose), list[tuple[int, int, range]]()
+        shards = self.in_use(step)
+        for _ in range(count):
+            shard = shards[int(rng.integers(len(shards)))]
+            shard = self.of_same_size(shard, picks[0][0], shards) if picks else shard
+            await_shard(self.shards, shard)
+            number = int(rng.integers(clips_in(self.shards, shard)))
+            start = int(rng.integers(self.config.data.window - frames + 1))
+            picks.append((shard, number, range(start, start + frames)))
+        return picks
+
+    def of_same_size(self, shard: int, first: int, shards: range) -> int:
+        """The one of `shards` next to `shard` whose clips have the size of those of `first`."""
+        near = shard - shard % len(self.sizes) + first % len(self.sizes)
+        return next((n for n in (near, near - len(self.sizes), near + len(self.sizes)) if n in shards), first)
+
+    def bring(self, step: int, count: int, frames: int, parts: Sequence[slice]) -> None:
+        """Fetch or make the shards that a process needs for its `parts` of a step, so that drawing them need not
+        wait."""
+        if not isinstance(self.shards, Path):
+            picks = self._picks(step, count, frames, "batch")
+            for shard, _, _ in (pick for part in parts for pick in picks[part]):
+                self.shards.reading(shard, lambda path: None)
+
+    def have_patches(self) -> bool:
+        """Whether the clips have patches at a higher resolution; seen in the first one."""
+        await_shard(self.shards, self.numbers[0])
+        return read_clip(self.shards, self.numbers[0], 0, range(1)).fine is not None
+
+    def weighed(self) -> Sequence[int]:
+        """Shards over which classes are counted."""
+        return self.in_use(0)[:20]
+
+    def to_score(self) -> Sequence[int]:
+        """Shards to score; InputError where none can be used."""
+        return self.scored
+
+
+def await_shard(folder: Path | ShardSource, city: int, patience_s: float = 900.0) -> None:
+    """Wait until a shard is there (it is being made by another process). One of another source is brought when it is
+    read."""
+    if not isinstance(folder, Path):
+        return
+    path, started = shard_path(folder, city), time.monotonic()
+    while not path.is_file():
+        if time.monotonic() - started > patience_s:
+            raise ResourceError(
+                "no training clips arrived",
+                where=str(path),
+                expected=f"within {patience_s:.0f} s",
+                remedy="see the errors of the generating processes above",
+            )
+        time.sleep(0.5)
+
+
+def class_weights(folder: Path | ShardSource, cities: Iterable[int], balance: float) -> Tensor:
+    """Weights f32[19] of the classes in the semantic loss: share^-balance, counted over some cities.
+
+    Scaled so that the mean over labelled pixels is 1; a class that never occurs weighs as much as the rarest that does.
+    """
+    counts = torch.zeros(256, dtype=torch.float64)
+    for city in cities:
+        await_shard(folder, city)
+        ids = read_clip(folder, city, 0, range(1)).semantics
+        counts += torch.bincount(ids.flatten(), minlength=256)
+    counts = counts[: len(CLASSES)]
+    if not bool(counts.any()):  # logs without labels
+        return torch.ones(len(CLASSES))
+    share = counts / counts.sum().clamp(min=1)
+    weight = share.clamp(min=max(float(share[share > 0].min()), 1e-3)) ** -balance
+    return (weight / (weight * share).sum().clamp(min=1e-9)).float()

@@ -154,7 +154,7 @@ class ConditionRules:
     same_time_s: float = 0.06
     """Recorded images nearer in time than this may also colour dynamic objects."""
     images_per_view: int = 6
-    """How many recorded images are tried per view, nearest in time (then in place) first."""
+    """How many recorded images are tried per view, nearest in time (then in place) first. 0: the backdrop alone."""
     other_camera_s: float = 0.1
     """Images of other cameras count as farther away in time by this."""
     least_overlap: float = 0.02
@@ -432,6 +432,7 @@ def build_conditions(
     vacated_at: VacatedAt | None = None,
     *,
     recolor: Recolor | None = None,
+    among: Sequence[Sequence[int]] | None = None,
 ) -> tuple[Condition, Condition]:
     """The model's condition for `views` (any path, any size; resized to the rules' size), and the same on the fine
     grid.
@@ -440,11 +441,12 @@ def build_conditions(
         cloud: fused points: static ones in the world, objects in their boxes, posed by `tracks` at each view's time.
         recorded: images of any cameras; the ones nearest in time to a view are warped into it; may be empty.
         sources: cache of prepared images (index into `recorded` -> WarpSource); pass the same dict again for further
-            views. Of `KeptImages` with a folder, fine conditions of large views lie in files.
+            views. Of `PreparedImages` with a folder, fine conditions of large views lie in files.
         render_at: renders of a fitted scene. They are part of the condition, and tell how far away is what no point was
             measured on (not with `published`). Recorded images that `sources` holds must have been prepared with the
             same renders.
         vacated_at: of an edited drive: where something stood that is not there any more (not with `published`).
+        among: for each view the numbers of the recorded images that it may know (None: all).
         recolor: with `published`: changes the colours of the points, at the camera's size, and of the reference.
 
     Returns:
@@ -459,7 +461,8 @@ def build_conditions(
     if not views:
         raise InputError("a condition needs at least one view", where="clips.build_conditions")
     small = [view.resized(rules.width, rules.height) for view in views]
-    reference = _reference(small[0], recorded, rules, recolor)
+    among = [range(len(recorded))] * len(views) if among is None else among
+    reference = _reference(small[0], [recorded[n] for n in among[0]], rules, recolor)
     if rules.published:
         condition = _published_condition(cloud, tracks, small, reference, rules, recolor)
         return condition, condition
@@ -467,8 +470,10 @@ def build_conditions(
     size = (rules.fine_width or rules.width, rules.fine_height or rules.height)
     fine_views = tuple(view.resized(*size) for view in views)
     points = DrawnCloud(cloud, tracks, rules, render_at, vacated_at)
-    folder = sources.folder if isinstance(sources, KeptImages) else None
-    made = (_condition_of_view(points, view, recorded, rules, sources) for view in fine_views)
+    folder = sources.folder if isinstance(sources, PreparedImages) else None
+    made = (
+        _condition_of_view(points, v, recorded, own, rules, sources) for v, own in zip(fine_views, among, strict=True)
+    )
     rows = ((*part, *(() if render_at is None else _planes(shown))) for part, shown in made)
     color, depth, valid, warped, backdrop, ids, far_ids, *planes = stacked(rows, len(fine_views), folder)
     renders = RenderPlanes(*planes) if planes else None
@@ -540,10 +545,15 @@ def _in_order(renders: RenderPlanes | None) -> RenderAt | None:
 
 
 def _condition_of_view(
-    points: DrawnCloud, view: View, recorded: Sequence[Photo], rules: ConditionRules, sources: dict[int, WarpSource]
+    points: DrawnCloud,
+    view: View,
+    recorded: Sequence[Photo],
+    among: Sequence[int],
+    rules: ConditionRules,
+    sources: dict[int, WarpSource],
 ) -> tuple[tuple[Tensor, ...], RenderPlanes | None]:
     """Colour f32[3,H,W], depth f32[1,H,W], valid and warped bool[1,H,W], backdrop f32[3,H,W], classes of the colour and
-    of the backdrop u8[1,H,W] of one view, at its size; and its render."""
+    of the backdrop u8[1,H,W] of one view, at its size; and its render. Images `among` the recorded ones are used."""
 
     def source(number: int) -> WarpSource:
         if number not in sources:
@@ -551,13 +561,13 @@ def _condition_of_view(
         return sources[number]
 
     shape = (view.camera.height, view.camera.width)
-    if not (rules.warp and recorded):
+    if not (rules.warp and among):
         here = points.look(view, torch.full(shape, palette.UNLABELLED, dtype=torch.uint8))
         found = torch.zeros_like(here.measured)
         here, color, own_ids, found = here.with_hole(here.color, here.ids, found)
         ids = own_ids[None]
         return (color, here.depth[None], here.measured[None], found[None], color, ids, ids), here.render
-    nearest = source(min(range(len(recorded)), key=_rank_of_images(view, recorded, rules)))
+    nearest = source(min(among, key=_rank_of_images(view, recorded, rules)))
     x, y, _ = carry(view, torch.full((1, *shape), rules.backdrop_m), nearest.view)
     backdrop, far_ids = look_up(nearest.rgb, x, y)[0], look_up_ids(nearest.semantics, x, y)
     known = None if nearest.usable is None else look_up_ids(nearest.usable, x, y)
@@ -566,7 +576,7 @@ def _condition_of_view(
     color, depth, ids, found = here.color, here.depth, here.ids, torch.zeros_like(here.measured)
     shown = points.cloud.colors
     backdrop = shown.image_of(view.camera.name, backdrop).clamp(0, 1) if shown.to_common else backdrop
-    for number in _order_of_images(view, depth, recorded, rules):
+    for number in _order_of_images(view, depth, recorded, among, rules):
         image = source(number)
         fresh = abs(image.view.time_s - view.time_s) <= rules.same_time_s
         surface = image.depth if fresh else torch.where(image.moving, torch.zeros_like(image.depth), image.depth)
@@ -710,15 +720,16 @@ def _rank_of_images(
     return rank
 
 
-def _order_of_images(view: View, depth: Tensor, recorded: Sequence[Photo], rules: ConditionRules) -> list[int]:
+def _order_of_images(
+    view: View, depth: Tensor, recorded: Sequence[Photo], among: Sequence[int], rules: ConditionRules
+) -> list[int]:
     """The images to try for a view of depth f32[H,W]: nearest in time first (steps of 20 ms; see `other_camera_s`), the
     same camera before others, then by distance. Images that hardly overlap the view are left out, but for the first."""
-
     columns, rows = min(view.camera.width, OVERLAP_GRID[0]), min(view.camera.height, OVERLAP_GRID[1])
     coarse = view.resized(columns, rows)
     there = functional.interpolate(depth[None, None], size=(rows, columns), mode="nearest-exact")[0]
     chosen: list[int] = []
-    for number in sorted(range(len(recorded)), key=_rank_of_images(view, recorded, rules)):
+    for number in sorted(among, key=_rank_of_images(view, recorded, rules)):
         if len(chosen) == rules.images_per_view:
             break
         other = recorded[number].view
@@ -762,8 +773,9 @@ LARGE_PIXELS = 2_500_000
 """Planes of more pixels lie in files where there is a folder for them."""
 
 
-class KeptImages(dict[int, "WarpSource"]):
-    """Recorded images that were prepared for warping, by their numbers.
+class PreparedImages(dict[int, WarpSource]):
+    """Recorded images made ready for warping, by their numbers, for all windows and trajectories that a process makes;
+    colours as bytes where that is exact.
 
     Args:
         folder: where large conditions are kept while they are used, in files without names; None: in memory.
@@ -772,6 +784,16 @@ class KeptImages(dict[int, "WarpSource"]):
     def __init__(self, folder: Path | None = None) -> None:
         super().__init__()
         self.folder = folder
+
+    def __setitem__(self, number: int, image: WarpSource) -> None:
+        coarse = (image.rgb * 255).round().clamp(0, 255).to(torch.uint8)
+        super().__setitem__(
+            number, replace(image, rgb=coarse) if torch.equal(coarse.float() / 255, image.rgb) else image
+        )
+
+    def __getitem__(self, number: int) -> WarpSource:
+        image = super().__getitem__(number)
+        return image if image.rgb.is_floating_point() else replace(image, rgb=image.rgb.float() / 255)
 
 
 def stacked(rows: Iterable[Sequence[Tensor]], count: int, folder: Path | None) -> list[Tensor]:

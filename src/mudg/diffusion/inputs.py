@@ -220,11 +220,20 @@ def conditions_of(
         else:
             whole = replace(whole, reference_in="frame" if parts == "concat" else "nowhere")
         return whole, whole
-    points = build_conditions(cloud, tracks, views, recorded, replace(rules, warp=False), kept)
-    if parts == "points":
-        return points
-    images = build_conditions(cloud, tracks, views, recorded, replace(rules, images_per_view=1), kept)
-    small, fine = (_with_backdrop(a, b, rules, parts) for a, b in zip(points, images, strict=True))
+    bare = replace(rules, warp=False) if parts == "points" else replace(rules, images_per_view=0)
+    built = build_conditions(cloud, tracks, views, recorded, bare, kept)
+    if parts != "reference":
+        return built
+    small, fine = (
+        replace(
+            c,
+            color=c.backdrop,
+            semantics=c.backdrop_semantics,
+            valid=torch.zeros_like(c.valid),
+            depth=torch.full_like(c.depth, rules.far_m),
+        )
+        for c in built
+    )
     return small, fine
 
 
@@ -257,17 +266,3 @@ def _of_renders(
 
     small, fine = (bare(given) for given in made)
     return small, fine
-
-
-def _with_backdrop(points: Condition, images: Condition, rules: ConditionRules, parts: ConditionParts) -> Condition:
-    """The points with the backdrop of the images, or that backdrop alone."""
-    given = replace(points, backdrop=images.backdrop, backdrop_semantics=images.backdrop_semantics)
-    if parts == "concat" or images.backdrop is None:
-        return given
-    return replace(
-        given,
-        color=images.backdrop,
-        semantics=images.backdrop_semantics,
-        valid=torch.zeros_like(points.valid),
-        depth=torch.full_like(points.depth, rules.far_m),
-    )

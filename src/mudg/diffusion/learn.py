@@ -17,35 +17,40 @@ OUT/tensorboard/  with `compute.tensorboard`
 
 from __future__ import annotations
 
+import concurrent.futures
 import contextlib
 import hashlib
 import importlib.util
+import os
 import shutil
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor
 
 from mudg.base import log, store
 from mudg.base.config import to_dict
-from mudg.base.errors import ResourceError, UsageError
+from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
-from mudg.base.processes import Interruption
+from mudg.base.processes import Interruption, calls_beside, run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput
-from mudg.diffusion import learn_clips, log_clips, model_files, models, parallel, score
-from mudg.diffusion.clips import ShardSource
-from mudg.diffusion.learn_clips import class_weights, draw_clips
+from mudg.diffusion import city_clips, log_clips, model_files, models, parallel, score
+from mudg.diffusion.city_clips import CityClipRules
+from mudg.diffusion.clips import TrainingClips, class_weights, clips_at, shard_path
+from mudg.diffusion.log_clips import LogClipRules, LogSource
 from mudg.diffusion.memory_plan import choose_bf16
 from mudg.diffusion.model import MDM, BatchPart, LossSettings
-from mudg.diffusion.models import Model, draw_weights, freeze, hold_finisher, rebuilt, starting_model
+from mudg.diffusion.models import Model, starting_model
 from mudg.diffusion.parallel import SAME_SIGNAL_S, Ranks, Spread, TrainingState, agreed_terms, mean_of
-from mudg.diffusion.requests import SampleRequest
+from mudg.diffusion.requests import SampleRequest, sized_to_area
 from mudg.diffusion.settings import LearnConfig
-from mudg.diffusion.shard_sources import ListedShards, is_list, read_list
+from mudg.diffusion.shard_sources import ListedClips, ListedShards, ShardCache, StreamedShards, is_list, read_list
+from mudg.scene.read import read_scene
 
 
 def check(config: LearnConfig) -> LearnConfig:
@@ -69,8 +74,8 @@ def check(config: LearnConfig) -> LearnConfig:
                 got="--data.scenes",
                 remedy="leave one of them out",
             )
-        config = learn_clips.without_renders(config)
-    learn_clips.is_streamed(config)  # refuses what does not go together
+        config = replace(config, data=replace(config.data, renders=False))
+    is_streamed(config)  # refuses what does not go together
     return config
 
 
@@ -117,12 +122,12 @@ def inputs_of(config: LearnConfig) -> dict[str, str]:
     inputs = {"start": model_files.digest(config.start)} if config.start else {}
     if is_list(config.data.scenes):
         inputs["list of scenes"] = hashlib.sha256(Location.of(config.data.scenes[0]).load()).hexdigest()
-    for number, source in enumerate(_sources(config)):
+    for number, source in enumerate(_logs(config)):
         inputs |= {f"scene {number}": store.digest(source.scene), f"fused {number}": store.digest(source.fused)}
     return inputs
 
 
-def _sources(config: LearnConfig) -> list[log_clips.LogSource]:
+def _logs(config: LearnConfig) -> list[LogSource]:
     return [] if is_list(config.data.scenes) else [log_clips.log_source(text) for text in config.data.scenes]
 
 
@@ -130,75 +135,287 @@ def files_read(config: LearnConfig, out: Path, overwrite: bool) -> dict[str, Pat
     """What is read, by names for messages. Clips may lie in `out` where they do by default, unless a result there is to
     be replaced."""
     read: dict[str, Path | str | None] = {"start": model_files.folder_of(config.start) if config.start else ""}
-    for number, source in enumerate(_sources(config)):
+    for number, source in enumerate(_logs(config)):
         read |= {f"scene {number}": source.scene, f"fused {number}": source.fused}
     if is_list(config.data.scenes):
         listed = [text for scene in read_list(config.data.scenes[0]).scenes for text in scene.path.split("=")]
         read |= {f"scene {text}": text for text in listed if Location.of(text).local is not None}
         read["list"] = config.data.scenes[0] if Location.of(config.data.scenes[0]).local is not None else ""
-    clips = "" if learn_clips.clips_at_address(config) else config.data.clips
+    clips = "" if clips_at_address(config) else config.data.clips
     own_clips = not overwrite and Path(clips).resolve() == (out / "clips").resolve()
     return {**read, "clips": "" if own_clips else clips}
 
 
 def _train(model: Model, fresh: set[str], config: LearnConfig, directory: RunDir, ranks: Ranks) -> None:
-    """Clips, codec, network, scores. From logs, `config` is rewritten in terms of shards: `given` is what the user
-    said."""
-    out, given = directory.path, config
+    """Clips, codec, network, scores."""
+    out = directory.path
     bf16 = choose_bf16(config.precision, ranks.device)
-    folder: Path | ShardSource = Path(config.data.clips) if config.data.clips else out / "clips"
-    about_data = ""
-    if isinstance(model, MDM) and not model.config.renders:
-        config = learn_clips.without_renders(config)
-    making: contextlib.AbstractContextManager[None] = contextlib.nullcontext()
-    if learn_clips.is_streamed(config):
-        config, folder = learn_clips.open_streamed(config, out, model.config.pixel_multiple, model.points_alone)
-        about_data = learn_clips.describe_list(config, folder) if isinstance(folder, ListedShards) else ""
-    elif isinstance(folder, Path) and config.data.scenes:
-        sources = [log_clips.log_source(text) for text in config.data.scenes]
-        rules = learn_clips.log_rules(config, sources, model.config.pixel_multiple, model.points_alone)
-        counts = ranks.leader_does(partial(learn_clips.make_log_clips, given, rules, folder))
-        config = learn_clips.for_logs(config, rules, *counts)
-        about_data = learn_clips.describe_logs(config, rules)
-    elif isinstance(folder, Path) and ranks.leads:
-        making = learn_clips.making_clips(config, folder, model.points_alone)
-    if model.points_alone:
-        config = learn_clips.of_one_size(config)
+    source, making = open_clips(config, model, out, ranks)
     with making:
         if "codec" in fresh and isinstance(model, MDM):
-            ranks.leader_does(lambda: models.train_codec(model.codec, config, directory, folder, bf16, ranks.device))
+            ranks.leader_does(lambda: models.train_codec(model.codec, source, directory, bf16, ranks.device))
             models.load_trained_codec(model.codec, out, ranks)
-            draw_weights(model.net, config.seed, "weights")
+            models.draw_weights(model.net, config.seed, "weights")
         for name in ("refiner", "finisher"):
             part = getattr(model, name, None)
             if name in fresh and part is not None:
-                draw_weights(part, config.seed, f"{name} weights")
+                models.draw_weights(part, config.seed, f"{name} weights")
                 part.reset()
         model.requires_grad_(False)
         model.trained_part().requires_grad_(True)
-        hold_finisher(model, fresh, learn_clips.have_patches(config, folder, config.data.skip_cities))
-        weights = _train_network(model, config, directory, folder, bf16, ranks)
+        models.hold_finisher(model, fresh, source.have_patches())
+        weights = _train_network(model, source, directory, bf16, ranks)
 
     def finish() -> None:
-        made = rebuilt(model, weights)
+        made = models.rebuilt(model, weights)
         if isinstance(made, MDM) and made.refiner is not None and config.loss.class_balance:
-            made.refiner.take_back(_class_weights(config, folder))
+            made.refiner.take_back(class_weights(source.shards, source.weighed(), config.loss.class_balance))
         request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
-        scores = score.score(made, learn_clips.scored_shards(config, folder), folder, request)
+        scores = score.score(made, source.to_score(), source.shards, request)
         store.write_json(out / "metrics.json", scores)
-        facts: dict[str, Any] = {"recipe": to_dict(given), "held_out": scores}
+        facts: dict[str, Any] = {"recipe": to_dict(config), "held_out": scores}
         if config.start:
             facts["continued_from"] = model_files.facts(config.start)
-        models.save(made, out / "model", models.model_card(made, config, scores, about_data), facts)
-        shutil.rmtree(out / learn_clips.CACHE, ignore_errors=True)
+        models.save(made, out / "model", models.model_card(made, source, scores), facts)
+        shutil.rmtree(out / CACHE, ignore_errors=True)
         directory.finish({"held_out": scores["average"]})
         log.info(*score.table(scores).splitlines())
 
     ranks.leader_does(finish)
 
 
-def _class_weights(config: LearnConfig, folder: Path | ShardSource) -> Tensor:
-    return class_weights(folder, learn_clips.weighed_shards(config, folder), config.loss.class_balance)
+# clips --------------------------------------------------------------------------------------------
+
+
+CACHE = "cache"
+"""Where in the output folder clips are kept that are fetched or made when they are needed, while training runs."""
+
+
+def clips_at_address(config: LearnConfig) -> bool:
+    """Whether the setting `clips` is an address in an object store."""
+    return bool(config.data.clips) and Location.of(config.data.clips).local is None
+
+
+def is_streamed(config: LearnConfig) -> bool:
+    """Whether clips are not all in one folder of this machine before training starts.
+
+    Raises:
+        UsageError: settings that do not go together.
+    """
+    listed, remote = is_list(config.data.scenes), clips_at_address(config)
+    if remote and config.data.scenes:
+        raise UsageError(
+            "logs and clips at an address are given",
+            where="--data.scenes, --data.clips",
+            got=config.data.clips,
+            remedy="leave one out; a list of scenes may name folders of clips at addresses",
+        )
+    if listed and config.data.clips:
+        raise UsageError(
+            "a list of scenes says where the clips are",
+            where="--data.clips",
+            got=config.data.clips,
+            remedy="leave it out; --compute.cache chooses where clips that were made or fetched are kept",
+        )
+    return listed or remote
+
+
+def open_clips(
+    config: LearnConfig, model: Model, out: Path, ranks: Ranks
+) -> tuple[TrainingClips, contextlib.AbstractContextManager[None]]:
+    """The clips of a training, those of logs made; and a block while which processes make the missing ones of cities.
+
+    A model that uses no renders needs no fitted cities.
+    """
+    data, points_alone = config.data, model.points_alone
+    folder, nothing = Path(data.clips) if data.clips else out / "clips", contextlib.nullcontext()
+    if is_list(data.scenes):
+        return listed_clips(config, model.config.pixel_multiple, points_alone, out), nothing
+    if data.scenes:
+        rules = log_rules(config, model.config.pixel_multiple, points_alone)
+        counts = ranks.leader_does(partial(make_log_clips, config, rules, folder))
+        return clips_of_logs(config, rules, folder, *counts), nothing
+    fitted = data.renders and isinstance(model, MDM) and model.config.renders
+    source = clips_of_cities(config, folder, points_alone)
+    if is_streamed(config):
+        shards = StreamedShards(Location.of(data.clips), _cache(config, out), data.clips_per_city)
+        return replace(source, shards=shards), nothing
+    return source, making_clips(source, city_rules(config, points_alone, fitted)) if ranks.leads else nothing
+
+
+def _cache(config: LearnConfig, out: Path) -> ShardCache:
+    compute = config.compute
+    return ShardCache(Path(compute.cache) if compute.cache else out / CACHE, int(compute.cache_gb * 1e9))
+
+
+def clips_of_cities(config: LearnConfig, folder: Path, points_alone: bool = False) -> TrainingClips:
+    """Clips of generated cities; of the published system's condition all are of one size, however varied the cities."""
+    data, size = config.data, (config.data.width, config.data.height)
+    sizes = [size]
+    if data.realism != "plain" and not points_alone:
+        sizes = [city_clips.size_of(city_rules(config), city) for city in range(city_clips.SIZES)]
+    held_out = [city_clips.HELD_OUT + n for n in range(data.held_out)]
+    numbers = range(data.skip_cities, data.skip_cities + data.cities)
+    return TrainingClips(config, folder, size, sizes, numbers, data.first_cities, held_out)
+
+
+def city_rules(config: LearnConfig, points_alone: bool = False, fitted: bool = False) -> CityClipRules:
+    """Rules for the generator; `points_alone`: the published system's condition."""
+    data = config.data
+    return CityClipRules(
+        data.width,
+        data.height,
+        data.window,
+        config.seed,
+        data.clips_per_city,
+        published=points_alone,
+        realism=data.realism,
+        textures=data.textures,
+        fitted=fitted,
+        near_points=data.condition == "freevs",
+        log_frames=data.log_frames,
+        side_cameras=data.side_cameras,
+        fit_steps=data.fit_steps,
+    )
+
+
+def making_clips(source: TrainingClips, rules: CityClipRules) -> contextlib.AbstractContextManager[None]:
+    """A block while which processes make the missing clips of cities, held-out ones first (see ``calls_beside``)."""
+    folder, workers = cast("Path", source.shards), source.config.compute.workers
+    wanted = [*source.scored, *source.numbers]
+    missing = [n for n in wanted if not shard_path(folder, n).is_file()]
+    for number in set(wanted).difference(missing):
+        clips_at(shard_path(folder, number))  # a damaged one is found before the training begins
+    if not missing or workers == 0:
+        return contextlib.nullcontext()
+    store.make_folder(folder)
+    if not os.access(folder, os.W_OK):
+        raise ResourceError(
+            "training clips cannot be written here", where=str(folder), remedy="choose another --data.clips"
+        )
+    log.info(f"learn: {len(missing)} cities to generate into {folder}, {workers} processes")
+    make = city_clips.write_fitted_city if rules.fitted else city_clips.write_city
+    return calls_beside(make, [(rules, n, folder) for n in missing], workers)
+
+
+def log_rules(config: LearnConfig, multiple: int, points_alone: bool = False) -> LogClipRules:
+    """How clips are cut from logs: of the configuration's area, in the aspect of the first log's first camera.
+
+    `points_alone`: with the published system's condition, and of the configuration's very size, whatever the aspect.
+    """
+    data, scene = config.data, read_scene(log_clips.log_source(config.data.scenes[0]).scene)
+    names = data.cameras or tuple(scene.cameras)
+    if names[0] not in scene.cameras:
+        raise InputError(
+            "the scene has no such camera",
+            where=f"--data.cameras, {scene.root}",
+            expected=", ".join(scene.cameras),
+            got=names[0],
+        )
+    camera, size = scene.cameras[names[0]], (data.width, data.height)
+    if not points_alone:
+        size = sized_to_area(data.width * data.height, camera.width / camera.height, multiple)
+    return rules_of_size(config, size, data.held_out_every, points_alone)
+
+
+def rules_of_size(config: LearnConfig, size: tuple[int, int], held_out_every: int, points_alone: bool) -> LogClipRules:
+    """How clips of a size are cut from logs."""
+    data = config.data
+    least_points = 1.0 if points_alone else LogClipRules.least_points
+    return LogClipRules(
+        *size,
+        window=data.window,
+        stride=data.stride,
+        cameras=data.cameras,
+        held_out_every=held_out_every,
+        seed=config.seed,
+        published=points_alone,
+        depth=data.depth,
+        least_points=least_points if data.least_points is None else data.least_points,
+    )
+
+
+def make_log_clips(config: LearnConfig, rules: LogClipRules, folder: Path) -> tuple[int, int]:
+    """Make the missing clips of all logs; returns how many there are to train on and to score."""
+    sources, workers = _logs(config), config.compute.workers
+    rows = log_clips.plan_shards(sources, rules, city_clips.HELD_OUT)
+    log_clips.claim_folder(folder, rules, sources)
+    jobs = [
+        (source, rules, [(number, window) for number, owner, window in rows if owner == source], folder)
+        for source in dict.fromkeys(sources)
+    ]
+    with log.task("clips of logs", len(jobs)) as bar:
+        if workers < 2 or len(jobs) == 1:
+            made = (log_clips.write_log(*job) for job in jobs)
+        else:
+            made = run_in_processes(log_clips.write_log, jobs, workers)
+        for _ in made:
+            bar.advance()
+    scored = sum(window.held_out for _, _, window in rows)
+    return len(rows) - scored, scored
+
+
+def clips_of_logs(config: LearnConfig, rules: LogClipRules, folder: Path, train: int, scored: int) -> TrainingClips:
+    """Clips of logs, one in each shard; where none is held out, the first one trained on is scored."""
+    data, size = config.data, (rules.width, rules.height)
+    if not scored:
+        log.warn("learn: no clip is held out; the scored clip was also trained on")
+    condition = "the projected points and the first image" if rules.published else "images taken at other times"
+    elsewhere = ", and from labels elsewhere" if rules.depth == "annotated" else ""
+    about = (
+        f"{train} clips of {data.window} frames of {len(data.scenes)} recorded"
+        f" {'log' if len(data.scenes) == 1 else 'logs'} at {rules.width}x{rules.height} pixels, seen from where"
+        f" they were\nrecorded, with {condition} as condition. Depth was learned where a sweep measured it{elsewhere}."
+        " The model this\none continues from has training data of its own. `held-out` below means every"
+        f" {data.held_out_every}. window of these logs."
+    )
+    to_score = [city_clips.HELD_OUT + n for n in range(scored)] if data.held_out_every else [0]
+    return TrainingClips(config, folder, size, [size], range(train), train, to_score, about)
+
+
+def listed_clips(config: LearnConfig, multiple: int, points_alone: bool, out: Path) -> ListedClips:
+    """Clips of listed scenes, of the configuration's size, which is rounded to what the model takes."""
+    data, size = config.data, (config.data.width, config.data.height)
+    if not points_alone:
+        size = round(data.width / multiple) * multiple, round(data.height / multiple) * multiple
+    scenes = read_list(data.scenes[0], data.held_out)
+    log.info(*f"learn: {data.scenes[0]}: {scenes.summary()}".splitlines())
+    shares = ", ".join(f"{name} {100 * share:.3g} %" for name, share in list(scenes.shares.items())[:20])
+    about = (
+        f"clips of {data.window} frames of {len(scenes.scenes)} listed scenes at {size[0]}x{size[1]} pixels\n"
+        f"({shares}). {len(scenes.scored)} scenes were held out for scoring."
+    )
+    shards = ListedShards(scenes, _cache(config, out), rules_of_size(config, size, 0, points_alone), data.bad_scenes)
+    return ListedClips(config, shards, size, [size], range(0), 0, (), about)
+
+
+class ReadingAhead:
+    """Threads that bring the shards of the next steps while a step is computed. What fails there fails again when it is
+    drawn.
+
+    Args:
+        bring: brings the shards of a step.
+        depth: so many steps ahead. 0: nothing is brought.
+        steps: of the training.
+    """
+
+    def __init__(self, bring: Callable[[int], None], depth: int, steps: int) -> None:
+        self._bring, self._depth, self._steps, self._next = bring, depth, steps, 0
+        self._pool = concurrent.futures.ThreadPoolExecutor(min(4, depth)) if depth else None
+
+    def __enter__(self) -> ReadingAhead:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._pool is not None:
+            self._pool.shutdown(wait=True, cancel_futures=True)
+
+    def beyond(self, step: int) -> None:
+        """Begin with what is missing for the steps after `step`."""
+        self._next = max(self._next, step + 1)
+        while self._pool is not None and self._next <= min(step + self._depth, self._steps - 1):
+            self._pool.submit(self._bring, self._next)
+            self._next += 1
 
 
 # network ------------------------------------------------------------------------------------------
@@ -220,7 +437,7 @@ def frames_at(config: LearnConfig, step: int) -> int:
 
 def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[TrainingState, Spread]:
     """Freeze, spread over the processes, make the optimiser, and take up the newest checkpoint."""
-    freeze(model, config.frozen)
+    models.freeze(model, config.frozen)
     model.to(ranks.device)
     trained = model.trained_part()
     trained.train()
@@ -254,31 +471,45 @@ def _batch(config: LearnConfig, ranks: Ranks, step: int) -> tuple[int, int, list
     return frames, count, ranks.share(count, config.compute.accumulate)
 
 
-def _reading_ahead(config: LearnConfig, folder: Path | ShardSource, ranks: Ranks) -> learn_clips.ReadingAhead:
+def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: bool, ranks: Ranks) -> dict[str, Tensor]:
+    """Train what the model names; returns the weights to use (the moving average), whole, in the leader."""
+    config, out = source.config, run_dir.path / "steps"
+    state, spread = _begin(model, config, out, ranks)
+    weights = class_weights(source.shards, source.weighed(), config.loss.class_balance).to(ranks.device)
+    settings = loss_settings(config, weights)
+    board: Any = None
+    if config.compute.tensorboard and ranks.leads:
+        from torch.utils.tensorboard import SummaryWriter
+
+        board = SummaryWriter(str(run_dir.path / "tensorboard"))
+
     def bring(step: int) -> None:
         frames, count, parts = _batch(config, ranks, step)
-        learn_clips.bring_shards(config, folder, step, count, frames, parts)
+        source.bring(step, count, frames, parts)
 
-    return learn_clips.ReadingAhead(bring, 0 if isinstance(folder, Path) else config.compute.read_ahead, config.steps)
+    def watch(weights: dict[str, Tensor], step: int) -> None:
+        """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
+        shards, picture = source.to_score()[: config.score.watched], _picture(run_dir, step)
+        request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
+        scores = score.score(models.rebuilt(model, weights), shards, source.shards, request, picture=picture)
+        run_dir.log(step=step, held_out=scores["average"])
+        log.info(f"step {step}", *score.table(scores).splitlines())
 
+    def is_watched(step: int) -> bool:
+        return step % config.score.every == 0 or step == config.steps
 
-def _train_network(
-    model: Model, config: LearnConfig, run_dir: RunDir, folder: Path | ShardSource, bf16: bool, ranks: Ranks
-) -> dict[str, Tensor]:
-    """Train what the model names; returns the weights to use (the moving average), whole, in the leader."""
-    out = run_dir.path / "steps"
-    state, spread = _begin(model, config, out, ranks)
-    settings = _loss_settings(config, _class_weights(config, folder).to(ranks.device))
-    board = _tensorboard(run_dir.path / "tensorboard") if config.compute.tensorboard and ranks.leads else None
+    done = state.step  # a training may have been stopped between a checkpoint and its picture
+    if done and is_watched(done) and not ranks.leader_does(lambda: _picture(run_dir, done).is_file()):
+        made = state.export_weights(ranks)
+        ranks.leader_does(partial(watch, made, done))
     facts = {"seed": config.seed, "layout": config.compute.parallel}
     recent: list[dict[str, float]] = []
     begun, clock, saved_at = state.step, time.monotonic(), state.step
-    watch = partial(_score_watched, model, config, run_dir, folder, bf16)
-    _watch_missed(state, config, run_dir, ranks, watch)
+    ahead_of = 0 if isinstance(source.shards, Path) else config.compute.read_ahead
     with (
         log.task("network", config.steps, begun) as bar,
         Interruption(SAME_SIGNAL_S) as interruption,
-        _reading_ahead(config, folder, ranks) as ahead,
+        ReadingAhead(bring, ahead_of, config.steps) as ahead,
     ):
         for step in range(begun, config.steps):
             ahead.beyond(step)
@@ -288,8 +519,7 @@ def _train_network(
             terms: dict[str, float] = {}
             state.optimizer.zero_grad(set_to_none=True)
             for part in parts:
-                drawn = draw_clips(config, folder, step, count, frames, "batch", part)
-                clips = [clip.to(ranks.device) for clip in drawn]
+                clips = [clip.to(ranks.device) for clip in source.draw(step, count, frames, "batch", part)]
                 with spread.portion(last=part is parts[-1]):
                     with torch.autocast(ranks.device.type, torch.bfloat16, enabled=bf16):
                         loss = spread.network(clips, BatchPart(config.seed, step, part.start, count), settings)
@@ -315,7 +545,7 @@ def _train_network(
                 took_s = state.save(out, ranks, facts, config.compute.checkpoints_kept)
                 log.info(f"learn: checkpoint of step {done} in {took_s:.2f} s")
                 saved_at = done
-            if _is_watched(config, done):
+            if is_watched(done):
                 made = state.export_weights(ranks)
                 ranks.leader_does(partial(watch, made, done))
             if stop and not last:
@@ -324,35 +554,6 @@ def _train_network(
     if board is not None:
         board.close()
     return state.export_weights(ranks)
-
-
-def _loss_settings(config: LearnConfig, class_weights: Tensor) -> LossSettings:
-    data = config.data
-    return LossSettings(
-        class_weights,
-        config.loss.refined_share,
-        data.reference_dropout,
-        frame_dropout=data.reference_dropout_scope == "tokens_and_frame",
-    )
-
-
-def _watch_missed(
-    state: TrainingState,
-    config: LearnConfig,
-    run_dir: RunDir,
-    ranks: Ranks,
-    watch: Callable[[dict[str, Tensor], int], None],
-) -> None:
-    """Score and draw after a training that was stopped between a checkpoint and its picture."""
-    done = state.step
-    if done and _is_watched(config, done) and not ranks.leader_does(lambda: _picture(run_dir, done).is_file()):
-        made = state.export_weights(ranks)
-        ranks.leader_does(partial(watch, made, done))
-
-
-def _is_watched(config: LearnConfig, step: int) -> bool:
-    """Whether a few held-out clips are scored and drawn after so many steps."""
-    return step % config.score.every == 0 or step == config.steps
 
 
 def _picture(run_dir: RunDir, step: int) -> Path:
@@ -368,25 +569,7 @@ def _record(run_dir: RunDir, board: Any, step: int, values: dict[str, float]) ->
             board.add_scalar(f"learn/{name}", value, step)
 
 
-def _tensorboard(folder: Path) -> Any:
-    from torch.utils.tensorboard import SummaryWriter
-
-    return SummaryWriter(str(folder))
-
-
-def _score_watched(
-    model: Model,
-    config: LearnConfig,
-    run_dir: RunDir,
-    folder: Path | ShardSource,
-    bf16: bool,
-    weights: dict[str, Tensor],
-    step: int,
-) -> None:
-    """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
-    made = rebuilt(model, weights)
-    shards = learn_clips.scored_shards(config, folder)[: config.score.watched]
-    request = SampleRequest(config.score.steps, config.seed, bf16=bf16)
-    scores = score.score(made, shards, folder, request, picture=_picture(run_dir, step))
-    run_dir.log(step=step, held_out=scores["average"])
-    log.info(f"step {step}", *score.table(scores).splitlines())
+def loss_settings(config: LearnConfig, weights: Tensor) -> LossSettings:
+    """What a configuration says about the loss."""
+    frame_dropout = config.data.reference_dropout_scope == "tokens_and_frame"
+    return LossSettings(weights, config.loss.refined_share, config.data.reference_dropout, frame_dropout)

@@ -35,7 +35,7 @@ from mudg.core.pictures import resize_area, resize_nearest
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import project_points, seen_pixels
 from mudg.diffusion.clips import FAR_M, pack_clips, shard_path, write_shard
-from mudg.diffusion.condition import ConditionRules, WarpSource, build_conditions, filled_depth, image_tensor
+from mudg.diffusion.condition import ConditionRules, build_conditions, filled_depth, image_tensor
 from mudg.scene.clouds import read_fused
 from mudg.scene.labels import photographs, read_label, read_trusted_classes
 from mudg.scene.read import read_image, read_points, read_scene
@@ -203,15 +203,10 @@ def _condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int)
     conditions = ConditionRules(rules.width, rules.height, rules.width * rules.fine, rules.height * rules.fine)
     margin = gap + conditions.images_per_view  # at a log's end all images come from one side
     images = log.images(log.moment[places[0]] - margin, log.moment[places[-1]] + margin)
-    sources: dict[int, WarpSource] = {}
-    parts = []
-    for place in places:
-        far = [n for n in images if abs(log.moment[n] - log.moment[place]) >= gap]
-        given = {index: sources[n] for index, n in enumerate(far) if n in sources}
-        view = images[place].view
-        parts.append(build_conditions(cloud, log.scene.tracks, [view], [images[n] for n in far], conditions, given)[0])
-        sources |= {far[index]: source for index, source in given.items()}
-    return _stacked(parts), images
+    moments = [log.moment[n] for n in images]
+    among = [[n for n, moment in enumerate(moments) if abs(moment - log.moment[place]) >= gap] for place in places]
+    views, recorded = [images[place].view for place in places], list(images.values())
+    return build_conditions(cloud, log.scene.tracks, views, recorded, conditions, among=among)[0], images
 
 
 def _published_condition(
@@ -236,19 +231,6 @@ def thinned_cloud(cloud: FusedCloud, share: float, rng: np.random.Generator) -> 
         return PointCloud(points.xyz[keep], points.rgb[keep], points.frame, semantics)
 
     return FusedCloud(part(cloud.static), {name: part(points) for name, points in cloud.objects.items()}, cloud.colors)
-
-
-def _stacked(parts: Sequence[Condition]) -> Condition:
-    """Conditions of one view each as one of all views; the reference is that of the first."""
-
-    def stack(name: str) -> Tensor | None:
-        values = [getattr(p, name) for p in parts]
-        return None if any(v is None for v in values) else torch.cat(values)
-
-    views = tuple(v for p in parts for v in p.views)
-    optional = {name: stack(name) for name in ("warped", "backdrop", "semantics", "backdrop_semantics")}
-    color, depth, valid = (torch.cat([getattr(p, name) for p in parts]) for name in ("color", "depth", "valid"))
-    return Condition(views, color, depth, valid, parts[0].reference, **optional)
 
 
 def _truth(log: OpenLog, frame: Frame, recorded: Photo, view: View) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -23,8 +23,7 @@ from mudg.base.run_folder import RunDir
 from mudg.base.types import Clip
 from mudg.core import losses
 from mudg.diffusion import model_files, published
-from mudg.diffusion.clips import ShardSource
-from mudg.diffusion.learn_clips import draw_clips
+from mudg.diffusion.clips import TrainingClips
 from mudg.diffusion.model import MDM
 from mudg.diffusion.network import MDMConfig
 from mudg.diffusion.parallel import Ranks, TrainingState, agreed_terms, mean_of, newest_checkpoint, read_rows
@@ -68,18 +67,18 @@ def save(model: Model, folder: Path, card: str, facts: Mapping[str, Any]) -> Non
     published.save(folder, model.config, tensors, {**facts, **handed_on}, card + licence)
 
 
-def model_card(model: Model, config: LearnConfig, scores: Mapping[str, Any], data: str = "") -> str:
-    """Text that travels with the weights: what the model is, how it was made, what it can and cannot do.
-
-    `data` says what it was trained on; empty = generated cities.
-    """
+def model_card(model: Model, source: TrainingClips, scores: Mapping[str, Any]) -> str:
+    """Text that travels with the weights: what the model is, how it was made, what it can and cannot do."""
+    config, (width, height) = source.config, source.size
     small = isinstance(model, MDM)
     own: dict[str, Any] = {"window": model.config.window}
     if small:
         own = {"refines": model.refiner is not None, "parameters": sum(p.numel() for p in model.parameters())}
     return html.render_text(
         "mdm_card.md.j2" if small else "published_card.md.j2",
-        data=data,
+        data=source.about,
+        width=width,
+        height=height,
         config=config,
         clips=config.data,
         rules=config.optimizer,
@@ -253,27 +252,29 @@ FIT_IMAGES = 8
 
 
 def train_codec(
-    codec: PatchCodec,
-    config: LearnConfig,
-    run_dir: RunDir,
-    folder: Path | ShardSource,
-    bf16: bool,
-    device: torch.device = CPU,
+    codec: PatchCodec, source: TrainingClips, run_dir: RunDir, bf16: bool, device: torch.device = CPU
 ) -> None:
-    """Fit the linear parts on the first cities of `folder`, on the CPU, then train the decoder on noisy latents, on a
-    device."""
+    """Fit the linear parts on the first clips, on the CPU, then train the decoder on noisy latents, on a device."""
+    config = source.config
     steps, out, alone = config.codec.steps, run_dir.path / "codec", Ranks(0, 1, device)
     codec.to(device)
     optimizer = torch.optim.AdamW(codec.parameters(), lr=LEARNING_RATE, betas=(0.9, 0.99), weight_decay=1e-3)
     state = TrainingState(nn.ModuleDict({"codec": codec}), optimizer, None)
     if not state.resume(out, alone):
-        codec.load_state_dict(_fitted(codec, config, folder).state_dict())
+        fitted = PatchCodec(codec.config)
+        draw_weights(fitted, config.seed, "codec weights")
+        batches = [source.draw(n, FIT_IMAGES, 1, "codec fit") for n in range(config.codec.fit_batches)]
+        images = [clip for batch in batches for clip in batch]
+        height, width = (min(clip.rgb.shape[axis] for clip in images) for axis in (-2, -1))  # steps may differ in size
+        fitted.fit_color(torch.cat([clip.rgb[..., :height, :width] for clip in images]))
+        fitted.fit_depth(torch.cat([clip.depth[..., :height, :width] for clip in images]))
+        codec.load_state_dict(fitted.state_dict())
     recent: list[dict[str, float]] = []
     with log.task("codec", steps, state.step) as bar:
         for step in range(state.step, steps):
             warm, left = min(1.0, (step + 1) / 50), 1 - step / steps
             optimizer.param_groups[0]["lr"] = LEARNING_RATE * warm * min(1.0, left / 0.6)
-            clips = [clip.to(device) for clip in draw_clips(config, folder, step, config.codec.batch, 1, "codec batch")]
+            clips = [clip.to(device) for clip in source.draw(step, config.codec.batch, 1, "codec batch")]
             with torch.autocast(device.type, torch.bfloat16, enabled=bf16):
                 loss, terms = codec_loss(codec, clips, seeds.torch_generator(config.seed, step, "codec noise"))
             terms, _ = agreed_terms(alone, terms, 1, step, "codec")
@@ -290,18 +291,6 @@ def train_codec(
                 recent = []
             if done % 200 == 0 or done == steps:
                 state.save(out, alone, {})
-
-
-def _fitted(like: PatchCodec, config: LearnConfig, folder: Path | ShardSource) -> PatchCodec:
-    """A codec on the CPU with weights drawn and its linear parts fitted."""
-    codec = PatchCodec(like.config)
-    draw_weights(codec, config.seed, "codec weights")
-    batches = [draw_clips(config, folder, n, FIT_IMAGES, 1, "codec fit") for n in range(config.codec.fit_batches)]
-    images = [clip for batch in batches for clip in batch]
-    height, width = (min(clip.rgb.shape[axis] for clip in images) for axis in (-2, -1))  # steps may differ in size
-    codec.fit_color(torch.cat([clip.rgb[..., :height, :width] for clip in images]))
-    codec.fit_depth(torch.cat([clip.depth[..., :height, :width] for clip in images]))
-    return codec
 
 
 def load_trained_codec(codec: PatchCodec, out: Path, ranks: Ranks) -> None:

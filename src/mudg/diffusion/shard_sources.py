@@ -26,9 +26,10 @@ from mudg.base import log, plain_yaml, seeds, store
 from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.location import Location
 from mudg.base.records import StrictRecord, parse_record, understood
+from mudg.base.types import Clip
 from mudg.diffusion import log_clips
 from mudg.diffusion.city_clips import HELD_OUT
-from mudg.diffusion.clips import Result, clips_at, shard_path
+from mudg.diffusion.clips import Result, TrainingClips, clips_at, shard_path
 from mudg.diffusion.log_clips import LogClipRules, LogSource
 from mudg.scene.read import read_scene
 
@@ -550,3 +551,49 @@ class ListedShards:
                 )
             facts.append(hashlib.sha256(record.load()).hexdigest())
         return self._of_log(None, scored, with_log, " ".join(facts))
+
+
+class ListedClips(TrainingClips):
+    """Clips of the scenes of a list. A scene of another size than `size` is a bad one."""
+
+    shards: ListedShards
+
+    def reader(self, step: int, count: int, frames: int, purpose: str) -> Callable[[int], Clip]:
+        """What reads the clip of a place in the batch."""
+        del count
+        return lambda place: self._drawn(step, place, frames, purpose)
+
+    def _drawn(self, step: int, place: int, frames: int, purpose: str) -> Clip:
+        seed = self.config.seed
+        chosen, start = seeds.numpy_rng(seed, step, f"{purpose}, frames {place}").random(2).tolist()
+
+        def take(shard: int) -> Clip:
+            clip = int(chosen * self.shards.clips_in(shard))
+            first = int(start * (self.config.data.window - frames + 1))
+            return self.read(shard, clip, range(first, first + frames), self.size)
+
+        return self.shards.draw(seeds.numpy_rng(seed, step, f"{purpose}, scene {place}"), take)
+
+    def bring(self, step: int, count: int, frames: int, parts: Sequence[slice]) -> None:
+        """Fetch or make the shards of some parts of a step."""
+        del frames
+        for place in (place for part in parts for place in range(count)[part]):
+            self.shards.draw(seeds.numpy_rng(self.config.seed, step, f"batch, scene {place}"), self.shards.clips_in)
+
+    def have_patches(self) -> bool:
+        """Whether the clips have patches at a higher resolution."""
+        return self._drawn(0, 0, 1, "patches").fine is not None
+
+    def weighed(self) -> Sequence[int]:
+        """Some shards that are drawn from the list, where classes are balanced."""
+
+        def usable(number: int) -> int:
+            self.shards.clips_in(number)
+            return number
+
+        count = 20 if self.config.loss.class_balance else 0
+        return [self.shards.draw(seeds.numpy_rng(self.config.seed, n, "class weights"), usable) for n in range(count)]
+
+    def to_score(self) -> Sequence[int]:
+        """The first shard of every held-out scene."""
+        return self.shards.scored()

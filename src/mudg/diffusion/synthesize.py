@@ -34,7 +34,7 @@ from mudg.core import trajectory
 from mudg.core.fusion import SweepShots
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
 from mudg.core.raster.cpu import release_memory
-from mudg.diffusion.condition import ConditionRules, VacatedAt
+from mudg.diffusion.condition import ConditionRules, PreparedImages, VacatedAt
 from mudg.diffusion.inputs import ConditionSources, InWeather, NearSweeps
 from mudg.diffusion.requests import GeneratedClip
 from mudg.diffusion.settings import SynthesizeConfig
@@ -44,12 +44,10 @@ from mudg.diffusion.views import (
     FREEVS,
     SOURCE,
     DiffusionModel,
-    PreparedImages,
     ViewMaker,
     half_of,
     load_any,
     recorded_images,
-    windows,
 )
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import render_planes
@@ -200,37 +198,30 @@ def make_trajectory(
         return len(path)
     model = model or load_any(config)
     maker = _view_maker(config, given, path, model, out)
-    spans = windows(len(path), model.config.window, min(config.overlap, model.config.window - 1))
+    spans = maker.spans(len(path), config.overlap)
     state = folder / "state"
     first, tail = _read_state(state)
     with understood("depth fits of an interrupted synthesis", str(state / FITS)):
         fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
     every = max(1, len(path) // 5)
     with ObservationWriter(folder, path.name, COLOR_ALONE.get(config.condition, SOURCE)) as writer:
-        done = spans[first - 1].stop if first else 0
-        for view in path.views[:done]:
+        for view in path.views[: spans[first - 1].stop if first else 0]:
             writer.skip(maker.sized(view))
-        for number in range(first, len(spans)):
-            span = spans[number]
-            shared = done - span.start
-            known = {m: z[-shared:] for m, z in tail.items()} if shared and tail else None
-            views = [path.views[i] for i in span]
-            sample, condition, observations = maker.make(views, number, known)
-            for place, (index, observation) in enumerate(zip(span, observations)):
-                if index >= done:
-                    writer.add(observation)
-                if index >= done and sample.depth_fits:
+        for number, fresh, (sample, condition, observations) in maker.along(path.views, spans, first, tail):
+            for index in fresh:
+                place = index - spans[number].start
+                writer.add(observations[place])
+                if sample.depth_fits:
                     fit = sample.depth_fits[place]
                     numbers = (fit.scale, fit.shift_m, fit.residual_before, fit.residual)
                     fits[f"{index:06d}"] = [round(x, 5) if math.isfinite(x) else None for x in numbers]
-                if index >= done and index % every == 0:
-                    row = {"row": _sheet_row(condition, sample, index - span.start)}
+                if index % every == 0:
+                    row = {"row": _sheet_row(condition, sample, place)}
                     store.write_safetensors(state / f"row{index:06d}.safetensors", row)
-            done, tail = span.stop, sample.latents
             store.write_json(state / FITS, fits)
-            store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(tail))
+            store.write_safetensors(state / f"{number + 1:04d}.safetensors", dict(sample.latents))
             (state / f"{number:04d}.safetensors").unlink(missing_ok=True)
-            del sample, condition, observations, observation  # before the next window is made
+            del sample, condition, observations  # before the next window is made
         rows = [store.read_safetensors(file)["row"] for file in sorted(state.glob("row*.safetensors"))]
         if rows:
             store.write_image(folder / "overview.png", np.concatenate(rows))

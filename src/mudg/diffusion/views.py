@@ -1,12 +1,11 @@
 """Windows of generated views: the condition of each, its sample, and the observations made of it.
 
-Whoever generates along a path (``synthesize``, repairs of edited views) goes through `windows` and asks a `ViewMaker`
-for each.
+Whoever generates along a path (``synthesize``, repairs of edited views) asks a `ViewMaker` for the windows `along` it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -22,7 +21,7 @@ from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Condition, Frame, Observation, Photo, Scene, View
 from mudg.core.raster.cpu import release_memory
 from mudg.diffusion import memory_plan, model_files, published
-from mudg.diffusion.condition import KeptImages, WarpSource
+from mudg.diffusion.condition import PreparedImages
 from mudg.diffusion.inputs import ConditionParts, ConditionSources, conditions_of
 from mudg.diffusion.memory_plan import half_format
 from mudg.diffusion.model import MDM
@@ -250,21 +249,6 @@ def recorded_pixels(scene: Scene, frame: Frame) -> NDArray[np.bool_] | None:
     return ~read_label(scene, frame, "rendered") if "rendered" in frame.labels else None
 
 
-class PreparedImages(KeptImages):
-    """Images made ready for warping, for all windows and trajectories that a process makes; colours as bytes where that
-    is exact."""
-
-    def __setitem__(self, number: int, image: WarpSource) -> None:
-        coarse = (image.rgb * 255).round().clamp(0, 255).to(torch.uint8)
-        super().__setitem__(
-            number, replace(image, rgb=coarse) if torch.equal(coarse.float() / 255, image.rgb) else image
-        )
-
-    def __getitem__(self, number: int) -> WarpSource:
-        image = super().__getitem__(number)
-        return image if image.rgb.is_floating_point() else replace(image, rgb=image.rgb.float() / 255)
-
-
 StartAt = Callable[[Sequence[View]], StartClip]
 """What a clip of some views, of the size that the model works at, is to stay like."""
 
@@ -296,6 +280,37 @@ class ViewMaker:
     def sized(self, view: View) -> View:
         """The view at the size that is written."""
         return view if self._full_size else view.resized(self._given.rules.width, self._given.rules.height)
+
+    def spans(self, frames: int, overlap: int) -> list[range]:
+        """The windows of a path of so many frames (see `windows`)."""
+        window = self._model.config.window
+        return windows(frames, window, min(overlap, window - 1))
+
+    def along(
+        self,
+        views: Sequence[View],
+        spans: Sequence[range],
+        first: int = 0,
+        tail: Mapping[Modality, Tensor] | None = None,
+        wanted: Callable[[range], bool] = bool,
+    ) -> Iterator[tuple[int, range, tuple[GeneratedClip, Condition, list[Observation]] | None]]:
+        """The windows of a path one after another; those that are `wanted` continue the one before.
+
+        Args:
+            first, tail: number of the window to begin with, and the latents of the one before, of an interrupted run.
+
+        Returns, of each: its number, its frames that are in none before, and what `make` gives, or None.
+        """
+        done = spans[first - 1].stop if first else 0
+        for number in range(first, len(spans)):
+            span, made = spans[number], None
+            if wanted(span):
+                shared = done - span.start
+                known = {m: z[-shared:] for m, z in tail.items()} if shared and tail else None
+                made = self.make([views[i] for i in span], number, known)
+            yield number, range(done, span.stop), made
+            done, tail = span.stop, made[0].latents if made else None
+            del made  # before the next window is made
 
     def make(
         self, views: Sequence[View], number: int, known: dict[Modality, Tensor] | None

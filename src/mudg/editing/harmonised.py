@@ -32,22 +32,12 @@ from mudg.base import log
 from mudg.base.errors import UsageError
 from mudg.base.palette import DYNAMIC_IDS
 from mudg.base.types import FusedCloud, Observation, Photo, Scene, Track, Trajectory, View
-from mudg.diffusion.condition import GROUND_IDS, ConditionRules, WarpSource, determined
-from mudg.diffusion.inputs import ConditionSources, InWeather, conditions_of
+from mudg.diffusion.condition import GROUND_IDS, ConditionRules, determined
+from mudg.diffusion.inputs import ConditionSources, InWeather
 from mudg.diffusion.published import is_published, window_of
-from mudg.diffusion.requests import StartClip, generated
+from mudg.diffusion.requests import StartClip
 from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
-from mudg.diffusion.views import (
-    EDITED_IMAGES_PER_VIEW,
-    ViewMaker,
-    check_config,
-    half_of,
-    load_any,
-    recorded_at_pose,
-    recorded_images,
-    request_of,
-    windows,
-)
+from mudg.diffusion.views import EDITED_IMAGES_PER_VIEW, ViewMaker, check_config, load_any, recorded_images
 from mudg.editing.carried import EditedDrive
 from mudg.editing.plan import EditPlan
 from mudg.editing.recorded import (
@@ -64,7 +54,6 @@ from mudg.editing.recorded import (
 )
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import FAR_M, raster_of, render_planes, render_view
-from mudg.networks.codec import Modality
 
 DYNAMIC: Final = torch.tensor(sorted(DYNAMIC_IDS), dtype=torch.uint8)
 FEATHER_PX: Final = 3
@@ -249,8 +238,7 @@ class Harmoniser:
         self._settings = check_config(settings_of(config, device), fitted=not is_published(config.model))
         self._sources, self._config = sources, config
         model = load_any(self._settings)
-        self.window, overlap = model.config.window, PUBLISHED_OVERLAP if model.points_alone else OVERLAP
-        self._overlap = min(overlap, self.window - 1)
+        self._overlap = PUBLISHED_OVERLAP if model.points_alone else OVERLAP
         width, height = model.image_size(*size, 0)
         rules = ConditionRules(
             width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=model.points_alone
@@ -279,19 +267,18 @@ class Harmoniser:
     def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
         """The views of a path, in order, with the touched pixels repaired. Nothing is generated for a window that edits
         do not touch."""
-        done, tail = 0, dict[Modality, Tensor]()
         parts: dict[int, tuple[Observation, Touched]] = {}
-        for number, span in enumerate(windows(len(views), self.window, self._overlap)):
+
+        def touched(span: range) -> bool:
+            nonlocal parts
             parts = {i: parts[i] if i in parts else self._part(views[i], draw) for i in span}
-            if not any(bool((touched.objects | touched.uncovered).any()) for _, touched in parts.values()):
-                yield from (parts[i][0] for i in span if i >= done)
-                done, tail = span.stop, {}
-                continue
             self._parts = list(parts.values())
-            known = {m: z[-(done - span.start) :] for m, z in tail.items()} if tail and done > span.start else None
-            sample, _, generated = self._maker.make([views[i] for i in span], number, known)
-            yield from [self._repaired(*parts[i], generated[i - span.start]) for i in span if i >= done]
-            done, tail = span.stop, sample.latents
+            return any(bool((touched.objects | touched.uncovered).any()) for _, touched in parts.values())
+
+        spans = self._maker.spans(len(views), self._overlap)
+        for number, fresh, made in self._maker.along(views, spans, wanted=touched):
+            start = spans[number].start
+            yield from [parts[i][0] if made is None else self._repaired(*parts[i], made[2][i - start]) for i in fresh]
 
     def _part(self, view: View, draw: DrawPair) -> tuple[Observation, Touched]:
         usual, made = draw(view)
@@ -397,12 +384,11 @@ class WeatherHarmoniser:
         device: str = "auto",
     ) -> None:
         """``size``: width and height of the views."""
-        settings = check_config(settings_of(config, device), fitted=False)
-        self._model = load_any(settings)
-        self._request = request_of(settings, half_of(settings) == torch.bfloat16)
-        width, height = self._model.image_size(*size, 0)
+        settings = check_config(replace(settings_of(config, device), full_size=False), fitted=False)
+        model = load_any(settings)
+        width, height = model.image_size(*size, 0)
         rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=True)
-        self._given = ConditionSources(
+        given = ConditionSources(
             sources.cloud,
             sources.tracks,
             sources.photos,
@@ -412,24 +398,16 @@ class WeatherHarmoniser:
             vacated_at(sources.plan),
             how,
         )
-        self._kept: dict[int, WarpSource] = {}
+        self._maker = ViewMaker(model, given, settings)
 
     def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
         """The views of a path, in order, corrected; ``draw`` makes each without and with the weather."""
-        done, tail = 0, dict[Modality, Tensor]()
-        renders: dict[int, Observation] = {}
-        window = self._model.config.window
-        for number, span in enumerate(windows(len(views), window, min(PUBLISHED_OVERLAP, window - 1))):
-            renders = {i: renders[i] if i in renders else draw(views[i])[1] for i in span}
-            condition = conditions_of(self._given, "full", [views[i] for i in span], self._kept)[0]
-            known = {m: z[-(done - span.start) :] for m, z in tail.items()} if tail and done > span.start else None
-            clip = generated(self._model, condition, replace(self._request, index=number, known=known))
-            elsewhere = not recorded_at_pose(views[span.start], self._given.recorded)  # frame 0 is the reference
-            for i in span:
-                if i >= done:
-                    stays = elsewhere and i == span.start
-                    yield renders[i] if stays else corrected(renders[i], clip.rgb[i - span.start])
-            done, tail = span.stop, clip.latents
+        spans = self._maker.spans(len(views), PUBLISHED_OVERLAP)
+        for number, fresh, (clip, _, made) in self._maker.along(views, spans):
+            for i in fresh:
+                place, render = i - spans[number].start, draw(views[i])[1]
+                # frame 0 may be the reference, from elsewhere
+                yield corrected(render, clip.rgb[place]) if bool(made[place].mask.all()) else render
 
 
 def corrected(render: Observation, made: Tensor) -> Observation:
