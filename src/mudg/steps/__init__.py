@@ -23,6 +23,7 @@ _HOMES: Final[Mapping[str, str]] = {
     "score": "mudg.steps.score:Score",
     "view": "mudg.steps.view:ViewScene",
     "page": "mudg.steps.page:Page",
+    "serve": "mudg.steps.serve:Serve",
     "report": "mudg.steps.report:Report",
     "edit": "mudg.steps.edit:Edit",
     "asset export": "mudg.steps.asset:AssetExport",

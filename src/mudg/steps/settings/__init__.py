@@ -26,6 +26,7 @@ HOMES: Final[Mapping[str, str]] = {
     "RenderConfig": "mudg.editing.view_settings:RenderConfig",
     "RunConfig": "mudg.steps.settings.run:RunConfig",
     "ScoreConfig": "mudg.editing.view_settings:ScoreConfig",
+    "ServeConfig": "mudg.sim.settings:ServeConfig",
     "SynthesizeConfig": "mudg.diffusion.settings:SynthesizeConfig",
     "ViewConfig": "mudg.viewer.settings:ViewConfig",
 }
