@@ -310,36 +310,15 @@ def test_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:
 
 # --- values of other types ------------------------------------------------------------------------
 
-COLUMNS = (
-    "log.logfile",
-    "ego_pose.token",
-    "ego_pose.timestamp",
-    "ego_pose.x",
-    "ego_pose.qw",
-    "camera.token",
-    "camera.channel",
-    "camera.translation",
-    "camera.intrinsic",
-    "camera.distortion",
-    "camera.width",
-    "image.camera_token",
-    "image.filename_jpg",
-    "image.timestamp",
-    "lidar.token",
-    "lidar.channel",
-    "lidar.rotation",
-    "lidar_pc.token",
-    "lidar_pc.lidar_token",
-    "lidar_pc.ego_pose_token",
-    "lidar_pc.filename",
-    "lidar_pc.timestamp",
-    "lidar_box.track_token",
-    "lidar_box.yaw",
-    "lidar_box.width",
-    "track.token",
-    "track.category_token",
-    "category.name",
-    "scene.name",
+COLUMNS = tuple(
+    (
+        "log.logfile ego_pose.token ego_pose.timestamp ego_pose.x ego_pose.qw camera.token camera.channel "
+        "camera.translation camera.intrinsic camera.distortion camera.width image.camera_token "
+        "image.filename_jpg image.timestamp lidar.token lidar.channel lidar.rotation lidar_pc.token "
+        "lidar_pc.lidar_token lidar_pc.ego_pose_token lidar_pc.filename lidar_pc.timestamp "
+        "lidar_box.track_token lidar_box.yaw lidar_box.width track.token track.category_token category.name "
+        "scene.name"
+    ).split()
 )
 VALUES = (
     "CAST(x'ff80' AS TEXT)",
