@@ -9,33 +9,26 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
 import write_av2 as made
 from PIL import Image
-from roundtrip import needs_native
 
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Scene, Track
-from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.argoverse2 import read_sweep
-from mudg.formats.importers.common import ImportOptions
 from mudg.scene.read import read_points
+
+pytestmark = roundtrip.needs_native
+truth = bad_logs.truth
+ingest = bad_logs.importer("argoverse2", cameras=("front", "front_left"))
 
 pytest.importorskip("pyarrow")
 Columns = dict[str, Any]
-
-
-def ingest(source: Path, out: Path, **options: object) -> Scene:
-    given = {"cameras": ("front", "front_left"), **options}
-    return IMPORTERS["argoverse2"](source, out, ImportOptions(**given))
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "scene")
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +39,6 @@ def drive(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- round trips ----------------------------------------------------------------------------------
 
 
-@needs_native
 def test_round_trip(truth: Scene, drive: Path, tmp_path: Path) -> None:
     assert RECOGNISERS["argoverse2"](drive)
     scene = ingest(drive, tmp_path / "plain", untwist="no")
@@ -66,7 +58,6 @@ def replace_tracks(scene: Scene, keep: tuple[Track, ...]) -> Scene:
     return replace(scene, tracks=tuple(track for track in scene.tracks if track.id in names))
 
 
-@needs_native
 def test_frames_and_logs_are_chosen(drive: Path, tmp_path: Path) -> None:
     scene = ingest(drive, tmp_path / "out", cameras=("ring_front_center",), frames=(3, 9))
     assert list(scene.cameras) == ["front"]
@@ -122,7 +113,6 @@ BROKEN: dict[str, tuple[str, Callable[[Columns], object], str]] = {
 }
 
 
-@needs_native
 @pytest.mark.parametrize("name", BROKEN)
 def test_broken_tables_are_refused_in_words(name: str, drive: Path, tmp_path: Path) -> None:
     table, change, words = BROKEN[name]
@@ -131,7 +121,6 @@ def test_broken_tables_are_refused_in_words(name: str, drive: Path, tmp_path: Pa
     roundtrip.assert_refused(ingest, copy, tmp_path / "out", words)
 
 
-@needs_native
 def test_broken_files_are_refused_in_words(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = shutil.copytree(drive, tmp_path / "log")
     scan = sorted((copy / "sensors" / "lidar").iterdir())[1]
@@ -167,7 +156,6 @@ def test_broken_files_are_refused_in_words(drive: Path, tmp_path: Path, capsys: 
         ingest(copy / "sensors", tmp_path / "other")
 
 
-@needs_native
 def test_optional_parts_and_unknown_categories(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = shutil.copytree(drive, tmp_path / "log")
     with pytest.raises(InputError, match="cameras are missing"):

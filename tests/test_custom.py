@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
@@ -23,13 +24,10 @@ from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.custom import read_log
 from mudg.scene.read import read_points
 
+truth = bad_logs.truth
+
 pytestmark = roundtrip.needs_native
 LIDAR = "lidar"
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
 
 
 @pytest.fixture(scope="module")

@@ -7,29 +7,23 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
 import write_dgp as made
-from roundtrip import needs_native
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, project, transform_points
 from mudg.base.types import Scene
-from mudg.formats.importers import IMPORTERS, RECOGNISERS
-from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers import RECOGNISERS
 from mudg.scene.read import read_points
 
+pytestmark = roundtrip.needs_native
+truth = bad_logs.truth
+ingest = bad_logs.importer("dgp")
+
 CAMERAS = {"front": "front", "front_left": "front_left"}
-
-
-def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["dgp"](source, out, ImportOptions(**options))
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "scene")
 
 
 @pytest.fixture(scope="module")
@@ -37,7 +31,6 @@ def folder(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made.write_dgp(truth, tmp_path_factory.mktemp("scenes") / "scene_01")
 
 
-@needs_native
 def test_round_trip(truth: Scene, folder: Path, tmp_path: Path) -> None:
     assert RECOGNISERS["dgp"](folder)
     scene = ingest(folder, tmp_path / "out")
@@ -47,7 +40,6 @@ def test_round_trip(truth: Scene, folder: Path, tmp_path: Path) -> None:
     assert (len(again.frames), len(again.sweeps)) == (2, 2)
 
 
-@needs_native
 def test_clocks_that_run_ten_times_too_fast_are_set_right(truth: Scene, tmp_path: Path) -> None:
     scene = ingest(made.write_dgp(truth, tmp_path / "scene", slowed=10), tmp_path / "out")
     roundtrip.assert_same_log(scene, truth, labels=made.READ_BACK)
@@ -86,7 +78,6 @@ BROKEN: dict[str, tuple[str, Callable[[dict[str, Any]], object], str]] = {
 }
 
 
-@needs_native
 @pytest.mark.parametrize("name", BROKEN)
 def test_broken_records_are_refused_in_words(name: str, folder: Path, tmp_path: Path) -> None:
     file, change, words = BROKEN[name]
@@ -95,7 +86,6 @@ def test_broken_records_are_refused_in_words(name: str, folder: Path, tmp_path: 
     roundtrip.assert_refused(ingest, copy, tmp_path / "out", words)
 
 
-@needs_native
 def test_swapped_sides_and_broken_files_are_refused(
     folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -129,7 +119,6 @@ def test_swapped_sides_and_broken_files_are_refused(
         ingest(copy, tmp_path / "out")
 
 
-@needs_native
 def test_scenes_are_chosen_by_folder(folder: Path, tmp_path: Path) -> None:
     for name in ("one", "two"):
         shutil.copytree(folder, tmp_path / "all" / name)

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import bad_logs
 import kitti_folders as made
 import numpy as np
 import pytest
@@ -14,16 +15,13 @@ import pytest
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert
-from mudg.base.types import Scene, View
-from mudg.formats.importers import IMPORTERS
+from mudg.base.types import View
 from mudg.formats.importers import kitti_files as kitti_boxes
-from mudg.formats.importers.common import ImportOptions, holdout_split, parse_frame_range
+from mudg.formats.importers.common import holdout_split, parse_frame_range
 from mudg.formats.importers.kitti_files import read_calibration_day, read_calibration_text, read_timestamps
 from mudg.scene.read import read_image, read_points
 
-
-def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["kitti"](source, out, ImportOptions(**options))
+ingest = bad_logs.importer("kitti")
 
 
 def worst(a: np.ndarray, b: np.ndarray) -> float:

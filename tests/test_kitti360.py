@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
@@ -17,19 +18,16 @@ from PIL import Image
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene
-from mudg.formats.importers import IMPORTERS, RECOGNISERS
-from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.kitti360 import read_boxes, read_calibration
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points
 
+truth = bad_logs.truth
+ingest = bad_logs.importer("kitti360", untwist="no")
+
 pytestmark = roundtrip.needs_native
 SAME = {"front": "front", "front_left": "front_stereo"}
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
 
 
 @pytest.fixture(scope="module")
@@ -41,10 +39,6 @@ def pristine(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def source(pristine: Path, tmp_path: Path) -> Path:
     """A copy to spoil."""
     return shutil.copytree(pristine, tmp_path / "KITTI-360")
-
-
-def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["kitti360"](source, out, ImportOptions(**{"untwist": "no", **options}))
 
 
 def parts(source: Path) -> dict[str, Path]:

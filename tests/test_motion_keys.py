@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import bad_logs
 import kitti_folders
 import numpy as np
 import pytest
@@ -22,6 +23,8 @@ from mudg.formats.importers import IMPORTERS, custom
 from mudg.formats.importers.common import ImportOptions
 from mudg.scene import motion
 from mudg.scene.check import check_records
+
+truth = bad_logs.truth
 
 RADIUS_M, SPEED_M_S = 12.0, 8.0
 LOST_S = (0.62, 1.88)
@@ -41,11 +44,6 @@ def arc(first_s: float, last_s: float, step_s: float, lost_s: tuple[float, float
 
 def warnings(scene: Scene, place: str) -> str:
     return "\n".join(f.message for f in check_records(scene) if f.level == "warning" and f.where.startswith(place))
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
 
 
 # --- gaps -----------------------------------------------------------------------------------------

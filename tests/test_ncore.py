@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
@@ -27,7 +28,7 @@ from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Scene, SweepPoints
 from mudg.formats.exporters.log_records import LogRecords
 from mudg.formats.exporters.ncore import sensor_ids, write_ncore
-from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers import ncore as container
 from mudg.formats.importers import ncore as importer
 from mudg.formats.importers.common import ImportOptions
@@ -36,6 +37,9 @@ from mudg.formats.ncore import PoseKeys, euler_of, package, rotation_of
 from mudg.scene.files import open_files
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_points
+
+truth = bad_logs.truth
+ingest = bad_logs.importer("ncore")
 
 try:
     package()
@@ -46,20 +50,11 @@ needs_package = pytest.mark.skipif(bool(REASON), reason="the package nvidia-ncor
 pytestmark = [needs_native, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
 
 
-def ingest(source: Path, out: Path, **options: Any) -> Scene:
-    return IMPORTERS["ncore"](source, out, ImportOptions(**options))
-
-
 def records(scene: Scene, **changes: Any) -> LogRecords:
     files = open_files(scene.root)
     return LogRecords(
         replace(scene, **changes), lambda frame: files.read(frame.image.path), lambda sweep: read_points(scene, sweep)
     )
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "scene")
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
@@ -19,17 +20,14 @@ from PIL import Image
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Scene
-from mudg.formats.importers import IMPORTERS, RECOGNISERS
-from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.nuplan import open_log
 from mudg.scene.read import read_image, read_points
 
+truth = bad_logs.truth
+ingest = bad_logs.importer("nuplan")
+
 pytestmark = roundtrip.needs_native
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +43,6 @@ def source(pristine: Path, tmp_path: Path) -> Path:
 
 def log(source: Path) -> Path:
     return source / "splits" / "mini" / f"{made.LOG}.db"
-
-
-def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["nuplan"](source, out, ImportOptions(**options))
 
 
 # --- what is read ---------------------------------------------------------------------------------

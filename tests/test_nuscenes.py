@@ -9,31 +9,24 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
 import write_nuscenes as made
-from roundtrip import needs_native
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene
-from mudg.formats.importers import IMPORTERS, RECOGNISERS
-from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.nuscenes import camera_from_intrinsics, find_records, iter_records, point_times, read_scan
 from mudg.scene.read import read_points
 
+pytestmark = roundtrip.needs_native
+truth = bad_logs.truth
+ingest = bad_logs.importer("nuscenes", sequence="scene-0007", cameras=("front", "front_left"))
+
 Rows = list[dict[str, Any]]
-
-
-def ingest(source: Path, out: Path, **options: object) -> Scene:
-    given = {"sequence": "scene-0007", "cameras": ("front", "front_left"), **options}
-    return IMPORTERS["nuscenes"](source, out, ImportOptions(**given))
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "scene")
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +37,6 @@ def release(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- round trips ----------------------------------------------------------------------------------
 
 
-@needs_native
 def test_round_trip(truth: Scene, release: Path, tmp_path: Path) -> None:
     assert RECOGNISERS["nuscenes"](release)
     scene = ingest(release, tmp_path / "out", untwist="no")
@@ -54,7 +46,6 @@ def test_round_trip(truth: Scene, release: Path, tmp_path: Path) -> None:
     assert np.allclose(scene.ego.world_from_ego[0], np.eye(4), atol=1e-9)
 
 
-@needs_native
 @pytest.mark.parametrize("first", [True, False])
 def test_fields_that_other_programs_added_are_passed_over(truth: Scene, tmp_path: Path, first: bool) -> None:
     release = made.write_nuscenes(truth, tmp_path / "release")
@@ -65,7 +56,6 @@ def test_fields_that_other_programs_added_are_passed_over(truth: Scene, tmp_path
     roundtrip.assert_same_log(ingest(release, tmp_path / "out", untwist="no"), truth, labels=made.READ_BACK, dt_s=None)
 
 
-@needs_native
 def test_sweeps_between_key_frames_are_read_and_boxes_are_interpolated(truth: Scene, tmp_path: Path) -> None:
     release = made.write_nuscenes(truth, tmp_path / "release", key_every=2)
     assert list((release / "sweeps" / "LIDAR_TOP").iterdir())
@@ -74,7 +64,6 @@ def test_sweeps_between_key_frames_are_read_and_boxes_are_interpolated(truth: Sc
     roundtrip.assert_same_log(scene, truth, labels=made.READ_BACK, box_pose=0.05)  # cars brake between keys
 
 
-@needs_native
 def test_frames_and_cameras_are_chosen(truth: Scene, release: Path, tmp_path: Path) -> None:
     scene = ingest(release, tmp_path / "out", cameras=("CAM_FRONT_LEFT",), frames=(1, 3), untwist="no")
     assert list(scene.cameras) == ["front_left"]
@@ -85,7 +74,6 @@ def test_frames_and_cameras_are_chosen(truth: Scene, release: Path, tmp_path: Pa
     assert np.abs(found - expected).max() < 1e-6
 
 
-@needs_native
 def test_point_times_bring_boxes_to_the_sweeps_time(truth: Scene, release: Path, tmp_path: Path) -> None:
     scene, plain = ingest(release, tmp_path / "out"), ingest(release, tmp_path / "plain", untwist="no")
     dt_s = np.concatenate([read_points(scene, sweep).dt_s for sweep in scene.sweeps])
@@ -103,7 +91,6 @@ def test_point_times_bring_boxes_to_the_sweeps_time(truth: Scene, release: Path,
         assert np.abs(step).max() <= 0.055 * np.linalg.norm(travel) / (track.times_s[-1] - track.times_s[0])
 
 
-@needs_native
 def test_riders_follow_from_attributes_and_a_release_without_boxes_has_no_tracks(
     truth: Scene, release: Path, tmp_path: Path
 ) -> None:
@@ -122,7 +109,6 @@ def test_riders_follow_from_attributes_and_a_release_without_boxes_has_no_tracks
     assert any("no annotations" in note for note in bare.source.notes)
 
 
-@needs_native
 def test_scene_must_be_chosen_and_releases_side_by_side_are_told_apart(release: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="several scenes") as several:
         ingest(release, tmp_path / "out", sequence="")
@@ -210,7 +196,6 @@ BROKEN: dict[str, tuple[str, Callable[[Rows], object], str]] = {
 }
 
 
-@needs_native
 @pytest.mark.parametrize("name", BROKEN)
 def test_broken_tables_are_refused_in_words(name: str, release: Path, tmp_path: Path) -> None:
     table, change, words = BROKEN[name]
@@ -226,7 +211,6 @@ def test_broken_tables_are_refused_in_words(name: str, release: Path, tmp_path: 
     assert not (tmp_path / "out").exists()
 
 
-@needs_native
 def test_broken_files_are_refused_in_words(release: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = shutil.copytree(release, tmp_path / "release")
     scan = sorted((copy / "samples" / "LIDAR_TOP").iterdir())[2]
@@ -262,7 +246,6 @@ def test_broken_files_are_refused_in_words(release: Path, tmp_path: Path, capsys
         ingest(copy / "samples", tmp_path / "out2")
 
 
-@needs_native
 def test_default_cameras_must_all_be_there_and_unknown_categories_are_named(
     release: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -10,6 +10,7 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
@@ -22,18 +23,15 @@ from mudg.base.palette import CLASSES, ID, UNLABELLED
 from mudg.base.types import Photo, Scene, Track
 from mudg.core.fusion import SweepShots, fuse_sweeps
 from mudg.core.project import DrawLimits, PointLayer, draw_points
-from mudg.formats.importers import IMPORTERS, RECOGNISERS
-from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.pandaset import CLASS_OF, read_frame
 from mudg.scene.check import camera_alignment, check_scene, image_point_classes
 from mudg.scene.read import read_image, read_points, read_scene
 
+truth = bad_logs.truth
+ingest = bad_logs.importer("pandaset")
+
 pytestmark = roundtrip.needs_native
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +43,6 @@ def pristine(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def source(pristine: Path, tmp_path: Path) -> Path:
     """A copy to spoil."""
     return shutil.copytree(pristine, tmp_path / "001")
-
-
-def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["pandaset"](source, out, ImportOptions(**options))
 
 
 def world_points(scene: Scene, sensor: str, index: int) -> np.ndarray:
