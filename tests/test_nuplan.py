@@ -98,9 +98,8 @@ def test_distorted_images_are_rectified_and_jpeg_stays_jpeg(truth: Scene, tmp_pa
     assert scene.frames[0].image.path.endswith(".jpg")
     assert any("rectified" in note for note in scene.source.notes)
     plain = made.write_nuplan(truth, tmp_path / "plain", jpeg=True)  # no distortion: the files are kept
-    roundtrip.assert_same_log(
-        ingest(plain, tmp_path / "same"), truth, labels={"car": "vehicle"}, intensity=0.002, color_levels=3
-    )
+    same = ingest(plain, tmp_path / "same")
+    roundtrip.assert_same_log(same, truth, labels={"car": "vehicle"}, intensity=0.002, color_levels=3)
 
 
 def test_rectified_pixels_show_the_rays_of_the_pinhole_camera(truth: Scene, tmp_path: Path) -> None:
@@ -148,20 +147,10 @@ def test_nothing_is_written_beside_the_database(pristine: Path, tmp_path: Path) 
 # --- bait and damage ------------------------------------------------------------------------------
 
 
-class Asks:
-    """Pickles as a command."""
-
-    def __init__(self, words: str) -> None:
-        self.words = words
-
-    def __reduce__(self) -> object:
-        return os.system, (self.words,)
-
-
 @pytest.mark.parametrize("column", ["translation", "rotation", "intrinsic", "distortion"])
 def test_a_calibration_that_asks_for_a_command_runs_nothing(source: Path, tmp_path: Path, column: str) -> None:
     bait = tmp_path / "ran"
-    change(source, f"UPDATE camera SET {column} = ?", pickle.dumps([Asks(f"touch {bait}")]))
+    change(source, f"UPDATE camera SET {column} = ?", pickle.dumps([bad_logs.Asks(os.system, f"touch {bait}")]))
     with pytest.raises(InputError, match=r"asks for '(posix|nt)\.system'") as caught:
         ingest(source, tmp_path / "out")
     assert column in caught.value.where
@@ -191,6 +180,9 @@ def rewritten(kind: str, edit: Callable[[bytes], bytes]) -> Callable[[Path], Non
     return spoil
 
 
+CAR_BOX = made.token("box", "car-001", 1)
+
+
 def cut(source: Path, size: int) -> None:
     log(source).write_bytes(log(source).read_bytes()[:size])
 
@@ -210,18 +202,12 @@ def cut(source: Path, size: int) -> None:
         (sql("UPDATE ego_pose SET timestamp = timestamp / 1000"), "no vehicle poses at the time"),
         (sql("UPDATE lidar_pc SET timestamp = timestamp / 1000"), "another unit"),
         (sql("UPDATE image SET timestamp = timestamp / 1000"), "no moment has images"),
-        (
-            sql("UPDATE lidar_pc SET timestamp = 'soon' WHERE token = ?", made.token("cloud", 1)),
-            "no whole number|numbers",
-        ),
+        (sql("UPDATE lidar_pc SET timestamp = 'soon' WHERE token = ?", made.token("cloud", 1)), "no whole number"),
         (sql("UPDATE ego_pose SET qw = qw * 1.5, qx = qx * 1.5, qy = qy * 1.5, qz = qz * 1.5"), "length 1"),
         (sql("UPDATE ego_pose SET x = NULL"), "not a finite number"),
         (sql("UPDATE lidar_pc SET ego_pose_token = x'00'"), "point cloud has no vehicle pose"),
         (sql("UPDATE lidar_pc SET lidar_token = x'00'"), "LiDAR that is not there"),
-        (
-            sql("UPDATE lidar_box SET track_token = x'00' WHERE token = ?", made.token("box", "car-001", 1)),
-            "names a track",
-        ),
+        (sql("UPDATE lidar_box SET track_token = x'00' WHERE token = ?", CAR_BOX), "names a track"),
         (sql("DELETE FROM category"), "names a track or class that is not there"),
         (sql("UPDATE lidar_box SET length = 0"), "size makes no sense"),
         (sql("UPDATE lidar_box SET yaw = 'north'"), "not a finite number"),
@@ -235,10 +221,7 @@ def cut(source: Path, size: int) -> None:
         (sql("UPDATE camera SET intrinsic = 'text'"), "no pickled list"),
         (sql("UPDATE camera SET width = 40"), "size"),
         (rewritten("MergedPointCloud", lambda c: c[:700]), "cut off|bytes"),
-        (
-            rewritten("MergedPointCloud", lambda c: re.sub(rb"(WIDTH|POINTS) \d+", rb"\1 99999999999", c)),
-            "POINTS|points|bytes",
-        ),
+        (rewritten("MergedPointCloud", lambda c: re.sub(rb"(WIDTH|POINTS) \d+", rb"\1 99999999999", c)), "POINTS"),
         (rewritten("MergedPointCloud", lambda c: c.replace(b"FIELDS x y z", b"FIELDS a y z")), "no coordinates"),
         (rewritten("CAM_F0", lambda c: c[:300]), "cannot be decoded"),
     ],
@@ -288,16 +271,12 @@ def test_cameras_may_fire_one_after_another(source: Path, tmp_path: Path) -> Non
         shutil.copy(tmp_path / "whole.db", log(source))
 
 
-def test_a_cloud_without_points_is_a_cloud(source: Path, tmp_path: Path) -> None:
+def test_a_cloud_without_points_is_a_cloud_and_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:
     blob("MergedPointCloud", 0)(source).write_bytes(made.pcd(np.zeros((0, 3)), np.zeros(0)))
+    change(source, "UPDATE category SET name = 'Hover Board'")
     scene = ingest(source, tmp_path / "out")
     assert sorted(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps)[0] == 0
     assert len(scene.sweeps) == 5
-
-
-def test_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:
-    change(source, "UPDATE category SET name = 'Hover Board'")
-    scene = ingest(source, tmp_path / "out", frames=(0, 2))
     assert {track.label for track in scene.tracks} == {"hover_board"}
     assert any("Hover Board" in note for note in scene.source.notes)
 
@@ -315,29 +294,15 @@ COLUMNS = tuple(
     ).split()
 )
 VALUES = (
-    "CAST(x'ff80' AS TEXT)",
-    "6000000000",
-    "-1",
-    "1.5",
-    "NULL",
-    "'text'",
-    "''",
-    "x'00ff'",
-    "zeroblob(3000000)",
-    "zeroblob(500000)",
-    "9e999",
-)
+    "CAST(x'ff80' AS TEXT); 6000000000; -1; 1.5; NULL; 'text'; ''; x'00ff'; zeroblob(3000000); zeroblob(500000); 9e999"
+).split("; ")
 
 
 def without_types(database: Path, table: str) -> sqlite3.Connection:
     """The database with a table whose columns take values of any type."""
     connection = sqlite3.connect(database)
-    for question in (
-        f"CREATE TABLE other AS SELECT * FROM {table}",
-        f"DROP TABLE {table}",
-        f"ALTER TABLE other RENAME TO {table}",
-    ):
-        connection.execute(question)
+    drop, rename = f"DROP TABLE {table}", f"ALTER TABLE other RENAME TO {table}"
+    connection.executescript(f"CREATE TABLE other AS SELECT * FROM {table}; {drop}; {rename}")
     return connection
 
 

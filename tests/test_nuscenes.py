@@ -79,10 +79,8 @@ def test_point_times_bring_boxes_to_the_sweeps_time(truth: Scene, release: Path,
     dt_s = np.concatenate([read_points(scene, sweep).dt_s for sweep in scene.sweeps])
     assert -0.05 <= dt_s.min() < -0.04 < -0.01 < dt_s.max() <= 0
     assert not any(read_points(plain, sweep).dt_s.any() for sweep in plain.sweeps)
-    ahead = [
-        (one.world_from_object[:, :3, 3] - other.world_from_object[:, :3, 3], one)
-        for one, other in zip(scene.tracks, plain.tracks, strict=True)
-    ]
+    pairs = zip(scene.tracks, plain.tracks, strict=True)
+    ahead = [(one.world_from_object[:, :3, 3] - other.world_from_object[:, :3, 3], one) for one, other in pairs]
     moved = [(step, track) for step, track in ahead if np.abs(step).max() > 0.05]
     assert moved  # boxes are drawn where the beam met the car, up to 0.05 s before the stamp: they come forward
     for step, track in moved:
@@ -95,11 +93,7 @@ def test_riders_follow_from_attributes_and_a_release_without_boxes_has_no_tracks
     truth: Scene, release: Path, tmp_path: Path
 ) -> None:
     copy = shutil.copytree(release, tmp_path / "release")
-
-    def to_bicycle(rows: Rows) -> None:
-        rows[0]["name"] = "vehicle.bicycle"
-
-    made.edit(copy, "category", to_bicycle)
+    made.edit(copy, "category", lambda rows: rows[0].update(name="vehicle.bicycle"))
     made.edit(copy, "sample_annotation", lambda rows: [r.update(attribute_tokens=[made.token("ridden")]) for r in rows])
     scene = ingest(copy, tmp_path / "out")
     assert "cyclist" in {track.label for track in scene.tracks}
@@ -131,6 +125,11 @@ def first(rows: Rows, **values: object) -> dict[str, Any]:
     return next(row for row in rows if all(row.get(key) == value for key, value in values.items()))
 
 
+def updating(**values: object) -> Callable[[Rows], object]:
+    """A change of the first LiDAR record of the scene."""
+    return lambda rows: of_scene(rows).update(values)
+
+
 def of_scene(rows: Rows) -> dict[str, Any]:
     return next(r for r in rows if "LIDAR_TOP" in r["filename"] and r["ego_pose_token"] == r["token"])
 
@@ -139,60 +138,47 @@ def all_stamps(factor: float) -> Callable[[Rows], None]:
     return lambda rows: [row.update(timestamp=int(row["timestamp"] * factor)) for row in rows]
 
 
+def shear(rows: Rows) -> None:
+    for row in rows:
+        if row["camera_intrinsic"]:
+            row["camera_intrinsic"][0][1] = 5.0
+
+
+def of_each(change: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[Rows], object]:
+    return lambda rows: [row.update(change(row)) for row in rows]
+
+
+DATA, BOXES, NOWHERE = "sample_data", "sample_annotation", "f" * 32
 BROKEN: dict[str, tuple[str, Callable[[Rows], object], str]] = {
-    "dangling ego pose": ("sample_data", lambda r: of_scene(r).update(ego_pose_token="f" * 32), "points nowhere"),
-    "dangling calibration": (
-        "sample_data",
-        lambda r: of_scene(r).update(calibrated_sensor_token="f" * 32),
-        "points nowhere",
-    ),
-    "dangling sample": ("sample", lambda r: first(r, prev="").update(next="f" * 32), "points nowhere"),
-    "dangling instance": ("sample_annotation", lambda r: r[0].update(instance_token="f" * 32), "points nowhere"),
+    "dangling ego pose": (DATA, updating(ego_pose_token=NOWHERE), "points nowhere"),
+    "dangling calibration": (DATA, updating(calibrated_sensor_token=NOWHERE), "points nowhere"),
+    "dangling sample": ("sample", lambda r: first(r, prev="").update(next=NOWHERE), "points nowhere"),
+    "dangling instance": (BOXES, lambda r: r[0].update(instance_token=NOWHERE), "points nowhere"),
     "chain in a circle": ("sample", lambda r: r[0].update(next=r[0]["prev"] or r[0]["token"]), "circle"),
     "milliseconds": ("sample", all_stamps(1e-3), "another unit"),
-    "nanoseconds": ("sample_data", all_stamps(1e3), "another unit"),
-    "chain backwards in time": (
-        "sample",
-        lambda r: r[1].update(timestamp=r[1]["timestamp"] + 10**6),
-        "do not increase",
-    ),
-    "a sweep of another day": (
-        "sample_data",
-        lambda r: of_scene(r).update(timestamp=made.START_US + 86_400 * 10**6),
-        "hours|outside",
-    ),
-    "width and length swapped": (
-        "sample_annotation",
-        lambda r: [x.update(size=[x["size"][i] for i in (1, 0, 2)]) for x in r],
-        "swapped",
-    ),
-    "size of zero": ("sample_annotation", lambda r: r[0].update(size=[0.0, 4.0, 1.5]), "makes no sense"),
+    "nanoseconds": (DATA, all_stamps(1e3), "another unit"),
+    "chain backwards": ("sample", lambda r: r[1].update(timestamp=r[1]["timestamp"] + 10**6), "do not increase"),
+    "a sweep of another day": (DATA, updating(timestamp=made.START_US + 86_400 * 10**6), "hours|outside"),
+    "width and length swapped": (BOXES, of_each(lambda x: {"size": [x["size"][i] for i in (1, 0, 2)]}), "swapped"),
+    "size of zero": (BOXES, lambda r: r[0].update(size=[0.0, 4.0, 1.5]), "makes no sense"),
     "scaled rotation": ("ego_pose", lambda r: r[0].update(rotation=[2 * v for v in r[0]["rotation"]]), "length 1"),
     "quaternions x y z w": (
         "ego_pose",
-        lambda r: [x.update(rotation=[*x["rotation"][1:], x["rotation"][0]]) for x in r],
+        of_each(lambda x: {"rotation": [*x["rotation"][1:], x["rotation"][0]]}),
         "upright",
     ),
     "three rotation values": ("ego_pose", lambda r: r[0].update(rotation=[1, 0, 0]), "missing or malformed"),
     "translation is a text": ("ego_pose", lambda r: r[0].update(translation=["1", 2, 3]), "missing or malformed"),
-    "intrinsics sheared": (
-        "calibrated_sensor",
-        lambda r: [x["camera_intrinsic"][0].__setitem__(1, 5.0) for x in r if x["camera_intrinsic"]],
-        "intrinsics are malformed",
-    ),
-    "file outside the release": (
-        "sample_data",
-        lambda r: of_scene(r).update(filename="../../etc/passwd"),
-        "file name contains",
-    ),
-    "missing timestamp": ("sample_data", lambda r: of_scene(r).pop("timestamp"), "missing or malformed"),
-    "two records with one token": ("sample_data", lambda r: r.append(of_scene(r)), "two records"),
+    "intrinsics sheared": ("calibrated_sensor", shear, "intrinsics are malformed"),
+    "file outside the release": (DATA, updating(filename="../../etc/passwd"), "file name contains"),
+    "missing timestamp": (DATA, lambda r: of_scene(r).pop("timestamp"), "missing or malformed"),
+    "two records with one token": (DATA, lambda r: r.append(of_scene(r)), "two records"),
     "other image size": (
-        "sample_data",
-        lambda r: [x.update(width=97) for x in r if "CAM_FRONT/" in x["filename"]],
+        DATA,
+        of_each(lambda x: {"width": 97} if "CAM_FRONT/" in x["filename"] else {}),
         "camera's size",
     ),
-    "no camera": ("sensor", lambda r: [x.update(channel="X") for x in r if "CAM" in x["channel"]], "no such camera"),
+    "no camera": ("sensor", of_each(lambda x: {"channel": "X"} if "CAM" in x["channel"] else {}), "no such camera"),
 }
 
 
@@ -215,12 +201,9 @@ def test_broken_files_are_refused_in_words(release: Path, tmp_path: Path, capsys
     copy = shutil.copytree(release, tmp_path / "release")
     scan = sorted((copy / "samples" / "LIDAR_TOP").iterdir())[2]
     content = scan.read_bytes()
-    cases = {
-        "cut off": content[:-3],
-        "not finite": np.array([1, np.nan, 2, 0, 0], "<f4").tobytes(),
-        "no ring": np.full((4, 5), 40, "<f4").tobytes(),
-    }
-    for words, wrong in cases.items():
+    numbers, rings = np.array([1, np.nan, 2, 0, 0], "<f4"), np.full((4, 5), 40, "<f4")
+    cases = (("cut off", content[:-3]), ("not finite", numbers.tobytes()), ("no ring", rings.tobytes()))
+    for words, wrong in cases:
         scan.write_bytes(wrong)
         with pytest.raises(InputError, match=words) as caught:
             ingest(copy, tmp_path / "out")
@@ -263,11 +246,10 @@ def test_default_cameras_must_all_be_there_and_unknown_categories_are_named(
 
 # --- the reader of tables -------------------------------------------------------------------------
 
+TEXTS = ("plain", "a } b", '{"group": "g1"}', 'end },\n{ "group": "g0" ', '\\" ] [ {', "\u00e9\u4e2d", "")
 ODD = [
     {"token": f"t{n}", "group": f"g{n % 3}", "text": text, "list": [n, [1.5, -2e-3]], "null": None}
-    for n, text in enumerate(
-        ["plain", "a } b", '{"group": "g1"}', 'end },\n{ "group": "g0" ', '\\" ] [ {', "\u00e9\u4e2d", ""]
-    )
+    for n, text in enumerate(TEXTS)
 ]
 
 
