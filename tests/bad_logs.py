@@ -81,6 +81,13 @@ def importer(kind: str, **usual: Any) -> Callable[..., Scene]:
     return lambda source, out, **options: IMPORTERS[kind](source, out, ImportOptions(**{**usual, **options}))
 
 
+def refused(words: str, call: Callable[..., object], *args: Any, raises: type = InputError, **options: Any) -> Any:
+    """The error that a call ends in; ``words``: a pattern in it."""
+    with pytest.raises(raises, match=words) as caught:
+        call(*args, **options)
+    return caught.value
+
+
 class Asks:
     """Pickles as a call of ``function``."""
 

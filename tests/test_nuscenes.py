@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import roundtrip
 import write_nuscenes as made
+from bad_logs import refused
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
@@ -104,16 +105,13 @@ def test_riders_follow_from_attributes_and_a_release_without_boxes_has_no_tracks
 
 
 def test_scene_must_be_chosen_and_releases_side_by_side_are_told_apart(release: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="several scenes") as several:
-        ingest(release, tmp_path / "out", sequence="")
-    assert "scene-0001, scene-0007" in several.value.expected
-    with pytest.raises(UsageError, match="no such scene"):
-        ingest(release, tmp_path / "out", sequence="scene-0008")
+    several = refused("several scenes", ingest, release, tmp_path / "out", sequence="", raises=UsageError)
+    assert "scene-0001, scene-0007" in several.expected
+    refused("no such scene", ingest, release, tmp_path / "out", sequence="scene-0008", raises=UsageError)
     copy = shutil.copytree(release, tmp_path / "release")
     shutil.copytree(copy / "v1.0-mini", copy / "v1.0-trainval")
     assert ingest(copy, tmp_path / "out").id == "scene-0007"
-    with pytest.raises(UsageError, match="no such scene"):
-        ingest(copy, tmp_path / "other", sequence="v1.0-test/scene-0007")
+    refused("no such scene", ingest, copy, tmp_path / "other", sequence="v1.0-test/scene-0007", raises=UsageError)
     scene = ingest(copy, tmp_path / "other", sequence="v1.0-trainval/scene-0007")
     assert any("v1.0-trainval" in note for note in scene.source.notes)
 
@@ -205,38 +203,28 @@ def test_broken_files_are_refused_in_words(release: Path, tmp_path: Path, capsys
     cases = (("cut off", content[:-3]), ("not finite", numbers.tobytes()), ("no ring", rings.tobytes()))
     for words, wrong in cases:
         scan.write_bytes(wrong)
-        with pytest.raises(InputError, match=words) as caught:
-            ingest(copy, tmp_path / "out")
-        assert scan.name in caught.value.where
+        assert scan.name in refused(words, ingest, copy, tmp_path / "out").where
     scan.unlink()
-    with pytest.raises(InputError, match="missing") as missing:
-        ingest(copy, tmp_path / "out")
-    assert "lidar_top lacks 1" in missing.value.got
+    assert "lidar_top lacks 1" in refused("missing", ingest, copy, tmp_path / "out").got
     scan.write_bytes(b"")  # no points is odd, not wrong
     scene = ingest(copy, tmp_path / "out")
     assert len(read_points(scene, scene.sweeps[2]).xyz) == 0
     assert "has no points" in capsys.readouterr().err
     image = sorted((copy / "samples" / "CAM_FRONT").iterdir())[1]
     image.write_bytes(image.read_bytes()[:200])
-    with pytest.raises(InputError, match="decoded") as cut:
-        ingest(copy, tmp_path / "out2")
-    assert image.name in cut.value.where
+    assert image.name in refused("decoded", ingest, copy, tmp_path / "out2").where
     table = copy / "v1.0-mini" / "sample_data.json"
     table.write_bytes(table.read_bytes()[:-200])
-    with pytest.raises(InputError, match="cut off"):
-        ingest(copy, tmp_path / "out2")
-    with pytest.raises(InputError, match="no nuScenes tables"):
-        ingest(copy / "samples", tmp_path / "out2")
+    refused("cut off", ingest, copy, tmp_path / "out2")
+    refused("no nuScenes tables", ingest, copy / "samples", tmp_path / "out2")
 
 
 def test_default_cameras_must_all_be_there_and_unknown_categories_are_named(
     release: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(InputError, match="cameras are missing") as caught:
-        ingest(release, tmp_path / "out", cameras=())
-    assert "--cameras front front_left" in caught.value.remedy
-    with pytest.raises(UsageError, match="already compensated"):
-        ingest(release, tmp_path / "out", untwist="yes")
+    caught = refused("cameras are missing", ingest, release, tmp_path / "out", cameras=())
+    assert "--cameras front front_left" in caught.remedy
+    refused("already compensated", ingest, release, tmp_path / "out", untwist="yes", raises=UsageError)
     copy = shutil.copytree(release, tmp_path / "release")
     made.edit(copy, "category", lambda rows: rows[0].update(name="vehicle.hovercraft"))
     scene = ingest(copy, tmp_path / "out", cameras=(), skip_missing=True)
@@ -285,12 +273,9 @@ def test_large_tables_give_the_same_records_whatever_the_buffer(
 def test_malformed_tables_are_refused(tmp_path: Path, read: Callable[[Path], Rows], text: str, words: str) -> None:
     path = tmp_path / "table.json"
     path.write_text(text)
-    with pytest.raises(InputError, match=words) as caught:
-        read(path)
-    assert str(path) in caught.value.where
+    assert str(path) in refused(words, read, path).where
     path.unlink()
-    with pytest.raises(InputError, match="table is missing"):
-        read(path)
+    refused("table is missing", read, path)
 
 
 # --- sweeps and cameras ---------------------------------------------------------------------------

@@ -14,10 +14,11 @@ import bad_logs
 import numpy as np
 import pytest
 import roundtrip
+from bad_logs import refused
 from pandas_pickles import write_frame
 from write_pandaset import CAMERA_OF, EPOCH_S, SOURCE_FROM_WORLD, cuboids, pose_entry, write_pandaset
 
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix, yaw_of
 from mudg.base.palette import CLASSES, ID, UNLABELLED
 from mudg.base.types import Photo, Scene, Track
@@ -84,17 +85,15 @@ def test_cameras_frames_and_sequences_are_chosen(truth: Scene, pristine: Path, t
     shutil.copytree(pristine, tmp_path / "all" / "002")
     shutil.copytree(pristine, tmp_path / "all" / "016")
     assert RECOGNISERS["pandaset"](tmp_path / "all")
-    with pytest.raises(UsageError, match="several sequences") as caught:
-        ingest(tmp_path / "all", tmp_path / "no")
-    assert "002, 016" in caught.value.expected
+    caught = refused("several sequences", ingest, tmp_path / "all", tmp_path / "no", raises=UsageError)
+    assert "002, 016" in caught.expected
     assert ingest(tmp_path / "all", tmp_path / "yes", sequence="016", frames=(0, 1)).id == "016"
     for options, words in (
         ({"sequence": "../001"}, "no such sequence"),
         ({"cameras": ("top",)}, "no such camera"),
         ({"boxes": Path("x")}, "no use for --boxes"),
     ):
-        with pytest.raises(UsageError, match=words):
-            ingest(tmp_path / "all", tmp_path / "no", **{"sequence": "002", **options})
+        refused(words, ingest, tmp_path / "all", tmp_path / "no", raises=UsageError, **{"sequence": "002", **options})
 
 
 def test_point_times_stay_and_boxes_come_from_the_time_they_were_measured(truth: Scene, tmp_path: Path) -> None:
@@ -277,9 +276,7 @@ def test_boxes_and_path_reach_the_images_taken_before_the_end_of_the_first_turn(
 def test_a_pickle_that_asks_for_a_command_runs_nothing(source: Path, tmp_path: Path, name: str) -> None:
     bait = tmp_path / "ran"
     (source / name).write_bytes(gzip.compress(pickle.dumps({"x": bad_logs.Asks(os.system, f"touch {bait}")})))
-    with pytest.raises(InputError, match=r"asks for '(posix|nt)\.system'") as caught:
-        ingest(source, tmp_path / "out")
-    assert name in caught.value.where
+    assert name in refused(r"asks for '(posix|nt)\.system'", ingest, source, tmp_path / "out").where
     assert not bait.exists()
     assert not (tmp_path / "out").exists()
 
