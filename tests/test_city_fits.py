@@ -20,8 +20,8 @@ from mudg.diffusion.training import clips as city_fits
 from mudg.diffusion.training import clips as learn_clips
 from mudg.diffusion.training import models as learn_models
 from mudg.scene.labels import read_label
-from mudg.scene.part import write_photos
 from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.write import write_photos
 from mudg.steps.learn import Learn
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the native library is not built")

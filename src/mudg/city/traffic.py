@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import geometry, seeds
-from mudg.city import objects as rec
+from mudg.city import layout as rec
 from mudg.city.config import CityConfig
-from mudg.city.layout import StreetPlan
-from mudg.city.objects import KERB_M, Color, Draws, record
+from mudg.city.layout import KERB_M, Color, Draws, StreetPlan, record
 from mudg.city.sensors import pitch_rotation
 
 Array = NDArray[np.float64]

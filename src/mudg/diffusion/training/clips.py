@@ -38,8 +38,8 @@ from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import short_fit
 from mudg.networks.codec import CLASSES
 from mudg.scene.clouds import write_fused
-from mudg.scene.part import PlacedSweep, write_photos
 from mudg.scene.read import read_scene
+from mudg.scene.write import PlacedSweep, write_photos
 
 # city fits ----------------------------------------------------------------------------------------
 #
