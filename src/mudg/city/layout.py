@@ -126,28 +126,9 @@ def plan_streets(config: CityConfig) -> StreetPlan:
     crossing = _crossing(rng, config, line, drive_length, urban)
     marks = _paint(rng, lanes, lane, (left, right))
     crosswalks = _crosswalks(rng, (left, right), crossing)
-    return StreetPlan(
-        line,
-        urban,
-        lane,
-        forward_u,
-        backward_u,
-        ego_u,
-        float(left),
-        float(right),
-        park_left,
-        park_right,
-        walks[0],
-        walks[1],
-        urban or rng.random() < 0.1,
-        urban or rng.random() < 0.1,
-        crossing,
-        marks,
-        crosswalks,
-        drive_s,
-        times,
-        drive_length,
-    )
+    paved = [urban or rng.random() < 0.1 for _ in range(2)]
+    street = (line, urban, lane, forward_u, backward_u, ego_u, float(left), float(right), park_left, park_right)
+    return StreetPlan(*street, *walks, *paved, crossing, marks, crosswalks, drive_s, times, drive_length)
 
 
 def _drive(rng: np.random.Generator, config: CityConfig) -> tuple[Array, Array]:
@@ -413,13 +394,14 @@ LABELS: Final = {
 }
 
 Color = tuple[float, float, float]
+Size = tuple[float, float, float]
 
 
 def record(
     kind: int,
-    xyz: tuple[float, float, float],
+    xyz: Size,
     yaw: float,
-    size: tuple[float, float, float],
+    size: Size,
     seed: int,
     rgb: Color = (0.5, 0.5, 0.5),
     rgb2: Color = (0.5, 0.5, 0.5),
@@ -511,12 +493,26 @@ class Furnisher(Draws):
         crossing = self.plan.crossing
         return crossing is not None and abs(s - crossing.s) < crossing.half_width + margin
 
+    def add(
+        self,
+        kind: int,
+        xyz: Size,
+        yaw: float,
+        size: Size,
+        seed: int,
+        rgb: Color,
+        rgb2: Color = (0.5, 0.5, 0.5),
+        parameters: tuple[float, ...] = (),
+    ) -> None:
+        """Add a record."""
+        self.rows.append(record(kind, xyz, yaw, size, seed, rgb, rgb2, parameters))
+
     def place(
         self,
         kind: int,
         place: tuple[float, float],
         turn: float,
-        size: tuple[float, float, float],
+        size: Size,
         rgb: Color,
         rgb2: Color = (0.5, 0.5, 0.5),
         parameters: tuple[float, ...] = (),
@@ -524,7 +520,7 @@ class Furnisher(Draws):
     ) -> None:
         """Add an object at street coordinates (s, u); ``turn`` is its heading relative to the street."""
         x, y, heading = self.plan.line.point(*place)
-        self.rows.append(record(kind, (x, y, z), heading + turn, size, self.seed(), rgb, rgb2, parameters))
+        self.add(kind, (x, y, z), heading + turn, size, self.seed(), rgb, rgb2, parameters)
 
 
 def plant_tree(f: Furnisher, s: float, u: float, garden: bool = False) -> None:
@@ -534,12 +530,5 @@ def plant_tree(f: Furnisher, s: float, u: float, garden: bool = False) -> None:
     height = f.uniform(6.0, 11.0) if habit == 0 else f.uniform(7, 12)
     radius = height * f.uniform(0.24, 0.32) if habit == 0 else f.uniform(1.0, 1.7)
     cell = f.uniform(0.20, 0.27) * (1 + 0.05 * max(0.0, height - 7))
-    f.place(
-        TREE,
-        (s, u),
-        f.uniform(0, 6.28),
-        (1.0, 1.0, height),
-        f.pick(LEAF_COLORS),
-        (0.13, 0.10, 0.075),
-        (radius, f.uniform(0.45, 0.72), habit, cell, f.uniform(0.11, 0.2)),
-    )
+    turn, leaves, crown = f.uniform(0, 6.28), f.pick(LEAF_COLORS), (radius, f.uniform(0.45, 0.72), habit, cell)
+    f.place(TREE, (s, u), turn, (1.0, 1.0, height), leaves, (0.13, 0.10, 0.075), (*crown, f.uniform(0.11, 0.2)))

@@ -144,25 +144,9 @@ def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
     if config.fog_visibility_m > 0:
         haze = config.fog_visibility_m / 3.0
     direction = [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    numbers = [
-        *direction,
-        *sun,
-        *zenith,
-        *horizon,
-        *ambient,
-        *cloud,
-        *tint,
-        cloudiness,
-        haze,
-        night,
-        exposure,
-        rng.uniform(0.95, 1.08),
-        rng.uniform(0.85, 1.08),
-        rng.uniform(0.003, 0.009),
-        rng.uniform(0.05, 0.3),
-        0.0035,
-    ]
-    return name, np.array(numbers, np.float64)
+    colors = [*direction, *sun, *zenith, *horizon, *ambient, *cloud, *tint]
+    camera = [rng.uniform(0.95, 1.08), rng.uniform(0.85, 1.08), rng.uniform(0.003, 0.009), rng.uniform(0.05, 0.3)]
+    return name, np.array([*colors, cloudiness, haze, night, exposure, *camera, 0.0035], np.float64)
 
 
 # weather ------------------------------------------------------------------------------------------

@@ -37,54 +37,27 @@ MOST_LISTS: Final = 2_000_000
 FLAT_LOG: Final = float(np.log(1e-6))
 """Thickness of flat Gaussians, whose files state none."""
 _MODES: Final = {"mip": True, "antialiased": True, "antialias": True, "default": False, "classic": False, "2dgs": False}
-_MOTION: Final = (
-    "trbf",
-    "motion",
-    "omega",
-    "t_",
-    "time",
-    "scale_t",
-    "scaling_t",
-    "rot_r",
-    "rotation_r",
-    "velocity",
-    "duration",
-)
+_MOTION: Final = tuple("trbf motion omega t_ time scale_t scaling_t rot_r rotation_r velocity duration".split())
 """Beginnings of columns with which methods for moving scenes move their Gaussians."""
 _UNREAD: Final = ("nx", "ny", "nz", "red", "green", "blue", "alpha")
 _ELEMENTS: Final = (
-    "face",
-    "edge",
-    "tristrips",
-    "material",
-    "camera",
-    "extrinsic",
-    "intrinsic",
-    "image_size",
-    "frame",
-    "disparity",
-    "color_space",
-    "version",
+    "face edge tristrips material camera extrinsic intrinsic image_size frame disparity color_space version".split()
 )
 """Columns and elements of others that say nothing about Gaussians (from ``extrinsic`` on: ml-sharp). PLY has no closed
 list."""
 _TYPES: Final = {
-    "char": "i1",
-    "int8": "i1",
-    "uchar": "u1",
-    "uint8": "u1",
-    "short": "i2",
-    "int16": "i2",
-    "ushort": "u2",
-    "uint16": "u2",
-    "int": "i4",
-    "int32": "i4",
-    "uint": "u4",
-    "uint32": "u4",
-    "float": "f4",
-    "float32": "f4",
-    "double": "f8",
-    "float64": "f8",
+    name: kind
+    for kind, names in {
+        "i1": "char int8",
+        "u1": "uchar uint8",
+        "i2": "short int16",
+        "u2": "ushort uint16",
+        "i4": "int int32",
+        "u4": "uint uint32",
+        "f4": "float float32",
+        "f8": "double float64",
+    }.items()
+    for name in names.split()
 }
 _LENGTHS: Final = {name for name, kind in _TYPES.items() if kind[0] != "f"}
 _REST: Final = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
@@ -94,15 +67,8 @@ _REST: Final = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 def to_bytes(cloud: SplatCloud, *, classes: bool = False, marks: Sequence[str] = ()) -> bytes:
     """A cloud as a PLY file; ``classes`` adds the column of our own, ``marks`` are comments (``marks_of``)."""
     with_classes = classes and cloud.class_ids is not None
-    columns = [
-        cloud.means,
-        np.zeros_like(cloud.means),
-        cloud.sh[:, 0],
-        channel_major(cloud.sh),
-        cloud.logits[:, None],
-        cloud.log_scales,
-        cloud.quats,
-    ]
+    columns = [cloud.means, np.zeros_like(cloud.means), cloud.sh[:, 0], channel_major(cloud.sh)]
+    columns += [cloud.logits[:, None], cloud.log_scales, cloud.quats]
     if with_classes and cloud.class_ids is not None:
         columns.append(cloud.class_ids[:, None])
     rows = np.concatenate([column.astype("<f4") for column in columns], 1)
@@ -129,13 +95,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if rest not in _REST or any(name not in names for name in _indexed("f_rest", rest)):
         what = "the number of f_rest columns fits no degree of harmonics"
         raise InputError(what, where=where, expected=", ".join(map(str, _REST)), got=str(rest))
-    sh = np.concatenate(
-        [
-            columns_of(table, _indexed("f_dc", 3))[:, None],
-            coefficient_major(columns_of(table, _indexed("f_rest", rest)))[:, :15],
-        ],
-        1,
-    )
+    first, others = columns_of(table, _indexed("f_dc", 3)), columns_of(table, _indexed("f_rest", rest))
+    sh = np.concatenate([first[:, None], coefficient_major(others)[:, :15]], 1)
     classes = None
     # others number classes in whole numbers, and otherwise
     if ours := "class" in names and table.dtype["class"].kind == "f":
@@ -148,18 +109,8 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
     if flat:
         logs = np.column_stack([logs, np.full(len(logs), FLAT_LOG, np.float32)])
         notes.append("it has no scale_2: read as flat Gaussians (2DGS)")
-    cloud = checked(
-        SplatCloud(
-            means,
-            columns_of(table, _indexed("rot", 4)),
-            logs,
-            np.asarray(table["opacity"], np.float32),
-            sh,
-            classes,
-            file.antialias,
-        ),
-        where,
-    )
+    quats, logits = columns_of(table, _indexed("rot", 4)), np.asarray(table["opacity"], np.float32)
+    cloud = checked(SplatCloud(means, quats, logs, logits, sh, classes, file.antialias), where)
     filters = [name for name in names if name.lower() == "filter_3d"]
     if filters:
         cloud = _filtered(cloud, np.asarray(table[filters[0]], np.float64), where)
@@ -424,19 +375,8 @@ def _indexed(name: str, count: int) -> tuple[str, ...]:
 
 def _names(degree: int) -> tuple[str, ...]:
     rest = 3 * ((degree + 1) ** 2 - 1)
-    return (
-        "x",
-        "y",
-        "z",
-        "nx",
-        "ny",
-        "nz",
-        *_indexed("f_dc", 3),
-        *_indexed("f_rest", rest),
-        "opacity",
-        *_indexed("scale", 3),
-        *_indexed("rot", 4),
-    )
+    head = ("x", "y", "z", "nx", "ny", "nz", *_indexed("f_dc", 3), *_indexed("f_rest", rest))
+    return (*head, "opacity", *_indexed("scale", 3), *_indexed("rot", 4))
 
 
 def channel_major(sh: NDArray[np.float32]) -> NDArray[np.float32]:

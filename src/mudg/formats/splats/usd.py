@@ -278,18 +278,10 @@ NVIDIA_CLASSES: Final[Mapping[str, str]] = {
     "van": "automobile",
     "vehicle": "other_vehicle",
     "truck": "heavy_truck",
-    "bus": "bus",
     "tram": "train_or_tram_car",
     "train": "train_or_tram_car",
     "pedestrian": "person",
-    "person": "person",
     "cyclist": "rider",
-    "rider": "rider",
-    "bicycle": "bicycle",
-    "motorcycle": "motorcycle",
-    "trailer": "trailer",
-    "stroller": "stroller",
-    "animal": "animal",
 }
 """Classes of objects as NVIDIA's recordings call them; others keep their names."""
 _NO_DATE: Final = "1970-01-01"
