@@ -21,8 +21,7 @@ from PIL import Image
 
 from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, project, transform_points, yaw_matrix, yaw_of
 from mudg.base.types import Scene, Track
-from mudg.scene.files import open_files
-from mudg.scene.read import read_points
+from mudg.scene.read import open_files, read_points
 
 Matrix = NDArray[np.float64]
 EPOCH_US = 1_553_735_853_462_203

@@ -46,8 +46,8 @@ from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.storage import load_model, model_of_scene
 from mudg.scene.clouds import read_fused
 from mudg.scene.labels import photographs, read_trusted_classes
-from mudg.scene.part import write_photos
 from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.write import write_photos
 
 # lessons ------------------------------------------------------------------------------------------
 #
