@@ -34,13 +34,9 @@ def rigid(value: Any, where: str) -> Matrix:
     matrix = np.array(value, np.float64)
     problem = geometry.rigid_problem(matrix)
     if problem:
-        raise InputError(
-            "pose is not a rigid motion",
-            where=where,
-            got=problem,
-            expected="f64[4, 4]: a right-handed rotation (orthonormal within 1e-4) and a translation in metres",
-            remedy="remove scale or mirroring from the matrix; check row against column order",
-        )
+        expected = "f64[4, 4]: a right-handed rotation (orthonormal within 1e-4) and a translation in metres"
+        remedy = "remove scale or mirroring from the matrix; check row against column order"
+        raise InputError("pose is not a rigid motion", where=where, got=problem, expected=expected, remedy=remedy)
     matrix.setflags(write=False)
     return matrix
 
@@ -52,13 +48,9 @@ def foreign_name(value: str, where: str) -> str:
     """An id, name or class from a file of others, at most 200 bytes long."""
     size = len(value) if len(value) > MAX_NAME_BYTES else len(value.encode("utf-8", "surrogatepass"))
     if size > MAX_NAME_BYTES:
-        raise InputError(
-            "name is too long",
-            where=where,
-            expected=f"at most {MAX_NAME_BYTES} bytes",
-            got=f"{size} bytes, beginning {value[:40]!r}",
-            remedy="is the file damaged, or of another format?",
-        )
+        what = "name is too long"
+        got, remedy = f"{size} bytes, beginning {value[:40]!r}", "is the file damaged, or of another format?"
+        raise InputError(what, where=where, expected=f"at most {MAX_NAME_BYTES} bytes", got=got, remedy=remedy)
     return value
 
 
@@ -80,8 +72,7 @@ def increasing_problem(times_s: NDArray[np.float64]) -> str | None:
 
 
 def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[np.float64], Matrix]:
-    """Check and freeze interpolation keys: increasing finite times f64[T], rigid poses f64[T, 4, 4] of the field
-    ``name``."""
+    """Check and freeze keys: increasing finite times f64[T], rigid poses f64[T, 4, 4] of the field ``name``."""
     times = np.array(times_s, np.float64).reshape(-1)
     matrices = np.array(poses, np.float64)
     if matrices.shape != (len(times), 4, 4):
@@ -89,13 +80,8 @@ def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[
         raise InputError("times and poses do not pair up", where=f"{owner}: {name}", expected=expected, got=got)
     problem = increasing_problem(times) if np.isfinite(times).all() else shortened(times)
     if problem is not None:
-        raise InputError(
-            "times do not increase",
-            where=f"{owner}: times_s",
-            expected="finite seconds, strictly increasing",
-            got=problem,
-            remedy="sort the poses by time and drop duplicates",
-        )
+        what, where, remedy = "times do not increase", f"{owner}: times_s", "sort the poses by time and drop duplicates"
+        raise InputError(what, where=where, expected="finite seconds, strictly increasing", got=problem, remedy=remedy)
     if not geometry.all_rigid(matrices):
         for index, matrix in enumerate(matrices):
             rigid(matrix, f"{owner}: {name}[{index}]")
@@ -421,8 +407,7 @@ class Track:
         object.__setattr__(self, "world_from_object", poses)
 
     def pose_at(self, time_s: float) -> Matrix | None:
-        """World-from-object f64[4, 4] at ``time_s``, interpolated between both neighbouring keys; None outside the
-        span."""
+        """World-from-object f64[4, 4] at ``time_s``, interpolated between neighbouring keys; None outside the span."""
         return geometry.pose_at(self.times_s, self.world_from_object, time_s)
 
 
