@@ -59,7 +59,7 @@ from mudg.gaussians import fit
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import short_fit
 from mudg.scene.clouds import write_fused
-from mudg.scene.part import PlacedSweep, write_photos
+from mudg.scene.write import PlacedSweep, write_photos
 
 # varied cities ------------------------------------------------------------------------------------
 #
