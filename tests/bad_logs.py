@@ -64,6 +64,40 @@ def shared(factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.fixture(scope="session")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
+    """The small city, the same for all test modules."""
+    return whole_city(shared(tmp_path_factory) / "city")
+
+
+@functools.cache
+def whole_city(folder: Path) -> Scene:
+    """All moments of the small city."""
+    return roundtrip.small_log(folder)
+
+
+def importer(kind: str, **usual: Any) -> Callable[..., Scene]:
+    """``ingest(source, out, **options)`` of a format, with its ``usual`` options."""
+    return lambda source, out, **options: IMPORTERS[kind](source, out, ImportOptions(**{**usual, **options}))
+
+
+def refused(words: str, call: Callable[..., object], *args: Any, raises: type = InputError, **options: Any) -> Any:
+    """The error that a call ends in; ``words``: a pattern in it."""
+    with pytest.raises(raises, match=words) as caught:
+        call(*args, **options)
+    return caught.value
+
+
+class Asks:
+    """Pickles as a call of ``function``."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.call = (function, arguments)
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
 @functools.cache
 def city(folder: Path) -> Scene:
     """Three moments of the small city."""

@@ -148,9 +148,8 @@ def test_a_photograph_carried_aside_is_nearer_to_the_truth_there(log):
 
 def test_truth_is_photographs_measured_depth_and_the_models_own_guesses(log, tmp_path):
     config = settings(log)
-    model = model_files.load(config.model)
-    learnt, lessons = adapt._open_log(config, model, log / "scene", log / "fuse", log / "fit")
-    lesson = lessons[0]
+    planned = adapt.PlannedAdaptation.of(config, log / "scene", log / "fuse", log / "fit")
+    model, learnt, lesson = planned.model, planned.learnt, planned.lessons[0]
     folder = adapt.fit_lesson(config, learnt, lesson, tmp_path / lesson.name, fit_scene)
     clip = adapt.ClipMaker(config, learnt, lesson, model, folder).make(lesson.truth[0][1], 0)
     scene = read_scene(log / "scene")

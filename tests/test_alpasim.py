@@ -22,7 +22,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, View
 from mudg.core.edit import HeightMap
 from mudg.exporting.settings import ExportConfig
-from mudg.formats.splats import alpasim
+from mudg.formats.splats import usd
 from mudg.formats.splats.cloud import SplatScene
 from mudg.gaussians.storage import save_model
 from mudg.steps.export import Export
@@ -81,7 +81,7 @@ class Package:
 
 @pytest.fixture(scope="module")
 def package() -> Package:
-    return Package(alpasim.to_package(toy_splats.scene(1), drive(), ground()))
+    return Package(usd.to_alpasim(toy_splats.scene(1), drive(), ground()))
 
 
 def test_the_package_is_a_usd_package_with_files_by_name(package: Package) -> None:
@@ -169,7 +169,7 @@ def test_unknown_ground_is_a_hole_and_the_mesh_turns_with_the_file() -> None:
     heights = np.zeros((3, 4))
     heights[1, 1] = np.nan
     turn = geometry.yaw_matrix(np.pi / 2, (10.0, 0.0, 1.0))
-    mesh = alpasim.ground_mesh(HeightMap(np.array([1.0, 2.0]), 0.5, heights), turn)
+    mesh = usd.ground_mesh(HeightMap(np.array([1.0, 2.0]), 0.5, heights), turn)
     package = object.__new__(Package)
     archive = io.BytesIO()
     with zipfile.ZipFile(archive, "w") as written:
@@ -181,33 +181,33 @@ def test_unknown_ground_is_a_hole_and_the_mesh_turns_with_the_file() -> None:
 
 
 def test_shutters_and_the_same_bytes(package: Package) -> None:
-    rolling = Package(alpasim.to_package(toy_splats.scene(1), drive(0.02), ground()))
+    rolling = Package(usd.to_alpasim(toy_splats.scene(1), drive(0.02), ground()))
     front, _ = rolling.trajectory["cameras_frame_timestamps_us"].values()
     assert [end - begin for begin, end in front] == [20_000, 20_000]
     told = next(iter(rolling.rig["camera_calibrations"].values()))["camera_model"]["parameters"]
     assert told["shutter_type"] == "ROLLING_TOP_TO_BOTTOM"
-    assert alpasim.to_package(toy_splats.scene(1), drive(), ground()) == package.content
+    assert usd.to_alpasim(toy_splats.scene(1), drive(), ground()) == package.content
     other = toy_splats.scene(1)
     moved = replace(other, nodes=(replace(other.nodes[0], cloud=toy_splats.cloud(4)), *other.nodes[1:]))
-    assert Package(alpasim.to_package(moved, drive(), ground())).metadata["uuid"] != package.metadata["uuid"]
+    assert Package(usd.to_alpasim(moved, drive(), ground())).metadata["uuid"] != package.metadata["uuid"]
 
 
 def test_intrinsics_are_those_of_the_vendors_package() -> None:
     data = pytest.importorskip("ncore.data")
     camera = Camera("a", 64, 48, 50.0, 51.0, 31.0, 25.0, readout_s=0.01)
-    found = data.OpenCVPinholeCameraModelParameters.from_dict(alpasim.intrinsics(camera))
-    assert found.to_dict() == alpasim.intrinsics(camera)
+    found = data.OpenCVPinholeCameraModelParameters.from_dict(usd.intrinsics(camera))
+    assert found.to_dict() == usd.intrinsics(camera)
 
 
 def test_the_command_needs_a_drive(tmp_path: Path) -> None:
     scene = SplatScene("toy", toy_splats.scene().nodes)
     with pytest.raises(InputError, match="none is known"):
-        alpasim.to_package(scene, None, ground())
+        usd.to_alpasim(scene, None, ground())
     parked = EgoPath(np.zeros(0), np.zeros((0, 4, 4)))
     with pytest.raises(InputError, match="none is known"):
-        alpasim.to_package(scene, replace(drive(), ego=parked), ground())
+        usd.to_alpasim(scene, replace(drive(), ego=parked), ground())
     with pytest.raises(InputError, match="ground"):
-        alpasim.to_package(scene, drive(), None)
+        usd.to_alpasim(scene, drive(), None)
     save_model(toy_fitted(0), tmp_path / "fit")
     with pytest.raises(InputError, match="--scene"):
         Export(format="alpasim", source=tmp_path / "fit", out=tmp_path / "a.usdz", settings=ExportConfig()).run()

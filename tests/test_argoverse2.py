@@ -9,33 +9,27 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
 import write_av2 as made
+from bad_logs import refused
 from PIL import Image
-from roundtrip import needs_native
 
-from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.errors import ResourceError, UsageError
 from mudg.base.geometry import invert, transform_points
 from mudg.base.types import Scene, Track
-from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.argoverse2 import read_sweep
-from mudg.formats.importers.common import ImportOptions
 from mudg.scene.read import read_points
+
+pytestmark = roundtrip.needs_native
+truth = bad_logs.truth
+ingest = bad_logs.importer("argoverse2", cameras=("front", "front_left"))
 
 pytest.importorskip("pyarrow")
 Columns = dict[str, Any]
-
-
-def ingest(source: Path, out: Path, **options: object) -> Scene:
-    given = {"cameras": ("front", "front_left"), **options}
-    return IMPORTERS["argoverse2"](source, out, ImportOptions(**given))
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "scene")
 
 
 @pytest.fixture(scope="module")
@@ -46,7 +40,6 @@ def drive(truth: Scene, tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- round trips ----------------------------------------------------------------------------------
 
 
-@needs_native
 def test_round_trip(truth: Scene, drive: Path, tmp_path: Path) -> None:
     assert RECOGNISERS["argoverse2"](drive)
     scene = ingest(drive, tmp_path / "plain", untwist="no")
@@ -66,7 +59,6 @@ def replace_tracks(scene: Scene, keep: tuple[Track, ...]) -> Scene:
     return replace(scene, tracks=tuple(track for track in scene.tracks if track.id in names))
 
 
-@needs_native
 def test_frames_and_logs_are_chosen(drive: Path, tmp_path: Path) -> None:
     scene = ingest(drive, tmp_path / "out", cameras=("ring_front_center",), frames=(3, 9))
     assert list(scene.cameras) == ["front"]
@@ -75,9 +67,8 @@ def test_frames_and_logs_are_chosen(drive: Path, tmp_path: Path) -> None:
     for name in ("aaa-1", "aaa-2"):
         shutil.copytree(drive, logs / name)
     for sequence, words in (("", "several logs"), ("aaa", "several logs"), ("b", "no such log")):
-        with pytest.raises(UsageError, match=words) as caught:
-            ingest(logs, tmp_path / "other", sequence=sequence)
-        assert "aaa-1, aaa-2" in caught.value.expected
+        caught = refused(words, ingest, logs, tmp_path / "other", sequence=sequence, raises=UsageError)
+        assert "aaa-1, aaa-2" in caught.expected
     assert ingest(logs, tmp_path / "other", sequence="aaa-2").id == "aaa-2"
 
 
@@ -122,7 +113,6 @@ BROKEN: dict[str, tuple[str, Callable[[Columns], object], str]] = {
 }
 
 
-@needs_native
 @pytest.mark.parametrize("name", BROKEN)
 def test_broken_tables_are_refused_in_words(name: str, drive: Path, tmp_path: Path) -> None:
     table, change, words = BROKEN[name]
@@ -131,16 +121,13 @@ def test_broken_tables_are_refused_in_words(name: str, drive: Path, tmp_path: Pa
     roundtrip.assert_refused(ingest, copy, tmp_path / "out", words)
 
 
-@needs_native
 def test_broken_files_are_refused_in_words(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = shutil.copytree(drive, tmp_path / "log")
     scan = sorted((copy / "sensors" / "lidar").iterdir())[1]
     content = scan.read_bytes()
     for wrong in (content[: len(content) // 2], content[:10], b""):
         scan.write_bytes(wrong)
-        with pytest.raises(InputError, match="cut off") as caught:
-            ingest(copy, tmp_path / "out")
-        assert scan.name in caught.value.where
+        assert scan.name in refused("cut off", ingest, copy, tmp_path / "out").where
     changes: dict[str, Callable[[Columns], object]] = {
         "point times": lambda c: c.update(offset_ns=c["offset_ns"].astype(np.int64) * 1000 + 10**9),
         "intensity": lambda c: c.update(intensity=c["intensity"] + 300),
@@ -149,8 +136,7 @@ def test_broken_files_are_refused_in_words(drive: Path, tmp_path: Path, capsys: 
     for words, change in changes.items():
         scan.write_bytes(content)
         made.edit(scan, change)
-        with pytest.raises(InputError, match=words):
-            ingest(copy, tmp_path / "out")
+        refused(words, ingest, copy, tmp_path / "out")
     scan.write_bytes(content)
     made.edit(scan, lambda c: c.update({name: values[:0] for name, values in c.items()}))
     scene = ingest(copy, tmp_path / "out")
@@ -158,20 +144,15 @@ def test_broken_files_are_refused_in_words(drive: Path, tmp_path: Path, capsys: 
     assert "has no points" in capsys.readouterr().err
     image = next((copy / "sensors" / "cameras" / "ring_front_left").iterdir())
     image.rename(image.with_name(f"{int(image.stem) // 1000}.png"))
-    with pytest.raises(InputError, match="another unit"):
-        ingest(copy, tmp_path / "other")
+    refused("another unit", ingest, copy, tmp_path / "other")
     shutil.rmtree(copy / "sensors" / "cameras")
-    with pytest.raises(InputError, match="no images"):
-        ingest(copy, tmp_path / "other")
-    with pytest.raises(InputError, match="no Argoverse 2 log"):
-        ingest(copy / "sensors", tmp_path / "other")
+    refused("no images", ingest, copy, tmp_path / "other")
+    refused("no Argoverse 2 log", ingest, copy / "sensors", tmp_path / "other")
 
 
-@needs_native
 def test_optional_parts_and_unknown_categories(drive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     copy = shutil.copytree(drive, tmp_path / "log")
-    with pytest.raises(InputError, match="cameras are missing"):
-        ingest(copy, tmp_path / "out", cameras=())
+    refused("cameras are missing", ingest, copy, tmp_path / "out", cameras=())
     made.edit(copy / BOXES, lambda c: c["category"].__setitem__(slice(None), "HOVERCRAFT"))
     scene = ingest(copy, tmp_path / "out", cameras=(), skip_missing=True)
     assert {track.label for track in scene.tracks} == {"hovercraft"}
@@ -192,9 +173,8 @@ def test_without_pyarrow_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.
         return plain(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(ResourceError, match="pyarrow") as caught:
-        read_sweep(tmp_path / "1.feather", np.eye(4))
-    assert "mudg[data]" in caught.value.remedy
+    caught = refused("pyarrow", read_sweep, tmp_path / "1.feather", np.eye(4), raises=ResourceError)
+    assert "mudg[data]" in caught.remedy
 
 
 # --- real data ------------------------------------------------------------------------------------

@@ -6,19 +6,20 @@ import io
 import json
 import shutil
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import bad_logs
 import kitti_folders as made
 import numpy as np
 import pytest
+from bad_logs import refused
 from PIL import Image
 from toy_scene import ToyStreet
 
 from mudg.base import store
 from mudg.base.errors import InputError, MudgError, ResourceError, UsageError
-from mudg.formats.importers import IMPORTERS
-from mudg.formats.importers.common import ImportOptions
 from mudg.formats.settings import IngestConfig
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.check import check_scene
@@ -32,6 +33,7 @@ from mudg.steps.ingest import Ingest
 from mudg.steps.run import Run
 from mudg.steps.settings.run import RunConfig
 
+ingest = bad_logs.importer("kitti")
 IMAGE = "image_02/data/0000000003.png"
 SCAN = "velodyne_points/data/0000000003.bin"
 
@@ -54,11 +56,13 @@ def nan_row(root: Path) -> None:
     rows.tofile(root / SCAN)
 
 
-def pose_line(root: Path, n: int, change: Callable[[list[str]], list[str]]) -> None:
-    path = root / "derived" / "poses_velo.txt"
-    lines = path.read_text().splitlines()
-    lines[n] = " ".join(change(lines[n].split()))
-    path.write_text("\n".join(lines) + "\n")
+def third_line(name: str, change: Callable[[list[str]], list[str]]) -> Callable[[Path], None]:
+    def spoil(root: Path) -> None:
+        lines = (root / name).read_text().splitlines()
+        lines[2] = " ".join(change(lines[2].split()))
+        (root / name).write_text("\n".join(lines) + "\n")
+
+    return spoil
 
 
 def scale(words: list[str]) -> list[str]:
@@ -69,94 +73,56 @@ def mirror(words: list[str]) -> list[str]:
     return [words[0], *[str(-float(w)) if i % 4 == 1 else w for i, w in enumerate(words[1:])]]
 
 
-def swap_images(root: Path) -> None:
-    (root / IMAGE).write_bytes((root / SCAN).read_bytes())
+def rewriting(name: str, change: Callable[[str], str]) -> Callable[[Path], None]:
+    return lambda root: rewrite(root / name, change)
 
 
-def resize_image(root: Path) -> None:
-    Image.new("RGB", (50, 20)).save(root / IMAGE)
-
-
-def sixteen_bit(root: Path) -> None:
-    Image.fromarray(np.zeros((made.HEIGHT, made.WIDTH), np.uint16)).save(root / IMAGE)
-
-
-def rotated(root: Path) -> None:
-    exif = Image.Exif()
-    exif[0x0112] = 6
-    Image.fromarray(made.image(3)).save(root / IMAGE, exif=exif)
-
-
-def label(root: Path, change: Callable[[list[str]], list[str]]) -> None:
-    path = root / "derived" / "label_02.txt"
-    lines = path.read_text().splitlines()
-    lines[2] = " ".join(change(lines[2].split()))
-    path.write_text("\n".join(lines) + "\n")
+POSES, LABELS = "derived/poses_velo.txt", "derived/label_02.txt"
+FIRST_P2 = made.numbers(made.projection(2))
 
 
 KITTI: dict[str, tuple[str, str, Callable[[Path], object]]] = {
-    # what is broken: (words of the error, where it points, how it is broken)
+    # what is broken: (words of the error, where it points, how it is broken); images: test_bad_images.py
     "missing image": ("do not pair up", "", lambda r: (r / IMAGE).unlink()),
     "missing scan": ("do not pair up", "", lambda r: (r / SCAN).unlink()),
-    "truncated image": ("cannot be decoded", IMAGE, lambda r: cut(r / IMAGE)),
-    "empty image": ("not a PNG or JPEG", IMAGE, lambda r: (r / IMAGE).write_bytes(b"")),
-    "scan called image": ("not a PNG or JPEG", IMAGE, swap_images),
-    "image of another size": ("camera's size", IMAGE, resize_image),
-    "16-bit image": ("not 8-bit", IMAGE, sixteen_bit),
-    "EXIF-rotated image": ("rotated", IMAGE, rotated),
+    "scan called image": ("not a PNG or JPEG", IMAGE, lambda r: (r / IMAGE).write_bytes((r / SCAN).read_bytes())),
+    "image of another size": ("camera's size", IMAGE, lambda r: Image.new("RGB", (50, 20)).save(r / IMAGE)),
     "truncated scan": ("cut off", SCAN, lambda r: (r / SCAN).write_bytes((r / SCAN).read_bytes()[:-7])),
     "NaN in scan": ("not finite", SCAN, nan_row),
-    "truncated pose file": (
-        "wrong number of values",
-        "poses_velo.txt",
-        lambda r: cut(r / "derived/poses_velo.txt", 0.57),
-    ),
+    "truncated pose file": ("wrong number of values", "poses_velo.txt", lambda r: cut(r / POSES, 0.57)),
     "pose file without a frame": (
         "lacks frames",
         "poses_velo.txt",
-        lambda r: rewrite(r / "derived/poses_velo.txt", lambda t: "\n".join(t.splitlines()[:-1])),
+        rewriting(POSES, lambda t: t[: t.rindex("\n5 ") + 1]),
     ),
-    "empty pose file": ("empty", "poses_velo.txt", lambda r: (r / "derived/poses_velo.txt").write_text("")),
-    "no pose file": ("no vehicle poses", "", lambda r: (r / "derived/poses_velo.txt").unlink()),
-    "NaN pose": ("not finite", "line 3", lambda r: pose_line(r, 2, lambda w: [*w[:4], "nan", *w[5:]])),
-    "text in pose": ("not a number", "line 3", lambda r: pose_line(r, 2, lambda w: [*w[:4], "1,5", *w[5:]])),
-    "scaled pose": ("is scaled", "frame 2", lambda r: pose_line(r, 2, scale)),
-    "mirrored pose": ("left-handed", "frame 2", lambda r: pose_line(r, 2, mirror)),
-    "binary pose file": (
-        "not text",
-        "poses_velo.txt",
-        lambda r: (r / "derived/poses_velo.txt").write_bytes(b"\xff\xfe\x00" * 9),
-    ),
+    "empty pose file": ("empty", "poses_velo.txt", lambda r: (r / POSES).write_text("")),
+    "no pose file": ("no vehicle poses", "", lambda r: (r / POSES).unlink()),
+    "NaN pose": ("not finite", "line 3", third_line(POSES, lambda w: [*w[:4], "nan", *w[5:]])),
+    "text in pose": ("not a number", "line 3", third_line(POSES, lambda w: [*w[:4], "1,5", *w[5:]])),
+    "scaled pose": ("is scaled", "frame 2", third_line(POSES, scale)),
+    "mirrored pose": ("left-handed", "frame 2", third_line(POSES, mirror)),
+    "binary pose file": ("not text", "poses_velo.txt", lambda r: (r / POSES).write_bytes(b"\xff\xfe\x00" * 9)),
     "no calibration": ("no calibration", "", lambda r: (r / "calib.txt").unlink()),
     "calibration cut off": (
         "lacks Tr_velo_to_cam",
         "calib.txt",
-        lambda r: rewrite(r / "calib.txt", lambda t: t[: t.index("Tr_velo")]),
+        rewriting("calib.txt", lambda t: t[: t.index("Tr_velo")]),
     ),
     "zero focal length": (
         "focal length",
         "P2",
-        lambda r: rewrite(
-            r / "calib.txt",
-            lambda t: t.replace(
-                made.numbers(made.projection(2)), "0 " + made.numbers(made.projection(2)).split(" ", 1)[1]
-            ),
-        ),
+        rewriting("calib.txt", lambda t: t.replace(FIRST_P2, "0 " + FIRST_P2.split(" ", 1)[1])),
     ),
     "calibration scaled": (
         "is scaled",
         "R0_rect",
-        lambda r: rewrite(r / "calib.txt", lambda t: t.replace(made.numbers(np.eye(3)), made.numbers(2 * np.eye(3)))),
+        rewriting("calib.txt", lambda t: t.replace(made.numbers(np.eye(3)), made.numbers(2 * np.eye(3)))),
     ),
-    "label columns": ("number of columns", "label_02.txt: line 3", lambda r: label(r, lambda w: w[:-3])),
-    "label text": ("not a number", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:-1], "left"])),
-    "label NaN": ("not finite", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:-1], "nan"])),
-    "flat box": ("makes no sense", "label_02.txt: line 3", lambda r: label(r, lambda w: [*w[:10], "0", *w[11:]])),
-    "two boxes of one track": (
-        "two boxes",
-        "label_02.txt",
-        lambda r: rewrite(r / "derived/label_02.txt", lambda t: t + t.splitlines()[1] + "\n"),
-    ),
+    "label columns": ("number of columns", "label_02.txt: line 3", third_line(LABELS, lambda w: w[:-3])),
+    "label text": ("not a number", "label_02.txt: line 3", third_line(LABELS, lambda w: [*w[:-1], "left"])),
+    "label NaN": ("not finite", "label_02.txt: line 3", third_line(LABELS, lambda w: [*w[:-1], "nan"])),
+    "flat box": ("makes no sense", "label_02.txt: line 3", third_line(LABELS, lambda w: [*w[:10], "0", *w[11:]])),
+    "two boxes of one track": ("two boxes", "label_02.txt", rewriting(LABELS, lambda t: t + t.splitlines()[1] + "\n")),
 }
 
 
@@ -171,7 +137,7 @@ def test_broken_kitti_log(case: str, drive: Path, tmp_path: Path) -> None:
     words, where, spoil = KITTI[case]
     spoil(drive)
     with pytest.raises(InputError) as caught:
-        IMPORTERS["kitti"](drive, tmp_path / "out", ImportOptions())
+        ingest(drive, tmp_path / "out")
     error = caught.value
     assert words in error.what
     assert where in error.where
@@ -180,33 +146,27 @@ def test_broken_kitti_log(case: str, drive: Path, tmp_path: Path) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["drive"], "something half-written is left"
 
 
+PACKET, TRACKLETS = "oxts/data/0000000002.txt", "tracklet_labels.xml"
+BAIT = '<!DOCTYPE b [<!ENTITY a "b">]>'
 RAW: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "missing packet": ("packets are missing", lambda r: (r / "oxts/data/0000000002.txt").unlink()),
-    "packet cut off": ("wrong number of values", lambda r: cut(r / "oxts/data/0000000002.txt", 0.5)),
-    "packet empty": ("packets are missing", lambda r: (r / "oxts/data/0000000002.txt").write_text("")),
-    "latitude": ("out of range", lambda r: rewrite(r / "oxts/data/0000000002.txt", lambda t: "149" + t[2:])),
+    "missing packet": ("packets are missing", lambda r: (r / PACKET).unlink()),
+    "packet cut off": ("wrong number of values", lambda r: cut(r / PACKET, 0.5)),
+    "packet empty": ("packets are missing", lambda r: (r / PACKET).write_text("")),
+    "latitude": ("out of range", rewriting(PACKET, lambda t: "149" + t[2:])),
     "timestamps cut off": ("do not cover", lambda r: cut(r / "image_02/timestamps.txt", 0.5)),
     "timestamps unsorted": (
         "do not increase",
-        lambda r: rewrite(r / "velodyne_points/timestamps.txt", lambda t: "\n".join(reversed(t.splitlines()))),
+        rewriting("velodyne_points/timestamps.txt", lambda t: "\n".join(reversed(t.splitlines()))),
     ),
-    "no such day": (
-        "no date",
-        lambda r: rewrite(r / "image_02/timestamps.txt", lambda t: t.replace("2011-09-26", "2011-09-31", 1)),
-    ),
-    "tracklets cut off": ("not valid XML", lambda r: cut(r / "tracklet_labels.xml", 0.7)),
+    "no such day": ("no date", rewriting("image_02/timestamps.txt", lambda t: t.replace("09-26", "09-31", 1))),
+    "tracklets cut off": ("not valid XML", lambda r: cut(r / TRACKLETS, 0.7)),
     "tracklets with entities": (
         "entities",
-        lambda r: rewrite(
-            r / "tracklet_labels.xml",
-            lambda t: t.replace("<!DOCTYPE boost_serialization>", '<!DOCTYPE b [<!ENTITY a "b">]>'),
-        ),
+        rewriting(TRACKLETS, lambda t: t.replace("<!DOCTYPE boost_serialization>", BAIT)),
     ),
     "tracklet without place": (
         "'tx'",
-        lambda r: rewrite(
-            r / "tracklet_labels.xml", lambda t: t.replace("<tx>", "<xx>", 1).replace("</tx>", "</xx>", 1)
-        ),
+        rewriting(TRACKLETS, lambda t: t.replace("<tx>", "<xx>", 1).replace("</tx>", "</xx>", 1)),
     ),
     "no IMU calibration": ("where the IMU is", lambda r: (r.parent / "calib_imu_to_velo.txt").unlink()),
 }
@@ -218,7 +178,7 @@ def test_broken_raw_drive(case: str, tmp_path: Path) -> None:
     folder = made.write_raw_drive(tmp_path / "day")
     spoil(folder)
     with pytest.raises(InputError) as caught:
-        IMPORTERS["kitti"](folder, tmp_path / "out", ImportOptions())
+        ingest(folder, tmp_path / "out")
     assert words in caught.value.what
     assert caught.value.where
     assert sorted(p.name for p in tmp_path.iterdir()) == ["day"]
@@ -227,18 +187,17 @@ def test_broken_raw_drive(case: str, tmp_path: Path) -> None:
 def test_incomplete_frames_can_be_left_out_on_request(drive: Path, tmp_path: Path) -> None:
     (drive / IMAGE).unlink()
     (drive / "velodyne_points/data/0000000005.bin").unlink()
-    scene = IMPORTERS["kitti"](drive, tmp_path / "out", ImportOptions(skip_missing=True))
+    scene = ingest(drive, tmp_path / "out", skip_missing=True)
     assert len(scene.frames) == len(scene.sweeps) == 4
     assert [round(f.view.time_s, 3) for f in scene.frames] == [0.0, 0.1, 0.2, 0.4]
 
 
 def test_unknown_camera_and_missing_files_named_by_flags(drive: Path, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no such camera") as caught:
-        IMPORTERS["kitti"](drive, tmp_path / "out", ImportOptions(cameras=("rear",)))
-    assert "front" in caught.value.expected
+    caught = refused("no such camera", ingest, drive, tmp_path / "out", cameras=("rear"), raises=UsageError)
+    assert "front" in caught.expected
     for option in ("poses", "boxes"):
         with pytest.raises(InputError, match=f"{option[:-1]} file does not exist|box file does not exist"):
-            IMPORTERS["kitti"](drive, tmp_path / "out", ImportOptions(**{option: tmp_path / "none.txt"}))
+            ingest(drive, tmp_path / "out", **{option: tmp_path / "none.txt"})
 
 
 # --- odd but usable: the whole way to fused clouds ------------------------------------------------
@@ -247,9 +206,8 @@ def test_unknown_camera_and_missing_files_named_by_flags(drive: Path, tmp_path: 
 def through(source: Path, tmp_path: Path) -> tuple[Any, Any]:
     scene_path = Ingest(log=source, out=tmp_path / "scene", settings=IngestConfig()).run()
     labelled = Annotate(scene=scene_path, out=tmp_path / "labelled", settings=AnnotateConfig()).run()
-    return read_scene(labelled), read_fused(
-        Fuse(scene=labelled, out=tmp_path / "fuse", settings=FuseConfig(min_object_points=1)).run()
-    )
+    settings = FuseConfig(min_object_points=1)
+    return read_scene(labelled), read_fused(Fuse(scene=labelled, out=tmp_path / "fuse", settings=settings).run())
 
 
 def test_no_tracks(drive: Path, tmp_path: Path) -> None:
@@ -271,14 +229,12 @@ def test_one_frame(tmp_path: Path) -> None:
 
 def test_no_lidar(drive: Path, tmp_path: Path) -> None:
     shutil.rmtree(drive / "velodyne_points")
-    scene = IMPORTERS["kitti"](drive, tmp_path / "scene", ImportOptions())
+    scene = ingest(drive, tmp_path / "scene")
     assert scene.sweeps == ()
     assert Annotate(scene=tmp_path / "scene", out=tmp_path / "annotated", settings=AnnotateConfig()).run().is_dir()
-    with pytest.raises(InputError, match="no LiDAR sweeps"):
-        Fuse(scene=tmp_path / "annotated", out=tmp_path / "fused", settings=FuseConfig()).run()
+    refused("no LiDAR sweeps", Fuse(scene=tmp_path / "annotated", out=tmp_path / "fused", settings=FuseConfig()).run)
     assert not (tmp_path / "fused").exists()
-    with pytest.raises(InputError, match="no LiDAR sweeps"):
-        Run(source=drive, out=tmp_path / "run", settings=RunConfig()).run()
+    refused("no LiDAR sweeps", Run(source=drive, out=tmp_path / "run", settings=RunConfig()).run)
     assert not (tmp_path / "run" / "annotate").exists()  # before minutes of work, not after
     assert any("no LiDAR" in f.message and f.level == "warning" for f in check_scene(scene.root))
 
@@ -289,12 +245,6 @@ def test_scan_with_zero_points(drive: Path, tmp_path: Path) -> None:
     assert len(read_points(scene, scene.sweeps[3]).xyz) == 0
     assert len(cloud.static) > 0
     assert any("no points" in f.message for f in check_scene(scene.root))
-
-
-def test_one_camera_of_several_is_enough(tmp_path: Path) -> None:
-    scene = ToyStreet(times=(0.0, 0.1)).write(tmp_path / "scene")
-    assert list(scene.cameras) == ["front"]
-    assert len(Annotate(scene=tmp_path / "scene", out=tmp_path / "out", settings=AnnotateConfig()).run().name) > 0
 
 
 # --- broken scenes reach every stage the same way -------------------------------------------------
@@ -310,51 +260,32 @@ def good_scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
-def nan_in_poses(root: Path) -> None:
-    text = (root / "scene.json").read_text()
-    (root / "scene.json").write_text(text.replace('"world_from_cam": [0.0', '"world_from_cam": [NaN', 1))
-
-
 def bend_track(root: Path) -> None:
     data = json.loads((root / "tracks.json").read_text())
     data["tracks"][0]["world_from_object"][1][0] = 0.5
     (root / "tracks.json").write_text(json.dumps(data))
 
 
+FRAME, SWEEP = "images/front/000002.png", "lidar/lidar/000002.safetensors"
+
+
+def sweep(**tensors: np.ndarray) -> Callable[[Path], None]:
+    return lambda root: store.write_safetensors(root / SWEEP, tensors)
+
+
+TWO = np.zeros(2, np.float32)
 SCENES: dict[str, tuple[str, Callable[[Path], object]]] = {
-    "missing image": ("missing", lambda r: (r / "images/front/000002.png").unlink()),
-    "truncated image": ("cannot be decoded", lambda r: cut(r / "images/front/000002.png")),
-    "truncated sweep": ("safetensors", lambda r: cut(r / "lidar/lidar/000002.safetensors")),
-    "missing sweep": ("missing", lambda r: (r / "lidar/lidar/000002.safetensors").unlink()),
-    "NaN pose": ("JSON", nan_in_poses),
+    "missing image": ("missing", lambda r: (r / FRAME).unlink()),
+    "truncated image": ("cannot be decoded", lambda r: cut(r / FRAME)),
+    "truncated sweep": ("safetensors", lambda r: cut(r / SWEEP)),
+    "missing sweep": ("missing", lambda r: (r / SWEEP).unlink()),
+    "NaN pose": ("JSON", rewriting("scene.json", lambda t: t.replace('_from_cam": [0.0', '_from_cam": [NaN', 1))),
     "bent track": ("not a rigid motion", bend_track),
     "index cut off": ("JSON", lambda r: cut(r / "scene.json")),
-    "sweep is an image": (
-        "safetensors",
-        lambda r: (r / "lidar/lidar/000002.safetensors").write_bytes((r / "images/front/000000.png").read_bytes()),
-    ),
-    "sweep without intensity": (
-        "no tensor 'intensity'",
-        lambda r: store.write_safetensors(r / "lidar/lidar/000002.safetensors", {"xyz": np.zeros((2, 3), np.float32)}),
-    ),
-    "sweep in double precision": (
-        "wrong form",
-        lambda r: store.write_safetensors(
-            r / "lidar/lidar/000002.safetensors",
-            {"xyz": np.zeros((2, 3)), "intensity": np.zeros(2), "dt_s": np.zeros(2)},
-        ),
-    ),
-    "sweep with NaN": (
-        "not finite",
-        lambda r: store.write_safetensors(
-            r / "lidar/lidar/000002.safetensors",
-            {
-                "xyz": np.full((2, 3), np.nan, np.float32),
-                "intensity": np.zeros(2, np.float32),
-                "dt_s": np.zeros(2, np.float32),
-            },
-        ),
-    ),
+    "sweep is an image": ("safetensors", lambda r: (r / SWEEP).write_bytes((r / FRAME).read_bytes())),
+    "sweep without intensity": ("no tensor 'intensity'", sweep(xyz=np.zeros((2, 3), np.float32))),
+    "sweep in double precision": ("wrong form", sweep(xyz=np.zeros((2, 3)), intensity=np.zeros(2), dt_s=np.zeros(2))),
+    "sweep with NaN": ("not finite", sweep(xyz=np.full((2, 3), np.nan, np.float32), intensity=TWO, dt_s=TWO)),
 }
 
 
@@ -365,12 +296,11 @@ def test_broken_scene(case: str, verb: str, good_scene: Path, tmp_path: Path) ->
     root = tmp_path / "scene"
     shutil.copytree(good_scene, root)
     spoil(root)
-    run = {
-        "fuse": lambda: Fuse(scene=root, out=tmp_path / "out", settings=FuseConfig()).run(),
-        "annotate": lambda: Annotate(scene=root, out=tmp_path / "out", settings=AnnotateConfig()).run(),
-    }
+    step = {"fuse": partial(Fuse, settings=FuseConfig()), "annotate": partial(Annotate, settings=AnnotateConfig())}[
+        verb
+    ]
     with pytest.raises(InputError) as caught:
-        run[verb]()
+        step(scene=root, out=tmp_path / "out").run()
     assert words in str(caught.value)
     assert str(root) in caught.value.where
     for finished in ("fuse.json", "scene.json", "manifest.json"):
@@ -381,14 +311,14 @@ def test_broken_scene(case: str, verb: str, good_scene: Path, tmp_path: Path) ->
 def test_output_that_cannot_be_written(tmp_path: Path) -> None:
     ToyStreet(times=(0.0,)).write(tmp_path / "scene")
     (tmp_path / "file").write_text("in the way")
-    for act in (
-        lambda: Fuse(scene=tmp_path / "scene", out=tmp_path / "file" / "out", settings=FuseConfig()).run(),
-        lambda: Ingest(log=tmp_path / "scene", out=tmp_path / "file" / "out", settings=IngestConfig()).run(),
-        lambda: Annotate(scene=tmp_path / "scene", out=tmp_path / "file" / "out", settings=AnnotateConfig()).run(),
+    source, out = tmp_path / "scene", tmp_path / "file" / "out"
+    for step in (
+        Fuse(scene=source, out=out, settings=FuseConfig()),
+        Ingest(log=source, out=out, settings=IngestConfig()),
+        Annotate(scene=source, out=out, settings=AnnotateConfig()),
     ):
-        with pytest.raises(MudgError) as caught:
-            act()
-        assert isinstance(caught.value, ResourceError | UsageError)
+        with pytest.raises((ResourceError, UsageError)):
+            step.run()
     assert (tmp_path / "file").read_text() == "in the way"
 
 
@@ -400,7 +330,7 @@ def test_images_with_colour_maps_and_grey_are_read_as_rgb(tmp_path: Path) -> Non
     Image.fromarray(made.image(1)).convert("P", palette=Image.Palette.ADAPTIVE).save(
         source / "image_02/data/0000000001.png"
     )
-    scene = IMPORTERS["kitti"](source, tmp_path / "out", ImportOptions())
+    scene = ingest(source, tmp_path / "out")
     assert (read_image(scene, scene.frames[0]) == grey[..., None]).all()
     assert read_image(scene, scene.frames[1]).shape == (made.HEIGHT, made.WIDTH, 3)
 

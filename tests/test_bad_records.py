@@ -62,14 +62,9 @@ def npz(change: Callable[[bytes], bytes], member: str) -> Change:
 
 def tall(content: bytes) -> bytes:
     """An array that says it has 10^12 rows; its header keeps its length."""
-    start, end = content.index(b"(") + 1, content.index(b",", content.index(b"("))
+    start, end, last = content.index(b"(") + 1, content.index(b",", content.index(b"(")), content.index(b"}") + 1
     rows = b"1000000000000"
-    return (
-        content[:start]
-        + rows
-        + content[end : content.index(b"}") + 1]
-        + content[content.index(b"}") + 1 + len(rows) - (end - start) :]
-    )
+    return content[:start] + rows + content[end:last] + content[last + len(rows) - (end - start) :]
 
 
 def flipped(at: float) -> Change:
@@ -132,9 +127,8 @@ def test_intensities_of_another_scale_are_refused_not_clipped(
 ) -> None:
     log = written(kind, folder)
     with bad_logs.damaged(log, kind, "cloud", change, tmp_path) as (source, where):
-        error = bad_logs.assert_refused(
-            kind, source, tmp_path, bad_logs.options_of(log), "intensity is out of range", where
-        )
+        words, options = "intensity is out of range", bad_logs.options_of(log)
+        error = bad_logs.assert_refused(kind, source, tmp_path, options, words, where)
     assert error.remedy
 
 
@@ -149,19 +143,17 @@ def swap_sides(log: write_waymo.Log) -> None:
             box["size"] = (width, length, height)
 
 
-def lying_shape(log: write_waymo.Log) -> None:
-    log.frames[1]["lasers"][0]["returns"][0] = Lying(log.frames[1]["lasers"][0]["returns"][0])
-
-
 class Lying(np.ndarray):
     """A range image that tells of more rows than it has."""
-
-    def __new__(cls, image: np.ndarray) -> Lying:
-        return np.asarray(image).view(cls)
 
     @property
     def shape(self) -> tuple[int, ...]:
         return (1 << 20, *super().shape[1:])
+
+
+def lying_shape(log: write_waymo.Log) -> None:
+    returns = log.frames[1]["lasers"][0]["returns"]
+    returns[0] = returns[0].view(Lying)
 
 
 def long_ids(log: write_waymo.Log) -> None:
@@ -194,9 +186,8 @@ def test_a_page_of_a_waymo_table_that_does_not_fit_its_checksum_is_refused(folde
     assert isinstance(log, write_waymo.Log)
     source = bad_logs.write_waymo_log(log, "waymo v2", tmp_path / "log")
     table = next((source / "camera_image").iterdir())
-    parquet.write_table(
-        parquet.read_table(table), table, compression="none", use_dictionary=False, write_page_checksum=True
-    )
+    plain = {"compression": "none", "use_dictionary": False, "write_page_checksum": True}
+    parquet.write_table(parquet.read_table(table), table, **plain)
     content = table.read_bytes()
     at = content.index(b"IDAT") + 20
     table.write_bytes(content[:at] + bytes([content[at] ^ 8]) + content[at + 1 :])
@@ -224,9 +215,8 @@ def swap_label(row: list[str]) -> None:
 
 
 def times(factor: float) -> Callable[[Path], None]:
-    return lambda root: (
-        (root / "times.txt").write_text("\n".join(str(0.1 * n * factor) for n in range(6)) + "\n") and None
-    )
+    text = "\n".join(str(0.1 * n * factor) for n in range(6)) + "\n"
+    return lambda root: (root / "times.txt").write_text(text) and None
 
 
 def nuplan(question: str) -> Callable[[Path], None]:
@@ -255,6 +245,18 @@ def dgp(file: str, change: Callable[[dict[str, Any]], object]) -> Callable[[Path
 LONG = "n" * 201
 
 
+def dgp_clouds(record: dict[str, Any]) -> None:
+    backslashes([d["datum"]["point_cloud"] for d in record["data"] if "point_cloud" in d["datum"]])
+
+
+def long_column(name: str) -> Callable[[Path], None]:
+    def spoil(root: Path) -> None:
+        change = lambda c: c.update({name: np.full(len(c["category"]), LONG, object)})  # noqa: E731
+        write_av2.edit(root / "annotations.feather", change)
+
+    return spoil
+
+
 def text(pattern: str, old: str, new: str) -> Callable[[Path], None]:
     """Replaces a text in the one file that fits the pattern."""
 
@@ -273,76 +275,38 @@ def long_labels(root: Path) -> None:
         write_frame(path, {**columns, "label": np.full(len(columns["label"]), LONG, object)})
 
 
+TOO_LONG = "name is too long"
+SWAP = "UPDATE lidar_box SET width = length, length = width"
+BACKSLASH = "UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"
+LAST_CENTURY = {"timestamp": "1970-01-18T20:00:00.123456Z"}
+LONG_NUMBER = text("data_3d_bboxes/train/*.xml", "<instanceId>1<", f"<instanceId>{'1' * 300}<")
 RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
     # format and what is wrong: (how the log is damaged, words of the error, the place it names)
     ("kitti", "times in milliseconds"): (times(1000), "another unit", "drive|kitti"),
     ("kitti", "times in microseconds"): (times(1e6), "another unit", "kitti"),
     ("kitti", "width and length swapped"): (label(swap_label), "swapped", "label_02.txt"),
     ("nuscenes", "Windows path"): (nuscenes("sample_data", backslashes), "backslash", "sample_data.json: record"),
-    ("nuplan", "Windows path"): (
-        nuplan("UPDATE image SET filename_jpg = replace(filename_jpg, '/', '\\')"),
-        "backslash",
-        "image at",
-    ),
-    ("nuplan", "width and length swapped"): (
-        nuplan("UPDATE lidar_box SET width = length, length = width"),
-        "swapped",
-        "lidar_box",
-    ),
-    ("dgp", "Windows path"): (
-        dgp(
-            "scene_abc.json",
-            lambda r: [
-                d["datum"]["point_cloud"].update(filename=d["datum"]["point_cloud"]["filename"].replace("/", "\\"))
-                for d in r["data"]
-                if "point_cloud" in d["datum"]
-            ],
-        ),
-        "backslash",
-        "datum LIDAR",
-    ),
+    ("nuplan", "Windows path"): (nuplan(BACKSLASH), "backslash", "image at"),
+    ("nuplan", "width and length swapped"): (nuplan(SWAP), "swapped", "lidar_box"),
+    ("dgp", "Windows path"): (dgp("scene_abc.json", dgp_clouds), "backslash", "datum LIDAR"),
     ("dgp", "times of another century"): (
-        dgp("scene_abc.json", lambda r: [d["id"].update(timestamp="1970-01-18T20:00:00.123456Z") for d in r["data"]]),
+        dgp("scene_abc.json", lambda r: [d["id"].update(LAST_CENTURY) for d in r["data"]]),
         "another unit",
         "scene_abc.json",
     ),
     ("dgp", "missing image"): (lambda r: (r / "rgb/FRONT/1.png").unlink(), "missing", "1.png"),
-    ("kitti", "class of 201 letters"): (text("derived/label_02.txt", "Car", LONG), "name is too long", "label_02.txt"),
-    ("kitti360", "number of an object of 300 digits"): (
-        text("data_3d_bboxes/train/*.xml", "<instanceId>1<", f"<instanceId>{'1' * 300}<"),
-        "name is too long",
-        "id of an object",
-    ),
+    ("kitti", "class of 201 letters"): (text("derived/label_02.txt", "Car", LONG), TOO_LONG, "label_02.txt"),
+    ("kitti360", "number of an object of 300 digits"): (LONG_NUMBER, TOO_LONG, "id of an object"),
     ("nuscenes", "class of 201 letters"): (
         nuscenes("category", lambda rows: rows[0].update(name=LONG)),
-        "name is too long",
+        TOO_LONG,
         "sample_annotation.json",
     ),
-    ("argoverse2", "class of 201 letters"): (
-        lambda r: write_av2.edit(
-            r / "annotations.feather", lambda c: c.update(category=np.full(len(c["category"]), LONG, object))
-        ),
-        "name is too long",
-        "annotations.feather",
-    ),
-    ("argoverse2", "id of 201 letters"): (
-        lambda r: write_av2.edit(
-            r / "annotations.feather", lambda c: c.update(track_uuid=np.full(len(c["category"]), LONG, object))
-        ),
-        "name is too long",
-        "annotations.feather",
-    ),
-    ("pandaset", "class of 201 letters"): (long_labels, "name is too long", "cuboids"),
-    ("dgp", "class of 201 letters"): (
-        text("ontology/*.json", '"Car"', f'"{LONG}"'),
-        "name is too long",
-        "bounding_box_3d",
-    ),
-    ("custom", "class of 201 letters"): (
-        text("log.json", '"class": "car"', f'"class": "{LONG}"'),
-        "name is too long",
-        "tracks",
-    ),
+    ("argoverse2", "class of 201 letters"): (long_column("category"), TOO_LONG, "annotations.feather"),
+    ("argoverse2", "id of 201 letters"): (long_column("track_uuid"), TOO_LONG, "annotations.feather"),
+    ("pandaset", "class of 201 letters"): (long_labels, TOO_LONG, "cuboids"),
+    ("dgp", "class of 201 letters"): (text("ontology/*.json", '"Car"', f'"{LONG}"'), TOO_LONG, "bounding_box_3d"),
+    ("custom", "class of 201 letters"): (text("log.json", '"class": "car"', f'"class": "{LONG}"'), TOO_LONG, "tracks"),
     ("nuscenes", "missing image"): (
         lambda r: bad_logs.second(r / "samples/CAM_FRONT").unlink(),
         "missing",
@@ -356,12 +320,10 @@ def test_a_bad_record_is_refused_by_name(kind: str, case: str, folder: Path, tmp
     log = written(kind, folder)
     assert isinstance(log, bad_logs.Files)
     spoil, words, where = RECORDS[kind, case]
-    whole = folder / kind
-    root = shutil.copytree(whole, tmp_path / kind)
+    root = shutil.copytree(folder / kind, tmp_path / kind)
     spoil(root)
-    bad_logs.assert_refused(
-        kind, root / log.source.relative_to(whole), tmp_path, bad_logs.options_of(log), words, where
-    )
+    source = root / log.source.relative_to(folder / kind)
+    bad_logs.assert_refused(kind, source, tmp_path, bad_logs.options_of(log), words, where)
 
 
 # --- taken, and said ------------------------------------------------------------------------------
@@ -394,11 +356,8 @@ def test_rows_in_any_order_give_the_same_scene(folder: Path, tmp_path: Path) -> 
         assert [frame.id for frame in other.frames] == [frame.id for frame in plain.frames]
         for one, two in zip(plain.frames, other.frames, strict=True):
             assert np.array_equal(one.view.world_from_cam, two.view.world_from_cam)
-        places = [
-            {track.id: track.world_from_object[:, :3, 3].round(9).tolist() for track in scene.tracks}
-            for scene in (plain, other)
-        ]
-        assert places[0] == places[1]
+        one, two = ({t.id: t.world_from_object[:, :3, 3].round(9).tolist() for t in s.tracks} for s in (plain, other))
+        assert one == two
 
 
 def reversed_tables(root: Path) -> None:

@@ -35,10 +35,9 @@ from mudg.formats.settings import IngestConfig
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationWriter
-from mudg.scene.part import write_part
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.scene.write import SceneWriter
+from mudg.scene.write import SceneWriter, write_part
 from mudg.steps.fuse import Fuse
 from mudg.steps.ingest import Ingest
 

@@ -14,7 +14,7 @@ from mudg import native
 from mudg.base import geometry, palette
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Camera, Source, View
-from mudg.city import objects as rec
+from mudg.city import layout as rec
 from mudg.city.config import CityConfig
 from mudg.city.world import CitySweep, CityWorld
 
@@ -507,7 +507,7 @@ def test_sources_without_a_recipe_are_refused(world: CityWorld) -> None:
 
 
 def test_without_the_library_the_error_says_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mudg.city import native as layer
+    from mudg.city import world as layer
 
     layer.library.cache_clear()
     monkeypatch.setattr(native, "library", lambda: None)
@@ -526,7 +526,7 @@ def test_no_traffic_and_one_camera_work() -> None:
 
 
 def test_records_agree_with_the_library() -> None:
-    from mudg.city.native import library
+    from mudg.city.world import library
 
     assert library().mudg_city_number_counts(2) == rec.COLUMNS
 

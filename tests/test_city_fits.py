@@ -18,8 +18,8 @@ from mudg.diffusion.city_clips import CityClipRules
 from mudg.diffusion.model import MDM
 from mudg.diffusion.parallel import Ranks
 from mudg.scene.labels import read_label
-from mudg.scene.part import write_photos
 from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.write import write_photos
 from mudg.steps.learn import Learn
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the native library is not built")

@@ -12,7 +12,7 @@ from PIL import Image
 from mudg import native
 from mudg.base.errors import InputError
 from mudg.city.config import CityConfig
-from mudg.city.photos import SKY_SLOT, draw_photos, panorama, radiance, surface
+from mudg.city.light import SKY_SLOT, draw_photos, panorama, radiance, surface
 from mudg.city.world import CityWorld
 
 

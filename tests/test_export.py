@@ -435,9 +435,9 @@ def test_starting_points_of_cameras(tmp_path: Path) -> None:
 
 
 def test_messages_are_read_in_order_and_through_the_index(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from mudg.formats.exporters import foxglove, log_records
+    from mudg.formats.exporters import messages
 
-    monkeypatch.setattr(log_records, "CHUNK_BYTES", 20_000)
+    monkeypatch.setattr(messages, "CHUNK_BYTES", 20_000)
     street = ToyStreet(times=[0.5, 0.6, 0.7], car_start=(8.0, 1.0), car_velocity=(3.0, 0.0))
     scene = street.write(tmp_path / "scene", width=24, height=12)
     assert app.main(["export", "mcap", str(tmp_path / "scene"), "--out", str(tmp_path / "a.mcap")]) == 0
@@ -458,5 +458,5 @@ def test_messages_are_read_in_order_and_through_the_index(tmp_path: Path, monkey
     sweep = next(value for topic, values in found.items() if topic.startswith("/lidar/") for value in values)
     assert sweep["point_stride"] == 16 and len(base64.b64decode(sweep["data"])) % 16 == 0
     assert found["/objects"][1]["entities"][0]["cubes"][0]["size"]["x"] == pytest.approx(4.0)
-    known = {name: set(schema["properties"]) for name, schema in foxglove.SCHEMAS.items()}
+    known = {name: set(schema["properties"]) for name, schema in messages.SCHEMAS.items()}
     assert set(found["/objects"][0]) == known["foxglove.SceneUpdate"] and set(sweep) == known["foxglove.PointCloud"]

@@ -20,11 +20,10 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, MudgError, ResourceError
 from mudg.base.types import PointCloud, Scene
 from mudg.exporting.settings import ExportConfig
-from mudg.formats.exporters import ros2
-from mudg.formats.exporters.log_records import LogRecords, write_mcap
+from mudg.formats.exporters import messages as ros2
+from mudg.formats.exporters.messages import LogRecords, write_mcap
 from mudg.gaussians.storage import save_model
-from mudg.scene.files import open_files
-from mudg.scene.read import read_points
+from mudg.scene.read import open_files, read_points
 from mudg.steps.export import Export
 
 

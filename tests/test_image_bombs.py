@@ -16,7 +16,7 @@ from PIL import Image
 
 from mudg.base.errors import InputError
 from mudg.base.types import Camera
-from mudg.city import photos
+from mudg.city import light as photos
 from mudg.formats.importers import kitti360
 from mudg.formats.importers.waymo import importer as waymo
 from mudg.scene import labels

@@ -10,6 +10,7 @@ from pathlib import Path
 import kitti_folders as made
 import numpy as np
 import pytest
+from bad_logs import refused
 from toy_scene import ToyStreet
 
 from mudg import app, native
@@ -108,8 +109,7 @@ def test_words_of_the_command_line(words: list[str], out: str | None, expected: 
     ],
 )
 def test_words_that_make_no_sense(words: list[str], out: str | None, expected: str) -> None:
-    with pytest.raises(UsageError, match=expected):
-        app.parse(["ingest", *words, *(["--out", out] if out else [])])
+    refused(expected, app.parse, ["ingest", *words, *(["--out", out] if out else [])], raises=UsageError)
     with pytest.raises(UsageError, match="--format was given twice"):
         app.parse(["ingest", "custom", "log", "o", "--format", "kitti"])
     with pytest.raises(UsageError, match="no such format") as caught:
@@ -123,8 +123,7 @@ def test_unknown_folders_and_missing_ones_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="not recognised") as caught:
         Ingest(log=str(tmp_path / "photos"), out=tmp_path / "out", settings=IngestConfig()).run()
     assert "a.jpg" in caught.value.got
-    with pytest.raises(InputError, match="does not exist"):
-        Ingest(log=str(tmp_path / "nowhere"), out=tmp_path / "out", settings=IngestConfig()).run()
+    refused("does not exist", Ingest(log=str(tmp_path / "nowhere"), out=tmp_path / "out", settings=IngestConfig()).run)
     assert not (tmp_path / "out").exists()
     (tmp_path / "photos" / "image_02").mkdir()
     with pytest.raises(InputError, match="no KITTI images"):
@@ -142,8 +141,7 @@ def test_finished_work_is_reused_and_other_settings_are_refused(tmp_path: Path) 
     with pytest.raises(UsageError, match="another configuration"):
         Ingest(log=drive, out=out, settings=IngestConfig(test_every=3)).run()
     (drive / "tracklet_labels.xml").unlink()  # the log changed
-    with pytest.raises(UsageError, match="another configuration"):
-        Ingest(log=drive, out=out, settings=IngestConfig()).run()
+    refused("another configuration", Ingest(log=drive, out=out, settings=IngestConfig()).run, raises=UsageError)
     assert len(read_scene(Ingest(log=drive, out=out, overwrite=True, settings=IngestConfig()).run()).tracks) == 0
 
 
@@ -157,9 +155,8 @@ def test_of_a_folder_with_many_logs_only_the_chosen_one_counts(tmp_path: Path) -
     assert Ingest(log=root, out=out, settings=config).run() == out
     labels = root / "label_02" / "0003.txt"
     labels.write_text(labels.read_text() + "\n")
-    with pytest.raises(UsageError, match="another configuration") as caught:
-        Ingest(log=root, out=out, settings=config).run()
-    assert "input 'source' changed" in caught.value.got
+    caught = refused("another configuration", Ingest(log=root, out=out, settings=config).run, raises=UsageError)
+    assert "input 'source' changed" in caught.got
     listed = files_of("kitti", root, ImportOptions(sequence="0003")).files
     assert {path.relative_to(root).as_posix() for path in listed} == {
         "image_02/0003",
@@ -210,8 +207,7 @@ def test_a_failed_import_leaves_nothing_and_a_repeat_finishes(tmp_path: Path) ->
             Ingest(log=drive, out=tmp_path / "out", settings=config).run()
         assert [path.name for path in tmp_path.iterdir()] == ["day"]
     (tmp_path / "out").mkdir()
-    with pytest.raises(InputError, match="cut off"):
-        Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run()
+    refused("cut off", Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run)
     assert list((tmp_path / "out").iterdir()) == []
     scan.write_bytes(content)
     assert len(read_scene(Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run()).frames) == 6
@@ -224,8 +220,7 @@ def test_what_a_killed_import_left_is_replaced_and_a_live_one_is_not(tmp_path: P
     partial = out / ".scene.999999999-1.part"
     partial.mkdir()
     store.write_json(out / "lock", {"pid": os.getppid(), "host": socket.gethostname()})
-    with pytest.raises(ResourceError, match="another process"):
-        Ingest(log=drive, out=out, settings=config).run()
+    refused("another process", Ingest(log=drive, out=out, settings=config).run, raises=ResourceError)
     assert partial.is_dir()
     store.write_json(out / "lock", {"pid": 999_999_999, "host": socket.gethostname()})
     assert len(read_scene(Ingest(log=drive, out=out, settings=config).run()).frames) == 6

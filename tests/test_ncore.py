@@ -15,9 +15,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
+from bad_logs import refused
 from memory_limits import at_most
 from roundtrip import needs_native
 
@@ -25,17 +27,19 @@ from mudg import app
 from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Camera, EgoPath, Frame, Scene, SweepPoints
-from mudg.formats.exporters.log_records import LogRecords
+from mudg.formats.exporters.messages import LogRecords
 from mudg.formats.exporters.ncore import sensor_ids, write_ncore
-from mudg.formats.importers import IMPORTERS, RECOGNISERS
+from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers import ncore as container
 from mudg.formats.importers import ncore as importer
 from mudg.formats.importers.common import ImportOptions
 from mudg.formats.importers.images import brown_conrady, equidistant, fit_images
 from mudg.formats.ncore import PoseKeys, euler_of, package, rotation_of
-from mudg.scene.files import open_files
 from mudg.scene.labels import read_label
-from mudg.scene.read import read_points
+from mudg.scene.read import open_files, read_points
+
+truth = bad_logs.truth
+ingest = bad_logs.importer("ncore")
 
 try:
     package()
@@ -46,20 +50,11 @@ needs_package = pytest.mark.skipif(bool(REASON), reason="the package nvidia-ncor
 pytestmark = [needs_native, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
 
 
-def ingest(source: Path, out: Path, **options: Any) -> Scene:
-    return IMPORTERS["ncore"](source, out, ImportOptions(**options))
-
-
 def records(scene: Scene, **changes: Any) -> LogRecords:
     files = open_files(scene.root)
     return LogRecords(
         replace(scene, **changes), lambda frame: files.read(frame.image.path), lambda sweep: read_points(scene, sweep)
     )
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "scene")
 
 
 @pytest.fixture(scope="module")
@@ -368,8 +363,7 @@ def test_a_path_that_is_too_short_goes_on_and_then_stands() -> None:
 def test_the_package_is_asked_for_in_words(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ncore.data", None)
     (tmp_path / "a.ncore4.zarr.itar").write_bytes(b"")
-    with pytest.raises(ResourceError, match=r"mudg\[ncore\]"):
-        ingest(tmp_path, tmp_path / "out")
+    refused(r"mudg\[ncore\]", ingest, tmp_path, tmp_path / "out", raises=ResourceError)
     assert app.main(["export", "ncore", str(tmp_path), "--out", str(tmp_path / "out")]) != 0
     assert not (tmp_path / "out").exists()
 
@@ -377,18 +371,15 @@ def test_the_package_is_asked_for_in_words(tmp_path: Path, monkeypatch: pytest.M
 @needs_package
 def test_what_cannot_be_written_is_refused(truth: Scene, tmp_path: Path) -> None:
     nowhere = EgoPath(np.zeros(0), np.zeros((0, 4, 4)))
-    with pytest.raises(InputError, match="vehicle's path"):
-        write_ncore(tmp_path, records(truth, ego=nowhere))
+    refused("vehicle's path", write_ncore, tmp_path, records(truth, ego=nowhere))
     twice = replace(truth.frames[0], id="front/000099")
-    with pytest.raises(InputError, match="front/000099"):
-        write_ncore(tmp_path, records(truth, frames=(*truth.frames, twice)))
+    refused("front/000099", write_ncore, tmp_path, records(truth, frames=(*truth.frames, twice)))
     early = replace(truth, sweeps=truth.sweeps[:1])
     reads = records(early)
     late = LogRecords(
         early, reads.picture, lambda sweep: replace(reads.points(sweep), dt_s=reads.points(sweep).dt_s - 3)
     )
-    with pytest.raises(InputError, match="more than a second"):
-        write_ncore(tmp_path, late)
+    refused("more than a second", write_ncore, tmp_path, late)
     assert not list(tmp_path.iterdir())
 
 
@@ -407,15 +398,13 @@ def test_one_of_several_recordings(recording: Path, tmp_path: Path) -> None:
     (store,) = recording.glob("*.itar")
     for name in ("a", "b"):
         shutil.copy(store, tmp_path / f"{name}.ncore4.zarr.itar")
-    with pytest.raises(UsageError, match="--sequence"):
-        ingest(tmp_path, tmp_path / "out")
+    refused("--sequence", ingest, tmp_path, tmp_path / "out", raises=UsageError)
     assert len(ingest(tmp_path, tmp_path / "out", sequence="b", cameras=("front",)).cameras) == 1
     assert len(ingest(tmp_path / "a.ncore4.zarr.itar", tmp_path / "one").frames) == 10
     listed = json.loads(next(recording.glob("*.json")).read_text())
     listed["component_stores"][0]["path"] = "../a.ncore4.zarr.itar"
     (tmp_path / "x.json").write_text(json.dumps(listed))
-    with pytest.raises(InputError, match="file name"):
-        ingest(tmp_path / "x.json", tmp_path / "two")
+    refused("file name", ingest, tmp_path / "x.json", tmp_path / "two")
 
 
 @needs_package

@@ -11,25 +11,24 @@ import sqlite3
 from collections.abc import Callable
 from pathlib import Path
 
+import bad_logs
 import numpy as np
 import pytest
 import roundtrip
 import write_nuplan as made
+from bad_logs import refused
 from PIL import Image
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Scene
-from mudg.formats.importers import IMPORTERS, RECOGNISERS
-from mudg.formats.importers.common import ImportOptions
+from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.nuplan import open_log
 from mudg.scene.read import read_image, read_points
 
+truth = bad_logs.truth
+ingest = bad_logs.importer("nuplan")
+
 pytestmark = roundtrip.needs_native
-
-
-@pytest.fixture(scope="module")
-def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
-    return roundtrip.small_log(tmp_path_factory.mktemp("truth") / "city")
 
 
 @pytest.fixture(scope="module")
@@ -45,10 +44,6 @@ def source(pristine: Path, tmp_path: Path) -> Path:
 
 def log(source: Path) -> Path:
     return source / "splits" / "mini" / f"{made.LOG}.db"
-
-
-def ingest(source: Path, out: Path, **options: object) -> Scene:
-    return IMPORTERS["nuplan"](source, out, ImportOptions(**options))
 
 
 # --- what is read ---------------------------------------------------------------------------------
@@ -78,20 +73,15 @@ def test_scenes_frames_cameras_and_logs_are_chosen(truth: Scene, pristine: Path,
         ({"cameras": ("CAM_B0",)}, "no such camera"),
         ({"untwist": "no"}, "no use for --untwist"),
     ):
-        with pytest.raises(UsageError, match=words):
-            ingest(log(pristine), tmp_path / "no", **options)
-    with pytest.raises(InputError, match="no clouds to import"):
-        ingest(log(pristine), tmp_path / "no", frames=(70, 80))
+        refused(words, ingest, log(pristine), tmp_path / "no", raises=UsageError, **options)
+    refused("no clouds to import", ingest, log(pristine), tmp_path / "no", frames=(70, 80))
 
 
 def test_several_logs_need_a_name(source: Path, tmp_path: Path) -> None:
     shutil.copy(log(source), log(source).with_name("2021.06.01.db"))
-    with pytest.raises(UsageError, match="several logs") as caught:
-        ingest(source, tmp_path / "no")
-    assert made.LOG in caught.value.expected
+    assert made.LOG in refused("several logs", ingest, source, tmp_path / "no", raises=UsageError).expected
     assert len(ingest(source, tmp_path / "yes", sequence=made.LOG, frames=(0, 1)).sweeps) == 1
-    with pytest.raises(UsageError, match="no such log"):
-        ingest(source, tmp_path / "no", sequence="2022.db")
+    refused("no such log", ingest, source, tmp_path / "no", sequence="2022.db", raises=UsageError)
 
 
 def test_distorted_images_are_rectified_and_jpeg_stays_jpeg(truth: Scene, tmp_path: Path) -> None:
@@ -104,9 +94,8 @@ def test_distorted_images_are_rectified_and_jpeg_stays_jpeg(truth: Scene, tmp_pa
     assert scene.frames[0].image.path.endswith(".jpg")
     assert any("rectified" in note for note in scene.source.notes)
     plain = made.write_nuplan(truth, tmp_path / "plain", jpeg=True)  # no distortion: the files are kept
-    roundtrip.assert_same_log(
-        ingest(plain, tmp_path / "same"), truth, labels={"car": "vehicle"}, intensity=0.002, color_levels=3
-    )
+    same = ingest(plain, tmp_path / "same")
+    roundtrip.assert_same_log(same, truth, labels={"car": "vehicle"}, intensity=0.002, color_levels=3)
 
 
 def test_rectified_pixels_show_the_rays_of_the_pinhole_camera(truth: Scene, tmp_path: Path) -> None:
@@ -154,23 +143,11 @@ def test_nothing_is_written_beside_the_database(pristine: Path, tmp_path: Path) 
 # --- bait and damage ------------------------------------------------------------------------------
 
 
-class Asks:
-    """Pickles as a command."""
-
-    def __init__(self, words: str) -> None:
-        self.words = words
-
-    def __reduce__(self) -> object:
-        return os.system, (self.words,)
-
-
 @pytest.mark.parametrize("column", ["translation", "rotation", "intrinsic", "distortion"])
 def test_a_calibration_that_asks_for_a_command_runs_nothing(source: Path, tmp_path: Path, column: str) -> None:
     bait = tmp_path / "ran"
-    change(source, f"UPDATE camera SET {column} = ?", pickle.dumps([Asks(f"touch {bait}")]))
-    with pytest.raises(InputError, match=r"asks for '(posix|nt)\.system'") as caught:
-        ingest(source, tmp_path / "out")
-    assert column in caught.value.where
+    change(source, f"UPDATE camera SET {column} = ?", pickle.dumps([bad_logs.Asks(os.system, f"touch {bait}")]))
+    assert column in refused(r"asks for '(posix|nt)\.system'", ingest, source, tmp_path / "out").where
     assert not bait.exists()
 
 
@@ -197,6 +174,9 @@ def rewritten(kind: str, edit: Callable[[bytes], bytes]) -> Callable[[Path], Non
     return spoil
 
 
+CAR_BOX = made.token("box", "car-001", 1)
+
+
 def cut(source: Path, size: int) -> None:
     log(source).write_bytes(log(source).read_bytes()[:size])
 
@@ -216,18 +196,12 @@ def cut(source: Path, size: int) -> None:
         (sql("UPDATE ego_pose SET timestamp = timestamp / 1000"), "no vehicle poses at the time"),
         (sql("UPDATE lidar_pc SET timestamp = timestamp / 1000"), "another unit"),
         (sql("UPDATE image SET timestamp = timestamp / 1000"), "no moment has images"),
-        (
-            sql("UPDATE lidar_pc SET timestamp = 'soon' WHERE token = ?", made.token("cloud", 1)),
-            "no whole number|numbers",
-        ),
+        (sql("UPDATE lidar_pc SET timestamp = 'soon' WHERE token = ?", made.token("cloud", 1)), "no whole number"),
         (sql("UPDATE ego_pose SET qw = qw * 1.5, qx = qx * 1.5, qy = qy * 1.5, qz = qz * 1.5"), "length 1"),
         (sql("UPDATE ego_pose SET x = NULL"), "not a finite number"),
         (sql("UPDATE lidar_pc SET ego_pose_token = x'00'"), "point cloud has no vehicle pose"),
         (sql("UPDATE lidar_pc SET lidar_token = x'00'"), "LiDAR that is not there"),
-        (
-            sql("UPDATE lidar_box SET track_token = x'00' WHERE token = ?", made.token("box", "car-001", 1)),
-            "names a track",
-        ),
+        (sql("UPDATE lidar_box SET track_token = x'00' WHERE token = ?", CAR_BOX), "names a track"),
         (sql("DELETE FROM category"), "names a track or class that is not there"),
         (sql("UPDATE lidar_box SET length = 0"), "size makes no sense"),
         (sql("UPDATE lidar_box SET yaw = 'north'"), "not a finite number"),
@@ -241,10 +215,7 @@ def cut(source: Path, size: int) -> None:
         (sql("UPDATE camera SET intrinsic = 'text'"), "no pickled list"),
         (sql("UPDATE camera SET width = 40"), "size"),
         (rewritten("MergedPointCloud", lambda c: c[:700]), "cut off|bytes"),
-        (
-            rewritten("MergedPointCloud", lambda c: re.sub(rb"(WIDTH|POINTS) \d+", rb"\1 99999999999", c)),
-            "POINTS|points|bytes",
-        ),
+        (rewritten("MergedPointCloud", lambda c: re.sub(rb"(WIDTH|POINTS) \d+", rb"\1 99999999999", c)), "POINTS"),
         (rewritten("MergedPointCloud", lambda c: c.replace(b"FIELDS x y z", b"FIELDS a y z")), "no coordinates"),
         (rewritten("CAM_F0", lambda c: c[:300]), "cannot be decoded"),
     ],
@@ -262,8 +233,7 @@ def test_spoilt_logs_are_refused_in_words(
 def test_a_table_that_is_a_view_or_virtual_is_no_table(source: Path, tmp_path: Path, instead: str) -> None:
     change(source, "ALTER TABLE category RENAME TO real_category")
     change(source, f"CREATE {instead}")
-    with pytest.raises(InputError, match="no table 'category'"):
-        ingest(source, tmp_path / "out")
+    refused("no table 'category'", ingest, source, tmp_path / "out")
 
 
 def test_incomplete_moments_can_be_skipped(source: Path, tmp_path: Path) -> None:
@@ -287,84 +257,44 @@ def test_cameras_may_fire_one_after_another(source: Path, tmp_path: Path) -> Non
     for channel in ("CAM_F0", "CAM_L0"):
         shutil.copy(log(source), tmp_path / "whole.db")
         change(source, "DELETE FROM image WHERE token = ?", made.token("image", channel, 2))
-        with pytest.raises(InputError, match="lacks images of some cameras") as caught:
-            ingest(source, tmp_path / "no")
-        assert caught.value.got == f"no {channel}; 1 such moments"
+        caught = refused("lacks images of some cameras", ingest, source, tmp_path / "no")
+        assert caught.got == f"no {channel}; 1 such moments"
         assert len(ingest(source, tmp_path / f"skip {channel}", skip_missing=True).frames) == 8
         shutil.copy(tmp_path / "whole.db", log(source))
 
 
-def test_a_cloud_without_points_is_a_cloud(source: Path, tmp_path: Path) -> None:
+def test_a_cloud_without_points_is_a_cloud_and_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:
     blob("MergedPointCloud", 0)(source).write_bytes(made.pcd(np.zeros((0, 3)), np.zeros(0)))
+    change(source, "UPDATE category SET name = 'Hover Board'")
     scene = ingest(source, tmp_path / "out")
     assert sorted(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps)[0] == 0
     assert len(scene.sweeps) == 5
-
-
-def test_unknown_classes_keep_their_names(source: Path, tmp_path: Path) -> None:
-    change(source, "UPDATE category SET name = 'Hover Board'")
-    scene = ingest(source, tmp_path / "out", frames=(0, 2))
     assert {track.label for track in scene.tracks} == {"hover_board"}
     assert any("Hover Board" in note for note in scene.source.notes)
 
 
 # --- values of other types ------------------------------------------------------------------------
 
-COLUMNS = (
-    "log.logfile",
-    "ego_pose.token",
-    "ego_pose.timestamp",
-    "ego_pose.x",
-    "ego_pose.qw",
-    "camera.token",
-    "camera.channel",
-    "camera.translation",
-    "camera.intrinsic",
-    "camera.distortion",
-    "camera.width",
-    "image.camera_token",
-    "image.filename_jpg",
-    "image.timestamp",
-    "lidar.token",
-    "lidar.channel",
-    "lidar.rotation",
-    "lidar_pc.token",
-    "lidar_pc.lidar_token",
-    "lidar_pc.ego_pose_token",
-    "lidar_pc.filename",
-    "lidar_pc.timestamp",
-    "lidar_box.track_token",
-    "lidar_box.yaw",
-    "lidar_box.width",
-    "track.token",
-    "track.category_token",
-    "category.name",
-    "scene.name",
+COLUMNS = tuple(
+    (
+        "log.logfile ego_pose.token ego_pose.timestamp ego_pose.x ego_pose.qw camera.token camera.channel "
+        "camera.translation camera.intrinsic camera.distortion camera.width image.camera_token "
+        "image.filename_jpg image.timestamp lidar.token lidar.channel lidar.rotation lidar_pc.token "
+        "lidar_pc.lidar_token lidar_pc.ego_pose_token lidar_pc.filename lidar_pc.timestamp "
+        "lidar_box.track_token lidar_box.yaw lidar_box.width track.token track.category_token category.name "
+        "scene.name"
+    ).split()
 )
 VALUES = (
-    "CAST(x'ff80' AS TEXT)",
-    "6000000000",
-    "-1",
-    "1.5",
-    "NULL",
-    "'text'",
-    "''",
-    "x'00ff'",
-    "zeroblob(3000000)",
-    "zeroblob(500000)",
-    "9e999",
-)
+    "CAST(x'ff80' AS TEXT); 6000000000; -1; 1.5; NULL; 'text'; ''; x'00ff'; zeroblob(3000000); zeroblob(500000); 9e999"
+).split("; ")
 
 
 def without_types(database: Path, table: str) -> sqlite3.Connection:
     """The database with a table whose columns take values of any type."""
     connection = sqlite3.connect(database)
-    for question in (
-        f"CREATE TABLE other AS SELECT * FROM {table}",
-        f"DROP TABLE {table}",
-        f"ALTER TABLE other RENAME TO {table}",
-    ):
-        connection.execute(question)
+    drop, rename = f"DROP TABLE {table}", f"ALTER TABLE other RENAME TO {table}"
+    connection.executescript(f"CREATE TABLE other AS SELECT * FROM {table}; {drop}; {rename}")
     return connection
 
 
@@ -391,9 +321,8 @@ def test_doubled_image_rows_are_refused(source: Path, tmp_path: Path) -> None:
     connection.execute("INSERT INTO image SELECT * FROM image WHERE rowid = 2")
     connection.commit()
     connection.close()
-    with pytest.raises(InputError, match="two images of one camera have the same time") as caught:
-        ingest(log(source), tmp_path / "out")
-    assert "image at" in caught.value.where
+    caught = refused("two images of one camera have the same time", ingest, log(source), tmp_path / "out")
+    assert "image at" in caught.where
 
 
 def test_long_names_are_refused_whichever_table_holds_them(source: Path, tmp_path: Path) -> None:
@@ -402,9 +331,7 @@ def test_long_names_are_refused_whichever_table_holds_them(source: Path, tmp_pat
         kept = connection.execute(f"SELECT {column} FROM {table} LIMIT 1").fetchone()
         connection.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = 1", ("n" * 201,))
         connection.commit()
-        with pytest.raises(InputError, match="name is too long") as caught:
-            ingest(log(source), tmp_path / "out")
-        assert table in caught.value.where
+        assert table in refused("name is too long", ingest, log(source), tmp_path / "out").where
         connection.execute(f"UPDATE {table} SET {column} = ? WHERE rowid = 1", kept)
         connection.commit()
         connection.close()

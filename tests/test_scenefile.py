@@ -21,9 +21,8 @@ from mudg.base.errors import InputError, IntegrityError, MudgError
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track, View
 from mudg.scene.check import check_scene
-from mudg.scene.files import open_files
 from mudg.scene.labels import read_label, read_trusted_classes
-from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.read import open_files, read_image, read_points, read_scene
 from mudg.scene.schema import ref_problem, scene_to_json_text
 from mudg.scene.write import SceneWriter, write_zip
 

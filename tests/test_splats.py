@@ -18,7 +18,7 @@ import toy_splats
 from PIL import Image
 
 from mudg.base.errors import InputError, ResourceError
-from mudg.formats.splats import binary, bundle, compressed_ply, formats, gltf, ply, sog, splat, spz, usd
+from mudg.formats.splats import binary, formats, gltf, ply, sog, spz, usd
 from mudg.formats.splats.cloud import SplatCloud, SplatScene, joined
 
 GOLDEN = Path(__file__).parent / "golden" / "splats.json"
@@ -149,8 +149,8 @@ def test_golden_bytes_of_three_gaussians() -> None:
     cloud = toy_splats.cloud(3, 1, 11)
     made: dict[str, object] = {
         "ply": ply.to_bytes(cloud).hex(),
-        "compressed-ply": compressed_ply.to_bytes(cloud).hex(),
-        "splat": splat.to_bytes(cloud.of_degree(0)).hex(),
+        "compressed-ply": ply.compressed_to_bytes(cloud).hex(),
+        "splat": formats.splat_bytes(cloud.of_degree(0)).hex(),
         "spz": zlib.decompress(spz.to_bytes(cloud), 31).hex(),
         "glb": content_of("glb", cloud).hex(),
         "usda": content_of("usda", cloud).decode(),
@@ -161,7 +161,7 @@ def test_golden_bytes_of_three_gaussians() -> None:
         for n in archive.namelist()
         if n.endswith("webp")
     }
-    files = zipfile.ZipFile(io.BytesIO(bundle.to_bytes(toy_splats.scene(0, 1))))
+    files = zipfile.ZipFile(io.BytesIO(formats.bundle_bytes(toy_splats.scene(0, 1))))
     made["bundle"] = {
         name: rounded(files.read(name)) if name.endswith("json") else files.read(name).hex()
         for name in files.namelist()
@@ -281,7 +281,7 @@ def _has_zstandard() -> bool:
 
 def test_the_bundle_holds_everything() -> None:
     scene = toy_splats.scene(1)
-    archive = zipfile.ZipFile(io.BytesIO(bundle.to_bytes(scene)))
+    archive = zipfile.ZipFile(io.BytesIO(formats.bundle_bytes(scene)))
     assert all(info.compress_type == zipfile.ZIP_STORED for info in archive.infolist())
     about, tracks = (json.loads(archive.read(name)) for name in ("bundle.json", "tracks.json"))
     assert [node["name"] for node in about["nodes"]] == ["background", "car-1", "1 person"]
@@ -349,7 +349,7 @@ def test_a_fit_that_draws_antialiased_says_so_where_it_can() -> None:
 
 def test_names_of_prims_and_files_are_valid_and_differ() -> None:
     assert usd.prim_names(["a-1", "a_1", "7", ""]) == ["a_1", "a_1_2", "_7", "node"]
-    assert bundle.file_names(["a/b", "A_b", ".."]) == ["a_b", "A_b_2", "node"]
+    assert formats.file_names(["a/b", "A_b", ".."]) == ["a_b", "A_b_2", "node"]
 
 
 def test_times_of_animations_rise_and_are_not_negative() -> None:

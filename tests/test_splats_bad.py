@@ -17,7 +17,7 @@ import pytest
 import toy_splats
 
 from mudg.base.errors import InputError, MudgError
-from mudg.formats.splats import binary, formats, gltf, ply, sog, splat, spz
+from mudg.formats.splats import binary, formats, gltf, ply, sog, spz
 from mudg.formats.splats.cloud import SplatCloud
 
 READ = [name for name, one in formats.FORMATS.items() if one.read]
@@ -274,7 +274,7 @@ def test_documents_of_glb_that_cannot_be_are_refused(change: Callable[[dict[str,
 
 
 def test_places_of_a_splat_file_that_are_no_numbers_are_refused() -> None:
-    content = bytearray(splat.to_bytes(toy_splats.cloud(2)))
+    content = bytearray(formats.splat_bytes(toy_splats.cloud(2)))
     content[32:36] = struct.pack("<f", np.nan)
     with pytest.raises(InputError, match="Gaussian 1"):
         read(bytes(content), "splat")

@@ -15,6 +15,8 @@ from mudg.base.types import (
     Clip,
     Condition,
     EgoPath,
+    Frame,
+    FusedCloud,
     Gaussians,
     Observation,
     PointCloud,
@@ -92,51 +94,17 @@ def test_point_arrays_are_checked() -> None:
 
 
 def test_tensor_types_check_shapes() -> None:
-    t, h, w = 2, 6, 8
-    condition = Condition(
-        (VIEW, VIEW),
-        torch.zeros(t, 3, h, w),
-        torch.zeros(t, 1, h, w),
-        torch.zeros(t, 1, h, w, dtype=torch.bool),
-        torch.zeros(3, h, w),
-    )
-    Clip(
-        condition,
-        torch.zeros(t, 3, h, w),
-        torch.zeros(t, 1, h, w),
-        torch.ones(t, 1, h, w, dtype=torch.bool),
-        torch.zeros(t, h, w, dtype=torch.long),
-    )
+    zeros = torch.zeros
+    color, one, known = zeros(2, 3, 6, 8), zeros(2, 1, 6, 8), torch.ones(2, 1, 6, 8, dtype=torch.bool)
+    condition = Condition((VIEW, VIEW), color, one, known, zeros(3, 6, 8))
+    classes = zeros(2, 6, 8, dtype=torch.long)
+    Clip(condition, color, one, known, classes)
     with pytest.raises(InputError, match="clip.depth"):
-        Clip(
-            condition,
-            torch.zeros(t, 3, h, w),
-            torch.zeros(t, 3, h, w),
-            torch.ones(t, 1, h, w, dtype=torch.bool),
-            torch.zeros(t, h, w, dtype=torch.long),
-        )
+        Clip(condition, color, color, known, classes)
     with pytest.raises(InputError, match="observation.rgb"):
-        Observation(
-            VIEW,
-            torch.zeros(3, 5, 8),
-            None,
-            None,
-            torch.ones(1, 6, 8),
-            torch.ones(1, 6, 8, dtype=torch.bool),
-            "virtual",
-            "x",
-        )
-    n = 3
+        Observation(VIEW, zeros(3, 5, 8), None, None, torch.ones(1, 6, 8), known[0], "virtual", "x")
     with pytest.raises(InputError, match="gaussians.quats"):
-        Gaussians(
-            torch.zeros(n, 3),
-            torch.zeros(n, 3),
-            torch.zeros(n, 3),
-            torch.zeros(n),
-            torch.zeros(n, 1, 3),
-            None,
-            torch.zeros(n),
-        )
+        Gaussians(*[zeros(3, 3)] * 3, zeros(3), zeros(3, 1, 3), None, zeros(3))
 
 
 def test_scene_look_ups_name_what_there_is() -> None:
@@ -148,6 +116,20 @@ def test_scene_look_ups_name_what_there_is() -> None:
         scene.track("7")
     with pytest.raises(TypeError):
         scene.cameras["rear"] = CAMERA
+
+
+def test_values_are_shown_in_one_short_line() -> None:
+    ego = EgoPath(np.arange(2000.0) / 10, np.tile(np.eye(4), (2000, 1, 1)))
+    frames = tuple(Frame(f"front/{n}", View(CAMERA, np.eye(4), n / 10), Ref(f"{n}.png")) for n in range(500))
+    scene = Scene("log", "/nowhere", {"front": CAMERA}, frames, (), (), ego, {}, Source("x", "y"))
+    assert repr(scene) == "Scene('log', 500 frames, 1 cameras, 0 objects, 199.9 s)"
+    assert repr(ego) == "EgoPath(times_s=float64[2000], world_from_ego=float64[2000, 4, 4])"
+    assert repr(VIEW) == "View(camera='front', world_from_cam=float64[4, 4], time_s=0.0)"
+    planes = (torch.zeros(3, 6, 8), torch.zeros(1, 6, 8), None, torch.ones(1, 6, 8), torch.ones(1, 6, 8))
+    observed = Observation(VIEW, *planes, "virtual", "x")
+    assert "rgb=float32[3, 6, 8], depth=float32[1, 6, 8], confidence=float32[1, 6, 8]" in repr(observed)
+    cloud = PointCloud(np.zeros((900, 3), np.float32), np.zeros((900, 3), np.uint8), "object")
+    assert repr(FusedCloud(cloud, {"a": cloud})).startswith("FusedCloud(static=PointCloud(xyz=float32[900, 3], rgb=")
 
 
 def test_palette_round_trip_and_margin() -> None:

@@ -11,11 +11,12 @@ import pytest
 import roundtrip
 import waymo_logs
 import write_waymo as made
+from bad_logs import refused
 from PIL import Image
 from waymo_logs import COLUMNS, ingest, write
 
 from mudg.base import geometry
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.city import sensors as rig
@@ -281,8 +282,7 @@ def test_boxes_of_the_real_frame_project_onto_the_recorded_rectangles(shared_dat
 
 
 def test_the_real_frame_without_images_is_refused_in_words(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="no images"):
-        ingest(shared_data("waymo_frame") / "labels_only_one_frame.tfrecord", tmp_path / "scene")
+    refused("no images", ingest, shared_data("waymo_frame") / "labels_only_one_frame.tfrecord", tmp_path / "scene")
 
 
 def test_the_real_table_of_poses(shared_data: Callable[[str], Path]) -> None:

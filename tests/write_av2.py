@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from mudg.base.geometry import invert, quaternion_from_matrix, transform_points, yaw_matrix
 from mudg.base.types import Scene
 from mudg.formats.importers.argoverse2 import CAMERAS
-from mudg.scene.files import open_files
-from mudg.scene.read import read_points
+from mudg.scene.read import open_files, read_points
 
 START_NS = 315_966_253_572_412_942
 CITY_FROM_WORLD = yaw_matrix(-0.7, (5172.6, 2419.1, 66.9))

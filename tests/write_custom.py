@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from mudg.base.geometry import invert, quaternion_from_matrix, yaw_of
-from mudg.base.types import Scene, SweepPoints
+from mudg.base.types import Camera, Scene, SweepPoints
 from mudg.scene.read import read_image, read_points
 
 START_NS = 1_700_000_000_123_456_789
@@ -44,56 +44,39 @@ def ns(time_s: float) -> int:
     return START_NS + round(time_s * 1e9)
 
 
+def pinhole(c: Camera, ego_from_camera: np.ndarray) -> dict[str, Any]:
+    """A camera of log.json."""
+    entry = {"width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy, "cx": c.cx - 0.5, "cy": c.cy - 0.5}
+    return entry | {"ego_from_camera": ego_from_camera.tolist()}
+
+
 def write_log(scene: Scene, root: Path, suffix: str = ".npz", edit: Edit | None = None) -> Path:
     """The scene in the neutral layout, nanoseconds, far from the origin; ``edit`` changes log.json's content first."""
     sensors = rig(scene)
-    cameras = {
-        name: {
-            "width": c.width,
-            "height": c.height,
-            "fx": c.fx,
-            "fy": c.fy,
-            "cx": c.cx - 0.5,
-            "cy": c.cy - 0.5,
-            "ego_from_camera": sensors[name].tolist(),
-        }
-        for name, c in scene.cameras.items()
-    }
+    cameras = {name: pinhole(c, sensors[name]) for name, c in scene.cameras.items()}
     lidar = scene.sweeps[0].sensor
+    ego = zip(scene.ego.times_s, scene.ego.world_from_ego, strict=True)
     log: dict[str, Any] = {
         "format": "mudg-log",
         "version": 1,
         "name": "round-trip",
         "licence": "none",
         "time_unit": "ns",
-        "cameras": cameras,
-        "lidars": {lidar: {"ego_from_lidar": sensors[lidar].tolist(), "motion_compensated": True}},
-        "ego": [
-            {"time": ns(t), "world_from_ego": far(pose).tolist()}
-            for t, pose in zip(scene.ego.times_s, scene.ego.world_from_ego, strict=True)
-        ],
-        "images": [],
-        "sweeps": [],
-        "tracks": [
-            {
-                "id": track.id,
-                "class": track.label,
-                "size_m": track.size_m.tolist(),
-                "boxes": [
-                    {"time": ns(t), "world_from_object": far(pose).tolist()}
-                    for t, pose in zip(track.times_s, track.world_from_object, strict=True)
-                ],
-            }
-            for track in scene.tracks
-        ],
     }
+    log |= {"cameras": cameras, "images": [], "sweeps": [], "tracks": []}
+    log["lidars"] = {lidar: {"ego_from_lidar": sensors[lidar].tolist(), "motion_compensated": True}}
+    log["ego"] = [{"time": ns(t), "world_from_ego": far(pose).tolist()} for t, pose in ego]
+    for track in scene.tracks:
+        keys = zip(track.times_s, track.world_from_object, strict=True)
+        boxes = [{"time": ns(t), "world_from_object": far(pose).tolist()} for t, pose in keys]
+        entry = {"id": track.id, "class": track.label, "size_m": track.size_m.tolist(), "boxes": boxes}
+        log["tracks"].append(entry)
     for frame in scene.frames:
         path = root / "images" / f"{frame.id}.png"
         path.parent.mkdir(parents=True, exist_ok=True)
         Image.fromarray(read_image(scene, frame)).save(path)
-        log["images"].append(
-            {"camera": frame.view.camera.name, "time": ns(frame.view.time_s), "file": f"images/{frame.id}.png"}
-        )
+        entry = {"camera": frame.view.camera.name, "time": ns(frame.view.time_s), "file": f"images/{frame.id}.png"}
+        log["images"].append(entry)
     for sweep in scene.sweeps:
         path = root / "lidar" / f"{sweep.id}{suffix}"
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -147,16 +130,11 @@ def write_recording(scene: Scene, root: Path) -> Path:
     """The scene as a raw recording of the form that the template converter reads."""
     root.mkdir(parents=True)
     sensors = rig(scene)
-    described: dict[str, Any] = {
-        name: {
-            "width": c.width,
-            "height": c.height,
-            "ego_from_sensor": sensors[name].tolist(),
-            "D": [0, 0, 0, 0, 0],
-            "K": [[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]],
-        }
-        for name, c in scene.cameras.items()
-    }
+    described: dict[str, Any] = {}
+    for name, c in scene.cameras.items():
+        k = [[c.fx, 0, c.cx - 0.5], [0, c.fy, c.cy - 0.5], [0, 0, 1]]
+        described[name] = {"width": c.width, "height": c.height, "ego_from_sensor": sensors[name].tolist()}
+        described[name] |= {"D": [0, 0, 0, 0, 0], "K": k}
     lidar = scene.sweeps[0].sensor
     described[lidar] = {"ego_from_sensor": sensors[lidar].tolist()}
     (root / "sensors.json").write_text(json.dumps(described))

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 
 from mudg.base.geometry import invert, quaternion_from_matrix, yaw_matrix
 from mudg.base.types import Scene
-from mudg.scene.files import open_files
-from mudg.scene.read import read_points
+from mudg.scene.read import open_files, read_points
 
 START = datetime.datetime(2019, 6, 27, 16, 30, 25, tzinfo=datetime.UTC)
 MAP_FROM_WORLD = yaw_matrix(2.4, (111.4, -2261.3, -12.7))

@@ -88,55 +88,31 @@ def write_nuplan(
     connection = sqlite3.connect(database)
     connection.executescript(TABLES)
 
-    def add(table: str, **row: object) -> None:
-        marks = ", ".join("?" * len(row))
-        connection.execute(f"INSERT INTO {table} ({', '.join(row)}) VALUES ({marks})", tuple(row.values()))
+    def add(table: str, columns: str, *values: object) -> None:
+        marks = ", ".join("?" * len(values))
+        connection.execute(f"INSERT INTO {table} ({columns}) VALUES ({marks})", values)
 
-    add("log", token=token("log"), logfile=LOG, location="here", timestamp=EPOCH_US)
-    add("category", token=token("vehicle"), name="vehicle")
+    add("log", "token, logfile, location, timestamp", token("log"), LOG, "here", EPOCH_US)
+    add("category", "token, name", token("vehicle"), "vehicle")
     for name in ("scene-0000", "scene-0001"):
-        add("scene", token=token(name), log_token=token("log"), name=name)
+        add("scene", "token, log_token, name", token(name), token("log"), name)
     for time_s, pose in zip(truth.ego.times_s, truth.ego.world_from_ego, strict=True):
-        pose = SOURCE_FROM_WORLD @ pose
-        qw, qx, qy, qz = wxyz(pose)
-        time_us = us(float(time_s))
-        add(
-            "ego_pose",
-            token=token("ego", time_us),
-            timestamp=time_us,
-            x=pose[0, 3],
-            y=pose[1, 3],
-            z=pose[2, 3],
-            qw=qw,
-            qx=qx,
-            qy=qy,
-            qz=qz,
-        )
+        pose, time_us = SOURCE_FROM_WORLD @ pose, us(float(time_s))
+        values = token("ego", time_us), time_us, *pose[:3, 3].tolist(), *wxyz(pose)
+        add("ego_pose", "token, timestamp, x, y, z, qw, qx, qy, qz", *values)
     ego = truth.ego.pose_at(truth.sweeps[0].time_s)
     assert ego is not None
     mount = invert(ego) @ truth.sweeps[0].world_from_lidar
-    add(
-        "lidar",
-        token=token("lidar"),
-        channel="MergedPointCloud",
-        translation=pickle.dumps(mount[:3, 3].tolist()),
-        rotation=pickle.dumps(wxyz(mount)),
-    )
+    place = pickle.dumps(mount[:3, 3].tolist()), pickle.dumps(wxyz(mount))
+    add("lidar", "token, channel, translation, rotation", token("lidar"), "MergedPointCloud", *place)
     for channel, name in (cameras or {channel: name for name, channel in CAMERA_OF.items()}).items():
         camera, frames = truth.cameras[name], truth.frames_of(name)
         mount = invert(ego) @ frames[0].view.world_from_cam
         k = [[camera.fx, 0.0, camera.cx - 0.5], [0.0, camera.fy, camera.cy - 0.5], [0.0, 0.0, 1.0]]
-        add(
-            "camera",
-            token=token(channel),
-            channel=channel,
-            width=camera.width,
-            height=camera.height,
-            translation=pickle.dumps(mount[:3, 3].tolist()),
-            rotation=pickle.dumps(wxyz(mount)),
-            intrinsic=pickle.dumps(k),
-            distortion=pickle.dumps(list(distortion)),
-        )
+        place = pickle.dumps(mount[:3, 3].tolist()), pickle.dumps(wxyz(mount))
+        lens = pickle.dumps(k), pickle.dumps(list(distortion))
+        columns = "token, channel, width, height, translation, rotation, intrinsic, distortion"
+        add("camera", columns, token(channel), channel, camera.width, camera.height, *place, *lens)
         (blobs / channel).mkdir(parents=True)
         for index, frame in enumerate(frames):
             time_us = us(frame.view.time_s)
@@ -144,50 +120,27 @@ def write_nuplan(
             buffer = io.BytesIO()
             Image.fromarray(read_image(truth, frame)).save(buffer, "JPEG" if jpeg else "PNG", quality=95, subsampling=0)
             (root / "sensor_blobs" / file).write_bytes(buffer.getvalue())
-            add(
-                "image",
-                token=token("image", channel, index),
-                camera_token=token(channel),
-                filename_jpg=file,
-                timestamp=time_us - IMAGE_DELAY_US,
-                ego_pose_token=token("ego", time_us),
-            )
+            tokens = token("image", channel, index), token(channel), token("ego", time_us)
+            columns = "token, camera_token, ego_pose_token, filename_jpg, timestamp"
+            add("image", columns, *tokens, file, time_us - IMAGE_DELAY_US)
     for track in truth.tracks:
-        add("track", token=token(track.id), category_token=token("vehicle"))
+        add("track", "token, category_token", token(track.id), token("vehicle"))
     (blobs / "MergedPointCloud").mkdir(parents=True)
     for index, sweep in enumerate(truth.sweeps):
         time_us, cloud = us(sweep.time_s), token("cloud", index)
         file = f"{LOG}/MergedPointCloud/{cloud.hex()}.pcd"
         points = read_points(truth, sweep)
         (root / "sensor_blobs" / file).write_bytes(pcd(points.xyz, points.intensity))
-        add(
-            "lidar_pc",
-            token=cloud,
-            ego_pose_token=token("ego", time_us),
-            lidar_token=token("lidar"),
-            filename=file,
-            scene_token=token("scene-0000" if index < 3 else "scene-0001"),
-            timestamp=time_us,
-        )
+        tokens = cloud, token("ego", time_us), token("lidar"), token("scene-0000" if index < 3 else "scene-0001")
+        columns = "token, ego_pose_token, lidar_token, scene_token, filename, timestamp"
+        add("lidar_pc", columns, *tokens, file, time_us)
         for track in truth.tracks:
             pose = track.pose_at(sweep.time_s)
             assert pose is not None
             pose = SOURCE_FROM_WORLD @ pose
-            length, width, height = track.size_m.tolist()
-            add(
-                "lidar_box",
-                token=token("box", track.id, index),
-                lidar_pc_token=cloud,
-                track_token=token(track.id),
-                x=pose[0, 3],
-                y=pose[1, 3],
-                z=pose[2, 3],
-                yaw=yaw_of(pose),
-                length=length,
-                width=width,
-                height=height,
-                confidence=0.9,
-            )
+            tokens = token("box", track.id, index), cloud, token(track.id)
+            columns = "token, lidar_pc_token, track_token, x, y, z, yaw, length, width, height, confidence"
+            add("lidar_box", columns, *tokens, *pose[:3, 3].tolist(), yaw_of(pose), *track.size_m.tolist(), 0.9)
     connection.commit()
     connection.close()
     return database

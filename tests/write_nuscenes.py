@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from mudg.base.geometry import invert, quaternion_from_matrix, yaw_matrix
 from mudg.base.types import Scene, Track
 from mudg.formats.importers.nuscenes import CAMERAS
-from mudg.scene.files import open_files
-from mudg.scene.read import read_points
+from mudg.scene.read import open_files, read_points
 
 START_US = 1_532_402_927_000_000
 MAP_FROM_WORLD = yaw_matrix(1.9, (411.3, 1180.9, 0.0))

@@ -21,8 +21,7 @@ from PIL import Image
 
 from mudg.base.geometry import CAM_FROM_EGO_AXES, invert, project, transform_points, yaw_matrix, yaw_of
 from mudg.base.types import Scene, Track
-from mudg.scene.files import open_files
-from mudg.scene.read import read_points
+from mudg.scene.read import open_files, read_points
 
 Matrix = NDArray[np.float64]
 EPOCH_US = 1_553_735_853_462_203
@@ -73,15 +72,9 @@ def log_of(
     for name, camera in truth.cameras.items():
         first = truth.frames_of(name)[0].view
         vehicle_from_cam = invert(truth.ego.pose_at(first.time_s)) @ first.world_from_cam
-        log.cameras.append(
-            {
-                "number": CAMERA_NUMBERS[name],
-                "width": camera.width,
-                "height": camera.height,
-                "intrinsic": [camera.fx, camera.fy, camera.cx, camera.cy, 0, 0, 0, 0, 0],
-                "extrinsic": vehicle_from_cam @ CAM_FROM_EGO_AXES,
-            }
-        )
+        intrinsic = [camera.fx, camera.fy, camera.cx, camera.cy, 0, 0, 0, 0, 0]
+        facts = CAMERA_NUMBERS[name], camera.width, camera.height, intrinsic, vehicle_from_cam @ CAM_FROM_EGO_AXES
+        log.cameras.append(named("number width height intrinsic extrinsic", *facts))
     for index, sweep in enumerate(truth.sweeps):
         pose = global_from_world @ truth.ego.pose_at(sweep.time_s)
         frame: dict[str, Any] = {"timestamp_us": EPOCH_US + round((sweep.time_s - 0.05) * 1e6), "pose": pose}
@@ -95,17 +88,10 @@ def log_of(
 def _image(truth: Scene, name: str, index: int, global_from_world: Matrix) -> dict[str, Any]:
     frame = truth.frames_of(name)[index]
     time = EPOCH_US / 1e6 + frame.view.time_s
-    return {
-        "number": CAMERA_NUMBERS[name],
-        "image": open_files(truth.root).read(frame.image.path),
-        "pose": global_from_world @ truth.ego.pose_at(frame.view.time_s),
-        "velocity": np.zeros(6),
-        "pose_time": time,
-        "shutter": SHUTTER_S,
-        "trigger": time - (READOUT_S + SHUTTER_S) / 2,
-        "done": time + (READOUT_S + SHUTTER_S) / 2,
-        "panoptic": None,
-    }
+    half, pose = (READOUT_S + SHUTTER_S) / 2, global_from_world @ truth.ego.pose_at(frame.view.time_s)
+    facts = CAMERA_NUMBERS[name], open_files(truth.root).read(frame.image.path), pose, np.zeros(6), None
+    times = named("pose_time shutter trigger done", time, SHUTTER_S, time - half, time + half)
+    return named("number image pose velocity panoptic", *facts) | times
 
 
 def _scan(
@@ -155,15 +141,8 @@ def _boxes(truth: Scene, moving: Sequence[Track], time_s: float, hold: str) -> l
         late = {"seen": late, "start": -0.05, "pose": 0.0}[hold]
         seen = own[track.id].pose_at(time_s + late)
         shown = now if seen is None else invert(vehicle) @ seen
-        boxes.append(
-            {
-                "id": track.id,
-                "type": TYPE_NUMBERS[track.label],
-                "centre": shown[:3, 3],
-                "size": track.size_m,
-                "heading": yaw_of(now),
-            }
-        )
+        facts = track.id, TYPE_NUMBERS[track.label], shown[:3, 3], track.size_m, yaw_of(now)
+        boxes.append(named("id type centre size heading", *facts))
     return boxes
 
 
@@ -179,11 +158,9 @@ def panoptic_png(ids: NDArray[np.integer]) -> bytes:
 
 def crc32c_bitwise(data: bytes) -> int:
     """CRC-32C by its definition, one bit after the other."""
-    table = []
-    for value in range(256):
-        for _ in range(8):
-            value = (value >> 1) ^ (0x82F63B78 if value & 1 else 0)
-        table.append(value)
+    table = list(range(256))
+    for _ in range(8):
+        table = [(value >> 1) ^ (0x82F63B78 if value & 1 else 0) for value in table]
     crc = 0xFFFFFFFF
     for byte in data:
         crc = table[(crc ^ byte) & 0xFF] ^ (crc >> 8)
@@ -258,24 +235,11 @@ def context_message(log: Log) -> bytes:
     """The Context message."""
     out = text(1, log.name.encode())
     for camera in log.cameras:
-        out += text(
-            2,
-            number(1, camera["number"])
-            + doubles(2, camera["intrinsic"])
-            + transform(3, camera["extrinsic"])
-            + number(4, camera["width"])
-            + number(5, camera["height"])
-            + number(6, 2),
-        )
+        lens = number(1, camera["number"]) + doubles(2, camera["intrinsic"]) + transform(3, camera["extrinsic"])
+        out += text(2, lens + number(4, camera["width"]) + number(5, camera["height"]) + number(6, 2))
     for laser in log.lasers:
-        out += text(
-            3,
-            number(1, laser["number"])
-            + doubles(2, laser["inclinations"])
-            + double(3, laser["min"])
-            + double(4, laser["max"])
-            + transform(5, laser["extrinsic"]),
-        )
+        beams = doubles(2, laser["inclinations"]) + double(3, laser["min"]) + double(4, laser["max"])
+        out += text(3, number(1, laser["number"]) + beams + transform(5, laser["extrinsic"]))
     return out + text(4, text(2, b"Day") + text(3, b"location_sf") + text(4, b"sunny"))
 
 
@@ -320,171 +284,79 @@ def write_tfrecord(log: Log, path: Path) -> Path:
 # --- format 2 -------------------------------------------------------------------------------------
 
 
+def named(names: str, *values: Any) -> dict[str, Any]:
+    """Values by their names."""
+    return dict(zip(names.split(), values, strict=True))
+
+
 def write_parquet(log: Log, root: Path) -> Path:
     """The log as a folder of components; small row groups, so that reading crosses them."""
     import pyarrow as pa
     from pyarrow import parquet
 
-    def save(component: str, rows: list[dict[str, Any]], types: dict[str, Any]) -> None:
-        if not rows:
-            return
-        folder = root / component
-        folder.mkdir(parents=True, exist_ok=True)
-        arrays = {}
-        for name in rows[0]:
-            arrays[name] = pa.array([row[name] for row in rows], types.get(name.split("].")[-1], types.get(name)))
-        parquet.write_table(pa.table(arrays), folder / f"{log.name}.parquet", row_group_size=4)
+    matrix = pa.list_(pa.float64(), 16)
+    types = {"beam_inclination.values": pa.list_(pa.float64()), "type": pa.int8()}
+    types |= {f"{name}.transform": matrix for name in ("world_from_vehicle", "extrinsic", "pose")}
+    types |= {f"range_image_return{n}.values": pa.list_(pa.float32()) for n in (1, 2)}
+    types |= {f"range_image_return{n}.shape": pa.list_(pa.int32(), 3) for n in (1, 2)}
 
-    f32, matrix = pa.list_(pa.float32()), pa.list_(pa.float64(), 16)
-    image_types = {f"range_image_return{n}.values": f32 for n in (1, 2)} | {
-        f"range_image_return{n}.shape": pa.list_(pa.int32(), 3) for n in (1, 2)
-    }
+    def save(component: str, title: str, keyed: Iterable[tuple[dict[str, Any], dict[str, Any]]]) -> None:
+        """Rows of keys, and of columns by their names within the component."""
+        rows = [{**keys, **{f"[{title}Component].{n}": v for n, v in values.items()}} for keys, values in keyed]
+        if rows:
+            (root / component).mkdir(parents=True, exist_ok=True)
+            arrays = {name: pa.array([row[name] for row in rows], types.get(name.split("].")[-1])) for name in rows[0]}
+            parquet.write_table(pa.table(arrays), root / component / f"{log.name}.parquet", row_group_size=4)
 
     def key(frame: dict[str, Any] | None = None, **more: Any) -> dict[str, Any]:
         time = {} if frame is None else {"key.frame_timestamp_micros": frame["timestamp_us"]}
         return {"key.segment_context_name": log.name, **time, **{f"key.{name}": value for name, value in more.items()}}
 
-    def flat(prefix: str, array: Any) -> dict[str, Any]:
-        values = None if array is None else array.astype(np.float32).ravel()
-        return {f"{prefix}.values": values, f"{prefix}.shape": None if array is None else list(array.shape)}
+    def flat(number: int, array: Any) -> dict[str, Any]:
+        parts = (None, None) if array is None else (array.astype(np.float32).ravel(), list(array.shape))
+        return named(f"range_image_return{number}.values range_image_return{number}.shape", *parts)
 
     save(
         "vehicle_pose",
-        [{**key(f), "[VehiclePoseComponent].world_from_vehicle.transform": f["pose"].ravel()} for f in log.frames],
-        {"world_from_vehicle.transform": matrix},
+        "VehiclePose",
+        ((key(f), {"world_from_vehicle.transform": f["pose"].ravel()}) for f in log.frames),
     )
-    names = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "p1", "p2", "k3")
-    save(
-        "camera_calibration",
-        [
-            {
-                **key(camera_name=c["number"]),
-                **{
-                    f"[CameraCalibrationComponent].intrinsic.{n}": float(v)
-                    for n, v in zip(names, c["intrinsic"], strict=True)
-                },
-                "[CameraCalibrationComponent].extrinsic.transform": c["extrinsic"].ravel(),
-                "[CameraCalibrationComponent].width": c["width"],
-                "[CameraCalibrationComponent].height": c["height"],
-                "[CameraCalibrationComponent].rolling_shutter_direction": 2,
-            }
-            for c in log.cameras
-        ],
-        {"extrinsic.transform": matrix},
+    lens = " ".join(f"intrinsic.{name}" for name in "f_u f_v c_u c_v k1 k2 p1 p2 k3".split())
+    size = "extrinsic.transform width height rolling_shutter_direction"
+    cameras = ((c, named(size, c["extrinsic"].ravel(), c["width"], c["height"], 2)) for c in log.cameras)
+    cameras = ((key(camera_name=c["number"]), named(lens, *map(float, c["intrinsic"])) | more) for c, more in cameras)
+    save("camera_calibration", "CameraCalibration", cameras)
+    names = "extrinsic.transform beam_inclination.min beam_inclination.max beam_inclination.values"
+    values = (
+        (one, (one["extrinsic"].ravel(), one["min"], one["max"], list(one["inclinations"]) or None))
+        for one in log.lasers
     )
     save(
         "lidar_calibration",
-        [
-            {
-                **key(laser_name=item["number"]),
-                "[LiDARCalibrationComponent].extrinsic.transform": item["extrinsic"].ravel(),
-                "[LiDARCalibrationComponent].beam_inclination.min": item["min"],
-                "[LiDARCalibrationComponent].beam_inclination.max": item["max"],
-                "[LiDARCalibrationComponent].beam_inclination.values": list(item["inclinations"]) or None,
-            }
-            for item in log.lasers
-        ],
-        {"extrinsic.transform": matrix, "beam_inclination.values": pa.list_(pa.float64())},
+        "LiDARCalibration",
+        ((key(laser_name=one["number"]), named(names, *v)) for one, v in values),
     )
-    prefix = "[CameraImageComponent]."
-    save(
-        "camera_image",
-        [
-            {
-                **key(f, camera_name=i["number"]),
-                f"{prefix}image": i["image"],
-                f"{prefix}pose.transform": i["pose"].ravel(),
-                **{f"{prefix}velocity.linear_velocity.{a}": v for a, v in zip("xyz", i["velocity"][:3], strict=True)},
-                **{f"{prefix}velocity.angular_velocity.{a}": v for a, v in zip("xyz", i["velocity"][3:], strict=True)},
-                f"{prefix}pose_timestamp": i["pose_time"],
-                f"{prefix}rolling_shutter_params.shutter": i["shutter"],
-                f"{prefix}rolling_shutter_params.camera_trigger_time": i["trigger"],
-                f"{prefix}rolling_shutter_params.camera_readout_done_time": i["done"],
-            }
-            for f in log.frames
-            for i in f["images"]
-        ],
-        {"pose.transform": matrix},
-    )
-    prefix = "[CameraSegmentationLabelComponent]."
-    save(
-        "camera_segmentation",
-        [
-            {
-                **key(f, camera_name=i["number"]),
-                f"{prefix}panoptic_label_divisor": DIVISOR,
-                f"{prefix}panoptic_label": i["panoptic"],
-            }
-            for f in log.frames
-            for i in f["images"]
-            if i["panoptic"] is not None
-        ],
-        {},
-    )
-    lasers = [(f, item) for f in log.frames for item in f["lasers"]]
-    save(
-        "lidar",
-        [
-            {
-                **key(f, laser_name=item["number"]),
-                **flat("[LiDARComponent].range_image_return1", item["returns"][0]),
-                **flat(
-                    "[LiDARComponent].range_image_return2", item["returns"][1] if len(item["returns"]) > 1 else None
-                ),
-            }
-            for f, item in lasers
-        ],
-        image_types,
-    )
-    save(
-        "lidar_pose",
-        [
-            {**key(f, laser_name=item["number"]), **flat("[LiDARPoseComponent].range_image_return1", item["poses"])}
-            for f, item in lasers
-            if item.get("poses") is not None
-        ],
-        image_types,
-    )
-    prefix = "[LiDARCameraProjectionComponent]."
-    save(
-        "lidar_camera_projection",
-        [
-            {
-                **key(f, laser_name=item["number"]),
-                **flat(f"{prefix}range_image_return1", item["projections"][0]),
-                **flat(f"{prefix}range_image_return2", item["projections"][1]),
-            }
-            for f, item in lasers
-            if item.get("projections")
-        ],
-        image_types,
-    )
-    prefix = "[LiDARBoxComponent]."
-    save(
-        "lidar_box",
-        [
-            {
-                **key(f, laser_object_id=b["id"]),
-                **{f"{prefix}box.center.{a}": float(v) for a, v in zip("xyz", b["centre"], strict=True)},
-                **{f"{prefix}box.size.{a}": float(v) for a, v in zip("xyz", b["size"], strict=True)},
-                f"{prefix}box.heading": float(b["heading"]),
-                f"{prefix}type": b["type"],
-            }
-            for f in log.frames
-            for b in f["boxes"]
-        ],
-        {"type": pa.int8()},
-    )
-    save(
-        "stats",
-        [
-            {
-                **key(log.frames[0]),
-                "[StatsComponent].time_of_day": "Day",
-                "[StatsComponent].location": "location_sf",
-                "[StatsComponent].weather": "sunny",
-            }
-        ],
-        {},
-    )
+    images = [(i, key(f, camera_name=i["number"])) for f in log.frames for i in f["images"]]
+    speeds = " ".join(f"velocity.{kind}_velocity.{axis}" for kind in ("linear", "angular") for axis in "xyz")
+    times = "shutter camera_trigger_time camera_readout_done_time".split()
+    times = " ".join(["image pose_timestamp", *(f"rolling_shutter_params.{name}" for name in times)])
+    facts = ((i, keys, [i[k] for k in ("image", "pose_time", "shutter", "trigger", "done")]) for i, keys in images)
+    poses = ((i, keys, named(times, *values) | {"pose.transform": i["pose"].ravel()}) for i, keys, values in facts)
+    save("camera_image", "CameraImage", ((keys, row | named(speeds, *i["velocity"])) for i, keys, row in poses))
+    names = "panoptic_label_divisor panoptic_label"
+    labels = ((keys, named(names, DIVISOR, i["panoptic"])) for i, keys in images if i["panoptic"] is not None)
+    save("camera_segmentation", "CameraSegmentationLabel", labels)
+    lasers = [(key(f, laser_name=one["number"]), one) for f in log.frames for one in f["lasers"]]
+    returns = ((keys, [*one["returns"], None][:2]) for keys, one in lasers)
+    save("lidar", "LiDAR", ((keys, flat(1, one) | flat(2, two)) for keys, (one, two) in returns))
+    with_poses = ((keys, flat(1, one["poses"])) for keys, one in lasers if one.get("poses") is not None)
+    save("lidar_pose", "LiDARPose", with_poses)
+    projected = ((keys, one["projections"]) for keys, one in lasers if one.get("projections"))
+    save("lidar_camera_projection", "LiDARCameraProjection", ((k, flat(1, p[0]) | flat(2, p[1])) for k, p in projected))
+    names = " ".join((*(f"box.{part}.{axis}" for part in ("center", "size") for axis in "xyz"), "box.heading type"))
+    boxes = ((key(f, laser_object_id=b["id"]), b) for f in log.frames for b in f["boxes"])
+    boxes = ((keys, [*map(float, (*b["centre"], *b["size"], b["heading"])), b["type"]]) for keys, b in boxes)
+    save("lidar_box", "LiDARBox", ((keys, named(names, *values)) for keys, values in boxes))
+    conditions = named("time_of_day location weather", "Day", "location_sf", "sunny")
+    save("stats", "Stats", [(key(log.frames[0]), conditions)])
     return root

@@ -558,6 +558,8 @@ def test_public_functions_are_annotated_and_documented(package_dir: Path) -> Non
             if node.name == "main" and name == "__main__.py":
                 continue
             explained = explained_once(tree) | (STEP_METHODS if name.startswith(("steps/", "benchmarks/")) else set())
+            if isinstance(node, ast.FunctionDef) and ast.unparse(node.body[0]) == "...":
+                continue  # of a protocol, whose text says what it asks for
             if not ast.get_docstring(node) and not (is_method and node.name in explained):
                 problems.append(f"{name}:{node.lineno}: {node.name} has no docstring")
             if isinstance(node, ast.ClassDef):

@@ -25,8 +25,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class ColorMap:
-    """wanted = gain * given + offset for each channel of colours in [0, 1]; ``pairs``: how many pairs of colours it was
-    fitted to."""
+    """wanted = gain * given + offset for each channel of colours in [0, 1]; ``pairs``: of colours it was fitted to."""
 
     gain: Triple = (1.0, 1.0, 1.0)
     offset: Triple = (0.0, 0.0, 0.0)

@@ -91,22 +91,13 @@ def read_shards(folder: Path, files: object, *, remedy: str = "make the model ag
     """
     tensors: dict[str, Tensor] = {}
     if not isinstance(files, Mapping) or not all(isinstance(digest, str) for digest in files.values()):
-        raise InputError(
-            "the description of a model does not name its weight files",
-            where=str(folder),
-            expected="files: {NAME: SHA256}",
-            got=str(files),
-            remedy=remedy,
-        )
+        what = "the description of a model does not name its weight files"
+        raise InputError(what, where=str(folder), expected="files: {NAME: SHA256}", got=str(files), remedy=remedy)
     for name, digest in files.items():
         path = folder / Path(name).name
         if not path.is_file() or store.sha256_file(path) != digest:
-            raise IntegrityError(
-                "a weight file is missing or altered",
-                where=str(path),
-                expected=f"sha256 {digest[:16]}...",
-                remedy=remedy,
-            )
+            what = "a weight file is missing or altered"
+            raise IntegrityError(what, where=str(path), expected=f"sha256 {digest[:16]}...", remedy=remedy)
         tensors |= read_tensors(path)
     return tensors
 
@@ -220,10 +211,6 @@ def latest(folder: Path) -> Checkpoint | None:
             problems.append(str(error))
             log.warn(f"checkpoint {path} does not verify and is skipped:", *str(error).splitlines())
     if problems:
-        raise IntegrityError(
-            "no checkpoint verifies",
-            where=str(folder),
-            got=f"{len(problems)} damaged",
-            remedy="restore the folder from a copy, or delete it to start again",
-        )
+        remedy = "restore the folder from a copy, or delete it to start again"
+        raise IntegrityError("no checkpoint verifies", where=str(folder), got=f"{len(problems)} damaged", remedy=remedy)
     return None

@@ -101,8 +101,7 @@ def _plain(value: Any) -> Any:
 def _without_retired(
     config_type: Any, values: Mapping[str, Any], where: str, path: str = "", fixed: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Settings without those of ``RETIRED`` and ``fixed``; UsageError for one with another value than results may
-    have."""
+    """Settings without those of ``RETIRED`` and ``fixed``; UsageError for one with another value than theirs."""
     known, rest = _types_of_fields(config_type), dict[str, Any]()
     retired = getattr(config_type, "RETIRED", {}) | {name: ("", getattr(config_type(), name)) for name in fixed}
     for name, value in values.items():
@@ -111,13 +110,8 @@ def _without_retired(
             inside = fixed_of(config_type, name)
             rest[name] = _without_retired(known[name], value, where, f"{path}{name}.", inside) if group else value
         elif (former := retired[name][1]) != (list(value) if isinstance(value, tuple) else value):
-            raise UsageError(
-                f"the setting {path}{name} was removed",
-                where=where,
-                expected=f"nothing, or {former!r}",
-                got=repr(value),
-                remedy="leave it out",
-            )
+            what, got = f"the setting {path}{name} was removed", repr(value)
+            raise UsageError(what, where=where, expected=f"nothing, or {former!r}", got=got, remedy="leave it out")
     return rest
 
 

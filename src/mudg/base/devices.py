@@ -72,13 +72,8 @@ def choose_device(wanted: str, purpose: str, kinds: tuple[str, ...] = ("cpu", "c
             "unknown device", where="--device", expected=f"auto, {', '.join(PROBLEMS)} or cuda:N", got=wanted
         )
     if SAME_CODE.get(kind, kind) not in kinds:
-        raise UsageError(
-            f"{purpose}: not implemented on this device",
-            where="--device",
-            expected=f"auto, {', '.join(kinds)}",
-            got=wanted,
-            remedy=REMEDY,
-        )
+        what = f"{purpose}: not implemented on this device"
+        raise UsageError(what, where="--device", expected=f"auto, {', '.join(kinds)}", got=wanted, remedy=REMEDY)
     problem = PROBLEMS[kind](int(number or 0))
     if problem:
         raise ResourceError(
@@ -112,8 +107,6 @@ def memory_of(device: torch.device, purpose: str) -> Iterator[None]:
     try:
         yield
     except torch.OutOfMemoryError as error:
-        raise ResourceError(
-            f"{purpose}: the memory of {device} ran out",
-            got=str(error).split(". ")[0],
-            remedy="smaller images (--width-px), fewer Gaussians (--densify.max-gaussians), or --device cpu",
-        ) from error
+        got = str(error).split(". ")[0]
+        remedy = "smaller images (--width-px), fewer Gaussians (--densify.max-gaussians), or --device cpu"
+        raise ResourceError(f"{purpose}: the memory of {device} ran out", got=got, remedy=remedy) from error

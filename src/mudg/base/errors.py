@@ -19,8 +19,7 @@ MOST_LETTERS: Final = 200
 _CONTROLS: Final = re.compile(
     "[\x00-\x1f\x7f-\x9f\xad\u061c\u200b\u200e\u200f\u2028-\u202e\u2060-\u2069\ufeff\ud800-\udfff]"
 )
-"""What a terminal obeys, what turns the direction of writing, what is not seen, and halves of letters that cannot be
-written."""
+"""What a terminal obeys, what turns the direction of writing, what is not seen, and halves of letters."""
 _LONGEST_LINE: Final = 2000
 _CONTINUED: Final = "\n    "
 """A further line of a remedy."""

@@ -74,11 +74,8 @@ def in_words(error: BaseException, smaller: str = "") -> MudgError | None:
 
 def ended_process(got: str = "") -> ResourceError:
     """A worker process that was killed."""
-    return ResourceError(
-        "a process ended without a word, most likely for want of memory",
-        got=got,
-        remedy="take fewer processes, or a machine with more memory; repeat the command to resume",
-    )
+    remedy = "take fewer processes, or a machine with more memory; repeat the command to resume"
+    return ResourceError("a process ended without a word, most likely for want of memory", got=got, remedy=remedy)
 
 
 def _is_memory(error: BaseException) -> bool:
@@ -101,8 +98,7 @@ def _asked(error: BaseException) -> str:
 
 
 def silence(stream: int) -> None:
-    """Let a stream that cannot be written (1: stdout, 2: stderr) lead nowhere, so that nothing fails when the process
-    ends."""
+    """Let a stream that cannot be written (1: stdout, 2: stderr) lead nowhere: the process ends without an error."""
     with contextlib.suppress(OSError):
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, stream)

@@ -111,8 +111,7 @@ def quaternion_from_matrix(rotation: ArrayLike) -> Matrix:
 
 
 def matrix_from_quaternion(quaternion: ArrayLike) -> Matrix:
-    """Rotation f64[3, 3] of a quaternion (w, x, y, z), which is normalised here. InputError if it is zero or not
-    finite."""
+    """Rotation f64[3, 3] of a quaternion (w, x, y, z) of any length. InputError if it is zero or not finite."""
     q = np.asarray(quaternion, np.float64)
     norm = float(np.linalg.norm(q))
     if not np.isfinite(norm) or norm < 1e-12:
@@ -148,8 +147,7 @@ def interpolate_pose(a_from_b0: Matrix, a_from_b1: Matrix, u: float) -> Matrix:
 
 
 def pose_at(times_s: NDArray[np.float64], poses: Matrix, time_s: float, tolerance_s: float = 1e-6) -> Matrix | None:
-    """Interpolate pose keys f64[T, 4, 4] at ``time_s``; exact at the keys, None outside their span (never
-    extrapolated)."""
+    """Interpolate pose keys f64[T, 4, 4] at ``time_s``; exact at the keys, None outside their span."""
     if len(times_s) == 0 or time_s < times_s[0] - tolerance_s or time_s > times_s[-1] + tolerance_s:
         return None
     after = int(np.searchsorted(times_s, time_s))

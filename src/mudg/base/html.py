@@ -1,5 +1,4 @@
-"""Pages and model cards from the Jinja templates of ``assets/templates``. On pages every value is escaped; CSS and
-scripts lie inside."""
+"""Pages, with all values escaped and CSS and scripts inside, and model cards from ``assets/templates`` (Jinja)."""
 
 from __future__ import annotations
 
@@ -25,21 +24,11 @@ PUBLISHED: Final = "published"
 ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
 SENSES: Final = {"higher": "higher is better", "lower": "lower is better", "one": "nearest to 1 is best"}
 """Which way the numbers of a column are better, as a sign and in words."""
-_LATEX: Final = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "↑": r"$\uparrow$",
-    "↓": r"$\downarrow$",
-    "→": r"$\to$",
-}
+_LATEX: Final = (
+    {character: f"\\{character}" for character in "&%$#_{}"}
+    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
+    | {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\to$"}
+)
 
 
 @dataclass(frozen=True)

@@ -69,18 +69,11 @@ def checked_address(text: str) -> str:
     head, _, tail = rest.partition("/")
     # Azure: container@account; a password may hold a slash
     if ("@" in head and PACKAGES[scheme][0] != "adlfs") or ":" in head:
-        raise UsageError(
-            "an address holds a user or a password",
-            where=f"{scheme}://...",
-            remedy="leave them out and set the environment instead, e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY",
-        )
+        remedy = "leave them out and set the environment instead, e.g. AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY"
+        raise UsageError("an address holds a user or a password", where=f"{scheme}://...", remedy=remedy)
     if "?" in rest:
-        raise UsageError(
-            "an address holds a query, which may be a secret",
-            where=f"{scheme}://{head.partition('?')[0]}/...",
-            expected=f"{scheme}://bucket/folder",
-            remedy="leave the part from ? on out",
-        )
+        what, where = "an address holds a query, which may be a secret", f"{scheme}://{head.partition('?')[0]}/..."
+        raise UsageError(what, where=where, expected=f"{scheme}://bucket/folder", remedy="leave the part from ? on out")
     parts = [part for part in tail.split("/") if part]
     if ".." in parts or "." in parts or "\0" in rest or "::" in head:
         raise UsageError(
@@ -104,12 +97,8 @@ def _file_system(scheme: str, process: int) -> Any:
 
         found = fsspec.filesystem(scheme, **options)
     except ImportError as error:
-        raise ResourceError(
-            f"a package for {scheme}:// is missing",
-            expected=package,
-            got=str(error).split("\n")[0],
-            remedy=f"pip install 'mudg[{extra}]'",
-        ) from error
+        what, got = f"a package for {scheme}:// is missing", str(error).split("\n")[0]
+        raise ResourceError(what, expected=package, got=got, remedy=f"pip install 'mudg[{extra}]'") from error
     if package == "s3fs":
         found.retries = 2  # of what botocore has repeated already
     return found
@@ -174,8 +163,7 @@ def without_secrets(text: str) -> str:
 
 @contextlib.contextmanager
 def _in_words(doing: str, where: str, missing: str = "") -> Iterator[None]:
-    """Failures of a store's package as ResourceError. missing: what is wrong where the store says that nothing is
-    there."""
+    """Failures of a store's package as ResourceError. missing: what is wrong where nothing is there."""
     try:
         yield
     except FileNotFoundError as error:
@@ -430,12 +418,8 @@ class Location:
             }
             complete = values["state"] == "complete"
         except (InputError, KeyError, TypeError, AttributeError, ValueError) as error:
-            raise IntegrityError(
-                "the record of an upload is damaged",
-                where=str(record),
-                got=str(error).split("\n")[0],
-                remedy="upload the folder again, to another address",
-            ) from error
+            what, remedy = "the record of an upload is damaged", "upload the folder again, to another address"
+            raise IntegrityError(what, where=str(record), got=str(error).split("\n")[0], remedy=remedy) from error
         return Upload(complete, {_plain(name, str(record)): one for name, one in files.items()})
 
     def fetch(self, to: Path, *, mirror: bool = False) -> None:
@@ -505,13 +489,10 @@ class Location:
         at = next(one for one in (to.absolute(), *to.absolute().parents) if one.exists())
         free = shutil.disk_usage(at).free
         if missing + _LEFT_FREE > free:
-            raise ResourceError(
-                "not enough space to fetch data",
-                where=str(to),
-                expected=f"{memory.in_words(missing)} for {self}",
-                got=f"{memory.in_words(free)} free",
-                remedy="free disk space, or choose a folder on a larger disk (--scratch)",
-            )
+            what = "not enough space to fetch data"
+            expected, got = f"{memory.in_words(missing)} for {self}", f"{memory.in_words(free)} free"
+            remedy = "free disk space, or choose a folder on a larger disk (--scratch)"
+            raise ResourceError(what, where=str(to), expected=expected, got=got, remedy=remedy)
 
     def _get(self, parts: Mapping[str, Path]) -> None:
         if self.local is not None:
@@ -548,12 +529,8 @@ class Location:
             return
         foreign = sorted(set(files) & set(sizes)) if earlier is None else []
         if foreign:
-            raise UsageError(
-                "the output address holds files of something else",
-                where=self.text,
-                got=", ".join(foreign[:8]),
-                remedy="choose an address at which nothing is",
-            )
+            what, got = "the output address holds files of something else", ", ".join(foreign[:8])
+            raise UsageError(what, where=self.text, got=got, remedy="choose an address at which nothing is")
         manifest = {store.MANIFEST} & set(files)
         (self / store.MANIFEST).remove()  # from now on it is no result
         record = self / CONTENTS
@@ -570,13 +547,9 @@ class Location:
         sizes = self.tree()
         for name in sorted(set(files) - manifest):
             if sizes.get(name) != files[name].size:
-                raise IntegrityError(
-                    "a file did not arrive as it was sent",
-                    where=f"{self}/{name}",
-                    expected=f"{files[name].size} bytes",
-                    got=f"{sizes.get(name, 'no')} bytes",
-                    remedy="repeat the command to upload it again",
-                )
+                what, where = "a file did not arrive as it was sent", f"{self}/{name}"
+                got, remedy = f"{sizes.get(name, 'no')} bytes", "repeat the command to upload it again"
+                raise IntegrityError(what, where=where, expected=f"{files[name].size} bytes", got=got, remedy=remedy)
         record.save(Upload(True, files).content())
         if manifest:
             (self / store.MANIFEST).save(store.read_bytes(frm / store.MANIFEST))
@@ -628,10 +601,7 @@ def _verify(part: Path, wanted: Expected, where: str) -> None:
     size, sha256 = part.stat().st_size, store.sha256_file(part) if wanted.sha256 else ""
     if (size, sha256) != (wanted.size, wanted.sha256):
         store.remove(part)
-        raise IntegrityError(
-            "what came is not what was uploaded",
-            where=where,
-            expected=f"{wanted.size} bytes, sha256 {wanted.sha256[:16]}...",
-            got=f"{size} bytes, sha256 {sha256[:16]}...",
-            remedy="repeat the command; if it fails again, upload the data again",
-        )
+        what = "what came is not what was uploaded"
+        expected, got = f"{wanted.size} bytes, sha256 {wanted.sha256[:16]}...", f"{size} bytes, sha256 {sha256[:16]}..."
+        remedy = "repeat the command; if it fails again, upload the data again"
+        raise IntegrityError(what, where=where, expected=expected, got=got, remedy=remedy)

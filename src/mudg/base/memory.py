@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 import os
 import re
 import sys
@@ -19,32 +18,28 @@ from mudg.base.errors import ResourceError
 
 GIB: Final = 1 << 30
 LEAST_ADDRESS_SPACE: Final = GIB
-"""With less, torch and the libraries behind it cannot be loaded, and end the process in ways that no program can
-catch."""
+"""With less, torch and the libraries behind it cannot be loaded, and end the process in ways no program can catch."""
 
 
 def free_bytes() -> int:
     """Memory that this process may still take: what the machine has, at most what a control group or ``ulimit -v``
-    allows; 0 where the system does not say."""
-    return min((one for one in (machine_bytes(), _group_bytes(), _address_bytes()) if one is not None), default=0)
+    allows; 0 where there is not even memory to ask."""
+    try:
+        import psutil  # late, as below: --help does without
 
-
-def machine_bytes() -> int | None:
-    """Memory that programs on this machine can still ask for; None where the system does not say."""
-    found = re.search(r"^MemAvailable:\s+(\d+) kB", system_text("/proc/meminfo"), re.MULTILINE)
-    return 1024 * int(found[1]) if found else None
+        left = (psutil.virtual_memory().available, _group_bytes(), _address_bytes())
+    except (ImportError, MemoryError, OSError):
+        return 0
+    return min(one for one in left if one is not None)
 
 
 def require_address_space(command: str) -> None:
     """ResourceError if ``ulimit -v`` leaves less than the libraries of ``command`` need just to be loaded."""
     left = _address_bytes()
     if left is not None and left < LEAST_ADDRESS_SPACE:
-        raise ResourceError(
-            f"{command} needs more memory than it may take",
-            expected=f"at least {in_words(LEAST_ADDRESS_SPACE)} of address space",
-            got=f"{in_words(left)} left of the limit (ulimit -v)",
-            remedy="raise the limit with ulimit -v",
-        )
+        expected = f"at least {in_words(LEAST_ADDRESS_SPACE)} of address space"
+        got, remedy = f"{in_words(left)} left of the limit (ulimit -v)", "raise the limit with ulimit -v"
+        raise ResourceError(f"{command} needs more memory than it may take", expected=expected, got=got, remedy=remedy)
 
 
 def require(count: int, asked: str, remedy: str) -> None:
@@ -55,21 +50,15 @@ def require(count: int, asked: str, remedy: str) -> None:
     """
     free = free_bytes()
     if free and count > free:
-        raise ResourceError(
-            f"{asked} needs more memory than there is",
-            expected=f"about {in_words(count)}",
-            got=f"{in_words(free)} free",
-            remedy=remedy,
-        )
+        what = f"{asked} needs more memory than there is"
+        raise ResourceError(what, expected=f"about {in_words(count)}", got=f"{in_words(free)} free", remedy=remedy)
 
 
 def give_back() -> None:
-    """Hand the system what was freed: glibc keeps freed memory for later, up to hundreds of megabytes after a fit.
-    Elsewhere: nothing."""
-    if sys.platform == "linux":
-        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
-        if trim is not None:
-            trim(0)
+    """Give back what was freed: C libraries keep freed memory for later, up to hundreds of megabytes after a fit."""
+    import psutil
+
+    getattr(psutil, "heap_trim", bool)()  # not with every C library
 
 
 def in_words(count: float) -> str:
@@ -96,11 +85,11 @@ def _address_bytes() -> int | None:
         return None
     import resource
 
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    pages = system_text("/proc/self/statm").split()
-    if limit == resource.RLIM_INFINITY or not pages:
+    if (limit := resource.getrlimit(resource.RLIMIT_AS)[0]) == resource.RLIM_INFINITY:
         return None
-    return max(0, limit - int(pages[0]) * resource.getpagesize())
+    import psutil
+
+    return max(0, limit - psutil.Process().memory_info().vms)
 
 
 def system_text(path: str) -> str:
@@ -140,8 +129,7 @@ class Resident(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What was taken so far. processor_s: of all threads, and of child processes that have ended. peak_bytes: None =
-    not known."""
+    """What was taken so far. processor_s: of all threads, and of child processes that ended. peak_bytes: if known."""
 
     seconds: float = 0.0
     processor_s: float = 0.0

@@ -10,82 +10,28 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-CLASSES: Final = (
-    "road",
-    "sidewalk",
-    "building",
-    "wall",
-    "fence",
-    "pole",
-    "traffic light",
-    "traffic sign",
-    "vegetation",
-    "terrain",
-    "sky",
-    "person",
-    "rider",
-    "car",
-    "truck",
-    "bus",
-    "train",
-    "motorcycle",
-    "bicycle",
+CLASSES: Final = tuple(
+    "road,sidewalk,building,wall,fence,pole,traffic light,traffic sign,vegetation,terrain,sky,person,rider,car,truck,"
+    "bus,train,motorcycle,bicycle".split(",")
 )
 ID: Final = {name: index for index, name in enumerate(CLASSES)}
 UNLABELLED: Final = 255
 DYNAMIC_IDS: Final = tuple(ID[n] for n in ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle"))
 
-COLORS: Final[NDArray[np.uint8]] = np.array(
-    [
-        [255, 120, 50],
-        [255, 192, 203],
-        [255, 255, 0],
-        [0, 150, 245],
-        [0, 255, 255],
-        [255, 127, 0],
-        [255, 0, 0],
-        [255, 240, 150],
-        [135, 60, 0],
-        [160, 32, 240],
-        [255, 0, 255],
-        [139, 137, 137],
-        [75, 0, 75],
-        [150, 240, 80],
-        [230, 230, 250],
-        [0, 175, 0],
-        [0, 255, 127],
-        [222, 155, 161],
-        [140, 62, 69],
-    ],
-    dtype=np.uint8,
-)
-COLORS.setflags(write=False)
 
-DISPLAY_COLORS: Final[NDArray[np.uint8]] = np.array(
-    [
-        [128, 64, 128],
-        [244, 35, 232],
-        [70, 70, 70],
-        [102, 102, 156],
-        [190, 153, 153],
-        [153, 153, 153],
-        [250, 170, 30],
-        [220, 220, 0],
-        [107, 142, 35],
-        [152, 251, 152],
-        [70, 130, 180],
-        [220, 20, 60],
-        [255, 0, 0],
-        [0, 0, 142],
-        [0, 0, 70],
-        [0, 60, 100],
-        [0, 80, 100],
-        [0, 0, 230],
-        [119, 11, 32],
-    ],
-    dtype=np.uint8,
+def _table(colors: str) -> NDArray[np.uint8]:
+    """Colours as #RRGGBB, without the #, as u8[19, 3] that cannot be written to."""
+    return np.frombuffer(bytes.fromhex(colors), np.uint8).reshape(-1, 3)
+
+
+COLORS: Final = _table(
+    "ff7832 ffc0cb ffff00 0096f5 00ffff ff7f00 ff0000 fff096 873c00 a020f0 ff00ff 8b8989 4b004b 96f050 e6e6fa "
+    "00af00 00ff7f de9ba1 8c3e45"
 )
-DISPLAY_COLORS.setflags(write=False)
+DISPLAY_COLORS: Final = _table(
+    "804080 f423e8 464646 66669c be9999 999999 faaa1e dcdc00 6b8e23 98fb98 4682b4 dc143c ff0000 00008e 000046 "
+    "003c64 005064 0000e6 770b20"
+)
 
 
 def encode(ids: NDArray[np.integer], colors: NDArray[np.uint8] = COLORS) -> NDArray[np.uint8]:

@@ -166,12 +166,8 @@ def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) 
                 return machine.result()
             machine.step(opcode.name, argument)
     except _MALFORMED as error:
-        raise InputError(
-            "pickle is malformed or cut off",
-            where=where,
-            got=f"{type(error).__name__}: {error}"[:200],
-            remedy="copy the file again",
-        ) from error
+        what, remedy = "pickle is malformed or cut off", "copy the file again"
+        raise InputError(what, where=where, got=f"{type(error).__name__}: {error}"[:200], remedy=remedy) from error
     raise InputError("pickle is cut off", where=where, expected="an end mark", remedy="copy the file again")
 
 
@@ -232,12 +228,9 @@ class _Machine:
         elif opcode == "DUP":
             stack.append(stack[-1])
         else:
-            raise InputError(
-                "pickle uses an operation that plain data does not need",
-                where=self._where,
-                got=opcode,
-                remedy="the file is not what the data set ships; do not open it with Python's pickle",
-            )
+            what = "pickle uses an operation that plain data does not need"
+            remedy = "the file is not what the data set ships; do not open it with Python's pickle"
+            raise InputError(what, where=self._where, got=opcode, remedy=remedy)
 
     def _since_mark(self) -> list[Any]:
         for index in range(len(self._stack) - 1, -1, -1):
@@ -254,13 +247,9 @@ class _Machine:
             name, module = self._stack.pop(), self._stack.pop()
         text = f"{module}.{name}"
         if text not in self._makers:
-            raise InputError(
-                f"pickle asks for {text!r}, which is not plain data",
-                where=self._where,
-                expected="numbers, texts, lists and arrays",
-                got=text[:120],
-                remedy="nothing was run. If the file comes from the data set itself, convert it to a plain format",
-            )
+            what, where, got = f"pickle asks for {text!r}, which is not plain data", self._where, text[:120]
+            remedy = "nothing was run. If the file comes from the data set itself, convert it to a plain format"
+            raise InputError(what, where=where, expected="numbers, texts, lists and arrays", got=got, remedy=remedy)
         self._stack.append(Name(text))
 
     def _remember(self, opcode: str, argument: Any) -> None:

@@ -40,8 +40,7 @@ _FLOAT: Final = re.compile(
 _DIRECTIVE: Final = re.compile(r"^%", re.MULTILINE)
 _MERGE: Final = "<<"
 Lines = dict[tuple[str | int, ...], int]
-"""Where a value stands, as keys and numbers of entries from the outermost value in -> line of its key or entry, from
-1."""
+"""Where a value stands, as keys and numbers of entries from the outermost value in -> line, from 1."""
 
 
 def parse_yaml(text: str | bytes, where: str, largest: int = LARGEST_BYTES) -> Any:
@@ -106,8 +105,7 @@ def _at(where: str, line: int) -> str:
 
 @dataclass(slots=True)
 class _Open:
-    """A list or mapping that is being read. count: values in it so far; key: of the value that comes next, None where a
-    key does."""
+    """A list or mapping that is being read. count: values in it so far; key: of the value that comes next, if any."""
 
     value: Any
     anchor: str | None
@@ -152,13 +150,8 @@ class _Builder:
     def _node(self, event: Any, line: int) -> None:
         at = _at(self._where, line)
         if getattr(event, "tag", None) is not None:
-            raise InputError(
-                "a value says of which type it is",
-                where=at,
-                got=f"{event.tag}",
-                expected="a plain value",
-                remedy="leave out the word that begins with !",
-            )
+            what, remedy = "a value says of which type it is", "leave out the word that begins with !"
+            raise InputError(what, where=at, got=f"{event.tag}", expected="a plain value", remedy=remedy)
         is_alias, is_scalar = isinstance(event, yaml.AliasEvent), isinstance(event, yaml.ScalarEvent)
         if not is_alias and event.anchor is not None and len(self._anchored) + len(self._open) > MOST_ANCHORS:
             raise InputError(
@@ -208,13 +201,8 @@ class _Builder:
                 if isinstance(event, yaml.CollectionStartEvent)
                 else f"*{event.anchor}"
             )
-            raise InputError(
-                "a key is no text",
-                where=at,
-                expected="the name of a setting",
-                got=got or "nothing",
-                remedy="put quotes around it, if it is a name",
-            )
+            what, remedy = "a key is no text", "put quotes around it, if it is a name"
+            raise InputError(what, where=at, expected="the name of a setting", got=got or "nothing", remedy=remedy)
         if key in holder.value and not (key == _MERGE and event.implicit[0]):
             raise InputError(f"{key!r} is given twice", where=at, remedy="keep one of them")
         if event.anchor is not None:
@@ -244,24 +232,17 @@ class _Builder:
             return
         self._open[-1].count += count
         if self._open[-1].count > self._most:
-            raise InputError(
-                "YAML stands for too many values",
-                where=_at(self._where, line),
-                expected=f"at most {self._most}",
-                got=f"{self._open[-1].count}" + (", repeated by aliases" if self._anchored else ""),
-            )
+            where = _at(self._where, line)
+            got = f"{self._open[-1].count}" + (", repeated by aliases" if self._anchored else "")
+            raise InputError("YAML stands for too many values", where=where, expected=f"at most {self._most}", got=got)
 
 
 def _scalar(event: yaml.ScalarEvent, at: str) -> Any:
     """The value of a word or a text."""
     text = event.value
     if len(text) > MOST_LETTERS:
-        raise InputError(
-            "a text is too long",
-            where=at,
-            expected=f"at most {MOST_LETTERS} letters",
-            got=f"{len(text)}: {text[:40]}...",
-        )
+        what = "a text is too long"
+        raise InputError(what, where=at, expected=f"at most {MOST_LETTERS} letters", got=f"{len(text)}: {text[:40]}...")
     if not text.isascii():
         text.encode()  # ValueError: half of a surrogate pair, as an escape
     if not event.implicit[0]:
@@ -272,12 +253,8 @@ def _scalar(event: yaml.ScalarEvent, at: str) -> Any:
     if number is None:
         return text
     if len(text) > MOST_DIGITS:
-        raise InputError(
-            "a number is too long",
-            where=at,
-            expected=f"at most {MOST_DIGITS} digits",
-            got=f"{len(text)}: {text[:40]}...",
-        )
+        what = "a number is too long"
+        raise InputError(what, where=at, expected=f"at most {MOST_DIGITS} digits", got=f"{len(text)}: {text[:40]}...")
     return number(
         text.replace("_", "")
         .replace(".inf", "inf")

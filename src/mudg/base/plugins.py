@@ -1,6 +1,5 @@
 """Importers and methods of other packages: entry points of the group ``mudg.plugins``, named ``importer.NAME`` or
-``method.NAME``. Names are read from the metadata of installed packages; a package's code is imported only when you ask
-for its name."""
+``method.NAME``. Names are read from package metadata; a package's code is imported only when you ask for its name."""
 
 from __future__ import annotations
 
@@ -38,9 +37,6 @@ def load_plugin(kind: Literal["importer", "method"], name: str) -> Any:
     try:
         return point.load()
     except (ImportError, AttributeError) as error:
-        raise UsageError(
-            f"the {kind} {name} of another package cannot be loaded",
-            where=origin(point),
-            got=f"{type(error).__name__}: {error}",
-            remedy="mend or uninstall the package that offers it",
-        ) from error
+        what = f"the {kind} {name} of another package cannot be loaded"
+        remedy = "mend or uninstall the package that offers it"
+        raise UsageError(what, where=origin(point), got=f"{type(error).__name__}: {error}", remedy=remedy) from error

@@ -59,8 +59,7 @@ GIB = 1 << 30
 
 @contextlib.contextmanager
 def one_torch_thread() -> Iterator[None]:
-    """One torch thread in this block: sums depend on the number of threads, results must not depend on how many cores
-    are free."""
+    """One torch thread in this block: sums depend on their number, results must not depend on how many are free."""
     import torch
 
     before = torch.get_num_threads()
@@ -95,16 +94,10 @@ def child_environment(threads: int, torch_threads: int = 1) -> Iterator[None]:
 
 
 def process_alive(pid: int) -> bool:
-    """Whether a process with this id runs on this machine; True where there is no harmless way to ask (Windows)."""
-    if os.name == "nt":
-        return True  # signal 0 would end the process there
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    except OSError:
-        return True
-    return pid > 0
+    """Whether a process with this id runs on this machine."""
+    import psutil  # late: --help does without
+
+    return psutil.pid_exists(pid)
 
 
 # ---- interrupts ----------------------------------------------------------------------------------
@@ -323,8 +316,7 @@ def _kill(pool: concurrent.futures.ProcessPoolExecutor) -> None:
 
 
 def _stop(pool: concurrent.futures.ProcessPoolExecutor) -> None:
-    """End the calls of a pool: a fit writes its checkpoint. Who has not ended in time, or when this is interrupted, is
-    killed."""
+    """End the calls of a pool: a fit writes its checkpoint. Who does not end in time, or at an interrupt, is killed."""
     members = _members(pool)
     pool.shutdown(wait=False, cancel_futures=True)
     waiting, begun_s = {process.sentinel for process in members}, time.monotonic()
@@ -347,8 +339,7 @@ _stop_asked = threading.Event()
 
 
 def _stoppable(function: Callable[..., Result], items: tuple[Any, ...]) -> Result:
-    """A call in a worker; SIGTERM and Ctrl-C raise KeyboardInterrupt in it, unless it takes them itself
-    (``Interruption``)."""
+    """A call in a worker; SIGTERM and Ctrl-C raise KeyboardInterrupt in it, unless it takes them (``Interruption``)."""
     heard = [n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) != signal.SIG_IGN]
     try:
         for number in heard:
@@ -404,8 +395,7 @@ LIFE_LINE = "MUDG_LIFE_LINE"
 
 @contextlib.contextmanager
 def life_line() -> Iterator[int]:
-    """A file number to be handed to a command (in ``LIFE_LINE``, and kept open there): it ends when this process
-    does."""
+    """A file number for a command (in ``LIFE_LINE``, and kept open there): it ends when this process does."""
     theirs, ours = os.pipe()
     try:
         yield theirs
@@ -429,8 +419,7 @@ def _exit_at_end_of(number: int) -> None:
 
 
 def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -> Generator[Result, None, None]:
-    """``compute(0)``, ``compute(1)``, ... in order, a few of them computed beforehand by other threads, each with one
-    torch thread."""
+    """``compute(0)``, ``compute(1)``, ... in order, a few ahead in other threads, each with one torch thread."""
     with one_torch_thread(), concurrent.futures.ThreadPoolExecutor(threads) as pool:
         waiting: deque[concurrent.futures.Future[Result]] = deque()
         try:
@@ -469,12 +458,10 @@ def run_limited(
         try:
             return pool.submit(_limited, work, limit_bytes, where, out_of_memory).result()
         except BrokenProcessPool as error:
-            raise ResourceError(
-                "the converting process was ended from outside, most likely for want of memory",
-                where=str(where),
-                expected=f"about {limit_bytes / GIB:.0f} GiB of address space, of which the file takes most",
-                remedy="close other programs, raise the limit (ulimit -v), or take a machine with more memory",
-            ) from error
+            what = "the converting process was ended from outside, most likely for want of memory"
+            expected = f"about {limit_bytes / GIB:.0f} GiB of address space, of which the file takes most"
+            remedy = "close other programs, raise the limit (ulimit -v), or take a machine with more memory"
+            raise ResourceError(what, where=str(where), expected=expected, remedy=remedy) from error
 
 
 def _limited(
@@ -485,8 +472,9 @@ def _limited(
         return 0
     import resource
 
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    most = pages * resource.getpagesize() + limit_bytes
+    import psutil
+
+    most = psutil.Process().memory_info().vms + limit_bytes
     hard = resource.getrlimit(resource.RLIMIT_AS)[1]  # of the shell (ulimit -v), which cannot be raised
     most = most if hard == resource.RLIM_INFINITY else min(most, hard)
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
@@ -495,11 +483,7 @@ def _limited(
     except (MemoryError, RuntimeError) as error:
         if isinstance(error, RuntimeError) and not out_of_memory(error):
             raise
-        raise ResourceError(
-            "conversion needs more memory than it may take",
-            where=str(where),
-            expected=f"<= {limit_bytes / 1e9:.1f} GB",
-            got=(str(error).splitlines() or [""])[0][:200],
-            remedy="raise --memory-gb, unless the file should be small",
-        ) from error
+        what, expected = "conversion needs more memory than it may take", f"<= {limit_bytes / 1e9:.1f} GB"
+        got, remedy = (str(error).splitlines() or [""])[0][:200], "raise --memory-gb, unless the file should be small"
+        raise ResourceError(what, where=str(where), expected=expected, got=got, remedy=remedy) from error
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024

@@ -41,8 +41,7 @@ _MEANINGS: Final = {
 
 
 class StrictRecord(BaseModel):
-    """A JSON object with known fields: types are not converted, unknown fields are refused and the nearest name
-    suggested."""
+    """A JSON object with known fields: no types are converted; others are refused, the nearest name suggested."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
 
@@ -55,8 +54,7 @@ class StrictRecord(BaseModel):
 
 
 class ForeignRecord(StrictRecord):
-    """A JSON object of a format that belongs to others: types are not converted; fields that it does not know are
-    passed over."""
+    """A JSON object of somebody else's format: no types are converted; fields that it does not know are passed over."""
 
     model_config = ConfigDict(strict=True, frozen=True, extra="allow")
 
@@ -217,11 +215,9 @@ def understood(what: str, where: str) -> Iterator[None]:
     except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RuntimeError) as error:
         if failures.in_words(error) is not None:  # want of memory
             raise
+        got, remedy = f"{type(error).__name__}: {error}", "make it again, or take an undamaged copy"
         raise InputError(
-            f"this cannot be read as {what}: parts are missing, or do not fit",
-            where=where,
-            got=f"{type(error).__name__}: {error}",
-            remedy="make it again, or take an undamaged copy",
+            f"this cannot be read as {what}: parts are missing, or do not fit", where=where, got=got, remedy=remedy
         ) from error
 
 

@@ -91,12 +91,9 @@ class Replacement:
         except OSError as error:
             if self.retired.exists() and not self.folder.exists():
                 self.retired.rename(self.folder)
-            raise ResourceError(
-                "the new result cannot take the place of the old one",
-                where=str(self.folder),
-                got=str(error),
-                remedy=f"it is finished and lies in {self.staging}; repeat the command, or move it",
-            ) from error
+            what = "the new result cannot take the place of the old one"
+            remedy = f"it is finished and lies in {self.staging}; repeat the command, or move it"
+            raise ResourceError(what, where=str(self.folder), got=str(error), remedy=remedy) from error
         store.fsync_directory(self.folder.parent)
         self._remove_retired(own_names)
 
@@ -121,12 +118,9 @@ class Replacement:
             self.staging.rename(self.folder)
             store.fsync_directory(self.folder.parent)
         elif self.staging.exists() or not is_finished(self.folder):
-            raise UsageError(
-                "a cut-off replacement and another folder are in each other's way",
-                where=str(self.folder),
-                got=f"the replaced result in {self.retired}",
-                remedy="move one of them elsewhere",
-            )
+            what = "a cut-off replacement and another folder are in each other's way"
+            remedy = "move one of them elsewhere"
+            raise UsageError(what, where=str(self.folder), got=f"the replaced result in {self.retired}", remedy=remedy)
         log.warn(f"{self.folder}: finished replacing the old result, which had been cut off")
         self._remove_retired(own_names)
 
@@ -239,35 +233,22 @@ def _refuse_impossible(out: Path | str) -> None:
     real = os.path.realpath(text)
     longest = max(len(os.fsencode(part)) for part in (*Path(text).parts, Path(real).name, "."))
     if longest > _LONGEST_NAME or len(os.fsencode(real)) > _LONGEST_PATH:
-        raise UsageError(
-            "the output's name is too long",
-            where=f"{text[:120]}...",
-            got=f"{longest} and {len(os.fsencode(real))} bytes",
-            expected=f"names of at most {_LONGEST_NAME} bytes, paths of at most {_LONGEST_PATH}",
-            remedy="choose a shorter --out",
-        )
+        what, got = "the output's name is too long", f"{longest} and {len(os.fsencode(real))} bytes"
+        expected = f"names of at most {_LONGEST_NAME} bytes, paths of at most {_LONGEST_PATH}"
+        raise UsageError(what, where=f"{text[:120]}...", got=got, expected=expected, remedy="choose a shorter --out")
     above = next((one for one in Path(real).parents if os.path.lexists(one)), None)
     if above is not None and not above.is_dir():
-        raise UsageError(
-            "the output lies below something that is no folder",
-            where=text,
-            got=str(above),
-            remedy="choose another --out",
-        )
+        remedy = "choose another --out"
+        raise UsageError("the output lies below something that is no folder", where=text, got=str(above), remedy=remedy)
 
 
 def _refuse(relation: str, out: str, name: str, given: Path | str) -> None:
-    raise UsageError(
-        f"the output {relation} an input",
-        where=f"output: {out}",
-        got=f"{name}: {given}",
-        remedy="choose an output apart from everything that is read",
-    )
+    remedy = "choose an output apart from everything that is read"
+    raise UsageError(f"the output {relation} an input", where=f"output: {out}", got=f"{name}: {given}", remedy=remedy)
 
 
 def _line_of(path: Path) -> list[object]:
-    """What identifies a path, then each folder above it: the file system's own number, or the name of what does not
-    exist."""
+    """What identifies a path, then each folder above it: the file system's own number, else the name."""
     real = Path(os.path.realpath(path))
     return [_identity(one) for one in (real, *real.parents)]
 
@@ -338,12 +319,8 @@ def run_state(folder: Path) -> dict[str, Any]:
     )
     if not folder.is_dir():
         if os.path.lexists(folder):
-            raise UsageError(
-                "the output is no folder",
-                where=str(folder),
-                got=_what_is(folder),
-                remedy="choose the name of a folder that does not exist yet",
-            )
+            remedy = "choose the name of a folder that does not exist yet"
+            raise UsageError("the output is no folder", where=str(folder), got=_what_is(folder), remedy=remedy)
         return {}
     if not (folder / _STATE).is_file():
         if any(not is_temporary(entry.name) and not _is_lock(entry) for entry in folder.iterdir()):
@@ -360,8 +337,7 @@ def run_state(folder: Path) -> dict[str, Any]:
 
 
 def known_input(folder: Path, name: str) -> Path | None:
-    """Where an input of a finished result lies, as seen from the result or from the root; None if unknown, gone or
-    changed."""
+    """Where an input of a result lies, as seen from the result or from the root; None if unknown, gone or changed."""
     try:
         state = store.read_json(folder / _STATE)
         places, digest = state["paths"][name], state["inputs"][name]
@@ -578,8 +554,7 @@ class RunDir:
         store.append_line(self.path / _LOG, store.json_text(fields, indent=None))
 
     def pause(self, summary: Mapping[str, Any] | None = None) -> None:
-        """Record an interruption: time spent so far is kept, the lock released; the same command continues. Said
-        once."""
+        """Record an interruption, once: the time spent is kept, the lock released; the same command continues."""
         if self._ended:
             return
         self._ended = True
@@ -653,12 +628,9 @@ def _refuse_other(
     with contextlib.suppress(InputError):
         old = parse_yaml(store.read_bytes(path / _SETTINGS), str(path / _SETTINGS)) or {}
         found += differences(old, {"verb": verb, **json.loads(store.json_text(dict(config)))})
-    raise UsageError(
-        "the output folder holds the result of another configuration",
-        where=str(path),
-        got="; ".join(found[:8]) or "another program version",
-        remedy="choose another --out, or add --overwrite to replace it",
-    )
+    what = "the output folder holds the result of another configuration"
+    got = "; ".join(found[:8]) or "another program version"
+    raise UsageError(what, where=str(path), got=got, remedy="choose another --out, or add --overwrite to replace it")
 
 
 def _drop_lock_of_the_dead(lock: Path) -> None:
@@ -711,12 +683,9 @@ def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
     pid, host = owner
     if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
         busy = "writing this file" if what else "working in this folder"
-        raise ResourceError(
-            f"another process is {busy}",
-            where=str(what or lock.parent),
-            got=f"pid {pid} on {host}",
-            remedy=f"wait for it, or choose another --out; if it is no longer running, delete {lock}",
-        )
+        got = f"pid {pid} on {host}"
+        remedy = f"wait for it, or choose another --out; if it is no longer running, delete {lock}"
+        raise ResourceError(f"another process is {busy}", where=str(what or lock.parent), got=got, remedy=remedy)
 
 
 # result file --------------------------------------------------------------------------------------
@@ -853,23 +822,16 @@ class ResultFile:
         if about.get("key") == self.key and [one.name for one in there] == [about["file"]]:
             self.complete = store.digest(there[0]) == about["sha256"]
             if not (self.complete or overwrite):
-                raise IntegrityError(
-                    "a file was altered after it was written",
-                    where=str(there[0]),
-                    expected=f"sha256 {about['sha256']}",
-                    remedy="add --overwrite to make it again, or choose another --out",
-                )
+                what = "a file was altered after it was written"
+                remedy = "add --overwrite to make it again, or choose another --out"
+                raise IntegrityError(what, where=str(there[0]), expected=f"sha256 {about['sha256']}", remedy=remedy)
         elif not overwrite:
             self._unknown = bool(there) and not os.path.lexists(file)
             blocked = (not there and not about and os.path.lexists(file)) or (there and not self._unknown)
             if blocked:
                 got = "a result of other settings or inputs" if about else "a file of something else"
-                raise UsageError(
-                    "the file exists",
-                    where=str(there[0] if there else file),
-                    got=got,
-                    remedy="choose another --out, or add --overwrite",
-                )
+                remedy = "choose another --out, or add --overwrite"
+                raise UsageError("the file exists", where=str(there[0] if there else file), got=got, remedy=remedy)
 
     def _recover(self) -> None:
         """Complete a ``finish`` that was cut off after its description was written, undo one that was before."""

@@ -50,13 +50,8 @@ class ScratchFile:
             while len(left):
                 count = self._read_into(left, begins + size - len(left))
                 if count == 0:
-                    raise ResourceError(
-                        "a scratch file ended early",
-                        where=self.where,
-                        expected=f"{begins + size} bytes",
-                        got=f"{begins + size - len(left)}",
-                        remedy=remedy,
-                    )
+                    what, where, got = "a scratch file ended early", self.where, f"{begins + size - len(left)}"
+                    raise ResourceError(what, where=where, expected=f"{begins + size} bytes", got=got, remedy=remedy)
                 left = left[count:]
         return found
 

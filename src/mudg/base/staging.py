@@ -133,23 +133,15 @@ class _Staging:
 
     def _check(self) -> None:
         if getattr(self.args, "list", None) is not None:
-            raise UsageError(
-                "a list is worked on in folders of this machine",
-                where="--list",
-                got=str(next(iter((*self.inputs, *self.outputs)))),
-                remedy="give paths for --list and --out",
-            )
+            got, remedy = str(next(iter((*self.inputs, *self.outputs)))), "give paths for --list and --out"
+            raise UsageError("a list is worked on in folders of this machine", where="--list", got=got, remedy=remedy)
         for out in self.outputs:
             if out.text.count("/") < 3:
                 raise UsageError("an output is a folder or file in a bucket", where=str(out), expected=f"{out}/name")
             for given in self.inputs:
                 if f"{out}/".startswith(f"{given}/") or f"{given}/".startswith(f"{out}/"):
-                    raise UsageError(
-                        "the output touches an input",
-                        where=f"output: {out}",
-                        got=f"input: {given}",
-                        remedy="choose an output apart from everything that is read",
-                    )
+                    where, remedy = f"output: {out}", "choose an output apart from everything that is read"
+                    raise UsageError("the output touches an input", where=where, got=f"input: {given}", remedy=remedy)
 
     @contextlib.contextmanager
     def locked(self) -> Iterator[None]:
@@ -217,12 +209,8 @@ def _refuse_in_settings(settings: Any, where: str) -> None:
     elif isinstance(settings, str | Path):
         found = re.match(r"([a-z0-9]+):/", str(settings))
         if found and found[1] in PACKAGES:
-            raise UsageError(
-                "a setting names a path of this machine",
-                where=f"--{where.replace('_', '-')}",
-                got=str(settings)[:200],
-                remedy="fetch what is there, and give its folder",
-            )
+            what, remedy = "a setting names a path of this machine", "fetch what is there, and give its folder"
+            raise UsageError(what, where=f"--{where.replace('_', '-')}", got=str(settings)[:200], remedy=remedy)
 
 
 def _make_private(folder: Path) -> None:
@@ -242,8 +230,7 @@ def _make_private(folder: Path) -> None:
 
 
 def _fetch_earlier(given: Location, at: Path) -> None:
-    """What the output holds already: the verb reuses it, or refuses it. What an interrupted command left here goes
-    first."""
+    """What the output holds already: the verb reuses or refuses it. What an interrupted command left goes first."""
     store.make_folder(at.parent)
     if at.exists() or not given.exists():
         return
@@ -251,11 +238,8 @@ def _fetch_earlier(given: Location, at: Path) -> None:
     if record is not None and not record.complete:
         return  # an upload that was stopped; this one takes its place
     if record is None and store.MANIFEST not in (names := given.names()) and names:
-        raise UsageError(
-            "the output address holds files of something else",
-            where=str(given),
-            remedy="choose an address at which nothing is",
-        )
+        remedy = "choose an address at which nothing is"
+        raise UsageError("the output address holds files of something else", where=str(given), remedy=remedy)
     log.info(f"fetching what {given} holds")
     partial = at.parent / f".{at.name}.earliers.part"
     given.fetch(partial, mirror=True)

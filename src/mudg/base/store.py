@@ -117,8 +117,7 @@ def write_blocks(path: Path, blocks: Iterable[bytes]) -> None:
 
 
 def write_image(path: Path, picture: NDArray[np.uint8] | Image.Image, **options: Any) -> None:
-    """Write a picture, u8[H, W, 3] or Pillow's, completely or not at all; the suffix names the format, ``options`` are
-    Pillow's."""
+    """Write a picture, u8[H, W, 3] or Pillow's, completely or not at all; the suffix names the format."""
     from PIL import Image
 
     with atomic_path(path) as temporary:
@@ -162,8 +161,7 @@ def sync_tree(folder: Path) -> None:
 
 
 def create_once(path: Path, content: bytes) -> bool:
-    """Write a file that does not exist yet, completely; False if it does. Of several processes that try, one
-    succeeds."""
+    """Write a file that does not exist yet, completely; False if it does. Of several that try, one succeeds."""
     path = Path(path)
     make_folder(path.parent)
     with disk_errors("cannot write here", path):
@@ -514,8 +512,7 @@ def list_files(folder: Path) -> list[str]:
 
 
 def write_manifest(folder: Path, names: Sequence[str] | None = None) -> str:
-    """Record size and sha256 of files below ``folder`` (None: of every file); return the digest of the record
-    itself."""
+    """Record size and sha256 of files below ``folder`` (None: of all); return the digest of the record itself."""
     files = {}
     for name in list_files(folder) if names is None else names:
         files[name] = {"bytes": (folder / name).stat().st_size, "sha256": sha256_file(folder / name)}
@@ -547,8 +544,7 @@ def verify_manifest(folder: Path) -> str:
 
 
 def sealed(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """The record of a finished run, with what proves it and the other bookkeeping unaltered: digests of manifest, log
-    and record."""
+    """The record of a finished run with the digests of manifest, log and record, which prove them unaltered."""
     log = folder / RUN_LOG
     digests = {"manifest": sha256_file(folder / MANIFEST), "log": sha256_file(log) if log.is_file() else None}
     return with_check({**values, "sealed": digests})
@@ -588,21 +584,13 @@ def verify_record(folder: Path) -> None:
         check, digests = (record.pop("check"), record["sealed"]) if state == "complete" else ("", {})
         intact = check == (_check(record) if digests else "")
     except (InputError, KeyError, TypeError, AttributeError) as error:
-        raise IntegrityError(
-            "the record of a run is damaged",
-            where=str(path),
-            got=str(error).split("\n")[0],
-            remedy="make the result again in another folder",
-        ) from error
+        got, remedy = str(error).split("\n")[0], "make the result again in another folder"
+        raise IntegrityError("the record of a run is damaged", where=str(path), got=got, remedy=remedy) from error
     if not intact:
         raise IntegrityError("the record of a run was altered after it was written", where=str(path))
     if state != "complete":
-        raise InputError(
-            "this folder holds an unfinished result",
-            where=str(folder),
-            got=f"state {state!r}",
-            remedy="repeat the command that makes it: it resumes",
-        )
+        where, remedy = str(folder), "repeat the command that makes it: it resumes"
+        raise InputError("this folder holds an unfinished result", where=where, got=f"state {state!r}", remedy=remedy)
     for name, expected in {MANIFEST: digests.get("manifest", ""), RUN_LOG: digests.get("log")}.items():
         file = folder / name
         if expected is not None and not file.is_file():

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
-from mudg.base.errors import InputError
+from mudg.base.errors import InputError, short
 
 if TYPE_CHECKING:
     import torch
@@ -34,13 +34,9 @@ def rigid(value: Any, where: str) -> Matrix:
     matrix = np.array(value, np.float64)
     problem = geometry.rigid_problem(matrix)
     if problem:
-        raise InputError(
-            "pose is not a rigid motion",
-            where=where,
-            got=problem,
-            expected="f64[4, 4]: a right-handed rotation (orthonormal within 1e-4) and a translation in metres",
-            remedy="remove scale or mirroring from the matrix; check row against column order",
-        )
+        expected = "f64[4, 4]: a right-handed rotation (orthonormal within 1e-4) and a translation in metres"
+        remedy = "remove scale or mirroring from the matrix; check row against column order"
+        raise InputError("pose is not a rigid motion", where=where, got=problem, expected=expected, remedy=remedy)
     matrix.setflags(write=False)
     return matrix
 
@@ -52,13 +48,9 @@ def foreign_name(value: str, where: str) -> str:
     """An id, name or class from a file of others, at most 200 bytes long."""
     size = len(value) if len(value) > MAX_NAME_BYTES else len(value.encode("utf-8", "surrogatepass"))
     if size > MAX_NAME_BYTES:
-        raise InputError(
-            "name is too long",
-            where=where,
-            expected=f"at most {MAX_NAME_BYTES} bytes",
-            got=f"{size} bytes, beginning {value[:40]!r}",
-            remedy="is the file damaged, or of another format?",
-        )
+        what = "name is too long"
+        got, remedy = f"{size} bytes, beginning {value[:40]!r}", "is the file damaged, or of another format?"
+        raise InputError(what, where=where, expected=f"at most {MAX_NAME_BYTES} bytes", got=got, remedy=remedy)
     return value
 
 
@@ -80,8 +72,7 @@ def increasing_problem(times_s: NDArray[np.float64]) -> str | None:
 
 
 def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[np.float64], Matrix]:
-    """Check and freeze interpolation keys: increasing finite times f64[T], rigid poses f64[T, 4, 4] of the field
-    ``name``."""
+    """Check and freeze keys: increasing finite times f64[T], rigid poses f64[T, 4, 4] of the field ``name``."""
     times = np.array(times_s, np.float64).reshape(-1)
     matrices = np.array(poses, np.float64)
     if matrices.shape != (len(times), 4, 4):
@@ -89,13 +80,8 @@ def pose_keys(times_s: Any, poses: Any, owner: str, name: str) -> tuple[NDArray[
         raise InputError("times and poses do not pair up", where=f"{owner}: {name}", expected=expected, got=got)
     problem = increasing_problem(times) if np.isfinite(times).all() else shortened(times)
     if problem is not None:
-        raise InputError(
-            "times do not increase",
-            where=f"{owner}: times_s",
-            expected="finite seconds, strictly increasing",
-            got=problem,
-            remedy="sort the poses by time and drop duplicates",
-        )
+        what, where, remedy = "times do not increase", f"{owner}: times_s", "sort the poses by time and drop duplicates"
+        raise InputError(what, where=where, expected="finite seconds, strictly increasing", got=problem, remedy=remedy)
     if not geometry.all_rigid(matrices):
         for index, matrix in enumerate(matrices):
             rigid(matrix, f"{owner}: {name}[{index}]")
@@ -137,11 +123,30 @@ def check_given_tensors(record: Any, **shapes: tuple[int | None, ...]) -> None:
     check_tensors(record, **{name: shape for name, shape in shapes.items() if getattr(record, name) is not None})
 
 
+class _Brief:
+    """``repr`` in one line: arrays and tensors by type and shape, containers by their number, without what is None."""
+
+    __slots__ = ()
+
+    def __repr__(self) -> str:
+        given = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        texts = [f"{name}={_in_brief(value)}" for name, value in given.items() if value is not None]
+        return f"{type(self).__name__}({', '.join(texts)})"
+
+
+def _in_brief(value: Any) -> str:
+    if hasattr(value, "shape"):
+        return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
+    if isinstance(value, Mapping | tuple):
+        return f"<{len(value)}>"
+    return repr(value.name) if isinstance(value, Camera) else short(repr(value))
+
+
 # what a fitted scene shows at some views, as the diffusion model's condition holds it. Imports no torch ---------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class RenderPlanes:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class RenderPlanes(_Brief):
     """What a fitted scene shows at T views (or at one view, without the leading dimension).
 
     Args:
@@ -246,8 +251,8 @@ class Camera:
         return replace(self, width=width, height=height, **intrinsics)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class View:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class View(_Brief):
     """A camera at a place and time.
 
     Args:
@@ -280,8 +285,8 @@ class View:
         return View(self.camera.resized(width, height), self.world_from_cam, self.time_s)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Trajectory:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Trajectory(_Brief):
     """An ordered path of views of one camera.
 
     Args:
@@ -305,8 +310,8 @@ class Ref:
     path: str
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Frame:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Frame(_Brief):
     """One recorded image.
 
     Args:
@@ -325,8 +330,8 @@ class Frame:
         object.__setattr__(self, "labels", _freeze(self.labels))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Photo:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Photo(_Brief):
     """A recorded image in memory: ``rgb`` u8[H, W, 3] of ``view``, ``semantics`` u8[H, W] train ids (255 = unknown) or
     None, ``usable`` bool[H, W]: pixels that show what is asked for (None = all). The image may have another size than
     the view's camera."""
@@ -337,8 +342,8 @@ class Photo:
     usable: NDArray[np.bool_] | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Sweep:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Sweep(_Brief):
     """One turn of a LiDAR.
 
     Args:
@@ -361,8 +366,8 @@ class Sweep:
         object.__setattr__(self, "time_s", finite(self.time_s, f"sweep {self.id!r}: time_s"))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SweepPoints:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SweepPoints(_Brief):
     """Points of a sweep.
 
     Args:
@@ -387,8 +392,8 @@ class SweepPoints:
             check_array(self.classes, "sweep points: classes", (len(self.xyz),), np.uint8)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Track:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Track(_Brief):
     """A tracked box.
 
     Args:
@@ -422,13 +427,12 @@ class Track:
         object.__setattr__(self, "world_from_object", poses)
 
     def pose_at(self, time_s: float) -> Matrix | None:
-        """World-from-object f64[4, 4] at ``time_s``, interpolated between both neighbouring keys; None outside the
-        span."""
+        """World-from-object f64[4, 4] at ``time_s``, interpolated between neighbouring keys; None outside the span."""
         return geometry.pose_at(self.times_s, self.world_from_object, time_s)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class EgoPath:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class EgoPath(_Brief):
     """The path of the recording vehicle.
 
     Args:
@@ -449,8 +453,8 @@ class EgoPath:
         return geometry.pose_at(self.times_s, self.world_from_ego, time_s)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Source:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Source(_Brief):
     """Where a scene comes from.
 
     Args:
@@ -466,8 +470,8 @@ class Source:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class PointCloud:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class PointCloud(_Brief):
     """Coloured points.
 
     Args:
@@ -492,8 +496,8 @@ class PointCloud:
         return len(self.xyz)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FusedCloud:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FusedCloud(_Brief):
     """The static world, and one cloud per dynamic object: track id -> cloud in its box frame.
 
     The points' colours are common ones; ``colors`` says how the cameras of the log show them.
@@ -507,8 +511,8 @@ class FusedCloud:
         object.__setattr__(self, "objects", _freeze(self.objects))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Scene:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Scene(_Brief):
     """A prepared driving log. Files are referenced, not loaded.
 
     Args:
@@ -537,6 +541,10 @@ class Scene:
         object.__setattr__(self, "cameras", _freeze(self.cameras))
         object.__setattr__(self, "split", _freeze(self.split))
 
+    def __repr__(self) -> str:
+        counts = f"{len(self.frames)} frames, {len(self.cameras)} cameras, {len(self.tracks)} objects"
+        return f"Scene({short(repr(self.id))}, {counts}, {np.diff(self.ego.times_s).sum():.1f} s)"
+
     def frames_of(self, camera: str) -> tuple[Frame, ...]:
         """Frames of one camera in time order. An unknown camera raises InputError with the names there are."""
         if camera not in self.cameras:
@@ -559,8 +567,8 @@ class Scene:
 # tensors ------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class SparseDepth:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class SparseDepth(_Brief):
     """Measured depth f32[T, 1, H, W] in metres, known where ``valid`` bool[T, 1, H, W] and meaningless elsewhere."""
 
     depth: Tensor
@@ -574,8 +582,8 @@ class SparseDepth:
         return SparseDepth(change(self.depth), change(self.valid))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Condition:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Condition(_Brief):
     """What the diffusion model is given for T views.
 
     Args:
@@ -631,8 +639,8 @@ class Condition:
         return replace(self, **_moved(self, device), renders=renders, measured=measured)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class FinePatch:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class FinePatch(_Brief):
     """A rectangle of a training clip at a higher resolution.
 
     Args:
@@ -651,8 +659,8 @@ class FinePatch:
         return replace(self, clip=self.clip.to(device))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Clip:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Clip(_Brief):
     """A training example: a condition and the truth for its T views.
 
     Args:
@@ -695,8 +703,8 @@ class Clip:
         return replace(self, condition=self.condition.to(device), **_moved(self, device), fine=fine)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Observation:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Observation(_Brief):
     """What is known, or believed, about one view. Recorded and generated frames are this same type.
 
     Args:
@@ -725,8 +733,8 @@ class Observation:
         check_given_tensors(self, depth=(1, h, w), semantics=(h, w))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Gaussians:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Gaussians(_Brief):
     """Gaussians in the world, activated (scales in metres, never their logarithm; opacity in [0, 1]).
 
     Args:
@@ -760,8 +768,8 @@ class Gaussians:
         return int(self.means.shape[0])
 
 
-@dataclass(slots=True, eq=False)
-class RasterTrace:
+@dataclass(slots=True, eq=False, repr=False)
+class RasterTrace(_Brief):
     """What densification needs to know about a render. Several views drawn at once add a leading dimension V to
     everything.
 
@@ -778,8 +786,8 @@ class RasterTrace:
     abs_grad2d: Tensor | None = None
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Render:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Render(_Brief):
     """A rendered view. Several views drawn at once add a leading dimension V to everything.
 
     Args:

@@ -17,7 +17,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -35,46 +34,37 @@ from mudg.base.plain_pickle import PERSISTENT, Maker, Name, PickledObject, read_
 # names of the attributes that lead to them.
 
 
+def _pairs(text: str) -> list[tuple[str, str]]:
+    """Both words of each entry of a list with commas."""
+    return [(one, other) for one, other in map(str.split, text.split(", "))]
+
+
 _STORAGES: Final = {
-    "torch.FloatStorage": (torch.float32, 4),
-    "torch.HalfStorage": (torch.float16, 2),
-    "torch.BFloat16Storage": (torch.bfloat16, 2),
-    "torch.DoubleStorage": (torch.float64, 8),
-    "torch.LongStorage": (torch.int64, 8),
-    "torch.IntStorage": (torch.int32, 4),
-    "torch.ShortStorage": (torch.int16, 2),
-    "torch.CharStorage": (torch.int8, 1),
-    "torch.ByteStorage": (torch.uint8, 1),
-    "torch.BoolStorage": (torch.bool, 1),
+    f"torch.{name}Storage": getattr(torch, dtype)
+    for name, dtype in _pairs(
+        "Float float32, Half float16, BFloat16 bfloat16, Double float64, Long int64, Int int32, Short int16, "
+        "Char int8, Byte uint8, Bool bool"
+    )
 }
 _PROGRAM: Final = "__torch__."
 _BUILDERS: Final = "torch.jit._pickle."
 _DEEPEST: Final = 64
 
 
-class _Names(Mapping[str, Maker | None]):
+class _Names(dict[str, Maker | None]):
     """Names that an archive may mention: classes of its program, storages, and what puts tensors and lists together."""
 
     def __init__(self) -> None:
-        self._known: dict[str, Maker | None] = {
-            "torch._utils._rebuild_tensor_v2": _tensor,
-            "collections.OrderedDict": dict,
-            **dict.fromkeys((PERSISTENT, *_STORAGES)),
-            **{f"{_BUILDERS}build_{kind}list": lambda items: items for kind in ("int", "double", "bool", "tensor")},
-            f"{_BUILDERS}restore_type_tag": lambda value, _kind: value,
-        }
+        super().__init__(dict.fromkeys((PERSISTENT, *_STORAGES)))
+        self |= {"torch._utils._rebuild_tensor_v2": _tensor, "collections.OrderedDict": dict}
+        self |= {f"{_BUILDERS}build_{kind}list": lambda items: items for kind in ("int", "double", "bool", "tensor")}
+        self[f"{_BUILDERS}restore_type_tag"] = lambda value, _kind: value
 
     def __contains__(self, name: object) -> bool:
-        return name in self._known or str(name).startswith(_PROGRAM)
+        return super().__contains__(name) or str(name).startswith(_PROGRAM)
 
-    def __getitem__(self, name: str) -> Maker | None:
-        return None if name.startswith(_PROGRAM) else self._known[name]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._known)
-
-    def __len__(self) -> int:
-        return len(self._known)
+    def __missing__(self, _of_the_program: str) -> None:
+        return None
 
 
 def _tensor(storage: Any, offset: Any, size: Any, stride: Any, *_more: Any) -> PickledObject:
@@ -106,12 +96,8 @@ def read_torchscript(path: Path) -> dict[str, Tensor]:
             folder = index.removesuffix("data.pkl") + "data/"
             return {name: _read(archive, folder, found, f"{path}: {name}") for name, found in _leaves(content, "", 0)}
     except (zipfile.BadZipFile, KeyError, ValueError, NotImplementedError) as error:
-        raise InputError(
-            "not a readable TorchScript archive",
-            where=str(path),
-            got=f"{type(error).__name__}: {error}"[:200],
-            remedy="fetch the file again and compare its size",
-        ) from error
+        what, got = "not a readable TorchScript archive", f"{type(error).__name__}: {error}"[:200]
+        raise InputError(what, where=str(path), got=got, remedy="fetch the file again and compare its size") from error
 
 
 def _leaves(value: Any, name: str, depth: int) -> Iterator[tuple[str, PickledObject]]:
@@ -130,31 +116,21 @@ def _leaves(value: Any, name: str, depth: int) -> Iterator[tuple[str, PickledObj
 def _read(archive: zipfile.ZipFile, folder: str, found: PickledObject, where: str) -> Tensor:
     storage, offset, size, stride = found.arguments
     ((mark, kind, key, _place, count),) = storage.arguments
-    if (
-        mark != "storage"
-        or not isinstance(kind, Name)
-        or kind.text not in _STORAGES
-        or not isinstance(key, str)
-        or not key.isalnum()
-    ):
+    known = mark == "storage" and isinstance(kind, Name) and kind.text in _STORAGES
+    if not (known and isinstance(key, str) and key.isalnum()):
         raise InputError("a tensor has an unknown storage", where=where, got=repr(storage.arguments)[:120])
-    dtype, width = _STORAGES[kind.text]
+    dtype = _STORAGES[kind.text]
     whole = [offset, count, *size, *stride]
     if not all(isinstance(number, int) and number >= 0 for number in whole) or len(size) != len(stride):
         raise InputError("a tensor has an impossible shape", where=where, got=f"{size}, strides {stride}")
     reach = offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True)) + 1 if math.prod(size) else 0
     content = archive.read(folder + key)
-    if len(content) != count * width or reach > count:
+    if len(content) != count * dtype.itemsize or reach > count:
         raise InputError(
             "a tensor does not fit its storage", where=where, expected=f"{count} values", got=f"{len(content)} bytes"
         )
-    flat = (
-        torch.from_numpy(np.frombuffer(content, np.uint8).copy()).view(dtype) if count else torch.zeros(0, dtype=dtype)
-    )
+    flat = torch.frombuffer(bytearray(content), dtype=dtype) if count else torch.zeros(0, dtype=dtype)
     return flat.as_strided(size, stride, offset).clone()
-
-
-# weights ------------------------------------------------------------------------------------------
 
 
 # names --------------------------------------------------------------------------------------------
@@ -165,67 +141,39 @@ _TEXT = "cond_stage_model.model."
 _IMAGE = "embedder.model."
 _IMAGE_TOKENS = "image_proj_model."
 
-_RES = (
-    ("in_layers.0", "norm1"),
-    ("in_layers.2", "conv1"),
-    ("emb_layers.1", "embed"),
-    ("out_layers.0", "norm2"),
-    ("out_layers.3", "conv2"),
-    ("skip_connection", "skip"),
-    ("temopral_conv.conv1.0", "temporal.0.norm"),
-    ("temopral_conv.conv1.2", "temporal.0.conv"),
-    ("temopral_conv.conv2.0", "temporal.1.norm"),
-    ("temopral_conv.conv2.3", "temporal.1.conv"),
-    ("temopral_conv.conv3.0", "temporal.2.norm"),
-    ("temopral_conv.conv3.3", "temporal.2.conv"),
-    ("temopral_conv.conv4.0", "temporal.3.norm"),
-    ("temopral_conv.conv4.3", "temporal.3.conv"),
-)
-_ATTENTION = (
-    ("to_q", "query"),
-    ("to_k", "key"),
-    ("to_v", "value"),
-    ("to_out.0", "out"),
-    ("to_k_ip", "image_key"),
-    ("to_v_ip", "image_value"),
-)
-_TRANSFORMER = (
-    ("norm", "norm"),
-    ("proj_in", "enter"),
-    ("proj_out", "out"),
-    *((f"transformer_blocks.0.norm{n}", f"block.norm{n}") for n in (1, 2, 3)),
-    *((f"transformer_blocks.0.attn{n}.{a}", f"block.attention{n}.{b}") for n in (1, 2) for a, b in _ATTENTION),
-    ("transformer_blocks.0.ff.net.0.proj", "block.feed.enter"),
-    ("transformer_blocks.0.ff.net.2", "block.feed.out"),
-)
-_VAE_BLOCK = (("norm1", "norm1"), ("conv1", "conv1"), ("norm2", "norm2"), ("conv2", "conv2"), ("nin_shortcut", "skip"))
-_VAE_MIDDLE = (
-    *((f"block_1.{a}", f"block1.{b}") for a, b in _VAE_BLOCK),
-    *((f"block_2.{a}", f"block2.{b}") for a, b in _VAE_BLOCK),
-    ("attn_1.norm", "attention.norm"),
-    ("attn_1.q", "attention.query"),
-    ("attn_1.k", "attention.key"),
-    ("attn_1.v", "attention.value"),
-    ("attn_1.proj_out", "attention.out"),
-)
-_TOWER_BLOCK = (
-    ("ln_1.weight", "norm1.weight"),
-    ("ln_1.bias", "norm1.bias"),
-    ("ln_2.weight", "norm2.weight"),
-    ("ln_2.bias", "norm2.bias"),
-    ("attn.in_proj_weight", "query_key_value.weight"),
-    ("attn.in_proj_bias", "query_key_value.bias"),
-    ("attn.out_proj.weight", "out.weight"),
-    ("attn.out_proj.bias", "out.bias"),
-    ("mlp.c_fc.weight", "feed_in.weight"),
-    ("mlp.c_fc.bias", "feed_in.bias"),
-    ("mlp.c_proj.weight", "feed_out.weight"),
-    ("mlp.c_proj.bias", "feed_out.bias"),
-)
-
 
 def _at(published: str, clean: str, leaves: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     return [(published + a, clean + b) for a, b in leaves]
+
+
+_RES = _pairs(
+    "in_layers.0 norm1, in_layers.2 conv1, emb_layers.1 embed, out_layers.0 norm2, out_layers.3 conv2, "
+    "skip_connection skip, temopral_conv.conv1.0 temporal.0.norm, temopral_conv.conv1.2 temporal.0.conv, "
+    "temopral_conv.conv2.0 temporal.1.norm, temopral_conv.conv2.3 temporal.1.conv, "
+    "temopral_conv.conv3.0 temporal.2.norm, temopral_conv.conv3.3 temporal.2.conv, "
+    "temopral_conv.conv4.0 temporal.3.norm, temopral_conv.conv4.3 temporal.3.conv"
+)
+_ATTENTION = _pairs("to_q query, to_k key, to_v value, to_out.0 out, to_k_ip image_key, to_v_ip image_value")
+_TRANSFORMER = (
+    *_pairs("norm norm, proj_in enter, proj_out out"),
+    *_at("transformer_blocks.0.norm", "block.norm", _pairs("1 1, 2 2, 3 3")),
+    *_at("transformer_blocks.0.attn1.", "block.attention1.", _ATTENTION),
+    *_at("transformer_blocks.0.attn2.", "block.attention2.", _ATTENTION),
+    *_at("transformer_blocks.0.ff.net.", "block.feed.", _pairs("0.proj enter, 2 out")),
+)
+_VAE_BLOCK = _pairs("norm1 norm1, conv1 conv1, norm2 norm2, conv2 conv2, nin_shortcut skip")
+_ENDS = _pairs("conv_in enter, norm_out norm, conv_out leave")
+_VAE_MIDDLE = (
+    *_at("block_1.", "block1.", _VAE_BLOCK),
+    *_at("block_2.", "block2.", _VAE_BLOCK),
+    *_at("attn_1.", "attention.", _pairs("norm norm, q query, k key, v value, proj_out out")),
+)
+_TOWER_BLOCK = _pairs(
+    "ln_1.weight norm1.weight, ln_1.bias norm1.bias, ln_2.weight norm2.weight, ln_2.bias norm2.bias, "
+    "attn.in_proj_weight query_key_value.weight, attn.in_proj_bias query_key_value.bias, "
+    "attn.out_proj.weight out.weight, attn.out_proj.bias out.bias, mlp.c_fc.weight feed_in.weight, "
+    "mlp.c_fc.bias feed_in.bias, mlp.c_proj.weight feed_out.weight, mlp.c_proj.bias feed_out.bias"
+)
 
 
 def _block(published: str, clean: str) -> list[tuple[str, str]]:
@@ -245,7 +193,7 @@ RULES: tuple[tuple[str, str], ...] = (
         [
             *(
                 (f"{_UNET}{a}.{n}", f"net.{b}.{n}")
-                for a, b in (("time_embed", "time"), ("class_embed", "label"), ("fps_embedding", "fps"))
+                for a, b in _pairs("time_embed time, class_embed label, fps_embedding fps")
                 for n in (0, 2)
             ),
             (f"{_UNET}input_blocks.0.0", "net.down.0.conv"),
@@ -266,14 +214,9 @@ RULES: tuple[tuple[str, str], ...] = (
     # autoencoder
     *_parameters(
         [
-            (f"{_VAE}encoder.conv_in", "codec.encoder.enter"),
-            (f"{_VAE}encoder.norm_out", "codec.encoder.norm"),
-            (f"{_VAE}encoder.conv_out", "codec.encoder.leave"),
-            (f"{_VAE}decoder.conv_in", "codec.decoder.enter"),
-            (f"{_VAE}decoder.norm_out", "codec.decoder.norm"),
-            (f"{_VAE}decoder.conv_out", "codec.decoder.leave"),
-            (f"{_VAE}quant_conv", "codec.to_moments"),
-            (f"{_VAE}post_quant_conv", "codec.from_latent"),
+            *_at(f"{_VAE}encoder.", "codec.encoder.", _ENDS),
+            *_at(f"{_VAE}decoder.", "codec.decoder.", _ENDS),
+            *_at(_VAE, "codec.", _pairs("quant_conv to_moments, post_quant_conv from_latent")),
             *_at(f"{_VAE}encoder.down.{{i}}.block.{{j}}.", "codec.encoder.down.{i}.blocks.{j}.", _VAE_BLOCK),
             (f"{_VAE}encoder.down.{{i}}.downsample.conv", "codec.encoder.down.{i}.scale"),
             *_at(f"{_VAE}encoder.mid.", "codec.encoder.middle.", _VAE_MIDDLE),
@@ -283,31 +226,28 @@ RULES: tuple[tuple[str, str], ...] = (
         ]
     ),
     # text tower
-    (f"{_TEXT}token_embedding.weight", "text.tokens.weight"),
-    (f"{_TEXT}positional_embedding", "text.places"),
+    *_at(_TEXT, "text.", _pairs("token_embedding.weight tokens.weight, positional_embedding places")),
     *_at(f"{_TEXT}transformer.resblocks.{{i}}.", "text.blocks.{i}.", _TOWER_BLOCK),
     *_parameters([(f"{_TEXT}ln_final", "text.norm")]),
     # image tower
-    (f"{_IMAGE}visual.class_embedding", "image.whole"),
-    (f"{_IMAGE}visual.positional_embedding", "image.places"),
-    (f"{_IMAGE}visual.conv1.weight", "image.patches.weight"),
+    *_at(
+        f"{_IMAGE}visual.",
+        "image.",
+        _pairs("class_embedding whole, positional_embedding places, conv1.weight patches.weight"),
+    ),
     *_parameters([(f"{_IMAGE}visual.ln_pre", "image.norm")]),
     *_at(f"{_IMAGE}visual.transformer.resblocks.{{i}}.", "image.blocks.{i}.", _TOWER_BLOCK),
     # image tokens
     (f"{_IMAGE_TOKENS}latents", "image_tokens.queries"),
     *_parameters(
         [
-            (f"{_IMAGE_TOKENS}proj_in", "image_tokens.enter"),
-            (f"{_IMAGE_TOKENS}proj_out", "image_tokens.leave"),
-            (f"{_IMAGE_TOKENS}norm_out", "image_tokens.norm"),
-            (f"{_IMAGE_TOKENS}layers.{{i}}.0.norm1", "image_tokens.layers.{i}.attention.norm_image"),
-            (f"{_IMAGE_TOKENS}layers.{{i}}.0.norm2", "image_tokens.layers.{i}.attention.norm_queries"),
-            (f"{_IMAGE_TOKENS}layers.{{i}}.0.to_q", "image_tokens.layers.{i}.attention.query"),
-            (f"{_IMAGE_TOKENS}layers.{{i}}.0.to_kv", "image_tokens.layers.{i}.attention.key_value"),
-            (f"{_IMAGE_TOKENS}layers.{{i}}.0.to_out", "image_tokens.layers.{i}.attention.out"),
-            (f"{_IMAGE_TOKENS}layers.{{i}}.1.0", "image_tokens.layers.{i}.feed.0"),
-            (f"{_IMAGE_TOKENS}layers.{{i}}.1.1", "image_tokens.layers.{i}.feed.1"),
-            (f"{_IMAGE_TOKENS}layers.{{i}}.1.3", "image_tokens.layers.{i}.feed.3"),
+            *_at(_IMAGE_TOKENS, "image_tokens.", _pairs("proj_in enter, proj_out leave, norm_out norm")),
+            *_at(
+                f"{_IMAGE_TOKENS}layers.{{i}}.0.",
+                "image_tokens.layers.{i}.attention.",
+                _pairs("norm1 norm_image, norm2 norm_queries, to_q query, to_kv key_value, to_out out"),
+            ),
+            *_at(f"{_IMAGE_TOKENS}layers.{{i}}.1.", "image_tokens.layers.{i}.feed.", _pairs("0 0, 1 1, 3 3")),
         ]
     ),
     # the dynamic rescale table: the one buffer whose values decide
@@ -317,35 +257,17 @@ RULES: tuple[tuple[str, str], ...] = (
 
 UNUSED: frozenset[str] = frozenset(
     (
-        "betas",
-        "alphas_cumprod",
-        "alphas_cumprod_prev",
-        "sqrt_alphas_cumprod",
-        "sqrt_one_minus_alphas_cumprod",
-        "log_one_minus_alphas_cumprod",
-        "sqrt_recip_alphas_cumprod",
-        "sqrt_recipm1_alphas_cumprod",
-        "posterior_variance",
-        "posterior_log_variance_clipped",
-        "posterior_mean_coef1",
-        "posterior_mean_coef2",
-        *(f"{tower}{name}" for tower in (_TEXT, _IMAGE) for name in ("text_projection", "logit_scale", "attn_mask")),
         *(
-            f"{_IMAGE}{name}"
-            for name in (
-                "positional_embedding",
-                "token_embedding.weight",
-                "ln_final.weight",
-                "ln_final.bias",
-                "visual.proj",
-                "visual.ln_post.weight",
-                "visual.ln_post.bias",
-            )
-        ),
+            "betas alphas_cumprod alphas_cumprod_prev sqrt_alphas_cumprod sqrt_one_minus_alphas_cumprod "
+            "log_one_minus_alphas_cumprod sqrt_recip_alphas_cumprod sqrt_recipm1_alphas_cumprod posterior_variance "
+            "posterior_log_variance_clipped posterior_mean_coef1 posterior_mean_coef2"
+        ).split(),
+        *(f"{tower}{name}" for tower in (_TEXT, _IMAGE) for name in ("text_projection", "logit_scale", "attn_mask")),
+        *(f"{_IMAGE}{name}" for name in ("positional_embedding", "token_embedding.weight", "visual.proj")),
+        *(f"{_IMAGE}{norm}.{kind}" for norm in ("ln_final", "visual.ln_post") for kind in ("weight", "bias")),
     )
 )
-"""Published names that may be there and are not read: tables that follow from the schedule, parts of the towers past
-the layers in use."""
+"""Published names that may be there and are not read: what follows from the schedule, unused parts of the towers."""
 
 _NUMBER = {"{i}": r"(?P<i>\d+)", "{j}": r"(?P<j>\d+)"}
 _Index = dict[tuple[str, int, str], list[tuple[re.Pattern[str], str]]]
@@ -414,34 +336,18 @@ def _mapping(*_: object) -> OrderedDict[str, Any]:
     return OrderedDict()
 
 
-INERT = (
-    "omegaconf.dictconfig.DictConfig",
-    "omegaconf.listconfig.ListConfig",
-    "omegaconf.base.ContainerMetadata",
-    "omegaconf.base.Metadata",
-    "omegaconf.nodes.AnyNode",
-    "omegaconf.nodes.IntegerNode",
-    "omegaconf.nodes.FloatNode",
-    "omegaconf.nodes.StringNode",
-    "omegaconf.nodes.BooleanNode",
-    "typing.Any",
-    "builtins.dict",
-    "builtins.list",
-    "builtins.tuple",
-    "builtins.int",
-    "builtins.float",
-    "builtins.str",
-    "builtins.bool",
-    "argparse.Namespace",
-    "numpy.dtype",
-    "numpy.core.multiarray.scalar",
-    "numpy._core.multiarray.scalar",
-    "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint",
-    "lightning.pytorch.callbacks.model_checkpoint.ModelCheckpoint",
-    "torch.optim.lr_scheduler.LambdaLR",
-    "deepspeed.runtime.fp16.loss_scaler.LossScaler",
-    "deepspeed.runtime.fp16.loss_scaler.DynamicLossScaler",
-    "deepspeed.runtime.zero.config.ZeroStageEnum",
+INERT = tuple(
+    (
+        "omegaconf.dictconfig.DictConfig omegaconf.listconfig.ListConfig omegaconf.base.ContainerMetadata "
+        "omegaconf.base.Metadata omegaconf.nodes.AnyNode omegaconf.nodes.IntegerNode omegaconf.nodes.FloatNode "
+        "omegaconf.nodes.StringNode omegaconf.nodes.BooleanNode typing.Any builtins.dict builtins.list builtins.tuple "
+        "builtins.int builtins.float builtins.str builtins.bool argparse.Namespace numpy.dtype "
+        "numpy.core.multiarray.scalar numpy._core.multiarray.scalar "
+        "pytorch_lightning.callbacks.model_checkpoint.ModelCheckpoint "
+        "lightning.pytorch.callbacks.model_checkpoint.ModelCheckpoint torch.optim.lr_scheduler.LambdaLR "
+        "deepspeed.runtime.fp16.loss_scaler.LossScaler deepspeed.runtime.fp16.loss_scaler.DynamicLossScaler "
+        "deepspeed.runtime.zero.config.ZeroStageEnum"
+    ).split()
 )
 """Names in pickles that are replaced by `_Ignored`. Not one of them is imported or called."""
 
@@ -476,12 +382,9 @@ def read_checkpoint(path: Path) -> dict[str, Tensor]:
     content = _unpickle(path)
     found = _named_tensors(content)
     if not found:
-        raise InputError(
-            "the file holds no named tensors",
-            where=str(path),
-            expected="state_dict, module, or names with tensors",
-            got=", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else type(content).__name__,
-        )
+        what = "the file holds no named tensors"
+        got = ", ".join(map(str, list(content)[:8])) if isinstance(content, Mapping) else type(content).__name__
+        raise InputError(what, where=str(path), expected="state_dict, module, or names with tensors", got=got)
     return _without_prefix(found)
 
 
@@ -497,22 +400,16 @@ def _unpickle(path: Path) -> Any:
         text = str(error)
         refused = re.search(r"GLOBAL (\S+)", text)
         if refused is not None:
-            raise InputError(
-                "the checkpoint holds an object that is neither a tensor nor known to be harmless; it was not loaded",
-                where=str(path),
-                expected="tensors, numbers, text and plain containers",
-                got=refused.group(1),
-                remedy="do not load it elsewhere either, unless you trust its maker; ask for safetensors",
-            ) from error
+            what = "the checkpoint holds an object that is neither a tensor nor known to be harmless; it was not loaded"
+            expected = "tensors, numbers, text and plain containers"
+            remedy = "do not load it elsewhere either, unless you trust its maker; ask for safetensors"
+            raise InputError(what, where=str(path), expected=expected, got=refused.group(1), remedy=remedy) from error
         if out_of_memory(error):
             raise MemoryError(text) from error
-        raise InputError(
-            "not a readable checkpoint",
-            where=str(path),
-            expected="a complete file written by torch.save, or safetensors",
-            got=text.splitlines()[0][:200] if text else type(error).__name__,
-            remedy="fetch the file again and compare its size",
-        ) from error
+        where, expected = str(path), "a complete file written by torch.save, or safetensors"
+        got = text.splitlines()[0][:200] if text else type(error).__name__
+        remedy = "fetch the file again and compare its size"
+        raise InputError("not a readable checkpoint", where=where, expected=expected, got=got, remedy=remedy) from error
 
 
 def out_of_memory(error: Exception) -> bool:
@@ -521,14 +418,7 @@ def out_of_memory(error: Exception) -> bool:
 
 
 _UNREADABLE: tuple[type[Exception], ...] = (
-    EOFError,
-    RuntimeError,
-    ValueError,
-    KeyError,
-    IndexError,
-    TypeError,
-    AttributeError,
-    OSError,
+    *(EOFError, RuntimeError, ValueError, LookupError, TypeError, AttributeError, OSError),
     # through torch: this package imports no pickle
     torch.serialization.pickle.UnpicklingError,  # type: ignore[attr-defined]
 )
@@ -552,8 +442,7 @@ def _without_prefix(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
 
 
 def with_towers(found: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """A checkpoint completed by an OpenCLIP file (names without prefix) where it has no text or no image tower of its
-    own."""
+    """A checkpoint completed by an OpenCLIP file (names without prefix) where it lacks the text or the image tower."""
     result = dict(found)
     for prefix in (_TEXT, _IMAGE):
         if not any(name.startswith(prefix) for name in found):
@@ -614,10 +503,6 @@ def match_exactly(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int
             for kind, names in (("missing", missing), ("unexpected", unexpected), ("of another shape", misshaped))
             if names
         ]
-        raise InputError(
-            "the checkpoint is not the network it should be",
-            where=where,
-            expected=f"{len(wanted)} tensors of {network}",
-            got="; ".join(lines),
-            remedy="check that the file is complete and of the right kind",
-        )
+        what = "the checkpoint is not the network it should be"
+        got, remedy = "; ".join(lines), "check that the file is complete and of the right kind"
+        raise InputError(what, where=where, expected=f"{len(wanted)} tensors of {network}", got=got, remedy=remedy)

@@ -30,8 +30,8 @@ from mudg.formats.importers.common import holdout_split, parse_frame_range, pars
 from mudg.formats.settings import IngestConfig
 from mudg.labels import annotate
 from mudg.labels.settings import AnnotateConfig
-from mudg.scene.part import write_part
 from mudg.scene.read import read_scene
+from mudg.scene.write import write_part
 from mudg.steps.annotate import Annotate
 from mudg.steps.ingest import Ingest
 from mudg.steps.outputs import Output

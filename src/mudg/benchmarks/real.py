@@ -2,7 +2,7 @@
 
 A protocol (a row of ``places.PROTOCOLS``) says which frames, sweeps or cameras are hidden and what is scored. Per log
 and way of hiding, the verbs of the chain are run with folders of their own. They are given scenes from which what is
-hidden was removed (``scene/part.py``), so they cannot use it. Whatever is finished is verified and reused.
+hidden was removed (``scene/write.py``), so they cannot use it. Whatever is finished is verified and reused.
 
     OUT/<log>/scene                                         the whole log; read by truth and scores alone
     OUT/<log>/<split>/shown annotate scene asked            what the methods see; with labels; and places of held-out
@@ -53,8 +53,8 @@ from mudg.diffusion.adapt import why_not
 from mudg.diffusion.settings import AdaptConfig
 from mudg.editing import render
 from mudg.editing.view_settings import RenderConfig
-from mudg.scene.part import write_part
 from mudg.scene.read import read_scene
+from mudg.scene.write import write_part
 from mudg.steps.adapt import Adapt
 from mudg.steps.outputs import Output
 from mudg.steps.settings.presets import PresetName

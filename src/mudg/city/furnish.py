@@ -4,18 +4,319 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
-from mudg.city import objects as rec
+from mudg.city import layout as rec
 from mudg.city.config import CityConfig
-from mudg.city.layout import AHEAD_M, StreetPlan
-from mudg.city.objects import BRICK_COLORS, KERB_M, LEAF_COLORS, RENDER_COLORS, Color, Furnisher, plant_tree, record
-from mudg.city.overhead import add_overhead
+from mudg.city.layout import (
+    AHEAD_M,
+    BRICK_COLORS,
+    KERB_M,
+    LEAF_COLORS,
+    RENDER_COLORS,
+    Color,
+    Furnisher,
+    Size,
+    StreetPlan,
+    plant_tree,
+)
+
+# overhead ------------------------------------------------------------------------------------------
+#
+# What stands above a LiDAR's field of view: crowns over the road, bare trees, bridges, gantries, wires, arms, taller
+# buildings.
+#
+# Only in cities with ``overhead`` > 0. Nothing comes lower than `CLEARANCE_M` above the corridor of the shifted
+# cameras.
+
+
+CLEARANCE_M = 4.0
+BUILDING, WALL, FENCE, POLE, SIGN_CLASS, VEGETATION = 2, 3, 4, 5, 7, 8  # Cityscapes train ids
+# materials; the same numbers stand in native/city_world.h
+PLAIN, BARK, METAL, BRICK, SIGN, CONCRETE = 0, 3, 4, 10, 12, 19
+GREYS: tuple[Color, ...] = ((0.36, 0.35, 0.33), (0.24, 0.24, 0.24), (0.45, 0.43, 0.39), (0.30, 0.27, 0.23))
+METALS: tuple[Color, ...] = (
+    (0.35, 0.36, 0.37),
+    (0.05, 0.06, 0.06),
+    (0.04, 0.10, 0.07),
+    (0.16, 0.17, 0.2),
+    (0.20, 0.10, 0.06),
+)
+Point = tuple[float, float, float]
+
+
+class Overhead:
+    """Adds what stands above; positions are street coordinates (s, u) and heights over the road."""
+
+    def __init__(self, furnisher: Furnisher, amount: float) -> None:
+        self.f, self.amount = furnisher, amount
+        self.end = furnisher.plan.drive_length + AHEAD_M - 60
+
+    def kerb(self, side: int) -> float:
+        """|u| of the kerb."""
+        return abs(self.f.plan.kerb(side))
+
+    def foot(self, s: float, side: int, beyond_m: float, half: float) -> float | None:
+        """u of something that stands on the sidewalk, out of the corridor; None where it would stand on the crossing
+        street."""
+        f, crossing = self.f, self.f.plan.crossing
+        if crossing is not None and f.near_crossing(s, crossing.corner + half + 1.0):
+            return None
+        return f.free_u(s, side * (self.kerb(side) + beyond_m), half, half, side, side * (self.kerb(side) + 12.0))
+
+    def cylinder(self, start: Point, end: Point, width_m: float, rgb: Color, looks: tuple[int, int]) -> None:
+        """A round bar between two places (s, u, z); ``looks`` = class and material."""
+        (x0, y0, _), (x1, y1, _) = self.f.plan.line.point(*start[:2]), self.f.plan.line.point(*end[:2])
+        shape = (1, *looks, x1 - x0, y1 - y0, end[2] - start[2])
+        self.f.add(rec.PART, (x0, y0, start[2]), 0.0, (1.0, width_m, 1.0), self.f.seed(), rgb, rgb, shape)
+
+    def box(self, place: Point, size: Point, rgb: Color, looks: tuple[int, int], turn: float = 0.0) -> None:
+        """A box with its centre at (s, u, z); ``size`` along the street, across it and upwards."""
+        self.f.place(rec.PART, place[:2], turn, size, rgb, parameters=(0, *looks), z=place[2])
+
+    def board(self, place: Point, width_m: float, height_m: float, rgb: Color, ink: Color, turn: float) -> None:
+        """A sign with letters that faces ``turn`` relative to the street."""
+        self.f.place(rec.PART, place[:2], turn, (0.1, width_m, height_m), rgb, ink, (0, SIGN_CLASS, SIGN), place[2])
+
+    def wire(self, start: Point, end: Point, sag_m: float, width_m: float) -> None:
+        """A hanging wire in six straight pieces."""
+        tone = self.f.uniform(0.01, 0.05)
+        last = start
+        for i in range(1, 7):
+            k = i / 6
+            drop = 4 * sag_m * k * (1 - k)
+            at = tuple(a + k * (b - a) for a, b in zip(start, end, strict=True))
+            here = (at[0], at[1], at[2] - drop)
+            self.cylinder(last, here, width_m, (tone, tone, tone), (POLE, METAL))
+            last = here
+
+
+def add_overhead(f: Furnisher, amount: float) -> None:
+    """Add what stands above the LiDAR to the records of a furnisher, in proportion to ``amount`` (0 to 1)."""
+    o = Overhead(f, amount)
+    _raise_buildings(f, amount)
+    for side in (-1, 1):
+        if f.chance(0.75 * amount):
+            _avenue(o, side)
+        if f.chance(0.35 * amount):
+            _bare_trees(o, side)
+        if f.chance(0.8 * amount):
+            _tall_lamps(o, side)
+    if f.chance(0.45 * amount):
+        for _ in range(1 + int(f.chance(0.4))):
+            _bridge(o, f.uniform(12, f.plan.drive_length + 70))
+    if f.chance(0.45 * amount):
+        _gantry(o, f.uniform(14, f.plan.drive_length + 60))
+    if f.chance(0.55 * amount):
+        _cross_wires(o)
+    if f.chance(0.5 * amount):
+        _pole_line(o, 1 if f.chance(0.5) else -1)
+    for _ in range(2):
+        if f.chance(0.5 * amount):
+            _signal_arm(o, f.uniform(12, f.plan.drive_length + 50))
+    if f.chance(0.3 * amount):
+        _banner(o, f.uniform(15, f.plan.drive_length + 50))
+
+
+def _raise_buildings(f: Furnisher, amount: float) -> None:
+    """Some buildings of the rows get more floors: facades that fill the image up to its upper edge."""
+    tall_street = f.chance(0.5)
+    for row in f.rows:
+        if row[0] == rec.BUILDING and row[7] > 7.5 and f.chance((0.7 if tall_street else 0.25) * amount):
+            row[7] += int(f.rng.integers(1, 9)) * row[16]
+
+
+def _avenue(o: Overhead, side: int) -> None:
+    """Old trees whose crowns meet over the road, dense or with holes."""
+    f = o.f
+    spacing, density = f.uniform(7, 15), f.uniform(0.15, 0.8)
+    leaves, size = f.pick(LEAF_COLORS, 0.3), f.uniform(0.8, 1.25)
+    s = -15 + f.uniform(0, spacing)
+    while s < min(o.end, f.plan.drive_length + 90):
+        u = o.foot(s, side, 0.9, 0.45)
+        if u is not None and f.chance(0.85):
+            height, radius = size * f.uniform(11, 16), size * f.uniform(4.2, 7.0)
+            k = f.uniform(0.8, 1.2)
+            rgb = (leaves[0] * k, leaves[1] * k, leaves[2] * k)
+            turn = f.uniform(0, 6.28)
+            crown = (radius, density * f.uniform(0.8, 1.2), 0.0, f.uniform(0.3, 0.42), f.uniform(0.18, 0.34))
+            f.place(rec.TREE, (s, u), turn, (1.0, 1.0, height), rgb, (0.10, 0.08, 0.06), crown)
+        s += spacing * f.uniform(0.85, 1.2)
+
+
+def _bare_trees(o: Overhead, side: int) -> None:
+    """Trees without leaves: trunks, boughs and twigs against the sky."""
+    f = o.f
+    for _ in range(int(f.rng.integers(2, 6))):
+        s = f.uniform(4, f.plan.drive_length + 50)
+        u = o.foot(s, side, 1.0, 0.4)
+        if u is None:
+            continue
+        height = f.uniform(7, 13)
+        tone = f.uniform(0.05, 0.13)
+        bark = (tone * 1.15, tone, tone * 0.85)
+        fork = (s, u, 0.33 * height)
+        o.cylinder((s, u, 0.0), fork, f.uniform(0.25, 0.5), bark, (VEGETATION, BARK))
+        for i in range(6):
+            angle = 1.05 * i + f.uniform(-0.3, 0.3)
+            out, up = f.uniform(0.14, 0.28) * height, f.uniform(0.2, 0.42) * height
+            bough = (s + out * math.cos(angle), u + out * math.sin(angle), fork[2] + up)
+            o.cylinder(fork, bough, f.uniform(0.09, 0.16), bark, (VEGETATION, BARK))
+            for _ in range(4):
+                turn, reach = angle + f.uniform(-1.2, 1.2), f.uniform(0.1, 0.2) * height
+                x, y = bough[0] + reach * math.cos(turn), bough[1] + reach * math.sin(turn)
+                twig = (x, y, bough[2] + f.uniform(0.0, 0.2) * height)
+                o.cylinder(bough, twig, f.uniform(0.03, 0.06), bark, (VEGETATION, BARK))
+
+
+def _tall_lamps(o: Overhead, side: int) -> None:
+    f = o.f
+    s, step, tone = -10 + f.uniform(0, 25), f.uniform(22, 38), f.uniform(0.03, 0.4)
+    height, reach = f.uniform(8, 12), f.uniform(2.5, 4.5)
+    while s < o.end:
+        u = o.foot(s, side, 0.5, 0.3)
+        if u is not None:
+            rgb = (tone, tone, tone)
+            f.place(rec.LAMP, (s, u), -side * math.pi / 2, (0.2, 0.2, height), rgb, parameters=(reach, 0.0))
+        s += step
+
+
+def _bridge(o: Overhead, s: float) -> None:
+    """A bridge or a short underpass across the road."""
+    f = o.f
+    if f.plan.crossing is not None and f.near_crossing(s, 12.0):
+        return
+    low, deck, along = f.uniform(4.6, 6.8), f.uniform(0.7, 1.8), f.uniform(4, 22)
+    stone = f.chance(0.3)
+    rgb = f.pick(GREYS) if not stone else f.pick(((0.28, 0.16, 0.11), (0.34, 0.29, 0.22)))
+    looks = (BUILDING, BRICK if stone else (METAL if f.chance(0.2) else CONCRETE))
+    x, y, heading = f.plan.line.point(s, 0.0)
+    yaw = heading + f.uniform(-0.25, 0.25)
+    f.add(rec.PART, (x, y, low + deck / 2), yaw, (along, 90.0, deck), f.seed(), rgb, rgb, (0, *looks))
+    seed, shade = f.seed(), (0, *looks, 0, 0, 0, along / 2, 40.0, f.uniform(0.35, 0.7))
+    f.add(rec.PART, (x, y, 0.0), yaw, (0.02, 0.02, 0.02), seed, rgb, rgb, shade)
+    c, n = math.cos(yaw), math.sin(yaw)
+    solid, girders = f.chance(0.5), int(f.rng.integers(0, 4))
+    edge = f.pick(METALS)
+    for end in (-1, 1):
+        at = (x + end * c * along / 2, y + end * n * along / 2)
+        high = f.uniform(0.9, 1.4)
+        if solid:
+            place, size = (*at, low + deck + high / 2), (0.25, 90.0, high)
+            f.add(rec.PART, place, yaw, size, f.seed(), rgb, rgb, (0, WALL, looks[1]))
+        else:
+            seed, bars = f.seed(), (float(f.chance(0.4)), 0.14, 0.04)
+            place = (*at, low + deck)
+            f.add(rec.FENCE, place, yaw + math.pi / 2, (70.0, 0.05, high), seed, edge, parameters=bars)
+    for i in range(girders):
+        at = ((i + 0.5) / girders - 0.5) * along
+        place = (x + c * at, y + n * at, low - 0.25)
+        f.add(rec.PART, place, yaw, (0.4, 90.0, 0.5), f.seed(), edge, edge, (0, looks[0], PLAIN))
+    walls = f.chance(0.5)
+    for side in (-1, 1):
+        u = max(o.kerb(side) + f.plan.sidewalk(side), f.reach + abs(f.plan.ego_u) + 0.6) + 0.4
+        if walls:
+            o.box((s, side * (u + 1.5), low / 2), (along * 0.98, 3.0, low), rgb, (WALL, looks[1]))
+        else:
+            for k in (-0.35, 0.35):
+                o.box((s + k * along, side * (u + 0.5), low / 2), (1.0, 1.0, low), rgb, (BUILDING, looks[1]))
+    if f.chance(0.4):
+        place = (s - along / 2 - 0.2, f.plan.ego_u, low + 0.5 * deck)
+        o.board(place, 3.0, min(0.9, deck), (0.72, 0.6, 0.05), (0.03, 0.03, 0.03), math.pi)
+
+
+def _gantry(o: Overhead, s: float) -> None:
+    """A frame across the road with direction signs over the lanes."""
+    f = o.f
+    right, left = (o.foot(s, side, 0.7, 0.4) for side in (-1, 1))
+    if right is None or left is None:
+        return
+    height, metal = f.uniform(5.6, 7.2), f.pick(METALS)
+    for u in (right, left):
+        o.cylinder((s, u, 0.0), (s, u, height + 0.8), f.uniform(0.25, 0.45), metal, (POLE, METAL))
+    for z in (height, height + 0.8):
+        o.cylinder((s, right, z), (s, left, z), 0.22, metal, (POLE, METAL))
+    rgb, ink = ((0.02, 0.08, 0.35), (0.8, 0.8, 0.8)) if f.chance(0.5) else ((0.02, 0.20, 0.09), (0.8, 0.8, 0.8))
+    if f.chance(0.2):
+        rgb, ink = (0.75, 0.75, 0.73), (0.03, 0.03, 0.03)
+    lanes = [*f.plan.forward_lanes, *f.plan.backward_lanes]
+    for u in lanes:
+        if f.chance(0.75):
+            turn = math.pi if u in f.plan.forward_lanes else 0.0
+            place = (s - 0.3 if turn else s + 0.3, u, height + 0.4)
+            o.board(place, f.uniform(2.0, 3.0), f.uniform(1.2, 2.2), rgb, ink, turn)
+
+
+def _cross_wires(o: Overhead) -> None:
+    """Wires across the street with lamps or signals hung on some, and two along it as over a tramway."""
+    f = o.f
+    height, step, hung = f.uniform(6.0, 9.0), f.uniform(14, 32), int(f.rng.integers(0, 3))
+    tram = f.chance(0.4)
+    places = []
+    s = f.uniform(3, 15)
+    while s < min(o.end, f.plan.drive_length + 80):
+        ends = [side * (o.kerb(side) + f.plan.sidewalk(side) + 0.3) for side in (-1, 1)]
+        far = (s + f.uniform(-1, 1), ends[1], height + 0.6)
+        o.wire((s, ends[0], height + 0.6), far, f.uniform(0.3, 0.9), f.uniform(0.02, 0.05))
+        if hung == 1:
+            middle = 0.5 * (ends[0] + ends[1])
+            o.box((s, middle, height - 0.5), (0.7, 0.35, 0.2), (0.4, 0.4, 0.39), (POLE, METAL))
+        places.append(s)
+        s += step
+    if tram:
+        for u in (f.plan.ego_u, f.plan.ego_u + 3.2):
+            for a, b in zip(places[:-1], places[1:], strict=True):
+                o.wire((a, u, height), (b, u, height), 0.15, 0.025)
+
+
+def _pole_line(o: Overhead, side: int) -> None:
+    """Wooden or concrete poles with bundles of wires along the street, some to the houses."""
+    f = o.f
+    step, height, tone = f.uniform(22, 34), f.uniform(8, 11), f.uniform(0.08, 0.3)
+    wires = [(f.uniform(-0.9, 0.9), f.uniform(0.2, 1.8)) for _ in range(int(f.rng.integers(2, 7)))]
+    tops: list[tuple[float, float]] = []
+    s = -25 + f.uniform(0, 20)
+    while s < o.end:
+        u = o.foot(s, side, 0.6, 0.3)
+        if u is not None:
+            f.place(rec.POLE, (s, u), 0.0, (0.28, 0.28, height), (tone, tone * 0.8, tone * 0.6), parameters=(1.0,))
+            tops.append((s, u))
+        s += step
+    for a, b in zip(tops[:-1], tops[1:], strict=True):
+        if b[0] - a[0] < 1.6 * step:
+            for across, below in wires:
+                start, end = ((at[0], at[1] + across, height - below) for at in (a, b))
+                o.wire(start, end, f.uniform(0.3, 0.9), 0.03)
+    for s, u in tops:
+        if f.chance(0.35):
+            far = -side * (o.kerb(-side) + f.plan.sidewalk(-side) + 2.0)
+            o.wire((s, u, height - 0.5), (s + f.uniform(-4, 4), far, f.uniform(5.5, 7.5)), 0.5, 0.03)
+
+
+def _signal_arm(o: Overhead, s: float) -> None:
+    """Signals on an arm over the lanes, facing the traffic."""
+    f = o.f
+    side = -1 if f.chance(0.75) else 1
+    u = o.foot(s, side, 0.6, 0.3)
+    if u is None:
+        return
+    tone = f.uniform(0.03, 0.4)
+    size, arm = (0.3, 0.3, f.uniform(5.6, 6.6)), (f.uniform(4.5, 8.5), float(f.rng.integers(0, 3)))
+    f.place(rec.SIGNAL, (s, u), math.pi if side < 0 else 0.0, size, (tone, tone, tone), parameters=arm)
+
+
+def _banner(o: Overhead, s: float) -> None:
+    """A banner or a string of lamps across the street."""
+    f = o.f
+    ends = [side * (o.kerb(side) + f.plan.sidewalk(side) + 0.3) for side in (-1, 1)]
+    height = f.uniform(6.0, 8.0)
+    o.wire((s, ends[0], height + 0.7), (s, ends[1], height + 0.7), 0.2, 0.03)
+    rgb = f.pick(((0.5, 0.05, 0.05), (0.7, 0.7, 0.68), (0.05, 0.2, 0.45), *RENDER_COLORS[:2]))
+    o.box((s, f.plan.ego_u, height), (0.03, f.uniform(4, 8), f.uniform(0.7, 1.3)), rgb, (BUILDING, PLAIN))
+
+
+# furnish -------------------------------------------------------------------------------------------
+
 
 # objects on the sidewalks: trees, lamps, poles, signs, bins, benches, bollards --------------------
-
-
-Size = tuple[float, float, float]
 
 
 class Sidewalk:
@@ -50,9 +351,8 @@ class Sidewalk:
         f, (s, from_kerb) = self.f, place
         if f.near_crossing(s, self.corner + across):
             return
-        u = f.free_u(
-            s, self.side * (self.kerb + from_kerb), max(across, 0.3), across, self.side, self.side * (self.front - 0.1)
-        )
+        limit = self.side * (self.front - 0.1)
+        u = f.free_u(s, self.side * (self.kerb + from_kerb), max(across, 0.3), across, self.side, limit)
         if u is not None:
             f.place(kind, (s, u), turn, size, rgb, rgb2, parameters)
 
@@ -151,16 +451,8 @@ def _sign(walk: Sidewalk, s: float) -> None:
         rgb = ((0.02, 0.08, 0.35), (0.03, 0.22, 0.10), (0.72, 0.72, 0.7))[int(f.rng.integers(3))]
     width = size * f.uniform(1.6, 2.6) if mask == 0 else 0.0
     ink = (0.75, 0.75, 0.74) if rgb[0] < 0.5 else (0.03, 0.03, 0.03)
-    walk.put(
-        rec.SIGN,
-        (s, f.uniform(0.35, 0.7)),
-        0.3,
-        towards,
-        (0.1, width, f.uniform(2.1, 2.7)),
-        rgb,
-        ink,
-        (float(mask), size, float(f.chance(0.25)), motif),
-    )
+    place, board = (s, f.uniform(0.35, 0.7)), (0.1, width, f.uniform(2.1, 2.7))
+    walk.put(rec.SIGN, place, 0.3, towards, board, rgb, ink, (mask, size, float(f.chance(0.25)), motif))
 
 
 # furnish ------------------------------------------------------------------------------------------
@@ -187,16 +479,8 @@ def _facade(f: Furnisher, shop: bool) -> tuple[float, ...]:
     width = f.uniform(0.6, 0.85) if modern else f.uniform(0.32, 0.55)
     window = f.uniform(1.6, 2.1) if modern else f.uniform(1.3, 1.8)
     sill = f.uniform(0.45, 0.8) if modern else f.uniform(0.75, 1.0)
-    return (
-        bay,
-        f.uniform(2.9, 3.5),
-        f.uniform(3.6, 4.6) if shop else f.uniform(2.9, 3.4),
-        width,
-        sill,
-        window,
-        f.uniform(0.12, 0.28),
-        float(shop),
-    )
+    floor, ground = f.uniform(2.9, 3.5), f.uniform(3.6, 4.6) if shop else f.uniform(2.9, 3.4)
+    return (bay, floor, ground, width, sill, window, f.uniform(0.12, 0.28), float(shop))
 
 
 def _building(f: Furnisher, x0: float, y0: float, x1: float, y1: float, side: int, depth: float, urban: bool) -> None:
@@ -222,18 +506,8 @@ def _building(f: Furnisher, x0: float, y0: float, x1: float, y1: float, side: in
     trim = f.pick(((0.62, 0.60, 0.56), (0.45, 0.43, 0.40), (0.30, 0.29, 0.28), (0.70, 0.69, 0.67)))
     balconies = float(urban and f.chance(0.35))
     yaw_out = yaw if side > 0 else yaw + math.pi  # local -y faces the street
-    f.rows.append(
-        record(
-            rec.BUILDING,
-            (cx, cy, 0.0),
-            yaw_out,
-            (length, depth, height),
-            f.seed(),
-            wall,
-            trim,
-            (*facade, float(gable), balconies, float(brick)),
-        )
-    )
+    front = (*facade, float(gable), balconies, float(brick))
+    f.add(rec.BUILDING, (cx, cy, 0.0), yaw_out, (length, depth, height), f.seed(), wall, trim, front)
 
 
 def _building_row(f: Furnisher, side: int, front: float) -> None:
@@ -272,35 +546,21 @@ def _front_garden(f: Furnisher, side: int, front: float, s: float, length: float
     extent = length + (0 if plan.urban else 2.0)
     if draw < 0.3:
         height = f.uniform(0.8, 1.6)
-        f.place(
-            rec.HEDGE,
-            (middle, u + side * 0.2),
-            0,
-            (extent, f.uniform(0.6, 0.9), height),
-            f.pick(LEAF_COLORS[:3]),
-            parameters=(0, 0, 0, 0.17),
-        )
+        size, rgb = (extent, f.uniform(0.6, 0.9), height), f.pick(LEAF_COLORS[:3])
+        f.place(rec.HEDGE, (middle, u + side * 0.2), 0, size, rgb, parameters=(0, 0, 0, 0.17))
     elif draw < 0.55:
         brick = f.chance(0.5)
-        color = f.pick(BRICK_COLORS if brick else RENDER_COLORS)
-        f.place(
-            rec.WALL, (middle, u), 0, (extent, 0.24, f.uniform(0.6, 1.5)), color, (0.5, 0.49, 0.46), (float(brick),)
-        )
+        color, size = f.pick(BRICK_COLORS if brick else RENDER_COLORS), (extent, 0.24, f.uniform(0.6, 1.5))
+        f.place(rec.WALL, (middle, u), 0, size, color, (0.5, 0.49, 0.46), (float(brick),))
     elif draw < 0.9:
         _fence(f, middle, u, 0, extent)
     if setback > 3.0:
         for _ in range(int(f.rng.integers(0, 3))):
             bush = side * (front + f.uniform(1.2, setback - 0.8))
             size = f.uniform(0.9, 1.7)
-            f.place(
-                rec.BUSH,
-                (s + f.uniform(0.5, length - 0.5), bush),
-                f.uniform(0, 3),
-                (size, size, size * f.uniform(0.7, 1.1)),
-                f.pick(LEAF_COLORS),
-                parameters=(0, 0, 0, 0.15),
-                z=0.08,
-            )
+            place, turn = (s + f.uniform(0.5, length - 0.5), bush), f.uniform(0, 3)
+            sizes, rgb = (size, size, size * f.uniform(0.7, 1.1)), f.pick(LEAF_COLORS)
+            f.place(rec.BUSH, place, turn, sizes, rgb, parameters=(0, 0, 0, 0.15), z=0.08)
         if f.chance(0.5) and setback > 4:
             plant_tree(f, s + f.uniform(1, length - 1), side * (front + setback * 0.5), garden=True)
 
@@ -311,14 +571,8 @@ def _fence(f: Furnisher, s: float, u: float, turn: float, length: float) -> None
     if style == 0 and f.chance(0.4):
         color = (0.6, 0.6, 0.58)
     wide = f.chance(0.35)
-    f.place(
-        rec.FENCE,
-        (s, u),
-        turn,
-        (length, 0.05, f.uniform(0.9, 1.8)),
-        color,
-        parameters=(float(style), 0.16 if wide else 0.13, 0.09 if wide else 0.025),
-    )
+    bars = (float(style), *((0.16, 0.09) if wide else (0.13, 0.025)))
+    f.place(rec.FENCE, (s, u), turn, (length, 0.05, f.uniform(0.9, 1.8)), color, parameters=bars)
 
 
 def _green_lot(f: Furnisher, side: int, front: float, s: float, length: float) -> None:
@@ -329,15 +583,8 @@ def _green_lot(f: Furnisher, side: int, front: float, s: float, length: float) -
             _fence(f, middle, u, 0, length)
         else:
             brick = f.chance(0.5)
-            f.place(
-                rec.WALL,
-                (middle, u),
-                0,
-                (length, 0.26, f.uniform(1.0, 2.3)),
-                f.pick(BRICK_COLORS if brick else RENDER_COLORS),
-                (0.5, 0.49, 0.46),
-                (float(brick),),
-            )
+            size, rgb = (length, 0.26, f.uniform(1.0, 2.3)), f.pick(BRICK_COLORS if brick else RENDER_COLORS)
+            f.place(rec.WALL, (middle, u), 0, size, rgb, (0.5, 0.49, 0.46), (float(brick),))
     for _ in range(int(length / 5)):
         plant_tree(f, s + f.uniform(0, length), side * (front + f.uniform(2.5, 12)), garden=True)
 
@@ -362,18 +609,9 @@ def _crossing_surroundings(f: Furnisher) -> None:
                 _building(f, x0, y0, x1, y1, side * arm, f.uniform(9, 12), plan.urban)
                 if f.chance(0.5):
                     x, y = crossing.to_world(arm * (a + 2), side * (crossing.half_width + 0.9))
-                    f.rows.append(
-                        record(
-                            rec.TREE,
-                            (x, y, KERB_M),
-                            0.0,
-                            (1, 1, f.uniform(6, 9)),
-                            f.seed(),
-                            f.pick(LEAF_COLORS),
-                            (0.13, 0.10, 0.075),
-                            (f.uniform(1.8, 2.5), 0.6, 0.0, 0.27, 0.15),
-                        )
-                    )
+                    size, seed, rgb = (1, 1, f.uniform(6, 9)), f.seed(), f.pick(LEAF_COLORS)
+                    crown = (f.uniform(1.8, 2.5), 0.6, 0.0, 0.27, 0.15)
+                    f.add(rec.TREE, (x, y, KERB_M), 0.0, size, seed, rgb, (0.13, 0.10, 0.075), crown)
                 a += length + (0.05 if plan.urban else f.uniform(3, 8))
         x, y = crossing.to_world(arm * 125.0, 0.0)  # something closes the view
         _block(f, (x, y), crossing.yaw + arm * -math.pi / 2, (40, 12, f.uniform(9, 16)))
@@ -383,18 +621,8 @@ def _crossing_surroundings(f: Furnisher) -> None:
 
 def _block(f: Furnisher, xy: tuple[float, float], yaw: float, size: tuple[float, float, float]) -> None:
     """A plain building at a place in the world."""
-    f.rows.append(
-        record(
-            rec.BUILDING,
-            (*xy, 0),
-            yaw,
-            size,
-            f.seed(),
-            f.pick(RENDER_COLORS),
-            (0.6, 0.58, 0.55),
-            (*_facade(f, False), 0.0, 0.0, 0.0),
-        )
-    )
+    seed, rgb = f.seed(), f.pick(RENDER_COLORS)
+    f.add(rec.BUILDING, (*xy, 0), yaw, size, seed, rgb, (0.6, 0.58, 0.55), (*_facade(f, False), 0.0, 0.0, 0.0))
 
 
 def _close_arm(f: Furnisher, arm: int) -> None:
@@ -435,16 +663,8 @@ def _signals(f: Furnisher) -> None:
         if f.blocked(crossing.s, a, 1.0, crossing.half_width + 1.5):
             continue
         facing = crossing.yaw + (0.0 if arm_side > 0 else math.pi)
-        row = record(
-            rec.SIGNAL,
-            (x, y, KERB_M),
-            facing,
-            (0.3, 0.3, 3.5),
-            f.seed(),
-            (tone, tone, tone),
-            parameters=(0.0, 2.0 - lit),
-        )
-        f.rows.append(row)
+        rgb = (tone, tone, tone)
+        f.add(rec.SIGNAL, (x, y, KERB_M), facing, (0.3, 0.3, 3.5), f.seed(), rgb, parameters=(0.0, 2.0 - lit))
 
 
 def _background(f: Furnisher) -> None:
@@ -458,16 +678,8 @@ def _background(f: Furnisher) -> None:
     for i in range(14):
         u = (i - 6.5) * 7.0 + f.uniform(-2, 2)
         size = f.uniform(9, 16)
-        f.place(
-            rec.TREE,
-            (end + f.uniform(16, 30), u),
-            0,
-            (1, 1, size),
-            f.pick(LEAF_COLORS[:4]),
-            (0.13, 0.10, 0.075),
-            (size * 0.34, 0.8, 0.0, 0.6, 0.25),
-            z=0.0,
-        )
+        place, rgb, crown = (end + f.uniform(16, 30), u), f.pick(LEAF_COLORS[:4]), (size * 0.34, 0.8, 0.0, 0.6, 0.25)
+        f.place(rec.TREE, place, 0, (1, 1, size), rgb, (0.13, 0.10, 0.075), crown, z=0.0)
     if plan.urban or f.chance(0.4):
         for side in (-1, 1):
             for _ in range(int(f.rng.integers(2, 7))):
@@ -475,26 +687,11 @@ def _background(f: Furnisher) -> None:
                 if f.near_crossing(s, 16):
                     continue
                 size = (f.uniform(12, 24), f.uniform(12, 20), f.uniform(20, 48))
-                f.place(
-                    rec.BUILDING,
-                    (s, u),
-                    0 if side > 0 else math.pi,
-                    size,
-                    f.pick(RENDER_COLORS),
-                    parameters=(*_facade(f, False), 0.0, 0.0, 0.0),
-                    z=0.0,
-                )
+                rgb, front = f.pick(RENDER_COLORS), (*_facade(f, False), 0.0, 0.0, 0.0)
+                f.place(rec.BUILDING, (s, u), 0 if side > 0 else math.pi, size, rgb, parameters=front, z=0.0)
     for i in range(8):
         angle, distance = heading + (i - 3.5) * 0.42, f.uniform(260, 480)
         height = f.uniform(10, 42)
         place = (x + distance * math.cos(angle), y + distance * math.sin(angle), -2.0)
-        row = record(
-            rec.HILL,
-            place,
-            f.uniform(0, 3),
-            (f.uniform(160, 320), f.uniform(120, 220), height),
-            f.seed(),
-            f.pick(LEAF_COLORS[:3]),
-            parameters=(float(np.sign(height - 14) > 0),),
-        )
-        f.rows.append(row)
+        yaw, size, seed = f.uniform(0, 3), (f.uniform(160, 320), f.uniform(120, 220), height), f.seed()
+        f.add(rec.HILL, place, yaw, size, seed, f.pick(LEAF_COLORS[:3]), parameters=(float(height > 14),))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,28 +126,9 @@ def plan_streets(config: CityConfig) -> StreetPlan:
     crossing = _crossing(rng, config, line, drive_length, urban)
     marks = _paint(rng, lanes, lane, (left, right))
     crosswalks = _crosswalks(rng, (left, right), crossing)
-    return StreetPlan(
-        line,
-        urban,
-        lane,
-        forward_u,
-        backward_u,
-        ego_u,
-        float(left),
-        float(right),
-        park_left,
-        park_right,
-        walks[0],
-        walks[1],
-        urban or rng.random() < 0.1,
-        urban or rng.random() < 0.1,
-        crossing,
-        marks,
-        crosswalks,
-        drive_s,
-        times,
-        drive_length,
-    )
+    paved = [urban or rng.random() < 0.1 for _ in range(2)]
+    street = (line, urban, lane, forward_u, backward_u, ego_u, float(left), float(right), park_left, park_right)
+    return StreetPlan(*street, *walks, *paved, crossing, marks, crosswalks, drive_s, times, drive_length)
 
 
 def _drive(rng: np.random.Generator, config: CityConfig) -> tuple[Array, Array]:
@@ -267,3 +249,286 @@ def _crosswalks(rng: np.random.Generator, kerbs: tuple[float, float], crossing: 
     elif rng.random() < 0.6:
         walks.append([float(rng.uniform(14, 55)), length, 0.0])
     return np.array(walks, np.float64).reshape(-1, 3)
+
+
+# paint ---------------------------------------------------------------------------------------------
+#
+# Where paint lies on the streets of the generated city, exactly: at any point of the ground, and as lines for scores
+# that want a map.
+#
+# The rules are those of ``native/city_ground.cpp``, without its blur over the footprint of a pixel and without wear.
+
+
+_BAR_PERIOD_M: Final = 1.1
+_BAR_MIDDLE_M: Final = 0.3
+_BAR_HALF_M: Final = 0.27
+_STOP_M: Final = 1.5
+_STOP_HALF_M: Final = 0.2
+_DOUBLE_M: Final = 0.15
+_STEP_M: Final = 0.5
+
+
+def painted(plan: StreetPlan, street: Array, xy: Array) -> NDArray[np.bool_]:
+    """Whether points of the road carry paint, bool[N].
+
+    Args:
+        street: s, u and distance to the kerb f64[N, 3] of the points (``CityHandle.street``). xy: the points f64[N, 2]
+            in the world.
+    """
+    s, u = street[:, 0], street[:, 1]
+    crossing = plan.crossing
+    a, b = (np.zeros(len(xy)), np.zeros(len(xy))) if crossing is None else _cross_coordinates(crossing, xy)
+    in_cross = np.zeros(len(xy), bool) if crossing is None else (u > plan.left) | (u < plan.right)
+    cut = in_cross if crossing is None else in_cross | (np.abs(b) < crossing.half_width + 0.6)
+    paint = np.zeros(len(xy), bool)
+    for start, length, on_cross in plan.crosswalks:
+        here = in_cross if on_cross and crossing is not None else np.ones(len(xy), bool)
+        along, across = (a if on_cross else s) - start, b if on_cross else u
+        near = here & (along > -2.2) & (along < length + 2.2)
+        if not on_cross:
+            cut = cut | near
+        bars = np.abs((across / _BAR_PERIOD_M) % 1.0 * _BAR_PERIOD_M - _BAR_MIDDLE_M) < _BAR_HALF_M
+        paint |= near & (along > 0) & (along < length) & bars
+        paint |= near & _stop_line(plan, along, across, length, bool(on_cross))
+    paint |= ~cut & _marks(plan, s, u)
+    if crossing is not None:
+        to_edge = np.where(a > 0, a - plan.left, -a + plan.right)
+        dashes = np.abs((a / 6.0) % 1.0 * 6.0 - 1.5) < 1.5
+        paint |= in_cross & (to_edge > 7.0) & (np.abs(b) < 0.07) & dashes
+    return paint & (street[:, 2] < 0)
+
+
+def _stop_line(plan: StreetPlan, along: Array, across: Array, length: float, on_cross: bool) -> NDArray[np.bool_]:
+    """Stop lines for traffic that comes towards a crossing."""
+    right = across < 0
+    line = np.where(right, -_STOP_M, length + _STOP_M)
+    if on_cross:
+        line = np.where(right, -99.0, length + _STOP_M)
+    half = (
+        plan.crossing.half_width if on_cross and plan.crossing is not None else np.where(right, -plan.right, plan.left)
+    )
+    return (np.abs(across) < half - 0.4) & (np.abs(along - line) < _STOP_HALF_M)
+
+
+def _marks(plan: StreetPlan, s: Array, u: Array) -> NDArray[np.bool_]:
+    """Lines along the main street."""
+    paint = np.zeros(len(s), bool)
+    for place, half, period, dash, kind, _ in plan.marks:
+        off = u - place
+        if kind == MARK_DOUBLE:
+            found = np.abs(np.abs(off) - _DOUBLE_M) < half
+        elif kind == MARK_HATCHED:
+            found = (np.abs(off) < half) & _dashed(s + 0.7 * off, period, dash)
+        else:
+            found = np.abs(off) < half
+            if kind == MARK_DASHED:
+                found &= _dashed(s, period, dash)
+        paint |= found
+    return paint
+
+
+def _dashed(along: Array, period: float, dash: float) -> NDArray[np.bool_]:
+    return np.abs((along / period) % 1.0 * period - 0.5 * dash) < 0.5 * dash
+
+
+def _cross_coordinates(crossing: Crossing, xy: Array) -> tuple[Array, Array]:
+    c, n = np.cos(crossing.yaw), np.sin(crossing.yaw)
+    dx, dy = xy[:, 0] - crossing.x, xy[:, 1] - crossing.y
+    return c * dx + n * dy, -n * dx + c * dy
+
+
+# ---- as a map has it -----------------------------------------------------------------------------
+
+
+def lane_lines(plan: StreetPlan) -> list[Array]:
+    """Road lines, road edges and the long sides of crosswalks as lines f64[N, 3] on the road, metres in the world.
+
+    As in a map, a dashed line is one line, and nothing is left out where a crossing street begins.
+    """
+    along = np.arange(plan.line.s[0], plan.line.s[-1], _STEP_M)
+    lines = [_street_line(plan.line, along, np.full(len(along), u)) for u in (*plan.marks[:, 0], plan.left, plan.right)]
+    for start, length, on_cross in plan.crosswalks:
+        for edge in (start, start + length):
+            if on_cross and plan.crossing is not None:
+                across = np.arange(-plan.crossing.half_width, plan.crossing.half_width, _STEP_M)
+                places = np.array([plan.crossing.to_world(edge, b) for b in across])
+                lines.append(np.c_[places, np.zeros(len(places))])
+            elif not on_cross:
+                across = np.arange(plan.right, plan.left, _STEP_M)
+                lines.append(_street_line(plan.line, np.full(len(across), edge), across))
+    return lines
+
+
+def _street_line(line: Centreline, s: Array, u: Array) -> Array:
+    """World places f64[N, 3] of street coordinates."""
+    x, y, _ = line.to_world(s, u)
+    return np.stack([x, y, np.zeros(len(s))], 1)
+
+
+# objects -------------------------------------------------------------------------------------------
+#
+# Collects the static objects along the streets and keeps the corridor of the shifted cameras free.
+
+
+# records ------------------------------------------------------------------------------------------
+#
+# Records: one row of numbers per object of the city. The native library makes shapes and materials from them.
+
+
+COLUMNS: Final = 28
+
+# kinds of objects; the same numbers stand in native/city_world.h
+BUILDING, TREE, HEDGE, LAMP, SIGN, SIGNAL, WALL, FENCE, POLE, BIN, BENCH = range(1, 12)
+SHELTER, HILL, BUSH = range(12, 15)
+BOLLARD, MOTORBIKE, PLANTER, PART = range(16, 20)
+CAR, VAN, TRUCK, BUS, PEDESTRIAN, CYCLIST, TANKER = range(50, 57)
+
+LABELS: Final = {
+    CAR: "car",
+    VAN: "car",
+    TRUCK: "truck",
+    BUS: "bus",
+    PEDESTRIAN: "pedestrian",
+    CYCLIST: "cyclist",
+    TANKER: "truck",
+}
+
+Color = tuple[float, float, float]
+Size = tuple[float, float, float]
+
+
+def record(
+    kind: int,
+    xyz: Size,
+    yaw: float,
+    size: Size,
+    seed: int,
+    rgb: Color = (0.5, 0.5, 0.5),
+    rgb2: Color = (0.5, 0.5, 0.5),
+    parameters: tuple[float, ...] = (),
+) -> list[float]:
+    """One row: position (metres, world), heading (radians), size (length, width, height in metres), linear colours,
+    up to 12 parameters whose meaning depends on the kind (see native/city_build.cpp), public instance id (0 = none)."""
+    padded = (*parameters, *(0.0,) * (12 - len(parameters)))
+    return [float(kind), *xyz, yaw, *size, float(seed), *rgb, *rgb2, *padded, 0.0]
+
+
+class Draws:
+    """Random numbers for one purpose."""
+
+    def __init__(self, seed: int, purpose: str) -> None:
+        self.rng = seeds.numpy_rng(seed, 0, purpose)
+
+    def seed(self) -> int:
+        """A new seed for one object."""
+        return int(self.rng.integers(1, 1 << 24))
+
+    def uniform(self, low: float, high: float) -> float:
+        """A uniform number."""
+        return low + (high - low) * float(self.rng.random())
+
+    def chance(self, probability: float) -> bool:
+        """True with this probability."""
+        return float(self.rng.random()) < probability
+
+
+# furnisher ----------------------------------------------------------------------------------------
+
+
+KERB_M = 0.13
+RENDER_COLORS: tuple[Color, ...] = (
+    (0.52, 0.46, 0.36),
+    (0.60, 0.56, 0.48),
+    (0.42, 0.42, 0.41),
+    (0.62, 0.52, 0.36),
+    (0.36, 0.30, 0.25),
+    (0.55, 0.38, 0.28),
+    (0.34, 0.38, 0.42),
+    (0.66, 0.62, 0.57),
+    (0.48, 0.30, 0.22),
+    (0.55, 0.50, 0.30),
+    (0.30, 0.36, 0.30),
+)
+BRICK_COLORS: tuple[Color, ...] = ((0.30, 0.13, 0.085), (0.36, 0.19, 0.12), (0.24, 0.12, 0.09), (0.42, 0.30, 0.20))
+LEAF_COLORS: tuple[Color, ...] = (
+    (0.085, 0.15, 0.035),
+    (0.11, 0.17, 0.04),
+    (0.06, 0.115, 0.03),
+    (0.15, 0.17, 0.045),
+    (0.20, 0.13, 0.03),
+)
+CLEARANCE_M = 1.0
+
+
+class Furnisher(Draws):
+    """Collects the records of static objects; keeps the corridor of the shifted cameras free."""
+
+    def __init__(self, config: CityConfig, plan: StreetPlan) -> None:
+        super().__init__(config.seed, "city furniture")
+        self.plan = plan
+        self.rows: list[list[float]] = []
+        self.reach = config.shift_margin_m + CLEARANCE_M
+        self._from_s, self._to_s = -2.5, plan.drive_length + 4.5
+
+    def pick(self, items: tuple[Color, ...], spread: float = 0.15) -> Color:
+        """One of the colours, a little lighter or darker."""
+        k = self.uniform(1 - spread, 1 + spread)
+        r, g, b = items[int(self.rng.integers(len(items)))]
+        return (r * k, g * k, b * k)
+
+    def blocked(self, s: float, u: float, along: float, across: float) -> bool:
+        """Would something of half extents (along, across) at (s, u) stand in the corridor of the shifted cameras?"""
+        inside = self._from_s - along < s < self._to_s + along
+        return inside and abs(u - self.plan.ego_u) < self.reach + across
+
+    def free_u(self, s: float, u: float, along: float, across: float, side: int, limit: float) -> float | None:
+        """``u``, moved outwards if the corridor needs it; None when there is no room before ``limit`` (|u| of a
+        wall)."""
+        if self.blocked(s, u, along, across):
+            u = self.plan.ego_u + side * (self.reach + across + 0.05)
+        return u if abs(u) + across < abs(limit) else None
+
+    def near_crossing(self, s: float, margin: float) -> bool:
+        """Is ``s`` within ``margin`` metres of the crossing street?"""
+        crossing = self.plan.crossing
+        return crossing is not None and abs(s - crossing.s) < crossing.half_width + margin
+
+    def add(
+        self,
+        kind: int,
+        xyz: Size,
+        yaw: float,
+        size: Size,
+        seed: int,
+        rgb: Color,
+        rgb2: Color = (0.5, 0.5, 0.5),
+        parameters: tuple[float, ...] = (),
+    ) -> None:
+        """Add a record."""
+        self.rows.append(record(kind, xyz, yaw, size, seed, rgb, rgb2, parameters))
+
+    def place(
+        self,
+        kind: int,
+        place: tuple[float, float],
+        turn: float,
+        size: Size,
+        rgb: Color,
+        rgb2: Color = (0.5, 0.5, 0.5),
+        parameters: tuple[float, ...] = (),
+        z: float = KERB_M,
+    ) -> None:
+        """Add an object at street coordinates (s, u); ``turn`` is its heading relative to the street."""
+        x, y, heading = self.plan.line.point(*place)
+        self.add(kind, (x, y, z), heading + turn, size, self.seed(), rgb, rgb2, parameters)
+
+
+def plant_tree(f: Furnisher, s: float, u: float, garden: bool = False) -> None:
+    """A tree at street coordinates; gardens also have conifers."""
+    draw = float(f.rng.random())
+    habit = 2.0 if garden and draw < 0.15 else (1.0 if draw > 0.9 else 0.0)
+    height = f.uniform(6.0, 11.0) if habit == 0 else f.uniform(7, 12)
+    radius = height * f.uniform(0.24, 0.32) if habit == 0 else f.uniform(1.0, 1.7)
+    cell = f.uniform(0.20, 0.27) * (1 + 0.05 * max(0.0, height - 7))
+    turn, leaves, crown = f.uniform(0, 6.28), f.pick(LEAF_COLORS), (radius, f.uniform(0.45, 0.72), habit, cell)
+    f.place(TREE, (s, u), turn, (1.0, 1.0, height), leaves, (0.13, 0.10, 0.075), (*crown, f.uniform(0.11, 0.2)))

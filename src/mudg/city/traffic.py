@@ -9,10 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import geometry, seeds
-from mudg.city import objects as rec
+from mudg.city import layout as rec
 from mudg.city.config import CityConfig
-from mudg.city.layout import StreetPlan
-from mudg.city.objects import KERB_M, Color, Draws, record
+from mudg.city.layout import KERB_M, Color, Draws, StreetPlan, record
 from mudg.city.sensors import pitch_rotation
 
 Array = NDArray[np.float64]
@@ -149,11 +148,8 @@ class TrafficPlanner(Draws):
                     distance = np.abs(ax * (b[:, 0] - a[:, 0]) + ay * (b[:, 1] - a[:, 1]))
                     reach = 0.25
                     for keys_k, hl, hw in ((a, half_l, half_w), (b, rect[0], rect[1])):
-                        reach = (
-                            reach
-                            + hl * np.abs(ax * np.cos(keys_k[:, 3]) + ay * np.sin(keys_k[:, 3]))
-                            + hw * np.abs(-ax * np.sin(keys_k[:, 3]) + ay * np.cos(keys_k[:, 3]))
-                        )
+                        cos, sin = np.cos(keys_k[:, 3]), np.sin(keys_k[:, 3])
+                        reach = reach + hl * np.abs(ax * cos + ay * sin) + hw * np.abs(-ax * sin + ay * cos)
                     separated |= distance > reach
             if not separated.all():
                 return True
@@ -173,8 +169,7 @@ class TrafficPlanner(Draws):
             return record(rec.VAN, origin, 0, size, seed, white)
         if allow_big and draw < 0.17:
             size = (self.uniform(6.5, 9.0), 2.45, self.uniform(3.0, 3.7))
-            white = self.chance(0.6)
-            box = PAINTS[1] if white else (self.uniform(0.05, 0.5), self.uniform(0.05, 0.4), self.uniform(0.05, 0.5))
+            box = PAINTS[1] if self.chance(0.6) else self.box_color()
             return record(rec.TRUCK, origin, 0, size, seed, paint, box)
         if allow_big and draw < 0.21:
             body = BUS_COLORS[int(self.rng.integers(5))]
@@ -188,29 +183,20 @@ class TrafficPlanner(Draws):
     def tall_vehicle(self, seed: int, paint: Color) -> list[float]:
         """Record of a lorry, tanker or bus of full height."""
         kind, origin = float(self.rng.random()), (0.0, 0.0, 0.0)
-        box = (
-            PAINTS[1]
-            if self.chance(0.5)
-            else (self.uniform(0.05, 0.5), self.uniform(0.05, 0.4), self.uniform(0.05, 0.5))
-        )
+        box = PAINTS[1] if self.chance(0.5) else self.box_color()
         if kind < 0.5:
-            return record(
-                rec.TRUCK, origin, 0, (self.uniform(7.0, 15.0), 2.5, self.uniform(3.6, 4.0)), seed, paint, box
-            )
+            size = (self.uniform(7.0, 15.0), 2.5, self.uniform(3.6, 4.0))
+            return record(rec.TRUCK, origin, 0, size, seed, paint, box)
         if kind < 0.65:
-            steel = self.uniform(0.3, 0.6)
-            return record(
-                rec.TANKER,
-                origin,
-                0,
-                (self.uniform(8.0, 13.0), 2.5, self.uniform(3.3, 3.7)),
-                seed,
-                paint,
-                (steel, steel, steel) if self.chance(0.6) else box,
-            )
+            steel, size = self.uniform(0.3, 0.6), (self.uniform(8.0, 13.0), 2.5, self.uniform(3.3, 3.7))
+            return record(rec.TANKER, origin, 0, size, seed, paint, (steel,) * 3 if self.chance(0.6) else box)
         body = BUS_COLORS[int(self.rng.integers(5))]
         height = self.uniform(4.1, 4.4) if self.chance(0.35) else self.uniform(3.1, 3.5)
         return record(rec.BUS, origin, 0, (self.uniform(10.5, 12), 2.5, height), seed, body, (0.6, 0.6, 0.58))
+
+    def box_color(self) -> Color:
+        """A colour of a lorry's box."""
+        return (self.uniform(0.05, 0.5), self.uniform(0.05, 0.4), self.uniform(0.05, 0.5))
 
     def cloth(self) -> Color:
         """A colour of clothing: mostly muted."""
@@ -220,19 +206,9 @@ class TrafficPlanner(Draws):
 
     def pedestrian(self, speed: float) -> list[float]:
         """Record of a random pedestrian."""
-        clothes = [self.cloth(), self.cloth()]
-        height = self.uniform(1.55, 1.9)
-        swing = min(0.5, 0.33 * speed)
-        return record(
-            rec.PEDESTRIAN,
-            (0, 0, 0),
-            0,
-            (0.85, 0.65, height),
-            self.seed(),
-            clothes[0],
-            tuple(0.4 * c for c in clothes[1]),
-            (swing, float(self.chance(0.3))),
-        )
+        coat, (r, g, b), height, seed = self.cloth(), self.cloth(), self.uniform(1.55, 1.9), self.seed()
+        gait, legs = (min(0.5, 0.33 * speed), float(self.chance(0.3))), (0.4 * r, 0.4 * g, 0.4 * b)
+        return record(rec.PEDESTRIAN, (0, 0, 0), 0, (0.85, 0.65, height), seed, coat, legs, gait)
 
     def along_street(self, s: Array, u: Array | float, direction: int, z: float = 0.0) -> Array:
         """Keys of an object that follows the main street; direction -1 = against it."""

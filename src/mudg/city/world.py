@@ -6,6 +6,8 @@ Needs the native library: without it, building a world raises ResourceError nami
 from __future__ import annotations
 
 import copy
+import ctypes
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -15,20 +17,167 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mudg import native
 from mudg.base import geometry, seeds
 from mudg.base.config import build, to_dict
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, EgoPath, Observation, Source, SweepPoints, Track, View
-from mudg.city import objects as rec
-from mudg.city import paint, sensors
+from mudg.city import layout as rec
+from mudg.city import sensors
 from mudg.city.config import CityConfig
 from mudg.city.furnish import furnish
 from mudg.city.layout import StreetPlan, plan_streets
-from mudg.city.light import lamp_places, light_numbers, weather_numbers
-from mudg.city.native import CityHandle
-from mudg.city.photos import draw_photos
+from mudg.city.light import draw_photos, lamp_places, light_numbers, weather_numbers
 from mudg.city.traffic import PosedObject, ego_keys, key_times, plan_traffic
+
+# native --------------------------------------------------------------------------------------------
+#
+# Thin ctypes layer over the city's ray caster in the native library.
+
+
+_P, _I, _L, _U = ctypes.c_void_p, ctypes.c_int, ctypes.c_int64, ctypes.c_uint32
+_F64, _F32, _U8, _I32 = (np.ctypeslib.ndpointer(kind, flags="C") for kind in ("f8", "f4", "u1", "i4"))
+_SIGNATURES: tuple[tuple[str, Any, list[Any]], ...] = (
+    ("number_counts", _I, [_I]),
+    ("create", _P, [_F64, _L, _F64, _L, _F64, _L, _F64, _L, _F64, _F64, _I]),
+    ("destroy", None, [_P]),
+    ("set_texture", _I, [_P, _I, _F32, _I, _I, ctypes.c_float]),
+    ("set_weather", _I, [_P, _F64, _F64, _L]),
+    ("planes", _I, [_P, _F64, _F64, _F64, _I, _I, _F64, _F32]),
+    ("shape_count", _L, [_P]),
+    ("render", _I, [_P, _F64, _F64, _F64, _I, _I, _F64, _I, _U, _F32, _F32, _U8, _I32]),
+    ("sweep", _I, [_P, _F64, _I, _F64, _F64, _I, _F64, _I, _F64, _F64, _F64, _U, _F32, _F32, _U8, _I32]),
+    ("street", None, [_P, _F64, _L, _F64]),
+)
+
+
+@functools.cache
+def library() -> ctypes.CDLL:
+    """The native library with the city's signatures set. ResourceError when there is none."""
+    lib = native.require("rendering the city")
+    for name, result, arguments in _SIGNATURES:
+        function = getattr(lib, f"mudg_city_{name}")
+        function.argtypes, function.restype = arguments, result
+    return lib
+
+
+def _f64(array: Any) -> NDArray[np.float64]:
+    return np.ascontiguousarray(array, np.float64)
+
+
+class CityHandle:
+    """Owns one native world."""
+
+    def __init__(
+        self,
+        records: NDArray[np.float64],
+        plan: StreetPlan,
+        road: NDArray[np.float64],
+        light: NDArray[np.float64],
+        seed: int,
+    ) -> None:
+        self._lib = library()
+        line = _f64(np.stack([plan.line.s, plan.line.x, plan.line.y, plan.line.heading], 1))
+        records, marks, walks, road, light = map(_f64, (records, plan.marks, plan.crosswalks, road, light))
+        got = (len(road), len(light), records.shape[1])
+        expected = tuple(self._lib.mudg_city_number_counts(which) for which in range(3))
+        if got != expected:
+            what = "the native library belongs to another version of the city"
+            raise ResourceError(what, expected=str(got), got=str(expected), remedy="build it again")
+        tables = [part for table in (records, line, marks, walks) for part in (table, len(table))]
+        self._handle = self._lib.mudg_city_create(*tables, road, light, seed & 0x7FFFFFFF)
+        if not self._handle:
+            raise ResourceError("not enough memory to build the city")
+        self.shape_count = int(self._lib.mudg_city_shape_count(self._handle))
+
+    def set_texture(self, slot: int, rgb: NDArray[np.float32], metres: float) -> None:
+        """Give a surface or the sky a photograph f32[H, W, 3]; before anything is rendered."""
+        pixels = np.ascontiguousarray(rgb, np.float32)
+        if self._lib.mudg_city_set_texture(self._handle, slot, pixels, pixels.shape[1], pixels.shape[0], metres):
+            raise ResourceError("not enough memory for a texture of the city")
+
+    def set_weather(self, numbers: NDArray[np.float64], lamps: NDArray[np.float64]) -> None:
+        """Wet ground, snow and lamps f64[N, 3]; before anything is rendered. Numbers as in native/city_weather.cpp."""
+        values, places = _f64(numbers), _f64(lamps).reshape(-1, 3)
+        if self._lib.mudg_city_set_weather(self._handle, values, places, len(places)):
+            raise ResourceError("not enough memory for the lamps of the city")
+
+    def planes(
+        self,
+        poses: NDArray[np.float64],
+        phases: NDArray[np.float64],
+        camera: Camera,
+        world_from_cam: NDArray[np.float64],
+    ) -> NDArray[np.float32]:
+        """Normal, albedo, open sky, sun, snow and water f32[H, W, 10] of what the rays through pixel centres meet."""
+        out = np.empty((camera.height, camera.width, 10), np.float32)
+        poses, phases, numbers, pose = map(_f64, (poses, phases, camera.intrinsics, world_from_cam))
+        size = (camera.width, camera.height)
+        if self._lib.mudg_city_planes(self._handle, poses, phases, numbers, *size, pose, out):
+            raise ResourceError("not enough memory to render the city")
+        return out
+
+    def __del__(self) -> None:
+        if getattr(self, "_handle", None):
+            self._lib.mudg_city_destroy(self._handle)
+            self._handle = None
+
+    def render(
+        self,
+        poses: NDArray[np.float64],
+        phases: NDArray[np.float64],
+        intrinsics: tuple[float, float, float, float],
+        width: int,
+        height: int,
+        world_from_cam: NDArray[np.float64],
+        supersample: int,
+        noise_key: int,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
+        """rgb f32[H, W, 3] in [0, 1], depth f32[H, W] (+inf in the sky), semantics u8[H, W], instance i32[H, W]."""
+        rgb, depth = np.empty((height, width, 3), np.float32), np.empty((height, width), np.float32)
+        semantics, instance = np.empty((height, width), np.uint8), np.empty((height, width), np.int32)
+        poses, phases, camera, pose = map(_f64, (poses, phases, intrinsics, world_from_cam))
+        view, key = (camera, width, height, pose), noise_key & 0xFFFFFFFF
+        truth = (rgb, depth, semantics, instance)
+        if self._lib.mudg_city_render(self._handle, poses, phases, *view, supersample, key, *truth):
+            raise ResourceError("not enough memory to render the city")
+        return truth
+
+    def sweep(
+        self,
+        poses: NDArray[np.float64],
+        phases: NDArray[np.float64],
+        elevations: NDArray[np.float64],
+        azimuths: NDArray[np.float64],
+        world_from_lidar: NDArray[np.float64],
+        fractions: NDArray[np.float64],
+        settings: tuple[float, float, float, float],
+        key: int,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8], NDArray[np.int32]]:
+        """World points f32[C, B, 3], intensity f32[C, B] (negative: no return), semantics u8[C, B], instance i32[C, B]
+        for C columns and B beams; ``poses`` f64[knots, objects, 4], ``world_from_lidar`` f64[C, 3, 4]."""
+        columns, beams = len(azimuths), len(elevations)
+        xyz, intensity = np.empty((columns, beams, 3), np.float32), np.empty((columns, beams), np.float32)
+        semantics, instance = np.empty((columns, beams), np.uint8), np.empty((columns, beams), np.int32)
+        poses, phases, rows, numbers = map(_f64, (poses, phases, world_from_lidar, settings))
+        elevations, azimuths, fractions = map(_f64, (elevations, azimuths, fractions))
+        scan = (elevations, beams, azimuths, columns, rows, fractions, numbers, key & 0xFFFFFFFF)
+        points = (xyz, intensity, semantics, instance)
+        if self._lib.mudg_city_sweep(self._handle, poses, len(poses), phases, *scan, *points):
+            raise ResourceError("not enough memory to scan the city")
+        return points
+
+    def street(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Per world point [N, 2]: street coordinates s, u and signed distance to the kerb (negative on the road)."""
+        xy = _f64(xy).reshape(-1, 2)
+        out = np.empty((len(xy), 3), np.float64)
+        self._lib.mudg_city_street(self._handle, xy, len(xy), out)
+        return out
+
+
+# world ---------------------------------------------------------------------------------------------
+
 
 DATASET = "mudg procedural city"
 GENERATOR_VERSION = 1
@@ -308,12 +457,12 @@ class CityWorld:
         xyz = geometry.unproject(view, np.stack([columns, rows], 1) + 0.5, truth.depth[rows, columns])
         mask = np.zeros(truth.semantics.shape, bool)
         if len(xyz):
-            mask[rows, columns] = paint.painted(self.plan, self._handle.street(xyz[:, :2]), xyz[:, :2])
+            mask[rows, columns] = rec.painted(self.plan, self._handle.street(xyz[:, :2]), xyz[:, :2])
         return mask
 
     def lane_lines(self) -> list[NDArray[np.float64]]:
         """Road lines, road edges and crosswalks as a map has them: lines f64[N, 3] in the world, metres."""
-        return paint.lane_lines(self.plan)
+        return rec.lane_lines(self.plan)
 
     # --- truth ------------------------------------------------------------------------------------
 
@@ -339,18 +488,8 @@ class CityWorld:
         if not 1 <= per_axis <= 8:
             raise UsageError("supersample must lie in 1..8", got=str(per_axis))
         poses = self._object_keys_at(np.array([view.time_s]))[0]
-        return CityTruth(
-            *self._handle.render(
-                poses,
-                self._phases(view.time_s),
-                intrinsics,
-                camera.width,
-                camera.height,
-                view.world_from_cam,
-                per_axis,
-                noise_key,
-            )
-        )
+        frame = (intrinsics, camera.width, camera.height, view.world_from_cam)
+        return CityTruth(*self._handle.render(poses, self._phases(view.time_s), *frame, per_axis, noise_key))
 
     def surfaces(self, view: View) -> CitySurfaces:
         """Exact surfaces behind the pixel centres of a view, as ``render`` sees them."""
@@ -384,18 +523,9 @@ class CityWorld:
             at = view.time_s + readout_s * ((top + bottom) / 2 / camera.height - 0.5)
             at = min(max(at, first), last)
             intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy - top)
-            parts.append(
-                self._handle.render(
-                    self._object_keys_at(np.array([at]))[0],
-                    self._phases(at),
-                    intrinsics,
-                    camera.width,
-                    bottom - top,
-                    self._world_from_ego(at) @ mount,
-                    self.config.supersample,
-                    0,
-                )
-            )
+            strip = (intrinsics, camera.width, bottom - top, self._world_from_ego(at) @ mount)
+            objects = (self._object_keys_at(np.array([at]))[0], self._phases(at))
+            parts.append(self._handle.render(*objects, *strip, self.config.supersample, 0))
         rgb, depth, semantics, instance = zip(*parts, strict=True)
         return CityTruth(*(np.concatenate(column) for column in (rgb, depth, semantics, instance)))
 
@@ -418,15 +548,10 @@ class CityWorld:
         world_from_lidar = self._world_from_ego(time_s) @ mount
         columns = _interpolated_poses(self._ego_times, self._ego_poses, time_s + offsets) @ mount
         settings = (config.lidar_range_m, config.lidar_noise_m, config.lidar_dropout, 0.55)
+        objects, beams = (self._object_keys_at(knots), self._phases(time_s)), (scan.elevations_rad, azimuths)
+        fractions, key = (offsets + period / 2) / period, seeds.key(config.seed, index, f"city lidar{scan.name}")
         xyz, intensity, semantics, instance = self._handle.sweep(
-            self._object_keys_at(knots),
-            self._phases(time_s),
-            scan.elevations_rad,
-            azimuths,
-            columns[:, :3],
-            (offsets + period / 2) / period,
-            settings,
-            seeds.key(config.seed, index, f"city lidar{scan.name}"),
+            *objects, *beams, columns[:, :3], fractions, settings, key
         )
         hit = intensity >= 0
         lidar_from_world = geometry.invert(world_from_lidar)
@@ -462,20 +587,12 @@ def _interpolated_poses(
             q = (np.sin((1 - u) * angle)[:, None] * q0 + np.sin(u * angle)[:, None] * q1) / math.sin(angle)
         q /= np.linalg.norm(q, axis=1, keepdims=True)
         w, x, y, z = q.T
-        out[rows, :3, :3] = np.stack(
-            [
-                1 - 2 * (y * y + z * z),
-                2 * (x * y - w * z),
-                2 * (x * z + w * y),
-                2 * (x * y + w * z),
-                1 - 2 * (x * x + z * z),
-                2 * (y * z - w * x),
-                2 * (x * z - w * y),
-                2 * (y * z + w * x),
-                1 - 2 * (x * x + y * y),
-            ],
-            1,
-        ).reshape(-1, 3, 3)
+        turns = [
+            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
+            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
+            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
+        ]
+        out[rows, :3, :3] = np.stack(turns, 1).reshape(-1, 3, 3)
         out[rows, :3, 3] = (1 - u)[:, None] * poses[i][:3, 3] + u[:, None] * poses[i + 1][:3, 3]
         out[rows, 3] = (0, 0, 0, 1)
     return out
@@ -488,55 +605,22 @@ def _seed31(config: CityConfig, purpose: str) -> int:
 def _road_numbers(config: CityConfig, plan: StreetPlan) -> NDArray[np.float64]:
     """Numbers of the road in the order of ``RoadNumber`` in native/city.cpp."""
     rng = seeds.numpy_rng(config.seed, 0, "city ground")
-    crossing = plan.crossing
     cross = [0.0] * 10
-    if crossing is not None:
-        cross = [
-            1.0,
-            crossing.s,
-            crossing.x,
-            crossing.y,
-            crossing.yaw,
-            crossing.half_width,
-            crossing.corner,
-            crossing.start,
-            crossing.end,
-            crossing.sidewalk,
-        ]
+    if (c := plan.crossing) is not None:
+        cross = [1.0, c.s, c.x, c.y, c.yaw, c.half_width, c.corner, c.start, c.end, c.sidewalk]
     grey = rng.uniform(0.045, 0.11)
     warm = rng.uniform(-0.06, 0.06)
     asphalt = grey * np.array([1 + warm, 1.0, 1 - warm])
     stone = rng.uniform(0.17, 0.32)
     pale = rng.uniform(-0.04, 0.10)
     sidewalk = stone * np.array([1 + pale, 1.0, 1 - pale])
-    terrain = np.array([[0.075, 0.12, 0.03], [0.10, 0.135, 0.035], [0.15, 0.145, 0.05], [0.06, 0.10, 0.03]])[
-        rng.integers(4)
-    ] * rng.uniform(0.85, 1.2)
-    line = plan.line
-    pad = 75.0
+    greens = np.array([[0.075, 0.12, 0.03], [0.10, 0.135, 0.035], [0.15, 0.145, 0.05], [0.06, 0.10, 0.03]])
+    terrain = greens[rng.integers(4)] * rng.uniform(0.85, 1.2)
+    line, pad = plan.line, 75.0
     bounds = [line.x.min() - pad, line.y.min() - pad, line.x.max() + pad, line.y.max() + pad]
-    return np.array(
-        [
-            plan.left,
-            plan.right,
-            plan.sidewalk_left,
-            plan.sidewalk_right,
-            plan.paved_left,
-            plan.paved_right,
-            plan.park_left,
-            plan.park_right,
-            *cross,
-            plan.lane_width,
-            float(_seed31(config, "city ground texture") % 1_000_000),
-            *asphalt,
-            *sidewalk,
-            *(sidewalk * rng.uniform(0.9, 1.2)),
-            *terrain,
-            rng.uniform(0.5, 1.6),
-            rng.uniform(0.0, 1.0),
-            rng.uniform(0.0, 1.0),
-            float(rng.random() < 0.3),
-            *np.floor(bounds),
-        ],
-        np.float64,
-    )
+    edges = ("left", "right", "sidewalk_left", "sidewalk_right", "paved_left", "paved_right", "park_left", "park_right")
+    grounds = [*asphalt, *sidewalk, *(sidewalk * rng.uniform(0.9, 1.2)), *terrain]
+    wear = [rng.uniform(0.5, 1.6), rng.uniform(0.0, 1.0), rng.uniform(0.0, 1.0), float(rng.random() < 0.3)]
+    texture = float(_seed31(config, "city ground texture") % 1_000_000)
+    numbers = [*(getattr(plan, edge) for edge in edges), *cross, plan.lane_width, texture, *grounds, *wear]
+    return np.array([*numbers, *np.floor(bounds)], np.float64)

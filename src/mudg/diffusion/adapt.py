@@ -13,7 +13,7 @@ out are never read.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from mudg.base import log, palette, seeds, store
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import InputError, UsageError
 from mudg.base.processes import one_torch_thread, run_in_processes
-from mudg.base.types import Clip, Condition, Frame, Photo, Scene, Trajectory, View
+from mudg.base.types import Clip, Condition, Frame, Photo, Scene, View
 from mudg.core import trajectory
 from mudg.core.pictures import resize_area, resize_nearest
 from mudg.diffusion import model_files, score
@@ -46,22 +46,21 @@ from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.storage import load_model, model_of_scene
 from mudg.scene.clouds import read_fused
 from mudg.scene.labels import photographs, read_trusted_classes
-from mudg.scene.part import write_photos
 from mudg.scene.read import read_image, read_points, read_scene
+from mudg.scene.write import write_photos
 
 # lessons ------------------------------------------------------------------------------------------
 #
-# What a log can teach about views that were not driven: its photographs as truth, seen without them.
-#
-# A lesson is a drive that shows some photographs and not others:
+# What a log can teach about views that were not driven: its photographs as truth, seen without them. A lesson is a
+# drive that shows some photographs and not others:
 #
 # * **gap**: blocks of consecutive frames are left out, every other block in the first lesson, the rest in the second.
 #   The truth are the photographs left out.
 # * **shifted**: every photograph is carried to a pose some metres to the side, with the depth of the scene fitted to
-# the log; what it does
-#   not show there is rendered. These pictures are taken for a recorded drive, and the real photographs, now beside its
-#   path, are the truth. The way there goes by the depth of the first fit, the way back by that of another, which is
-#   fitted to the carried pictures alone, so holes, splinters and wrong parallax are those of a lateral shift.
+#   the log; what it does not show there is rendered. These pictures are taken for a recorded drive, and the real
+#   photographs, now beside its path, are the truth. The way there goes by the depth of the first fit, the way back by
+#   that of another, which is fitted to the carried pictures alone, so holes, splinters and wrong parallax are those of
+#   a lateral shift.
 #
 # A short fit to what a lesson shows gives the renders of its conditions, as `synthesize` would have them.
 
@@ -120,18 +119,16 @@ def lessons_of(scene: Scene, config: AdaptConfig) -> list[Lesson]:
     """All lessons of a log."""
     blocks = blocks_of(scene, config)
     everything = tuple(f.id for block in blocks for f in block)
-    clips = [(n, ids) for n, block in enumerate(blocks) for ids in _by_camera(block)]
+    clips = []
+    for n, block in enumerate(blocks):
+        for name in dict.fromkeys(f.view.camera.name for f in block):
+            clips.append((n, tuple(f.id for f in block if f.view.camera.name == name)))
     lessons = [Lesson(f"shift{shift:+g}", shift, everything, tuple(clips)) for shift in config.shifts_m]
     if config.gaps and len(blocks) >= 3:
         for odd in (0, 1):
             shown = tuple(f.id for n, block in enumerate(blocks) for f in block if n % 2 != odd)
             lessons.append(Lesson(f"gap{odd}", 0.0, shown, tuple((n, ids) for n, ids in clips if n % 2 == odd)))
     return lessons
-
-
-def _by_camera(block: Sequence[Frame]) -> list[tuple[str, ...]]:
-    names = dict.fromkeys(f.view.camera.name for f in block)
-    return [tuple(f.id for f in block if f.view.camera.name == name) for name in names]
 
 
 # what a lesson shows ------------------------------------------------------------------------------
@@ -151,8 +148,7 @@ def shown_photos(scene: Scene, lesson: Lesson, config: AdaptConfig, model: Scene
 
 def moved_view(scene: Scene, view: View, shift_m: float) -> View:
     """The view of a vehicle that is `shift_m` to the left."""
-    path: Trajectory = trajectory.shifted(scene, view.camera.name, shift_m)
-    return min(path.views, key=lambda v: abs(v.time_s - view.time_s))
+    return min(trajectory.shifted(scene, view.camera.name, shift_m).views, key=lambda v: abs(v.time_s - view.time_s))
 
 
 def carried(photo: Photo, target: View, model: SceneModel, width_px: int) -> Photo:
@@ -198,8 +194,6 @@ def fit_lesson(config: AdaptConfig, log: LearntLog, lesson: Lesson, folder: Path
 
 
 # clips --------------------------------------------------------------------------------------------
-#
-# Training clips of a log's lessons (see `adapt.py`).
 #
 # The truth of a clip are photographs, and depth where a sweep measured it. Elsewhere depth and all classes are what the
 # model that is adapted makes itself of the same condition: the log shows colours, but nobody knows what stands above
@@ -299,12 +293,9 @@ class ClipMaker:
         rgb = torch.stack(
             [image_tensor(resize_area(i, v.camera.width, v.camera.height)) for i, v in zip(images, condition.views)]
         )
-        depth, known = (torch.stack(parts) for parts in zip(*(self._measured(view) for view in condition.views)))
+        depth, known = zip(*(measured_depth(self._scene, view) for view in condition.views))
+        depth, known = torch.from_numpy(np.stack(depth))[:, None], torch.from_numpy(np.stack(known))[:, None]
         return Clip(condition, rgb, torch.where(known, depth, made.depth), torch.ones_like(known), made.semantics)
-
-    def _measured(self, view: View) -> tuple[torch.Tensor, torch.Tensor]:
-        depth, known = measured_depth(self._scene, view)
-        return torch.from_numpy(depth)[None], torch.from_numpy(known)[None]
 
 
 # adapt --------------------------------------------------------------------------------------------
@@ -350,7 +341,21 @@ class PlannedAdaptation:
                 got=config.model,
                 remedy="choose another model; `embedded` is one that was",
             )
-        learnt, lessons = _open_log(config, model, scene, fused, fitted)
+        loaded = read_scene(scene)
+        model_of_scene(fitted, loaded)  # refuses the fit of another scene
+        names = cameras_of(loaded, config)
+        unknown = [name for name in names if name not in loaded.cameras]
+        if unknown or not names:
+            raise InputError(
+                "the scene has no such camera",
+                where=f"--cameras, {loaded.root}",
+                expected=", ".join(loaded.cameras),
+                got=", ".join(unknown),
+            )
+        camera = loaded.cameras[names[0]]
+        width, height = model.image_size(camera.width, camera.height)
+        scale = max(1, min(MOST_SCALE, camera.width // width))
+        learnt, lessons = LearntLog(scene, fused, fitted, width, height, scale), lessons_of(loaded, config)
         clips = plan_clips(lessons, config)
         reason = why_too_short(clips, config)
         if reason:
@@ -365,17 +370,8 @@ class PlannedAdaptation:
     def make_clips(self, fit_scene: FitScene, work: Path) -> None:
         """Fits and clips of all lessons, several made at a time. fit_scene: fuses and fits one, also in another
         process."""
-        jobs = [
-            (
-                self.config,
-                self.learnt,
-                lesson,
-                [row for row in self.clips if row[1].name == lesson.name],
-                work,
-                fit_scene,
-            )
-            for lesson in self.lessons
-        ]
+        rows = {lesson.name: [row for row in self.clips if row[1].name == lesson.name] for lesson in self.lessons}
+        jobs = [(self.config, self.learnt, one, rows[one.name], work, fit_scene) for one in self.lessons]
         made, cores = 0, native.default_threads()
         processes = self.config.processes or (cores if self.config.device == "cpu" else min(cores, SHARING))
         with log.task("lessons", len(jobs)) as bar:
@@ -385,8 +381,36 @@ class PlannedAdaptation:
         log.info(f"adapt: {len(self.clips)} clips, {made} of them made now")
 
     def training(self, work: Path) -> LearnConfig:
-        """The settings of the training, in terms of `learn`."""
-        return _training(self.config, self.learnt, self.clips, work / CLIPS)
+        """The settings of the training, in terms of `learn`; the network is taken as it is."""
+        train = sum(number < HELD_OUT for number, _, _ in self.clips)
+        return LearnConfig(
+            seed=self.config.seed,
+            start=self.config.model,
+            steps=self.config.steps,
+            precision=self.config.precision,
+            threads=self.config.threads or native.default_threads(),
+            frozen="denoiser" if self.config.trained == "refiner" else "nothing",
+            data=LearnData(
+                width=self.learnt.width_px,
+                height=self.learnt.height_px,
+                window=self.config.block,
+                clips=str(work / CLIPS),
+                cities=train,
+                first_cities=train,
+                clips_per_city=1,
+                held_out=len(self.clips) - train,
+                renders=False,
+            ),
+            optimizer=LearnOptimizer(
+                batch_frames=self.config.batch_frames,
+                lr=self.config.lr,
+                full_window_share=1.0,
+                warmup_steps=min(10, self.config.steps // 4),
+                average_decay=0.95,
+            ),
+            score=LearnScore(every=1_000_000, watched=len(self.clips) - train, steps=SCORED_STEPS),
+            compute=LearnCompute(device=self.config.device, workers=0, checkpoint_every=20, log_every=10),
+        )
 
     def write_model(self, adapted: Path, work: Path, out: Path) -> dict[str, Any]:
         """Write the better one of the model as it was and as it was adapted; returns a summary."""
@@ -398,60 +422,6 @@ class PlannedAdaptation:
         )
         store.write_json(out / "adapt.json", record)
         return {"adapted": record["adapted"], "psnr": [record["before"]["psnr"], record["after"]["psnr"]]}
-
-
-def _open_log(
-    config: AdaptConfig, model: MDM, scene: Path, fused: Path, fitted: Path
-) -> tuple[LearntLog, list[Lesson]]:
-    loaded = read_scene(scene)
-    model_of_scene(fitted, loaded)  # refuses the fit of another scene
-    names = cameras_of(loaded, config)
-    unknown = [name for name in names if name not in loaded.cameras]
-    if unknown or not names:
-        raise InputError(
-            "the scene has no such camera",
-            where=f"--cameras, {loaded.root}",
-            expected=", ".join(loaded.cameras),
-            got=", ".join(unknown),
-        )
-    camera = loaded.cameras[names[0]]
-    width, height = model.image_size(camera.width, camera.height)
-    scale = max(1, min(MOST_SCALE, camera.width // width))
-    return LearntLog(scene, fused, fitted, width, height, scale), lessons_of(loaded, config)
-
-
-def _training(config: AdaptConfig, learnt: LearntLog, plan: Plan, clips: Path) -> LearnConfig:
-    """The settings of the training, in terms of `learn`."""
-    train = sum(number < HELD_OUT for number, _, _ in plan)
-    return LearnConfig(
-        seed=config.seed,
-        start=config.model,
-        steps=config.steps,
-        precision=config.precision,
-        threads=config.threads or native.default_threads(),
-        frozen="denoiser" if config.trained == "refiner" else "nothing",
-        data=LearnData(
-            width=learnt.width_px,
-            height=learnt.height_px,
-            window=config.block,
-            clips=str(clips),
-            cities=train,
-            # the network is taken as it is
-            first_cities=train,
-            clips_per_city=1,
-            held_out=len(plan) - train,
-            renders=False,
-        ),
-        optimizer=LearnOptimizer(
-            batch_frames=config.batch_frames,
-            lr=config.lr,
-            full_window_share=1.0,
-            warmup_steps=min(10, config.steps // 4),
-            average_decay=0.95,
-        ),
-        score=LearnScore(every=1_000_000, watched=len(plan) - train, steps=SCORED_STEPS),
-        compute=LearnCompute(device=config.device, workers=0, checkpoint_every=20, log_every=10),
-    )
 
 
 def _choose(config: AdaptConfig, base: MDM, plan: Plan, work: Path, out: Path) -> dict[str, Any]:
@@ -466,9 +436,10 @@ def _choose(config: AdaptConfig, base: MDM, plan: Plan, work: Path, out: Path) -
     }
     picture = work / "learn" / "samples" / f"{config.steps:07d}.png"
     store.atomic_write(out / "after.png", store.read_bytes(picture))
-    scores = {
-        name: {"psnr": _mean_psnr(row), **{k: v for k, v in row.items() if k != "clips"}} for name, row in found.items()
-    }
+    scores = {}
+    for name, row in found.items():
+        psnr = [shift["psnr"] for shift in row["by_shift"].values()]
+        scores[name] = {"psnr": round(sum(psnr) / len(psnr), 4), **{k: v for k, v in row.items() if k != "clips"}}
     gain = scores["after"]["psnr"] - scores["before"]["psnr"]
     verdict = "" if gain >= LEAST_GAIN_DB else "; the model is kept as it was"
     log.info(f"adapt: {_in_db(scores)}, on {len(kept)} clips not learned from{verdict}")
@@ -478,11 +449,6 @@ def _choose(config: AdaptConfig, base: MDM, plan: Plan, work: Path, out: Path) -
         "clips": {"learned": len(plan) - len(kept), "scored": len(kept)},
         **scores,
     }
-
-
-def _mean_psnr(found: Mapping[str, Any]) -> float:
-    rows = [row["psnr"] for row in found["by_shift"].values()]
-    return round(sum(rows) / len(rows), 4)
 
 
 def _card(config: AdaptConfig, record: Mapping[str, Any]) -> str:

@@ -16,6 +16,7 @@ import math
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Final, Literal
 
@@ -28,7 +29,7 @@ from mudg.base import crop, geometry, seeds
 from mudg.base.config import result_settings
 from mudg.base.log import progress
 from mudg.base.run_folder import RunDir
-from mudg.base.types import Clip, Condition, FinePatch, FusedCloud, Photo, RenderPlanes, SweepPoints, Track, View
+from mudg.base.types import Clip, Condition, FinePatch, FusedCloud, Photo, Track, View
 from mudg.city.config import CityConfig
 from mudg.city.sensors import (
     BoxFaults,
@@ -58,7 +59,7 @@ from mudg.gaussians import fit
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import short_fit
 from mudg.scene.clouds import write_fused
-from mudg.scene.part import PlacedSweep, write_photos
+from mudg.scene.write import PlacedSweep, write_photos
 
 # varied cities ------------------------------------------------------------------------------------
 #
@@ -166,12 +167,8 @@ def draw_sensors(seed: int, city: int, config: CityConfig) -> SensorFaults:
         cameras[name] = faults
     second = None
     if rng.random() < 0.2:
-        second = LidarMount(
-            (float(rng.uniform(0.5, 2.0)), float(rng.uniform(-0.9, 0.9)), float(rng.uniform(0.8, 2.0))),
-            int(rng.choice([16, 32])),
-            -20.0,
-            float(rng.choice([2.0, 15.0])),
-        )
+        place = (float(rng.uniform(0.5, 2.0)), float(rng.uniform(-0.9, 0.9)), float(rng.uniform(0.8, 2.0)))
+        second = LidarMount(place, int(rng.choice([16, 32])), -20.0, float(rng.choice([2.0, 15.0])))
     return SensorFaults(looks, cameras, _lidar_faults(rng), _pose_faults(rng), _box_faults(rng), second)
 
 
@@ -295,14 +292,10 @@ def record_with_faults(config: CityConfig, sensors: SensorFaults, used: Sequence
             sweep = world.lidar_sweep(index, scan)
             points = thinned(sweep.points, sensors.lidar, seeds.key(key, index, f"points{scan.name}"))
             sweeps.append(SweepShots(sweep.time_s, wrong @ sweep.world_from_lidar @ mounting, points, shots))
-    sweeps = [s for s in sweeps if _usable(s.points)]
+    sweeps = [s for s in sweeps if len(s.points.xyz)]
     cloud, _ = fuse_sweeps(sweeps, boxes, FusionRules(min_object_points=40))
     images = tuple(p for name in config.cameras for p in photos[name])
     return CityLog(world, cloud, images, tuple(sweeps), sensors, boxes, errors)
-
-
-def _usable(points: SweepPoints) -> bool:
-    return len(points.xyz) > 0
 
 
 def _photos(world: CityWorld, sensors: SensorFaults, errors: NDArray[np.float64], name: str, key: int) -> list[Photo]:
@@ -451,11 +444,8 @@ def start_of(rules: CityClipRules, city: int, number: int) -> int:
     """First frame of clip `number` of a city: where the log reaches `FIRST` frames beyond the clip at both ends, if it
     is so long."""
     last = rules.frames - FIRST - rules.window
-    return (
-        FIRST
-        if last <= FIRST
-        else int(seeds.numpy_rng(rules.seed, city * 64 + number, "start").integers(FIRST, last + 1))
-    )
+    rng = seeds.numpy_rng(rules.seed, city * 64 + number, "start")
+    return FIRST if last <= FIRST else int(rng.integers(FIRST, last + 1))
 
 
 def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
@@ -463,9 +453,9 @@ def make_log(rules: CityClipRules, city: int, frames: int = FRAMES) -> CityLog:
     config = replace(city_config(rules, city), n_frames=frames)
     rng = seeds.numpy_rng(rules.seed, city, "log")
     if is_varied(rules, city):
-        used = (
-            range(frames) if rng.random() < 0.6 else np.flatnonzero(rng.random(frames) < rng.uniform(0.3, 0.9)).tolist()
-        )
+        used = range(frames)
+        if rng.random() >= 0.6:
+            used = np.flatnonzero(rng.random(frames) < rng.uniform(0.3, 0.9)).tolist()
         key = seeds.key(rules.seed, city, "log with faults")
         return record_with_faults(config, sensors_of(rules, city), used or [frames // 2], key)
     world = CityWorld(config)
@@ -521,7 +511,8 @@ def make_clips(
     clips = []
     sources: dict[int, WarpSource] = {}
     known = _known(rules, city, log, rng)
-    near = near_sweeps(log)
+    times = tuple(sweep.time_s for sweep in log.sweeps)
+    near = NearSweeps(times, lambda number: log.sweeps[number], tracks, 1 / log.world.config.rate_hz)
     for number, shift_m in enumerate(shifts_of(rules, city)):
         start = start_of(rules, city, number)
         views = [shifted_view(log.world, view, shift_m) for view in front_views[start : start + rules.window]]
@@ -543,12 +534,6 @@ def make_clips(
             clip = replace(clip, fine=cut_patch(full, scale, patch_side(size), place))
         clips.append(clip)
     return clips
-
-
-def near_sweeps(log: CityLog) -> NearSweeps:
-    """The sweeps of a city's log for FreeVS' condition."""
-    times = tuple(sweep.time_s for sweep in log.sweeps)
-    return NearSweeps(times, lambda number: log.sweeps[number], log.tracks(), 1 / log.world.config.rate_hz)
 
 
 def _split_moments(
@@ -656,18 +641,14 @@ def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:
     config = short_fit(steps, width, images[0].view.camera.width, seed=city)
     with tempfile.TemporaryDirectory() as text:
         folder = Path(text)
-        write_photos(
-            folder / "scene", log.world.source(), log.world.ego_path(), log.tracks(), images, placed_sweeps(log)
-        )
+        world, sweeps = log.world, placed_sweeps(log)
+        write_photos(folder / "scene", world.source(), world.ego_path(), log.tracks(), images, sweeps)
         write_fused(folder / "fused", log.cloud, {})
         work = RunDir.open(folder / "fit", fit.OUTPUT, result_settings(config), {})
         fit.write_fit(config, fit.FitInputs(folder / "scene", folder / "fused"), work)
         model = fit.load_model(work.path)
 
-    def render_at(view: View) -> RenderPlanes:
-        return render_planes(model, view)
-
-    return render_at
+    return partial(render_planes, model)
 
 
 def steps_of(rules: CityClipRules, city: int) -> int:

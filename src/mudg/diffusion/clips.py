@@ -57,68 +57,34 @@ def shard_path(folder: Path, city: int) -> Path:
     return folder / f"city_{city:07d}.safetensors"
 
 
+_OPTIONAL = ("point_color", "measured", "depth_confidence")
+_RENDERS = ("render", "render_depth", "alpha", "certainty", "render_ids")
+_IDS = ("semantics", "ids", "backdrop_ids", "render_ids")
+_ARRAYS = {
+    **dict.fromkeys(("rgb", "color", "backdrop", "point_color", "render"), ("U8", "KT3HW")),
+    **dict.fromkeys(("depth", "sparse_depth", "measured", "render_depth"), ("F16", "KTHW")),
+    **dict.fromkeys((*_IDS, "flags", "alpha", "certainty", "depth_confidence"), ("U8", "KTHW")),
+    "world_from_cam": ("F64", "KT44"),
+    "intrinsics": ("F64", "KT4"),
+    "reference": ("U8", "K3HW"),
+    "shift_m": ("F32", "K"),
+    "rendered": ("BOOL", "K"),
+    "place": ("I32", "K3"),
+}
+"""Types and axes of a shard's arrays: clips, frames, rows, columns, and sizes that are always the same."""
+_PER_FRAME = [n for n, (_, axes) in _ARRAYS.items() if axes[:2] == "KT" and n not in (*_OPTIONAL, *_RENDERS)]
+
+
 def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArray[np.generic]]:
     """Arrays of a shard from clips of one size.
 
     Depth that is not valid is stored as far away, as is right for a generated sky. With `gaps` it is stored as it is,
     and marked as unknown. A condition's depth of 0 (nothing seen; points alone) stays 0.
     """
-
-    def u8(image: Tensor) -> NDArray[np.uint8]:
-        return (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
-
-    def f16(depth: Tensor, known: Tensor | None = None) -> NDArray[np.float16]:
-        far = torch.where(torch.isfinite(depth) & (depth > 0), depth, torch.full_like(depth, FAR_M))
-        far = far if known is None or gaps else torch.where(known, far, torch.full_like(far, FAR_M))
-        return far.clamp(max=FAR_M)[:, 0].numpy().astype(np.float16)
-
-    def flags(clip: Clip) -> NDArray[np.uint8]:
-        c = clip.condition
-        warped = torch.zeros_like(c.valid) if c.warped is None else c.warped
-        unknown = ~clip.depth_valid if gaps else torch.zeros_like(c.valid)
-        marks = c.valid * FLAG_VALID + warped * FLAG_WARPED + unknown * FLAG_DEPTH_UNKNOWN
-        return marks[:, 0].to(torch.uint8).numpy()
-
-    def ids(c: Condition, known: Tensor | None) -> NDArray[np.uint8]:
-        return (torch.full_like(c.valid, 255, dtype=torch.uint8) if known is None else known)[:, 0].numpy()
-
-    def intrinsics(c: Condition) -> NDArray[np.float64]:
-        return np.array([[v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy] for v in c.views], np.float64)
-
-    conditions = [clip.condition for clip in clips]
-    arrays = {
-        "rgb": np.stack([u8(c.rgb) for c in clips]),
-        "depth": np.stack([f16(c.depth, c.depth_valid) for c in clips]),
-        "semantics": np.stack([c.semantics.to(torch.uint8).numpy() for c in clips]),
-        "color": np.stack([u8(c.color) for c in conditions]),
-        "sparse_depth": np.stack([f16(c.depth) * (c.depth[:, 0] != 0).numpy() for c in conditions]),
-        "flags": np.stack([flags(c) for c in clips]),
-        "backdrop": np.stack([u8(c.color if c.backdrop is None else c.backdrop) for c in conditions]),
-        "reference": np.stack([u8(c.reference) for c in conditions]),
-        "ids": np.stack([ids(c, c.semantics) for c in conditions]),
-        "backdrop_ids": np.stack([ids(c, c.backdrop_semantics) for c in conditions]),
-        "world_from_cam": np.stack([np.stack([v.world_from_cam for v in c.views]) for c in conditions]),
-        "intrinsics": np.stack([intrinsics(c) for c in conditions]),
-        "shift_m": np.asarray([c.shift_m for c in clips], np.float32),
-    }
-    points = [u8(c.point_color) for c in clips if c.point_color is not None]
-    if points:
-        arrays["point_color"] = np.stack(points)
-    if any(c.renders is not None for c in conditions):
-        shown = [_empty_renders(c) if c.renders is None else c.renders for c in conditions]
-        arrays |= {
-            "render": np.stack([u8(r.color) for r in shown]),
-            "render_depth": np.stack([f16(r.depth) for r in shown]),
-            "alpha": np.stack([u8(r.alpha)[:, 0] for r in shown]),
-            "certainty": np.stack([u8(r.certainty)[:, 0] for r in shown]),
-            "render_ids": np.stack([r.semantics[:, 0].numpy() for r in shown]),
-            "rendered": np.array([c.renders is not None for c in conditions]),
-        }
-    measured = [c.measured for c in conditions if c.measured is not None]
-    if measured and len(measured) == len(clips):
-        arrays["measured"] = np.stack([f16(m.depth) * m.valid[:, 0].numpy() for m in measured])
-    if any(c.depth_confidence is not None for c in clips):
-        arrays["depth_confidence"] = np.stack([u8(c.depth_weight)[:, 0] for c in clips])
+    rendered = any(clip.condition.renders is not None for clip in clips)
+    weighed = any(clip.depth_confidence is not None for clip in clips)
+    rows = [_packed(clip, gaps, rendered, weighed) for clip in clips]
+    arrays = {name: np.stack([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
     patches = [clip.fine for clip in clips if clip.fine is not None]
     if patches and len(patches) == len(clips):
         fine = pack_clips([patch.clip for patch in patches], gaps=gaps)
@@ -127,11 +93,51 @@ def pack_clips(clips: Sequence[Clip], *, gaps: bool = False) -> dict[str, NDArra
     return arrays
 
 
-def _empty_renders(condition: Condition) -> RenderPlanes:
-    nothing = torch.zeros_like(condition.depth)
-    return RenderPlanes(
-        condition.color, nothing, nothing, nothing, torch.full_like(condition.valid, 255, dtype=torch.uint8)
-    )
+def _packed(clip: Clip, gaps: bool, rendered: bool, weighed: bool) -> dict[str, NDArray[Any]]:
+    """The arrays of one clip, those of `renders` and depth confidence if they are wanted."""
+    c = clip.condition
+    nothing, unlabelled = torch.zeros_like(c.valid), torch.full_like(c.valid, UNLABELLED, dtype=torch.uint8)
+
+    def u8(image: Tensor) -> NDArray[np.uint8]:
+        return (image.clamp(0, 1) * 255).round().to(torch.uint8).numpy()
+
+    def f16(depth: Tensor, known: Tensor | None = None) -> NDArray[np.float16]:
+        near = torch.isfinite(depth) & (depth > 0) if known is None else torch.isfinite(depth) & (depth > 0) & known
+        return torch.where(near, depth, FAR_M).clamp(max=FAR_M)[:, 0].numpy().astype(np.float16)
+
+    def ids(given: Tensor | None) -> NDArray[np.uint8]:
+        return (unlabelled if given is None else given)[:, 0].numpy()
+
+    flags = c.valid * FLAG_VALID + (nothing if c.warped is None else c.warped) * FLAG_WARPED
+    flags = flags + (~clip.depth_valid if gaps else nothing) * FLAG_DEPTH_UNKNOWN
+    arrays: dict[str, Any] = {
+        "rgb": u8(clip.rgb),
+        "depth": f16(clip.depth, None if gaps else clip.depth_valid),
+        "semantics": clip.semantics.to(torch.uint8).numpy(),
+        "color": u8(c.color),
+        "sparse_depth": f16(c.depth) * (c.depth[:, 0] != 0).numpy(),
+        "flags": flags[:, 0].to(torch.uint8).numpy(),
+        "backdrop": u8(c.color if c.backdrop is None else c.backdrop),
+        "reference": u8(c.reference),
+        "ids": ids(c.semantics),
+        "backdrop_ids": ids(c.backdrop_semantics),
+        "world_from_cam": np.stack([v.world_from_cam for v in c.views]),
+        "intrinsics": np.array([[v.camera.fx, v.camera.fy, v.camera.cx, v.camera.cy] for v in c.views], np.float64),
+        "shift_m": np.float32(clip.shift_m),
+    }
+    if clip.point_color is not None:
+        arrays["point_color"] = u8(clip.point_color)
+    if c.measured is not None:
+        arrays["measured"] = f16(c.measured.depth) * c.measured.valid[:, 0].numpy()
+    if weighed:
+        arrays["depth_confidence"] = u8(clip.depth_weight)[:, 0]
+    if rendered:
+        none = torch.zeros_like(c.depth)
+        r = RenderPlanes(c.color, none, none, none, unlabelled) if c.renders is None else c.renders
+        arrays |= {"render": u8(r.color), "render_depth": f16(r.depth), "alpha": u8(r.alpha)[:, 0]}
+        arrays |= {"certainty": u8(r.certainty)[:, 0], "render_ids": ids(r.semantics)}
+        arrays["rendered"] = np.bool_(c.renders is not None)
+    return arrays
 
 
 def write_shard(folder: Path, city: int, arrays: Mapping[str, NDArray[np.generic]]) -> None:
@@ -185,47 +191,12 @@ def _open(path: Path) -> safe_open:
         ) from error
 
 
-_PER_FRAME = (
-    "rgb",
-    "depth",
-    "semantics",
-    "color",
-    "sparse_depth",
-    "flags",
-    "backdrop",
-    "ids",
-    "backdrop_ids",
-    "world_from_cam",
-    "intrinsics",
-)
-
-
-_RENDERS = ("render", "render_depth", "alpha", "certainty", "render_ids")
-_ARRAYS = {
-    **dict.fromkeys(("rgb", "color", "backdrop", "point_color", "render"), ("U8", "KT3HW")),
-    "reference": ("U8", "K3HW"),
-    **dict.fromkeys(("depth", "sparse_depth", "measured", "render_depth"), ("F16", "KTHW")),
-    **dict.fromkeys(
-        ("semantics", "flags", "ids", "backdrop_ids", "alpha", "certainty", "render_ids", "depth_confidence"),
-        ("U8", "KTHW"),
-    ),
-    "world_from_cam": ("F64", "KT44"),
-    "intrinsics": ("F64", "KT4"),
-    "shift_m": ("F32", "K"),
-    "rendered": ("BOOL", "K"),
-    "place": ("I32", "K3"),
-}
-"""Types and axes of a shard's arrays: clips, frames, rows, columns, and sizes that are always the same."""
-
-
 def _check_arrays(shard: Any, path: Path) -> None:
     """InputError where an array is missing, or of another type or size than the others say; only the header is read."""
     names = set(shard.keys())
     for prefix in ("", FINE) if f"{FINE}place" in names else ("",):
-        required = {
-            prefix + name
-            for name in (*_PER_FRAME, "reference", "shift_m", *(_RENDERS if f"{prefix}rendered" in names else ()))
-        }
+        rendered = _RENDERS if f"{prefix}rendered" in names else ()
+        required = {prefix + name for name in (*_PER_FRAME, "reference", "shift_m", *rendered)}
         if required - names:
             raise _damaged(path, "every array of a shard", f"no {', '.join(sorted(required - names))}")
         shape = shard.get_slice(f"{prefix}rgb").get_shape()
@@ -239,19 +210,14 @@ def _check_arrays(shard: Any, path: Path) -> None:
                     raise _damaged(path, f"{kind} {wanted}", got)
 
 
-def _check_values(found: Mapping[str, Tensor], path: Path) -> None:
+def _check_values(planes: Mapping[str, Tensor], path: Path) -> None:
     """InputError for numbers that are not finite, and for classes that do not exist."""
-    for name, value in found.items():
+    for name, value in planes.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             raise _damaged(path, "finite numbers", name)
-        if name in ("semantics", "ids", "backdrop_ids", "render_ids") and bool(
-            ((value >= len(CLASSES)) & (value != UNLABELLED)).any()
-        ):
-            raise _damaged(
-                path,
-                f"classes below {len(CLASSES)}, or {UNLABELLED}",
-                f"{name}: {int(value[value != UNLABELLED].max())}",
-            )
+        labels = value[value != UNLABELLED]
+        if name in _IDS and bool((labels >= len(CLASSES)).any()):
+            raise _damaged(path, f"classes below {len(CLASSES)}, or {UNLABELLED}", f"{name}: {int(labels.max())}")
 
 
 def _damaged(path: Path, expected: str, got: str) -> InputError:
@@ -293,62 +259,46 @@ def clip_at(path: Path, clip: int, frames: Sequence[int]) -> Clip:
 
 def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int], path: Path) -> Clip:
     """A clip, or its patch, from the arrays whose names begin with `prefix`."""
-    there = set(shard.keys())
-    if f"{prefix}effect" in there:
-        raise InputError(
-            "the clips are of generated cities in other weather, which are no longer learned from",
-            got="an array effect",
-            remedy="choose another folder of clips: it is filled anew",
-        )
-    rendered = f"{prefix}rendered" in there and bool(shard.get_slice(f"{prefix}rendered")[clip])
-    names = [
-        *_PER_FRAME,
-        *(name for name in ("point_color", "measured", "depth_confidence") if prefix + name in there),
-        *(_RENDERS if rendered else ()),
-    ]
-    found = {name: torch.from_numpy(shard.get_slice(prefix + name)[clip][np.asarray(frames)]) for name in names}
-    reference = torch.from_numpy(shard.get_slice(f"{prefix}reference")[clip])
+    names = {name.removeprefix(prefix) for name in shard.keys() if name.startswith(prefix)}
+    rendered = "rendered" in names and bool(shard.get_slice(f"{prefix}rendered")[clip])
+    chosen = [*_PER_FRAME, *(n for n in _OPTIONAL if n in names), *(_RENDERS if rendered else ())]
+    x = {name: torch.from_numpy(shard.get_slice(prefix + name)[clip][np.asarray(frames)]) for name in chosen}
     shift_m = float(shard.get_tensor(f"{prefix}shift_m")[clip])
-    _check_values({**found, "shift_m": torch.tensor(shift_m)}, path)
-    image = lambda x: x.float() / 255  # noqa: E731
-    plane = lambda x: x.float().unsqueeze(1)  # noqa: E731
-    flags, (height, width) = found["flags"].unsqueeze(1), found["rgb"].shape[-2:]
+    _check_values({**x, "shift_m": torch.tensor(shift_m)}, path)
+    image = lambda name: x[name].float() / 255  # noqa: E731
+    plane = lambda name: x[name].float().unsqueeze(1)  # noqa: E731
+    ids = lambda name: x[name].unsqueeze(1)  # noqa: E731
+    height, width = x["rgb"].shape[-2:]
     views = tuple(
         View(Camera("clip", width, height, *lens.tolist()), pose.numpy(), float(frame))
-        for frame, lens, pose in zip(frames, found["intrinsics"], found["world_from_cam"])
+        for frame, lens, pose in zip(frames, x["intrinsics"], x["world_from_cam"])
     )
-    renders = None
+    renders, measured = None, plane("measured") if "measured" in x else None
     if rendered:
-        renders = RenderPlanes(
-            image(found["render"]),
-            plane(found["render_depth"]),
-            plane(found["alpha"]) / 255,
-            plane(found["certainty"]) / 255,
-            found["render_ids"].unsqueeze(1),
-        )
-    measured = plane(found["measured"]) if "measured" in found else None
+        alpha, certainty = (plane(name) / 255 for name in ("alpha", "certainty"))
+        renders = RenderPlanes(image("render"), plane("render_depth"), alpha, certainty, ids("render_ids"))
     condition = Condition(
         views,
-        image(found["color"]),
-        plane(found["sparse_depth"]),
-        (flags & FLAG_VALID) > 0,
-        image(reference),
-        warped=(flags & FLAG_WARPED) > 0,
-        backdrop=image(found["backdrop"]),
-        semantics=found["ids"].unsqueeze(1),
-        backdrop_semantics=found["backdrop_ids"].unsqueeze(1),
+        image("color"),
+        plane("sparse_depth"),
+        (ids("flags") & FLAG_VALID) > 0,
+        torch.from_numpy(shard.get_slice(f"{prefix}reference")[clip]).float() / 255,
+        warped=(ids("flags") & FLAG_WARPED) > 0,
+        backdrop=image("backdrop"),
+        semantics=ids("ids"),
+        backdrop_semantics=ids("backdrop_ids"),
         renders=renders,
         measured=None if measured is None else SparseDepth(measured, measured > 0),
     )
     return Clip(
         condition,
-        image(found["rgb"]),
-        plane(found["depth"]),
-        (flags & FLAG_DEPTH_UNKNOWN) == 0,
-        found["semantics"].long(),
+        image("rgb"),
+        plane("depth"),
+        (ids("flags") & FLAG_DEPTH_UNKNOWN) == 0,
+        x["semantics"].long(),
         shift_m,
-        image(found["point_color"]) if "point_color" in found else None,
-        depth_confidence=plane(found["depth_confidence"]) / 255 if "depth_confidence" in found else None,
+        image("point_color") if "point_color" in x else None,
+        depth_confidence=plane("depth_confidence") / 255 if "depth_confidence" in x else None,
     )
 
 

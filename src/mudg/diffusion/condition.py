@@ -40,15 +40,13 @@ from mudg.core.project import ProjectConfig, ProjectedPoints, project_sparse
 
 # vacated ------------------------------------------------------------------------------------------
 #
-# Conditions of an edited drive where something stood that is not there any more.
-#
-# No photograph taken then shows what is behind it. Other photographs may, taken earlier or later from elsewhere: they
-# are warped in as everywhere. What is left is a hole: its colours continue those around it, and nothing in it counts as
-# seen.
+# Conditions of an edited drive where something stood that is not there any more. Photographs taken earlier or later, or
+# from elsewhere, show what is behind it: they are warped in as everywhere. What is left is a hole: its colours continue
+# those around it, and nothing in it counts as seen.
 
 
 GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
-DYNAMIC = torch.tensor(sorted(palette.DYNAMIC_IDS), dtype=torch.uint8)
+MOVING_IDS = torch.tensor(palette.DYNAMIC_IDS, dtype=torch.uint8)
 KNOWN_SHARE = 0.5
 """A render shows what is there where its certainty is at least this share of the usual one of its view."""
 
@@ -97,13 +95,13 @@ def ground_behind(depth: Tensor, measured: Tensor, vacated: Vacated) -> Tensor:
 def continued(color: Tensor, ids: Tensor, vacated: Vacated, hole: Tensor) -> tuple[Tensor, Tensor]:
     """Colours f32[3,H,W] and classes u8[H,W] with those of a `hole` bool[H,W] continued smoothly from around it: ground
     from ground, what is above it from what stands there or from the sky, nothing from objects that move."""
-    ground, moving = torch.isin(ids, GROUND_IDS), torch.isin(ids, DYNAMIC)
+    ground, moving = torch.isin(ids, GROUND_IDS), torch.isin(ids, MOVING_IDS)
     low = torch.isfinite(vacated.ground)
     for part, given in ((hole & low, ground), (hole & ~low, ~ground & ~moving)):
         source = given & ~hole
         if bool(part.any()) and bool(source.any()):
             filled = _pulled(color[None] * source, source.float()[None, None])[0]
-            color, ids = torch.where(part, filled, color), torch.where(part, _nearest(ids, source), ids)
+            color, ids = torch.where(part, filled, color), torch.where(part, ids[nearest_pixels(source)], ids)
     return color, ids
 
 
@@ -119,12 +117,6 @@ def _pulled(color: Tensor, weight: Tensor) -> Tensor:
     coarse = _pulled(coarse * (share > 0), (share > 0).float())
     larger = functional.interpolate(coarse, size=color.shape[-2:], mode="bilinear", align_corners=False)
     return color + (1 - weight) * larger
-
-
-def _nearest(ids: Tensor, source: Tensor) -> Tensor:
-    """Class u8[H,W] of the nearest pixel of `source` bool[H,W], for every pixel."""
-    rows, columns = ndimage.distance_transform_edt(~source.numpy(), return_distances=False, return_indices=True)
-    return ids[torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(columns.astype(np.int64))]
 
 
 def uncertain_there(render: RenderPlanes, vacated: Vacated, hole: Tensor, color: Tensor) -> RenderPlanes:
@@ -201,8 +193,6 @@ class ConditionRules:
 
 OVERLAP_GRID = 24, 16
 """Columns and rows of the places of a view by which it is told how much of it another image shows."""
-GROUND_IDS = torch.tensor([palette.ID[name] for name in ("road", "sidewalk", "terrain")], dtype=torch.uint8)
-MOVING_IDS = torch.tensor(palette.DYNAMIC_IDS, dtype=torch.uint8)
 BOX_MARGIN_M = 0.2
 """Rendered surfaces this far outside an object's box still count as the object."""
 LEAST_FALL = 0.02
@@ -234,43 +224,49 @@ class DrawnCloud:
     vacated_at: VacatedAt | None = None
     """Where something stood that an edit took away."""
 
-    def look(self, view: View, far_ids: Tensor) -> Surfaces:
-        """The surfaces at a view: measured ones, and between them those of the render or else of the nearest measured
-        pixel.
+    def look(self, view: View, far_ids: Tensor, render: RenderPlanes | None = None) -> Surfaces:
+        """The surfaces at a view: measured ones, and between them those of the render (None: of `render_at`) or else of
+        the nearest measured pixel.
 
         What the render does not cover is taken for sky, unless it lies below the horizon or `far_ids` u8[H,W], the
         classes of what a recorded image shows in the same direction (255 = unknown), are something else: there a
         surface stands that no image shows, and the nearest measured pixel stands for it, in the render too.
         """
-        sparse = self.rules.project(self.cloud, self.tracks, view)
-        nearest = _nearest_measured(sparse)
-        color, depth, moving, ids = _filled(sparse, nearest, self.rules)
-        vacated = None if self.vacated_at is None else self.vacated_at(view)
-        if self.render_at is None:
-            depth = depth if vacated is None else ground_behind(depth, sparse.valid, vacated)
-            return Surfaces(sparse.valid, color, depth, moving, ids, None, vacated)
-        render = self.render_at(view)
-        near = torch.from_numpy(
-            ndimage.binary_dilation(sparse.valid.numpy(), iterations=max(self.rules.measured_reach_px, 1))
+        rules, sparse = self.rules, self.rules.project(self.cloud, self.tracks, view)
+        valid, nearest = sparse.valid, nearest_pixels(sparse.valid)
+        color, depth, moving, ids = (
+            sparse.rgb,
+            torch.full_like(sparse.depth, rules.far_m),
+            sparse.moving,
+            sparse.semantics,
         )
-        solid = render.alpha[0] >= self.rules.solid_alpha
-        near &= _among_measured(sparse, depth, self.rules) | ~_another_surface(depth, render, self.rules)
+        if bool(valid.any()):
+            here = (..., *nearest)
+            color, depth, moving, ids = color[here], sparse.depth[here], moving[here], ids[here]
+        vacated = None if self.vacated_at is None else self.vacated_at(view)
+        render = self.render_at(view) if render is None and self.render_at is not None else render
+        if render is None:
+            depth = depth if vacated is None else ground_behind(depth, valid, vacated)
+            return Surfaces(valid, color, depth, moving, ids, None, vacated)
+        near = torch.from_numpy(ndimage.binary_dilation(valid.numpy(), iterations=max(rules.measured_reach_px, 1)))
+        solid = render.alpha[0] >= rules.solid_alpha
+        # where the render shows another surface, which photographs determined
+        sure = (render.alpha[0] > rules.sure_alpha) & determined(render, torch.ones_like(depth, dtype=torch.bool))
+        other = sure & ((render.depth[0] - depth).abs() > rules.another_surface * depth)
+        near &= _among_measured(sparse, depth, rules) | ~other
         surface_seen = (far_ids != palette.ID["sky"]) & (far_ids != palette.UNLABELLED)
-        hidden = ~solid & (below_horizon(view, self.rules.ground_slope) | surface_seen) & bool(sparse.valid.any())
-        depth = torch.where(sparse.valid, depth, _levelled(view, depth, ids, nearest).clamp(max=self.rules.far_m))
+        hidden = ~solid & (below_horizon(view, rules.ground_slope) | surface_seen) & bool(valid.any())
+        depth = torch.where(valid, depth, _levelled(view, depth, ids, nearest).clamp(max=rules.far_m))
         render = replace(
             render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics)
         )
-        shown = torch.where(solid, render.depth[0], torch.full_like(depth, self.rules.far_m)).clamp(
-            max=self.rules.far_m
-        )
+        shown = torch.where(solid, render.depth[0], torch.full_like(depth, rules.far_m)).clamp(max=rules.far_m)
         pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)  # noqa: E731
         depth = pick(depth, shown)
-        depth = depth if vacated is None else ground_behind(depth, sparse.valid, vacated)
+        depth = depth if vacated is None else ground_behind(depth, valid, vacated)
         moving = (moving & near) | self._in_objects(view, depth, ~near & torch.isin(render.semantics[0], MOVING_IDS))
-        return Surfaces(
-            sparse.valid, pick(color, render.color), depth, moving, pick(ids, render.semantics[0]), render, vacated
-        )
+        color, ids = pick(color, render.color), pick(ids, render.semantics[0])
+        return Surfaces(valid, color, depth, moving, ids, render, vacated)
 
     def _in_objects(self, view: View, depth: Tensor, asked: Tensor) -> Tensor:
         """Which of the `asked` pixels bool[H,W], at `depth` f32[H,W], lie in the box of an object that has a cloud of
@@ -331,6 +327,12 @@ def nearest_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[n
         return rows, columns
     nearest: Any = ndimage.distance_transform_edt(~valid, return_distances=False, return_indices=True)
     return nearest[0], nearest[1]
+
+
+def nearest_pixels(valid: Tensor) -> tuple[Tensor, Tensor]:
+    """The same of bool[H,W], i64[H,W] each."""
+    rows, columns = nearest_valid(valid.numpy())
+    return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(columns.astype(np.int64))
 
 
 def filled_depth(measured: SparseDepth, far_m: float = 100.0) -> Tensor:
@@ -471,10 +473,8 @@ def build_conditions(
     fine_views = tuple(view.resized(*size) for view in views)
     points = DrawnCloud(cloud, tracks, rules, render_at, vacated_at)
     folder = sources.folder if isinstance(sources, PreparedImages) else None
-    made = (
-        _condition_of_view(points, v, recorded, own, rules, sources) for v, own in zip(fine_views, among, strict=True)
-    )
-    rows = ((*part, *(() if render_at is None else _planes(shown))) for part, shown in made)
+    made = (_condition_of_view(points, view, recorded, own, rules, sources) for view, own in zip(fine_views, among))
+    rows = ((*part, *(getattr(r, x.name) for x in fields(RenderPlanes) if r is not None)) for part, r in made)
     color, depth, valid, warped, backdrop, ids, far_ids, *planes = stacked(rows, len(fine_views), folder)
     renders = RenderPlanes(*planes) if planes else None
     fine = Condition(
@@ -506,8 +506,10 @@ def build_conditions(
             reduced(renders.certainty),
             picked(renders.semantics),
         )
-    small_points = DrawnCloud(cloud, tracks, rules, _in_order(small_renders), vacated_at)
-    own = [small_points.look(view, there[0]) for view, there in zip(small, picked(far_ids))]
+    own = []
+    for n, (view, there) in enumerate(zip(small, picked(far_ids), strict=True)):
+        render = None if small_renders is None else small_renders.map(lambda x, n=n: x[n])
+        own.append(DrawnCloud(cloud, tracks, rules, None, vacated_at).look(view, there[0], render))
     own = [o.with_hole(o.color, o.ids, there[0] > 0.5)[0] for o, there in zip(own, reduced(warped))]
     scratch.rest_mapped()
     own_depth, own_valid = (torch.stack([getattr(o, name) for o in own])[:, None] for name in ("depth", "measured"))
@@ -524,24 +526,6 @@ def build_conditions(
         small_renders,
     )
     return condition, fine
-
-
-def _planes(render: RenderPlanes | None) -> tuple[Tensor, ...]:
-    return tuple(getattr(render, f.name) for f in fields(RenderPlanes))
-
-
-def _in_order(renders: RenderPlanes | None) -> RenderAt | None:
-    """Renders [T,..] that are at hand, handed out one view after another."""
-    if renders is None:
-        return None
-    numbers = iter(range(len(renders.color)))
-
-    def next_one(view: View) -> RenderPlanes:
-        del view
-        number = next(numbers)
-        return renders.map(lambda x: x[number])
-
-    return next_one
 
 
 def _condition_of_view(
@@ -590,30 +574,6 @@ def _condition_of_view(
     if known is not None:  # what stood there is not part of the picture any more
         backdrop, far_ids = torch.where(known, backdrop, color), torch.where(known, far_ids, ids[None])
     return (color, depth[None], here.measured[None], found[None], backdrop, ids[None], far_ids), here.render
-
-
-def _nearest_measured(sparse: ProjectedPoints) -> tuple[Tensor, Tensor]:
-    """Row and column of the nearest measured pixel, i64[H,W] each, for every pixel."""
-    rows, columns = nearest_valid(sparse.valid.numpy())
-    return torch.from_numpy(rows.astype(np.int64)), torch.from_numpy(columns.astype(np.int64))
-
-
-def _filled(
-    sparse: ProjectedPoints, nearest: tuple[Tensor, Tensor], rules: ConditionRules
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Colour f32[3,H,W], depth f32[H,W], moving bool[H,W] and classes u8[H,W] of the nearest measured pixel, for every
-    pixel."""
-    if not bool(sparse.valid.any()):
-        return sparse.rgb, torch.full_like(sparse.depth, rules.far_m), sparse.moving, sparse.semantics
-    here = (..., *nearest)
-    return sparse.rgb[here], sparse.depth[here], sparse.moving[here], sparse.semantics[here]
-
-
-def _another_surface(depth: Tensor, render: RenderPlanes, rules: ConditionRules) -> Tensor:
-    """Where a render shows another surface than the one at `depth` f32[H,W], and photographs determined it,
-    bool[H,W]."""
-    sure = (render.alpha[0] > rules.sure_alpha) & determined(render, torch.ones_like(depth, dtype=torch.bool))
-    return sure & ((render.depth[0] - depth).abs() > rules.another_surface * depth)
 
 
 def _among_measured(sparse: ProjectedPoints, depth: Tensor, rules: ConditionRules) -> Tensor:
@@ -744,26 +704,17 @@ def _prepare_source(points: DrawnCloud, recorded: Photo, target: View, rules: Co
     scale = (target.camera.width * target.camera.height / (camera.width * camera.height)) ** 0.5
     width, height = max(8, round(camera.width * scale)), max(8, round(camera.height * scale))
     view = recorded.view.resized(width, height)
-    ids = _ids_at(recorded, width, height)
+    own = np.full((height, width), palette.UNLABELLED) if recorded.semantics is None else recorded.semantics
+    own = torch.from_numpy(own.astype(np.uint8))[None, None]
+    ids = functional.interpolate(own, size=(height, width), mode="nearest-exact")[0, 0]
     here = points.look(view, ids)
     rgb = image_tensor(resize_area(recorded.rgb, width, height))
     common = points.cloud.colors.image_to_common(camera.name, rgb)
-    usable = None if recorded.usable is None else _coarser(recorded.usable, width, height)
+    usable = None
+    if recorded.usable is not None:  # pixels that show nothing but usable ones
+        spoilt = torch.from_numpy(~recorded.usable).float()[None, None]
+        usable = functional.adaptive_max_pool2d(spoilt, (height, width))[0, 0] == 0
     return WarpSource(view, common, here.depth, here.moving, ids, usable)
-
-
-def _coarser(usable: NDArray[np.bool_], width: int, height: int) -> Tensor:
-    """Which pixels bool[height,width] of an image brought to this size show nothing but usable ones."""
-    spoilt = torch.from_numpy(~usable).float()[None, None]
-    return functional.adaptive_max_pool2d(spoilt, (height, width))[0, 0] == 0
-
-
-def _ids_at(recorded: Photo, width: int, height: int) -> Tensor:
-    """The image's classes u8[height,width], each from the pixel in its middle; 255 without labels."""
-    if recorded.semantics is None:
-        return torch.full((height, width), palette.UNLABELLED, dtype=torch.uint8)
-    own = torch.from_numpy(recorded.semantics.astype(np.uint8))
-    return functional.interpolate(own[None, None], size=(height, width), mode="nearest-exact")[0, 0]
 
 
 # planes of all views, in memory or in files -------------------------------------------------------

@@ -62,11 +62,11 @@ def run(config: ConvertConfig, checkpoint: Path, to: Path, conversion: Conversio
     checkpoint, to = Path(checkpoint), Path(to)
     refuse_overlap(to, {"checkpoint": checkpoint, "towers": config.towers})
     replacement = Replacement.at(to)
-    replacement.recover(_holds_model, own_names)
+    replacement.recover(lambda folder: bool(own_names(folder)), own_names)
     replaces = to.exists()
     if replaces and not overwrite:
         raise UsageError("the folder exists", where=str(to), remedy="choose another --to, or add --overwrite")
-    if replaces and not _holds_model(to):
+    if replaces and not own_names(to):
         raise UsageError(
             "the folder holds files that do not belong to a model", where=str(to), remedy="choose another --to"
         )
@@ -88,14 +88,8 @@ def run(config: ConvertConfig, checkpoint: Path, to: Path, conversion: Conversio
     return to
 
 
-def _holds_model(folder: Path) -> bool:
-    """Whether a folder holds a model that was converted, or trained, by this program."""
-    return bool(own_names(folder))
-
-
 def own_names(folder: Path) -> list[str]:
-    """Names of the files that a model folder's description lists, and its own last; none if there is no such
-    description."""
+    """Names of the files of a model folder that this program wrote, its description last; none of any other."""
     try:
         content = store.read_json(folder / "model.json")
         files = list(content["files"]) if "files" in content else []

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Final, Literal
+from typing import Final, Literal, cast
 
 import numpy as np
 import torch
@@ -18,7 +18,7 @@ from torch import Tensor
 from mudg.base import palette
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import UsageError
-from mudg.base.types import Condition, FusedCloud, Photo, Track, View
+from mudg.base.types import Condition, FusedCloud, Photo, RenderPlanes, Track, View
 from mudg.base.weather_settings import Conditions
 from mudg.core import weather
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
@@ -28,15 +28,11 @@ from mudg.diffusion.condition import ConditionRules, RenderAt, VacatedAt, WarpSo
 
 # near points --------------------------------------------------------------------------------------
 #
-# The condition of FreeVS: coloured LiDAR points of a few frames around each view, and nothing else.
-#
-# Points of the sweeps within two frames of a view's time; those of moving objects are gathered in their boxes and put
-# where the boxes are at the view's time. One pixel per point, the nearest wins, black elsewhere. No depth, no recorded
-# image, no classes, no renders. Unlike FreeVS we do not reserve a margin around objects, and do not crop rows that
-# LiDAR never covers.
-#
-# Its training simulates another view on the recorded path: half of the clips there are made of points that are four
-# frames off.
+# The condition of FreeVS: coloured LiDAR points of the sweeps within two frames of a view's time, one pixel per point,
+# the nearest wins, black elsewhere; those of moving objects where their boxes are at the view's time. No depth, no
+# recorded image, no classes, no renders. Unlike FreeVS we do not reserve a margin around objects, and do not crop rows
+# that LiDAR never covers. Its training simulates another view on the recorded path: half of the clips there are made of
+# points that are four frames off.
 
 
 NEAR_FRAMES: Final = 2
@@ -66,9 +62,7 @@ class NearSweeps:
 
     def numbers_at(self, time_s: float) -> tuple[int, ...]:
         """The sweeps within two frames of the one nearest to a time."""
-        if not self.times_s:
-            return ()
-        nearest = min(self.times_s, key=lambda t: abs(t - time_s))
+        nearest = min(self.times_s, key=lambda t: abs(t - time_s), default=0.0)
         reach = (NEAR_FRAMES + 0.5) * self.period_s
         return tuple(n for n, t in enumerate(self.times_s) if abs(t - nearest) <= reach)
 
@@ -249,20 +243,17 @@ def _of_renders(
     empty = FusedCloud(
         replace(static, xyz=static.xyz[:0], rgb=static.rgb[:0], semantics=labels), {}, sources.cloud.colors
     )
-    made = build_conditions(empty, (), views, sources.recorded, rules, kept, sources.render_at)
-
-    def bare(given: Condition) -> Condition:
-        shown = given.renders
-        if shown is None:
-            raise UsageError("this condition needs renders of a fitted scene", got="repair")
-        return replace(
-            given,
-            color=shown.color,
-            depth=shown.depth,
-            semantics=shown.semantics,
-            valid=torch.zeros_like(given.valid),
-            warped=shown.alpha > COVERED,
+    built = build_conditions(empty, (), views, sources.recorded, rules, kept, sources.render_at)
+    renders = [cast("RenderPlanes", c.renders) for c in built]
+    small, fine = (
+        replace(
+            c,
+            color=r.color,
+            depth=r.depth,
+            semantics=r.semantics,
+            valid=torch.zeros_like(c.valid),
+            warped=r.alpha > COVERED,
         )
-
-    small, fine = (bare(given) for given in made)
+        for c, r in zip(built, renders, strict=True)
+    )
     return small, fine

@@ -192,9 +192,8 @@ def make_clip(log: OpenLog, window: LogWindow, number: int) -> Clip:
     known = confidence > 0
     given = condition.depth if condition.measured is None else filled_depth(condition.measured)
     depth = torch.where(known, depth, given)  # a plausible filling: the noisy input shows it
-    return Clip(
-        condition, rgb, depth, known, ids, depth_confidence=None if bool((confidence[known] == 1).all()) else confidence
-    )
+    sure = bool((confidence[known] == 1).all())
+    return Clip(condition, rgb, depth, known, ids, depth_confidence=None if sure else confidence)
 
 
 def _condition(log: OpenLog, cloud: FusedCloud, places: Sequence[int], gap: int) -> tuple[Condition, dict[int, Photo]]:
@@ -245,10 +244,8 @@ def _truth(log: OpenLog, frame: Frame, recorded: Photo, view: View) -> tuple[Ten
     confidence, sky = known.astype(np.float32), (ids == SKY) & ~known
     if log.rules.depth == "annotated" and "depth" in frame.labels:
         label = lambda name: resize_nearest(read_label(scene, frame, name), height, width)  # noqa: E731
-        labelled, sure = (
-            label("depth"),
-            (label("depth_confidence") if "depth_confidence" in frame.labels else np.float32(1)),
-        )
+        labelled = label("depth")
+        sure = label("depth_confidence") if "depth_confidence" in frame.labels else np.float32(1)
         more = ~known & ~sky & np.isfinite(labelled) & ~(label("ego") if "ego" in frame.labels else np.False_)
         depth, confidence = np.where(more, labelled, depth), np.where(more, sure, confidence)
         if "sky" in frame.labels:  # made labels have a depth there, too
@@ -299,10 +296,8 @@ def plan_shards(
             "the logs are too short to hold out windows",
             where=", ".join(str(s.scene) for s in sources),
             got=f"{counts[False]} windows to train on, {counts[True]} to score",
-            remedy=(
-                "smaller --data.stride or --data.window, or --data.held-out-every 0 (scores are then of clips"
-                " trained on)"
-            ),
+            remedy="smaller --data.stride or --data.window, or --data.held-out-every 0 (scores are then of clips"
+            " trained on)",
         )
     return rows
 

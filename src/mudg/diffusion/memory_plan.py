@@ -59,11 +59,8 @@ def half_format(precision: Precision, device: torch.device = CPU, *, float16: bo
         chosen, reason = {"bfloat16": torch.bfloat16, "float16": torch.float16}.get(precision), f"asked for {precision}"
     elif device.type == "cpu":
         capabilities = getattr(torch.cpu, "get_capabilities", dict)()
-        able = [
-            title
-            for name, title in (("amx_bf16", "AMX"), ("avx512_bf16", "AVX-512 BF16"))
-            if capabilities.get(name, False)
-        ]
+        names = {"amx_bf16": "AMX", "avx512_bf16": "AVX-512 BF16"}
+        able = [title for name, title in names.items() if capabilities.get(name, False)]
         chosen = torch.bfloat16 if able else None
         reason = f"the CPU has {able[0]}" if able else "the CPU has no bfloat16"
     elif device.type == "cuda":
@@ -172,12 +169,10 @@ def autoencoder_bytes(model: PublishedMDM, height: int, width: int, frames: int)
     codec, dtype = model.codec, model.dtype
     with torch.device("meta"):
         image = torch.empty(frames, 3, height, width, dtype=dtype)
-        z = torch.empty(
-            frames, model.config.codec.latent_channels, height // codec.factor, width // codec.factor, dtype=dtype
-        )
-    return max(
-        peak_activations(lambda: codec.moments(image)), peak_activations(lambda: codec.decoder(codec.from_latent(z)))
-    )
+        cells = height // codec.factor, width // codec.factor
+        z = torch.empty(frames, model.config.codec.latent_channels, *cells, dtype=dtype)
+    encoding = peak_activations(lambda: codec.moments(image))
+    return max(encoding, peak_activations(lambda: codec.decoder(codec.from_latent(z))))
 
 
 def sampling_bytes(model: PublishedMDM, split: WorkSplit, *, guidance: bool = True) -> int:
@@ -203,7 +198,7 @@ def sampling_bytes(model: PublishedMDM, split: WorkSplit, *, guidance: bool = Tr
 
 
 def parameter_bytes(model: nn.Module) -> int:
-    """Bytes of all weights; of the model: denoising network, autoencoder, image tower, resampler."""
+    """Bytes of all weights."""
     return sum(math.prod(p.shape) * p.element_size() for p in [*model.parameters(), *model.buffers()])
 
 
@@ -245,14 +240,12 @@ def choose(
         offload: whether the image tower is on the CPU, in the order in which it is tried with each cut. Moving it costs
             a fraction of a second per clip, smaller batches cost more.
     """
-    found = [_cut(needs, budget_bytes, cut, away, guidance) for cut in CUTS for away in offload]
-    return next((way for way in found if way[1] <= budget_bytes), found[-1])
-
-
-def _cut(needs: Needs, budget_bytes: int, cut: tuple[bool, bool], away: bool, guidance: bool) -> tuple[WorkSplit, int]:
-    """One cut with as many frames per decoding as fit, and its peak in bytes."""
-    videos = needs.one_video * (MODALITIES if cut[0] else 1) * (2 if cut[1] and guidance else 1)
-    stays = needs.parameters + needs.clip - away * needs.tower + RESERVE_BYTES
-    frames = next((n for n in FRAMES_AT_ONCE if needs.one_frame * n <= budget_bytes - stays), 1)
-    peak = max(stays + max(videos, needs.one_frame * frames), stays + away * needs.tower)
-    return WorkSplit(cut[0], cut[1], frames, away), peak
+    ways = []
+    for cut in CUTS:
+        for away in offload:
+            videos = needs.one_video * (MODALITIES if cut[0] else 1) * (2 if cut[1] and guidance else 1)
+            stays = needs.parameters + needs.clip - away * needs.tower + RESERVE_BYTES
+            frames = next((n for n in FRAMES_AT_ONCE if needs.one_frame * n <= budget_bytes - stays), 1)
+            peak = max(stays + max(videos, needs.one_frame * frames), stays + away * needs.tower)
+            ways.append((WorkSplit(cut[0], cut[1], frames, away), peak))
+    return next((way for way in ways if way[1] <= budget_bytes), ways[-1])

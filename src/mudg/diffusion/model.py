@@ -177,14 +177,11 @@ class MDM(nn.Module):
         self.net.to(memory_format=torch.channels_last)
         self.refiner: Refiner | None = None
         if config.refine_widths:
-            (fine, coarse), (outer, inner) = config.refine_widths, config.refine_blocks
-            self.refiner = Refiner(noisy, (fine, coarse), (outer, inner), config.renders).to(
-                memory_format=torch.channels_last
-            )
+            self.refiner = Refiner(noisy, config.refine_widths, config.refine_blocks, config.renders)
+            self.refiner.to(memory_format=torch.channels_last)
         self.finisher: Finisher | None = None
         if config.finish_widths:
-            (fine, coarse), (outer, inner) = config.finish_widths, config.finish_blocks
-            self.finisher = Finisher((fine, coarse), (outer, inner)).to(memory_format=torch.channels_last)
+            self.finisher = Finisher(config.finish_widths, config.finish_blocks).to(memory_format=torch.channels_last)
 
     @property
     def device(self) -> torch.device:
@@ -240,16 +237,8 @@ class MDM(nn.Module):
 
     def _pixels_of(self, given: Stacked) -> ConditionPixels:
         """What the refiner sees of a batch of conditions, [B*T,..]."""
-        code = self.codec.linear_depth_code
-        pixels = [
-            given.color * 2 - 1,
-            given.backdrop * 2 - 1,
-            code(given.depth),
-            given.valid,
-            given.warped,
-            given.ids,
-            given.backdrop_ids,
-        ]
+        code, pixels = self.codec.linear_depth_code, [given.color * 2 - 1, given.backdrop * 2 - 1]
+        pixels += [code(given.depth), given.valid, given.warped, given.ids, given.backdrop_ids]
         if self.config.renders:
             shown = given.renders
             pixels += [shown.color * 2 - 1, code(shown.depth), shown.alpha, shown.certainty, shown.semantics]
@@ -378,9 +367,8 @@ class MDM(nn.Module):
             made = Made(*(torch.cat([getattr(m, f.name) for m in enlarged]) for f in fields(Made)))
             given = self._pixels_of(Stacked.of([patch.clip.condition for _, patch in patches]))
             truth = self.pixel_truth([patch.clip for _, patch in patches])
-            scale = torch.tensor(
-                [float(patch.scale) for _, patch in patches], device=made.rgb.device
-            ).repeat_interleave(frames)
+            scales = [float(patch.scale) for _, patch in patches]
+            scale = torch.tensor(scales, device=made.rgb.device).repeat_interleave(frames)
         done = self.finisher(made, given, frames, scale)
         found = Refined(done.rgb, done.depth_code, class_scores(done), done.log_error)
         return self._pixel_terms(found, truth, settings, "fine")
@@ -390,7 +378,7 @@ class MDM(nn.Module):
     ) -> Made:
         """What denoiser and refiner make of the patch of clip `number`, at the patch's size. Only its surroundings are
         refined."""
-        frames, *cells = stated["rgb"].shape[1], *stated["rgb"].shape[-2:]
+        frames, cells = stated["rgb"].shape[1], stated["rgb"].shape[-2:]
         factor, own = self.codec.factor, slice(number, number + 1)
         starts, sides = (patch.row, patch.column), (side // patch.scale for side in patch.clip.rgb.shape[-2:])
         around = [_around(start, side, factor, count) for start, side, count in zip(starts, sides, cells, strict=True)]
@@ -453,12 +441,8 @@ class MDM(nn.Module):
         This network has no temporal layers with parameters besides its attentions.
         """
         del which
-        kinds = {name for name, module in self.trained_part().named_modules() if isinstance(module, TemporalAttention)}
-        return {
-            f"{owner}.{name}"
-            for owner in kinds
-            for name, _ in self.trained_part().get_submodule(owner).named_parameters()
-        }
+        layers = [x for x in self.trained_part().named_modules() if isinstance(x[1], TemporalAttention)]
+        return {f"{owner}.{name}" for owner, layer in layers for name, _ in layer.named_parameters()}
 
     # sampling -------------------------------------------------------------------------------------
 
@@ -529,23 +513,14 @@ class MDM(nn.Module):
         decoded = self._decoded(made)
         confidence = torch.exp(-_expected_error(made.log_error) / TRUSTED_ERROR) * depth_agreement(decoded.depth, fine)
         depth = settle_depth(decoded.depth, fine, self.config.codec.far_m)
-        return replace(
-            clip,
-            rgb=decoded.rgb,
-            depth=depth,
-            semantics=decoded.semantics,
-            confidence=confidence,
-            log_error=made.log_error,
-        )
+        own = {"rgb": decoded.rgb, "semantics": decoded.semantics, "log_error": made.log_error}
+        return replace(clip, depth=depth, confidence=confidence, **own)
 
     def _decoded(self, made: Made) -> Decoded:
         """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made; takes its
         colour over."""
-        return Decoded(
-            made.rgb.add_(1).div_(2).clamp_(0, 1),
-            code_to_depth(made.depth_code, self.config.codec),
-            made.ids[:, 0].long(),
-        )
+        rgb = made.rgb.add_(1).div_(2).clamp_(0, 1)
+        return Decoded(rgb, code_to_depth(made.depth_code, self.config.codec), made.ids[:, 0].long())
 
     def _denoise(self, encoded: ConditionLatents, request: SampleRequest) -> tuple[dict[Modality, Tensor], Tensor]:
         """Draw a clip; returns latents [1,T,C,h,w] and how much the colour's still changed, [1,T,1,h,w]."""
@@ -637,8 +612,12 @@ class Stacked:
     @classmethod
     def of(cls, batch: Sequence[Condition]) -> Stacked:
         """Of conditions of one shape."""
-        unknown = torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8)
-        renders = [_no_render(c) if c.renders is None else c.renders for c in batch]
+        unknown, nothing = (
+            torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8),
+            torch.zeros_like(batch[0].depth),
+        )
+        no_render = lambda c: RenderPlanes(c.color, c.depth, nothing + NO_RENDER, nothing, unknown)  # noqa: E731
+        renders = [no_render(c) if c.renders is None else c.renders for c in batch]
         return cls(
             *(torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth")),
             torch.stack([c.valid for c in batch]).float(),
@@ -658,10 +637,3 @@ def cell_means(mask: Tensor, factor: int) -> Tensor:
 def cell_shares(ids: Tensor) -> Tensor:
     """Share of each class in each cell, u8[B,T,1,H,W] -> f32[B,T,19,h,w]."""
     return shares(ids.flatten(0, 1)).unflatten(0, ids.shape[:2])
-
-
-def _no_render(condition: Condition) -> RenderPlanes:
-    """The planes that stand for: there is no render."""
-    nothing = torch.zeros_like(condition.depth)
-    unknown = torch.full_like(condition.valid, palette.UNLABELLED, dtype=torch.uint8)
-    return RenderPlanes(condition.color, condition.depth, nothing + NO_RENDER, nothing, unknown)

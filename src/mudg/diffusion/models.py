@@ -126,11 +126,12 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
         UsageError: the settings ask for another network than the earlier model has, or for clips that it cannot take.
     """
     wanted = model_config(config)
+    usual = wanted == model_config(LearnConfig(data=config.data))  # the network is left as it is by default
     can_grow = config.data.renders and not config.data.scenes
     if not config.start:
         return MDM(wanted if can_grow else _with_renders_of(wanted, None)), {"codec", "refiner", "finisher"}
     if is_published(config.start):
-        if not _network_is_default(config):
+        if not usual:
             raise UsageError(
                 "the shape of a published-type network cannot be changed",
                 where="--start",
@@ -145,7 +146,7 @@ def starting_model(config: LearnConfig) -> tuple[Model, set[str]]:
         )
     wanted = wanted if can_grow else _with_renders_of(wanted, before.config)
     resized = model_of_window(before, wanted.window, wanted.area_px)
-    if wanted != resized.config and not same_denoiser(resized.config, wanted) and _network_is_default(config):
+    if wanted != resized.config and not same_denoiser(resized.config, wanted) and usual:
         log.info("learn: the network has the shape of --start")
         wanted = resized.config
     if wanted == resized.config:
@@ -163,11 +164,8 @@ def model_of_window(model: MDM, window: int, area_px: int = 0) -> MDM:
 
 def _with_renders_of(wanted: MDMConfig, before: MDMConfig | None) -> MDMConfig:
     """A network that uses renders, and has a finisher, as `before` does (None: neither)."""
-    if before is None:
-        return replace(wanted, renders=False, finish_widths=(), finish_blocks=())
-    return replace(
-        wanted, renders=before.renders, finish_widths=before.finish_widths, finish_blocks=before.finish_blocks
-    )
+    own = (before.renders, before.finish_widths, before.finish_blocks) if before is not None else (False, (), ())
+    return replace(wanted, renders=own[0], finish_widths=own[1], finish_blocks=own[2])
 
 
 def hold_finisher(model: Model, fresh: set[str], patches: bool) -> None:
@@ -186,12 +184,6 @@ def hold_finisher(model: Model, fresh: set[str], patches: bool) -> None:
         )
     model.finisher.requires_grad_(False)
     log.info("learn: the clips have no patches at a higher resolution; the finisher keeps its weights")
-
-
-def _network_is_default(config: LearnConfig) -> bool:
-    """Whether the settings leave the network as it is by default."""
-    default = LearnConfig(data=config.data)
-    return model_config(config) == model_config(default)
 
 
 def model_config(config: LearnConfig) -> MDMConfig:
@@ -344,18 +336,13 @@ def codec_loss(codec: PatchCodec, clips: Sequence[Clip], generator: torch.Genera
 # models that go on from an earlier, plainer one ---------------------------------------------------
 
 
+_AFTER_DENOISER = {"refine_widths": (), "refine_blocks": (), "finish_widths": (), "finish_blocks": ()}
+
+
 def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
     """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the size trained
     at."""
-    plain = {
-        "refine_widths": (),
-        "refine_blocks": (),
-        "finish_widths": (),
-        "finish_blocks": (),
-        "renders": False,
-        "area_px": 0,
-    }
-    without = lambda config: replace(config, **plain)  # noqa: E731
+    without = lambda config: replace(config, **_AFTER_DENOISER, renders=False, area_px=0)  # noqa: E731
     return without(one) == without(other)
 
 
@@ -380,17 +367,12 @@ def extended(before: MDM, config: MDMConfig) -> MDM:
         if name in state and state[name].shape == old.shape:
             state[name] = old
         elif name in state and name.removesuffix(".weight").removesuffix(".bias") in _WIDENED:
-            state[name] = _widened(old, state[name], zero=name.startswith(_WIDENED[:2]))
+            larger = torch.zeros_like(state[name]) if name.startswith(_WIDENED[:2]) else state[name].clone()
+            larger[tuple(slice(size) for size in old.shape)] = old  # in its first places
+            state[name] = larger
     model.load_state_dict(state)
     return model
 
 
 _WIDENED = ("net.enter", "refiner.enter", "net.leave", "refiner.leave")
 """Layers that have further inputs or outputs, behind the others, in a model that uses renders."""
-
-
-def _widened(old: Tensor, new: Tensor, zero: bool) -> Tensor:
-    """A larger tensor with `old` in its first places, and in the others those of `new`, or 0."""
-    made = torch.zeros_like(new) if zero else new.clone()
-    made[tuple(slice(size) for size in old.shape)] = old
-    return made

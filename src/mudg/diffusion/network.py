@@ -81,20 +81,15 @@ class MDMConfig:
     def __post_init__(self) -> None:
         levels = {len(self.widths), len(self.blocks), len(self.spatial_attention), len(self.temporal_attention)}
         if len(levels) != 1:
-            raise UsageError(
-                "widths, blocks and attention switches must have one entry per level", got=f"{sorted(levels)}"
-            )
+            what = "widths, blocks and attention switches must have one entry per level"
+            raise UsageError(what, got=f"{sorted(levels)}")
         attended = zip(self.widths, self.spatial_attention, self.temporal_attention)
         if any((spatial or temporal) and width % self.head_width for width, spatial, temporal in attended):
             raise UsageError("a width is no multiple of the attention head width", got=f"{self.widths}")
-        if (len(self.refine_widths), len(self.refine_blocks)) not in ((0, 0), (2, 2)):
-            raise UsageError(
-                "refine_widths and refine_blocks have two entries each, or none", got=str(self.refine_widths)
-            )
-        if (len(self.finish_widths), len(self.finish_blocks)) not in ((0, 0), (2, 2)):
-            raise UsageError(
-                "finish_widths and finish_blocks have two entries each, or none", got=str(self.finish_widths)
-            )
+        for name in ("refine", "finish"):
+            widths, blocks = getattr(self, f"{name}_widths"), getattr(self, f"{name}_blocks")
+            if (len(widths), len(blocks)) not in ((0, 0), (2, 2)):
+                raise UsageError(f"{name}_widths and {name}_blocks have two entries each, or none", got=str(widths))
         if self.finish_widths and not (self.refine_widths and self.renders):
             raise UsageError(
                 "a finisher needs a refiner before it, and renders", got=f"renders {self.renders}, {self.refine_widths}"
@@ -443,39 +438,24 @@ class Refiner(CellNet):
         rgb, depth, scores = codec.decode_raw(latents)
         fold = lambda x: functional.pixel_unshuffle(x, 2)  # noqa: E731
         seen = [given.color, given.backdrop, given.depth_code, given.valid, given.warped]
-        planes = [
-            *(latents[m] for m in MODALITIES),
-            fold(rgb),
-            fold(depth),
-            *(fold(x) for x in seen),
-            shares(given.ids),
-            shares(given.backdrop_ids),
-        ]
+        planes = [*(latents[m] for m in MODALITIES), *map(fold, (rgb, depth, *seen))]
+        planes += [shares(given.ids), shares(given.backdrop_ids)]
         if self.renders:
-            planes += [
-                *(fold(x) for x in (given.render, given.render_code, given.alpha, given.certainty)),
-                shares(given.render_ids),
-            ]
+            planes += map(fold, (given.render, given.render_code, given.alpha, given.certainty))
+            planes.append(shares(given.render_ids))
         out = self.pixels(joined(planes, rgb.dtype), frames)
         parts = out.split([size // 4 for size in self.sizes], 1)
-        more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error = parts[
-            : len(self.SIZES)
-        ]
+        more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error, *of_render = parts
         if self.renders:
-            take_render, take_code, take_render_ids = (gate.sigmoid() for gate in parts[len(self.SIZES) :])
+            take_render, take_code, take_render_ids = (gate.sigmoid() for gate in of_render)
             rgb = rgb + take_render * (given.render - rgb)
             depth = depth + take_code * given.alpha.clamp(min=0) * (given.render_code - depth)
             scores = scores + COPY_SCORE * take_render_ids * one_hot(given.render_ids)
         rgb = rgb + take.sigmoid() * (given.color - rgb)
         rgb = rgb + take_far.sigmoid() * (given.backdrop - rgb) + 0.2 * more
         depth = depth + take_depth.sigmoid() * (given.depth_code - depth) + 0.05 * deeper
-        scores = (
-            scores
-            + more_scores
-            + COPY_SCORE
-            * (take_ids.sigmoid() * one_hot(given.ids) + take_far_ids.sigmoid() * one_hot(given.backdrop_ids))
-        )
-        return Refined(rgb, depth, scores, log_error)
+        copied = take_ids.sigmoid() * one_hot(given.ids) + take_far_ids.sigmoid() * one_hot(given.backdrop_ids)
+        return Refined(rgb, depth, scores + more_scores + COPY_SCORE * copied, log_error)
 
 
 @dataclass(frozen=True)
@@ -550,11 +530,8 @@ class Finished:
 
         (``max`` finds the first of several equal ones, as ``argmax`` does, in half of the time.)
         """
-        most = (
-            _shares(w[None], s[None]).max(1, keepdim=True).indices
-            for w, s in zip(self.weights, self.sources, strict=True)
-        )
-        return torch.cat([one.to(torch.uint8) for one in most])
+        shares = (_shares(w[None], s[None]) for w, s in zip(self.weights, self.sources, strict=True))
+        return torch.cat([one.max(1, keepdim=True).indices.to(torch.uint8) for one in shares])
 
 
 def _shares(weights: Tensor, sources: Tensor) -> Tensor:
@@ -621,12 +598,7 @@ class Finisher(CellNet):
         masks = [given.valid, given.warped, given.alpha, given.certainty]
         fold = lambda x: functional.pixel_unshuffle(x, 2)  # noqa: E731
         agree = (ids[:, 1:] == ids[:, :1]).float().flatten(1, 2)
-        planes = [
-            fold(colors.flatten(1, 2)),
-            fold(depths.flatten(1, 2)),
-            *(fold(m) for m in masks),
-            fold(made.log_error),
-        ]
+        planes = [*map(fold, (colors.flatten(1, 2), depths.flatten(1, 2), *masks, made.log_error))]
         planes.append(functional.avg_pool2d(agree, 2))
         planes.append(scale.log2().view(-1, 1, 1, 1).expand(-1, 1, *planes[0].shape[-2:]))
         out = self.pixels(joined(planes, colors.dtype), frames)
@@ -656,24 +628,18 @@ def with_detail(rgb: Tensor, given: ConditionPixels) -> Tensor:
 
 
 def spans(length: int, longest: int = TILE_PX) -> list[tuple[int, int]]:
-    """Cut 0..length into pieces of about equal size, none longer than `longest` (up to `STRIDE_PX`), with borders at
-    multiples of `STRIDE_PX`."""
+    """Cut 0..length into about equal pieces, none longer than `longest`, with borders at multiples of `STRIDE_PX`."""
     count = -(-length // max(longest, STRIDE_PX))
     borders = [round(number * length / count / STRIDE_PX) * STRIDE_PX for number in range(count)] + [length]
     return [(first, last) for first, last in zip(borders, borders[1:], strict=False) if first < last]
 
 
 class PixelSource(Protocol):
-    """The condition of a clip at the size that is wanted, of which one rectangle at a time is asked."""
+    """The condition of a clip at the size that is wanted (N, H, W), of which one rectangle at a time is asked."""
 
     @property
-    def grid(self) -> tuple[int, int, int]:
-        """N, H, W."""
-        ...
-
-    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
-        """A rectangle of pixels."""
-        ...
+    def grid(self) -> tuple[int, int, int]: ...
+    def crop(self, rows: slice, columns: slice) -> ConditionPixels: ...
 
 
 def finish_in_tiles(
@@ -690,12 +656,8 @@ def finish_in_tiles(
     small, device = made.rgb.shape[-2:], made.rgb.device
     scale = torch.full((frames,), (size[0] * size[1] / (small[0] * small[1])) ** 0.5, device=device)
     margin = finisher.margin_px
-    whole = Made(
-        *(
-            torch.empty(frames, c, *size, dtype=t, device=device)
-            for c, t in ((3, torch.float32), (1, torch.float32), (1, torch.uint8), (1, torch.float32))
-        )
-    )
+    empty = lambda c, kind=torch.float32: torch.empty(frames, c, *size, dtype=kind, device=device)  # noqa: E731
+    whole = Made(empty(3), empty(1), empty(1, torch.uint8), empty(1))
     for top, bottom in spans(size[0], tile_px):
         for left, right in spans(size[1], tile_px):
             rows, columns = (

@@ -242,7 +242,9 @@ class Spread:
         else:
             mesh = init_device_mesh(ranks.device.type, (ranks.size,))
         for part in trained.values():
-            _stored_plainly(part)
+            with torch.no_grad():  # channels-last weights to row-major, which sharding asks for
+                for value in part.parameters():
+                    value.data = value.data.contiguous()
             for block in blocks(part):
                 fully_shard(block, mesh=mesh)
             fully_shard(part, mesh=mesh)
@@ -284,17 +286,17 @@ def blocks(part: nn.Module) -> list[nn.Module]:
 
     These are what is sharded, and recomputed, as a unit.
     """
-    found: list[nn.Module] = []
+
+    def members(modules: nn.ModuleList) -> list[nn.Module]:
+        return [inner for m in modules for inner in (members(m) if isinstance(m, nn.ModuleList) else [m])]
+
+    units: list[nn.Module] = []
     for child in part.children():
         if isinstance(child, nn.ModuleList):
-            found += [m for m in _members(child) if any(True for _ in m.children())]
+            units += [m for m in members(child) if any(True for _ in m.children())]
         else:
-            found += blocks(child)
-    return found
-
-
-def _members(modules: nn.ModuleList) -> list[nn.Module]:
-    return [inner for m in modules for inner in (_members(m) if isinstance(m, nn.ModuleList) else [m])]
+            units += blocks(child)
+    return units
 
 
 def recompute(part: nn.Module) -> int:
@@ -304,13 +306,6 @@ def recompute(part: nn.Module) -> int:
     for block in found:
         block.forward = functools.partial(recomputed, block.forward, use_reentrant=False)
     return len(found)
-
-
-def _stored_plainly(part: nn.Module) -> None:
-    """Channels-last weights to row-major, which sharding asks for."""
-    with torch.no_grad():
-        for value in part.parameters():
-            value.data = value.data.contiguous()
 
 
 def is_sharded(value: Tensor) -> bool:

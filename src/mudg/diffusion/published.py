@@ -95,25 +95,22 @@ class PublishedConfig:
     there."""
 
     def __post_init__(self) -> None:
-        if self.text.width != self.net.context_width or self.image_tokens.context_width != self.net.context_width:
-            raise UsageError(
+        net, tokens, latent = self.net, self.image_tokens, self.codec.latent_channels
+        for what, expected, got in (
+            (
                 "caption and image tokens must have the width of the network's context",
-                expected=str(self.net.context_width),
-                got=f"{self.text.width}, {self.image_tokens.context_width}",
-            )
-        if self.image.width != self.image_tokens.image_width:
-            raise UsageError(
-                "image tower and resampler differ in width", got=f"{self.image.width}, {self.image_tokens.image_width}"
-            )
-        if (
-            self.net.channels_in != 3 * self.codec.latent_channels
-            or self.net.channels_out != self.codec.latent_channels
-        ):
-            raise UsageError(
+                f"{net.context_width}, {net.context_width}",
+                f"{self.text.width}, {tokens.context_width}",
+            ),
+            ("image tower and resampler differ in width", str(tokens.image_width), str(self.image.width)),
+            (
                 "the network must take three latents (noisy, colour, depth) and give one",
-                expected=f"{3 * self.codec.latent_channels} -> {self.codec.latent_channels}",
-                got=f"{self.net.channels_in} -> {self.net.channels_out}",
-            )
+                f"{3 * latent} -> {latent}",
+                f"{net.channels_in} -> {net.channels_out}",
+            ),
+        ):
+            if expected != got:
+                raise UsageError(what, expected=expected, got=got)
 
     @property
     def window(self) -> int:
@@ -238,15 +235,14 @@ class PublishedMDM(nn.Module):
 
     def check_frames(self, frames: int) -> None:
         """UsageError unless a clip has exactly the number of frames that the image tokens are made for."""
-        if frames != self.config.window:
+        own = self.config.window
+        if frames != own:
             raise UsageError(
                 "a clip of the published model has a fixed number of frames: its image tokens belong to one frame each",
                 where="PublishedMDM",
-                expected=f"{self.config.window} frames",
+                expected=f"{own} frames",
                 got=f"{frames}",
-                remedy=(
-                    f"use trajectories of at least {self.config.window} frames; they are made in windows of that length"
-                ),
+                remedy=f"use trajectories of at least {own} frames; they are made in windows of that length",
             )
 
     def encode_condition(
@@ -284,10 +280,8 @@ class PublishedMDM(nn.Module):
             seen = torch.cat([torch.ones_like(seen[:, : len(known)]), seen[:, len(known) :]], 1)
         color = torch.cat([first[:, None], color[:, 1:]], 1)
         seen = torch.cat([first_seen[:, None], seen[:, 1:]], 1)
-        generator = self._posterior(generator)
-        planes = torch.cat(
-            [self._encode(color * 2 - 1, generator), self._encode(self.codec.depth_image(depth), generator)], 2
-        )
+        generator, images = self._posterior(generator), (color * 2 - 1, self.codec.depth_image(depth))
+        planes = torch.cat([self._encode(image, generator) for image in images], 2)
         shown = torch.where(in_tokens, reference * 2 - 1, 0.0)
         features = self._features(torch.cat([shown, torch.zeros_like(reference[:1])]))
         return PublishedLatents(planes, features[:-1], features[-1:], self._share_of_cells(seen))
@@ -375,13 +369,10 @@ class PublishedMDM(nn.Module):
                         expected="points alone, as the published-type model is given",
                         remedy="give another folder of clips; they are made anew",
                     )
-                draws = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}")
-                bare = settings.frame_dropout and bool(no_reference[number])
-                encoded.append(
-                    self.encode_condition(
-                        replace(clip.condition, reference_in="nowhere") if bare else clip.condition, draws
-                    )
-                )
+                draws, given = seeds.torch_generator(part.seed, part.step, f"posterior, clip {number}"), clip.condition
+                if settings.frame_dropout and bool(no_reference[number]):
+                    given = replace(given, reference_in="nowhere")
+                encoded.append(self.encode_condition(given, draws))
                 truths.append(self.encode_truth(clip.rgb[None], clip.depth[None], clip.semantics[None], draws))
             truth: dict[Modality, Tensor] = {m: torch.cat([one[m] for one in truths]) for m in MODALITIES}
             classes = torch.stack([clip.semantics != palette.UNLABELLED for clip in clips]).unsqueeze(2)
@@ -509,11 +500,9 @@ class PublishedMDM(nn.Module):
         aspect."""
         del width, height
         own = self.config
-        return (
-            sized_to_width(width_px, own.width / own.height, own.pixel_multiple)
-            if width_px
-            else (own.width, own.height)
-        )
+        if not width_px:
+            return own.width, own.height
+        return sized_to_width(width_px, own.width / own.height, own.pixel_multiple)
 
     @torch.no_grad()
     def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
@@ -531,9 +520,8 @@ class PublishedMDM(nn.Module):
         with torch.autocast(self.device.type, torch.bfloat16) if half else contextlib.nullcontext():
             before = None if request.known is None else request.known["rgb"].to(self.device)
             before = None if before is None else self.codec.decode_rgb(before, frames_at_once)
-            encoded = self.encode_condition(
-                condition, seeds.torch_generator(request.seed, request.index, "posterior"), before
-            )
+            posterior = seeds.torch_generator(request.seed, request.index, "posterior")
+            encoded = self.encode_condition(condition, posterior, before)
             tokens = self.image_tokens(torch.cat([encoded.features, encoded.grey]).to(self.image_tokens.queries.dtype))
             groups = [MODALITIES] if self.split.modalities_together else [(m,) for m in MODALITIES]
             latents: dict[Modality, Tensor] = {}
@@ -580,13 +568,9 @@ class PublishedMDM(nn.Module):
         rescale = GUIDANCE_RESCALE if request.guidance_rescale is None else request.guidance_rescale
         count, both = len(names), slice(0, 1 if guidance == 1 else 2)  # 0: with caption and reference, 1: without
         halves = [both] if self.split.guidance_together or guidance == 1 else [slice(0, 1), slice(1, 2)]
+        twice = lambda x, half: x[half].repeat_interleave(count, 0)  # noqa: E731
         told = [
-            self._told(
-                names * len(self.text[half]),
-                self.text[half].repeat_interleave(count, 0),
-                tokens[half].repeat_interleave(count, 0),
-                ahead=True,
-            )
+            self._told(names * len(self.text[half]), twice(self.text, half), twice(tokens, half), ahead=True)
             for half in halves
         ]
 
@@ -656,14 +640,8 @@ def save(
         store.write_safetensors(partial / "scale.safetensors", small)
         files["scale.safetensors"] = store.sha256_file(partial / "scale.safetensors")
         store.write_text(partial / "MODEL_CARD.md", card)
-        description = {
-            "schema": 1,
-            "kind": KIND,
-            "config": dataclasses.asdict(config),
-            "files": files,
-            "facts": dict(facts),
-        }
-        store.write_json(partial / MODEL_FILE, description)
+        description = {"schema": 1, "kind": KIND, "config": dataclasses.asdict(config)}
+        store.write_json(partial / MODEL_FILE, {**description, "files": files, "facts": dict(facts)})
         store.sync_tree(partial)
 
 

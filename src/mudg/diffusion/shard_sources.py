@@ -17,7 +17,7 @@ import threading
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 import numpy as np
 from pydantic import BeforeValidator, Field
@@ -93,13 +93,13 @@ class FolderOfShards:
     @classmethod
     def open(cls, place: Location) -> FolderOfShards:
         """The folder, or one inside a folder that was uploaded as a whole, such as the output of a training."""
-        for above, prefix in ((place, ""), (_parent(place), f"{place.name}/")):
-            found = above.uploaded() if above is not None else None
-            if found is not None:
-                return cls(
-                    place,
-                    {name[len(prefix) :]: one.sha256 for name, one in found.files.items() if name.startswith(prefix)},
-                )
+        head = place.text.rpartition("/")[0]
+        parent = [(Location.of(head), f"{place.name}/")] if head and not head.endswith("/") else []
+        for above, prefix in ((place, ""), *parent):
+            upload = above.uploaded()
+            if upload is not None:
+                files = upload.files.items()
+                return cls(place, {n[len(prefix) :]: one.sha256 for n, one in files if n.startswith(prefix)})
         return cls(place, {})
 
     @property
@@ -139,11 +139,6 @@ class FolderOfShards:
                 )
 
 
-def _parent(place: Location) -> Location | None:
-    head = place.text.rpartition("/")[0]
-    return Location.of(head) if head and not head.endswith("/") else None
-
-
 class StreamedShards:
     """The clips of a training, at an address: fetched when they are needed.
 
@@ -160,8 +155,7 @@ class StreamedShards:
         Raises:
             InputError: it has another number of clips, or is not there. IntegrityError: it is damaged.
         """
-        name = f"{self._folder.key}/{number:07d}.safetensors"
-        return self._cache.get(name, lambda path: self._bring(number, path))
+        return self._cache.get(f"{self._folder.key}/{number:07d}.safetensors", lambda path: self._bring(number, path))
 
     def _bring(self, number: int, path: Path) -> None:
         self._folder.bring(number, path)
@@ -344,11 +338,10 @@ def _plain_lines(content: bytes, where: str) -> list[ListedScene]:
 # shards of listed scenes --------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class _OpenScene:
+class _OpenScene(NamedTuple):
     """What is known of a scene once it was drawn: the numbers of its shards, and how each is found."""
 
-    shards: tuple[int, ...]
+    shards: Sequence[int]
     find: Callable[[int], Path]
 
 
@@ -474,13 +467,11 @@ class ListedShards:
             folder = FolderOfShards.open(place) if place.local is None else FolderOfShards(place, {})
             numbers = folder.numbers()
             if numbers:
-                chosen = tuple(n for n in numbers if n < HELD_OUT) or numbers
+                chosen = [n for n in numbers if n < HELD_OUT] or numbers
                 if place.local is not None:
                     return _OpenScene(chosen, lambda n: shard_path(Path(place.text), n))
-                return _OpenScene(
-                    chosen,
-                    lambda n: self._cache.get(f"{folder.key}/{n:07d}.safetensors", lambda at: folder.bring(n, at)),
-                )
+                name = f"{folder.key}/{{:07d}}.safetensors"
+                return _OpenScene(chosen, lambda n: self._cache.get(name.format(n), lambda at: folder.bring(n, at)))
         places = [Location.of(given), Location.of(fused)] if separator else [Location.of(given)]
         if all(place.local is not None for place in places):
             return self._of_log(log_clips.log_source(text), scored, lambda make: make(log_clips.log_source(text)))
@@ -524,7 +515,7 @@ class ListedShards:
 
             return self._cache.get(f"{folder.name}/{shard_path(Path(), number).name}", bring)
 
-        return _OpenScene(tuple(range(count)), find)
+        return _OpenScene(range(count), find)
 
     def _of_remote_log(self, places: Sequence[Location], scored: bool) -> _OpenScene:
         def with_log(make: Callable[[LogSource], None]) -> None:
@@ -540,15 +531,11 @@ class ListedShards:
 
         facts = []
         for place in places:
-            record = next(
-                (place / n for n in ("_contents.json", store.MANIFEST, "scene.json") if (place / n).exists()), None
-            )
+            records = (place / name for name in ("_contents.json", store.MANIFEST, "scene.json"))
+            record = next((one for one in records if one.exists()), None)
             if record is None:
-                raise InputError(
-                    "no clips and no log here",
-                    where=place.text,
-                    remedy="check the address, and whether its upload was finished",
-                )
+                remedy = "check the address, and whether its upload was finished"
+                raise InputError("no clips and no log here", where=place.text, remedy=remedy)
             facts.append(hashlib.sha256(record.load()).hexdigest())
         return self._of_log(None, scored, with_log, " ".join(facts))
 

@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from torch import Tensor
 
 from mudg import native
 from mudg.base import log, memory, store
@@ -52,7 +51,6 @@ from mudg.diffusion.views import (
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.storage import load_model
-from mudg.networks.codec import Modality
 from mudg.scene import fuse
 from mudg.scene.clouds import read_fused
 from mudg.scene.observations import ObservationWriter
@@ -121,11 +119,20 @@ def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, work:
     if len(set(names)) < len(names):
         raise UsageError("two shifts give the same trajectory", got=", ".join(names))
     half_of(config)  # said before other processes begin
-    started = time.monotonic()
+    started, frames = time.monotonic(), 0
     processes = config.processes or usual_processes(config, paths)
     model = load_any(config) if processes == 1 else None  # several processes load one each
+    jobs = [(config, given, work.path, path, model) for path in paths]
+    processes = min(processes, len(jobs))
+    if processes > 1:
+        release_memory()
+        log.info_once(f"synthesize: {processes} processes with one thread each")
     try:
-        frames = _run_jobs([(config, given, work.path, path, model) for path in paths], names, processes)
+        with log.task("synthesize", len(jobs)) as bar:
+            for index, views in run_in_processes(make_trajectory, jobs, processes):
+                frames += views
+                bar.update(names[index])
+                bar.advance()
     finally:
         _recorded_again.cache_clear()
     seconds = time.monotonic() - started
@@ -153,21 +160,6 @@ def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> in
     return possible
 
 
-def _run_jobs(jobs: Sequence[tuple[Any, ...]], names: Sequence[str], processes: int) -> int:
-    """Make the trajectories, each in one thread, several processes at a time; returns the number of views."""
-    processes = min(processes, len(jobs))
-    if processes > 1:
-        release_memory()
-        log.info_once(f"synthesize: {processes} processes with one thread each")
-    made = 0
-    with log.task("synthesize", len(jobs)) as bar:
-        for index, views in run_in_processes(make_trajectory, jobs, processes):
-            made += views
-            bar.update(names[index])
-            bar.advance()
-    return made
-
-
 # one trajectory -----------------------------------------------------------------------------------
 
 
@@ -184,8 +176,8 @@ def near_sweeps(scene: Scene, cloud: FusedCloud, path: Trajectory) -> NearSweeps
 
 def without_classes(cloud: FusedCloud) -> FusedCloud:
     """The cloud without its points' classes."""
-    bare = lambda points: replace(points, semantics=None)  # noqa: E731
-    return FusedCloud(bare(cloud.static), {name: bare(points) for name, points in cloud.objects.items()}, cloud.colors)
+    objects = {name: replace(points, semantics=None) for name, points in cloud.objects.items()}
+    return FusedCloud(replace(cloud.static, semantics=None), objects, cloud.colors)
 
 
 def make_trajectory(
@@ -200,7 +192,8 @@ def make_trajectory(
     maker = _view_maker(config, given, path, model, out)
     spans = maker.spans(len(path), config.overlap)
     state = folder / "state"
-    first, tail = _read_state(state)
+    finished = sorted(state.glob("[0-9]*.safetensors"))  # the last one's latents, by the number of windows
+    first, tail = (int(finished[-1].stem), store.read_tensors(finished[-1])) if finished else (0, None)
     with understood("depth fits of an interrupted synthesis", str(state / FITS)):
         fits: dict[str, list[float | None]] = dict(store.read_json(state / FITS)) if (state / FITS).is_file() else {}
     every = max(1, len(path) // 5)
@@ -253,14 +246,6 @@ def _view_maker(
         cloud, drive.scene.tracks, drive.recorded, rules, render_at, near, drive.vacated, drive.weather
     )
     return ViewMaker(model, sources, config, images=drive.images.setdefault(fine, PreparedImages(scratch)))
-
-
-def _read_state(state: Path) -> tuple[int, dict[Modality, Tensor]]:
-    """Number of finished windows and the latents of the last one."""
-    files = sorted(state.glob("[0-9]*.safetensors"))
-    if not files:
-        return 0, {}
-    return int(files[-1].stem), store.read_tensors(files[-1])
 
 
 def _sheet_row(condition: Condition, sample: GeneratedClip, i: int) -> np.ndarray:

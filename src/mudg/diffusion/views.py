@@ -103,15 +103,10 @@ def check_config(config: SynthesizeConfig, fitted: bool, *, weather: bool = Fals
         )
     if full_size:
         return replace(config, processes=config.processes or 1)  # one copy of a large model in memory
-    for flag, given in (
-        ("memory-budget-gb", config.memory_budget_gb),
-        ("offload", config.offload),
-        ("compiled", config.compiled),
-    ):
-        if given:
-            raise UsageError(
-                "this setting applies to published-type models only", where=f"--{flag}", remedy="leave it out"
-            )
+    for name in ("memory_budget_gb", "offload", "compiled"):
+        if getattr(config, name):
+            what, flag = "this setting applies to published-type models only", f"--{name.replace('_', '-')}"
+            raise UsageError(what, where=flag, remedy="leave it out")
     model = model_files.load(config.model)  # fails now rather than in every process
     if fitted and not model.config.renders:
         raise UsageError(
@@ -166,7 +161,8 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
     dtype = None if device.type == "cpu" else half or torch.float32
     model = published.load(Path(config.model), dtype=dtype)
     model.split = WorkSplit(frames_at_once=1, offload=config.offload)
-    budget_gb = config.memory_budget_gb or _free_gb(device)
+    free_gb = torch.cuda.mem_get_info(device)[0] / 1e9 if device.type == "cuda" else 0.0
+    budget_gb = config.memory_budget_gb or free_gb  # 0: unknown
     if budget_gb:
         model.split = _choose_split(model, config, budget_gb, 4 if half is None else 2)
     tower = model.image
@@ -176,11 +172,6 @@ def load_any(config: SynthesizeConfig) -> DiffusionModel:
     if config.compiled:
         model.net.compile()
     return model
-
-
-def _free_gb(device: torch.device) -> float:
-    """Free memory of a CUDA device in GB, 0 of others (unknown)."""
-    return torch.cuda.mem_get_info(device)[0] / 1e9 if device.type == "cuda" else 0.0
 
 
 def _choose_split(model: PublishedMDM, config: SynthesizeConfig, budget_gb: float, bytes_per_value: int) -> WorkSplit:
@@ -325,21 +316,10 @@ class ViewMaker:
         if self._model.points_alone and not recorded_at_pose(views[0], self._given.recorded):
             usable[0] = False
         trust = made.confidence * usable
-        source, color_alone = COLOR_ALONE.get(self._parts, SOURCE), self._parts in COLOR_ALONE
-        observations = [
-            Observation(
-                view,
-                made.rgb[i],
-                None if color_alone else made.depth[i],
-                None if color_alone else made.semantics[i],
-                trust[i],
-                usable[i],
-                "virtual",
-                source,
-            )
-            for i, view in enumerate(made_views)
-        ]
-        return sample, condition, observations
+        source, nothing = COLOR_ALONE.get(self._parts, SOURCE), [None] * len(made_views)
+        depth, ids = (nothing, nothing) if self._parts in COLOR_ALONE else (made.depth, made.semantics)
+        planes = zip(made_views, made.rgb, depth, ids, trust, usable, strict=True)
+        return sample, condition, [Observation(*one, "virtual", source) for one in planes]
 
     def _generated(
         self, condition: Condition, fine: Condition, views: Sequence[View], request: SampleRequest
@@ -371,11 +351,8 @@ def recorded_at_pose(view: View, recorded: Sequence[Photo]) -> bool:
     The published model puts the reference, as it was recorded, into frame 0 of a window. On a shifted trajectory that
     frame is a picture from another place, and must not be used as if it were one from there.
     """
-    for image in recorded:
-        moved = image.view.cam_from_world @ view.world_from_cam
-        if np.linalg.norm(moved[:3, 3]) < 0.05 and np.abs(moved[:3, :3] - np.eye(3)).max() < 0.01:
-            return True
-    return False
+    moves = (image.view.cam_from_world @ view.world_from_cam for image in recorded)
+    return any(np.linalg.norm(m[:3, 3]) < 0.05 and np.abs(m[:3, :3] - np.eye(3)).max() < 0.01 for m in moves)
 
 
 def enlarge(

@@ -60,8 +60,7 @@ class Stop:
 
 @dataclass(frozen=True)
 class Ending:
-    """How a step ended. code: exit code of its process; words: why it failed, in one line; text: the end of what it
-    said."""
+    """How a step ended. code: of its process; words: why it failed, in one line; text: the end of what it said."""
 
     code: int
     words: str = ""
@@ -143,8 +142,7 @@ def _guarded(words: Sequence[str]) -> list[str]:
 
 @contextlib.contextmanager
 def _turn(alone: bool, stop: Stop) -> Iterator[None]:
-    """Hold the turn of a step: beside others of this user on this machine, or alone. Who waits to be alone holds the
-    door meanwhile."""
+    """Hold the turn of a step: beside others of this user on this machine, or alone, holding the door meanwhile."""
     if fcntl is None or os.environ.get(_HELD):
         yield
         return

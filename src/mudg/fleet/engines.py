@@ -50,8 +50,7 @@ class LocalRun:
     _ahead: dict[str, threading.Thread] = field(default_factory=dict)
 
     def run(self, tell: Tell) -> None:
-        """Do them all. Ctrl-C and SIGTERM stop every step with a checkpoint, a second one at once; KeyboardInterrupt
-        goes on then."""
+        """Do them all. Ctrl-C and SIGTERM stop steps with a checkpoint, a second one at once: KeyboardInterrupt."""
         waiting, told = deque(self.entries), queue.SimpleQueue[Ended | None]()
 
         def work() -> None:
@@ -227,24 +226,16 @@ def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> t
         with executor.batch():
             tasks = [executor.submit(SlurmTask(job, entries[index::count])) for index in range(count)]
     except (RuntimeError, submitit.core.utils.FailedJobError, OSError) as error:
-        raise ResourceError(
-            "Slurm refused, or is not on this machine",
-            where="sbatch",
-            got=str(error).strip()[:500],
-            remedy="run this on a login node, or take another --engine",
-        ) from error
+        what, remedy = "Slurm refused, or is not on this machine", "run this on a login node, or take another --engine"
+        raise ResourceError(what, where="sbatch", got=str(error).strip()[:500], remedy=remedy) from error
     return str(tasks[0].job_id).partition("_")[0], folder
 
 
 def _option(text: str) -> tuple[str, str | bool]:
     name, separator, value = text.partition("=")
     if not name or name.startswith("-") or any(letter in text for letter in "\n\r") or name in _OWN_OPTIONS:
-        raise UsageError(
-            "not an option for the array job",
-            where="--slurm-options",
-            got=text[:80],
-            expected="NAME or NAME=VALUE without dashes, other than " + ", ".join(sorted(_OWN_OPTIONS)),
-        )
+        expected = "NAME or NAME=VALUE without dashes, other than " + ", ".join(sorted(_OWN_OPTIONS))
+        raise UsageError("not an option for the array job", where="--slurm-options", got=text[:80], expected=expected)
     return name, value if separator else True
 
 

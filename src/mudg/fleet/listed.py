@@ -107,11 +107,8 @@ def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: 
         except (InputError, TypeError):
             known = False
         if not known:
-            raise UsageError(
-                "the status file would replace a file that does not belong to this list",
-                where=str(status),
-                remedy="choose another --out",
-            )
+            what = "the status file would replace a file that does not belong to this list"
+            raise UsageError(what, where=str(status), remedy="choose another --out")
 
 
 def _outcome(entry: Entry, report: Ended, folder: Path, before: str) -> dict[str, Any]:

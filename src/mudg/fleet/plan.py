@@ -39,8 +39,7 @@ SHARD_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
 
 @dataclass(frozen=True, slots=True)
 class Entry:
-    """One line of a list: the source, the name of its output folder, and settings of its own (``sequence``, ``frames``,
-    ...)."""
+    """One line of a list: the source, the name of its output folder, and its own settings (``sequence``, ...)."""
 
     name: str
     source: str
@@ -72,12 +71,9 @@ def read_list(listed: Path | str, settings: Sequence[str] = ()) -> list[Entry]:
     sources: dict[str, str] = {}
     for entry in entries:
         if entry.name in sources:
-            raise InputError(
-                "two entries would write the same folder",
-                where=str(place),
-                got=f"{sources[entry.name]} and {entry.source}",
-                remedy=f"give one of them another name: SOURCE name={entry.name}-2",
-            )
+            what = "two entries would write the same folder"
+            remedy = f"give one of them another name: SOURCE name={entry.name}-2"
+            raise InputError(what, where=str(place), got=f"{sources[entry.name]} and {entry.source}", remedy=remedy)
         sources[entry.name] = entry.source
     return entries
 
@@ -93,13 +89,9 @@ def _entry(line: str, where: str, folder: str, settings: Sequence[str]) -> Entry
     for word in words[1:]:
         key, separator, value = word.partition("=")
         if not separator or key not in ("name", *settings):
-            raise InputError(
-                "unknown setting in the line",
-                where=where,
-                got=word[:80],
-                expected=", ".join(f"{key}=..." for key in ("name", *settings)),
-                remedy="put quotes around a path with spaces",
-            )
+            got, expected = word[:80], ", ".join(f"{key}=..." for key in ("name", *settings))
+            remedy = "put quotes around a path with spaces"
+            raise InputError("unknown setting in the line", where=where, got=got, expected=expected, remedy=remedy)
         given[key] = os.path.abspath(value) if key in ("poses", "boxes") and os.path.exists(value) else value
     source = words[0] if words[0] == CITY else _below(folder, words[0])
     name = given.pop("name", "") or Path(source).name.removesuffix(".zip")
@@ -135,12 +127,8 @@ def parse_shard(text: str, environment: Mapping[str, str] = os.environ) -> tuple
     if first == "env":
         first, count = _numbered(count, environment)
     if not first.isdecimal() or not count.isdecimal() or not int(first) < int(count):
-        raise UsageError(
-            "invalid shard",
-            where="--shard",
-            expected="i/n with i from 0 to n-1, e.g. 0/4; or env, env/n",
-            got=text if "env" not in text else f"{text}: {first or '?'}/{count or '?'}",
-        )
+        what, got = "invalid shard", text if "env" not in text else f"{text}: {first or '?'}/{count or '?'}"
+        raise UsageError(what, where="--shard", expected="i/n with i from 0 to n-1, e.g. 0/4; or env, env/n", got=got)
     return int(first), int(count)
 
 
@@ -151,11 +139,8 @@ def _numbered(count: str, environment: Mapping[str, str]) -> tuple[str, str]:
             lowest = environment.get(lowest_name, "") or "0"
             index = str(int(index) - int(lowest)) if index.isdecimal() and lowest.isdecimal() else index
             return index, count or environment.get(count_name, "")
-    raise UsageError(
-        "no scheduler has numbered this task",
-        where="--shard env",
-        expected=f"one of {', '.join(names[0] for names in SHARD_VARIABLES)} in the environment",
-    )
+    expected = f"one of {', '.join(names[0] for names in SHARD_VARIABLES)} in the environment"
+    raise UsageError("no scheduler has numbered this task", where="--shard env", expected=expected)
 
 
 def shard(entries: Sequence[Entry], part: tuple[int, int]) -> list[Entry]:
@@ -287,11 +272,8 @@ def plan_of(
         read = set(_PLACEHOLDER.findall(" ".join(words)))
         missing = (read & set(lines)) - set(made)
         if missing and name != COMMAND:
-            raise UsageError(
-                f"the step {name} needs {' and '.join(sorted(missing))} before it",
-                where="--stages",
-                got=" ".join(names),
-            )
+            where, got = "--stages", " ".join(names)
+            raise UsageError(f"the step {name} needs {' and '.join(sorted(missing))} before it", where=where, got=got)
         own = {} if name == COMMAND else dict(settings if name == "run" else settings[name])
         stages.append(BatchStage(name, words, tuple(one for one in made if one in read), own))
     if len(set(names)) < len(names) or not names:

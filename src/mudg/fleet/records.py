@@ -122,13 +122,8 @@ def _checked(kind: type[Kind], content: bytes, where: str, remedy: str) -> Kind:
         return kind.model_validate_json(store.json_text(store.parse_json(content, where), indent=None))
     except ValidationError as error:
         problem = first_problem(error, f"{where}: ")
-        raise InputError(
-            f"a record of the batch is damaged: {problem.what}",
-            where=problem.where,
-            expected=problem.expected,
-            got=problem.got,
-            remedy=remedy,
-        ) from error
+        what, got = f"a record of the batch is damaged: {problem.what}", problem.got
+        raise InputError(what, where=problem.where, expected=problem.expected, got=got, remedy=remedy) from error
 
 
 def this_host() -> str:
@@ -203,12 +198,9 @@ class BatchFolder:
         if not file.save((store.json_text(record) + "\n").encode(), only_if_absent=True):
             before = store.parse_json(file.load(), str(file))
             if before != record:
-                raise UsageError(
-                    "the output holds a batch of other steps or settings",
-                    where=str(self.out),
-                    got="; ".join(differences(before, record)[:8]),
-                    remedy="choose another --out",
-                )
+                what = "the output holds a batch of other steps or settings"
+                got = "; ".join(differences(before, record)[:8])
+                raise UsageError(what, where=str(self.out), got=got, remedy="choose another --out")
         values = [[one.name, one.source, dict(one.settings)] for one in sorted(entries, key=lambda one: one.name)]
         content = json.dumps(values, ensure_ascii=False).encode()
         listed = self.own / f"list.{hashlib.sha256(content).hexdigest()[:12]}.json"
@@ -280,12 +272,9 @@ class BatchFolder:
                     continue
                 if mine.exists() and mine.load() == content:
                     mine.remove()
-                raise UsageError(
-                    "another driver works on this batch" if alive else "another machine may still drive this batch",
-                    where=str(self.own / other_name),
-                    got=str(other),
-                    remedy="wait for it, or stop it" if alive else "if it is gone, add --take-over",
-                )
+                what = "another driver works on this batch" if alive else "another machine may still drive this batch"
+                remedy = "wait for it, or stop it" if alive else "if it is gone, add --take-over"
+                raise UsageError(what, where=str(self.own / other_name), got=str(other), remedy=remedy)
             if not mine.save(content, only_if_absent=True) and mine.load() != content:
                 raise UsageError(
                     "another driver works on this batch", where=str(mine), remedy="wait for it, or stop it"

@@ -1,5 +1,4 @@
-"""How far a batch is, from its records: steps by state, failures by reason, time and costs, and facts about the
-logs."""
+"""How far a batch is, from its records: steps by state, failures by reason, time, costs, and facts about the logs."""
 
 from __future__ import annotations
 

@@ -101,8 +101,7 @@ class Job:
 
 
 def run_scene(job: Job, entry: Entry, stop: Stop) -> list[Ended]:
-    """Do the steps of a scene that are not on record yet, until one fails or work is to stop; returns how they
-    ended."""
+    """Do the steps of a scene that are not on record yet, until one fails or work is to stop; returns their ends."""
     ended: list[Ended] = []
     with contextlib.ExitStack() as held:
         for unit in job.plan.units(entry):
@@ -318,8 +317,7 @@ class _Step:
         link.symlink_to(os.path.abspath(local))
 
     def _with_fetched(self, settings: Mapping[str, Any]) -> dict[str, Any]:
-        """Settings with names below the work folder for addresses: weights are fetched once for all scenes on this
-        machine."""
+        """Settings with names below the work folder for addresses; weights are fetched once for a machine."""
         values: dict[str, Any] = {}
         for name, value in settings.items():
             if isinstance(value, Mapping):
@@ -419,8 +417,7 @@ class _Step:
 
 
 def digest_of(folder: Path) -> str:
-    """What the bytes of a result are told by: the hash of its manifest; of a chain, of the manifests of its steps; else
-    of all files."""
+    """What tells a result's bytes: the hash of its manifest; of a chain, of its steps' manifests; else of all files."""
     if (folder / store.MANIFEST).is_file():
         return store.sha256_file(folder / store.MANIFEST)
     manifests = sorted(path.relative_to(folder).as_posix() for path in folder.rglob(store.MANIFEST))

@@ -156,8 +156,7 @@ def depth_origin(config: AnnotateConfig, networks: Mapping[str, str], made: Sequ
 
 
 def describe_folder(folder: str, digest: str) -> str:
-    """Name (of one that did not come with the package) and digest of a network's folder, in words for the scene's
-    notes."""
+    """Name (of one that the package does not ship) and digest of a network's folder, for the scene's notes."""
     where = f" in folder '{title(find(folder))}'" if folder else ""
     return f"{where} (sha256 {digest[:16]})"
 
@@ -392,8 +391,7 @@ _FRAMES_PER_PROCESS = 8
 
 
 def write_labelled(config: AnnotateConfig, scene: Path, work: RunDir) -> dict[str, Any]:
-    """Label a scene; the work folder becomes a scene with labels, and ``labels.html`` shows some of them. Returns a
-    summary."""
+    """Label a scene: the work folder becomes one with labels, and ``labels.html`` shows some. Returns a summary."""
     loaded, out = read_scene(scene), work.path
     wanted = wanted_labels(config)
     missing = [frame for frame in loaded.frames if not wanted <= set(frame.labels)]

@@ -44,8 +44,7 @@ _THIN: Final = (ID["person"], ID["rider"], ID["bicycle"], ID["motorcycle"])
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Measured:
-    """Visible returns of an image: ``depth_m`` f32[H, W], NaN = none, and ``away_px`` f32[H, W], distance to the
-    nearest."""
+    """Visible returns: ``depth_m`` f32[H, W], NaN = none, and ``away_px`` f32[H, W], distance to the nearest."""
 
     depth_m: NDArray[np.float32]
     away_px: NDArray[np.float32]
@@ -58,8 +57,7 @@ class _Measured:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Surface:
-    """Dense depth in space: ``xyz_world`` f32[H, W, 3] (NaN = unknown), depth f32[H, W] metres, ``confidence`` f32[H,
-    W]."""
+    """Dense depth: ``xyz_world`` f32[H, W, 3] (NaN = unknown), ``depth`` f32[H, W] metres, ``confidence`` f32[H, W]."""
 
     xyz_world: NDArray[np.float32]
     depth: NDArray[np.float32]
@@ -88,8 +86,7 @@ def label_by_geometry(given: LabelInput) -> Labels:
 
 
 def label_by_network(given: LabelInput, semantics: NDArray[np.uint8], confidence: NDArray[np.float32]) -> Labels:
-    """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, depth and dynamic
-    objects as by rules."""
+    """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, the rest by rules."""
     measured = _measure(given)
     sky = (semantics == ID["sky"]) & ~np.isfinite(measured.depth_m)
     return _with_surface(given, semantics, confidence, sky, _complete(given, measured, sky))
@@ -158,8 +155,7 @@ def _paint_surface(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BoxPixels:
-    """Pixels of a box: the part of the image around it; in there its outline, and where the surface lies in the box,
-    both bool[h, w]."""
+    """Of a box: the part of the image around it; there its outline, and where the surface lies in it, bool[h, w]."""
 
     window: tuple[slice, slice]
     outline: NDArray[np.bool_]
@@ -186,8 +182,7 @@ def _paint_box(
     measured: _Measured,
     surface: _Surface,
 ) -> None:
-    """Paint a tracked box: surely where the surface lies in it, less surely in the rest of its outline; not behind
-    nearer things."""
+    """Paint a tracked box: surely where the surface lies in it, less surely in its outline; not behind what is near."""
     pixels = _box_pixels(box, view, surface)
     if pixels is None:
         return
@@ -220,8 +215,7 @@ def _span(present: NDArray[np.bool_], margin: int) -> slice:
 
 
 def greenness_of(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
-    """Positive where a smoothed pixel is green rather than red or blue, or the dark mottled colour of leaves; f32[H,
-    W]."""
+    """Positive where a smoothed pixel is rather green, or the dark mottled colour of leaves; f32[H, W]."""
     smooth = ndimage.uniform_filter(rgb.astype(np.float32), (5, 5, 1))
     red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]
     return green - np.maximum(red * 0.97, blue * 1.04) - 1.5

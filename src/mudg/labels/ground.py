@@ -81,8 +81,7 @@ def above_plane(plane: NDArray[np.float64], xyz_world: NDArray[np.floating]) -> 
 
 
 def driven_path(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Places f64[M, 3] of a vehicle with poses f64[T, 4, 4]; of one that stood, 1 m behind and ahead of it too, for its
-    direction."""
+    """Places f64[M, 3] of a vehicle with poses f64[T, 4, 4]; of one that stood, 1 m behind and ahead of it, too."""
     places = world_from_ego[:, :3, 3]
     if len(places) == 0 or np.linalg.norm(places[:, :2] - places[0, :2], axis=1).max() > _STOOD_M:
         return places
@@ -143,8 +142,7 @@ class GroundMap:
     def under(
         self, xyz_world: NDArray[np.floating]
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
-        """``reachable``, ``direct`` and ``raised_m`` under points ``[..., 3]``; False and 0 outside the map and for
-        what is no ground."""
+        """``reachable``, ``direct`` and ``raised_m`` under points ``[..., 3]``; False and 0 where is no ground."""
         place = np.floor(np.nan_to_num((xyz_world[..., :2] - self.corner_m) / CELL_M, nan=-1.0)).astype(np.int64)
         last = len(self.reachable) - 1
         low = (place >= 0).all(-1) & (place <= last).all(-1) & (np.abs(above_plane(self.plane, xyz_world)) < LOW_M)

@@ -130,8 +130,7 @@ def far_to_near(given: LabelInput) -> list[PlacedBox]:
 def box_outline(
     view: View, world_from_box: NDArray[np.float64], size_m: NDArray[np.float64]
 ) -> NDArray[np.bool_] | None:
-    """Convex outline of a projected box bool[H, W], cut at the camera's near plane; None if it lies outside the
-    image."""
+    """Convex outline of a projected box bool[H, W], cut at the near plane; None if it lies outside the image."""
     camera, hull = view.camera, geometry.box_hull(view, world_from_box, size_m)
     if hull is None:
         return None

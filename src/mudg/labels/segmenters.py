@@ -37,8 +37,7 @@ def _dense(output: Any, size: tuple[int, int]) -> Tensor:
 
 
 def _masks(output: Any, size: tuple[int, int]) -> Tensor:
-    """Mask2Former, EoMT: classes [B, Q, C + 1] (the last: none) and masks [B, Q, h, w] -> probabilities [B, C, H,
-    W]."""
+    """Mask2Former, EoMT: classes [B, Q, C + 1] (the last: none), masks [B, Q, h, w] -> probabilities [B, C, H, W]."""
     classes = output.class_queries_logits.float().softmax(-1)[..., :-1]
     masks = functional.interpolate(output.masks_queries_logits.float(), size=size, mode="bilinear", align_corners=False)
     scores = torch.einsum("bqc,bqhw->bchw", classes, masks.sigmoid())
@@ -105,12 +104,8 @@ class Segmenter:
         settings = folders.read_settings(path / "config.json")
         kind = str(settings.get("model_type"))
         if kind not in KINDS:
-            raise InputError(
-                "the folder holds another kind of network",
-                where=str(path / "config.json"),
-                expected=", ".join(KINDS),
-                got=kind,
-            )
+            what = "the folder holds another kind of network"
+            raise InputError(what, where=str(path / "config.json"), expected=", ".join(KINDS), got=kind)
         train_ids = match_classes(settings.get("id2label", {}), str(path / "config.json"))
         prepared = path / "preprocessor_config.json"
         colors = folders.read_settings(prepared) if prepared.is_file() else {}
@@ -177,12 +172,8 @@ def match_classes(names: Mapping[str, str], where: str) -> NDArray[np.intp]:
     ordered = [names[key] for key in sorted(names, key=int)]
     found = [wanted.get(str(name).replace(" ", "").replace("_", "").lower(), UNLABELLED) for name in ordered]
     if not any(index != UNLABELLED for index in found):
-        raise InputError(
-            "none of the network's classes is a Cityscapes class",
-            where=where,
-            expected=", ".join(CLASSES),
-            got=", ".join(map(str, ordered[:8])) or "no id2label",
-        )
+        expected, got = ", ".join(CLASSES), ", ".join(map(str, ordered[:8])) or "no id2label"
+        raise InputError("none of the network's classes is a Cityscapes class", where=where, expected=expected, got=got)
     return np.array(found, np.intp)
 
 

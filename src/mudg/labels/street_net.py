@@ -84,8 +84,7 @@ class _Block(nn.Module):
 
 
 class StreetNet(nn.Module):
-    """Class scores f32[N, 19, H, W] of colours f32[N, 3, H, W] in 0..1 and evidence f32[N, 17, H, W]; H, W multiples of
-    32."""
+    """Class scores f32[N, 19, H, W] of colours f32[N, 3, H, W] in 0..1 and evidence f32[N, 17, H, W]; H, W in 32s."""
 
     def __init__(self, config: StreetNetConfig) -> None:
         super().__init__()
@@ -117,8 +116,7 @@ class StreetNet(nn.Module):
 
     @torch.inference_mode()
     def probabilities(self, rgb: NDArray[np.uint8], evidence: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Probability of each class f32[19, H, W] of an image u8[H, W, 3] and its evidence f32[17, H, W], of any
-        size."""
+        """Probability of each class f32[19, H, W] of an image u8[H, W, 3] and its evidence f32[17, H, W]."""
         height, width = rgb.shape[:2]
         pad = (0, -width % STRIDE, 0, -height % STRIDE)
         color = functional.pad(torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None].float() / 255, pad, mode="replicate")
@@ -183,12 +181,9 @@ def _described(folder: Path | str) -> Path:
     """The description in a folder."""
     where = Path(folder) / MODEL_FILE
     if not where.is_file():
-        raise ResourceError(
-            "the labeller's weights are missing",
-            where=str(folder),
-            expected=f"a folder with {MODEL_FILE}",
-            remedy="leave out --weights to use the network that comes with the package",
-        )
+        expected = f"a folder with {MODEL_FILE}"
+        remedy = "leave out --weights to use the network that comes with the package"
+        raise ResourceError("the labeller's weights are missing", where=str(folder), expected=expected, remedy=remedy)
     return where
 
 

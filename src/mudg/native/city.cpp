@@ -10,7 +10,7 @@ namespace {
 
 using namespace mudg::city;
 
-// Order of the numbers in `road` and `light`; city/native.py holds the same lists.
+// Order of the numbers in `road` and `light`; city/world.py holds the same lists.
 enum RoadNumber {
   kLeft, kRight, kWalkLeft, kWalkRight, kPavedLeft, kPavedRight, kParkLeft, kParkRight, kHasCross, kCrossS, kCrossX, kCrossY, kCrossYaw,
   kCrossHalf, kCorner, kCrossFrom, kCrossTo, kCrossWalk, kLaneWidth, kSeed, kAsphalt, kWalkColor = kAsphalt + 3, kKerbColor = kWalkColor + 3,

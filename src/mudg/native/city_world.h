@@ -123,7 +123,7 @@ struct World {
 };
 Vec3 textured(const World& world, TextureSlot slot, Vec3 point, Vec3 normal, float footprint_m);
 
-// Row layout of the records handed over by Python (city/objects.py keeps the same list).
+// Row layout of the records handed over by Python (city/layout.py keeps the same list).
 enum RecordKind {
   kRecBuilding = 1, kRecTree, kRecHedge, kRecLamp, kRecSign, kRecSignal, kRecWall, kRecFence, kRecPole, kRecBin, kRecBench,
   kRecShelter, kRecHill, kRecBush, kRecBridge, kRecBollard, kRecMotorbike, kRecPlanter, kRecPart,

@@ -103,12 +103,9 @@ class ClipImageFeatures(nn.Module):
             found.get(f"visual.{name}") for name in ("positional_embedding", "conv1.weight", "proj")
         )
         if places is None or kernel is None or projection is None or kernel.shape[0] % HEAD_WIDTH:
-            raise InputError(
-                "these are not the weights of a CLIP image tower",
-                where=where,
-                got=", ".join(list(state)[:5]),
-                expected="visual.* as OpenAI names them, or vision_model.* and visual_projection.weight",
-            )
+            got = ", ".join(list(state)[:5])
+            expected = "visual.* as OpenAI names them, or vision_model.* and visual_projection.weight"
+            raise InputError("these are not the weights of a CLIP image tower", where=where, got=got, expected=expected)
         self.width, self.patch, self.out = int(kernel.shape[0]), int(kernel.shape[-1]), int(projection.shape[-1])
         self.side = round((len(places) - 1) ** 0.5) * self.patch
         self.blocks = len({name.split(".")[3] for name in found if name.startswith("visual.transformer.resblocks.")})

@@ -70,15 +70,9 @@ class DinoFeatures(nn.Module):
         super().__init__()
         places, first = state.get("pos_embed"), state.get("blocks.0.mlp.fc1.weight")
         if places is None or first is None or places.dim() != 3 or places.shape[2] % HEAD_WIDTH:
-            raise InputError(
-                "these are not the weights of a DINOv2 network",
-                where=where,
-                expected="pos_embed, blocks.0, ...",
-                got=", ".join(list(state)[:5]),
-                remedy=(
-                    "use dinov2_vits14_pretrain.pth or dinov2_vitl14_pretrain.pth, not those with registers, nor ViT-g"
-                ),
-            )
+            what, expected = "these are not the weights of a DINOv2 network", "pos_embed, blocks.0, ..."
+            remedy = "use dinov2_vits14_pretrain.pth or dinov2_vitl14_pretrain.pth, not those with registers, nor ViT-g"
+            raise InputError(what, where=where, expected=expected, got=", ".join(list(state)[:5]), remedy=remedy)
         self.width = int(places.shape[2])
         self.blocks = 1 + max(
             int(name.split(".")[1]) for name in state if name.startswith("blocks.") and name.split(".")[1].isdigit()
@@ -93,8 +87,7 @@ class DinoFeatures(nn.Module):
         return NAMES.get((self.width, self.blocks), f"a network of {self.blocks} blocks of {self.width}")
 
     def forward(self, images: Tensor) -> Tensor:
-        """Features ``[n, width]`` of prepared images ``[n, 3, H, W]``, H and W multiples of 14: the class token after
-        the last norm."""
+        """Features ``[n, width]``: normed class token of prepared images ``[n, 3, H, W]``, sides in 14s."""
         return self._norm("norm", self.tokens(images))[:, 0]
 
     def tokens(self, images: Tensor) -> Tensor:

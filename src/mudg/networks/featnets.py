@@ -414,8 +414,7 @@ class PerceptualDistance:
             return float(distance)
 
     def in_bands(self, pair: Pair) -> bool:
-        """Whether images of this size are compared band by band: no machine should hold all features of them at
-        once."""
+        """Whether images of this size are compared band by band, because all their features would not fit."""
         if pair.rgb is None or pair.truth_rgb is None or not isinstance(self._features, CodecFeatures):
             return False
         return pair.rgb.shape[-2] * pair.rgb.shape[-1] > WHOLE_PIXELS
@@ -450,8 +449,7 @@ def _mean_of_stages(bands: Sequence[Sequence[tuple[float, float]]]) -> float:
 
 @dataclass(frozen=True)
 class _Compared:
-    """Images that are held against one truth band by band: ``[3, H, W]`` each, and the pixels that count f32[1, H,
-    W]."""
+    """Images held against one truth band by band: ``[3, H, W]`` each, and the pixels that count f32[1, H, W]."""
 
     network: CodecFeatures
     device: torch.device

@@ -48,21 +48,14 @@ def checked_state(
         found = state.get(name)
         if found is None or tuple(found.shape) != shape or not found.is_floating_point():
             got = "missing" if found is None else f"{found.dtype} {tuple(found.shape)}"
-            raise InputError(
-                f"{network} weights are incomplete or of another network",
-                where=f"{where}: {name}",
-                expected=str(shape),
-                got=got,
-            )
+            what = f"{network} weights are incomplete or of another network"
+            raise InputError(what, where=f"{where}: {name}", expected=str(shape), got=got)
         if not bool(torch.isfinite(found).all()):
             raise InputError(f"{network} weights hold values that are not finite", where=f"{where}: {name}")
     for name in state:
         if name not in wanted and not ignored(name):
-            raise InputError(
-                f"{network} weights hold a tensor that the network has not",
-                where=f"{where}: {name}",
-                expected=f"{len(wanted)} tensors",
-            )
+            what = f"{network} weights hold a tensor that the network has not"
+            raise InputError(what, where=f"{where}: {name}", expected=f"{len(wanted)} tensors")
     return {name: state[name].detach().float() for name in wanted}
 
 
@@ -74,8 +67,7 @@ _REMEDY: Final = "pip install 'mudg[models]'"
 
 @dataclass(frozen=True, slots=True)
 class Place:
-    """Device of a network, one that `choose_device` accepts, and whether its convolutions and matrix products are
-    computed in bfloat16."""
+    """Device of a network (for `choose_device`), and whether it computes in bfloat16 (convolutions, products)."""
 
     device: DeviceName = "cpu"
     bf16: bool = False
@@ -119,21 +111,16 @@ def find(name: str | Path) -> Path:
     try:
         hub = package("huggingface_hub")
     except ResourceError as error:
-        raise ResourceError(
-            "no such folder, nor the package that knows the Hugging Face cache",
-            where=text,
-            remedy=f"name a folder that exists; for names of repositories: {_REMEDY}",
-        ) from error
+        what = "no such folder, nor the package that knows the Hugging Face cache"
+        remedy = f"name a folder that exists; for names of repositories: {_REMEDY}"
+        raise ResourceError(what, where=text, remedy=remedy) from error
     try:
         found = hub.snapshot_download(parts["repository"], revision=parts["revision"], local_files_only=True)
     except (OSError, ValueError) as error:
-        raise ResourceError(
-            "no such folder, and no copy of such a repository in the Hugging Face cache",
-            where=text,
-            got=str(error).splitlines()[0],
-            expected=f"a folder, or a copy below {hub.constants.HF_HUB_CACHE}",
-            remedy=f"hf download {parts['repository']}",
-        ) from error
+        what = "no such folder, and no copy of such a repository in the Hugging Face cache"
+        got, expected = str(error).splitlines()[0], f"a folder, or a copy below {hub.constants.HF_HUB_CACHE}"
+        remedy = f"hf download {parts['repository']}"
+        raise ResourceError(what, where=text, got=got, expected=expected, remedy=remedy) from error
     return Path(found)
 
 
@@ -175,13 +162,9 @@ def member(owner: ModuleType, class_name: str) -> Any:
     """A class of a package; ResourceError where the installed version is too old to have it."""
     found = getattr(owner, class_name, None)
     if found is None:
-        raise ResourceError(
-            f"the installed {owner.__name__} package has no {class_name}",
-            where="pretrained network",
-            expected="a newer version",
-            got=str(getattr(owner, "__version__", "")),
-            remedy=f"pip install --upgrade {owner.__name__}",
-        )
+        what = f"the installed {owner.__name__} package has no {class_name}"
+        got, remedy = str(getattr(owner, "__version__", "")), f"pip install --upgrade {owner.__name__}"
+        raise ResourceError(what, where="pretrained network", expected="a newer version", got=got, remedy=remedy)
     return found
 
 
@@ -214,21 +197,15 @@ def load_network(network_class: Any, folder: Path, place: Place = CPU, subfolder
         network, report = network_class.from_pretrained(str(folder), **options)
     except (OSError, ValueError, TypeError, KeyError, RuntimeError) as error:
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise InputError(
-            f"the folder cannot be read as {network_class.__name__}",
-            where=where,
-            got=lines[0][:300],
-            expected="the configuration and the safetensors file that save_pretrained writes",
-        ) from error
+        what = f"the folder cannot be read as {network_class.__name__}"
+        expected = "the configuration and the safetensors file that save_pretrained writes"
+        raise InputError(what, where=where, got=lines[0][:300], expected=expected) from error
     lacking = sorted(str(name) for key in ("missing_keys", "mismatched_keys") for name in report.get(key) or ())
     if lacking:
-        raise InputError(
-            f"weights of the {network_class.__name__} are missing, or have another shape",
-            where=where,
-            expected="a value for every parameter",
-            got=", ".join(lacking[:4]) + (" ..." if len(lacking) > 4 else ""),
-            remedy="take the folder of the whole network, with its task's head",
-        )
+        what = f"weights of the {network_class.__name__} are missing, or have another shape"
+        got = ", ".join(lacking[:4]) + (" ..." if len(lacking) > 4 else "")
+        remedy = "take the folder of the whole network, with its task's head"
+        raise InputError(what, where=where, expected="a value for every parameter", got=got, remedy=remedy)
     if any(value.dtype != torch.float32 for value in network.parameters()):
         network = network.float()
     return network.to(device).eval().requires_grad_(False)

@@ -160,11 +160,8 @@ class I3DFeatures(nn.Module):
             or clips.shape[3:] != (SIDE_PX, SIDE_PX)
             or clips.shape[2] < SHORTEST
         ):
-            raise InputError(
-                "FVD's network takes clips of one size",
-                expected=f"[n, 3, T >= {SHORTEST}, {SIDE_PX}, {SIDE_PX}]",
-                got=str(tuple(clips.shape)),
-            )
+            expected = f"[n, 3, T >= {SHORTEST}, {SIDE_PX}, {SIDE_PX}]"
+            raise InputError("FVD's network takes clips of one size", expected=expected, got=str(tuple(clips.shape)))
         x = clips
         for step in _STEPS:
             if isinstance(step, _Cube):
@@ -237,25 +234,15 @@ def _checked(state: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
         value = found.get(name)
         if value is None or tuple(value.shape) != shape or not value.is_floating_point():
             got = "missing" if value is None else f"{value.dtype} {tuple(value.shape)}"
-            raise InputError(
-                "I3D weights are incomplete or of another network",
-                where=f"{where}: {given.get(name, name)}",
-                expected=str(shape),
-                got=got,
-            )
+            what = "I3D weights are incomplete or of another network"
+            raise InputError(what, where=f"{where}: {given.get(name, name)}", expected=str(shape), got=got)
         if not bool(torch.isfinite(value).all()) or (name.endswith("running_var") and bool((value < 0).any())):
-            raise InputError(
-                "I3D weights hold impossible values",
-                where=f"{where}: {given[name]}",
-                expected="finite numbers, variances of at least 0",
-            )
+            what = "I3D weights hold impossible values"
+            raise InputError(what, where=f"{where}: {given[name]}", expected="finite numbers, variances of at least 0")
     for name in found:
         if name not in wanted and not name.endswith(".bn.num_batches_tracked"):
-            raise InputError(
-                "I3D weights hold a tensor that FVD's network has not",
-                where=f"{where}: {given[name]}",
-                expected=f"{len(wanted)} tensors",
-            )
+            what = "I3D weights hold a tensor that FVD's network has not"
+            raise InputError(what, where=f"{where}: {given[name]}", expected=f"{len(wanted)} tensors")
     return {name: found[name].detach().float() for name in wanted}
 
 

@@ -134,8 +134,7 @@ _STEM: Final[tuple[_Unit | str, ...]] = (
     _Unit("Conv2d_4a_3x3", 192, (3, 3), 1, False),
     "192",
 )
-"""Convolutions from the image on; a name of a tap stands for a maximum pool, 3x3 at every second place, and the tap
-after it."""
+"""Convolutions from the image on; a tap's name stands for a maximum pool, 3x3 at every second place, and the tap."""
 
 _BLOCKS: Final[dict[str, tuple[_Branch, ...]]] = {
     "Mixed_5b": _block_a(32),
@@ -217,11 +216,8 @@ class InceptionFeatures(nn.Module):
             Tap -> ``[n, width]``; ``logits_unbiased`` ``[n, 1008]``.
         """
         if images.shape[1:] != (3, SIDE_PX, SIDE_PX):
-            raise InputError(
-                "FID's network takes images of one size",
-                expected=f"[n, 3, {SIDE_PX}, {SIDE_PX}]",
-                got=str(tuple(images.shape)),
-            )
+            expected = f"[n, 3, {SIDE_PX}, {SIDE_PX}]"
+            raise InputError("FID's network takes images of one size", expected=expected, got=str(tuple(images.shape)))
         found: dict[str, Tensor] = {}
         for name, x in self._places(images):
             if name in taps:
@@ -281,27 +277,17 @@ def _checked(state: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
         found = state.get(name)
         if found is None or tuple(found.shape) != shape or not found.is_floating_point():
             got = "missing" if found is None else f"{found.dtype} {tuple(found.shape)}"
-            raise InputError(
-                "Inception weights are incomplete or of another network",
-                where=f"{where}: {name}",
-                expected=str(shape),
-                got=got,
-                remedy="use pt_inception-2015-12-05-6726825d.pth or a copy of it as safetensors",
-            )
+            what = "Inception weights are incomplete or of another network"
+            remedy = "use pt_inception-2015-12-05-6726825d.pth or a copy of it as safetensors"
+            raise InputError(what, where=f"{where}: {name}", expected=str(shape), got=got, remedy=remedy)
         if not bool(torch.isfinite(found).all()) or (name.endswith("running_var") and bool((found < 0).any())):
-            raise InputError(
-                "Inception weights hold impossible values",
-                where=f"{where}: {name}",
-                expected="finite numbers, variances of at least 0",
-            )
+            expected = "finite numbers, variances of at least 0"
+            raise InputError("Inception weights hold impossible values", where=f"{where}: {name}", expected=expected)
     for name in state:
         if name not in wanted and not name.endswith(".bn.num_batches_tracked"):
-            raise InputError(
-                "Inception weights hold a tensor that FID's network has not",
-                where=f"{where}: {name}",
-                expected=f"{len(wanted)} tensors",
-                remedy="torchvision's Inception-v3 is another network",
-            )
+            what = "Inception weights hold a tensor that FID's network has not"
+            remedy = "torchvision's Inception-v3 is another network"
+            raise InputError(what, where=f"{where}: {name}", expected=f"{len(wanted)} tensors", remedy=remedy)
     return {name: state[name].detach().float() for name in wanted}
 
 

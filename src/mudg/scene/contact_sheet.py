@@ -38,19 +38,8 @@ _COURSE_COLOR: Final = (150, 110, 60)
 _MARGIN_M: Final = 8.0
 
 PEOPLE: Final = frozenset(
-    (
-        "pedestrian",
-        "person",
-        "person_sitting",
-        "person (sitting)",
-        "cyclist",
-        "rider",
-        "motorcyclist",
-        "bicyclist",
-        "stroller",
-        "wheelchair",
-    )
-)
+    "pedestrian person person_sitting cyclist rider motorcyclist bicyclist stroller wheelchair".split()
+) | {"person (sitting)"}
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,7 +13,7 @@ from PIL import Image, UnidentifiedImageError
 from mudg.base import palette, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Frame, Scene
-from mudg.scene.files import open_files
+from mudg.scene.read import open_files
 from mudg.scene.schema import LABEL_NAMES, MAX_IMAGE_SIDE_PX
 
 _PNG_LABELS: Final = ("semantics", "sky", "ego", "dynamic", "rendered")

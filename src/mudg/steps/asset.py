@@ -91,20 +91,20 @@ class AssetImport(Result):
         return VerbOutput("asset", 1, MODEL_FILES)
 
     def checked(self) -> Self:
-        from mudg.exporting import imports
+        from mudg.exporting import export
 
-        imports.refuse_other_settings(self.settings)
+        export.refuse_other_settings(self.settings)
         if self.is_file:
             refuse_other_name(self.out)
-            imports.bounded(self.file)
+            export.bounded(self.file)
         return self
 
     def key_settings(self) -> dict[str, Any]:
         return super().key_settings() | ({"name": self.file.name} if self.is_file else {})
 
     def prepare(self, inputs: dict[str, str]) -> Make:
-        from mudg.exporting import imports
+        from mudg.exporting import export
 
         if self.is_file:
-            return partial(imports.write_object, self.settings, self.file)
-        return partial(imports.write_scene, self.settings, self.file, *imports.read_file(self.file, self.settings))
+            return partial(export.write_object, self.settings, self.file)
+        return partial(export.write_scene, self.settings, self.file, *export.read_file(self.file, self.settings))

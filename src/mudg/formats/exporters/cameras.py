@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mudg.base import geometry, store
 from mudg.base.types import Frame, PointCloud, Scene
 from mudg.formats.splats import ply
-from mudg.scene.files import open_files
+from mudg.scene.read import open_files
 
 # names and bytes of a log's pictures for data sets of cameras -------------------------------------
 

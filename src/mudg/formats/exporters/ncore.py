@@ -21,7 +21,7 @@ from mudg.base import geometry, log, store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Frame, Scene, Sweep, Track
 from mudg.base.versions import version
-from mudg.formats.exporters.log_records import LogRecords, picture_format
+from mudg.formats.exporters.messages import LogRecords, picture_format
 from mudg.formats.ncore import (
     ABOUT,
     EGO_MASK,
@@ -39,7 +39,7 @@ from mudg.formats.ncore import (
     euler_of,
     package,
 )
-from mudg.formats.splats.bundle import file_names
+from mudg.formats.splats.formats import file_names
 from mudg.scene.labels import read_label
 
 FILES: Final = (f"*{MARK}.zarr.itar", f"*{MARK}.json")

@@ -23,7 +23,7 @@ from mudg.base import geometry, store
 from mudg.base.errors import ResourceError
 from mudg.base.types import Frame
 from mudg.core.harmonics import C0
-from mudg.formats.exporters.log_records import NANO, LogRecords, box_color, picture_format
+from mudg.formats.exporters.messages import NANO, LogRecords, box_color, picture_format
 from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene
 
 TIMELINE: Final = "time"

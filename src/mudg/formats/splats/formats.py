@@ -3,22 +3,227 @@ it."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import PurePath
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import geometry, log
+from mudg.base import geometry, log, store
 from mudg.base.errors import InputError
+from mudg.base.palette import CLASSES
 from mudg.base.types import Scene
 from mudg.core.edit import HeightMap
-from mudg.formats.splats import alpasim, bundle, compressed_ply, gltf, ply, sog, splat, spz, usd
+from mudg.core.harmonics import C0
+from mudg.formats.splats import binary, gltf, ply, sog, spz, usd
 from mudg.formats.splats import cloud as axes
-from mudg.formats.splats import gltf as gltf_read
-from mudg.formats.splats.cloud import SplatCloud, SplatFile, SplatNode, SplatScene, doubtful_values
+from mudg.formats.splats.cloud import (
+    LEAST_LOG,
+    SplatCloud,
+    SplatFile,
+    SplatNode,
+    SplatScene,
+    checked,
+    doubtful_values,
+    logit,
+    spacing_m,
+)
+from mudg.formats.splats.usd import png
+
+# bundle --------------------------------------------------------------------------------------------
+#
+# The bundle: everything that an export can carry, for programs that move objects themselves. A stored zip:
+#
+# bundle.json            what it is: names, files, axes, classes, times
+# static.ply             what stands, in the axes of the file          objects/NAME.ply   objects in the frame of their
+#                        box
+# tracks.json            paths of the objects: layout splatsim.sequence_tracks/v2 (times in microseconds, translation,
+#                        rotation x y z w)
+# deform/NAME.safetensors  ``displacement`` f32[K, n, 3]: what the Gaussians of a deforming object are moved by at each
+#                          key, linear between
+# sky.png                panorama: zenith on top, longitude from -pi to pi growing to the right of the picture (to the
+#                        left as one looks)
+# cameras.json           intrinsics and recorded poses, where the log is known
+
+
+SCHEMA: Final = "mudg.bundle/v1"
+TRACKS: Final = "splatsim.sequence_tracks/v2"
+MICROSECONDS: Final = 1_000_000
+CONVENTION: Final = {
+    "world": "right-handed, z up",
+    "object": "centre of the box, x forward, y left, z up",
+    "camera": "opencv: x right, y down, z forward",
+    "rotation": "x y z w",
+    "matrix": "row-major, a_from_b",
+    "unit": "metre",
+    "time_unit": "microsecond",
+}
+
+
+def bundle_bytes(scene: SplatScene, log: Scene | None = None) -> bytes:
+    """A scene with its motion as a bundle; ``log``: whose cameras are listed."""
+    names = file_names([node.name for node in scene.nodes])
+    files: dict[str, bytes] = {}
+    listed: list[dict[str, Any]] = []
+    antialias = bool(scene.facts.get("drawing", {}).get("antialias", False))
+    for name, node in zip(names, scene.nodes):
+        place = f"objects/{name}.ply" if node.moves else ("static.ply" if node is scene.nodes[0] else f"{name}.ply")
+        cloud = node.cloud if node.moves else node.cloud.moved(scene.file_from_world)
+        files[place] = ply.to_bytes(cloud, classes=True, marks=ply.marks_of(antialias, z_up=True))
+        entry = {"name": node.name, "file": place, "gaussians": len(cloud), "degree": cloud.degree, "moves": node.moves}
+        if node.displacement is not None:
+            entry["deform"] = f"deform/{name}.safetensors"
+            files[entry["deform"]] = _safetensors(node)
+        listed.append(entry)
+    files["tracks.json"] = _json(tracks_of(scene, listed))
+    if scene.sky is not None:
+        files["sky.png"] = png(scene.sky)
+    if log is not None:
+        files["cameras.json"] = _json(cameras_of(log, scene))
+    about = {
+        "schema": SCHEMA,
+        "name": scene.name,
+        "nodes": listed,
+        "frame_convention": CONVENTION,
+        "classes": list(CLASSES),
+        "file_from_world": scene.file_from_world.tolist(),
+        "span_s": list(scene.span_s),
+        "facts": dict(scene.facts),
+    }
+    return binary.stored_zip({"bundle.json": _json(about), **files})
+
+
+def tracks_of(scene: SplatScene, listed: list[dict[str, Any]]) -> dict[str, Any]:
+    """The paths of what moves."""
+    tracks = []
+    for node, entry in zip(scene.nodes, listed):
+        if not node.moves:
+            continue
+        poses = scene.file_from_world @ node.world_from_node
+        frames = [
+            {
+                "timestamp_us": round(float(time_s) * MICROSECONDS),
+                "translation": pose[:3, 3].tolist(),
+                "rotation": geometry.quaternion_from_matrix(pose)[[1, 2, 3, 0]].tolist(),
+            }
+            for time_s, pose in zip(node.times_s, poses)
+        ]
+        tracks.append(
+            {
+                "track_id": node.name,
+                "class_name": node.label,
+                "size": list(node.size_m),
+                "flag": "CONTROLLABLE",
+                "frames": frames,
+                "metadata": {"file": entry["file"], "deform": entry.get("deform")},
+            }
+        )
+    return {"schema": TRACKS, "frame": "world", "frame_convention": CONVENTION, "tracks": tracks}
+
+
+def cameras_of(log: Scene, scene: SplatScene) -> dict[str, Any]:
+    """Intrinsics of the cameras of a log and the poses of its images, in the axes of the file."""
+    cameras = {
+        name: {
+            "width": camera.width,
+            "height": camera.height,
+            "fx": camera.fx,
+            "fy": camera.fy,
+            "cx": camera.cx,
+            "cy": camera.cy,
+        }
+        for name, camera in log.cameras.items()
+    }
+    frames = [
+        {
+            "id": frame.id,
+            "camera": frame.view.camera.name,
+            "timestamp_us": round(frame.view.time_s * MICROSECONDS),
+            "world_from_camera": (scene.file_from_world @ frame.view.world_from_cam).tolist(),
+        }
+        for frame in log.frames
+    ]
+    return {"frame_convention": CONVENTION, "cameras": cameras, "frames": frames}
+
+
+def file_names(names: list[str]) -> list[str]:
+    """Names that every file system accepts, each once."""
+    made: dict[str, None] = {}
+    for name in names:
+        plain = re.sub(r"[^A-Za-z0-9_.-]", "_", name).strip(".") or "node"
+        chosen, count = plain, 1
+        while chosen.lower() in {known.lower() for known in made}:
+            count += 1
+            chosen = f"{plain}_{count}"
+        made[chosen] = None
+    return list(made)
+
+
+def _safetensors(node: SplatNode) -> bytes:
+    from safetensors.numpy import save
+
+    displacement = np.ascontiguousarray(node.displacement, np.float32)
+    return save({"displacement": displacement, "times_s": np.ascontiguousarray(node.times_s)})
+
+
+def _json(value: Mapping[str, Any]) -> bytes:
+    return (store.json_text(value) + "\n").encode()
+
+
+# splat ---------------------------------------------------------------------------------------------
+#
+# The ``.splat`` of web viewers: no header, 32 bytes a Gaussian, no harmonics beyond degree 0.
+#
+# f32 x y z  f32 scale x y z (metres)  u8 r g b (colour of degree 0), opacity
+# u8 rotation w x y z = round((q + 1) / 2 * 255)
+
+
+_SPLAT_ROW: Final = np.dtype([("means", "<f4", 3), ("scales", "<f4", 3), ("rgba", "u1", 4), ("quats", "u1", 4)])
+
+
+def splat_bytes(cloud: SplatCloud) -> bytes:
+    """A cloud as a .splat file, large and opaque Gaussians first: viewers show them while they load."""
+    order = np.argsort(-(np.exp(cloud.log_scales.sum(1).astype(np.float64)) * cloud.opacity), kind="stable")
+    cloud = cloud.take(order)
+    rows = np.zeros(len(cloud), _SPLAT_ROW)
+    rows["means"], rows["scales"] = cloud.means, np.exp(cloud.log_scales.astype(np.float64))
+    color = np.concatenate([cloud.sh[:, 0] * C0 + 0.5, cloud.opacity[:, None]], 1)
+    rows["rgba"] = np.round(color * 255).clip(0, 255)
+    rows["quats"] = np.round((cloud.quats + 1) / 2 * 255).clip(0, 255)
+    return rows.tobytes()
+
+
+def splat_from_bytes(content: bytes, where: str) -> SplatFile:
+    """The Gaussians of a .splat file.
+
+    Raises:
+        InputError: no such file, or a damaged one.
+    """
+    if len(content) % _SPLAT_ROW.itemsize:
+        what, got = "the length of a .splat file is a multiple of 32 bytes", f"{len(content)} bytes"
+        raise InputError(what, where=where, got=got, remedy="it was cut off, or is another kind of file")
+    binary.refuse_count(len(content) // _SPLAT_ROW.itemsize, where)
+    rows = np.frombuffer(content, _SPLAT_ROW)
+    scales = rows["scales"].astype(np.float64)
+    if (scales < 0).any():
+        what = "the size of a Gaussian is negative"
+        remedy = "a .splat file holds sizes in metres, not their logarithms: write exp(scale)"
+        raise InputError(what, where=f"{where}: Gaussian {int((scales < 0).any(1).argmax())}", remedy=remedy)
+    with np.errstate(divide="ignore"):
+        logs = np.maximum(np.log(scales), LEAST_LOG)
+    rgba = rows["rgba"] / 255
+    sh = ((rgba[:, None, :3] - 0.5) / C0).astype(np.float32)
+    quats = (rows["quats"] / 255 * 2 - 1).astype(np.float32)
+    cloud = checked(
+        SplatCloud(rows["means"].astype(np.float64), quats, logs.astype(np.float32), logit(rgba[:, 3]), sh), where
+    )
+    return SplatFile(cloud, step_m=spacing_m(rows["means"]))
+
+
+# formats -------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -85,7 +290,7 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
     "bundle": SplatFormat(
         (".zip",),
         axes.WORLD,
-        lambda r: bundle.to_bytes(r.scene, r.log),
+        lambda r: bundle_bytes(r.scene, r.log),
         None,
         frozenset({"harmonics", "motion", "deformation", "classes", "sky", "antialias"}),
     ),
@@ -100,7 +305,7 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
         (".glb",),
         "FUR",
         lambda r: gltf.to_bytes(r.scene, r.time_s),
-        gltf_read.from_bytes,
+        gltf.from_bytes,
         frozenset({"harmonics", "motion", "antialias"}),
     ),
     "usda": SplatFormat(
@@ -120,15 +325,15 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
     "alpasim": SplatFormat(
         (".usdz",),
         axes.WORLD,
-        lambda r: alpasim.to_package(r.scene, r.log, r.ground),
+        lambda r: usd.to_alpasim(r.scene, r.log, r.ground),
         None,
         frozenset({"harmonics", "motion", "deformation", "classes", "sky"}),
     ),
     "compressed-ply": SplatFormat(
         (".compressed.ply", ".ply"),
         "RDF",
-        lambda r: compressed_ply.to_bytes(r.cloud, r.marks),
-        compressed_ply.from_bytes,
+        lambda r: ply.compressed_to_bytes(r.cloud, r.marks),
+        ply.compressed_from_bytes,
         frozenset({"harmonics", "antialias"}),
     ),
     "sog": SplatFormat(
@@ -138,7 +343,7 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
         sog.from_bytes,
         frozenset({"harmonics", "antialias"}),
     ),
-    "splat": SplatFormat((".splat",), "RDF", lambda r: splat.to_bytes(r.cloud), splat.from_bytes, frozenset()),
+    "splat": SplatFormat((".splat",), "RDF", lambda r: splat_bytes(r.cloud), splat_from_bytes, frozenset()),
 }
 
 
@@ -173,7 +378,7 @@ def format_of(content: bytes, name: str) -> str:
     """
     suffix = PurePath(name).suffix.lower()
     if content[:3] == b"ply":
-        return "compressed-ply" if compressed_ply.is_compressed(content) else "ply"
+        return "compressed-ply" if ply.is_compressed(content) else "ply"
     for mark, found in ((b"\x1f\x8b", "spz"), (b"NGSP", "spz"), (b"glTF", "glb"), (b"PK\x03\x04", "sog")):
         if content.startswith(mark):
             if suffix == ".usdz":

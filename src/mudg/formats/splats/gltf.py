@@ -199,62 +199,14 @@ _LINEAR: Final = {"srgb_rec709_display": False, "lin_rec709_display": True, "BT.
 """Colour spaces and whether they are linear; the last two are names of the drafts."""
 _KIND: Final = ("kernel", "colorSpace", "projection", "sortingMethod", "extensions", "extras")
 _STANDARD: Final[Mapping[str, frozenset[str]]] = {
-    "": frozenset(
-        {
-            "accessors",
-            "animations",
-            "asset",
-            "buffers",
-            "bufferViews",
-            "cameras",
-            "extensions",
-            "extensionsRequired",
-            "extensionsUsed",
-            "extras",
-            "images",
-            "materials",
-            "meshes",
-            "nodes",
-            "samplers",
-            "scene",
-            "scenes",
-            "skins",
-            "textures",
-        }
-    ),
-    "nodes.": frozenset(
-        {
-            "camera",
-            "children",
-            "extensions",
-            "extras",
-            "matrix",
-            "mesh",
-            "name",
-            "rotation",
-            "scale",
-            "skin",
-            "translation",
-            "weights",
-        }
-    ),
-    "primitives.": frozenset({"attributes", "extensions", "extras", "indices", "material", "mode", "targets"}),
-    "accessors.": frozenset(
-        {
-            "bufferView",
-            "byteOffset",
-            "componentType",
-            "count",
-            "extensions",
-            "extras",
-            "max",
-            "min",
-            "name",
-            "normalized",
-            "sparse",
-            "type",
-        }
-    ),
+    owner: frozenset(f"{fields} extensions extras".split())
+    for owner, fields in {
+        "": "accessors animations asset buffers bufferViews cameras extensionsRequired extensionsUsed images materials "
+        "meshes nodes samplers scene scenes skins textures",
+        "nodes.": "camera children matrix mesh name rotation scale skin translation weights",
+        "primitives.": "attributes indices material mode targets",
+        "accessors.": "bufferView byteOffset componentType count max min name normalized sparse type",
+    }.items()
 }
 """Objects of glTF 2.0 -> their fields, read or not; ``extras`` belong to users."""
 _ATTRIBUTE: Final = re.compile(

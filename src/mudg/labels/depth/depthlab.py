@@ -83,12 +83,8 @@ class DepthLabSampling:
 
     def __post_init__(self) -> None:
         if int(self.steps * self.strength) < 1:
-            raise UsageError(
-                "too few denoising steps: none is left of them",
-                where="--depth-steps",
-                got=str(self.steps),
-                expected=f"at least {int(np.ceil(1 / self.strength))}",
-            )
+            where, got, expected = "--depth-steps", str(self.steps), f"at least {int(np.ceil(1 / self.strength))}"
+            raise UsageError("too few denoising steps: none is left of them", where=where, got=got, expected=expected)
 
 
 PUBLISHED_SAMPLING: Final = DepthLabSampling()
@@ -112,12 +108,8 @@ def part_configs(
     except KeyError as error:
         raise InputError("a network's description lacks a number", where="DepthLab", expected=str(error)) from error
     if abs(float(vae.get("scaling_factor", LATENT_SCALE)) - LATENT_SCALE) > 1e-9:
-        raise InputError(
-            "the autoencoder scales its latents otherwise than DepthLab does",
-            where="vae: scaling_factor",
-            expected=str(LATENT_SCALE),
-            got=str(vae["scaling_factor"]),
-        )
+        what = "the autoencoder scales its latents otherwise than DepthLab does"
+        raise InputError(what, where="vae: scaling_factor", expected=str(LATENT_SCALE), got=str(vae["scaling_factor"]))
     return {
         "denoising_unet": {**plain, "in_channels": 3 * latent},
         "reference_unet": {**plain, "in_channels": latent},
@@ -191,12 +183,8 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
         files = {name: {str(f): str(d) for f, d in described["parts"][name]["files"].items()} for name in PARTS}
         schedule = dict(described["scheduler"])
     except (KeyError, TypeError, AttributeError, ValueError) as error:
-        raise InputError(
-            "the description of a DepthLab model is not whole",
-            where=str(where),
-            got=repr(error)[:200],
-            remedy="convert the published files again",
-        ) from error
+        what, got = "the description of a DepthLab model is not whole", repr(error)[:200]
+        raise InputError(what, where=str(where), got=got, remedy="convert the published files again") from error
     with records.understood("a DepthLab model", str(where)):
         made = blank_parts(configs)
     for name, network in made.items():
@@ -209,8 +197,7 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
 
 
 def _fill_tables(network: nn.Module, part: str) -> None:
-    """Numbers the places of the image encoder's patches: the one table that a network has and its file does not
-    hold."""
+    """Number the places of the image encoder's patches: the one table that its file does not hold."""
     for name, table in list(network.named_buffers()):
         if not table.is_meta:
             continue
@@ -265,11 +252,8 @@ def share_features(reference_unet: Any, denoising_unet: Any) -> None:
         for unet in (reference_unet, denoising_unet)
     )
     if set(writers) != set(readers) or not writers:
-        raise InputError(
-            "the two U-Nets differ in their self-attentions",
-            where="DepthLab",
-            got=", ".join(sorted(set(writers) ^ set(readers))[:4]) or "none at all",
-        )
+        got = ", ".join(sorted(set(writers) ^ set(readers))[:4]) or "none at all"
+        raise InputError("the two U-Nets differ in their self-attentions", where="DepthLab", got=got)
     for name, writer in writers.items():
         source = _SharedAttention(writer.processor)
         writer.set_processor(source)
@@ -342,8 +326,7 @@ def known_depth(measured: NDArray[np.float32], size: tuple[int, int]) -> NDArray
 
 
 def linear_fill(values: NDArray[np.floating]) -> NDArray[np.float32]:
-    """Known values f[h, w] (NaN = unknown) interpolated linearly in the triangles between them; 0 outside, f32[h,
-    w]."""
+    """Known values f[h, w] (NaN = unknown) interpolated in the triangles between them; 0 outside, f32[h, w]."""
     row, column = np.nonzero(np.isfinite(values))
     try:
         between = LinearNDInterpolator(np.stack([row, column], 1), values[row, column], fill_value=0)
@@ -355,8 +338,7 @@ def linear_fill(values: NDArray[np.floating]) -> NDArray[np.float32]:
 
 
 def clip_crop(rgb: NDArray[np.uint8], side_px: int) -> Tensor:
-    """Image u8[H, W, 3] as CLIP's own preparation gives it, f32[1, 3, S, S]: bicubic to the shorter side, middle cut
-    out, normalised."""
+    """Image u8[H, W, 3] as CLIP prepares it, f32[1, 3, S, S]: bicubic to the shorter side, the middle, normalised."""
     height, width = rgb.shape[:2]
     shorter = min(height, width)
     high, wide = height * side_px // shorter, width * side_px // shorter
@@ -391,13 +373,9 @@ class DepthLab:
         file = Path(folder) / DESCRIPTION
         described = folders.read_settings(file)
         if described.get("kind") != KIND or described.get("schema") != SCHEMA:
-            raise InputError(
-                "not a DepthLab model of this version",
-                where=str(file),
-                expected=f"kind {KIND}, schema {SCHEMA}",
-                got=f"{described.get('kind')}, {described.get('schema')}",
-                remedy="convert the published files again",
-            )
+            what = "not a DepthLab model of this version"
+            got, remedy = f"{described.get('kind')}, {described.get('schema')}", "convert the published files again"
+            raise InputError(what, where=str(file), expected=f"kind {KIND}, schema {SCHEMA}", got=got, remedy=remedy)
         sampling = records.parse_dataclass(DepthLabSampling, described.get("sampling"), f"{file}: sampling")
         sampling = dataclasses.replace(sampling, steps=options.steps or sampling.steps)
         return cls(read_parts(Path(folder), described, place), sampling, place)
@@ -415,8 +393,7 @@ class DepthLab:
         return Prediction.resized(found, given, "depth", least=0)
 
     def predict(self, made: Prepared, noise: Tensor) -> Tensor:
-        """Depth f32[1, 1, h, w], 0..1 between the least and the greatest known (others go beyond), from noise [1, C, H,
-        W] in cells."""
+        """Depth f32[1, 1, h, w], 0..1 between least and greatest known (others go beyond), from noise [1, C, H, W]."""
         parts, sampling, device = self._parts, self._sampling, self._place.device
         noise = noise.to(device)
         with torch.inference_mode():
@@ -575,13 +552,9 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
     schedule = folders.read_settings(file)
     marigold.ddim_scheduler(schedule, str(file))
     if schedule.get("rescale_betas_zero_snr"):
-        raise InputError(
-            "this is the noise schedule of a later Marigold",
-            where=str(file),
-            got="rescale_betas_zero_snr: true",
-            expected="that of marigold-depth-v1-0, which DepthLab was made from",
-            remedy="take marigold-depth-v1-0",
-        )
+        what = "this is the noise schedule of a later Marigold"
+        expected, remedy = "that of marigold-depth-v1-0, which DepthLab was made from", "take marigold-depth-v1-0"
+        raise InputError(what, where=str(file), got="rescale_betas_zero_snr: true", expected=expected, remedy=remedy)
     return part_configs(unet, vae, vision_config), schedule
 
 

@@ -47,8 +47,7 @@ MAX_RETURNS: Final = 50_000
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MarigoldParts:
-    """The networks of a folder: U-Net, autoencoder and scheduler of diffusers, and the embedding [1, N, D] of the empty
-    text."""
+    """The networks of a folder: U-Net, autoencoder, scheduler of diffusers, and the embedding [1, N, D] of no text."""
 
     unet: Any
     vae: Any
@@ -79,8 +78,7 @@ class Marigold:
         longest_px: int = PROCESSING_PX,
         place: Place = CPU,
     ) -> None:
-        """``longest_px``: longest side at which the networks work. Raises: UsageError: more steps than the noise
-        schedule has."""
+        """``longest_px``: longest side for the networks. Raises: UsageError: more steps than the noise schedule has."""
         check_steps(parts.scheduler, steps)
         self._parts, self._space, self._steps, self._guided = parts, space, steps, guided
         self._longest_px, self._place = longest_px, place
@@ -130,8 +128,7 @@ class Marigold:
         return Prediction.resized(found, given, self._space)
 
     def _prepared(self, rgb: NDArray[np.uint8]) -> tuple[Tensor, tuple[int, int]]:
-        """Image u8[H, W, 3] -> f32[1, 3, h, w] in -1..1 with the last row and column repeated to whole cells; and its
-        unpadded size."""
+        """Image u8[H, W, 3] -> f32[1, 3, h, w] in -1..1, its borders repeated to whole cells; and its unpadded size."""
         image = torch.from_numpy(rgb.copy()).permute(2, 0, 1)[None].float() / 127.5 - 1
         size = working_size(rgb, self._longest_px)
         image = functional.interpolate(image, size=size, mode="bilinear", antialias=True)
@@ -139,8 +136,7 @@ class Marigold:
         return functional.pad(image, fill, mode="replicate").to(self._place.device), size
 
     def predict(self, image: Tensor, size: tuple[int, int], noise: Tensor, returns: _Returns | None = None) -> Tensor:
-        """Depth f32[1, 1, h, w] in 0..1 of a prepared image [1, 3, H, W], from noise [1, C, H / cell, W / cell];
-        steered by returns."""
+        """Depth f32[1, 1, h, w] in 0..1 of a prepared image, from noise [1, C, h, w] in cells; steered by returns."""
         scheduler, vae = self._parts.scheduler, self._parts.vae
         scheduler.set_timesteps(self._steps)
         with torch.no_grad(), self._place.autocast():
@@ -260,12 +256,8 @@ def ddim_scheduler(settings: Mapping[str, Any], where: str) -> Any:
     """
     kind, prediction = settings.get("_class_name"), settings.get("prediction_type", "epsilon")
     if kind != "DDIMScheduler" or prediction not in _PREDICTIONS:
-        raise InputError(
-            "the folder's noise schedule is of another kind",
-            where=where,
-            got=f"{kind}, {prediction}",
-            expected=f"DDIMScheduler, {', '.join(_PREDICTIONS)}",
-        )
+        got, expected = f"{kind}, {prediction}", f"DDIMScheduler, {', '.join(_PREDICTIONS)}"
+        raise InputError("the folder's noise schedule is of another kind", where=where, got=got, expected=expected)
     scheduler_class = folders.member(folders.package("diffusers"), "DDIMScheduler")
     return scheduler_class.from_config({name: value for name, value in settings.items() if not name.startswith("_")})
 

@@ -47,8 +47,7 @@ _SKY_CONFIDENCE: Final = 0.8
 
 @dataclass(frozen=True, slots=True)
 class Preparation:
-    """Preparation of images as a folder describes it: size in pixels, the multiple of both sides, mean and deviation of
-    colours in 0..1."""
+    """Preparation of images: size in pixels, the multiple of both sides, mean and deviation of colours in 0..1."""
 
     height: int
     width: int
@@ -173,19 +172,13 @@ def kind_of(folder: str | Path) -> str:
         if folder and (path / name).is_file():
             kind = str(folders.read_settings(path / name).get(key))
             if kind not in KINDS:
-                raise InputError(
-                    "the folder holds another kind of network",
-                    where=str(path / name),
-                    expected=", ".join(KINDS),
-                    got=kind,
-                )
+                what = "the folder holds another kind of network"
+                raise InputError(what, where=str(path / name), expected=", ".join(KINDS), got=kind)
             return kind
-    raise ResourceError(
-        "the depth network's weights are missing",
-        where=str(folder) or "--depth-network",
-        expected="a folder with config.json (transformers), model_index.json (diffusers) or model.json (mudg convert)",
-        remedy="give the folder of such a network as --depth-network, or leave the flag out",
-    )
+    where = str(folder) or "--depth-network"
+    expected = "a folder with config.json (transformers), model_index.json (diffusers) or model.json (mudg convert)"
+    remedy = "give the folder of such a network as --depth-network, or leave the flag out"
+    raise ResourceError("the depth network's weights are missing", where=where, expected=expected, remedy=remedy)
 
 
 def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> DepthNetwork:
@@ -217,12 +210,8 @@ def align_to_lidar(prediction: Prediction, given: DepthInput, rules: CompletionR
         InputError: prediction and image differ in size.
     """
     if prediction.values.shape != given.measured.shape:
-        raise InputError(
-            "a network's depth and its image differ in size",
-            where="depth network",
-            expected=str(given.measured.shape),
-            got=str(prediction.values.shape),
-        )
+        what, where = "a network's depth and its image differ in size", "depth network"
+        raise InputError(what, where=where, expected=str(given.measured.shape), got=str(prediction.values.shape))
     known = np.isfinite(given.measured) & ~given.sky
     values, measured = prediction.values[known], given.measured[known]
     fit = fit_affine(torch.from_numpy(values), torch.from_numpy(measured), prediction.space)

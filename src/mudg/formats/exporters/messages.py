@@ -1,0 +1,780 @@
+"""A driving log as records over time: what every format of messages is made of, and MCAP files of such messages.
+
+Times count from the first record. Pictures and sweeps are read when they are written, one at a time.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path, PurePosixPath
+from types import SimpleNamespace
+from typing import Any, ClassVar, Final, NamedTuple
+
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+
+from mudg.base import geometry, store
+from mudg.base.errors import InputError, ResourceError
+from mudg.base.palette import CLASSES, DISPLAY_COLORS, ID
+from mudg.base.types import Frame, PointCloud, Scene, Sweep, SweepPoints, Track, View
+from mudg.base.versions import version
+
+NANO: Final = 1_000_000_000
+CHUNK_BYTES: Final = 4 << 20
+"""Bytes of messages that an MCAP file holds together, and that are in memory at once."""
+BOX_LIFE_S: Final = 0.15
+"""Boxes vanish if no message follows for this long."""
+MOUNT_M: Final = 1e-4
+"""Metres (and entries of rotations) by which the place of a fixed sensor on the vehicle may vary."""
+
+Matrix = NDArray[np.float64]
+
+
+class LogRecords:
+    """The records of a log.
+
+    Args:
+        picture: bytes of a frame's image. points: of a sweep. fused: a cloud that is sent once, or None.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        picture: Callable[[Frame], bytes],
+        points: Callable[[Sweep], SweepPoints],
+        fused: PointCloud | None = None,
+    ) -> None:
+        self.scene, self.picture, self.points = scene, picture, points
+        self.fused = fused if fused is not None and len(fused) else None
+        times = [f.view.time_s for f in scene.frames] + [s.time_s for s in scene.sweeps] + scene.ego.times_s.tolist()
+        self.start_s = min(times, default=0.0)
+
+    def nanoseconds(self, time_s: float) -> int:
+        """Since the first record."""
+        return max(0, round((time_s - self.start_s) * NANO))
+
+    def moments(self) -> list[float]:
+        """Seconds of all pictures and sweeps, each once, in order."""
+        return sorted({f.view.time_s for f in self.scene.frames} | {s.time_s for s in self.scene.sweeps})
+
+    def boxes(self, time_s: float) -> list[tuple[Track, Matrix]]:
+        """The objects that are there at a time, and their poses."""
+        found = [(track, track.pose_at(time_s)) for track in self.scene.tracks]
+        return [(track, pose) for track, pose in found if pose is not None]
+
+    def mounts(self, tolerance_m: float = MOUNT_M) -> dict[str, Matrix]:
+        """Ego-from-sensor f64[4, 4] of the sensors that do not move on the vehicle: ``camera/NAME``, ``lidar/NAME``.
+
+        A sensor whose recorded poses the vehicle's path does not explain to ``tolerance_m`` is left out.
+        """
+        first: dict[str, Matrix] = {}
+        moving: set[str] = set()
+        for name, time_s, pose in self.sensor_poses():
+            ego = self.scene.ego.pose_at(time_s)
+            mount = None if ego is None else geometry.invert(ego) @ pose
+            if mount is None or np.abs(first.setdefault(name, mount) - mount).max() > tolerance_m:
+                moving.add(name)
+        return {name: mount for name, mount in first.items() if name not in moving}
+
+    def sensor_poses(self) -> list[tuple[str, float, Matrix]]:
+        """``camera/NAME`` or ``lidar/NAME``, seconds, and world-from-sensor of every picture and sweep."""
+        return [
+            *((f"camera/{f.view.camera.name}", f.view.time_s, f.view.world_from_cam) for f in self.scene.frames),
+            *((f"lidar/{s.sensor}", s.time_s, s.world_from_lidar) for s in self.scene.sweeps),
+        ]
+
+
+def picture_format(frame: Frame) -> str:
+    """``jpeg``, ``png``, ..., by the name of the file."""
+    ending = PurePosixPath(frame.image.path).suffix.lower().lstrip(".")
+    return {"jpg": "jpeg"}.get(ending, ending)
+
+
+def box_color(label: str) -> tuple[float, float, float]:
+    """Red, green, blue in [0, 1] of a class name."""
+    name = {"pedestrian": "person", "cyclist": "rider", "van": "car"}.get(label.lower(), label.lower())
+    red, green, blue = DISPLAY_COLORS[ID[name]].tolist() if name in CLASSES else (160, 160, 160)
+    return red / 255, green / 255, blue / 255
+
+
+def above(pose: Matrix, track: Track) -> Matrix:
+    """Where the name of an object stands: 0.4 m over its box."""
+    return pose @ geometry.yaw_matrix(0.0, (0, 0, float(track.size_m[2]) / 2 + 0.4))
+
+
+# MCAP files ---------------------------------------------------------------------------------------
+
+
+class LogMessage(NamedTuple):
+    """One message: its topic, the name of its schema, seconds on the log's clock, and what makes its value when it is
+    written."""
+
+    topic: str
+    schema: str
+    time_s: float
+    value: Callable[[], Any]
+
+
+class LogMessages:
+    """The messages of a log in order of time, and how they stand in an MCAP file (names of its specification)."""
+
+    profile: ClassVar[str] = ""
+    schema_encoding: ClassVar[str]
+    message_encoding: ClassVar[str]
+
+    def __init__(self, records: LogRecords) -> None:
+        self._log, self._scene = records, records.scene
+
+    def __iter__(self) -> Iterator[LogMessage]:
+        raise NotImplementedError
+
+    def nanoseconds(self, time_s: float) -> int:
+        """The stamp of a message."""
+        return self._log.nanoseconds(time_s)
+
+    def schema(self, name: str) -> str:
+        """The text of a schema."""
+        raise NotImplementedError
+
+    def content(self, message: LogMessage) -> bytes:
+        """The bytes of a message."""
+        raise NotImplementedError
+
+    def channel_metadata(self, topic: str) -> dict[str, str]:
+        """What the channel of a topic carries."""
+        return {}
+
+
+def mcap_writer() -> Any:
+    """The module ``mcap.writer``; ResourceError if the packages of messages are not installed."""
+    try:
+        import mcap.writer
+        import rosbags.typesys  # noqa: F401
+    except ImportError as error:
+        what = "MCAP files and bags are written with the packages mcap and rosbags, which are not installed"
+        raise ResourceError(what, got=str(error), remedy="pip install 'mudg[ros]'") from error
+    return mcap.writer
+
+
+class McapStream(list[bytes]):
+    """What a writer wrote and nobody took yet; ``tell`` counts all of it."""
+
+    size = 0
+
+    def write(self, content: bytes) -> None:
+        """Keep a block."""
+        self.append(bytes(content))
+        self.size += len(content)
+
+    def tell(self) -> int:
+        """Bytes written so far."""
+        return self.size
+
+
+def write_mcap(path: Path, messages: LogMessages) -> tuple[dict[str, tuple[str, int]], tuple[int, int]]:
+    """Write an MCAP file, completely or not at all; no more than one chunk is in memory.
+
+    Returns:
+        Schema and number of messages of every topic, and the nanoseconds of the first and the last message.
+    """
+    package, schemas, channels, stream = mcap_writer(), dict[str, int](), dict[str, int](), McapStream()
+    topics, stamps = dict[str, tuple[str, int]](), [0]
+    writer = package.Writer(stream, CHUNK_BYTES, package.CompressionType.NONE)
+
+    def blocks() -> Iterator[bytes]:
+        writer.start(messages.profile, f"mudg {version()}")
+        for message in messages:
+            topic, name, stamp = message.topic, message.schema, messages.nanoseconds(message.time_s)
+            if name not in schemas:
+                text = messages.schema(name).encode()
+                schemas[name] = writer.register_schema(name, messages.schema_encoding, text)
+            if topic not in channels:
+                about = messages.channel_metadata(topic)
+                channels[topic] = writer.register_channel(topic, messages.message_encoding, schemas[name], about)
+            number = topics.get(topic, (name, 0))[1]
+            writer.add_message(channels[topic], stamp, messages.content(message), stamp, number)
+            stamps[:] = [stamps[0] if topics else stamp, stamp]
+            topics[topic] = (name, number + 1)
+            yield from stream
+            stream.clear()
+        writer.finish()
+        yield from stream
+
+    store.write_blocks(path, blocks())
+    return topics, (stamps[0], stamps[-1])
+
+
+# foxglove ------------------------------------------------------------------------------------------
+#
+# A driving log as messages that Foxglove shows: JSON with the names of Foxglove's schemas; pictures and points are
+# base64 inside.
+#
+#     /tf  /ego  /objects  /camera/NAME/image  /camera/NAME/calibration  /lidar/NAME  /points (fused, once)
+
+
+_NUMBER: Final = {"type": "number"}
+_TEXT: Final = {"type": "string"}
+_BYTES: Final = {"type": "string", "contentEncoding": "base64"}
+_TIME: Final = {
+    "type": "object",
+    "title": "time",
+    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
+}
+
+
+def _record(**properties: Any) -> dict[str, Any]:
+    return {"type": "object", "properties": properties}
+
+
+def _list(items: Mapping[str, Any]) -> dict[str, Any]:
+    return {"type": "array", "items": dict(items)}
+
+
+_VECTOR: Final = _record(x=_NUMBER, y=_NUMBER, z=_NUMBER)
+_TURN: Final = _record(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
+_POSE: Final = _record(position=_VECTOR, orientation=_TURN)
+_COLOR: Final = _record(r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
+_STAMPED: Final = {"timestamp": _TIME, "frame_id": _TEXT}
+_CUBE: Final = _record(pose=_POSE, size=_VECTOR, color=_COLOR)
+_LABEL: Final = _record(
+    pose=_POSE,
+    billboard={"type": "boolean"},
+    font_size=_NUMBER,
+    scale_invariant={"type": "boolean"},
+    color=_COLOR,
+    text=_TEXT,
+)
+_ENTITY: Final = _record(
+    **_STAMPED,
+    id=_TEXT,
+    lifetime=_TIME,
+    frame_locked={"type": "boolean"},
+    metadata=_list(_record(key=_TEXT, value=_TEXT)),
+    cubes=_list(_CUBE),
+    texts=_list(_LABEL),
+)
+
+SCHEMAS: Final[Mapping[str, dict[str, Any]]] = {
+    "foxglove.FrameTransforms": _record(
+        transforms=_list(
+            _record(timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_TURN)
+        )
+    ),
+    "foxglove.PoseInFrame": _record(**_STAMPED, pose=_POSE),
+    "foxglove.CompressedImage": _record(**_STAMPED, data=_BYTES, format=_TEXT),
+    "foxglove.CameraCalibration": _record(
+        **_STAMPED,
+        width={"type": "integer"},
+        height={"type": "integer"},
+        distortion_model=_TEXT,
+        D=_list(_NUMBER),
+        K=_list(_NUMBER),
+        R=_list(_NUMBER),
+        P=_list(_NUMBER),
+    ),
+    "foxglove.PointCloud": _record(
+        **_STAMPED,
+        pose=_POSE,
+        point_stride={"type": "integer"},
+        fields=_list(_record(name=_TEXT, offset={"type": "integer"}, type={"type": "integer"})),
+        data=_BYTES,
+    ),
+    "foxglove.SceneUpdate": _record(deletions=_list(_record(timestamp=_TIME, id=_TEXT)), entities=_list(_ENTITY)),
+}
+
+
+class FoxgloveMessages(LogMessages):
+    """The messages of a log for Foxglove."""
+
+    schema_encoding, message_encoding = "jsonschema", "json"
+
+    def __iter__(self) -> Iterator[LogMessage]:
+        messages = [*self._of_cameras(), *self._of_sweeps(), *self._of_objects()]
+        if self._log.fused is not None:
+            messages.append(LogMessage("/points", "foxglove.PointCloud", self._log.start_s, self._fused_points))
+        return iter(sorted(messages, key=lambda message: (message.time_s, message.topic)))
+
+    def schema(self, name: str) -> str:
+        """The text of a schema."""
+        return json.dumps({"title": name, **SCHEMAS[name]})
+
+    def content(self, message: LogMessage) -> bytes:
+        """The bytes of a message."""
+        return json.dumps(message.value(), separators=(",", ":"), allow_nan=False).encode()
+
+    def _stamp(self, time_s: float) -> dict[str, int]:
+        nanoseconds = self.nanoseconds(time_s)
+        return {"sec": nanoseconds // NANO, "nsec": nanoseconds % NANO}
+
+    def _of_cameras(self) -> Iterator[LogMessage]:
+        for frame in self._scene.frames:
+            name, view = frame.view.camera.name, frame.view
+            yield LogMessage(
+                "/tf",
+                "foxglove.FrameTransforms",
+                view.time_s,
+                lambda v=view: self._transforms(v.time_s, [(f"camera/{v.camera.name}", v.world_from_cam)]),
+            )
+            yield LogMessage(
+                f"/camera/{name}/calibration",
+                "foxglove.CameraCalibration",
+                view.time_s,
+                lambda v=view: self._calibration(v),
+            )
+            yield LogMessage(
+                f"/camera/{name}/image", "foxglove.CompressedImage", view.time_s, lambda f=frame: self._image(f)
+            )
+
+    def _of_sweeps(self) -> Iterator[LogMessage]:
+        for sweep in self._scene.sweeps:
+            place = [(f"lidar/{sweep.sensor}", sweep.world_from_lidar)]
+            yield LogMessage(
+                "/tf", "foxglove.FrameTransforms", sweep.time_s, lambda s=sweep, p=place: self._transforms(s.time_s, p)
+            )
+            yield LogMessage(
+                f"/lidar/{sweep.sensor}", "foxglove.PointCloud", sweep.time_s, lambda s=sweep: self._sweep(s)
+            )
+
+    def _of_objects(self) -> Iterator[LogMessage]:
+        for moment in self._log.moments():
+            yield LogMessage("/objects", "foxglove.SceneUpdate", moment, lambda t=moment: self._boxes(t))
+            pose = self._scene.ego.pose_at(moment)
+            if pose is not None:
+                yield LogMessage(
+                    "/ego",
+                    "foxglove.PoseInFrame",
+                    moment,
+                    lambda t=moment, p=pose: {"timestamp": self._stamp(t), "frame_id": "world", "pose": _pose(p)},
+                )
+                yield LogMessage(
+                    "/tf",
+                    "foxglove.FrameTransforms",
+                    moment,
+                    lambda t=moment, p=pose: self._transforms(t, [("ego", p)]),
+                )
+
+    def _transforms(self, time_s: float, frames: Sequence[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:
+        return {
+            "transforms": [
+                {
+                    "timestamp": self._stamp(time_s),
+                    "parent_frame_id": "world",
+                    "child_frame_id": name,
+                    "translation": _pose(pose)["position"],
+                    "rotation": _pose(pose)["orientation"],
+                }
+                for name, pose in frames
+            ]
+        }
+
+    def _calibration(self, view: View) -> dict[str, Any]:
+        camera = view.camera
+        k = camera.matrix
+        return {
+            "timestamp": self._stamp(view.time_s),
+            "frame_id": f"camera/{camera.name}",
+            "width": camera.width,
+            "height": camera.height,
+            "distortion_model": "",
+            "D": [],
+            "K": k.reshape(-1).tolist(),
+            "R": np.eye(3).reshape(-1).tolist(),
+            "P": np.column_stack([k, np.zeros(3)]).reshape(-1).tolist(),
+        }
+
+    def _image(self, frame: Frame) -> dict[str, Any]:
+        return {
+            "timestamp": self._stamp(frame.view.time_s),
+            "frame_id": f"camera/{frame.view.camera.name}",
+            "format": picture_format(frame),
+            "data": _base64(self._log.picture(frame)),
+        }
+
+    def _sweep(self, sweep: Sweep) -> dict[str, Any]:
+        points = self._log.points(sweep)
+        rows = np.zeros(len(points.xyz), [("xyz", "<f4", 3), ("intensity", "<f4")])
+        rows["xyz"], rows["intensity"] = points.xyz, points.intensity
+        return self._cloud(sweep.time_s, f"lidar/{sweep.sensor}", rows, [("intensity", 12, 7)])
+
+    def _fused_points(self) -> dict[str, Any]:
+        cloud = self._log.fused
+        count = 0 if cloud is None else len(cloud)
+        rows = np.zeros(count, [("xyz", "<f4", 3), ("rgba", "u1", 4)])
+        if cloud is not None:
+            rows["xyz"], rows["rgba"] = cloud.xyz, np.column_stack([cloud.rgb, np.full(count, 255)])
+        channels = [(name, 12 + index, 1) for index, name in enumerate(("red", "green", "blue", "alpha"))]
+        return self._cloud(self._log.start_s, "world", rows, channels)
+
+    def _cloud(self, time_s: float, frame: str, rows: NDArray[Any], more: list[tuple[str, int, int]]) -> dict[str, Any]:
+        fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), *more]
+        return {
+            "timestamp": self._stamp(time_s),
+            "frame_id": frame,
+            "pose": _pose(np.eye(4)),
+            "point_stride": rows.dtype.itemsize,
+            "fields": [{"name": name, "offset": offset, "type": kind} for name, offset, kind in fields],
+            "data": _base64(rows.tobytes()),
+        }
+
+    def _boxes(self, time_s: float) -> dict[str, Any]:
+        entities = []
+        for track, pose in self._log.boxes(time_s):
+            red, green, blue = box_color(track.label)
+            entities.append(
+                {
+                    "timestamp": self._stamp(time_s),
+                    "frame_id": "world",
+                    "id": track.id,
+                    "frame_locked": False,
+                    "lifetime": {"sec": 0, "nsec": round(BOX_LIFE_S * NANO)},
+                    "metadata": [{"key": "class", "value": track.label}],
+                    "cubes": [
+                        {
+                            "pose": _pose(pose),
+                            "size": _vector(track.size_m),
+                            "color": {"r": red, "g": green, "b": blue, "a": 0.4},
+                        }
+                    ],
+                    "texts": [
+                        {
+                            "pose": _pose(above(pose, track)),
+                            "billboard": True,
+                            "font_size": 0.5,
+                            "scale_invariant": False,
+                            "color": {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0},
+                            "text": f"{track.id} ({track.label})",
+                        }
+                    ],
+                }
+            )
+        return {"deletions": [], "entities": entities}
+
+
+def _vector(values: NDArray[np.floating]) -> dict[str, float]:
+    return {"x": float(values[0]), "y": float(values[1]), "z": float(values[2])}
+
+
+def _pose(matrix: NDArray[np.float64]) -> dict[str, Any]:
+    w, x, y, z = geometry.quaternion_from_matrix(matrix).tolist()
+    return {"position": _vector(matrix[:3, 3]), "orientation": {"x": x, "y": y, "z": z, "w": w}}
+
+
+def _base64(content: bytes) -> str:
+    return base64.b64encode(content).decode("ascii")
+
+
+# ros2 ----------------------------------------------------------------------------------------------
+#
+# A driving log as a bag of ROS 2 (rosbag2 with MCAP storage), written without ROS: the package rosbags gives types and
+# bytes of messages. Its own writer begins with bags of version 8, which Humble does not read.
+#
+#     /tf  /tf_static  /ego/path (once)  /ego/pose  /camera/NAME/image/compressed  /camera/NAME/camera_info
+#     /lidar/NAME/points
+#     /objects/markers  /objects/detections  /points (fused, once)
+#
+# Frames (REP 103, REP 105): ``map``, ``base_link`` (the vehicle), ``camera_NAME_optical`` (x right, y down, z forward),
+# ``lidar_NAME``. A sensor whose place on the vehicle is fixed hangs on ``base_link`` by /tf_static, any other on
+# ``map`` by /tf. Principal points count from the centre of the first pixel, as OpenCV's do: half a pixel less than in
+# this program.
+
+
+START_S: Final = 1
+"""Stamp of the first record: ROS reads the stamp 0 as 'the latest'."""
+BAG_FILE: Final = "log_0.mcap"
+BAG_METADATA: Final = "metadata.yaml"
+MAP: Final = "map"
+VEHICLE: Final = "base_link"
+FLOAT32: Final = 7
+CUBE: Final = 1
+WORDS: Final = 9
+VISION: Final = {
+    "ObjectHypothesis": "string class_id\nfloat64 score",
+    "ObjectHypothesisWithPose": "vision_msgs/ObjectHypothesis hypothesis\ngeometry_msgs/PoseWithCovariance pose",
+    "BoundingBox3D": "geometry_msgs/Pose center\ngeometry_msgs/Vector3 size",
+    "Detection3D": (
+        "std_msgs/Header header\nvision_msgs/ObjectHypothesisWithPose[] results\nvision_msgs/BoundingBox3D bbox\n"
+        "string id"
+    ),
+    "Detection3DArray": "std_msgs/Header header\nvision_msgs/Detection3D[] detections",
+}
+"""Messages of the package vision_msgs, which rosbags does not have."""
+ONCE: Final = frozenset({"/tf_static", "/ego/path", "/points"})
+"""Topics whose one message is kept for those who join later."""
+
+
+def bag_metadata(topics: Mapping[str, tuple[str, int]], span: tuple[int, int]) -> bytes:
+    """``metadata.yaml`` of a bag, version 5 (Humble; read by all later ones).
+
+    Args:
+        topics: type and number of messages of every topic. span: nanoseconds of the first and the last message.
+    """
+    start, length = {"nanoseconds_since_epoch": span[0]}, {"nanoseconds": span[1] - span[0]}
+    total = sum(count for _, count in topics.values())
+    listed = [
+        {
+            "topic_metadata": {
+                "name": topic,
+                "type": kind,
+                "serialization_format": "cdr",
+                "offered_qos_profiles": _qos(topic),
+            },
+            "message_count": count,
+        }
+        for topic, (kind, count) in topics.items()
+    ]
+    about = {
+        "version": 5,
+        "storage_identifier": "mcap",
+        "duration": length,
+        "starting_time": start,
+        "message_count": total,
+        "topics_with_message_count": listed,
+        "compression_format": "",
+        "compression_mode": "",
+        "relative_file_paths": [BAG_FILE],
+        "files": [{"path": BAG_FILE, "starting_time": dict(start), "duration": dict(length), "message_count": total}],
+    }
+    return yaml.safe_dump({"rosbag2_bagfile_information": about}, sort_keys=False).encode()
+
+
+def _qos(topic: str) -> str:
+    """Quality of service as rosbag2 writes it: reliable; kept for those who join later where one message is all."""
+    never = {"sec": 9223372036, "nsec": 854775807}
+    once = topic in ONCE
+    profile = {
+        "history": 1,
+        "depth": 1 if once else 10,
+        "reliability": 1,
+        "durability": 1 if once else 2,
+        "deadline": dict(never),
+        "lifespan": dict(never),
+        "liveliness": 1,
+        "liveliness_lease_duration": dict(never),
+        "avoid_ros_namespace_conventions": False,
+    }
+    return yaml.safe_dump([profile], sort_keys=False)
+
+
+def ros_names(names: Iterable[str]) -> dict[str, str]:
+    """Names that ROS accepts as a part of topics (letters, digits, single underscores, a letter first), each once."""
+    made: dict[str, str] = {}
+    for name in names:
+        plain = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "sensor"
+        plain = f"n{plain}" if plain[0].isdigit() else plain
+        chosen, count = plain, 1
+        while chosen in made.values():
+            count += 1
+            chosen = f"{plain}_{count}"
+        made[name] = chosen
+    return made
+
+
+def ros_types() -> Any:
+    """The messages of Humble and later as rosbags keeps them; ResourceError if it is not installed."""
+    mcap_writer()
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    for name, text in VISION.items():
+        types.register(get_types_from_msg(text, f"vision_msgs/msg/{name}"))
+    return types
+
+
+class Ros2Messages(LogMessages):
+    """The messages of a log for ROS 2; of one moment, transforms first.
+
+    Raises:
+        InputError: an object's id or class holds a zero byte.
+    """
+
+    profile, schema_encoding, message_encoding = "ros2", "ros2msg", "cdr"
+
+    def __init__(self, records: LogRecords) -> None:
+        super().__init__(records)
+        self._types = ros_types()
+        packages = {"builtin_interfaces", "std_msgs", "geometry_msgs", "sensor_msgs", "nav_msgs", "tf2_msgs"}
+        packages |= {"visualization_msgs", "vision_msgs"}
+        classes = {
+            kind.split("/")[-1]: made for kind, made in self._types.types.items() if kind.split("/")[0] in packages
+        }
+        self._ros: Any = SimpleNamespace(**classes)
+        lidars = {sweep.sensor: 0 for sweep in self._scene.sweeps}
+        self._names = {f"camera/{name}": plain for name, plain in ros_names(self._scene.cameras).items()}
+        self._names |= {f"lidar/{name}": plain for name, plain in ros_names(lidars).items()}
+        self._mounts = records.mounts()
+        for text in (text for track in self._scene.tracks for text in (track.id, track.label)):
+            if "\0" in text:
+                raise InputError("a name holds a zero byte, which ROS cannot carry", got=repr(text))
+
+    def __iter__(self) -> Iterator[LogMessage]:
+        messages = [*self._once(), *self._transforms(), *self._of_sensors(), *self._of_objects()]
+        return iter(sorted(messages, key=lambda one: (one.time_s, not one.topic.startswith("/tf"), one.topic)))
+
+    def nanoseconds(self, time_s: float) -> int:
+        """The stamp of a message."""
+        return super().nanoseconds(time_s) + START_S * NANO
+
+    def schema(self, name: str) -> str:
+        """The text of a schema."""
+        return self._types.generate_msgdef(name, ros_version=2)[0]
+
+    def content(self, message: LogMessage) -> bytes:
+        """The bytes of a message."""
+        return bytes(self._types.serialize_cdr(message.value(), message.schema, little_endian=True))
+
+    def channel_metadata(self, topic: str) -> dict[str, str]:
+        """Quality of service."""
+        return {"offered_qos_profiles": _qos(topic)}
+
+    def _header(self, time_s: float, frame: str) -> Any:
+        return self._ros.Header(self._ros.Time(*divmod(self.nanoseconds(time_s), NANO)), frame)
+
+    def _frame(self, sensor: str) -> str:
+        return f"{sensor.partition('/')[0]}_{self._names[sensor]}" + "_optical" * sensor.startswith("camera/")
+
+    def _turn(self, pose: Matrix) -> Any:
+        w, x, y, z = (geometry.quaternion_from_matrix(pose) + 0.0).tolist()  # no negative zeros
+        return self._ros.Quaternion(x, y, z, w)
+
+    def _pose(self, pose: Matrix) -> Any:
+        return self._ros.Pose(self._ros.Point(*pose[:3, 3].tolist()), self._turn(pose))
+
+    def _once(self) -> Iterator[LogMessage]:
+        start, ego = self._log.start_s, self._scene.ego
+        if self._mounts:
+            yield self._tf("/tf_static", start, VEHICLE, {self._frame(name): m for name, m in self._mounts.items()})
+
+        def path() -> Any:
+            poses = [
+                (self._header(float(t), MAP), self._pose(pose)) for t, pose in zip(ego.times_s, ego.world_from_ego)
+            ]
+            return self._ros.Path(self._header(start, MAP), [self._ros.PoseStamped(*pose) for pose in poses])
+
+        yield LogMessage("/ego/path", "nav_msgs/msg/Path", start, path)
+        if self._log.fused is not None:
+            yield LogMessage("/points", "sensor_msgs/msg/PointCloud2", start, self._fused)
+
+    def _transforms(self) -> Iterator[LogMessage]:
+        """The vehicle at every moment at which something was recorded, and sensors that are not fixed to it."""
+        for moment in self._log.moments():
+            pose = self._scene.ego.pose_at(moment)
+            if pose is not None:
+                yield self._tf("/tf", moment, MAP, {VEHICLE: pose})
+                yield LogMessage(
+                    "/ego/pose",
+                    "geometry_msgs/msg/PoseStamped",
+                    moment,
+                    lambda t=moment, p=pose: self._ros.PoseStamped(self._header(t, MAP), self._pose(p)),
+                )
+        for sensor, time_s, pose in self._log.sensor_poses():
+            if sensor not in self._mounts:
+                yield self._tf("/tf", time_s, MAP, {self._frame(sensor): pose})
+
+    def _tf(self, topic: str, time_s: float, parent: str, poses: Mapping[str, Matrix]) -> LogMessage:
+        """Parent-from-child poses by the name of the child."""
+        ros = self._ros
+
+        def transforms() -> Any:
+            header = self._header(time_s, parent)
+            values = {
+                child: ros.Transform(ros.Vector3(*pose[:3, 3].tolist()), self._turn(pose))
+                for child, pose in poses.items()
+            }
+            return ros.TFMessage([ros.TransformStamped(header, child, value) for child, value in values.items()])
+
+        return LogMessage(topic, "tf2_msgs/msg/TFMessage", time_s, transforms)
+
+    def _of_sensors(self) -> Iterator[LogMessage]:
+        for frame in self._scene.frames:
+            topic, view = f"/camera/{self._names[f'camera/{frame.view.camera.name}']}", frame.view
+            info, image = (lambda v=view: self._camera_info(v)), (lambda f=frame: self._image(f))
+            yield LogMessage(f"{topic}/camera_info", "sensor_msgs/msg/CameraInfo", view.time_s, info)
+            yield LogMessage(f"{topic}/image/compressed", "sensor_msgs/msg/CompressedImage", view.time_s, image)
+        for sweep in self._scene.sweeps:
+            topic = f"/lidar/{self._names[f'lidar/{sweep.sensor}']}/points"
+            yield LogMessage(topic, "sensor_msgs/msg/PointCloud2", sweep.time_s, lambda s=sweep: self._sweep(s))
+
+    def _camera_info(self, view: View) -> Any:
+        camera, k = view.camera, view.camera.matrix
+        k[:2, 2] -= 0.5
+        return self._ros.CameraInfo(
+            self._header(view.time_s, self._frame(f"camera/{camera.name}")),
+            camera.height,
+            camera.width,
+            "plumb_bob",
+            d=np.zeros(5),
+            k=k.reshape(-1),
+            r=np.eye(3).reshape(-1),
+            p=np.column_stack([k, np.zeros(3)]).reshape(-1),
+            binning_x=0,
+            binning_y=0,
+            roi=self._ros.RegionOfInterest(0, 0, 0, 0, False),
+        )
+
+    def _image(self, frame: Frame) -> Any:
+        header = self._header(frame.view.time_s, self._frame(f"camera/{frame.view.camera.name}"))
+        picture = np.frombuffer(self._log.picture(frame), np.uint8)
+        return self._ros.CompressedImage(header, picture_format(frame), picture)
+
+    def _sweep(self, sweep: Sweep) -> Any:
+        points = self._log.points(sweep)
+        rows = np.zeros(len(points.xyz), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("intensity", "<f4")])
+        rows["x"], rows["y"], rows["z"], rows["intensity"] = *points.xyz.T, points.intensity
+        return self._cloud(sweep.time_s, self._frame(f"lidar/{sweep.sensor}"), rows)
+
+    def _fused(self) -> Any:
+        """Fused points; colours as programs of ROS expect them: 0x00RRGGBB in the bits of a float."""
+        cloud = self._log.fused
+        rows = np.zeros(0 if cloud is None else len(cloud), [("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<f4")])
+        if cloud is not None:
+            red, green, blue = cloud.rgb.T.astype("<u4")
+            rows["x"], rows["y"], rows["z"] = cloud.xyz.T
+            rows["rgb"] = (red << 16 | green << 8 | blue).astype("<u4").view("<f4")
+        return self._cloud(self._log.start_s, MAP, rows)
+
+    def _cloud(self, time_s: float, frame: str, rows: NDArray[Any]) -> Any:
+        names, size = rows.dtype.names or (), rows.dtype.itemsize
+        fields = [self._ros.PointField(name, 4 * index, FLOAT32, 1) for index, name in enumerate(names)]
+        content = np.frombuffer(rows.tobytes(), np.uint8)
+        return self._ros.PointCloud2(
+            self._header(time_s, frame), 1, len(rows), fields, False, size, len(content), content, is_dense=True
+        )
+
+    def _of_objects(self) -> Iterator[LogMessage]:
+        for time_s in self._log.moments():
+            markers, boxes = (lambda t=time_s: self._markers(t)), (lambda t=time_s: self._detections(t))
+            yield LogMessage("/objects/markers", "visualization_msgs/msg/MarkerArray", time_s, markers)
+            yield LogMessage("/objects/detections", "vision_msgs/msg/Detection3DArray", time_s, boxes)
+
+    def _markers(self, time_s: float) -> Any:
+        ros, header, numbers = self._ros, self._header(time_s, MAP), {}
+        for number, track in enumerate(self._scene.tracks):
+            numbers[track.id] = number
+        picture = ros.CompressedImage(ros.Header(ros.Time(0, 0), ""), "", np.zeros(0, np.uint8))
+        rest = {"action": 0, "lifetime": ros.Duration(0, round(BOX_LIFE_S * NANO)), "frame_locked": False}
+        rest |= {"points": [], "colors": [], "texture_resource": "", "texture": picture, "uv_coordinates": []}
+        rest |= {"mesh_resource": "", "mesh_file": ros.MeshFile("", np.zeros(0, np.uint8))}
+        rest |= {"mesh_use_embedded_materials": False}
+        markers = []
+        for track, pose in self._log.boxes(time_s):
+            color, name = ros.ColorRGBA(*box_color(track.label), 0.4), f"{track.id} ({track.label})"
+            size, white = ros.Vector3(*track.size_m.tolist()), ros.ColorRGBA(1.0, 1.0, 1.0, 1.0)
+            box = {"ns": "boxes", "type": CUBE, "pose": self._pose(pose), "scale": size, "color": color, "text": ""}
+            label = {"ns": "names", "type": WORDS, "pose": self._pose(above(pose, track)), "color": white, "text": name}
+            label["scale"] = ros.Vector3(0.0, 0.0, 0.5)
+            markers += [ros.Marker(header=header, id=numbers[track.id], **rest, **one) for one in (box, label)]
+        return ros.MarkerArray(markers)
+
+    def _detections(self, time_s: float) -> Any:
+        ros, header, detections = self._ros, self._header(time_s, MAP), []
+        for track, pose in self._log.boxes(time_s):
+            center = self._pose(pose)
+            size = ros.Vector3(*track.size_m.tolist())
+            hypothesis = ros.ObjectHypothesis(track.label, 1.0)
+            result = ros.ObjectHypothesisWithPose(hypothesis, ros.PoseWithCovariance(center, np.zeros(36)))
+            detections.append(ros.Detection3D(header, [result], ros.BoundingBox3D(center, size), track.id))
+        return ros.Detection3DArray(header, detections)
