@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from mudg.base.palette import ID
-from mudg.benchmarks.edit import EVERY_FRAMES, EditCase, case_of
+from mudg.benchmarks.cities import EVERY_FRAMES, EditCase, case_of
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city.world import CityWorld
 from mudg.editing.light import surface_light

@@ -16,8 +16,7 @@ from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.benchmarks import run as bench
 from mudg.benchmarks import shift
-from mudg.benchmarks.papers import RECORDED, TABLES
-from mudg.benchmarks.rows import LONGER, method_fit, shift_rows
+from mudg.benchmarks.rows import LONGER, RECORDED, TABLES, method_fit, shift_rows
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.city.config import CityConfig
 from mudg.city.logs import LogRules

@@ -16,7 +16,7 @@ from mudg.base.camera_colors import ColorMap
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Observation, SweepPoints, View
-from mudg.benchmarks import columns, places, real, truth
+from mudg.benchmarks import columns, places, real
 from mudg.benchmarks.chain import Chain, FillViews
 from mudg.benchmarks.places import PROTOCOLS, SPLITS
 from mudg.benchmarks.rows import real_rows
@@ -287,7 +287,7 @@ def test_a_color_map_is_found_under_noise_and_outliers():
 
 
 def sight(maps, *, depth=None, rgb=None, semantics=None, photo=None):
-    target = truth.Target("front", None, VIEW, maps, ColorMap())
+    target = columns.Target("front", None, VIEW, maps, ColorMap())
     rgb = torch.full((3, 30, 40), 0.5) if rgb is None else rgb
     return columns.Sight(target, rgb, depth, semantics, photo, None)
 
@@ -374,13 +374,13 @@ def exact(city, tmp_path_factory):
             with ObservationWriter(out / "views" / path.name, path.name, "truth") as writer:
                 for view in path.views:
                     writer.add(world.observation(view, world.render(view)))
-        targets = truth.MakeTargets(
+        targets = columns.MakeTargets(
             log=city, shown=seen, protocol=protocol, held=tuple(held.frames), cameras=cameras, out=out / "truth"
         ).run()
         scored = columns.ScoreTargets(
             log=city, truth=targets, views=out / "views", protocol=protocol, out=out / "score"
         ).run()
-        return store.read_json(scored / "metrics.json")["mean"], truth.read_targets(targets)
+        return store.read_json(scored / "metrics.json")["mean"], columns.read_targets(targets)
 
     return of
 
@@ -576,7 +576,7 @@ def test_classes_of_points_are_scored_where_a_log_has_them_and_hidden_from_metho
     assert 0.3 < found["accuracy"] < 1 and 0.05 < found["miou"] < 1
     log = out / "001"
     whole = read_scene(log / "scene")
-    targets = truth.read_targets(log / "truth" / "classes")
+    targets = columns.read_targets(log / "truth" / "classes")
     target = targets.load(0, whole)
     known = target.maps["classes"][target.maps["classes"] != 255]
     assert set(np.unique(known)) == {ID["road"], ID["building"]} and len(known) > 100

@@ -20,7 +20,7 @@ from mudg.base.palette import ID
 from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
 from mudg.baselines.bezier import BezierNode
 from mudg.baselines.omnire import DeformedNode
-from mudg.benchmarks.edit import city_keys
+from mudg.benchmarks.cities import city_keys
 from mudg.city import objects as rec
 from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld

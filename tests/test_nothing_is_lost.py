@@ -23,7 +23,7 @@ from toy_scene import ToyStreet
 
 from mudg.base import store
 from mudg.base.errors import UsageError
-from mudg.benchmarks import chain, page
+from mudg.benchmarks import chain
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city.config import CityConfig
@@ -161,7 +161,7 @@ VERBS: dict[str, Verb] = {
         ("city",),
     ),
     "film": Verb(
-        lambda g, out, v, o: page.Film(
+        lambda g, out, v, o: chain.Film(
             views={"truth": (g["views"],), **({"b": (g["views"],)} if v == 2 else {})},
             paths=_paths(g["scene"], 1),
             out=out,

@@ -358,7 +358,7 @@ def test_outputs_are_kept_apart_from_inputs(package_dir: Path) -> None:
         compared = [
             call.lineno for call, function in calls(tree) if function.endswith(("refuse_overlap", "_refuse_overlap"))
         ]
-        if len(compared) < len(opened) and name not in ("benchmarks/poses.py", "diffusion/training/clips.py"):
+        if len(compared) < len(opened) and name not in ("benchmarks/cities.py", "diffusion/training/clips.py"):
             problems.append(f"{name}:{opened[0]}: RunDir.open without refuse_overlap")
     refuse(problems)
 
