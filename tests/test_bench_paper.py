@@ -28,7 +28,7 @@ from mudg.core.feature_distances import frechet_distance, kernel_distance
 from mudg.diffusion import files as mdm_files
 from mudg.diffusion.model import MDM
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians.methods import METHODS

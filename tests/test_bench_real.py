@@ -29,7 +29,7 @@ from mudg.diffusion.model import MDM
 from mudg.diffusion.settings.adapt import AdaptConfig
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.editing import render
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import RenderConfig
 from mudg.formats import ingest
 from mudg.formats.importers.pandaset import read_frame
 from mudg.formats.settings import IngestConfig

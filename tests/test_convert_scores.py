@@ -16,7 +16,7 @@ from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.diffusion.settings.convert import ConvertConfig
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import i3d, inception
 from mudg.scoring import converted
 from mudg.steps.convert import Convert

@@ -28,11 +28,9 @@ from mudg.core import edit
 from mudg.core.edit import Displacement, HeightMap, Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.editing import assets
+from mudg.editing import apply as assets
 from mudg.editing import model as edited
-from mudg.editing.apply import edited_cloud, edited_model
-from mudg.editing.carried import carry_out
-from mudg.editing.light import surface_light, take_light
+from mudg.editing.apply import carry_out, edited_cloud, edited_model, surface_light, take_light
 from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, collisions, plan_edits
 from mudg.editing.script import parse_edits, read_edits
 from mudg.gaussians.model import CERTAINTY, SceneModel, compose

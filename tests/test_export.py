@@ -28,8 +28,7 @@ from mudg.baselines.pvg import VibrationNode, starting_columns
 from mudg.core.edit import HeightMap, Motion
 from mudg.core.metrics import psnr
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.editing.assets import read_asset
-from mudg.editing.carried import background_of
+from mudg.editing.apply import background_of, read_asset
 from mudg.editing.plan import EditWorld, place_background
 from mudg.editing.runs import find_run
 from mudg.exporting import export

@@ -32,7 +32,7 @@ from mudg.core import native_ops
 from mudg.core.raster import place
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.editing.view_settings import RenderConfig, ScoreConfig
+from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.gaussians import fit
 from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.densify import (

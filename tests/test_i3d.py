@@ -12,7 +12,7 @@ import toy_views
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import i3d
 from mudg.scene.read import read_scene
 from mudg.scoring import sets as distributions

@@ -33,7 +33,7 @@ from mudg.diffusion.model import MDM, MDMConfig
 from mudg.diffusion.published import convert
 from mudg.diffusion.settings.convert import ConvertConfig
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.editing.view_settings import RenderConfig, ScoreConfig
+from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.fleet.listed import run_listed
 from mudg.fleet.plan import Entry
 from mudg.formats import ingest

@@ -16,7 +16,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
 from mudg.core.metrics import METRICS
 from mudg.core.pictures import resize_nearest
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import featnets
 from mudg.scoring import score
 from mudg.scoring import tables as score_tables

@@ -16,7 +16,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Observation
 from mudg.core import feature_distances
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import inception
 from mudg.scene.read import read_scene
 from mudg.scoring import score

@@ -22,7 +22,7 @@ from mudg.core import losses as perceptual
 from mudg.core import metrics
 from mudg.core.metrics import Pair
 from mudg.diffusion import files
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance, lpips_shapes
 from mudg.scoring import score
 from mudg.scoring import tables as score_tables

@@ -13,7 +13,7 @@ from mudg import app
 from mudg.base import staging, store
 from mudg.base.errors import ResourceError
 from mudg.base.location import Location
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.steps.report import Report
 from mudg.steps.score import Score
 

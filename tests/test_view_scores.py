@@ -21,7 +21,7 @@ from mudg.city.world import CityWorld
 from mudg.core import metrics, trajectory, view_metrics
 from mudg.core.metrics import Pair, ViewFacts
 from mudg.core.street_scores import nta_truths
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
 from mudg.scoring import detections

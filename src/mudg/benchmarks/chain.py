@@ -31,7 +31,7 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.core.pictures import resize_area
 from mudg.core.raster.place import drawing_device
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import RenderConfig
 from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import read_fused

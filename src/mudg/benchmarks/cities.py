@@ -90,8 +90,7 @@ from mudg.diffusion.training import score as learn_score
 from mudg.diffusion.training.clips import fit_city
 from mudg.diffusion.training.memory_plan import choose_bf16
 from mudg.diffusion.views import windows
-from mudg.editing.assets import complete_asset, write_asset
-from mudg.editing.carried import EditedDrive, carry_out
+from mudg.editing.apply import EditedDrive, carry_out, complete_asset, write_asset
 from mudg.editing.harmonised import repairing
 from mudg.editing.model import linear_of
 from mudg.editing.recorded import DriveChange, EditedImages, write_edited_scene

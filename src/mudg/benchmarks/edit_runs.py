@@ -51,14 +51,22 @@ from mudg.core.edit import Motion
 from mudg.core.fusion import STATIC
 from mudg.core.lidar import DEPTH_LIMIT_M, OwnedPoints
 from mudg.core.raster.place import drawing_device
-from mudg.editing.apply import ground_of
-from mudg.editing.assets import asset_from, read_asset, write_asset
-from mudg.editing.carried import EditedDrive, background_of, carry_out
+from mudg.editing.apply import (
+    Drawer,
+    EditedDrive,
+    asset_from,
+    background_of,
+    carry_out,
+    ground_of,
+    in_weather,
+    read_asset,
+    weather_of,
+    write_asset,
+)
 from mudg.editing.plan import EditPlan, EditSources, EditWorld, collisions, plan_edits
 from mudg.editing.recorded import boxes_mask, ground_mask, outlines, touched_boxes
 from mudg.editing.runs import RunParts, find_run
-from mudg.editing.script import EditScript, parse_edits
-from mudg.editing.weathered import Drawer, conditions_of, in_weather, weather_of
+from mudg.editing.script import EditScript, conditions_of, parse_edits
 from mudg.formats.exporters.video import jpeg_bytes
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view

@@ -59,7 +59,7 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import standard_error, virtual_fits_of
 from mudg.core.metrics import METRICS
 from mudg.diffusion import files as mdm_files
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.methods import METHODS
 from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, compared, distances
 from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS

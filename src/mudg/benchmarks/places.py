@@ -29,7 +29,7 @@ from mudg.city import logs as city_logs
 from mudg.city.logs import STANDARD, LogRules
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.editing import render
-from mudg.editing.view_settings import RenderConfig, ScoreConfig
+from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.formats import ingest
 from mudg.formats.importers.common import holdout_split, parse_frame_range, parse_resolution
 from mudg.formats.settings import IngestConfig

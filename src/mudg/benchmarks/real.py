@@ -49,7 +49,7 @@ from mudg.diffusion import files as mdm_files
 from mudg.diffusion.adapt import why_not
 from mudg.diffusion.settings.adapt import AdaptConfig
 from mudg.editing import render
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import RenderConfig
 from mudg.scene.part import write_part
 from mudg.scene.read import read_scene
 from mudg.steps.adapt import Adapt

@@ -7,7 +7,7 @@ from typing import Literal
 from mudg.base.config import changed, setting, settings
 from mudg.base.devices import DeviceName
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.settings import FuseConfig
 from mudg.steps.settings.presets import PresetName, run_preset

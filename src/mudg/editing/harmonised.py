@@ -40,20 +40,10 @@ from mudg.diffusion.requests import StartClip, generated
 from mudg.diffusion.settings.harmonize import HarmonizeConfig
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.diffusion.views import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_at_pose, recorded_images, windows
-from mudg.editing.carried import EditedDrive
+from mudg.editing import recorded as records
+from mudg.editing.apply import EditedDrive
 from mudg.editing.plan import EditPlan
-from mudg.editing.recorded import (
-    CHANGED_ABOVE,
-    GROWN_PX,
-    EditedImages,
-    boxes_mask,
-    cleared_cloud,
-    ground_mask,
-    others,
-    photos_of_edited,
-    touched_boxes,
-    vacated_at,
-)
+from mudg.editing.recorded import EditedImages, boxes_mask, ground_mask, others, touched_boxes, vacated_at
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import FAR_M, raster_of, render_planes, render_view
 from mudg.networks.codec import Modality
@@ -81,32 +71,22 @@ def settings_of(config: HarmonizeConfig, device: str) -> SynthesizeConfig:
     strengths = {"uncovered": config.uncovered, "objects": config.objects, "weather": config.weather}
     partial = [f"--harmonize.{name} {value:g}" for name, value in strengths.items() if 0 < value < 1]
     if partial and is_published(config.model):
-        raise UsageError(
-            "a published-type model makes views from noise: it cannot stay near a render",
-            where=partial[0].split()[0],
-            expected="0 or 1",
-            got=partial[0].split()[1],
-        )
-    return SynthesizeConfig(
-        model=config.model, steps=config.steps, precision=config.precision, seed=config.seed, device=device, processes=1
-    )
+        name, value = partial[0].split()
+        what = "a published-type model makes views from noise: it cannot stay near a render"
+        raise UsageError(what, where=name, expected="0 or 1", got=value)
+    own = {name: getattr(config, name) for name in ("model", "steps", "precision", "seed")}
+    return SynthesizeConfig(**own, device=device, processes=1)
 
 
 def check_paths(config: HarmonizeConfig, frames: Mapping[str, int]) -> None:
     """UsageError for what a published-type model cannot do with paths of so many frames, by name, before anything is
     written."""
     settings_of(config, "cpu")
-    short = {
-        name: count for name, count in frames.items() if is_published(config.model) and count < window_of(config.model)
-    }
-    for name, count in short.items():
-        raise UsageError(
-            "a path is too short for a published-type model, whose clips have a fixed number of frames",
-            where=name,
-            expected=f"at least {window_of(config.model)} frames",
-            got=str(count),
-            remedy="harmonise with a small model",
-        )
+    for name, count in frames.items() if is_published(config.model) else ():
+        if count < (window := window_of(config.model)):
+            what = "a path is too short for a published-type model, whose clips have a fixed number of frames"
+            expected, remedy = f"at least {window} frames", "harmonise with a small model"
+            raise UsageError(what, where=name, expected=expected, got=str(count), remedy=remedy)
 
 
 DrawPair = Callable[[View], tuple[Observation, Observation]]
@@ -146,31 +126,27 @@ class EditedSources:
 
     @classmethod
     def of(cls, drive: EditedDrive, fitted: SceneModel, recorded: Scene) -> EditedSources:
-        """Of a script that was carried out on a scene with its clouds.
-
-        Args:
-            fitted: edited. recorded: the scene as it was.
-        """
+        """Of a script that was carried out on a scene with its clouds; ``fitted``: edited, ``recorded``: as it was."""
         if drive.scene is None or drive.cloud is None:
-            raise UsageError(
-                "the diffusion model needs the fused clouds of the drive",
-                remedy="give --fused, as `mudg fuse` wrote it",
-            )
-        plan, edited, cloud = drive.plan, drive.scene, drive.cloud
-        photos = photos_of_edited(recorded_images(recorded, SynthesizeConfig()), plan)
-        return cls(fitted, plan, cleared_cloud(cloud, plan), edited.tracks, photos)
+            what = "the diffusion model needs the fused clouds of the drive"
+            raise UsageError(what, remedy="give --fused, as `mudg fuse` wrote it")
+        plan, cloud = drive.plan, records.cleared_cloud(drive.cloud, drive.plan)
+        photos = records.photos_of_edited(recorded_images(recorded, SynthesizeConfig()), plan)
+        return cls(fitted, plan, cloud, drive.scene.tracks, photos)
+
+    def conditions(self, rules: ConditionRules, *how: InWeather) -> ConditionSources:
+        """What conditions of views of the drive are made of, in weather if there is some."""
+        render, vacated = functools.partial(render_planes, self.fitted), vacated_at(self.plan)
+        return ConditionSources(self.cloud, self.tracks, self.photos, rules, render, None, vacated, *how)
 
 
 def touched_pixels(plan: EditPlan, view: View, pictures: tuple[Observation, Observation]) -> Touched:
-    """What edits touch in a view.
-
-    Args:
-        pictures: renders of the view without and with the edits.
-    """
+    """What edits touch in a view, of which there are renders without and with the edits."""
     usual, made = pictures
     before, after = (touched_boxes(plan, view.time_s, when) for when in ("before", "after"))
-    differs = ((made.rgb - usual.rgb).abs().amax(0) > CHANGED_ABOVE).numpy()
-    differs = np.asarray(ndimage.binary_dilation(differs, iterations=GROWN_PX), bool) if differs.any() else differs
+    differs = ((made.rgb - usual.rgb).abs().amax(0) > records.CHANGED_ABOVE).numpy()
+    if differs.any():
+        differs = np.asarray(ndimage.binary_dilation(differs, iterations=records.GROWN_PX), bool)
     old_ground, new_box, new_ground = ground_mask(view, before), boxes_mask(view, after), ground_mask(view, after)
     near = new_box | ground_mask(view, after, CONTACT_REACH)
     uncovered = differs & (boxes_mask(view, before) | old_ground) & ~near
@@ -244,28 +220,16 @@ class Harmoniser:
         self.window, overlap = model.config.window, PUBLISHED_OVERLAP if model.points_alone else OVERLAP
         self._overlap = min(overlap, self.window - 1)
         width, height = model.image_size(*size, 0)
-        rules = ConditionRules(
-            width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=model.points_alone
-        )
-        given = ConditionSources(
-            sources.cloud,
-            sources.tracks,
-            sources.photos,
-            rules,
-            functools.partial(render_planes, sources.fitted),
-            None,
-            vacated_at(sources.plan),
-        )
-        self._maker = ViewMaker(model, given, self._settings, None if model.points_alone else self._start_at)
+        alone = model.points_alone
+        rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=alone)
+        self._maker = ViewMaker(model, sources.conditions(rules), self._settings, None if alone else self._start_at)
         self._parts: list[tuple[Observation, Touched]] = []
 
     def _start_at(self, views: Sequence[View]) -> StartClip:
         """The renders of the window that is being made, at the size that the model works at."""
-        size = views[0].camera.height, views[0].camera.width
+        size, config = (views[0].camera.height, views[0].camera.width), self._config
         renders, touched = [part[0] for part in self._parts], [part[1] for part in self._parts]
-        freedom = [
-            self._config.uncovered * (t.uncovered | t.shaded) + self._config.objects * t.objects for t in touched
-        ]
+        freedom = [config.uncovered * (t.uncovered | t.shaded) + config.objects * t.objects for t in touched]
         return start_clip(renders, freedom, size)
 
     def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
@@ -315,16 +279,11 @@ def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> Edit
     def draw(view: View) -> tuple[Observation, Observation]:
         return render_view(images.before, view, raster), render_view(images.after, view, raster)
 
-    views = {name: [f.view for f in edited.frames if f.view.camera.name == name] for name in edited.cameras}
-    made = {
-        name: (
-            Harmoniser(sources, config, (mine[0].camera.width, mine[0].camera.height), images.config.device).along(
-                mine, draw
-            )
-        )
-        for name, mine in views.items()
-        if mine
-    }
+    made = {}
+    for name in edited.cameras:
+        if views := [frame.view for frame in edited.frames if frame.view.camera.name == name]:
+            size = views[0].camera.width, views[0].camera.height
+            made[name] = Harmoniser(sources, config, size, images.config.device).along(views, draw)
     return replace(images, repaired=made)
 
 
@@ -356,10 +315,9 @@ class RepairedViews:
         return next(made for own, made in self._left if own is view)
 
 
-# harmonised weather -------------------------------------------------------------------------------
+# -- weather ---------------------------------------------------------------------------------------
 #
 # Views in other weather or light that a published-type diffusion model makes, after the formulas of `core.weather`.
-#
 # The model is given points and a reference image in that weather, as in the paper's figure of edited backgrounds, and
 # makes the view from noise. It works at its own size: what it changes there is enlarged and added to the render, which
 # so keeps its detail. Depth, classes and confidence stay as rendered.
@@ -394,16 +352,7 @@ class WeatherHarmoniser:
         self._request = loading.request_of(settings, loading.half_of(settings) == torch.bfloat16)
         width, height = self._model.image_size(*size, 0)
         rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=True)
-        self._given = ConditionSources(
-            sources.cloud,
-            sources.tracks,
-            sources.photos,
-            rules,
-            functools.partial(render_planes, sources.fitted),
-            None,
-            vacated_at(sources.plan),
-            how,
-        )
+        self._given = sources.conditions(rules, how)
         self._kept: dict[int, WarpSource] = {}
 
     def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:

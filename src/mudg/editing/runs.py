@@ -14,6 +14,7 @@ from mudg.base.run_folder import known_input
 
 BEST_FIRST: Final = ("mudg_s", "street_gaussians")
 """Fits that ``mudg run`` makes; where one has to speak for all, the first that is there."""
+NO_FIT: Final = "this folder holds no fitted scene"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,13 +54,9 @@ def find_run(folder: Path, scene: Path | None = None, fused: Path | None = None)
     there = {"fit": bool(fits), "scene": own_scene is not None, "fuse": (own_fused / "fuse.json").is_file()}
     if not all(there.values()):
         missing = [name for name, found in there.items() if not found]
-        raise InputError(
-            "this folder holds no fitted scene",
-            where=str(folder),
-            expected="a folder made by `mudg fit`, or by a finished `mudg run` or `mudg demo`",
-            got=f"no {', no '.join(missing)}" if folder.is_dir() else "no such folder",
-            remedy=similar_path(folder),
-        )
+        expected = "a folder made by `mudg fit`, or by a finished `mudg run` or `mudg demo`"
+        got = f"no {', no '.join(missing)}" if folder.is_dir() else "no such folder"
+        raise InputError(NO_FIT, where=str(folder), expected=expected, got=got, remedy=similar_path(folder))
     return RunParts(fits, scene or own_scene, fused or own_fused, True)
 
 
@@ -91,12 +88,8 @@ def scene_at(path: Path) -> Path:
     found = scene_of_run(path)
     if found is None:
         what = "folder is not a scene: it has no scene.json" if path.is_dir() else "no such file or folder"
-        raise InputError(
-            what,
-            where=str(path),
-            expected="a scene made by `mudg ingest` or `mudg annotate`, or a folder made by `mudg run`",
-            remedy=similar_path(path),
-        )
+        expected = "a scene made by `mudg ingest` or `mudg annotate`, or a folder made by `mudg run`"
+        raise InputError(what, where=str(path), expected=expected, remedy=similar_path(path))
     return found
 
 
@@ -105,12 +98,8 @@ def fused_at(path: Path) -> Path:
     for folder in (path, path / "fuse", known_input(path, "fused") or path):
         if (folder / "fuse.json").is_file():
             return folder
-    raise InputError(
-        "file not found",
-        where=str(path / "fuse.json"),
-        expected="a folder made by `mudg fuse`, or by `mudg run`",
-        remedy=similar_path(path),
-    )
+    where, expected = str(path / "fuse.json"), "a folder made by `mudg fuse`, or by `mudg run`"
+    raise InputError("file not found", where=where, expected=expected, remedy=similar_path(path))
 
 
 def fit_at(path: Path, order: Sequence[str] = BEST_FIRST) -> Path:
@@ -118,13 +107,8 @@ def fit_at(path: Path, order: Sequence[str] = BEST_FIRST) -> Path:
     for folder in (path, *(path / "fit" / name for name in order)):
         if (folder / "model.json").is_file():
             return folder
-    raise InputError(
-        "this folder holds no fitted scene",
-        where=str(path),
-        expected="a folder made by `mudg fit`, or by `mudg run`",
-        got="" if path.is_dir() else "no such folder",
-        remedy=similar_path(path),
-    )
+    expected, got = "a folder made by `mudg fit`, or by `mudg run`", "" if path.is_dir() else "no such folder"
+    raise InputError(NO_FIT, where=str(path), expected=expected, got=got, remedy=similar_path(path))
 
 
 def plain_fit_at(path: Path) -> Path:
@@ -140,18 +124,12 @@ def views_at(path: Path, name: str = "") -> Path:
     return next((folder for folder in folders if is_run and folder.is_dir()), path)
 
 
-PARTS: Final = {
-    "scene": scene_at,
-    "fused": fused_at,
-    "model": fit_at,
-    "fitted": plain_fit_at,
-    "start_from": plain_fit_at,
-}
+_PLAIN: Final = {"fitted": plain_fit_at, "start_from": plain_fit_at}
+PARTS: Final = {"scene": scene_at, "fused": fused_at, "model": fit_at, **_PLAIN}
 """Inputs of commands, and how each is found at a path."""
 _WORDS: Final = {
     "fused": "point clouds made by `mudg fuse`",
-    "model": "a folder made by `mudg fit`",
-    "fitted": "a folder made by `mudg fit`",
+    **dict.fromkeys(("model", "fitted"), "a folder made by `mudg fit`"),
 }
 
 
@@ -171,9 +149,8 @@ def parts_of(given: Mapping[str, Any], required: Sequence[str] = ()) -> dict[str
     for name, path in given.items():
         if path is None and name in required:
             if not is_run:
-                raise UsageError(
-                    f"no --{name} was given", expected=f"{_WORDS[name]}, or the folder of a run in the place of SCENE"
-                )
+                expected = f"{_WORDS[name]}, or the folder of a run in the place of SCENE"
+                raise UsageError(f"no --{name} was given", expected=expected)
             path = scene
         if path is not None and name in PARTS:
             found[name] = PARTS[name](Path(path))

@@ -14,7 +14,7 @@ from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import CLASSES, ID
 from mudg.base.run_folder import ResultFile, RunDir
-from mudg.editing.assets import write_asset
+from mudg.editing.apply import write_asset
 from mudg.editing.model import Asset
 from mudg.exporting.export import model_of_cloud
 from mudg.exporting.settings import ImportConfig

@@ -33,7 +33,7 @@ from mudg.core.street_scores import (
     VEHICLE_LABELS,
     ImageBox,
 )
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.scene.read import read_points
 from mudg.scoring import tables as score_tables
 from mudg.scoring.truth import SAME_SWEEP_S

@@ -23,7 +23,7 @@ from mudg.core.fusion import STATIC
 from mudg.core.metrics import LaneFacts, Pair, ViewFacts
 from mudg.core.street_scores import VEHICLE_LABELS, visible_agents
 from mudg.core.view_metrics import AgentIou, LaneIou
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.labels.ground import driven_path, ground_near
 from mudg.labels.inputs import box_outline
 from mudg.scene.labels import read_label

@@ -32,7 +32,7 @@ from mudg.core.losses import LPIPS_EPSILON
 from mudg.core.metrics import ViewFacts
 from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
 from mudg.diffusion import files as mdm_files
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.perception import lpips_network
 from mudg.networks.featnets import WHOLE_PIXELS, CodecFeatures, LpipsTrunk, PerceptualDistance
 from mudg.scene.clouds import read_fused

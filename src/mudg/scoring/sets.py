@@ -29,7 +29,7 @@ from mudg.base.weights import read_checkpoint
 from mudg.core import feature_distances
 from mudg.core.feature_distances import cmmd_distance, frechet_distance, polynomial_distance
 from mudg.core.pictures import resize_rgb, to_bytes
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import clip_image, dinov2, i3d, inception
 from mudg.scene.read import read_image
 from mudg.scoring import tables as score_tables

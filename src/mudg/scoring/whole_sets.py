@@ -15,7 +15,7 @@ from mudg.base import log
 from mudg.base.errors import InputError
 from mudg.base.types import Scene
 from mudg.core.pictures import to_bytes
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.scene.observations import ObservationSet, read_observations
 from mudg.scoring import detections
 from mudg.scoring.detections import Detections, ViewImages, detections_of

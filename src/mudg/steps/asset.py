@@ -53,9 +53,9 @@ class AssetExport(Result):
         return {"id": self.track_id}
 
     def prepare(self, inputs: dict[str, str]) -> Make:
-        from mudg.editing import assets, runs
+        from mudg.editing import apply, runs
 
-        return partial(assets.write_asset_from, runs.find_run(self.source, self.scene), self.track_id)
+        return partial(apply.write_asset_from, runs.find_run(self.source, self.scene), self.track_id)
 
 
 def refuse_other_name(out: Path) -> None:

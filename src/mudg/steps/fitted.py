@@ -125,7 +125,7 @@ class FittedScene:
         Raises:
             InputError: the script is not valid, or asks for what cannot be done here.
         """
-        from mudg.editing.carried import carry_out
+        from mudg.editing.apply import carry_out
         from mudg.editing.script import read_edits
 
         drive = carry_out(read_edits(script), self._model, scene)
@@ -139,7 +139,7 @@ class FittedScene:
                 it was seen.
         """
         from mudg.base.run_folder import ResultFile
-        from mudg.editing.assets import complete_asset, write_asset
+        from mudg.editing.apply import complete_asset, write_asset
         from mudg.editing.model import asset_of
 
         model, views = self._model, () if scene is None else tuple(frame.view for frame in scene.frames)

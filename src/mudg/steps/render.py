@@ -13,7 +13,7 @@ from mudg.steps.outputs import Output
 from mudg.steps.step import FILE_YAML, Flag
 
 if TYPE_CHECKING:
-    from mudg.editing.view_settings import RenderConfig
+    from mudg.editing.settings import RenderConfig
 
 
 class RenderViews(Output):

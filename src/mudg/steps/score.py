@@ -15,7 +15,7 @@ from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import RunDir
-    from mudg.editing.view_settings import ScoreConfig
+    from mudg.editing.settings import ScoreConfig
 
 _FILES = (
     "lpips_weights",

@@ -54,7 +54,7 @@ class Synthesize(Output):
 
     def checked(self) -> Self:
         from mudg.diffusion.views import check_config
-        from mudg.editing.generated import shows_weather
+        from mudg.editing.edit import shows_weather
 
         script, renders = script_of(self.edits), self.fitted is not None
         weather = script is not None and shows_weather(self.settings, script, renders)
@@ -75,7 +75,7 @@ class Synthesize(Output):
 
     def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.diffusion.synthesize import JobInputs, write_views
-        from mudg.editing.generated import edited_drive, edited_scene
+        from mudg.editing.edit import edited_drive, edited_scene
         from mudg.gaussians.storage import model_of_scene
         from mudg.scene.read import read_scene
 

@@ -24,13 +24,11 @@ from mudg.base.types import Camera, FusedCloud, Observation, Scene, View
 from mudg.core.edit import Motion
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.diffusion.clips.inputs import InWeather
-from mudg.editing.apply import left_behind, street_left
-from mudg.editing.carried import FACT, EditedDrive, carry_out
+from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, left_behind, street_left, weather_of
 from mudg.editing.model import motion_of
 from mudg.editing.plan import EditPlan
 from mudg.editing.runs import find_run
-from mudg.editing.script import EditScript, parse_edits, read_edits
-from mudg.editing.weathered import Drawer, conditions_of, in_weather, weather_of
+from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edits
 from mudg.formats.exporters.video import mp4_bytes
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode

@@ -20,9 +20,8 @@ from mudg.base.run_folder import ResultFile, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import HeightMap
 from mudg.core.raster.place import drawing_device
-from mudg.editing.apply import ground_of
+from mudg.editing.apply import SEED, ground_of
 from mudg.editing.runs import RunParts, find_run
-from mudg.editing.weathered import SEED
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.storage import load_model, model_of_scene
 from mudg.scene.clouds import read_fused

@@ -23,9 +23,9 @@ HOMES: Final[Mapping[str, str]] = {
     "LearnConfig": "mudg.diffusion.settings.learn:LearnConfig",
     "PageConfig": "mudg.viewer.settings:PageConfig",
     "PresetName": "mudg.steps.settings.presets:PresetName",
-    "RenderConfig": "mudg.editing.view_settings:RenderConfig",
+    "RenderConfig": "mudg.editing.settings:RenderConfig",
     "RunConfig": "mudg.steps.settings.run:RunConfig",
-    "ScoreConfig": "mudg.editing.view_settings:ScoreConfig",
+    "ScoreConfig": "mudg.editing.settings:ScoreConfig",
     "SynthesizeConfig": "mudg.diffusion.settings.synthesize:SynthesizeConfig",
     "ViewConfig": "mudg.viewer.settings:ViewConfig",
 }

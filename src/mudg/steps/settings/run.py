@@ -9,7 +9,7 @@ from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
 from mudg.diffusion.settings.adapt import AdaptConfig
 from mudg.diffusion.settings.synthesize import SynthesizeConfig
-from mudg.editing.view_settings import RenderConfig, ScoreConfig
+from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians.settings import FitConfig
 from mudg.labels.settings import AnnotateConfig
