@@ -35,8 +35,7 @@ from mudg.gaussians.methods import METHODS
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Fuse, Ingest
 
 PSNR, FID = PAPERS.columns["psnr"], PAPERS.columns["fid"]
 TOY_YAML = """

@@ -32,9 +32,8 @@ from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_image, read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
-from mudg.steps.settings.presets import run_preset
+from mudg.steps.ingest import Fuse, Ingest
+from mudg.steps.settings import run_preset
 
 MODALITIES = 3
 

@@ -40,8 +40,7 @@ from mudg.scene.part import write_part
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import SceneWriter
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Fuse, Ingest
 
 CITY = {
     "n_frames": 6,

@@ -20,7 +20,7 @@ from mudg.editing.settings import ScoreConfig
 from mudg.networks import i3d, inception
 from mudg.scoring import converted
 from mudg.steps.convert import Convert
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 
 STATES = {
     "inception": lambda: {**toy_inception.state(), "Conv2d_1a_3x3.bn.num_batches_tracked": torch.tensor(3)},

@@ -38,7 +38,7 @@ from mudg.gaussians.nodes import DeformableNode, RigidNode, StaticNode
 from mudg.gaussians.rendering import render_view
 from mudg.gaussians.sky import SkyNode
 from mudg.gaussians.start import SH_C0
-from mudg.steps.settings.presets import DEMO_CITY
+from mudg.steps.settings import DEMO_CITY
 
 SIZE = (4.0, 2.0, 1.5)
 

@@ -34,7 +34,7 @@ from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.edit import Edit
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Fuse
 from mudg.steps.render import RenderViews
 
 FRAMES = 4

@@ -20,7 +20,7 @@ from mudg.editing.settings import ScoreConfig
 from mudg.networks import clip_image, dinov2
 from mudg.scoring import tables as score_tables
 from mudg.scoring.sets import subject_consistency
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 
 
 def images(count: int, side: int, seed: int = 0) -> torch.Tensor:

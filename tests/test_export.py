@@ -41,7 +41,7 @@ from mudg.gaussians.fit import render_view
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import DeformableNode, RigidNode
 from mudg.gaussians.storage import load_model, save_model
-from mudg.steps.asset import AssetImport
+from mudg.steps.edit import AssetImport
 from mudg.steps.export import Export
 
 LEAST_DB = {"ply": 50, "glb": 50, "usda": 50, "spz": 38, "compressed-ply": 38, "sog": 38, "splat": 30}

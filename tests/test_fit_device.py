@@ -54,9 +54,8 @@ from mudg.gaussians.sky import SkyNode
 from mudg.scene.observations import read_observations
 from mudg.scoring import score
 from mudg.steps.fit import Fit
-from mudg.steps.render import RenderViews
-from mudg.steps.score import Score
-from mudg.steps.settings.run import RunConfig, with_device
+from mudg.steps.render import RenderViews, Score
+from mudg.steps.settings import RunConfig, with_device
 
 SIZE, FRAMES = (36, 24), 4
 PRETEND = torch.device("pretend", 0)

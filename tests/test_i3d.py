@@ -18,7 +18,7 @@ from mudg.scene.read import read_scene
 from mudg.scoring import sets as distributions
 from mudg.scoring import sets as videos
 from mudg.scoring import tables as score_tables
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 from mudg.viewer import report as page
 
 

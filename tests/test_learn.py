@@ -15,7 +15,7 @@ from mudg.diffusion.clips import shards as clip_shards
 from mudg.diffusion.requests import GeneratedClip
 from mudg.diffusion.training import clips as learn_clips
 from mudg.diffusion.training import score as learn_score
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 
 @pytest.fixture(scope="module")

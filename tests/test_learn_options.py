@@ -17,7 +17,7 @@ from mudg.diffusion.model import MDM, MDMConfig
 from mudg.diffusion.settings.learn import LearnConfig, LearnData, LearnNetwork
 from mudg.diffusion.training import models as learn_models
 from mudg.diffusion.training.state import TrainingState
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 
 @pytest.fixture(scope="module")

@@ -22,7 +22,7 @@ from mudg.diffusion.training import models as learn_models
 from mudg.diffusion.training import parallel as learn_parallel
 from mudg.diffusion.training.parallel import Ranks
 from mudg.diffusion.training.state import TrainingState, read_rows
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 SAME = 2e-6
 """Relative. The same sums in another order; measured for 1 -> 2 ddp -> 2 fsdp -> 1 over 6 steps: 7e-8 (pytest -s shows

@@ -44,17 +44,13 @@ from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import write_zip
 from mudg.steps import pipeline
-from mudg.steps.annotate import Annotate
 from mudg.steps.convert import Convert
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
-from mudg.steps.learn import Learn
-from mudg.steps.render import RenderViews
+from mudg.steps.ingest import Annotate, Fuse, Ingest
+from mudg.steps.render import DrawTruth, RenderViews, Score
 from mudg.steps.run import Run
-from mudg.steps.score import DrawTruth, Score
-from mudg.steps.settings.run import RunConfig
-from mudg.steps.synthesize import Synthesize
+from mudg.steps.settings import RunConfig
+from mudg.steps.synthesize import Learn, Synthesize
 
 SMALL = MDMConfig(
     widths=(16, 32),

@@ -27,7 +27,7 @@ from mudg.base.errors import InputError
 from mudg.base.types import Observation
 from mudg.editing.script import read_edits
 from mudg.editing.settings import ScoreConfig
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 from mudg.viewer import report
 from mudg.viewer import report as report_page
 

@@ -19,7 +19,7 @@ from mudg.diffusion import learn
 from mudg.diffusion.clips.sources import FolderOfShards, ShardCache, StreamedShards
 from mudg.diffusion.training import clips as learn_clips
 from mudg.diffusion.training.scene_list import ListedScene, ListedShards, SceneList, is_list, read_list
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from mudg.editing.settings import ScoreConfig
 from mudg.networks import featnets
 from mudg.scoring import score
 from mudg.scoring import tables as score_tables
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 
 PLAIN = ScoreConfig(perceptual_views=0)
 

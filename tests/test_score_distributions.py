@@ -23,7 +23,7 @@ from mudg.scoring import score
 from mudg.scoring import sets as distributions
 from mudg.scoring import tables as score_tables
 from mudg.scoring.sets import Distributions, FeatureFiles, ImageSet, TrajectorySets
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 from mudg.viewer import report as page
 
 CPU = torch.device("cpu")

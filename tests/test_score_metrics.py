@@ -26,7 +26,7 @@ from mudg.editing.settings import ScoreConfig
 from mudg.networks.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance, lpips_shapes
 from mudg.scoring import score
 from mudg.scoring import tables as score_tables
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 
 
 def pair(**given) -> Pair:

@@ -26,7 +26,7 @@ from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
 from mudg.scoring import detections
 from mudg.scoring import tables as score_tables
-from mudg.steps.score import DrawTruth, Score
+from mudg.steps.render import DrawTruth, Score
 
 QUICK = ScoreConfig(perceptual_views=0, error_pictures=False)
 Change = Callable[[Observation], Observation]

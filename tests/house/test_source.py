@@ -47,7 +47,6 @@ TORCH_FREE = (
     "__main__.py",
     "app.py",
     "steps/*.py",
-    "steps/settings/*.py",
     "*/settings.py",
     "*/settings/*.py",
     "*/*_settings.py",

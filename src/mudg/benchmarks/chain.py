@@ -38,10 +38,9 @@ from mudg.scene.clouds import read_fused
 from mudg.scene.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
 from mudg.scene.read import read_scene
 from mudg.scoring import score
-from mudg.steps.engine import Result
+from mudg.steps.engine import Output, Result
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.outputs import Output
+from mudg.steps.ingest import Fuse
 from mudg.steps.pipeline import WITHOUT_DIFFUSION, fits_of
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize

@@ -46,7 +46,7 @@ from mudg.scene.read import read_image, read_scene
 from mudg.scoring import truth
 from mudg.scoring.score import evenly
 from mudg.scoring.truth import SAME_PLACE_M, SAME_TIME_S, LogPoints, apart_m
-from mudg.steps.outputs import Output
+from mudg.steps.engine import Output
 
 LEAST_SEEN: Final = 0.05
 """Cameras of whose pixels the shown cameras saw less than this share are left out."""

@@ -63,7 +63,7 @@ from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.methods import METHODS
 from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, compared, distances
 from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
-from mudg.steps.settings.presets import PresetName
+from mudg.steps.settings import PresetName
 
 PAGES: Final = ("bench.json", "bench.md", "bench.csv", "bench.tex", "page.html")
 ANCHORS: Final = {TRUTH: "the truth itself", FILL: "fused points, holes filled"}

@@ -38,11 +38,10 @@ from mudg.labels import annotate
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.part import write_part
 from mudg.scene.read import read_scene
-from mudg.steps.annotate import Annotate
-from mudg.steps.ingest import Ingest
-from mudg.steps.outputs import Output
-from mudg.steps.score import DrawTruth, Score
-from mudg.steps.settings.run import on_device
+from mudg.steps.engine import Output
+from mudg.steps.ingest import Annotate, Ingest
+from mudg.steps.render import DrawTruth, Score
+from mudg.steps.settings import on_device
 
 CITY: Final = "city:"
 """How the name of a list of generated cities begins."""

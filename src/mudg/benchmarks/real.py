@@ -52,10 +52,9 @@ from mudg.editing import render
 from mudg.editing.settings import RenderConfig
 from mudg.scene.part import write_part
 from mudg.scene.read import read_scene
-from mudg.steps.adapt import Adapt
-from mudg.steps.outputs import Output
-from mudg.steps.settings.presets import PresetName
-from mudg.steps.settings.run import on_device
+from mudg.steps.engine import Output
+from mudg.steps.settings import PresetName, on_device
+from mudg.steps.synthesize import Adapt
 
 PAGES: Final = ("bench.json", "bench.md", "page.html")
 

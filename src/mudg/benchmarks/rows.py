@@ -28,7 +28,7 @@ from mudg.networks.inception import ResizeRule
 from mudg.scoring import score
 from mudg.scoring.tables import title_of
 from mudg.steps.pipeline import CONTINUED_SHARE, WITHOUT_DIFFUSION, refuse_missing
-from mudg.steps.settings.presets import PresetName
+from mudg.steps.settings import PresetName
 
 FILE: Final = Path(__file__).with_name("papers.yaml")
 RECORDED: Final = "0"

@@ -35,7 +35,7 @@ from mudg.diffusion import files as mdm_files
 from mudg.diffusion.published.model import is_published
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.pipeline import refuse_missing
-from mudg.steps.settings.presets import PresetName
+from mudg.steps.settings import PresetName
 
 _FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "edited/", "fits/", "rows/*.json")
 EDIT, SHIFT, REAL, PAPER = "edit", "shift", "real", "paper"

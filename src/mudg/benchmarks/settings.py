@@ -10,7 +10,7 @@ from mudg.diffusion.settings.synthesize import SynthesizeConfig
 from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.settings import FuseConfig
-from mudg.steps.settings.presets import PresetName, run_preset
+from mudg.steps.settings import PresetName, run_preset
 
 
 @settings

@@ -39,7 +39,7 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
 from mudg.city.logs import STANDARD, LogRules
 from mudg.diffusion import files as mdm_files
-from mudg.steps.settings.presets import PresetName
+from mudg.steps.settings import PresetName
 
 SHIFTED: Final = "shifted"
 """The mean over the lateral distances."""

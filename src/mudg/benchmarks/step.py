@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from mudg.steps.outputs import Output
+from mudg.steps.engine import Output
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
     from mudg.benchmarks.settings import BenchConfig
-    from mudg.steps.settings.presets import PresetName
+    from mudg.steps.settings import PresetName
 
 
 class Bench(Output):

@@ -91,12 +91,8 @@ def read_detections(path: Path) -> dict[str, list[Detection]]:
                 sizes[image["id"]] = (str(image["file_name"]), *scale)
             content = content["annotations"]
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-            raise InputError(
-                "malformed file of boxes",
-                where=str(path),
-                expected="images (id, file_name, width, height) and annotations",
-                got=repr(error),
-            ) from error
+            expected, got = "images (id, file_name, width, height) and annotations", repr(error)
+            raise InputError("malformed file of boxes", where=str(path), expected=expected, got=got) from error
     if not isinstance(content, list):
         raise InputError("a file of boxes holds no list", where=str(path), expected=_BOXES, got=type(content).__name__)
     found: dict[str, list[Detection]] = {}
@@ -118,19 +114,13 @@ def _parsed(record: Any, sizes: Mapping[Any, tuple[str, float, float]], where: s
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError("a detected box is malformed", where=where, expected=_BOXES, got=repr(record)[:120]) from error
     if not all(map(math.isfinite, (x, y, width, height, score))) or width < 0 or height < 0 or not 0 <= score <= 1:
-        raise InputError(
-            "a detected box is impossible",
-            where=where,
-            expected="finite numbers, sizes of at least 0, a score in 0..1",
-            got=repr(record)[:120],
-        )
+        expected = "finite numbers, sizes of at least 0, a score in 0..1"
+        raise InputError("a detected box is impossible", where=where, expected=expected, got=repr(record)[:120])
     if sizes and given not in sizes:
-        raise InputError(
-            "a detected box belongs to no image", where=where, got=str(given), expected="an id of the images"
-        )
-    return image_name(name), Detection(
-        np.array([x * across, y * down, (x + width) * across, (y + height) * down]), category, score
-    )
+        what, got = "a detected box belongs to no image", str(given)
+        raise InputError(what, where=where, got=got, expected="an id of the images")
+    box = np.array([x * across, y * down, (x + width) * across, (y + height) * down])
+    return image_name(name), Detection(box, category, score)
 
 
 def image_name(given: str) -> str:
@@ -168,23 +158,17 @@ class BoxDetections:
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, for metrics.json."""
+        published, sweeps = "as published: corners behind the camera are not cut off", bool(self._scene.sweeps)
+        counted = "counted in the sweeps taken with the view"
         return {
             "file_sha256": self.sha256,
             "confidence_above": NTA_CONFIDENCE,
             "reach_px": street_scores.NTA_REACH_PX,
             "size": [NTA_WIDTH_PX, NTA_HEIGHT_PX],
             "classes": "all; beside it COCO's car and bus alone (2 and 5)",
-            "boxes": (
-                "as published: corners behind the camera are not cut off"
-                if self._as_published
-                else "cut at the near plane"
-            ),
-            "fewest_points": NTA_FEWEST_POINTS if self._scene.sweeps else None,
-            "points": (
-                "counted in the sweeps taken with the view"
-                if self._scene.sweeps
-                else "no sweeps: boxes of any number count"
-            ),
+            "boxes": published if self._as_published else "cut at the near plane",
+            "fewest_points": NTA_FEWEST_POINTS if sweeps else None,
+            "points": counted if sweeps else "no sweeps: boxes of any number count",
         }
 
     def _tracks_at(self, view: View) -> Sequence[Track]:
@@ -221,13 +205,9 @@ class LaneDetections:
 
     def __init__(self, scene: Scene, folder: Path) -> None:
         if scene.source.recipe is None:
-            raise InputError(
-                "the log has no lane lines to hold detected lanes against",
-                where=scene.root,
-                got=scene.source.dataset,
-                expected="a generated city: prepared logs keep no map",
-                remedy="leave out --lanes",
-            )
+            what = "the log has no lane lines to hold detected lanes against"
+            got, expected = scene.source.dataset, "a generated city: prepared logs keep no map"
+            raise InputError(what, where=scene.root, got=got, expected=expected, remedy="leave out --lanes")
         if not folder.is_dir():
             raise InputError("no such folder of lane masks", where=str(folder))
         self._lines = CityWorld.from_source(scene.source).lane_lines()
@@ -248,19 +228,14 @@ class LaneDetections:
             values.append(street_scores.ntl_iou(found, true))
             union = int((found | true).sum())
             lanes.append(float((found & true).sum() / union) if union else 0.0)
-        return {
-            "frames": len(values),
-            "value": round(sum(values) / len(values), 6),
-            "lanes": round(sum(lanes) / len(lanes), 6),
-        }
+        mean = lambda numbers: round(sum(numbers) / len(numbers), 6)  # noqa: E731
+        return {"frames": len(values), "value": mean(values), "lanes": mean(lanes)}
 
     def against(self, images: ViewImages, true: ViewImages) -> float | None:
         """The second convention: masks of the images against the detector's own masks of the true images; None where
         those are missing."""
-        pairs = [
-            (self._folder / f"{a}.png", self._folder / f"{b}.png")
-            for a, b in zip(images.names(), true.names(), strict=True)
-        ]
+        names = zip(images.names(), true.names(), strict=True)
+        pairs = [[self._folder / f"{name}.png" for name in pair] for pair in names]
         if not pairs or not all(path.is_file() for pair in pairs for path in pair):
             return None
         masks = [[street_scores.at_lane_size(read_mask(path)) for path in pair] for pair in pairs]

@@ -10,9 +10,10 @@ interrupted run does not compute a set again.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -97,19 +98,12 @@ class SetDistances:
 
     def record(self) -> dict[str, Any]:
         """As JSON values, rounded to 6 digits after the point."""
-        values = {
-            "kid_standard_error": self.kid_standard_error,
-            "mind": self.mind,
-            "fid_at_infinity": self.fid_at_infinity,
-        }
-        return {
-            "n": self.n,
-            "n_reference": self.n_reference,
-            **{k: None if v is None else round(v, 6) for k, v in values.items()},
-        }
+        values = {name: getattr(self, name) for name in ("kid_standard_error", "mind", "fid_at_infinity")}
+        rounded = {name: None if value is None else round(value, 6) for name, value in values.items()}
+        return {"n": self.n, "n_reference": self.n_reference, **rounded}
 
 
-@dataclass(frozen=True)
+@dataclass
 class EmbeddingFiles:
     """Embeddings of sets of images by a network, kept in a folder.
 
@@ -145,8 +139,8 @@ class EmbeddingFiles:
         return np.concatenate(batches)
 
 
-class FeatureFiles:
-    """Features of sets of images by FID's network, kept in a folder.
+class FeatureFiles(EmbeddingFiles):
+    """Features f32[n, 2048] of sets of images by FID's network, kept in a folder.
 
     Args:
         weights: file with the network's weights. rule: how images get its size. folder: where features are kept.
@@ -157,26 +151,13 @@ class FeatureFiles:
     """
 
     def __init__(self, weights: Path, rule: inception.ResizeRule, folder: Path, device: torch.device) -> None:
-        self.rule: inception.ResizeRule = rule
-        state = read_checkpoint(weights)
-        self.sha256, self.source_sha256 = store.sha256_file(weights), source_sha256(weights)
+        state, sha256 = read_checkpoint(weights), store.sha256_file(weights)
         network = inception.InceptionFeatures(state, str(weights)).to(device)
-        self._files = EmbeddingFiles(
-            lambda batch: network(batch)["2048"],
-            lambda rgb: inception.prepared(rgb, rule),
-            inception.WIDTH,
-            f"Inception {self.sha256} {rule}",
-            folder,
-            device,
-        )
-
-    def of(self, images: ImageSet) -> NDArray[np.float32]:
-        """Features f32[n, 2048] of a set."""
-        return self._files.of(images)
-
-    def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
-        """The name of the file that holds the features of a set, and the features."""
-        return self._files.named(images)
+        prepare = functools.partial(inception.prepared, rule=rule)
+        key = f"Inception {sha256} {rule}"
+        super().__init__(lambda batch: network(batch)["2048"], prepare, inception.WIDTH, key, folder, device)
+        self.rule: inception.ResizeRule = rule
+        self.sha256, self.source_sha256 = sha256, source_sha256(weights)
 
 
 def kept_features(
@@ -210,16 +191,25 @@ def recorded_images(scene: Scene, sets: TrajectorySets) -> ImageSet:
     return ImageSet(len(frames), lambda number: read_image(scene, frames[number])).resized(sets.width, sets.height)
 
 
-@dataclass(frozen=True)
-class FeatureSets:
-    """Which files of features were compared, so that sets of several logs can be pooled: one record per method and
-    trajectory."""
+class SetNotes:
+    """Which files of features were compared, so that sets of several logs can be pooled, one record per method and
+    trajectory; and the floors."""
 
-    records: list[dict[str, str]] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.sets: list[dict[str, str]] = []
+        self.floors: list[dict[str, Any]] = []
 
     def note(self, trajectory: str, method: str, made: str, reference: str) -> None:
         """Note the names of two files in the folder of features."""
-        self.records.append({"trajectory": trajectory, "method": method, "made": made, "reference": reference})
+        self.sets.append({"trajectory": trajectory, "method": method, "made": made, "reference": reference})
+
+    def note_floor(self, trajectory: str, how: str, values: Mapping[str, Any]) -> None:
+        """Note what the truth itself scores."""
+        self.floors.append({"trajectory": trajectory, "how": how, **values})
+
+    def record(self) -> dict[str, Any]:
+        """For metrics.json."""
+        return {"floors": self.floors, "sets": self.sets}
 
 
 class Distributions:
@@ -232,8 +222,7 @@ class Distributions:
     def __init__(self, scene: Scene, features: FeatureFiles) -> None:
         self._scene, self._features = scene, features
         self._recorded: dict[tuple[str, int, int], tuple[str, NDArray[np.float32]]] = {}
-        self._floors: list[dict[str, Any]] = []
-        self._sets = FeatureSets()
+        self._notes = SetNotes()
 
     def of(self, sets: TrajectorySets) -> dict[str, SetDistances | str]:
         """Distances by method, or why there are none; the floor of the trajectory is noted for ``record``.
@@ -243,12 +232,9 @@ class Distributions:
         """
         counts = {method: images.count for method, images in sets.methods.items()}
         if len(set(counts.values())) > 1:
-            raise InputError(
-                "FID of sets of different size cannot be compared",
-                where=sets.name,
-                expected="the same views for all methods",
-                got=", ".join(f"{method}: {count}" for method, count in counts.items()),
-            )
+            what, expected = "FID of sets of different size cannot be compared", "the same views for all methods"
+            got = ", ".join(f"{method}: {count}" for method, count in counts.items())
+            raise InputError(what, where=sets.name, expected=expected, got=got)
         name, reference = self._reference(sets)
         if not len(reference):
             return dict.fromkeys(counts, score_tables.NO_TRUTH)
@@ -257,7 +243,7 @@ class Distributions:
         found: dict[str, SetDistances | str] = {}
         for method, images in sets.methods.items():
             own, made = self._features.named(images.resized(sets.width, sets.height))
-            self._sets.note(sets.name, method, own, name)
+            self._notes.note(sets.name, method, own, name)
             found[method] = distances(made, reference)
         self._note_floor(sets, reference)
         return found
@@ -271,8 +257,7 @@ class Distributions:
             "resize": self._features.rule,
             "reference": "recorded frames of the same camera",
             "covariance": "n - 1",
-            "floors": self._floors,
-            "sets": self._sets.records,
+            **self._notes.record(),
         }
 
     def _reference(self, sets: TrajectorySets) -> tuple[str, NDArray[np.float32]]:
@@ -290,7 +275,7 @@ class Distributions:
         else:
             return
         values = {"fid": round(found.fid, 6), "kid": round(found.kid, 6), **found.record()}
-        self._floors.append({"trajectory": sets.name, "how": how, **values})
+        self._notes.note_floor(sets.name, how, values)
 
 
 def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> Distributions | None:
@@ -301,41 +286,34 @@ def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> Distributi
     """
     if not config.fid_weights:
         return None
-    device = choose_device(config.device, "networks of the scores")
-    return Distributions(
-        scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, out / FEATURES_FOLDER, device)
-    )
+    device, folder = choose_device(config.device, "networks of the scores"), out / FEATURES_FOLDER
+    return Distributions(scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, folder, device))
 
 
 def distances(made: NDArray[np.float32], reference: NDArray[np.float32]) -> SetDistances:
     """All distances of two sets of features ``[n, d]``, at least two rows each; rows in order of time."""
     blocks = tuple(np.arange(len(rows)) // BLOCK_FRAMES for rows in (made, reference))
-    error = None
+    error, at_infinity, rng = None, None, lambda purpose: seeds.numpy_rng(0, 0, purpose)
     if all(len(set(numbers.tolist())) >= FEWEST_BLOCKS for numbers in blocks):
-        error = feature_distances.kernel_distance_error(made, reference, blocks, seeds.numpy_rng(0, 0, "blocks of KID"))
-    many = min(len(made), len(reference)) >= FEWEST_TO_EXTRAPOLATE
+        error = feature_distances.kernel_distance_error(made, reference, blocks, rng("blocks of KID"))
+    if min(len(made), len(reference)) >= FEWEST_TO_EXTRAPOLATE:
+        at_infinity = feature_distances.frechet_at_infinity(made, reference, rng("sizes of FID"))
     return SetDistances(
         n=len(made),
         n_reference=len(reference),
         fid=feature_distances.frechet_distance(made, reference),
         kid=feature_distances.kernel_distance(made, reference),
         kid_standard_error=error,
-        mind=feature_distances.mind_distance(made, reference, seeds.numpy_rng(0, 0, "directions of MIND")),
-        fid_at_infinity=(
-            feature_distances.frechet_at_infinity(made, reference, seeds.numpy_rng(0, 0, "sizes of FID"))
-            if many
-            else None
-        ),
+        mind=feature_distances.mind_distance(made, reference, rng("directions of MIND")),
+        fid_at_infinity=at_infinity,
     )
 
 
-# videos -------------------------------------------------------------------------------------------
+# -- videos ----------------------------------------------------------------------------------------
 #
-# FVD of a method on a trajectory: its clips as a set, against the clips of the recorded video of the same camera.
-#
-# All views count, in order: held-out frames alone are no video. Clips have 16 frames and begin at every eighth, so that
-# a drive of 40 frames gives four.
-
+# FVD of a method on a trajectory: its clips as a set, against the clips of the recorded video of the same camera. All
+# views count, in order: held-out frames alone are no video. Clips have 16 frames and begin at every eighth, so that a
+# drive of 40 frames gives four.
 
 CLIP_FRAMES: Final = 16
 HOP_FRAMES: Final = 8
@@ -402,8 +380,7 @@ class VideoDistances:
 
     def __init__(self, scene: Scene, clips: ClipFiles) -> None:
         self._scene, self._clips = scene, clips
-        self._floors: list[dict[str, Any]] = []
-        self._sets = FeatureSets()
+        self._notes = SetNotes()
 
     def of(self, sets: TrajectorySets) -> dict[str, dict[str, Any] | str]:
         """By method ``{"fvd", "n", "n_reference"}``, or why there is none; the floor of the trajectory is noted for
@@ -421,17 +398,15 @@ class VideoDistances:
         found: dict[str, dict[str, Any] | str] = {}
         for method, images in sets.methods.items():
             own, made = self._clips.named(images.resized(sets.width, sets.height))
-            self._sets.note(sets.name, method, own, name)
+            self._notes.note(sets.name, method, own, name)
             found[method] = compared(made, reference)
         half = len(reference) // 2
         if sets.truth is not None:
             floor = compared(self._clips.of(sets.truth.resized(sets.width, sets.height)), reference)
-            self._floors.append({"trajectory": sets.name, "how": "true images of the same views", **floor})
+            self._notes.note_floor(sets.name, "true images of the same views", floor)
         elif half >= FEWEST:
             floor = compared(reference[:half], reference[half:])
-            self._floors.append(
-                {"trajectory": sets.name, "how": "first half of the recorded video against the second", **floor}
-            )
+            self._notes.note_floor(sets.name, "first half of the recorded video against the second", floor)
         return found
 
     def record(self) -> dict[str, Any]:
@@ -445,8 +420,7 @@ class VideoDistances:
             "hop_frames": HOP_FRAMES,
             "reference": "recorded video of the same camera",
             "covariance": "n - 1",
-            "floors": self._floors,
-            "sets": self._sets.records,
+            **self._notes.record(),
         }
 
 
@@ -467,14 +441,12 @@ def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> VideoDistances | 
     return VideoDistances(scene, ClipFiles(Path(config.fvd_weights), config.fvd_resize, out / FEATURES_FOLDER, device))
 
 
-# video features -----------------------------------------------------------------------------------
+# -- video features --------------------------------------------------------------------------------
 #
 # Distances of videos in features that an extractor elsewhere made of their clips, such as V-JEPA (JEDi) or VideoMAE.
-#
-# Extractors are not run here: a saved program (TorchScript, or an exported one) would be code from a file, and this
-# package executes no data. What they give is a table of numbers, and that is what is read:
-# ``METHOD/TRAJECTORY.safetensors`` and ``recorded/CAMERA.safetensors``, each with one tensor ``features`` [clips,
-# values].
+# Extractors are not run here: a saved program (TorchScript, or an exported one) would be code from a file. What they
+# give is read: ``METHOD/TRAJECTORY.safetensors`` and ``recorded/CAMERA.safetensors``, each with one tensor ``features``
+# [clips, values].
 
 
 RECORDED: Final = "recorded"
@@ -493,15 +465,10 @@ class VideoFeatures:
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
-            raise InputError(
-                "no such folder of features",
-                where=str(folder),
-                expected=(
-                    "METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors, each with a tensor features [clips,"
-                    " values]"
-                ),
-                remedy="run the extractor yourself and save what it gives; programs (TorchScript) are not read",
-            )
+            tables = "METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors"
+            expected = f"{tables}, each with a tensor features [clips, values]"
+            remedy = "run the extractor yourself and save what it gives; programs (TorchScript) are not read"
+            raise InputError("no such folder of features", where=str(folder), expected=expected, remedy=remedy)
         self._folder = folder
         self._floors: list[dict[str, Any]] = []
         self._width: int | None = None
@@ -540,12 +507,9 @@ class VideoFeatures:
             return None
         found = store.read_safetensors(path).get("features")
         if found is None or found.ndim != 2 or not np.issubdtype(found.dtype, np.floating):
-            raise InputError(
-                "a table of video features is malformed",
-                where=str(path),
-                expected="one tensor features [clips, values]",
-                got="no such tensor" if found is None else f"{found.dtype} {found.shape}",
-            )
+            what, expected = "a table of video features is malformed", "one tensor features [clips, values]"
+            got = "no such tensor" if found is None else f"{found.dtype} {found.shape}"
+            raise InputError(what, where=str(path), expected=expected, got=got)
         self._width = int(found.shape[1])
         return found.astype(np.float64)
 
@@ -557,13 +521,11 @@ def _compared(made: NDArray[np.float64], reference: NDArray[np.float64]) -> dict
     return {"values": {k: round(v, 6) for k, v in values.items()}, "n": len(made), "n_reference": len(reference)}
 
 
-# embeddings ---------------------------------------------------------------------------------------
+# -- embeddings ------------------------------------------------------------------------------------
 #
 # Scores of images through one embedding each: FD-DINOv2 and consistency with DINOv2, CMMD, CLIP-F and CLIP-V with CLIP.
-#
 # Distances of sets compare the counted views of a trajectory with the recorded frames of the same camera, as FID does.
 # CLIP-F and consistency follow the video, so all views count.
-
 
 Rows = NDArray[np.float32]
 
@@ -587,11 +549,8 @@ class SetDistance:
     def note_floor(self, sets: TrajectorySets, reference: Rows, counted: Sequence[int]) -> None:
         """Note what the truth itself scores."""
         if sets.truth is not None:
-            how, made, against = (
-                "true images of the same views",
-                self.files.of(_sized(sets.truth, sets))[list(counted)],
-                reference,
-            )
+            how, against = "true images of the same views", reference
+            made = self.files.of(_sized(sets.truth, sets))[list(counted)]
         elif len(reference) >= 2 * FEWEST:
             how, made, against = "every second recorded frame against the others", reference[::2], reference[1::2]
         else:
@@ -725,10 +684,7 @@ def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> ClipScores | None:
     path, device = Path(config.clip_weights), choose_device(config.device, "networks of the scores")
     network = clip_image.ClipImageFeatures(read_checkpoint(path), str(path)).to(device)
     sha256 = store.sha256_file(path)
-
-    def prepare(rgb: NDArray[np.uint8]) -> Tensor:
-        return clip_image.prepared(rgb, network.side)
-
+    prepare = functools.partial(clip_image.prepared, side=network.side)
     files = EmbeddingFiles(network, prepare, network.out, f"CLIP {sha256}", out / FEATURES_FOLDER, device)
     made = {
         "network": f"CLIP {network.name}, projected, {network.out} values",

@@ -79,12 +79,11 @@ def truth_of(scene: Scene) -> Truth:
         for frame in scene.frames:
             there, stated = world.ego_path().pose_at(frame.view.time_s), scene.ego.pose_at(frame.view.time_s)
             if there is None or stated is None or not np.allclose(there, stated, atol=1e-3):
-                raise InputError(
-                    "the scene is not the generated city that its recipe names, so its truth would be another street's",
-                    where=f"{scene.root}: source.recipe, frame {frame.id}",
-                    expected="the path of the vehicle that the recipe makes",
-                    remedy="generate the city again; in scenes of other origin, leave the recipe out",
-                )
+                what = "the scene is not the generated city that its recipe names"
+                what += ", so its truth would be another street's"
+                where, expected = f"{scene.root}: source.recipe, frame {frame.id}", "the path that the recipe makes"
+                remedy = "generate the city again; in scenes of other origin, leave the recipe out"
+                raise InputError(what, where=where, expected=expected, remedy=remedy)
         moving = np.array(city_logs.moving_instances(world), np.int32)
         return Truth(True, lambda view, _frame, _name: _city_view(world, moving, view))
     return Truth(False, lambda view, frame, _name: None if frame is None else ViewTruth(_recorded(scene, frame, view)))
@@ -112,9 +111,8 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path) -> N
                 for view in path.views:
                     true = truth.at_view(view, None, path.name)
                     if true is None or true.moving is None or true.instance is None or true.marking is None:
-                        raise InputError(
-                            "the city has no ground truth at this view", where=f"{path.name}, {view.time_s:g} s"
-                        )
+                        where = f"{path.name}, {view.time_s:g} s"
+                        raise InputError("the city has no ground truth at this view", where=where)
                     own = (true.moving[0].numpy().astype(np.uint8), true.instance, true.marking.astype(np.uint8))
                     for found, value in zip(maps.values(), own, strict=True):
                         found.append(value)
@@ -134,20 +132,17 @@ def stored_truth(folder: Path) -> Truth:
     def find(view: View, _frame: Frame | None, name: str) -> ViewTruth:
         stored = sets.get(name)
         if stored is None:
-            raise InputError(
-                "the folder of ground truth lacks a trajectory", where=str(folder), expected=name, got=", ".join(sets)
-            )
+            what, got = "the folder of ground truth lacks a trajectory", ", ".join(sets)
+            raise InputError(what, where=str(folder), expected=name, got=got)
         index = min(range(len(stored)), key=lambda i: abs(stored.views[i].time_s - view.time_s))
         there = stored.views[index]
         distance_m = apart_m(there, view)
         same_size = (there.camera.width, there.camera.height) == (view.camera.width, view.camera.height)
         if abs(there.time_s - view.time_s) > SAME_TIME_S or distance_m > SAME_PLACE_M or not same_size:
-            raise InputError(
-                "the stored ground truth shows another view",
-                where=f"{folder / name}, view {index}",
-                expected=f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}",
-                got=f"{there.time_s:.4f} s, {there.camera.width}x{there.camera.height}, {distance_m:.3f} m apart",
-            )
+            size = lambda view: f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}"  # noqa: E731
+            what, where = "the stored ground truth shows another view", f"{folder / name}, view {index}"
+            got = f"{size(there)}, {distance_m:.3f} m apart"
+            raise InputError(what, where=where, expected=size(view), got=got)
         own = maps[name]
         moving = torch.from_numpy(own["moving"][index].astype(bool))[None]
         return ViewTruth(stored[index], moving, own["instance"][index], own["marking"][index].astype(bool))
@@ -160,9 +155,8 @@ def _recorded(scene: Scene, frame: Frame, view: View) -> Observation:
     height, width = view.camera.height, view.camera.width
 
     def label(name: str) -> NDArray[Any] | None:
-        if (
-            name not in frame.labels or f"{name}_confidence" in frame.labels
-        ):  # a label with a confidence is a labeller's
+        # a label with a confidence is a labeller's
+        if name not in frame.labels or f"{name}_confidence" in frame.labels:
             return None
         return resize_nearest(read_label(scene, frame, name), height, width)
 
@@ -185,16 +179,13 @@ def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
     if not sweeps:
         return None
     clouds = [(sweep, read_points(scene, sweep).xyz) for sweep in sweeps]
-    world = np.concatenate([geometry.transform_points(sweep.world_from_lidar, xyz) for sweep, xyz in clouds]).astype(
-        np.float32
-    )
+    placed = [geometry.transform_points(sweep.world_from_lidar, xyz) for sweep, xyz in clouds]
+    world = np.concatenate(placed).astype(np.float32)
     gap_deg = max(largest_beam_gap(xyz) for _, xyz in clouds)
     return torch.from_numpy(visible_depth(view, world, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=MAX_LIDAR_M))[None]
 
 
-# the LiDAR points of a log, for truth at views that no camera recorded ----------------------------
-
-
+# -- the LiDAR points of a log, for truth at views that no camera recorded -------------------------
 MERGED_SWEEPS: Final = 6
 """Sweeps of each LiDAR whose points tell what the shown cameras saw."""
 KEPT_SWEEPS: Final = 96
@@ -268,9 +259,8 @@ class LogPoints:
         kept = self._kept.get(sweep.id)
         if kept is None:
             points = read_points(self.scene, sweep)
-            owner, owned = separate(
-                SweepShots(sweep.time_s, sweep.world_from_lidar, points, ()), self.dynamic, self._rules
-            )
+            shots = SweepShots(sweep.time_s, sweep.world_from_lidar, points, ())
+            owner, owned = separate(shots, self.dynamic, self._rules)
             xyz = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
             for number, local in owned.items():
                 xyz[owner == number] = local

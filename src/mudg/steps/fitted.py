@@ -167,11 +167,8 @@ class FittedScene:
         from mudg.gaussians.rendering import raster_of, render_view
 
         if not isinstance(camera, Camera):
-            raise UsageError(
-                "the camera is not a mudg.Camera",
-                expected='e.g. scene.frames_of("front")[0].view.camera',
-                got=repr(camera),
-            )
+            expected = 'e.g. scene.frames_of("front")[0].view.camera'
+            raise UsageError("the camera is not a mudg.Camera", expected=expected, got=repr(camera))
         view = View(camera, np.asarray(world_from_cam, np.float64), float(time_s))
         with torch.no_grad():
             seen = render_view(self._model, view, raster_of(self._model, backend))  # type: ignore[arg-type]

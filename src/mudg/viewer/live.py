@@ -36,12 +36,9 @@ from mudg.gaussians.rendering import raster_of, render_view
 from mudg.viewer.page import begin_of, key_rows
 from mudg.viewer.report import FAR_M, NEAR_M
 
-# edits --------------------------------------------------------------------------------------------
+# -- edits -----------------------------------------------------------------------------------------
 #
-# Edits made on the viewer's page: checked and carried out by the functions that ``mudg edit`` uses, and saved as a
-# script.
-
-
+# Made on the viewer's page: checked and carried out by the functions that ``mudg edit`` uses, and saved as a script.
 MARK: Final = "# Edits made in mudg view. For mudg edit, mudg render --edits and mudg view --edits.\n"
 """First line of a saved script; a file without it belongs to somebody else."""
 NAME: Final = "edits.yaml"
@@ -95,17 +92,13 @@ class EditDesk:
     _making: threading.Lock = field(default_factory=threading.Lock)
 
     def entries(self) -> list[dict[str, Any]]:
-        """The edits that the page begins with, as [{verb: settings}] with absolute paths."""
+        """The edits that the page begins with, as [{verb: settings}] with absolute paths: they may be saved
+        elsewhere."""
         if self.begin is None:
             return []
-        return [
-            {e.verb: e.settings.model_dump(mode="json", by_alias=True, exclude_unset=True)}
-            for e in self._absolute(self.begin).edits
-        ]
-
-    def _absolute(self, script: EditScript) -> EditScript:
-        """The script with absolute paths: it may be saved elsewhere."""
-        return parse_edits(script.text(), "edits", Path()) if script.files() else script
+        script = parse_edits(self.begin.text(), "edits", Path()) if self.begin.files() else self.begin
+        said = lambda settings: settings.model_dump(mode="json", by_alias=True, exclude_unset=True)  # noqa: E731
+        return [{edit.verb: said(edit.settings)} for edit in script.edits]
 
     def edited(self, text: str) -> list[SceneModel]:
         """The fits with a script carried out; as they are where it is empty.
@@ -134,17 +127,11 @@ class EditDesk:
         script = parse_edits(text, NAME)  # others need not wait while a long text is read
         with self._lock:
             if text not in self._planned:
-                known = (
-                    {str(path.resolve()) for path in self.begin.files().values()} if self.begin is not None else set()
-                )
-                foreign = sorted(set(script.files()) - known - {self.run})
-                if foreign:
-                    raise InputError(
-                        "a page may name no files but those of --edits",
-                        where=NAME,
-                        got=foreign[0],
-                        remedy="write them into the script by hand",
-                    )
+                files = {} if self.begin is None else self.begin.files()
+                known = {str(path.resolve()) for path in files.values()}
+                if foreign := sorted(set(script.files()) - known - {self.run}):
+                    what, remedy = "a page may name no files but those of --edits", "write them into the script by hand"
+                    raise InputError(what, where=NAME, got=foreign[0], remedy=remedy)
                 drive = carry_out(script, self.models[0], self.scene, self.cloud)
                 self._planned = {**_last(self._planned, KEPT - 1), text: drive}
             return self._planned[text]
@@ -154,12 +141,9 @@ class EditDesk:
         said: dict[str, Any] = {"paths": {}, "removed": [], "inserted": [], "notes": [], "saved": None}
         if asked.script.strip():
             drive = self._checked(asked.script)
-            said |= {
-                "paths": self._paths(drive),
-                "removed": list(drive.plan.removed),
-                "inserted": list(drive.plan.inserted),
-                "notes": [note["text"] for note in drive.notes] + _unseen(drive),
-            }
+            notes = [note["text"] for note in drive.notes] + _unseen(drive)
+            said |= {"paths": self._paths(drive), "removed": list(drive.plan.removed)}
+            said |= {"inserted": list(drive.plan.inserted), "notes": notes}
         if asked.save:
             said["saved"] = str(self.save(asked.script))
         return store.json_text(said, indent=None).encode(), "application/json"
@@ -182,14 +166,11 @@ class EditDesk:
         nodes = {node.name: node for node in self.models[0].nodes if isinstance(node, RigidNode)}
 
         def record(motion: Motion) -> dict[str, Any]:
-            return {
-                "rows": key_rows(motion.times_s - begin, motion.poses).tolist(),
-                "source": (motion.source_s - begin).tolist(),
-            }
+            rows = key_rows(motion.times_s - begin, motion.poses).tolist()
+            return {"rows": rows, "source": (motion.source_s - begin).tolist()}
 
-        changed = {
-            name: drive.plan.changed(name, motion_of(nodes[name])) for name in drive.plan.changes if name in nodes
-        }
+        own = [name for name in drive.plan.changes if name in nodes]
+        changed = {name: drive.plan.changed(name, motion_of(nodes[name])) for name in own}
         standing = {name: drive.plan.after.actors[name].motion for name in drive.plan.touched() if name not in changed}
         return {name: record(motion) for name, motion in {**changed, **standing}.items()}
 
@@ -202,11 +183,8 @@ class EditDesk:
         if not text.strip():
             raise InputError("there are no edits to save", remedy="hide, move or remove an object first")
         if self.place.exists() and not self.overwrite and not store.read_bytes(self.place).startswith(MARK.encode()):
-            raise InputError(
-                "the file was not written by mudg view",
-                where=str(self.place),
-                remedy="start mudg view with another --edits-out, or add --overwrite",
-            )
+            remedy = "start mudg view with another --edits-out, or add --overwrite"
+            raise InputError("the file was not written by mudg view", where=str(self.place), remedy=remedy)
         store.atomic_write(self.place, (MARK + text).encode())
         return self.place
 
@@ -220,14 +198,11 @@ def _unseen(drive: EditedDrive) -> list[str]:
     """What the page, or its exact frames, do not show of a script."""
     found = []
     if drive.plan.closed and drive.plan.views:
-        found.append(
-            "exact frames close the street that objects leave (close_street), the first one after some seconds; the"
-            " page's own picture shows it as it was fitted"
-        )
+        later = "the first one after some seconds; the page's own picture shows it as it was fitted"
+        found.append(f"exact frames close the street that objects leave (close_street), {later}")
     if drive.plan.moves_ego:
-        found.append(
-            "the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle"
-        )
+        moved = "mudg render moves them with the vehicle"
+        found.append(f"the recorded cameras of this page stay on the recorded path; {moved}")
     return found
 
 
@@ -255,12 +230,8 @@ def place_for(run: Path, given: Path | None) -> Path:
     """
     if given is not None:
         if _sealed(given) or given.is_dir():
-            raise UsageError(
-                "edits are not saved into the result of a command",
-                where="--edits-out",
-                got=str(given),
-                expected="a file outside of runs",
-            )
+            what, expected = "edits are not saved into the result of a command", "a file outside of runs"
+            raise UsageError(what, where="--edits-out", got=str(given), expected=expected)
         return given
     beside = Path(run).resolve().parent / NAME
     return Path(NAME) if _sealed(beside) else beside
@@ -270,9 +241,7 @@ def _sealed(path: Path) -> bool:
     return any((folder / name).is_file() for folder in path.resolve().parents for name in SEALED)
 
 
-# frames -------------------------------------------------------------------------------------------
-
-
+# -- frames ----------------------------------------------------------------------------------------
 LAYERS: Final = ("color", "depth", "class")
 VIDEO_CRF: Final = 18
 """x264's quality of videos; lower is better."""
@@ -344,13 +313,9 @@ class FrameSource:
     def __init__(
         self, edited: Callable[[str], Sequence[SceneModel]], scene: Scene, widest: int, device: torch.device
     ) -> None:
-        self._edited = edited
-        self._scene = scene
-        self._device = device
+        self._edited, self._scene, self._widest, self._device = edited, scene, widest, device
         self._shown: _Shown | None = None
-        self._widest = widest
-        self._lock = threading.Lock()
-        self._filming = threading.Lock()
+        self._lock, self._filming = threading.Lock(), threading.Lock()
 
     def png(self, asked: FrameRequest) -> bytes:
         """A frame as PNG bytes.
@@ -358,10 +323,8 @@ class FrameSource:
         Raises:
             InputError: a camera that is none, or edits that cannot be carried out.
         """
-        content = io.BytesIO()
-        picture = self._picture(
-            asked.layer, self._drawer(asked), View(self._camera(asked), _pose(asked), float(asked.time_s))
-        )
+        content, view = io.BytesIO(), View(self._camera(asked), _pose(asked), float(asked.time_s))
+        picture = self._picture(asked.layer, self._drawer(asked), view)
         Image.fromarray(picture).save(content, "PNG", compress_level=1)
         return content.getvalue()
 
@@ -375,17 +338,13 @@ class FrameSource:
         """
         camera, count = self._camera(asked), len(asked.moments)
         if camera.width * camera.height * count > MOST_PIXELS:
-            raise InputError(
-                "the video is too large",
-                where="video",
-                expected=f"at most {MOST_PIXELS:,} pixels in all frames together",
-                got=f"{count} frames of {camera.width} x {camera.height}",
-                remedy="start mudg view with a smaller --width-px, or use mudg render",
-            )
+            expected = f"at most {MOST_PIXELS:,} pixels in all frames together"
+            got = f"{count} frames of {camera.width} x {camera.height}"
+            remedy = "start mudg view with a smaller --width-px, or use mudg render"
+            raise InputError("the video is too large", where="video", expected=expected, got=got, remedy=remedy)
         if not self._filming.acquire(blocking=False):
-            raise ResourceError(
-                "another video is being made", remedy="wait for it, or cancel it where it was asked for"
-            )
+            remedy = "wait for it, or cancel it where it was asked for"
+            raise ResourceError("another video is being made", remedy=remedy)
         try:
             content = mp4_bytes(self._pictures(asked, camera, send), asked.fps, crf=VIDEO_CRF)
         finally:
