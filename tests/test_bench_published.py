@@ -265,10 +265,7 @@ def test_table_3_runs_with_a_published_type_model_as_recorded(weights, tmp_path,
         assert state["summary"]["steps"] == 6 and "start" not in state["inputs"]  # from nothing, with all steps
         ran = configuration.load(FitConfig, yaml_path=log / "fit" / row.name / "run.yaml")
         assert (ran.loss.semantic_weight, ran.virtual.beside, ran.virtual.perception, ran.sh_degree) == (
-            0.0,
-            False,
-            "lpips",
-            3,
+            *(0.0, False, "lpips", 3),
         )
         assert math.isfinite(document["cells"][row.name][RECORDED]["psnr"]["mean"])
     recorded = document["settings"]["fit"]

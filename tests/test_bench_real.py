@@ -533,21 +533,11 @@ def test_rows_say_what_they_leave_out():
         row.name: row for row in real_rows(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))
     }
     assert list(rows) == [
-        "street_gaussians",
-        "street_gaussians-longer",
-        "mudg_r",
-        "mudg_r-no-adapt",
-        "mudg_r-no-renders",
-        "mudg_s",
-        "mudg_s-no-adapt",
-        "mudg_s-no-renders",
-        "a",
+        *("street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_r-no-adapt", "mudg_r-no-renders", "mudg_s"),
+        *("mudg_s-no-adapt", "mudg_s-no-renders", "a"),
     ]
     assert [rows[name].sees for name in ("mudg_s", "mudg_s-no-adapt", "mudg_s-no-renders", "a")] == [
-        "adapted",
-        "renders",
-        "points",
-        "adapted",
+        *("adapted", "renders", "points", "adapted")
     ]
     assert rows["mudg_s"].title != rows["mudg_s-no-adapt"].title
 

@@ -69,16 +69,8 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 CHAIN = [
-    "ingest",
-    "fuse",
-    "fit:street_gaussians",
-    "synthesize",
-    "fit:mudg_s",
-    "render:street_gaussians",
-    "render:mudg_s",
-    "score",
-    "viewer",
-    "report",
+    *("ingest", "fuse", "fit:street_gaussians", "synthesize", "fit:mudg_s", "render:street_gaussians"),
+    *("render:mudg_s", "score", "viewer", "report"),
 ]
 
 

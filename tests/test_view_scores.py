@@ -128,12 +128,7 @@ def test_a_still_video_does_not_flicker(log_scores: dict) -> None:
 def test_missing_files_name_their_flags(log_scores: dict) -> None:
     text = score_tables.markdown(log_scores)
     for flag in (
-        "--detections",
-        "--lanes",
-        "--dino-weights",
-        "--clip-weights",
-        "--video-features",
-        "--lpips-vgg-weights",
+        *("--detections", "--lanes", "--dino-weights", "--clip-weights", "--video-features", "--lpips-vgg-weights"),
     ):
         assert flag in text
 

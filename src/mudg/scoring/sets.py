@@ -278,14 +278,8 @@ class Distributions:
         self._notes.note_floor(sets.name, how, values)
 
 
-def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> Distributions | None:
-    """What computes FID and KID, or None where no weights are given.
-
-    Raises:
-        InputError: the file of weights is missing, damaged, or holds another network.
-    """
-    if not config.fid_weights:
-        return None
+def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> Distributions:
+    """What computes FID and KID."""
     device, folder = choose_device(config.device, "networks of the scores"), out / FEATURES_FOLDER
     return Distributions(scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, folder, device))
 
@@ -429,14 +423,8 @@ def compared(made: NDArray[np.float32], reference: NDArray[np.float32]) -> dict[
     return {"fvd": round(frechet_distance(made, reference), 6), "n": len(made), "n_reference": len(reference)}
 
 
-def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> VideoDistances | None:
-    """What computes FVD, or None where no weights are given.
-
-    Raises:
-        InputError: the file of weights is missing, damaged, or holds another network.
-    """
-    if not config.fvd_weights:
-        return None
+def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> VideoDistances:
+    """What computes FVD."""
     device = choose_device(config.device, "networks of the scores")
     return VideoDistances(scene, ClipFiles(Path(config.fvd_weights), config.fvd_resize, out / FEATURES_FOLDER, device))
 
@@ -530,109 +518,73 @@ def _compared(made: NDArray[np.float64], reference: NDArray[np.float64]) -> dict
 Rows = NDArray[np.float32]
 
 
-class SetDistance:
-    """A distance of counted views from the recorded frames, with its floors.
+class EmbeddingScores:
+    """A distance of counted views from the recorded frames, with its floors, and what else an embedding tells of a
+    video, for every trajectory of a scene.
 
     Args:
         scene: whose recorded frames are the reference. files: makes embeddings. name: of the metric. distance: of two
             sets.
+        further: other values by name, or why there is none, from the embeddings of all views and of the recorded
+            frames, and pairs of both at the same time.
+        made: how the numbers are made.
     """
 
-    def __init__(self, scene: Scene, files: EmbeddingFiles, name: str, distance: Callable[[Rows, Rows], float]) -> None:
-        self.scene, self.files, self._name, self._distance = scene, files, name, distance
-        self.floors: list[dict[str, Any]] = []
-
-    def recorded(self, sets: TrajectorySets) -> Rows:
-        """Embeddings of the recorded frames of a trajectory's camera."""
-        return self.files.of(recorded_images(self.scene, sets))
-
-    def note_floor(self, sets: TrajectorySets, reference: Rows, counted: Sequence[int]) -> None:
-        """Note what the truth itself scores."""
-        if sets.truth is not None:
-            how, against = "true images of the same views", reference
-            made = self.files.of(_sized(sets.truth, sets))[list(counted)]
-        elif len(reference) >= 2 * FEWEST:
-            how, made, against = "every second recorded frame against the others", reference[::2], reference[1::2]
-        else:
-            return
-        floor = {self._name: round(self._distance(made, against), 6), "n": len(made), "n_reference": len(against)}
-        self.floors.append({"trajectory": sets.name, "how": how, **floor})
-
-    def value(self, made: Rows, reference: Rows) -> dict[str, Any]:
-        """The distance and the sizes of both sets; or why there is none."""
-        if not len(reference):
-            return {"values": {self._name: score_tables.NO_TRUTH}}
-        if min(len(made), len(reference)) < FEWEST:
-            return {"values": {self._name: score_tables.TOO_FEW}}
-        found = {self._name: round(self._distance(made, reference), 6)}
-        return {"values": found, "n": len(made), "n_reference": len(reference)}
-
-
-def _sized(images: ImageSet, sets: TrajectorySets) -> ImageSet:
-    return images.resized(sets.width, sets.height)
-
-
-class DinoScores:
-    """FD-DINOv2 and the consistency of the video, of every trajectory of a scene."""
-
-    def __init__(self, scene: Scene, files: EmbeddingFiles, made: dict[str, Any]) -> None:
-        self._sets, self._made = SetDistance(scene, files, "fd_dinov2", frechet_distance), made
-
-    def of(
-        self, sets: TrajectorySets, counted: Sequence[int], _views: Sequence[View]
-    ) -> dict[str, dict[str, Any] | str]:
-        """By method ``values`` and sizes; ``sets`` holds all views, of which those ``counted`` enter the distance."""
-        reference, found = self._sets.recorded(sets), {}
-        for method, images in sets.methods.items():
-            rows = self._sets.files.of(_sized(images, sets))
-            of = self._sets.value(rows[list(counted)], reference)
-            steady = subject_consistency(rows)
-            of["values"]["subject_consistency"] = score_tables.TOO_FEW if steady is None else round(steady, 6)
-            found[method] = of
-        self._sets.note_floor(sets, reference, counted)
-        return found
-
-    def record(self) -> dict[str, Any]:
-        """How the numbers were made, and the floors."""
-        return {**self._made, "floors": self._sets.floors}
-
-
-class ClipScores:
-    """CMMD, CLIP-F and CLIP-V of every trajectory of a scene."""
-
-    def __init__(self, scene: Scene, files: EmbeddingFiles, made: dict[str, Any]) -> None:
-        self._scene, self._made = scene, made
-        self._sets = SetDistance(scene, files, "cmmd", cmmd_distance)
+    def __init__(
+        self,
+        scene: Scene,
+        files: EmbeddingFiles,
+        name: str,
+        distance: Callable[[Rows, Rows], float],
+        further: Callable[[Rows, Rows, Sequence[tuple[int, int]]], dict[str, float | str]],
+        made: dict[str, Any],
+    ) -> None:
+        self._scene, self._files, self._name, self._distance = scene, files, name, distance
+        self._further, self._made, self._floors = further, made, list[dict[str, Any]]()
 
     def of(
         self, sets: TrajectorySets, counted: Sequence[int], views: Sequence[View]
     ) -> dict[str, dict[str, Any] | str]:
-        """By method ``values`` and sizes; ``sets`` holds all views, of which those ``counted`` enter the distance and
-        CLIP-V."""
-        reference, found = self._sets.recorded(sets), {}
+        """By method ``values`` and sizes; ``sets`` holds all ``views``, of which those ``counted`` enter the
+        distance."""
+        reference, found = self._files.of(recorded_images(self._scene, sets)), {}
         frames = self._scene.frames_of(sets.camera) if sets.camera in self._scene.cameras else ()
-        times = np.array([frame.view.time_s for frame in frames])
-        pairs = []
+        times, pairs = np.array([frame.view.time_s for frame in frames]), []
         for place in counted if len(times) else ():
             nearest = int(np.argmin(np.abs(times - views[place].time_s)))
             if abs(times[nearest] - views[place].time_s) <= SAME_TIME_S:
                 pairs.append((place, nearest))
+        embedded = lambda images: self._files.of(images.resized(sets.width, sets.height))  # noqa: E731
         for method, images in sets.methods.items():
-            rows = self._sets.files.of(_sized(images, sets))
-            of = self._sets.value(rows[list(counted)], reference)
-            units = _units(rows)
-            steps = (units[1:] * units[:-1]).sum(1)
-            of["values"]["clip_f"] = round(float(steps.mean()), 6) if len(steps) else score_tables.TOO_FEW
-            sources = _units(reference)
-            same = [float(units[a] @ sources[b]) for a, b in pairs]
-            of["values"]["clip_v"] = round(sum(same) / len(same), 6) if same else score_tables.NO_TRUTH
-            found[method] = of
-        self._sets.note_floor(sets, reference, counted)
+            rows = embedded(images)
+            found[method] = self._compared(rows[list(counted)], reference)
+            found[method]["values"] |= {
+                name: value if isinstance(value, str) else round(value, 6)
+                for name, value in self._further(rows, reference, pairs).items()
+            }
+        if sets.truth is not None:
+            floor = self._compared(embedded(sets.truth)[list(counted)], reference, fewest=0)
+            self._note_floor(sets.name, "true images of the same views", floor)
+        elif len(reference) >= 2 * FEWEST:
+            floor = self._compared(reference[::2], reference[1::2])
+            self._note_floor(sets.name, "every second recorded frame against the others", floor)
         return found
+
+    def _note_floor(self, trajectory: str, how: str, floor: dict[str, Any]) -> None:
+        self._floors.append({"trajectory": trajectory, "how": how, **floor.pop("values"), **floor})
+
+    def _compared(self, made: Rows, reference: Rows, fewest: int = FEWEST) -> dict[str, Any]:
+        """The distance and the sizes of both sets; or why there is none."""
+        if fewest and not len(reference):
+            return {"values": {self._name: score_tables.NO_TRUTH}}
+        if min(len(made), len(reference)) < fewest:
+            return {"values": {self._name: score_tables.TOO_FEW}}
+        value = round(self._distance(made, reference), 6)
+        return {"values": {self._name: value}, "n": len(made), "n_reference": len(reference)}
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors."""
-        return {**self._made, "floors": self._sets.floors}
+        return {**self._made, "floors": self._floors}
 
 
 def _units(rows: Rows) -> NDArray[np.float64]:
@@ -650,14 +602,18 @@ def subject_consistency(rows: NDArray[np.floating]) -> float | None:
     return float(((np.maximum(before, 0) + np.maximum(first, 0)) / 2).mean())
 
 
-def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> DinoScores | None:
-    """What computes FD-DINOv2, or None where no weights are given.
+def _clip_values(rows: Rows, reference: Rows, pairs: Sequence[tuple[int, int]]) -> dict[str, float | str]:
+    """CLIP-F and CLIP-V."""
+    units, sources = _units(rows), _units(reference)
+    steps, same = (units[1:] * units[:-1]).sum(1), [float(units[a] @ sources[b]) for a, b in pairs]
+    return {
+        "clip_f": float(steps.mean()) if len(steps) else score_tables.TOO_FEW,
+        "clip_v": sum(same) / len(same) if same else score_tables.NO_TRUTH,
+    }
 
-    Raises:
-        InputError: the file of weights is missing, damaged, or holds another network.
-    """
-    if not config.dino_weights:
-        return None
+
+def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> EmbeddingScores:
+    """What computes FD-DINOv2 and the consistency of the video."""
     path, device = Path(config.dino_weights), choose_device(config.device, "networks of the scores")
     network = dinov2.DinoFeatures(read_checkpoint(path), str(path)).to(device)
     sha256 = store.sha256_file(path)
@@ -670,17 +626,16 @@ def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> DinoScores | None:
         "reference": "recorded frames of the same camera",
         "covariance": "n - 1",
     }
-    return DinoScores(scene, files, made)
+
+    def further(rows: Rows, _reference: Rows, _pairs: Sequence[tuple[int, int]]) -> dict[str, float | str]:
+        steady = subject_consistency(rows)
+        return {"subject_consistency": score_tables.TOO_FEW if steady is None else steady}
+
+    return EmbeddingScores(scene, files, "fd_dinov2", frechet_distance, further, made)
 
 
-def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> ClipScores | None:
-    """What computes CMMD, or None where no weights are given.
-
-    Raises:
-        InputError: the file of weights is missing, damaged, or holds another network.
-    """
-    if not config.clip_weights:
-        return None
+def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> EmbeddingScores:
+    """What computes CMMD, CLIP-F and CLIP-V."""
     path, device = Path(config.clip_weights), choose_device(config.device, "networks of the scores")
     network = clip_image.ClipImageFeatures(read_checkpoint(path), str(path)).to(device)
     sha256 = store.sha256_file(path)
@@ -693,4 +648,4 @@ def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> ClipScores | None:
         "kernel": "Gaussian, sigma 10, biased, times 1000",
         "reference": "recorded frames of the same camera",
     }
-    return ClipScores(scene, files, made)
+    return EmbeddingScores(scene, files, "cmmd", cmmd_distance, _clip_values, made)

@@ -17,22 +17,10 @@ from mudg.base.types import Scene
 from mudg.core.pictures import to_bytes
 from mudg.editing.settings import ScoreConfig
 from mudg.scene.observations import ObservationSet, read_observations
-from mudg.scoring import detections
+from mudg.scoring import detections, sets
 from mudg.scoring.detections import Detections, ViewImages, detections_of
 from mudg.scoring.facts import ANCHORED, Reference, ScoredTrajectory
-from mudg.scoring.sets import (
-    ClipScores,
-    DinoScores,
-    Distributions,
-    ImageSet,
-    TrajectorySets,
-    VideoDistances,
-    VideoFeatures,
-    clip_of,
-    dino_of,
-    distributions_of,
-    videos_of,
-)
+from mudg.scoring.sets import ImageSet, TrajectorySets
 
 BASELINE: Final = "nearest_fill"
 Rows = Sequence[dict[str, Any]]
@@ -48,11 +36,11 @@ OF_ENTRY: Final[Mapping[str, tuple[str, ...]]] = {
 class SetScores:
     """What is computed of whole sets; None where its weights or files were not given."""
 
-    distributions: Distributions | None
-    videos: VideoDistances | None
-    dinov2: DinoScores | None
-    clip: ClipScores | None
-    video_features: VideoFeatures | None
+    distributions: sets.Distributions | None
+    videos: sets.VideoDistances | None
+    dinov2: sets.EmbeddingScores | None
+    clip: sets.EmbeddingScores | None
+    video_features: sets.VideoFeatures | None
     detections: Detections
 
     def add_to(self, results: Rows, trajectories: Sequence[ScoredTrajectory], reference: Reference, out: Path) -> None:
@@ -69,10 +57,22 @@ class SetScores:
     def _add(self, trajectory: ScoredTrajectory, rows: Rows, reference: Reference, out: Path) -> None:
         counted = trajectory.counted(reference.held_out)
         if self.distributions is not None:
-            _add_distributions(rows, self.distributions, _sets_of(trajectory, reference, out, counted))
+            distances = self.distributions.of(_sets_of(trajectory, reference, out, counted))
+            for row in rows:
+                value = distances[row["method"]]
+                if isinstance(value, str):
+                    row["values"] |= {"fid": value, "kid": value}
+                else:
+                    row["values"] |= {"fid": round(value.fid, 6), "kid": round(value.kid, 6)}
+                    row["distribution"] = value.record()
         every = _sets_of(trajectory, reference, out, range(len(trajectory.views)))
         if self.videos is not None:
-            _add_videos(rows, self.videos, every)
+            distances = self.videos.of(every)
+            for row in rows:
+                value = distances[row["method"]]
+                row["values"]["fvd"] = value if isinstance(value, str) else value["fvd"]
+                if not isinstance(value, str):
+                    row["video"] = {"n": value["n"], "n_reference": value["n_reference"]}
         for name, embedded in (("dinov2", self.dinov2), ("clip", self.clip)):
             if embedded is not None:
                 _add_named(rows, name, embedded.of(every, counted, trajectory.views))
@@ -96,11 +96,11 @@ def set_scores_of(config: ScoreConfig, scene: Scene, out: Path) -> SetScores:
         InputError: a file is missing, damaged, or holds another network.
     """
     return SetScores(
-        distributions_of(config, scene, out),
-        videos_of(config, scene, out),
-        dino_of(config, scene, out),
-        clip_of(config, scene, out),
-        VideoFeatures(Path(config.video_features)) if config.video_features else None,
+        sets.distributions_of(config, scene, out) if config.fid_weights else None,
+        sets.videos_of(config, scene, out) if config.fvd_weights else None,
+        sets.dino_of(config, scene, out) if config.dino_weights else None,
+        sets.clip_of(config, scene, out) if config.clip_weights else None,
+        sets.VideoFeatures(Path(config.video_features)) if config.video_features else None,
         detections_of(config, scene),
     )
 
@@ -154,28 +154,6 @@ def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path, coun
             truth = chosen(read_observations(out / "truth" / trajectory.name), every)
     camera = trajectory.views[0].camera
     return TrajectorySets(trajectory.name, trajectory.camera, camera.width, camera.height, methods, truth)
-
-
-def _add_videos(rows: Rows, videos: VideoDistances, here: TrajectorySets) -> None:
-    """FVD into the results of one trajectory."""
-    found = videos.of(here)
-    for row in rows:
-        value = found[row["method"]]
-        row["values"]["fvd"] = value if isinstance(value, str) else value["fvd"]
-        if not isinstance(value, str):
-            row["video"] = {"n": value["n"], "n_reference": value["n_reference"]}
-
-
-def _add_distributions(rows: Rows, sets: Distributions, here: TrajectorySets) -> None:
-    """FID and KID into the results of one trajectory."""
-    found = sets.of(here)
-    for row in rows:
-        value = found[row["method"]]
-        if isinstance(value, str):
-            row["values"] |= {"fid": value, "kid": value}
-        else:
-            row["values"] |= {"fid": round(value.fid, 6), "kid": round(value.kid, 6)}
-            row["distribution"] = value.record()
 
 
 def _add_named(rows: Rows, entry: str, found: Mapping[str, dict[str, Any] | str]) -> None:
