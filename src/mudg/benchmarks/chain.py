@@ -66,12 +66,8 @@ def compare(
     texts: Mapping[str, Callable[[Mapping[str, Any]], str]],
 ) -> Path:
     """Do all jobs, several at a time with one thread each; write ``bench.json`` and its texts. Results do not depend on
-    how many run at a time; finished steps of an interrupted benchmark are reused.
-
-    Args:
-        document: what ``bench.json`` holds, from what the jobs measured, in their order. texts: file -> its text, from
-            the document.
-    """
+    how many run at a time; finished steps of an interrupted benchmark are reused. ``document``: what ``bench.json``
+    holds, from what the jobs measured, in their order. ``texts``: file -> its text, from the document."""
     measured: dict[int, dict[str, Any]] = {}
     with log.task("logs", len(jobs)) as bar, native.one_thread():
         for index, facts in run_in_processes(_measure, [(job,) for job in jobs], min(at_once(config), len(jobs))):
@@ -118,12 +114,9 @@ def finished(path: Path, measure: Callable[[], Any]) -> Any:
 def refuse_foreign(
     out: Path, pages: Sequence[str], is_own: Callable[[Any], bool], may_be: Callable[[Path], bool] = Path.is_dir
 ) -> None:
-    """UsageError if a folder holds anything that a benchmark does not write.
-
-    Args:
-        out: it need not exist. pages: names of its files at the top; the first is its result, in JSON.
-        is_own: whether that result is this benchmark's. may_be: whether an entry may belong to it, if it is no page.
-    """
+    """UsageError if a folder holds anything that a benchmark does not write. ``out``: it need not exist. ``pages``:
+    names of its files at the top; the first is its result, in JSON. ``is_own``: whether that result is this
+    benchmark's. ``may_be``: whether an entry may belong to it, if it is no page."""
     if not out.exists():
         return
     entries = [entry for entry in out.iterdir() if not is_temporary(entry.name)] if out.is_dir() else [out]
@@ -159,13 +152,9 @@ REPAIR_STEPS: Final = 3
 
 @dataclass(frozen=True)
 class Chain:
-    """The steps of one scene.
-
-    Args:
-        out: folder of all. scene: what methods see. config: its settings of steps, as ``mudg run`` takes them.
-            overwrite: replace what other settings left there.
-        generator: settings of generated views that fits learn from, whose places are those of repaired ones.
-    """
+    """The steps of one scene. ``out``: folder of all. ``scene``: what methods see. ``config``: its settings of steps,
+    as ``mudg run`` takes them. ``overwrite``: replace what other settings left there. ``generator``: settings of
+    generated views that fits learn from, whose places are those of repaired ones."""
 
     out: Path
     scene: Path
@@ -196,12 +185,8 @@ class Chain:
         return self.run(FillViews(scene=self.scene, fused=self.fused, paths=tuple(paths), out=self.out / FILL))
 
     def rendered(self, row: Row, virtual: Sequence[Path], drawn: RenderConfig, scene: Path | None = None) -> Path:
-        """Views of a row's fit.
-
-        Args:
-            virtual: views that it learns from, if its method learns from such. drawn: which views. scene: with their
-                places, if other.
-        """
+        """Views of a row's fit. ``virtual``: views that it learns from, if its method learns from such. ``drawn``:
+        which views. ``scene``: with their places, if other."""
         model, out = self.fitted(row, virtual), self.out / "render" / row.name
         return self.run(RenderViews(scene=scene or self.scene, model=model, out=out, settings=drawn))
 
@@ -392,13 +377,9 @@ def _shift_of(name: str) -> float:
 
 
 def render_page(title: str, command: str, lead: str, sections: Sequence[Mapping[str, Any]], footer: str = "") -> str:
-    """A page.
-
-    Args:
-        command: what makes it. lead: first sentence. sections: each with ``title``, and any of ``tables``
-            (``report.tables.TextTable``), ``notes`` above and ``below`` them, the values of `films`, and ``walls``.
-            footer: where the pictures lie.
-    """
+    """A page. ``command``: what makes it. ``lead``: first sentence. ``sections``: each with ``title``, and any of
+    ``tables`` (``report.tables.TextTable``), ``notes`` above and ``below`` them, the values of `films`, and ``walls``.
+    ``footer``: where the pictures lie."""
     usual = {"tables": (), "notes": (), "below": (), "films": (), "walls": (), "log_choices": (), "shift_choices": ()}
     whole = [{**usual, **section} for section in sections]
     return html.render("bench.html.j2", title=title, kicker=command, lead=lead, footer=footer, sections=whole)

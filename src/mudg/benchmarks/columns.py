@@ -361,11 +361,8 @@ Measure = Callable[[Sight], Sum | None]
 
 @dataclass(frozen=True)
 class Column:
-    """A column: its heading, digits, and whether it is compared as a ratio, since lower is better.
-
-    Args:
-        of: what a view adds, or None where it has nothing to say. close: the value from the sum over views.
-    """
+    """A column: its heading, digits, and whether it is compared as a ratio, since lower is better. ``of``: what a view
+    adds, or None where it has nothing to say. ``close``: the value from the sum over views."""
 
     title: str
     digits: int

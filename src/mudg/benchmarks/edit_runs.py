@@ -87,11 +87,8 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunCase:
-    """A recorded drive to edit.
-
-    Args:
-        frames: the recorded frames of its front camera, in order. lead: id of the vehicle that is edited.
-    """
+    """A recorded drive to edit. ``frames``: the recorded frames of its front camera, in order. ``lead``: id of the
+    vehicle that is edited."""
 
     name: str
     scene: Scene
@@ -104,11 +101,8 @@ class RunCase:
 
 @dataclass(slots=True, eq=False)
 class Video:
-    """One of the two videos, frame by frame: the fit, what draws it, and sums over what was seen of it.
-
-    Args:
-        actor: id of the vehicle whose path is followed, or empty. motion: its path. size_m: of its box.
-    """
+    """One of the two videos, frame by frame: the fit, what draws it, and sums over what was seen of it. ``actor``: id
+    of the vehicle whose path is followed, or empty. ``motion``: its path. ``size_m``: of its box."""
 
     model: SceneModel
     draw: Drawer
@@ -195,14 +189,8 @@ class Sums:
 
 
 def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> dict[str, Any]:
-    """The numbers of one edit.
-
-    Args:
-        shown: gets the number of each frame, and its renders without and with the edit.
-
-    Raises:
-        InputError: the script cannot be carried out on this drive.
-    """
+    """The numbers of one edit. ``shown``: gets the number of each frame, and its renders without and with the edit.
+    InputError: the script cannot be carried out on this drive."""
     drive = carry_out(script, case.model, case.scene, case.cloud)
     usual, edited, weather = _videos(case, drive)
     sums = Sums()
@@ -360,15 +348,8 @@ OUTPUT: Final = VerbOutput(
 
 def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
     """Edit recorded drives; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``. What an interrupted
-    one finished is kept.
-
-    Args:
-        sources: folders of finished ``mudg run``.
-
-    Raises:
-        UsageError: ``--harmonize``, which compares with a truth. InputError: a folder is no finished run, its scene has
-            no labels, no LiDAR or no moving vehicle.
-    """
+    one finished is kept. ``sources``: folders of finished ``mudg run``. UsageError: ``--harmonize``, which compares
+    with a truth. InputError: a folder is no finished run, its scene has no labels, no LiDAR or no moving vehicle."""
     if config.harmonize:
         what = "what a diffusion model adds is compared with generated cities alone"
         raise UsageError(what, where="--harmonize", remedy="leave it out, or name no runs")
@@ -449,11 +430,8 @@ def _stem(name: str, edit: str) -> str:
 
 
 def case_of(name: str, parts: RunParts, device: torch.device, lead: str = "") -> RunCase:
-    """A run, read; ``lead``: the vehicle that is edited, if it is known.
-
-    Raises:
-        InputError: no classes, no LiDAR, or no vehicle that moves.
-    """
+    """A run, read; ``lead``: the vehicle that is edited, if it is known. InputError: no classes, no LiDAR, or no
+    vehicle that moves."""
     if parts.scene is None or parts.fused is None:  # a whole run has both
         raise InputError("a run without its scene", where=name)
     scene, fused = read_scene(parts.scene), read_fused(parts.fused)
@@ -473,11 +451,7 @@ def case_of(name: str, parts: RunParts, device: torch.device, lead: str = "") ->
 
 def lead_of(scene: Scene, model: SceneModel, frames: Sequence[Frame], points: LogPoints) -> str:
     """The moving vehicle with Gaussians of its own that shows the most pixels, of those that are ahead where there are
-    any.
-
-    Raises:
-        InputError: there is none.
-    """
+    any. InputError: there is none."""
     nodes = model.node_names()
     tracks = [t for t in points.dynamic if t.id in nodes and t.label in street_scores.VEHICLE_LABELS]
     chosen = [frames[int(i)].view for i in np.unique(np.linspace(0, len(frames) - 1, min(LOOKS, len(frames))).round())]

@@ -205,12 +205,9 @@ def further_columns(exact: bool) -> tuple[PaperColumn, ...]:
 
 
 def at_place(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
-    """Values of one method on one log at a place.
-
-    Args:
-        documents: contents of ``metrics.json`` that hold its trajectories, one method each.
-        names: trajectories of the place; the mean over them, and the sum of their numbers of views.
-    """
+    """Values of one method on one log at a place. ``documents``: contents of ``metrics.json`` that hold its
+    trajectories, one method each. ``names``: trajectories of the place; the mean over them, and the sum of their
+    numbers of views."""
     results = {row["trajectory"]: row for document in documents for row in document["results"]}
     rows = [results.get(name) for name in names]
     known = {metric["name"] for document in documents for metric in document["metrics"]}
@@ -266,11 +263,8 @@ def _made_of(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def files_at(documents: Mapping[Path, Mapping[str, Any]], names: Sequence[str], out: Path) -> Files:
     """Files of features of one method on one log at a place; an entry that lacks a trajectory is left out.
-
-    Args:
-        documents: folder of scores -> its metrics.json, one method each. names: trajectories of the place. out: of the
-            benchmark.
-    """
+    ``documents``: folder of scores -> its metrics.json, one method each. ``names``: trajectories of the place. ``out``:
+    of the benchmark."""
     result: Files = {}
     for entry in POOLED:
         sets: dict[str, list[str]] = {}
@@ -287,10 +281,7 @@ def files_at(documents: Mapping[Path, Mapping[str, Any]], names: Sequence[str], 
 
 def pooled(logs: Sequence[Mapping[str, Any]], out: Path) -> dict[str, dict[str, Values]]:
     """Cells of pooled sets, row -> place -> metric -> mean and standard error; only where every log has its features.
-
-    Args:
-        logs: per log its facts, with ``features[row][place]`` as from `files_at`. out: folder of the benchmark.
-    """
+    ``logs``: per log its facts, with ``features[row][place]`` as from `files_at`. ``out``: folder of the benchmark."""
     result: dict[str, dict[str, Values]] = {}
     for row, places in {row: of for entry in logs for row, of in entry["features"].items()}.items():
         for place in places:
@@ -400,11 +391,7 @@ def _cell(
 
 def _refuse_other_counts(cells: dict[str, dict[str, Values]], place: str, column: PaperColumn) -> None:
     """Refuse methods with different numbers of views in a column; a floor with another number is left out of the table,
-    with the reason.
-
-    Raises:
-        InputError: they differ.
-    """
+    with the reason. InputError: they differ."""
     counts = {name: of[place][column.key].get("n") for name, of in cells.items()}
     floor = counts.pop(TRUTH)
     wanted = {tuple(n) for n in counts.values() if n is not None}

@@ -66,13 +66,9 @@ class ListedCity:
 
 @dataclass(frozen=True)
 class RecordedLog:
-    """A recorded log.
-
-    Args:
-        name: of its folder. source: a dataset's log or a scene. frames: first and last frame (both included), or None
-            for all. size: of imported images (empty = as recorded). side: of one-sided shifts. note: what is to be said
-            of it.
-    """
+    """A recorded log. ``name``: of its folder. ``source``: a dataset's log or a scene. ``frames``: first and last frame
+    (both included), or None for all. ``size``: of imported images (empty = as recorded). ``side``: of one-sided shifts.
+    ``note``: what is to be said of it."""
 
     name: str
     source: Path
@@ -86,14 +82,9 @@ Log = ListedCity | RecordedLog
 
 
 def logs_of(config: BenchConfig, sources: Sequence[Path], table: PaperTable) -> tuple[Log, ...]:
-    """The logs that a table is filled with.
-
-    Args:
-        sources: ``city:NAME`` alone (see ``city/logs.py``), or folders of recorded logs.
-
-    Raises:
-        UsageError: no log, an unknown list, lists and folders together, or settings that make no sense for them.
-    """
+    """The logs that a table is filled with. ``sources``: ``city:NAME`` alone (see ``city/logs.py``), or folders of
+    recorded logs. UsageError: no log, an unknown list, lists and folders together, or settings that make no sense for
+    them."""
     names = [str(source) for source in sources]
     lists = [name.removeprefix(CITY) for name in names if name.startswith(CITY)]
     if not names or (lists and len(names) > 1):
@@ -158,11 +149,8 @@ def missing_scenes(table: PaperTable, logs: Sequence[Log]) -> list[str]:
 def names_of(
     sources: Sequence[Path], pages: Sequence[str] = ("bench.json", "bench.md", "page.html")
 ) -> dict[str, Path]:
-    """Name -> log: the last part of its path, in characters that every file system takes.
-
-    Raises:
-        UsageError: no log, two of one name, or one that is the name of a page.
-    """
+    """Name -> log: the last part of its path, in characters that every file system takes. UsageError: no log, two of
+    one name, or one that is the name of a page."""
     if not sources:
         raise UsageError("no log was given", expected="mudg bench real LOG... --out FOLDER")
     named: dict[str, Path] = {}
@@ -180,14 +168,9 @@ def names_of(
 
 
 def make_scene(log: Log, table: PaperTable, out: Path, device: DeviceName, overwrite: bool) -> Path:
-    """The scene of a log under the rules of a table, made if need be.
-
-    Args:
-        out: folder of the log. device: of the labeller's network. overwrite: replace what other settings left there.
-
-    Raises:
-        InputError: the log has fewer frames than the table asks for. Whatever a verb raises.
-    """
+    """The scene of a log under the rules of a table, made if need be. ``out``: folder of the log. ``device``: of the
+    labeller's network. ``overwrite``: replace what other settings left there. InputError: the log has fewer frames than
+    the table asks for. Whatever a verb raises."""
     if isinstance(log, ListedCity):
         settings = IngestConfig(test_every=table.held_out_every, city=city_logs.log_config(log.seed, log.rules))
         return run_step(Ingest(log=ingest.CITY, out=out / "scene", overwrite=overwrite, settings=settings))

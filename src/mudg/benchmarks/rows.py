@@ -46,13 +46,9 @@ class SceneRange(StrictRecord):
 
 
 class PaperPlace(StrictRecord):
-    """Where views are scored.
-
-    Args:
-        name: in result files. title: in headings. shifts_m: lateral shifts, metres, positive to the left (0 = the
-            recorded path), and
-        paths: further paths by name (``core.trajectory.named``); their scores are averaged.
-    """
+    """Where views are scored. ``name``: in result files. ``title``: in headings. ``shifts_m``: lateral shifts, metres,
+    positive to the left (0 = the recorded path). ``paths``: further paths by name (``core.trajectory.named``); their
+    scores are averaged."""
 
     name: str
     title: str
@@ -167,11 +163,7 @@ def _refuse(unknown: set[Any], what: str) -> None:
 
 def read_papers(text: str, where: str) -> Papers:
     """The tables of a text in the form of ``papers.yaml``; names of columns and places stand for their records, and
-    lines of text for published rows.
-
-    Raises:
-        InputError: it is not YAML, or not such tables.
-    """
+    lines of text for published rows. InputError: it is not YAML, or not such tables."""
     raw = parse_yaml(text, where)
     try:
         columns = {key: {"key": key, **column} for key, column in raw["columns"].items()}
@@ -293,11 +285,7 @@ def usual_fit(config: BenchConfig) -> FitConfig:
 
 def method_fit(usual: FitConfig, method: str, preset: PresetName) -> FitConfig:
     """The usual settings with a method. What a preset sets and a method for comparison does not know has its default
-    there.
-
-    Raises:
-        UsageError: a setting beyond the preset that the method does not know.
-    """
+    there. UsageError: a setting beyond the preset that the method does not know."""
     recipe, named, plain = recipe_of(method), bench_preset(preset).fit, FitConfig()
     settings = configuration.load(FitConfig, usual, overrides={"method": method})
     for name in (*recipe.unfit, *(f"loss.{weight}" for weight in recipe.own_weights)):
@@ -378,12 +366,8 @@ def refuse_unfit(
 
 
 def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The methods, ablation rows and variants of ``mudg bench shift``, in the order of the tables.
-
-    Raises:
-        UsageError: an unknown method, one that does not know a setting beyond the preset, or a malformed or repeated
-            variant.
-    """
+    """The methods, ablation rows and variants of ``mudg bench shift``, in the order of the tables. UsageError: an
+    unknown method, one that does not know a setting beyond the preset, or a malformed or repeated variant."""
     known = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
     wanted, usual = {*config.methods, *((BASE, FULL) if config.ablation else ())}, usual_fit(config)
     _refuse_unknown(wanted, known)
@@ -418,12 +402,8 @@ def real_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row,
 
 def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "default") -> tuple[Row, ...]:
     """The rows of a paper's table: its own where it has such, else the methods asked for (all of them, where none is
-    named).
-
-    Raises:
-        UsageError: an unknown method, one that does not know a setting beyond the preset, or methods for a table that
-            has rows of its own.
-    """
+    named). UsageError: an unknown method, one that does not know a setting beyond the preset, or methods for a table
+    that has rows of its own."""
     usual_methods, freevs = BenchConfig().methods, config.freevs_model
     if table.rows:
         if config.methods != usual_methods:

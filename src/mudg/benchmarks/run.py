@@ -85,15 +85,9 @@ def run(
     preset: PresetName = "default",
     overwrite: bool = False,
 ) -> Path:
-    """Run a benchmark; returns the folder with `bench.json` and `bench.md`.
-
-    Args:
-        sources: logs, for real; logs or a list of cities, for paper; finished runs, for edit. preset: what the
-            configuration started from, for shift, real and paper.
-
-    Raises:
-        UsageError: no such benchmark, a setting that it does not use, or logs for one that makes its own.
-    """
+    """Run a benchmark; returns the folder with `bench.json` and `bench.md`. ``sources``: logs, for real; logs or a list
+    of cities, for paper; finished runs, for edit. ``preset``: what the configuration started from, for shift, real and
+    paper. UsageError: no such benchmark, a setting that it does not use, or logs for one that makes its own."""
     if name not in (*BENCHES, *CHAINS):
         raise UsageError("no such benchmark", expected=", ".join((*BENCHES, *CHAINS)), got=name)
     refuse_unused(RUNS if name == EDIT and sources else name, config, preset)

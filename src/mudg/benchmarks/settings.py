@@ -124,11 +124,8 @@ class BenchConfig(BenchOwn):
 
 def bench_preset(name: PresetName = "default") -> BenchConfig:
     """The settings of ``mudg bench shift``, ``real`` and ``paper`` before any file or flag: those of a preset that say
-    how clouds, views and fits are made. Which logs, and their size, is the benchmark's matter.
-
-    Raises:
-        UsageError: no such preset.
-    """
+    how clouds, views and fits are made. Which logs, and their size, is the benchmark's matter. UsageError: no such
+    preset."""
     run = run_preset(name)
     usual = SynthesizeConfig()
     return changed(

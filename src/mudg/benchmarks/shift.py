@@ -172,13 +172,9 @@ def document(
     distances_m: Sequence[float],
     settings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Everything ``bench.json`` holds.
-
-    Args:
-        logs: per log its facts, ``values[method][distance][metric]`` (a number, or why there is none) and seconds.
-        rows: name, title and fit of each method. distances_m: lateral shifts off the recorded path. settings: of the
-            bench.
-    """
+    """Everything ``bench.json`` holds. ``logs``: per log its facts, ``values[method][distance][metric]`` (a number, or
+    why there is none) and seconds. ``rows``: name, title and fit of each method. ``distances_m``: lateral shifts off
+    the recorded path. ``settings``: of the bench."""
     shifted = [f"{d:g}" for d in sorted(distances_m)]
     full = [{**entry, "values": {m: with_mean(of, shifted) for m, of in entry["values"].items()}} for entry in logs]
     names = [row["name"] for row in rows]

@@ -121,11 +121,8 @@ def _some(names: Sequence[str]) -> str:
 def edited_model(
     model: SceneModel, plan: EditPlan, sky: Path | None = None, street_of: StreetOf = street_left
 ) -> SceneModel:
-    """A fitted scene with a plan carried out.
-
-    Args:
-        sky: panorama of the plan's ``sky``. street_of: makes the street that objects left, or remembers it.
-    """
+    """A fitted scene with a plan carried out. ``sky``: panorama of the plan's ``sky``. ``street_of``: makes the street
+    that objects left, or remembers it."""
     model = street_of(model, plan)
     if plan.background is not None:
         other, pose = plan.background
@@ -173,11 +170,7 @@ def hidden_by(actor: Actor, views: Sequence[View]) -> Hidden:
 
 def _cut_out(model: SceneModel, names: Sequence[str], plan: EditPlan) -> SceneModel:
     """A copy with objects of their own for what stands in boxes. What the fit does not show is named, if it is only to
-    be removed.
-
-    Raises:
-        UsageError: an object that is to be moved does not show in the fit.
-    """
+    be removed. UsageError: an object that is to be moved does not show in the fit."""
     missing: dict[str, str] = {}
     for name in names:
         actor = plan.before.actors[name]
@@ -340,12 +333,8 @@ FACT = "edits"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EditedDrive:
-    """What a script made of a drive.
-
-    Args:
-        plan: what was done. scene, cloud: edited; None where they were not given.
-        notes: what the reader should know (``checks.check``).
-    """
+    """What a script made of a drive. ``plan``: what was done. ``scene``, ``cloud``: edited; None where they were not
+    given. ``notes``: what the reader should know (``checks.check``)."""
 
     script: EditScript
     plan: EditPlan
@@ -354,12 +343,9 @@ class EditedDrive:
     notes: list[dict[str, Any]]
 
     def model(self, model: SceneModel, keep_ego: bool = False, street_of: StreetOf = street_left) -> SceneModel:
-        """A fitted scene of this drive, edited.
-
-        Args:
-            keep_ego: note the vehicle's new path in the scene's facts, for those who know the recorded path alone.
-            street_of: makes the street that objects left (``apply.street_left``), or remembers it.
-        """
+        """A fitted scene of this drive, edited. ``keep_ego``: note the vehicle's new path in the scene's facts, for
+        those who know the recorded path alone. ``street_of``: makes the street that objects left
+        (``apply.street_left``), or remembers it."""
         sky = None if self.plan.sky is None else self.script.path_of(self.plan.sky.image)
         made = edited_model(model, self.plan, sky, street_of)
         facts = {**made.facts, FACT: {"script": self.script.canonical(), "notes": self.notes}}
@@ -371,15 +357,9 @@ class EditedDrive:
 def carry_out(
     script: EditScript, model: SceneModel, scene: Scene | None = None, cloud: FusedCloud | None = None
 ) -> EditedDrive:
-    """Carry out a script on a drive, but for its fitted scenes (``EditedDrive.model``).
-
-    Args:
-        model: a fit of the drive: its objects are those that a script can name where there is no scene; its ground
-            where there is no cloud.
-
-    Raises:
-        InputError: something in the script that cannot be done here.
-    """
+    """Carry out a script on a drive, but for its fitted scenes (``EditedDrive.model``). ``model``: a fit of the drive:
+    its objects are those that a script can name where there is no scene; its ground where there is no cloud.
+    InputError: something in the script that cannot be done here."""
     if conditions_of(script.canonical()) is not None and not model.classes:
         what = "weather, light and season need the classes of surfaces, and this scene was fitted without"
         remedy = "fit a scene with labels (`mudg annotate` makes them), or take them out of the script"
@@ -411,11 +391,8 @@ def is_recording(scene: Scene) -> bool:
 
 
 def background_of(parts: RunParts, name: str) -> Background:
-    """The street of a run; or of a file, which begins at its origin and leads along x.
-
-    Raises:
-        InputError: a fit by itself, of which the path of the vehicle is not known, or one without ground.
-    """
+    """The street of a run; or of a file, which begins at its origin and leads along x. InputError: a fit by itself, of
+    which the path of the vehicle is not known, or one without ground."""
     if parts.scene is None:
         model = load_model(parts.model)
         if model.facts.get("method") != IMPORTED:
@@ -503,11 +480,7 @@ def write_asset(path: Path, asset: Asset) -> None:
 
 
 def read_asset(path: Path) -> Asset:
-    """Read an asset file.
-
-    Raises:
-        InputError: it is missing, damaged, or no asset.
-    """
+    """Read an asset file. InputError: it is missing, damaged, or no asset."""
     content = store.read_bytes(path)
     arrays = store.parse_safetensors(content, str(path))
     text = store.safetensors_metadata(content, str(path)).get(HEADER)
@@ -561,10 +534,7 @@ def surface_light(model: SceneModel, views: Sequence[View]) -> NDArray[np.float6
 
 def take_light(plan: EditPlan, model: SceneModel) -> None:
     """Give a plan's new objects, and those that are kept in another street, the light of the street where they will be.
-
-    Args:
-        plan: with the views of the recording. model: the fitted scene to be edited.
-    """
+    ``plan``: with the views of the recording. ``model``: the fitted scene to be edited."""
     wanting = [name for name, insertion in plan.inserted.items() if insertion.match_light]
     if not wanting and not plan.match_objects:
         return
@@ -595,15 +565,9 @@ Drawer = Callable[[View], Observation]
 
 
 def weather_of(draw: Drawer, conditions: Conditions, scene: Scene) -> InWeather:
-    """Weather for all views of a drive, with its light and ground.
-
-    Args:
-        draw: the views as they are, with depth and classes.
-        scene: its recorded views tell the light of the drive, its path where wheels went and how fast the cameras are.
-
-    Raises:
-        InputError: views without depth or classes.
-    """
+    """Weather for all views of a drive, with its light and ground. ``draw``: the views as they are, with depth and
+    classes. ``scene``: its recorded views tell the light of the drive, its path where wheels went and how fast the
+    cameras are. InputError: views without depth or classes."""
     frames = sorted(scene.frames, key=lambda frame: (frame.view.time_s, frame.view.camera.name))
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(WITNESSES, len(frames))).round().astype(int))
     witnesses = [_shown(draw(frames[int(index)].view)) for index in chosen]
@@ -615,10 +579,7 @@ def weather_of(draw: Drawer, conditions: Conditions, scene: Scene) -> InWeather:
 
 def in_weather(draw: Drawer, how: InWeather) -> Drawer:
     """What draws a view with the colours of other weather or light; depth, classes and confidence stay as they are.
-
-    Args:
-        draw: the views as they are, with depth and classes.
-    """
+    ``draw``: the views as they are, with depth and classes."""
 
     def drawn(view: View) -> Observation:
         seen = draw(view)

@@ -56,11 +56,8 @@ class PlannedEdit:
 
     @classmethod
     def of(cls, config: EditConfig, script: EditScript, parts: RunParts) -> PlannedEdit:
-        """Carry out a script on the parts of a run; nothing is written.
-
-        Raises:
-            InputError: the script asks for what cannot be done. UsageError: repairs of images that there are not.
-        """
+        """Carry out a script on the parts of a run; nothing is written. InputError: the script asks for what cannot be
+        done. UsageError: repairs of images that there are not."""
         loaded = None if parts.scene is None else read_scene(parts.scene)
         model = load_model(parts.model) if loaded is None else model_of_scene(parts.model, loaded)
         drive = carry_out(script, model, loaded, None if parts.fused is None else read_fused(parts.fused))
@@ -129,11 +126,8 @@ def _report_of(parts: RunParts, cloud: FusedCloud) -> dict[str, object]:
 
 
 def edited_scene(script: EditScript, config: SynthesizeConfig, given: JobInputs, scene: Scene) -> Scene:
-    """The scene as the script leaves it. What cannot be done is told here, before anything is written.
-
-    Raises:
-        UsageError: a condition that shows no edits, or an edit that the drive does not allow.
-    """
+    """The scene as the script leaves it. What cannot be done is told here, before anything is written. UsageError: a
+    condition that shows no edits, or an edit that the drive does not allow."""
     if config.condition == FREEVS:
         what = "this condition is made of recorded sweeps, which show no edits"
         remedy = "edit a whole run with `mudg edit` and give its scene"

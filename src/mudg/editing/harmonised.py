@@ -63,11 +63,8 @@ PUBLISHED_OVERLAP: Final = 8
 
 
 def settings_of(config: HarmonizeConfig, device: str) -> SynthesizeConfig:
-    """How the model of a configuration samples.
-
-    Raises:
-        UsageError: a published-type model is to leave a render part of the way: it makes its clips from noise alone.
-    """
+    """How the model of a configuration samples. UsageError: a published-type model is to leave a render part of the
+    way: it makes its clips from noise alone."""
     strengths = {"uncovered": config.uncovered, "objects": config.objects, "weather": config.weather}
     partial = [f"--harmonize.{name} {value:g}" for name, value in strengths.items() if 0 < value < 1]
     if partial and is_published(config.model):
@@ -111,12 +108,9 @@ class Touched:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EditedSources:
-    """What the diffusion model is told of an edited drive.
-
-    Args:
-        fitted: its fitted scene. cloud: edited clouds, without what was left behind (``cleared_cloud``).
-        tracks: edited boxes. photos: recorded images with the pixels marked that do not show the edited drive.
-    """
+    """What the diffusion model is told of an edited drive. ``fitted``: its fitted scene. ``cloud``: edited clouds,
+    without what was left behind (``cleared_cloud``). ``tracks``: edited boxes. ``photos``: recorded images with the
+    pixels marked that do not show the edited drive."""
 
     fitted: SceneModel
     plan: EditPlan
@@ -268,11 +262,8 @@ class Harmoniser:
 
 
 def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> EditedImages:
-    """The same with every image of an edited run repaired, camera by camera.
-
-    Args:
-        recorded: the scene as it was; the views are those of the edited one.
-    """
+    """The same with every image of an edited run repaired, camera by camera. ``recorded``: the scene as it was; the
+    views are those of the edited one."""
     raster, edited = raster_of(images.before, images.config.raster), drive.scene or recorded
     sources, config = EditedSources.of(drive, images.after, recorded), images.config.harmonize
 

@@ -55,11 +55,8 @@ def motion_of(node: RigidNode) -> Motion:
 
 def node_along(node: RigidNode, motion: Motion) -> RigidNode:
     """The same object on another path; what its rows do inside the box is that of the moments that the path shows (a
-    ``DeformedNode``: of the time itself).
-
-    Raises:
-        InputError: an object on curves, whose Gaussians have places along the recorded path.
-    """
+    ``DeformedNode``: of the time itself). InputError: an object on curves, whose Gaussians have places along the
+    recorded path."""
     if isinstance(node, BezierNode):
         what = "an object that was fitted on curves cannot take another path"
         remedy = "remove or replace it, or use a fit with boxes (mudg_s, street_gaussians)"
@@ -84,11 +81,8 @@ def _at_keys(values: Tensor, shown: NDArray[np.float64]) -> Tensor:
 
 
 def with_motions(model: SceneModel, motions: Mapping[str, Motion]) -> SceneModel:
-    """A copy with some objects on other paths; it shares the table of Gaussians.
-
-    Raises:
-        UsageError: an object that the scene has no node for.
-    """
+    """A copy with some objects on other paths; it shares the table of Gaussians. UsageError: an object that the scene
+    has no node for."""
     wanted = {model.dynamic_object(name).name for name in motions}
     other = lambda node: isinstance(node, RigidNode) and node.name in wanted  # noqa: E731
     nodes = tuple(node_along(node, motions[node.name]) if other(node) else node for node in model.nodes)
@@ -129,13 +123,8 @@ def lowest_points(model: SceneModel) -> NDArray[np.float32]:
 
 def cut_out(model: SceneModel, track: Track) -> SceneModel:
     """A copy in which what stands in a box of the background is an object of its own, which can be moved or taken away.
-
-    Args:
-        track: a box that stands; its middle pose counts.
-
-    Raises:
-        UsageError: nothing of the background lies in the box, or the background changes with time.
-    """
+    ``track``: a box that stands; its middle pose counts. UsageError: nothing of the background lies in the box, or the
+    background changes with time."""
     if model.nodes[0].kind != "static":
         what, where = "nothing can be cut out of a background that changes with time", f"track {track.id!r}"
         got = f"a background of kind {model.nodes[0].kind}"
@@ -254,11 +243,8 @@ def asset_of(
     origin: str = "",
     light_rgb: NDArray[np.float64] | None = None,
 ) -> Asset:
-    """An object of a fitted scene. What deforms is taken as it is in the middle of its track.
-
-    Raises:
-        UsageError: no such object.
-    """
+    """An object of a fitted scene. What deforms is taken as it is in the middle of its track. UsageError: no such
+    object."""
     node = model.dynamic_object(name)
     index = model.nodes.index(node)
     rows = (model.table.labels["node"] == index).nonzero()[:, 0]
@@ -352,11 +338,7 @@ def with_relit_objects(model: SceneModel, gain: NDArray[np.float64]) -> SceneMod
 
 
 def with_asset(model: SceneModel, asset: Asset, name: str, motion: Motion, label: str = "") -> SceneModel:
-    """A copy with an object more, on a path.
-
-    Raises:
-        UsageError: the scene has an object of that name.
-    """
+    """A copy with an object more, on a path. UsageError: the scene has an object of that name."""
     if name in model.node_names():
         what, remedy = "there is an object of this name already", "give the inserted object another id"
         raise UsageError(what, got=name, remedy=remedy)

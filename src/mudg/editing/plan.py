@@ -76,12 +76,8 @@ class Actor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EditWorld:
-    """What a script can speak of.
-
-    Args:
-        actors: by id. ego: path of the vehicle, None where only a fitted scene is given. ground: None = heights are not
-            known.
-    """
+    """What a script can speak of. ``actors``: by id. ``ego``: path of the vehicle, None where only a fitted scene is
+    given. ``ground``: None = heights are not known."""
 
     actors: Mapping[str, Actor]
     ego: Motion | None = None
@@ -170,12 +166,8 @@ _DISPLACING: Final = frozenset({"move", "stop", "speed", "lane_change", "path"})
 
 
 def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> EditPlan:
-    """Carry out a script on paths.
-
-    Raises:
-        InputError: an id that does not exist, or something that cannot be done; the message names the line and the
-            verb.
-    """
+    """Carry out a script on paths. InputError: an id that does not exist, or something that cannot be done; the message
+    names the line and the verb."""
     plan = EditPlan(world, world, conditions=script.conditions())
     for edit in script.edits:
         if edit.verb in plan.conditions:
@@ -505,10 +497,7 @@ ANOTHER_SIDE_RAD: Final = np.radians(3.0)
 
 def check(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> list[dict[str, Any]]:
     """Notes of a plan and what its checks found, each with ``kind``, ids, numbers and a sentence ``text``.
-
-    Args:
-        views_before: recorded views. views_after: the same with the edited path of the vehicle.
-    """
+    ``views_before``: recorded views. ``views_after``: the same with the edited path of the vehicle."""
     return [*plan.notes, *collisions(plan), *unseen_sides(plan, views_before, views_after)]
 
 

@@ -78,11 +78,8 @@ class SweptCounts:
 def edited_points(
     points: SweepPoints, sweep: Sweep, plan: EditPlan, cloud: FusedCloud
 ) -> tuple[SweepPoints, SweptCounts]:
-    """The points of a sweep as the sensor would see the edited drive.
-
-    Args:
-        cloud: edited fused clouds: they hold the surfaces of objects, in the frames of their boxes.
-    """
+    """The points of a sweep as the sensor would see the edited drive. ``cloud``: edited fused clouds: they hold the
+    surfaces of objects, in the frames of their boxes."""
     xyz = points.xyz.astype(np.float64)
     ranges = np.linalg.norm(xyz, axis=1)
     usable = ranges > 1e-3
@@ -239,14 +236,8 @@ class DriveOfEdits:
 def drive_of_edits(
     script: EditScript, scene: Scene, cloud: FusedCloud, model: SceneModel | None, *, told: bool = False
 ) -> DriveOfEdits:
-    """Carry out a script on a scene and its clouds, and on its fit where there is one.
-
-    Args:
-        told: warn of what the script says and the conditions do not show.
-
-    Raises:
-        InputError: something in the script that cannot be done here.
-    """
+    """Carry out a script on a scene and its clouds, and on its fit where there is one. ``told``: warn of what the
+    script says and the conditions do not show. InputError: something in the script that cannot be done here."""
     if told and conditions_of(script.canonical()) is not None:
         takes = "that takes --fitted and a published-type model"
         log.info(f"generated views show no weather and light ({takes}); `mudg render` does")
@@ -403,12 +394,8 @@ RENDERED: Final = "rendered"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EditedImages:
-    """Makes images of an edited drive.
-
-    Args:
-        before, after: a fitted scene without and with the edits.
-        whole: every pixel is rendered: the vehicle drives another path, or through another street.
-    """
+    """Makes images of an edited drive. ``before``, ``after``: a fitted scene without and with the edits. ``whole``:
+    every pixel is rendered: the vehicle drives another path, or through another street."""
 
     before: SceneModel
     after: SceneModel
@@ -432,11 +419,8 @@ class EditedImages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveChange:
-    """What is to be written.
-
-    Args:
-        plan: what was done. scene: with the edited boxes, path and poses (``apply.edited_scene``). cloud: edited.
-    """
+    """What is to be written. ``plan``: what was done. ``scene``: with the edited boxes, path and poses
+    (``apply.edited_scene``). ``cloud``: edited."""
 
     plan: EditPlan
     scene: Scene
@@ -444,11 +428,7 @@ class DriveChange:
 
 
 def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, root: Path) -> SweptCounts:
-    """Write a scene whose files show the edits; returns what became of LiDAR returns.
-
-    Args:
-        scene: as recorded.
-    """
+    """Write a scene whose files show the edits; returns what became of LiDAR returns. ``scene``: as recorded."""
     edited, counts = drive.scene, SweptCounts()
     source = replace(scene.source, recipe=None, notes=(*scene.source.notes, NOTE))
     with SceneWriter(root, scene.id, source) as writer:

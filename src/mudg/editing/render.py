@@ -59,11 +59,8 @@ Edited = tuple[Scene, SceneModel, EditedDrive | None]
 def prepare(
     config: RenderConfig, scene: Path, model: Path, script: EditScript | None, fused: Path | None
 ) -> Edited | None:
-    """Carry out the edit script, if there is one: what cannot be done is told before anything is written.
-
-    Args:
-        fused: fused clouds of the scene, for ``config.harmonize``.
-    """
+    """Carry out the edit script, if there is one: what cannot be done is told before anything is written. ``fused``:
+    fused clouds of the scene, for ``config.harmonize``."""
     radiance = kind_of(model) == RADIANCE
     if radiance and (config.remove_tracks or script is not None):
         what = "a radiance field has no objects to leave out or to edit"
@@ -77,12 +74,8 @@ def prepare(
 
 def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited | None, work: RunDir) -> dict[str, Any]:
     """Render every camera and shift of the configuration, one observation folder (and video) per trajectory; returns a
-    summary. An interrupted run continues with the next missing view.
-
-    Args:
-        scene: gives cameras, times and the path of the vehicle. model: folder made by fit. edited: what ``prepare``
-            made of them.
-    """
+    summary. An interrupted run continues with the next missing view. ``scene``: gives cameras, times and the path of
+    the vehicle. ``model``: folder made by fit. ``edited``: what ``prepare`` made of them."""
     followers, out = list[RepairedViews](), work.path
     if kind_of(model) == RADIANCE:
         device = choose_device(config.device, "render")
@@ -187,10 +180,7 @@ def _field_drawer(config: RenderConfig, model: Path, device: torch.device) -> tu
 
 def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
     """The trajectories a configuration names: every camera at every shift (0 = recorded), and on every further path.
-
-    Raises:
-        UsageError: an unknown camera, or nothing to render.
-    """
+    UsageError: an unknown camera, or nothing to render."""
     cameras = config.cameras or tuple(scene.cameras)[:1]
     if not config.shifts_m and not config.paths:
         what, remedy = "nothing to render: no shifts were given", "at least one of --shifts-m; 0 is the recorded path"

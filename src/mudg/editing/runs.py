@@ -19,12 +19,8 @@ NO_FIT: Final = "this folder holds no fitted scene"
 
 @dataclass(frozen=True, slots=True)
 class RunParts:
-    """Where the parts of a run lie.
-
-    Args:
-        fits: folders of fitted scenes by method, the best one first. scene, fused: None where they are not known.
-        whole: a folder of ``mudg run``, not a fit by itself.
-    """
+    """Where the parts of a run lie. ``fits``: folders of fitted scenes by method, the best one first. ``scene``,
+    ``fused``: None where they are not known. ``whole``: a folder of ``mudg run``, not a fit by itself."""
 
     fits: dict[str, Path]
     scene: Path | None
@@ -38,14 +34,8 @@ class RunParts:
 
 
 def find_run(folder: Path, scene: Path | None = None, fused: Path | None = None) -> RunParts:
-    """What a folder holds.
-
-    Args:
-        scene, fused: count in place of its own.
-
-    Raises:
-        InputError: neither a fit nor a folder of ``mudg run``, or one that is not finished.
-    """
+    """What a folder holds. ``scene``, ``fused``: count in place of its own. InputError: neither a fit nor a folder of
+    ``mudg run``, or one that is not finished."""
     folder = Path(folder)
     if (folder / "model.json").is_file():
         return RunParts({"": folder}, scene or known_input(folder, "scene"), fused, False)
@@ -78,11 +68,7 @@ def scene_of_run(folder: Path) -> Path | None:
 
 
 def scene_at(path: Path) -> Path:
-    """The scene at a path: itself, or that of a run.
-
-    Raises:
-        InputError: nothing is there, or something else.
-    """
+    """The scene at a path: itself, or that of a run. InputError: nothing is there, or something else."""
     if (path / "scene.json").is_file() or path.is_file():
         return path
     found = scene_of_run(path)
@@ -134,15 +120,9 @@ _WORDS: Final = {
 
 
 def parts_of(given: Mapping[str, Any], required: Sequence[str] = ()) -> dict[str, Any]:
-    """The inputs of a command, each as the part that it stands for; before anything heavy is loaded.
-
-    Args:
-        given: name -> path, or None; names that are not in ``PARTS`` are left as they are. required: those that a run
-            at ``scene`` gives where they are None.
-
-    Raises:
-        UsageError: one is missing. InputError: one is not there, or something else.
-    """
+    """The inputs of a command, each as the part that it stands for; before anything heavy is loaded. ``given``: name ->
+    path, or None; names that are not in ``PARTS`` are left as they are. ``required``: those that a run at ``scene``
+    gives where they are None. UsageError: one is missing. InputError: one is not there, or something else."""
     scene = given.get("scene")
     is_run = scene is not None and not (Path(scene) / "scene.json").is_file() and scene_of_run(Path(scene)) is not None
     found = dict(given)

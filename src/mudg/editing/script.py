@@ -273,12 +273,8 @@ class ScriptEdit:
 
 @dataclass(frozen=True, slots=True)
 class EditScript:
-    """A checked script.
-
-    Args:
-        edits: in the order in which they apply.
-        folder: what relative paths in it are relative to.
-    """
+    """A checked script. ``edits``: in the order in which they apply. ``folder``: what relative paths in it are relative
+    to."""
 
     edits: tuple[ScriptEdit, ...]
     folder: Path
@@ -296,11 +292,8 @@ class EditScript:
         return [{edit.verb: edit.settings.model_dump(mode="json", by_alias=True)} for edit in self.edits]
 
     def digest(self) -> str:
-        """Hash of what the script says and of what it reads; part of the key of everything made with it.
-
-        Raises:
-            InputError: a file or folder that it names does not exist. IntegrityError: one was altered.
-        """
+        """Hash of what the script says and of what it reads; part of the key of everything made with it. InputError: a
+        file or folder that it names does not exist. IntegrityError: one was altered."""
         contents = {}
         for edit in self.edits:
             for name in files_of(edit.settings):
@@ -341,21 +334,13 @@ def _with_contents(value: Any, names: Mapping[str, str]) -> Any:
 
 
 def read_edits(path: Path | str) -> EditScript:
-    """Read a script.
-
-    Raises:
-        InputError: it is missing, no YAML, or says something that no verb understands.
-    """
+    """Read a script. InputError: it is missing, no YAML, or says something that no verb understands."""
     path = Path(path)
     return parse_edits(store.read_bytes(path), str(path), path.parent)
 
 
 def parse_edits(text: str | bytes, where: str, folder: Path = Path()) -> EditScript:
-    """Check a script.
-
-    Args:
-        where: name of the file for messages. folder: what its paths are relative to.
-    """
+    """Check a script. ``where``: name of the file for messages. ``folder``: what its paths are relative to."""
     entries, lines = parse_with_lines(text, where)
     if not isinstance(entries, list) or not entries:
         got = "nothing" if entries in (None, []) else type(entries).__name__

@@ -162,11 +162,8 @@ class _Cells:
 
 def shaded_cells(light: Array, below: Rows, reach_m: float) -> Rows:
     """Cells bool[X, Y] of the shadow of what stood on some: those darker than lit ground about them that lie behind it,
-    and behind each other, in one direction: the one in which there are most.
-
-    Args:
-        light: luminance f64[X, Y] in linear light, NaN = not known. below: where it stood, bool[X, Y].
-    """
+    and behind each other, in one direction: the one in which there are most. ``light``: luminance f64[X, Y] in linear
+    light, NaN = not known. ``below``: where it stood, bool[X, Y]."""
     known = np.isfinite(light)
     size = 2 * round(AROUND_M / SHADOW_CELL_M) + 1
     lit = ndimage.generic_filter(np.where(known, light, np.nan), _upper, size=size, mode="constant", cval=np.nan)
@@ -191,12 +188,9 @@ def _upper(values: Array) -> float:
 def brightened(
     model: SceneModel, size_m: tuple[float, float, float], poses: Array, ground: Mapping[int, Rows], weights: Array
 ) -> SceneModel:
-    """A copy without the shadow of what stood in boxes; the model itself where none is found.
-
-    Args:
-        poses: world_from_box f64[V, 4, 4]. ground: rows bool[N] of each class of ground. weights: pixels that views
-            show of each, f64[N].
-    """
+    """A copy without the shadow of what stood in boxes; the model itself where none is found. ``poses``: world_from_box
+    f64[V, 4, 4]. ``ground``: rows bool[N] of each class of ground. ``weights``: pixels that views show of each,
+    f64[N]."""
     means = model.table["means"].detach().cpu().numpy().astype(np.float64)[:, :2]
     shown = colors_of(model)
     luminance = linear_of(shown) @ LUMINANCE
@@ -261,11 +255,8 @@ BELOW_M: Final = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hidden:
-    """An object of the recording and the views of it.
-
-    Args:
-        size_m: of its box. motion: of its box. moves: whether it leaves its place. views: at whose times it is there.
-    """
+    """An object of the recording and the views of it. ``size_m``: of its box. ``motion``: of its box. ``moves``:
+    whether it leaves its place. ``views``: at whose times it is there."""
 
     size_m: tuple[float, float, float]
     motion: Motion
@@ -524,10 +515,7 @@ def _flat(places: Array, scales_m: Sequence[float], opacity: float, colors: Arra
 
 def with_copies(model: SceneModel, likeness: NDArray[np.int64], changed: Mapping[str, Array]) -> SceneModel:
     """With copies of some rows, appended, that differ from them in some columns; nobody saw what they show.
-
-    Args:
-        likeness: rows i64[M]. changed: columns f64[M, ...] by name.
-    """
+    ``likeness``: rows i64[M]. ``changed``: columns f64[M, ...] by name."""
     rows = torch.from_numpy(likeness).to(model.device)
     columns = {name: value.detach()[rows].clone() for name, value in model.table.columns.items()}
     for name, values in changed.items():
@@ -582,11 +570,8 @@ def with_closed_sides(
     model: SceneModel, names: Collection[str], views: Sequence[View], raster: RasterConfig
 ) -> SceneModel:
     """A copy in which some vehicles have flanks where the recording showed none; other objects stay as they are.
-
-    Args:
-        model: with the objects on their recorded paths. names: of objects. views: recorded ones, from which nothing new
-            is to be seen.
-    """
+    ``model``: with the objects on their recorded paths. ``names``: of objects. ``views``: recorded ones, from which
+    nothing new is to be seen."""
     first = len(model.table)
     for name in names:
         node = model.dynamic_object(name)
@@ -635,12 +620,9 @@ def _with_flanks(model: SceneModel, node: RigidNode) -> SceneModel:
 
 
 def _flanks(places: Array, half: Array, cabin: bool) -> Array:
-    """Places f64[M, 3] on a grid over both flanks of a vehicle, in the frame of its box.
-
-    Args:
-        places: f64[N, 3] of its Gaussians, which say how wide it is at each height. half: of the size of its box.
-            cabin: a car, of the usual shape; else a box.
-    """
+    """Places f64[M, 3] on a grid over both flanks of a vehicle, in the frame of its box. ``places``: f64[N, 3] of its
+    Gaussians, which say how wide it is at each height. ``half``: of the size of its box. ``cabin``: a car, of the usual
+    shape; else a box."""
     found = []
     for z in np.arange(SIDE_FLOOR_M + STEP_M / 2, 2 * half[2] - 0.02, STEP_M) - half[2]:
         level = np.abs(places[np.abs(places[:, 2] - z) < SAME_HEIGHT_M, 1])

@@ -66,11 +66,8 @@ NETWORKS: Final[Mapping[str, ScoreNetwork]] = {
 
 
 def convert_weights(network: str, checkpoint: Path, to: Path) -> None:
-    """Write the folder ``to``: ``weights.safetensors`` in float32, and ``model.json`` with its origin.
-
-    Raises:
-        InputError: the file is missing, damaged, or holds another network; nothing is written.
-    """
+    """Write the folder ``to``: ``weights.safetensors`` in float32, and ``model.json`` with its origin. InputError: the
+    file is missing, damaged, or holds another network; nothing is written."""
     kind, found = NETWORKS[network], read_checkpoint(checkpoint)
     tensors = kind.named(found)
     kind.check(tensors, str(checkpoint))

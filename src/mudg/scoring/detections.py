@@ -57,11 +57,8 @@ class Detection:
 
 @dataclass(frozen=True)
 class ViewImages:
-    """Images of one method on one trajectory.
-
-    Args:
-        key: first part of their names. numbers: of the images that count. views: of these.
-    """
+    """Images of one method on one trajectory. ``key``: first part of their names. ``numbers``: of the images that
+    count. ``views``: of these."""
 
     key: str
     numbers: tuple[int, ...]
@@ -129,12 +126,8 @@ def image_name(given: str) -> str:
 
 
 class BoxDetections:
-    """NTA-IoU of methods.
-
-    Args:
-        scene: whose tracked boxes are the truth. path: file of boxes. as_published: true boxes also of corners behind
-            the camera.
-    """
+    """NTA-IoU of methods. ``scene``: whose tracked boxes are the truth. ``path``: file of boxes. ``as_published``: true
+    boxes also of corners behind the camera."""
 
     def __init__(self, scene: Scene, path: Path, as_published: bool) -> None:
         self._scene, self._as_published = scene, as_published
@@ -193,15 +186,8 @@ class BoxDetections:
 
 
 class LaneDetections:
-    """NTL-IoU of methods.
-
-    Args:
-        scene: a generated city, whose markings and kerbs take the place of a map. folder: masks
-            ``METHOD/TRAJECTORY/000003.png``.
-
-    Raises:
-        InputError: the scene has no lane lines, or the folder is missing.
-    """
+    """NTL-IoU of methods. ``scene``: a generated city, whose markings and kerbs take the place of a map. ``folder``:
+    masks ``METHOD/TRAJECTORY/000003.png``. InputError: the scene has no lane lines, or the folder is missing."""
 
     def __init__(self, scene: Scene, folder: Path) -> None:
         if scene.source.recipe is None:
@@ -214,11 +200,8 @@ class LaneDetections:
         self._folder = folder
 
     def of(self, images: ViewImages) -> dict[str, Any] | str:
-        """``value``, IoU of ``lanes`` alone, and number of ``frames``; or why there is none.
-
-        Raises:
-            InputError: some masks of a set are missing, or one cannot be read.
-        """
+        """``value``, IoU of ``lanes`` alone, and number of ``frames``; or why there is none. InputError: some masks of
+        a set are missing, or one cannot be read."""
         files = [self._folder / f"{name}.png" for name in images.names()]
         if not any(path.is_file() for path in files):
             return score_tables.NO_DETECTIONS
@@ -281,10 +264,7 @@ class Detections:
 
 
 def detections_of(config: ScoreConfig, scene: Scene) -> Detections:
-    """What reads the files that a configuration names.
-
-    Raises:
-        InputError: a file is missing or malformed, or the log has no lane lines.
-    """
+    """What reads the files that a configuration names. InputError: a file is missing or malformed, or the log has no
+    lane lines."""
     boxes = BoxDetections(scene, Path(config.detections), config.as_published) if config.detections else None
     return Detections(boxes, LaneDetections(scene, Path(config.lanes)) if config.lanes else None)

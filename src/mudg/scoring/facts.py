@@ -231,11 +231,8 @@ class Reference:
 
 
 def trajectories_of(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]) -> list[ScoredTrajectory]:
-    """The trajectories that some method has, by camera and distance.
-
-    Raises:
-        InputError: there are none, or methods disagree about a trajectory's views.
-    """
+    """The trajectories that some method has, by camera and distance. InputError: there are none, or methods disagree
+    about a trajectory's views."""
     read = lambda folder: {n: read_observations(path) for n, path in list_observation_sets(folder).items()}  # noqa: E731
     sets = {method: read(folder) for method, folder in methods.items()}
     names = sorted({name for found in sets.values() for name in found}, key=_order)

@@ -376,10 +376,7 @@ def pair_of(
     seen: Observation, truth: ViewTruth | None, view: View | None = None, facts: ViewFacts | None = None
 ) -> metrics.Pair:
     """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m).
-
-    Args:
-        view: of both; without it, the truth's. facts: what is known of the view beside the truth.
-    """
+    ``view``: of both; without it, the truth's. ``facts``: what is known of the view beside the truth."""
     true = None if truth is None else truth.seen
     view = view or (seen.view if true is None else true.view)
     height, width = view.camera.height, view.camera.width

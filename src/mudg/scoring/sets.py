@@ -68,13 +68,9 @@ class ImageSet:
 
 @dataclass(frozen=True)
 class TrajectorySets:
-    """What is compared on one trajectory.
-
-    Args:
-        name, camera: of the trajectory. width, height: common size, pixels.
-        methods: the counted images of every method.
-        truth: the true images of the same views where they are known and are not the recorded ones, else None.
-    """
+    """What is compared on one trajectory. ``name``, ``camera``: of the trajectory. ``width``, ``height``: common size,
+    pixels. ``methods``: the counted images of every method. ``truth``: the true images of the same views where they are
+    known and are not the recorded ones, else None."""
 
     name: str
     camera: str
@@ -105,13 +101,9 @@ class SetDistances:
 
 @dataclass
 class EmbeddingFiles:
-    """Embeddings of sets of images by a network, kept in a folder.
-
-    Args:
-        network: images ``[n, 3, h, w]`` -> ``[n, width]``. prepare: an image u8[H, W, 3] as the network wants it.
-            width: of the embedding.
-        key: weights and rules, by which kept files are found. folder: where they lie. device: of the network.
-    """
+    """Embeddings of sets of images by a network, kept in a folder. ``network``: images ``[n, 3, h, w]`` -> ``[n,
+    width]``. ``prepare``: an image u8[H, W, 3] as the network wants it. ``width``: of the embedding. ``key``: weights
+    and rules, by which kept files are found. ``folder``: where they lie. ``device``: of the network."""
 
     network: Callable[[Tensor], Tensor]
     prepare: Callable[[NDArray[np.uint8]], Tensor]
@@ -140,15 +132,9 @@ class EmbeddingFiles:
 
 
 class FeatureFiles(EmbeddingFiles):
-    """Features f32[n, 2048] of sets of images by FID's network, kept in a folder.
-
-    Args:
-        weights: file with the network's weights. rule: how images get its size. folder: where features are kept.
-            device: of the network.
-
-    Raises:
-        InputError: the file is missing, damaged, or holds another network.
-    """
+    """Features f32[n, 2048] of sets of images by FID's network, kept in a folder. ``weights``: file with the network's
+    weights. ``rule``: how images get its size. ``folder``: where features are kept. ``device``: of the network.
+    InputError: the file is missing, damaged, or holds another network."""
 
     def __init__(self, weights: Path, rule: inception.ResizeRule, folder: Path, device: torch.device) -> None:
         state, sha256 = read_checkpoint(weights), store.sha256_file(weights)
@@ -164,12 +150,8 @@ def kept_features(
     folder: Path, key: str, images: ImageSet, shape: tuple[int, int], compute: Callable[[], NDArray[np.float32]]
 ) -> tuple[str, NDArray[np.float32]]:
     """The name of the file with the features of a set, and the features: from a folder if these very pixels went
-    through the same network before, else computed and kept there.
-
-    Args:
-        folder: where files lie. key: weights and rules. images: what is described. shape: of the features. compute:
-            makes them.
-    """
+    through the same network before, else computed and kept there. ``folder``: where files lie. ``key``: weights and
+    rules. ``images``: what is described. ``shape``: of the features. ``compute``: makes them."""
     content = hashlib.sha256(f"{key} {images.count}".encode())
     for number in range(images.count):
         picture = images.image(number)
@@ -213,11 +195,8 @@ class SetNotes:
 
 
 class Distributions:
-    """FID and KID of every trajectory of a scene.
-
-    Args:
-        scene: whose recorded frames are the reference. features: how images become features.
-    """
+    """FID and KID of every trajectory of a scene. ``scene``: whose recorded frames are the reference. ``features``: how
+    images become features."""
 
     def __init__(self, scene: Scene, features: FeatureFiles) -> None:
         self._scene, self._features = scene, features
@@ -225,11 +204,8 @@ class Distributions:
         self._notes = SetNotes()
 
     def of(self, sets: TrajectorySets) -> dict[str, SetDistances | str]:
-        """Distances by method, or why there are none; the floor of the trajectory is noted for ``record``.
-
-        Raises:
-            InputError: methods have different numbers of images.
-        """
+        """Distances by method, or why there are none; the floor of the trajectory is noted for ``record``. InputError:
+        methods have different numbers of images."""
         counts = {method: images.count for method, images in sets.methods.items()}
         if len(set(counts.values())) > 1:
             what, expected = "FID of sets of different size cannot be compared", "the same views for all methods"
@@ -314,15 +290,9 @@ HOP_FRAMES: Final = 8
 
 
 class ClipFiles:
-    """Features of the clips of a video by FVD's network, kept in a folder.
-
-    Args:
-        weights: file with the network's weights. rule: how frames get its size. folder: where features are kept.
-            device: of the network.
-
-    Raises:
-        InputError: the file is missing, damaged, or holds another network.
-    """
+    """Features of the clips of a video by FVD's network, kept in a folder. ``weights``: file with the network's
+    weights. ``rule``: how frames get its size. ``folder``: where features are kept. ``device``: of the network.
+    InputError: the file is missing, damaged, or holds another network."""
 
     def __init__(self, weights: Path, rule: i3d.VideoRule, folder: Path, device: torch.device) -> None:
         self.rule: i3d.VideoRule = rule
@@ -366,11 +336,8 @@ def clip_count(frames: int) -> int:
 
 
 class VideoDistances:
-    """FVD of every trajectory of a scene.
-
-    Args:
-        scene: whose recorded video is the reference. clips: how videos become features.
-    """
+    """FVD of every trajectory of a scene. ``scene``: whose recorded video is the reference. ``clips``: how videos
+    become features."""
 
     def __init__(self, scene: Scene, clips: ClipFiles) -> None:
         self._scene, self._clips = scene, clips
@@ -378,11 +345,7 @@ class VideoDistances:
 
     def of(self, sets: TrajectorySets) -> dict[str, dict[str, Any] | str]:
         """By method ``{"fvd", "n", "n_reference"}``, or why there is none; the floor of the trajectory is noted for
-        ``record``.
-
-        Args:
-            sets: with all views of every method, in order of time.
-        """
+        ``record``. ``sets``: with all views of every method, in order of time."""
         recorded = recorded_images(self._scene, sets)
         if not recorded.count:
             return dict.fromkeys(sets.methods, score_tables.NO_TRUTH)
@@ -442,14 +405,8 @@ TRUTH: Final = "truth"
 
 
 class VideoFeatures:
-    """Frechet and polynomial distances of every trajectory.
-
-    Args:
-        folder: of the tables.
-
-    Raises:
-        InputError: there is no such folder.
-    """
+    """Frechet and polynomial distances of every trajectory. ``folder``: of the tables. InputError: there is no such
+    folder."""
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():

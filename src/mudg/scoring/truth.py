@@ -56,11 +56,8 @@ class ViewTruth:
 
 @dataclass(frozen=True)
 class Truth:
-    """Where truth comes from: ``at_view(view, frame, trajectory)`` is None where there is none.
-
-    Args:
-        exact: truth exists at every pixel of every view. stored: it lies on disk already and need not be written again.
-    """
+    """Where truth comes from: ``at_view(view, frame, trajectory)`` is None where there is none. ``exact``: truth exists
+    at every pixel of every view. ``stored``: it lies on disk already and need not be written again."""
 
     exact: bool
     at_view: Callable[[View, Frame | None, str], ViewTruth | None]
@@ -96,11 +93,8 @@ def _city_view(world: CityWorld, moving: NDArray[np.int32], view: View) -> ViewT
 
 
 def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path) -> None:
-    """Draw the truth of a generated city on some trajectories once, for many scores.
-
-    Raises:
-        InputError: the scene was not generated.
-    """
+    """Draw the truth of a generated city on some trajectories once, for many scores. InputError: the scene was not
+    generated."""
     truth = truth_of(read_scene(scene))
     if not truth.exact:
         raise InputError("only a generated city has ground truth at every view", where=str(scene))
@@ -225,11 +219,8 @@ class LogPoints:
         return lidar.carried(frame.view, read_image(self.scene, frame), world, points.gap_deg)
 
     def truth_at(self, view: View, frame: Frame | None) -> PointTruth | None:
-        """What the points of the sweeps taken with a view say about it; None without such sweeps.
-
-        Args:
-            frame: the recorded image of that time, which gives the points' colours and classes, or None.
-        """
+        """What the points of the sweeps taken with a view say about it; None without such sweeps. ``frame``: the
+        recorded image of that time, which gives the points' colours and classes, or None."""
         points = self.of_moment(view.time_s)
         if points is None or not len(points.xyz):
             return None

@@ -90,11 +90,8 @@ class SetScores:
 
 
 def set_scores_of(config: ScoreConfig, scene: Scene, out: Path) -> SetScores:
-    """What the given weights and files allow to compute.
-
-    Raises:
-        InputError: a file is missing, damaged, or holds another network.
-    """
+    """What the given weights and files allow to compute. InputError: a file is missing, damaged, or holds another
+    network."""
     return SetScores(
         sets.distributions_of(config, scene, out) if config.fid_weights else None,
         sets.videos_of(config, scene, out) if config.fvd_weights else None,

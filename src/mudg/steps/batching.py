@@ -162,12 +162,8 @@ def _refuse_overlap(entries: Sequence[Entry], folder: BatchFolder, listed: str) 
 
 
 def show_status(out: str, html: bool = False, price: float = 0.0, every_s: float = 0.0) -> dict[str, Any]:
-    """How far a batch is, what has failed and what it took.
-
-    Args:
-        html: also write ``status.html`` in its folder. price: of a core-hour. every_s: show it again until nothing is
-            left (0: once).
-    """
+    """How far a batch is, what has failed and what it took. ``html``: also write ``status.html`` in its folder.
+    ``price``: of a core-hour. ``every_s``: show it again until nothing is left (0: once)."""
     while True:
         state = status.read_status(BatchFolder(Location.of(out)), price)
         result: dict[str, Any] = {**state.record(), "text": status.text_of(state)}
@@ -182,11 +178,8 @@ def show_status(out: str, html: bool = False, price: float = 0.0, every_s: float
 
 
 def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -> RunConfig:
-    """Settings of the steps: a preset, then a file of ``mudg run``, then ``STEP.NAME=VALUE``.
-
-    Raises:
-        UsageError: an unknown setting or a value out of range.
-    """
+    """Settings of the steps: a preset, then a file of ``mudg run``, then ``STEP.NAME=VALUE``. UsageError: an unknown
+    setting or a value out of range."""
     values: dict[str, Any] = {}
     for text in given:
         name, separator, value = text.partition("=")
@@ -199,11 +192,7 @@ def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -
 
 def retry(out: str, reason: str = "") -> dict[str, Any]:
     """Forget failures, so that the next ``mudg batch run`` tries them again. reason: exit codes with commas (empty:
-    all).
-
-    Raises:
-        InputError: no batch is here, or nothing failed for this reason. UsageError: not a list of exit codes.
-    """
+    all). InputError: no batch is here, or nothing failed for this reason. UsageError: not a list of exit codes."""
     folder, words = BatchFolder(Location.of(out)), reason.replace(",", " ").split()
     if not all(word.isdecimal() for word in words):
         raise UsageError("unknown reason", where="--reason", got=reason, expected="exit codes with commas, as 5,137")

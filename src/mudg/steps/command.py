@@ -41,12 +41,8 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
-    """The words behind a verb as its step, and the flags that every command has.
-
-    Raises:
-        UsageError: an unknown flag (the nearest is named), a missing or wrong value. InputError: --config cannot be
-            read.
-    """
+    """The words behind a verb as its step, and the flags that every command has. UsageError: an unknown flag (the
+    nearest is named), a missing or wrong value. InputError: --config cannot be read."""
     listed = {option.name: option for option in _all_options(cls)}
     parser = _Parser(prog=f"mudg {cls.verb()}", add_help=False, allow_abbrev=False)
     for option in listed.values():
@@ -184,13 +180,8 @@ _FLAG_COLUMNS = 26
 
 
 def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
-    """A verb's page of help.
-
-    Args:
-        everything: all settings with their whole texts; else those that most people need, with the first sentence of
-            each.
-        part: only what this part of the verb takes.
-    """
+    """A verb's page of help. ``everything``: all settings with their whole texts; else those that most people need,
+    with the first sentence of each. ``part``: only what this part of the verb takes."""
     head = f"mudg {cls.verb()}{f' {part}' if part else ''}"
     examples = [line for line in cls.examples if line.startswith(f"{head} ") or not part]
     shown = examples if everything or part else examples[:3]

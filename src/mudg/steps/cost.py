@@ -96,11 +96,8 @@ class Estimate:
 
 
 def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0, device: str = "cpu") -> Estimate:
-    """Forecast ``mudg run SCENE``.
-
-    Args:
-        cores: that the steps may use. speed: 1 = the machine of the unit costs. device: ``cpu`` or ``cuda``.
-    """
+    """Forecast ``mudg run SCENE``. ``cores``: that the steps may use. ``speed``: 1 = the machine of the unit costs.
+    ``device``: ``cpu`` or ``cuda``."""
     fit, pixels, published = config.fit, size.width * size.height, config.synthesize.guidance is not None
     lines, adapts = len(config.synthesize.shifts_m), size.adapts and config.adaptation != "off" and not published
     made, rendered = size.path_images * lines, size.path_images * len(config.render.shifts_m)

@@ -124,11 +124,8 @@ def _write_viewer(out: Path) -> Path:
 
 def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--synthesize.model") -> None:
     """UsageError where weights that are not shipped are asked for and not given; InputError where there is no diffusion
-    model. Before anything is written: the first of these is needed only after a fit.
-
-    Args:
-        flag: what names the diffusion model on this command line.
-    """
+    model. Before anything is written: the first of these is needed only after a fit. ``flag``: what names the diffusion
+    model on this command line."""
     from mudg.diffusion.files import read_description
     from mudg.diffusion.published.model import is_published
 
@@ -218,11 +215,8 @@ def _has_semantics(scene: Path) -> bool:
 
 def _diffusion_of(config: RunConfig, scene: Path) -> tuple[bool, bool]:
     """Whether the chain's diffusion model has renders of the first fit in its input, and whether it is adapted to the
-    log; said in a line where that is not what the settings say at first sight.
-
-    Raises:
-        UsageError: adaptation is asked for, but the model cannot be adapted or the log is too short.
-    """
+    log; said in a line where that is not what the settings say at first sight. UsageError: adaptation is asked for, but
+    the model cannot be adapted or the log is too short."""
     from mudg.diffusion.files import uses_renders
 
     renders = uses_renders(config.synthesize.model)

@@ -182,11 +182,8 @@ PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
 
 
 def run_preset(name: PresetName = "default") -> RunConfig:
-    """The chain's settings before any file or flag; the first camera of whatever scene it is.
-
-    Raises:
-        UsageError: no such preset.
-    """
+    """The chain's settings before any file or flag; the first camera of whatever scene it is. UsageError: no such
+    preset."""
     if name not in PRESETS:
         raise UsageError("no such preset", where="--preset", expected=", ".join(get_args(PresetName)), got=repr(name))
     own = {"ingest.city.seed": DEMO_CITY, "synthesize.cameras": (), "render.cameras": ()}

@@ -29,12 +29,9 @@ MANY: Final = 200
 
 @dataclass(frozen=True)
 class GalleryEntry:
-    """A finished folder on the page.
-
-    Args:
-        folder: of the run. kind: what made it: run, score or bench. scores: its metrics.json, None of a benchmark.
-        facts: words below its name. picture: of a rendered view, if there is one. pages: title -> file.
-    """
+    """A finished folder on the page. ``folder``: of the run. ``kind``: what made it: run, score or bench. ``scores``:
+    its metrics.json, None of a benchmark. ``facts``: words below its name. ``picture``: of a rendered view, if there is
+    one. ``pages``: title -> file."""
 
     folder: Path
     kind: str
@@ -53,11 +50,8 @@ class Unread:
 
 
 def read_shown(folder: Path) -> GalleryEntry:
-    """What a folder of ``mudg run``, ``mudg score`` or ``mudg bench`` holds.
-
-    Raises:
-        InputError: it is none of them, unfinished, or damaged.
-    """
+    """What a folder of ``mudg run``, ``mudg score`` or ``mudg bench`` holds. InputError: it is none of them,
+    unfinished, or damaged."""
     if not folder.is_dir():
         raise InputError("no such folder", where=str(folder))
     with understood("a finished run", str(folder)):
@@ -124,11 +118,8 @@ def _picture(folder: Path) -> Path | None:
 
 
 def page(shown: Sequence[GalleryEntry], unread: Sequence[Unread], out: Path) -> str:
-    """The whole page. Links are relative to ``out``, the file that it becomes; pictures lie inside.
-
-    Args:
-        shown: in this order. unread: listed with their reasons.
-    """
+    """The whole page. Links are relative to ``out``, the file that it becomes; pictures lie inside. ``shown``: in this
+    order. ``unread``: listed with their reasons."""
     names = _names([one.folder for one in shown])
     width = THUMBNAIL_PX[len(shown) > MANY]
     cards = [_card(one, name, out, width) for one, name in zip(shown, names, strict=True)]

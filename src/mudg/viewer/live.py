@@ -101,11 +101,8 @@ class EditDesk:
         return [{edit.verb: said(edit.settings)} for edit in script.edits]
 
     def edited(self, text: str) -> list[SceneModel]:
-        """The fits with a script carried out; as they are where it is empty.
-
-        Raises:
-            InputError: it cannot be carried out; the message names line, verb and field.
-        """
+        """The fits with a script carried out; as they are where it is empty. InputError: it cannot be carried out; the
+        message names line, verb and field."""
         if not text.strip():
             return list(self.models)
         drive = self._carried(text)
@@ -175,11 +172,7 @@ class EditDesk:
         return {name: record(motion) for name, motion in {**changed, **standing}.items()}
 
     def save(self, text: str) -> Path:
-        """Write the script.
-
-        Raises:
-            InputError: there is nothing to save, or the file belongs to somebody else.
-        """
+        """Write the script. InputError: there is nothing to save, or the file belongs to somebody else."""
         if not text.strip():
             raise InputError("there are no edits to save", remedy="hide, move or remove an object first")
         if self.place.exists() and not self.overwrite and not store.read_bytes(self.place).startswith(MARK.encode()):
@@ -209,11 +202,8 @@ def _unseen(drive: EditedDrive) -> list[str]:
 def desk_for(
     models: Sequence[SceneModel], scene: Scene, cloud: FusedCloud | None, run: Path, files: EditFiles
 ) -> EditDesk:
-    """What carries out the edits of a page.
-
-    Raises:
-        InputError: the script cannot be carried out. UsageError: edits would be saved into a finished result.
-    """
+    """What carries out the edits of a page. InputError: the script cannot be carried out. UsageError: edits would be
+    saved into a finished result."""
     begin = None if files.script is None else read_edits(files.script)
     own = str(Path(run).resolve()) if find_run(run).whole else ""
     desk = EditDesk(models, scene, cloud, place_for(run, files.out), begin, files.overwrite, own)
@@ -223,11 +213,8 @@ def desk_for(
 
 
 def place_for(run: Path, given: Path | None) -> Path:
-    """Where edits of a run are saved: the given file, else beside the run, else in the current folder.
-
-    Raises:
-        UsageError: the given file lies in the result of a command.
-    """
+    """Where edits of a run are saved: the given file, else beside the run, else in the current folder. UsageError: the
+    given file lies in the result of a command."""
     if given is not None:
         if _sealed(given) or given.is_dir():
             what, expected = "edits are not saved into the result of a command", "a file outside of runs"
@@ -302,13 +289,9 @@ def _drawer_of(model: SceneModel) -> Drawer:
 
 
 class FrameSource:
-    """Draws frames of one or two fitted scenes, one at a time.
-
-    Args:
-        edited: the scenes with a script carried out; "" = as they are. scene: the log; its recorded views tell the
-            light of the drive, where a script asks for other weather or light.
-        widest: pixels of the widest frame.
-    """
+    """Draws frames of one or two fitted scenes, one at a time. ``edited``: the scenes with a script carried out; "" =
+    as they are. ``scene``: the log; its recorded views tell the light of the drive, where a script asks for other
+    weather or light. ``widest``: pixels of the widest frame."""
 
     def __init__(
         self, edited: Callable[[str], Sequence[SceneModel]], scene: Scene, widest: int, device: torch.device
@@ -318,11 +301,7 @@ class FrameSource:
         self._lock, self._filming = threading.Lock(), threading.Lock()
 
     def png(self, asked: FrameRequest) -> bytes:
-        """A frame as PNG bytes.
-
-        Raises:
-            InputError: a camera that is none, or edits that cannot be carried out.
-        """
+        """A frame as PNG bytes. InputError: a camera that is none, or edits that cannot be carried out."""
         content, view = io.BytesIO(), View(self._camera(asked), _pose(asked), float(asked.time_s))
         picture = self._picture(asked.layer, self._drawer(asked), view)
         Image.fromarray(picture).save(content, "PNG", compress_level=1)
@@ -330,12 +309,8 @@ class FrameSource:
 
     def film(self, asked: VideoRequest, send: Callable[[bytes], None]) -> None:
         """Make a video and send it: after each frame a line of JSON with its number, then one with the number of bytes,
-        then the MP4 file. Frames that are asked for meanwhile are drawn in between.
-
-        Raises:
-            InputError: as ``png``, or too many pixels. ResourceError: another video is being made. OSError: of
-                ``send``; nothing is left.
-        """
+        then the MP4 file. Frames that are asked for meanwhile are drawn in between. InputError: as ``png``, or too many
+        pixels. ResourceError: another video is being made. OSError: of ``send``; nothing is left."""
         camera, count = self._camera(asked), len(asked.moments)
         if camera.width * camera.height * count > MOST_PIXELS:
             expected = f"at most {MOST_PIXELS:,} pixels in all frames together"

@@ -60,13 +60,9 @@ _SLICE: Final = 1 << 18
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The rows of a page.
-
-    Args:
-        rows: of the scene, in the order of the page, intp[n]. size: rows per chunk.
-        given: rows of the scene. visible: of these, rows that can be drawn.
-        lost: what was left out for the budget covers this share of what all of them cover, 0 to 1.
-    """
+    """The rows of a page. ``rows``: of the scene, in the order of the page, intp[n]. ``size``: rows per chunk.
+    ``given``: rows of the scene. ``visible``: of these, rows that can be drawn. ``lost``: what was left out for the
+    budget covers this share of what all of them cover, 0 to 1."""
 
     rows: NDArray[np.intp]
     size: int
@@ -94,16 +90,9 @@ def lay_out(
     most: int = 0,
     size: int = CHUNK,
 ) -> Layout:
-    """Choose and order rows.
-
-    Args:
-        columns: of the scene's table. node: of each row.
-        path: positions of the cameras f64[m, 3]. most: rows to keep (0 = all that can be drawn). size: rows per chunk
-            of a scene that is not small.
-
-    Raises:
-        UsageError: more rows than a page can hold.
-    """
+    """Choose and order rows. ``columns``: of the scene's table. ``node``: of each row. ``path``: positions of the
+    cameras f64[m, 3]. ``most``: rows to keep (0 = all that can be drawn). ``size``: rows per chunk of a scene that is
+    not small. UsageError: more rows than a page can hold."""
     rows = np.flatnonzero(opacity_of(columns["logits"]) >= ALPHA_MIN)
     visible, lost = len(rows), 0.0
     worth = coverage(columns, node, path)[rows]
@@ -452,11 +441,8 @@ UNKNOWN: Final = 65535
 
 @dataclass(frozen=True, slots=True)
 class PageFacts:
-    """The log for the page.
-
-    Args:
-        facts: JSON values. sections: see the module's docstring. images: all WebP files behind one another.
-    """
+    """The log for the page. ``facts``: JSON values. ``sections``: see the module's docstring. ``images``: all WebP
+    files behind one another."""
 
     facts: dict[str, Any]
     sections: Sections
@@ -469,12 +455,8 @@ def begin_of(scene: Scene) -> float:
 
 
 def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images: int) -> PageFacts:
-    """Everything but the Gaussians.
-
-    Args:
-        scene: the log. colors: of the fit. image_width: of recorded images on the page, pixels.
-        most_images: how many images the page may hold; taken evenly.
-    """
+    """Everything but the Gaussians. ``scene``: the log. ``colors``: of the fit. ``image_width``: of recorded images on
+    the page, pixels. ``most_images``: how many images the page may hold; taken evenly."""
     begin = begin_of(scene)
     frames = sorted(scene.frames, key=lambda frame: (frame.view.camera.name, frame.view.time_s))
     keys, tracks = [key_rows(scene.ego.times_s - begin, scene.ego.world_from_ego)], []
@@ -605,11 +587,8 @@ MODULES: Final = (
 
 @dataclass(frozen=True, slots=True)
 class PageFile:
-    """One data file of a page, gzipped where that helps.
-
-    Args:
-        name: of the element that holds it in a page of one file. content: bytes.
-    """
+    """One data file of a page, gzipped where that helps. ``name``: of the element that holds it in a page of one file.
+    ``content``: bytes."""
 
     name: str
     content: bytes
@@ -627,14 +606,9 @@ class PageFile:
 
 @dataclass(frozen=True, slots=True)
 class ViewerPage:
-    """What is to be written.
-
-    Args:
-        title, subtitle, about: texts. report: relative address of the report, or empty.
-        scenes: (name, scene), the one that is shown first; at most two.
-        log: everything else. live: settings of a server behind the page, or None.
-        effort: of gzip, 1 to 9.
-    """
+    """What is to be written. ``title``, ``subtitle``, ``about``: texts. ``report``: relative address of the report, or
+    empty. ``scenes``: (name, scene), the one that is shown first; at most two. ``log``: everything else. ``live``:
+    settings of a server behind the page, or None. ``effort``: of gzip, 1 to 9."""
 
     title: str
     subtitle: str

@@ -154,12 +154,9 @@ PANEL_ROWS: Final = (("rgb", "Colour"), ("depth", "Depth"), ("semantics", "Class
 
 @dataclass(frozen=True)
 class TrajectoryVideo:
-    """The video of one trajectory.
-
-    Args:
-        name, camera, shift_m: as in the scores. width, height: of one panel, pixels. frames: number of pictures.
-        panels: column name -> rows it has. video, poster: data URIs (video may be empty: no encoder).
-    """
+    """The video of one trajectory. ``name``, ``camera``, ``shift_m``: as in the scores. ``width``, ``height``: of one
+    panel, pixels. ``frames``: number of pictures. ``panels``: column name -> rows it has. ``video``, ``poster``: data
+    URIs (video may be empty: no encoder)."""
 
     name: str
     camera: str
@@ -520,13 +517,9 @@ def panel_size(camera_width: int, camera_height: int, widest: int) -> tuple[int,
 def panel_grid(
     views: Mapping[str, Observation | None], rows: Sequence[str], size: tuple[int, int], truth: Observation | None
 ) -> NDArray[np.uint8]:
-    """One picture u8[rows * height, columns * width, 3] of one moment; what a method lacks stays grey.
-
-    Args:
-        views: column -> what it shows. rows: of ``rgb``, ``depth``, ``semantics``, ``error``.
-        size: width and height of a panel, pixels. truth: what colour errors are measured against; its own column has
-            none.
-    """
+    """One picture u8[rows * height, columns * width, 3] of one moment; what a method lacks stays grey. ``views``:
+    column -> what it shows. ``rows``: of ``rgb``, ``depth``, ``semantics``, ``error``. ``size``: width and height of a
+    panel, pixels. ``truth``: what colour errors are measured against; its own column has none."""
     width, height = size
     grid = np.full((height * len(rows), width * len(views), 3), BLANK, np.uint8)
     true_rgb = None if truth is None else resize_rgb(truth.rgb, height, width).clamp(0, 1)
@@ -581,11 +574,7 @@ class Columns:
 
 def film(out: Path) -> list[TrajectoryVideo]:
     """The costly half of ``OUT/report.html``: one video per trajectory, from what the chain left in ``out`` (see
-    ``steps.pipeline``).
-
-    Raises:
-        InputError: the run is not scored yet, or a folder of views is damaged.
-    """
+    ``steps.pipeline``). InputError: the run is not scored yet, or a folder of views is damaged."""
     out = Path(out)
     with understood("a scored run", str(out)):
         scores = store.read_json(out / "score" / "metrics.json")

@@ -55,14 +55,9 @@ TYPES: Final = {"html": "text/html; charset=utf-8", "bin": "application/octet-st
 
 @dataclass(frozen=True)
 class Site:
-    """What is served.
-
-    Args:
-        files: name -> content; "" is the page. answers: name -> what answers a POST with JSON there: bytes and their
-            type.
-        streams: the same for answers that take long. token: secret that every request must bring, in the address, a
-            cookie or a header.
-    """
+    """What is served. ``files``: name -> content; "" is the page. ``answers``: name -> what answers a POST with JSON
+    there: bytes and their type. ``streams``: the same for answers that take long. ``token``: secret that every request
+    must bring, in the address, a cookie or a header."""
 
     files: Mapping[str, bytes]
     answers: Mapping[str, Answer]
@@ -71,11 +66,8 @@ class Site:
 
 
 def token_for(host: str, token: str) -> str:
-    """The secret of a page: the given one, or on the loopback address a random one.
-
-    Raises:
-        UsageError: another address without a token, or a token that is too short.
-    """
+    """The secret of a page: the given one, or on the loopback address a random one. UsageError: another address without
+    a token, or a token that is too short."""
     if not is_loopback(host) and not token:
         what, expected = "this address can be reached by other machines", "127.0.0.1"
         remedy = "leave --host out and use an ssh tunnel, or add --token SECRET"
@@ -168,11 +160,8 @@ class SiteServer(ThreadingHTTPServer):
 
 
 def open_server(site: Site, host: str, port: int) -> SiteServer:
-    """A server that listens; ``serve_forever`` is the caller's.
-
-    Raises:
-        ResourceError: the port is taken, or the address is none of this machine.
-    """
+    """A server that listens; ``serve_forever`` is the caller's. ResourceError: the port is taken, or the address is
+    none of this machine."""
     try:
         return SiteServer((host, port), type("OwnSiteRequest", (SiteRequest,), {"site": site}))
     except (OSError, OverflowError, UnicodeError) as error:  # a port, a name that cannot be

@@ -175,22 +175,15 @@ class ShownSources:
         return {name: store.digest(path) for name, path in named.items() if path is not None}
 
     def read(self) -> Shown:
-        """What is there.
-
-        Raises:
-            InputError: it cannot be read, or the fits are of different logs.
-        """
+        """What is there. InputError: it cannot be read, or the fits are of different logs."""
         loaded = read_scene(self.scene)
         fits = tuple(_read_fit(folder, whole, loaded) for folder, whole in self.fits)
         return Shown(loaded, fits, None if self.cloud is None else read_fused(self.cloud))
 
 
 def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> ShownSources:
-    """The log and the fits that a page is to show.
-
-    Raises:
-        InputError: no fitted scene. UsageError: a fit has no scene of its own and none was given, or a run no such fit.
-    """
+    """The log and the fits that a page is to show. InputError: no fitted scene. UsageError: a fit has no scene of its
+    own and none was given, or a run no such fit."""
     parts = find_run(run)
     place = scene or parts.scene
     if place is None:
@@ -294,15 +287,9 @@ def run_view(
     scene: Path | None = None,
     files: EditFiles | None = None,
 ) -> dict[str, Any]:
-    """Serve the page of a run until it is interrupted.
-
-    Args:
-        files: the script that it begins with, and where edits are saved.
-
-    Raises:
-        UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As
-            ``run_page``.
-    """
+    """Serve the page of a run until it is interrupted. ``files``: the script that it begins with, and where edits are
+    saved. UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As
+    ``run_page``."""
     server, site = server_of(config, run, compare, scene, files)
     address = address_of(server, site)
     log.info(f"viewer: {address}   (Ctrl-C ends it)")
