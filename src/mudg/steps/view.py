@@ -1,4 +1,4 @@
-"""``mudg view``."""
+"""Verbs that show a drive: ``mudg view``, ``page``, ``report``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from mudg.steps.step import FILE_YAML, RUN, Flag, Step
 
 if TYPE_CHECKING:
-    from mudg.viewer.settings import ViewConfig
+    from mudg.viewer.settings import PageConfig, ViewConfig
 
 
 class ViewScene(Step):
@@ -41,3 +41,52 @@ class ViewScene(Step):
 
         files = edits.EditFiles(self.edits, self.edits_out, self.overwrite)
         return view.run_view(self.settings, self.source, self.compare, scene=self.scene, files=files)
+
+
+class Page(Step):
+    """Write a fitted scene as one HTML page: fly through it, any layer, any time, without a network."""
+
+    section = "look at a drive"
+    result = "page"
+    examples = (
+        "mudg page runs/kitti --out kitti.html",
+        "mudg page runs/kitti --compare runs/kitti --out both.html",
+        "mudg page runs/mudg_s --scene scenes/city --out city.html",
+    )
+    source: Annotated[Path, RUN]
+    """Folder of a finished mudg run, or Gaussian scene written by fit."""
+    out: Annotated[Path, Flag("FILE.html")]
+    """Page to write: one file. Above 32 MB, a folder FILE_page beside it, for a web server."""
+    scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None
+    """Scene directory that a Gaussian scene was fitted to. A run has its own."""
+    compare: Annotated[Path | None, Flag("RUN2")] = None
+    """A second run or fit of the same log, to compare with. The same run: its two fits."""
+    overwrite: bool = False
+    """Replace the page if it exists."""
+    settings: PageConfig
+
+    def act(self) -> dict[str, Any]:
+        from mudg.viewer import view
+
+        return view.run_page(
+            self.settings, self.source, self.out, scene=self.scene, compare=self.compare, overwrite=self.overwrite
+        )
+
+
+class Report(Step):
+    """Write one page over many finished runs: pictures, links, and a table of all scores to sort and filter."""
+
+    section = "look at a drive"
+    result = "page"
+    examples = ("mudg report runs/kitti runs/city --out runs.html", "mudg report runs --out runs.html")
+    runs: Annotated[tuple[Path, ...], Flag("RUN ...", "rest")]
+    """Folders of mudg run, score or bench; of any other folder, the folders in it."""
+    out: Annotated[Path, Flag("FILE.html")]
+    """Page to write."""
+    overwrite: bool = False
+    """Replace the page if it exists."""
+
+    def act(self) -> dict[str, Any]:
+        from mudg.viewer import gallery
+
+        return gallery.run(self.runs, self.out, overwrite=self.overwrite)
