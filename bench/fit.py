@@ -36,8 +36,7 @@ from mudg.gaussians.settings import DensifyConfig, FitConfig
 from mudg.gaussians.views import StoredView, ViewSet
 from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Fuse, Ingest
 
 FORWARD = ("project", "sort", "bin", "blend")
 BACKWARD = ("blend_backward", "project_backward")

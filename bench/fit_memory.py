@@ -43,8 +43,7 @@ from mudg.scene.clouds import read_fused
 from mudg.scene.observations import ObservationSet, ObservationWriter, read_observations
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Fuse, Ingest
 
 GIB = 1 << 30
 FRAMES, CAMERAS = 4, ("front", "front_left")

@@ -1,4 +1,4 @@
-"""How well the light of a street is known for a vehicle from another one (``editing/light.py``), on generated cities.
+"""How well the light of a street is known for a vehicle from another one (``editing/apply.py``), on generated cities.
 
 Every city is fitted as by `mudg bench edit`. Of its vehicle that shows most pixels the true mean light is known in its
 own city, and, drawn in place of theirs (``CityWorld.recast``), in all others: their ratio per channel is the factor
@@ -18,10 +18,10 @@ from pathlib import Path
 import numpy as np
 
 from mudg.base.palette import ID
-from mudg.benchmarks.edit import EVERY_FRAMES, EditCase, case_of
+from mudg.benchmarks.cities import EVERY_FRAMES, EditCase, case_of
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city.world import CityWorld
-from mudg.editing.light import surface_light
+from mudg.editing.apply import surface_light
 from mudg.editing.model import LIGHT_EXPONENT, linear_of
 
 FEWEST_PX = 100

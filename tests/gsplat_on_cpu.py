@@ -86,11 +86,8 @@ class Kernels:
 
     def __init__(self) -> None:
         for name in (
-            "GLOBAL",
-            "ROLLING_TOP_TO_BOTTOM",
-            "ROLLING_LEFT_TO_RIGHT",
-            "ROLLING_BOTTOM_TO_TOP",
-            "ROLLING_RIGHT_TO_LEFT",
+            *("GLOBAL", "ROLLING_TOP_TO_BOTTOM", "ROLLING_LEFT_TO_RIGHT", "ROLLING_BOTTOM_TO_TOP"),
+            *("ROLLING_RIGHT_TO_LEFT",),
         ):
             setattr(self, name, name)
         self.UnscentedTransformParameters = self.FThetaCameraDistortionParameters = SimpleNamespace

@@ -13,7 +13,7 @@ from toy_clips import before_each_batch
 from toy_published import published_settings
 
 from mudg.base.processes import Interruption
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 rank, store, start, clips, out = int(sys.argv[1]), *sys.argv[2:5], Path(sys.argv[5])
 dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)

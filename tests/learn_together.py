@@ -14,7 +14,7 @@ from toy_clips import before_each_batch, tiny
 
 from mudg.base.errors import NumericsError, UsageError
 from mudg.base.processes import Interruption
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 rank, store, clips, out = int(sys.argv[1]), sys.argv[2], sys.argv[3], Path(sys.argv[4])
 dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=2)

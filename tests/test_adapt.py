@@ -34,10 +34,9 @@ from mudg.formats.settings import IngestConfig
 from mudg.gaussians.storage import load_model
 from mudg.scene.read import read_image, read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.adapt import Adapt, fit_scene
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Fuse, Ingest
+from mudg.steps.synthesize import Adapt, fit_scene
 
 SIZE = (96, 64)
 

@@ -29,7 +29,7 @@ from mudg.scene.check import check_scene
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.write import SceneWriter
-from mudg.steps.annotate import Annotate
+from mudg.steps.ingest import Annotate
 
 STREET = ToyStreet(car_start=(11, 1.0), car_velocity=(2, 0))
 

@@ -27,11 +27,9 @@ from mudg.scene.clouds import read_fused
 from mudg.scene.read import decode_image, read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import write_zip
-from mudg.steps.annotate import Annotate
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Annotate, Fuse, Ingest
 from mudg.steps.run import Run
-from mudg.steps.settings.run import RunConfig
+from mudg.steps.settings import RunConfig
 
 ingest = bad_logs.importer("kitti")
 IMAGE = "image_02/data/0000000003.png"

@@ -28,7 +28,7 @@ from mudg.fleet.settings import BatchConfig
 from mudg.fleet.work import Job, facts_of
 from mudg.steps import batching
 from mudg.steps.batch import stage_lines
-from mudg.steps.settings.run import RunConfig
+from mudg.steps.settings import RunConfig
 
 STEP = """
 # step.sh NAME OUT TALLY: a line per run; then what is in TALLY/NAME.do, or a small result

@@ -9,13 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mudg.benchmarks import edit
+from mudg.benchmarks import cities
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.settings import BenchConfig
 from mudg.editing.model import display_of
 
 
-def seen(vehicle: float, truth: float) -> edit.Seen:
+def seen(vehicle: float, truth: float) -> cities.Seen:
     """Grey render and truth, in linear light, where the vehicle is; elsewhere they differ grossly, which must not
     count."""
     mask = np.zeros((48, 64), bool)
@@ -28,34 +28,36 @@ def seen(vehicle: float, truth: float) -> edit.Seen:
 
 
 def test_scores_are_those_of_the_vehicle_alone() -> None:
-    found = edit.vehicle_scores([seen(0.1, 0.2)] * 2, [seen(0.3, 0.3)])
+    found = cities.vehicle_scores([seen(0.1, 0.2)] * 2, [seen(0.3, 0.3)])
     error = float(display_of(np.array(0.2)) - display_of(np.array(0.1)))
     assert found["psnr"] == pytest.approx(-20 * math.log10(error), abs=1e-3)
     assert found["light"] == pytest.approx(2.0, rel=1e-4)
     assert found["psnr_recorded"] > 80
     assert (
-        edit.vehicle_scores([seen(0.3, 0.3)], [seen(0.1, 0.4)])["perceptual"]
-        < edit.vehicle_scores([seen(0.1, 0.4)], [])["perceptual"]
+        cities.vehicle_scores([seen(0.3, 0.3)], [seen(0.1, 0.4)])["perceptual"]
+        < cities.vehicle_scores([seen(0.1, 0.4)], [])["perceptual"]
     )
-    nothing = edit.vehicle_scores([], [seen(0.3, 0.3)])
+    nothing = cities.vehicle_scores([], [seen(0.3, 0.3)])
     assert nothing["psnr"] is None and nothing["light"] is None and nothing["perceptual"] is None
 
 
 def test_the_summary_leaves_out_what_no_frame_shows_and_takes_dark_and_bright_alike() -> None:
     row = {"psnr": 20.0, "psnr_recorded": 30.0, "perceptual": 0.2, "perceptual_recorded": 0.1}
-    rows = [{"way": way, **row, "light": light} for way in edit.LIGHTS for light in (2.0, 0.5)]
+    rows = [{"way": way, **row, "light": light} for way in cities.LIGHTS for light in (2.0, 0.5)]
     rows.append({"way": "as recorded", **dict.fromkeys(row), "light": None})
-    one, two = edit.REPLACED.summary(rows)
+    one, two = cities.REPLACED.summary(rows)
     assert one["light"] == pytest.approx(2.0) and (one["cities"], two["cities"]) == (2, 2)
-    assert "| as recorded | 20.00 | 30.00 | 0.2000 | 0.1000 | 2.0x | 2.00x |" in edit.REPLACED.table([one, two])
+    assert "| as recorded | 20.00 | 30.00 | 0.2000 | 0.1000 | 2.0x | 2.00x |" in cities.REPLACED.table([one, two])
 
 
 @pytest.mark.slow
 def test_the_command_edits_cities_and_puts_vehicles_of_one_into_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fitted, case_of = [], edit.case_of
-    monkeypatch.setattr(edit, "case_of", lambda config, city, out: (fitted.append(city), case_of(config, city, out))[1])
+    fitted, case_of = [], cities.case_of
+    monkeypatch.setattr(
+        cities, "case_of", lambda config, city, out: (fitted.append(city), case_of(config, city, out))[1]
+    )
     out = bench.run("edit", BenchConfig(cities="development", count=2, pose_iterations=40), tmp_path / "out")
     content = json.loads((out / "bench.json").read_text())
     text = (out / "bench.md").read_text()

@@ -28,10 +28,8 @@ from mudg.gaussians.storage import load_model
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.clouds import write_fused
 from mudg.scene.settings import FuseConfig
-from mudg.steps.annotate import Annotate
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Annotate, Fuse, Ingest
 
 FRAMES = 4
 

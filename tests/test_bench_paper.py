@@ -16,28 +16,26 @@ from test_bench import SMALL
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
-from mudg.benchmarks import page, paper, papers, places, views
+from mudg.benchmarks import chain, paper, places
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.chain import FillViews
-from mudg.benchmarks.papers import PAPERS, RECORDED, SCENE_LISTS, TABLES
-from mudg.benchmarks.rows import LONGER, paper_rows
+from mudg.benchmarks.rows import LONGER, PAPERS, RECORDED, SCENE_LISTS, TABLES, paper_rows, read_papers
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
 from mudg.city.config import CityConfig
 from mudg.core import trajectory
 from mudg.core.feature_distances import frechet_distance, kernel_distance
-from mudg.diffusion import model_files
+from mudg.diffusion import model_files as mdm_files
 from mudg.diffusion.model import MDM
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians.methods import METHODS
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Fuse, Ingest
 
 PSNR, FID = PAPERS.columns["psnr"], PAPERS.columns["fid"]
 TOY_YAML = """
@@ -63,7 +61,7 @@ tables:
           Paper's method | 50.0 60.5
           Other | - 70.0
 """
-TOY = papers.read_papers(TOY_YAML, "toy.yaml").tables["toy"]
+TOY = read_papers(TOY_YAML, "toy.yaml").tables["toy"]
 
 
 # ---- tables as data ------------------------------------------------------------------------------
@@ -104,7 +102,7 @@ def test_a_table_is_complete_and_its_rows_change_something(table):
 def test_what_is_wrong_with_a_file_of_tables_is_said(old, new, what):
     assert old in TOY_YAML
     with pytest.raises(InputError) as caught:
-        papers.read_papers(TOY_YAML.replace(old, new), "toy.yaml")
+        read_papers(TOY_YAML.replace(old, new), "toy.yaml")
     assert what in str(caught.value)
 
 
@@ -153,16 +151,18 @@ def test_methods_are_all_of_this_version_unless_some_are_named():
 
 
 def test_how_rows_are_scored(tmp_path):
-    plain = views.score_settings(BenchConfig(), TABLES["panda"])
+    plain = places.score_settings(BenchConfig(), TABLES["panda"])
     assert (plain.fid_resize, plain.baseline, plain.perceptual_views) == ("neurad", False, 12)
-    asked = views.score_settings(BenchConfig(score=ScoreConfig(fid_resize="clean", lpips_weights="x")), TABLES["panda"])
+    asked = places.score_settings(
+        BenchConfig(score=ScoreConfig(fid_resize="clean", lpips_weights="x")), TABLES["panda"]
+    )
     assert asked.fid_resize == "clean" and asked.perceptual_views > 1000
     (tmp_path / "7.json").write_text("[]")
     (tmp_path / "lanes" / "7").mkdir(parents=True)
     given = ScoreConfig(detections=str(tmp_path), lanes=str(tmp_path / "lanes"))  # every log has its own
     of_7 = dataclasses.replace(given, detections=str(tmp_path / "7.json"), lanes=str(tmp_path / "lanes" / "7"))
-    assert (views.of_log(given, "7"), views.of_log(given, "8")) == (of_7, given)
-    assert views.of_log(ScoreConfig(), "7") == ScoreConfig()
+    assert (places.of_log(given, "7"), places.of_log(given, "8")) == (of_7, given)
+    assert places.of_log(ScoreConfig(), "7") == ScoreConfig()
 
 
 # ---- numbers -------------------------------------------------------------------------------------
@@ -465,7 +465,7 @@ def test_pictures_without_truth(recorded, tmp_path):
     one, both = (
         FillViews(scene=recorded, fused=fused, paths=tuple(paths[:n]), out=tmp_path / f"fill{n}").run() for n in (1, 2)
     )
-    out = page.Film(
+    out = chain.Film(
         views={"one": (one,), "both": (both,)}, paths=tuple(paths), videos=False, out=tmp_path / "film"
     ).run()
     assert sorted(path.name for path in out.glob("*.jpg")) == ["front_lane+0.1.jpg", "front_shift+2.0.jpg"]
@@ -511,7 +511,7 @@ def test_an_interrupted_table_goes_on(tmp_path, monkeypatch):
         methods=("nearest_fill",),
         table="drivedreamer4d",
     )
-    make_scene, seen = views.make_scene, []
+    make_scene, seen = places.make_scene, []
 
     def interrupted(log, *rest):
         seen.append(log.name)
@@ -519,7 +519,7 @@ def test_an_interrupted_table_goes_on(tmp_path, monkeypatch):
             raise KeyboardInterrupt
         return make_scene(log, *rest)
 
-    monkeypatch.setattr(views, "make_scene", interrupted)
+    monkeypatch.setattr(places, "make_scene", interrupted)
     with pytest.raises(KeyboardInterrupt):
         bench.run("paper", config, tmp_path / "out", sources=("city:development",))
     first = tmp_path / "out" / seen[0]
@@ -537,7 +537,7 @@ def test_an_interrupted_table_goes_on(tmp_path, monkeypatch):
 def filled(tmp_path_factory):
     torch.manual_seed(0)
     model = tmp_path_factory.mktemp("model") / "model"
-    model_files.save(MDM(dataclasses.replace(SMALL, renders=True)), model, "a model of tests", {})
+    mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), model, "a model of tests", {})
     config = BenchConfig(
         logs=2,
         iterations=20,

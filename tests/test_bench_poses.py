@@ -7,8 +7,8 @@ import pytest
 
 from mudg.base import geometry
 from mudg.base.types import Track
-from mudg.benchmarks import poses as bench_poses
-from mudg.benchmarks.poses import NOISE_M, NOISE_RAD, disturbed, pose_errors
+from mudg.benchmarks import cities as bench_poses
+from mudg.benchmarks.cities import NOISE_M, NOISE_RAD, disturbed, pose_errors
 
 
 def tracks(count: int = 6, keys: int = 60) -> tuple[Track, ...]:

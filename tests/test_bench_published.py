@@ -16,8 +16,7 @@ from mudg.base import store
 from mudg.base.errors import UsageError
 from mudg.benchmarks import run as bench
 from mudg.benchmarks import shift
-from mudg.benchmarks.papers import RECORDED, TABLES
-from mudg.benchmarks.rows import LONGER, method_fit, shift_rows
+from mudg.benchmarks.rows import LONGER, RECORDED, TABLES, method_fit, shift_rows
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.city.config import CityConfig
 from mudg.city.logs import LogRules
@@ -33,9 +32,8 @@ from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_image, read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
-from mudg.steps.settings.presets import run_preset
+from mudg.steps.ingest import Fuse, Ingest
+from mudg.steps.settings import run_preset
 
 MODALITIES = 3
 
@@ -267,10 +265,7 @@ def test_table_3_runs_with_a_published_type_model_as_recorded(weights, tmp_path,
         assert state["summary"]["steps"] == 6 and "start" not in state["inputs"]  # from nothing, with all steps
         ran = configuration.load(FitConfig, yaml_path=log / "fit" / row.name / "run.yaml")
         assert (ran.loss.semantic_weight, ran.virtual.beside, ran.virtual.perception, ran.sh_degree) == (
-            0.0,
-            False,
-            "lpips",
-            3,
+            *(0.0, False, "lpips", 3),
         )
         assert math.isfinite(document["cells"][row.name][RECORDED]["psnr"]["mean"])
     recorded = document["settings"]["fit"]

@@ -16,7 +16,7 @@ from mudg.base.camera_colors import ColorMap
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, Observation, SweepPoints, View
-from mudg.benchmarks import columns, places, real, truth
+from mudg.benchmarks import columns, places, real
 from mudg.benchmarks.chain import Chain, FillViews
 from mudg.benchmarks.places import PROTOCOLS, SPLITS
 from mudg.benchmarks.rows import real_rows
@@ -24,11 +24,11 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.city.world import CityWorld
 from mudg.core import calibration, lidar
 from mudg.core.fusion import STATIC
-from mudg.diffusion import model_files
+from mudg.diffusion import model_files as mdm_files
 from mudg.diffusion.model import MDM
 from mudg.diffusion.settings import AdaptConfig, SynthesizeConfig
 from mudg.editing import render
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import RenderConfig
 from mudg.formats import ingest
 from mudg.formats.importers.pandaset import read_frame
 from mudg.formats.settings import IngestConfig
@@ -38,8 +38,7 @@ from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import SceneWriter, write_part
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Fuse, Ingest
 
 CITY = {
     "n_frames": 6,
@@ -155,7 +154,7 @@ def model(tmp_path_factory):
     """A small model that uses renders."""
     folder = tmp_path_factory.mktemp("model") / "model"
     torch.manual_seed(0)
-    model_files.save(MDM(dataclasses.replace(SMALL, renders=True)), folder, "a model of tests", {})
+    mdm_files.save(MDM(dataclasses.replace(SMALL, renders=True)), folder, "a model of tests", {})
     return str(folder)
 
 
@@ -285,7 +284,7 @@ def test_a_color_map_is_found_under_noise_and_outliers():
 
 
 def sight(maps, *, depth=None, rgb=None, semantics=None, photo=None):
-    target = truth.Target("front", None, VIEW, maps, ColorMap())
+    target = columns.Target("front", None, VIEW, maps, ColorMap())
     rgb = torch.full((3, 30, 40), 0.5) if rgb is None else rgb
     return columns.Sight(target, rgb, depth, semantics, photo, None)
 
@@ -372,13 +371,13 @@ def exact(city, tmp_path_factory):
             with ObservationWriter(out / "views" / path.name, path.name, "truth") as writer:
                 for view in path.views:
                     writer.add(world.observation(view, world.render(view)))
-        targets = truth.MakeTargets(
+        targets = columns.MakeTargets(
             log=city, shown=seen, protocol=protocol, held=tuple(held.frames), cameras=cameras, out=out / "truth"
         ).run()
         scored = columns.ScoreTargets(
             log=city, truth=targets, views=out / "views", protocol=protocol, out=out / "score"
         ).run()
-        return store.read_json(scored / "metrics.json")["mean"], truth.read_targets(targets)
+        return store.read_json(scored / "metrics.json")["mean"], columns.read_targets(targets)
 
     return of
 
@@ -521,7 +520,7 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
     use = job.use("adapted", chain)
     assert (use.sees, use.model) == ("renders", model) and "too short to adapt to, 1 clip" in use.note
     plain = str(tmp_path / "plain")
-    model_files.save(MDM(SMALL), tmp_path / "plain", "a model without renders", {})
+    mdm_files.save(MDM(SMALL), tmp_path / "plain", "a model without renders", {})
     use = dataclasses.replace(job, config=BenchConfig(model=plain)).use("adapted", chain)
     assert (use.sees, use.model) == ("points", plain) and "does not use renders" in use.note
     assert job.use("points", chain) == real.DiffusionUse("points", model)
@@ -532,21 +531,11 @@ def test_rows_say_what_they_leave_out():
         row.name: row for row in real_rows(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))
     }
     assert list(rows) == [
-        "street_gaussians",
-        "street_gaussians-longer",
-        "mudg_r",
-        "mudg_r-no-adapt",
-        "mudg_r-no-renders",
-        "mudg_s",
-        "mudg_s-no-adapt",
-        "mudg_s-no-renders",
-        "a",
+        *("street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_r-no-adapt", "mudg_r-no-renders", "mudg_s"),
+        *("mudg_s-no-adapt", "mudg_s-no-renders", "a"),
     ]
     assert [rows[name].sees for name in ("mudg_s", "mudg_s-no-adapt", "mudg_s-no-renders", "a")] == [
-        "adapted",
-        "renders",
-        "points",
-        "adapted",
+        *("adapted", "renders", "points", "adapted")
     ]
     assert rows["mudg_s"].title != rows["mudg_s-no-adapt"].title
 
@@ -574,7 +563,7 @@ def test_classes_of_points_are_scored_where_a_log_has_them_and_hidden_from_metho
     assert 0.3 < found["accuracy"] < 1 and 0.05 < found["miou"] < 1
     log = out / "001"
     whole = read_scene(log / "scene")
-    targets = truth.read_targets(log / "truth" / "classes")
+    targets = columns.read_targets(log / "truth" / "classes")
     target = targets.load(0, whole)
     known = target.maps["classes"][target.maps["classes"] != 255]
     assert set(np.unique(known)) == {ID["road"], ID["building"]} and len(known) > 100

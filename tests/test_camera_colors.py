@@ -27,8 +27,7 @@ from mudg.scene.read import read_image, read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import SceneWriter
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Fuse, Ingest
 
 DARK = ColorMap((1.4, 1.3, 1.2), (0.02, 0.0, -0.01), 1000)
 """To the common colours from those of a camera that takes darker images."""

@@ -20,7 +20,7 @@ from mudg.diffusion.parallel import Ranks
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.write import write_photos
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the native library is not built")
 RULES = CityClipRules(width=48, height=32, window=2, clips=2, fitted=True)

@@ -12,8 +12,7 @@ from mudg import app
 from mudg.base import config as configuration
 from mudg.base.errors import InputError, IntegrityError, MudgError, NumericsError, ResourceError, UsageError
 from mudg.steps.doctor import Doctor
-from mudg.steps.settings.presets import run_preset
-from mudg.steps.settings.run import with_seed
+from mudg.steps.settings import run_preset, with_seed
 
 
 def parse(*words: str) -> Any:

@@ -14,7 +14,7 @@ from pydantic import ValidationError
 
 from mudg.base import config
 from mudg.base.errors import InputError, UsageError
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import RenderConfig
 
 
 @config.settings

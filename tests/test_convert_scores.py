@@ -16,11 +16,11 @@ from mudg import app
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.diffusion.settings import ConvertConfig
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import i3d, inception
 from mudg.scoring import converted
 from mudg.steps.convert import Convert
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 
 STATES = {
     "inception": lambda: {**toy_inception.state(), "Conv2d_1a_3x3.bn.num_batches_tracked": torch.tensor(3)},

@@ -15,11 +15,10 @@ from mudg.base import store
 from mudg.base.memory import in_words
 from mudg.core.raster import probe
 from mudg.gaussians import views as kept
-from mudg.steps import diagnosis
+from mudg.steps import cost
+from mudg.steps import doctor as diagnosis
 from mudg.steps.run import Demo, Run
-from mudg.steps.settings import cost
-from mudg.steps.settings.presets import run_preset
-from mudg.steps.settings.run import RunConfig
+from mudg.steps.settings import RunConfig, run_preset
 from mudg.steps.step import texts_of
 
 DEMO = cost.SceneSize(images=72, path_images=24, width=384, height=256, points=100_600)

@@ -32,7 +32,7 @@ from mudg.scene.observations import read_observations
 from mudg.scoring import score
 from mudg.scoring.detections import read_detections
 from mudg.steps import pipeline
-from mudg.steps.settings.run import RunConfig
+from mudg.steps.settings import RunConfig
 from mudg.viewer import gallery, report
 
 CASES = 24

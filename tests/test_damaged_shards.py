@@ -13,7 +13,7 @@ from toy_clips import tiny, write_clips
 
 from mudg.base.errors import InputError
 from mudg.diffusion import clips as clip_shards
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 Arrays = dict[str, np.ndarray]
 NOT_FINITE = (

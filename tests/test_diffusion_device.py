@@ -39,10 +39,8 @@ from mudg.scene.labels import read_label
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.annotate import Annotate
-from mudg.steps.fuse import Fuse
-from mudg.steps.learn import Learn
-from mudg.steps.synthesize import Synthesize
+from mudg.steps.ingest import Annotate, Fuse
+from mudg.steps.synthesize import Learn, Synthesize
 
 NEAR = 1e-4
 """Relative to the largest value: attention sums in another order there. Measured: 1e-7 for the small model, 2e-5 with

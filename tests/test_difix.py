@@ -131,11 +131,7 @@ def test_only_the_colour_of_a_repair_counts():
     used = recipe_of("difix").used(FitConfig(method="difix")).virtual
     assert (used.probability, used.continued_probability, used.color_weight, used.ssim_weight) == (0.3, 0.3, 0.3, 0.2)
     assert (used.depth_weight, used.lidar_weight, used.semantic_weight, used.perceptual_weight, used.gaussians) == (
-        0,
-        0,
-        0,
-        0,
-        0,
+        *(0, 0, 0, 0, 0),
     )
     assert "virtual" not in METHODS["difix"].supervision and "no last repair" in METHODS["difix"].title
     assert recipe_of("mudg_s").used(FitConfig()) == FitConfig()

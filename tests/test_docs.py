@@ -42,12 +42,8 @@ FOREIGN_FLAGS = {
     **dict.fromkeys(("--rm", "--network", "--gpus", "--build-arg", "--user"), "docker"),
     **dict.fromkeys(
         (
-            "--rdzv-backend",
-            "--rdzv-endpoint",
-            "--rdzv-id",
-            "--max-restarts",
-            "--signals-to-handle",
-            "--shutdown-timeout",
+            *("--rdzv-backend", "--rdzv-endpoint", "--rdzv-id", "--max-restarts", "--signals-to-handle"),
+            *("--shutdown-timeout",),
         ),
         "torchrun",
     ),
@@ -62,14 +58,8 @@ GROUPS = "virtual loss densify poses objects appearance start optimizer compute 
 
 FILE_ENDINGS = tuple(".py .json .jsonl .yaml .txt .md .png .jpg .mp4 .html .pt .ckpt .safetensors".split())
 FOREIGN_NAMES = (
-    "PromptDepthAnything",
-    "DepthLab",
-    "DynamiCrafter",
-    "DeepSpeed",
-    "SegFormer",
-    "MergedPointCloud",
-    "RayCluster",
-    "RayJob",
+    *("PromptDepthAnything", "DepthLab", "DynamiCrafter", "DeepSpeed", "SegFormer", "MergedPointCloud"),
+    *("RayCluster", "RayJob"),
 )
 
 

@@ -10,7 +10,7 @@ import toy_views
 
 from mudg import app
 from mudg.formats.exporters import video
-from mudg.steps import diagnosis
+from mudg.steps import doctor as diagnosis
 
 
 def test_machine_report_names_what_matters() -> None:

@@ -21,8 +21,7 @@ from mudg.gaussians.settings import AppearanceConfig, DensifyConfig, DrawingConf
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Fuse, Ingest
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
 CPU = torch.device("cpu")

@@ -20,7 +20,7 @@ from mudg.core import calibration as edges
 from mudg.formats.importers import IMPORTERS
 from mudg.formats.importers.common import ImportOptions
 from mudg.scene.check import camera_alignment, describe
-from mudg.steps import diagnosis
+from mudg.steps import doctor as diagnosis
 
 TURNS = ((1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0))
 

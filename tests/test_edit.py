@@ -20,7 +20,7 @@ from mudg.base.palette import ID
 from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
 from mudg.baselines.bezier import BezierNode
 from mudg.baselines.omnire import DeformedNode
-from mudg.benchmarks.edit import city_keys
+from mudg.benchmarks.cities import city_keys
 from mudg.city import layout as rec
 from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
@@ -28,11 +28,9 @@ from mudg.core import edit
 from mudg.core.edit import Displacement, HeightMap, Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.editing import assets
+from mudg.editing import apply as assets
 from mudg.editing import model as edited
-from mudg.editing.apply import edited_cloud, edited_model
-from mudg.editing.carried import carry_out
-from mudg.editing.light import surface_light, take_light
+from mudg.editing.apply import carry_out, edited_cloud, edited_model, surface_light, take_light
 from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, collisions, plan_edits
 from mudg.editing.script import parse_edits, read_edits
 from mudg.gaussians.model import CERTAINTY, SceneModel, compose
@@ -40,7 +38,7 @@ from mudg.gaussians.nodes import DeformableNode, RigidNode, StaticNode
 from mudg.gaussians.rendering import render_view
 from mudg.gaussians.sky import SkyNode
 from mudg.gaussians.start import SH_C0
-from mudg.steps.settings.presets import DEMO_CITY
+from mudg.steps.settings import DEMO_CITY
 
 SIZE = (4.0, 2.0, 1.5)
 

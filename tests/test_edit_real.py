@@ -17,11 +17,9 @@ from mudg.labels.settings import AnnotateConfig
 from mudg.scene.check import check_scene
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.annotate import Annotate
 from mudg.steps.edit import Edit
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Annotate, Fuse, Ingest
 
 pytestmark = pytest.mark.slow
 LEAD = "0"

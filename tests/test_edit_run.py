@@ -22,11 +22,9 @@ from mudg.base.types import Scene
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.settings import BenchConfig
 from mudg.editing import edit
-from mudg.editing.apply import left_behind
-from mudg.editing.carried import EditedDrive, carry_out
+from mudg.editing.apply import EditedDrive, carry_out, left_behind
 from mudg.editing.script import parse_edits
-from mudg.editing.settings import EditConfig
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import EditConfig, RenderConfig
 from mudg.gaussians.storage import load_model
 from mudg.scene.check import check_scene
 from mudg.scene.clouds import read_fused, write_fused
@@ -36,7 +34,7 @@ from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.edit import Edit
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Fuse
 from mudg.steps.render import RenderViews
 
 FRAMES = 4

@@ -9,8 +9,7 @@ import pytest
 from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.weather_settings import Conditions, FogSettings, RainSettings, SnowSettings, WeatherSettings
-from mudg.editing.script import parse_edits, read_edits
-from mudg.editing.weathered import conditions_of
+from mudg.editing.script import conditions_of, parse_edits, read_edits
 
 EVERY_VERB = """
 - remove: {ids: [car-017]}

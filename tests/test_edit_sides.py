@@ -14,7 +14,7 @@ from mudg.base.types import Camera, View
 from mudg.core.edit import Motion
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.editing.assets import complete_asset
+from mudg.editing.apply import complete_asset
 from mudg.editing.plan import Actor, EditSources, EditWorld, plan_edits, shown_anew
 from mudg.editing.script import parse_edits
 from mudg.editing.street import with_closed_sides

@@ -16,11 +16,11 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
 from mudg.core import feature_distances
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import clip_image, dinov2
 from mudg.scoring import tables as score_tables
 from mudg.scoring.sets import subject_consistency
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 
 
 def images(count: int, side: int, seed: int = 0) -> torch.Tensor:

@@ -19,8 +19,7 @@ from mudg.base.errors import InputError, IntegrityError, UsageError
 from mudg.base.run_folder import RunDir
 from mudg.steps.batch import stage_lines
 from mudg.steps.command import parse, words_of
-from mudg.steps.engine import Make, Result, paths_of
-from mudg.steps.outputs import Output
+from mudg.steps.engine import Make, Output, Result, paths_of
 from mudg.steps.step import Flag
 
 LINES = {

@@ -28,8 +28,7 @@ from mudg.baselines.pvg import VibrationNode, starting_columns
 from mudg.core.edit import HeightMap, Motion
 from mudg.core.metrics import psnr
 from mudg.core.raster.rasterize import RasterConfig
-from mudg.editing.assets import read_asset
-from mudg.editing.carried import background_of
+from mudg.editing.apply import background_of, read_asset
 from mudg.editing.plan import EditWorld, place_background
 from mudg.editing.runs import find_run
 from mudg.exporting import export
@@ -42,7 +41,7 @@ from mudg.gaussians.fit import render_view
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import DeformableNode, RigidNode
 from mudg.gaussians.storage import load_model, save_model
-from mudg.steps.asset import AssetImport
+from mudg.steps.edit import AssetImport
 from mudg.steps.export import Export
 
 LEAST_DB = {"ply": 50, "glb": 50, "usda": 50, "spz": 38, "compressed-ply": 38, "sog": 38, "splat": 30}

@@ -22,7 +22,7 @@ from mudg import app
 from mudg.base import failures, log, memory
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.processes import run_in_processes
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 FULL = Path("/dev/full")
 needs_full_device = pytest.mark.skipif(not FULL.exists(), reason="needs /dev/full")

@@ -22,7 +22,7 @@ from mudg import app
 from mudg.base import store
 from mudg.base.errors import ResourceError
 from mudg.base.run_folder import Replacement, RunDir, VerbOutput
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 OUTPUT = VerbOutput("small", 1, ("*.txt", "rows/*.txt"))
 SWEPT = [name for name in VERBS if name not in ("learn", "bench", "film")]

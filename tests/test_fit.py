@@ -36,7 +36,7 @@ from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
 from mudg.steps.fit import Fit
-from mudg.steps.settings.presets import run_preset
+from mudg.steps.settings import run_preset
 
 SIZE = (60, 40)
 FRAMES = 6

@@ -25,14 +25,14 @@ from mudg.base import store
 from mudg.base.camera_colors import CameraColors, ColorMap
 from mudg.base.config import result_settings
 from mudg.base.errors import NumericsError, ResourceError, UsageError
-from mudg.benchmarks import loop, rows
-from mudg.benchmarks import poses as bench_poses
+from mudg.benchmarks import chain, rows
+from mudg.benchmarks import cities as bench_poses
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import native_ops
 from mudg.core.raster import place
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
-from mudg.editing.view_settings import RenderConfig, ScoreConfig
+from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.gaussians import fit
 from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.densify import (
@@ -54,9 +54,8 @@ from mudg.gaussians.sky import SkyNode
 from mudg.scene.observations import read_observations
 from mudg.scoring import score
 from mudg.steps.fit import Fit
-from mudg.steps.render import RenderViews
-from mudg.steps.score import Score
-from mudg.steps.settings.run import RunConfig, with_device
+from mudg.steps.render import RenderViews, Score
+from mudg.steps.settings import RunConfig, with_device
 
 SIZE, FRAMES = (36, 24), 4
 PRETEND = torch.device("pretend", 0)
@@ -459,10 +458,10 @@ def test_benchmarks_hand_their_device_to_every_step(monkeypatch):
     assert {
         fitted.device for fitted in (*fits, rows.usual_fit(config), bench_poses.fit_settings(config, "learnt"))
     } == {"cuda:1"}
-    monkeypatch.setattr(loop, "drawing_device", lambda wanted, purpose: PRETEND if wanted == "cuda:1" else CPU)
-    assert loop.at_once(config) == 1
-    assert loop.at_once(replace(config, processes=3)) == 3
-    assert loop.at_once(replace(config, device="cpu")) == os.cpu_count()
+    monkeypatch.setattr(chain, "drawing_device", lambda wanted, purpose: PRETEND if wanted == "cuda:1" else CPU)
+    assert chain.at_once(config) == 1
+    assert chain.at_once(replace(config, processes=3)) == 3
+    assert chain.at_once(replace(config, device="cpu")) == os.cpu_count()
 
 
 # ---- render and score ----------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 from mudg.base import geometry
 from mudg.base.config import to_dict
 from mudg.base.run_folder import RunDir
-from mudg.benchmarks.poses import pose_errors
+from mudg.benchmarks.cities import pose_errors
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.gaussians import fit
 from mudg.gaussians import poses as fit_poses

@@ -16,7 +16,7 @@ from toy_published import TINY, tiny_checkpoint
 from mudg.base import store
 from mudg.diffusion import published
 from mudg.scene.observations import list_observation_sets, read_observations
-from mudg.steps.settings.presets import PRESETS
+from mudg.steps.settings import PRESETS
 
 TOY = (
     "import sys; from toy_published import TINY; from mudg.diffusion.published import convert; convert.PublishedConfig"

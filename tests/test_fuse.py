@@ -39,7 +39,7 @@ from mudg.scene import fuse
 from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.read import read_image, read_points
 from mudg.scene.settings import FuseConfig
-from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Fuse
 
 RULES = FusionRules(min_object_points=1)
 

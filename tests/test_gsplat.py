@@ -22,7 +22,7 @@ from mudg.core.raster import gsplat_cuda
 from mudg.core.raster import gsplat_cuda as gsplat_package
 from mudg.core.raster import rasterize as raster
 from mudg.core.raster.rasterize import ONLY_GSPLAT, RasterConfig, rasterize
-from mudg.steps import diagnosis
+from mudg.steps import doctor as diagnosis
 
 GROUPS = ("means", "quats", "scales", "opacity", "sh", "extra")
 IMAGES = ("rgb", "depth", "alpha", "extra")

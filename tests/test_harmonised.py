@@ -40,8 +40,7 @@ from mudg.editing.harmonised import Touched, corrected, guarded, pasted, soft_ed
 from mudg.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.editing.recorded import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
 from mudg.editing.script import parse_edits
-from mudg.editing.settings import EditConfig
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import EditConfig, RenderConfig
 from mudg.gaussians import fit
 from mudg.networks.codec import CodecConfig
 from mudg.scene.clouds import read_fused, write_fused

@@ -12,13 +12,13 @@ import toy_views
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import i3d
 from mudg.scene.read import read_scene
 from mudg.scoring import sets as distributions
 from mudg.scoring import sets as videos
 from mudg.scoring import tables as score_tables
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 from mudg.viewer import report as page
 
 

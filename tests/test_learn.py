@@ -11,7 +11,7 @@ from mudg.base.errors import NumericsError, ResourceError, UsageError
 from mudg.diffusion import city_clips, learn, model_files, score
 from mudg.diffusion.clips import await_shard, class_weights, read_clip
 from mudg.diffusion.requests import GeneratedClip
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 
 @pytest.fixture(scope="module")

@@ -16,7 +16,7 @@ from mudg.diffusion import learn, model_files, models
 from mudg.diffusion.model import MDM, MDMConfig
 from mudg.diffusion.parallel import TrainingState
 from mudg.diffusion.settings import LearnConfig, LearnData, LearnNetwork
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 
 @pytest.fixture(scope="module")

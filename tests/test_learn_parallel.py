@@ -19,7 +19,7 @@ from mudg.diffusion import learn, model_files, models, parallel
 from mudg.diffusion.clips import class_weights
 from mudg.diffusion.model import MDM, BatchPart, LossSettings
 from mudg.diffusion.parallel import Ranks, TrainingState, read_rows
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 SAME = 2e-6
 """Relative. The same sums in another order; measured for 1 -> 2 ddp -> 2 fsdp -> 1 over 6 steps: 7e-8 (pytest -s shows

@@ -28,9 +28,8 @@ from mudg.diffusion.views import recorded_images
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.fuse import Fuse
-from mudg.steps.learn import Learn
-from mudg.steps.synthesize import Synthesize
+from mudg.steps.ingest import Fuse
+from mudg.steps.synthesize import Learn, Synthesize
 
 
 @pytest.fixture(scope="module")

@@ -22,8 +22,8 @@ from mudg.scene.labels import photographs, read_label
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import SceneWriter
-from mudg.steps.fuse import Fuse
-from mudg.steps.learn import Learn
+from mudg.steps.ingest import Fuse
+from mudg.steps.synthesize import Learn
 
 RULES = LogClipRules(width=48, height=24, window=3, stride=2, held_out_every=4, farthest=2)
 FRAMES = 16

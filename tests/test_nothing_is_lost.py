@@ -23,15 +23,16 @@ from toy_scene import ToyStreet
 
 from mudg.base import store
 from mudg.base.errors import UsageError
-from mudg.benchmarks import chain, page
+from mudg.benchmarks import chain
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city.config import CityConfig
 from mudg.core import trajectory
-from mudg.diffusion import convert, model_files
+from mudg.diffusion import convert
+from mudg.diffusion import model_files as files
 from mudg.diffusion.model import MDM, MDMConfig
 from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
-from mudg.editing.view_settings import RenderConfig, ScoreConfig
+from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.fleet.listed import run_listed
 from mudg.fleet.plan import Entry
 from mudg.formats import ingest
@@ -42,17 +43,13 @@ from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import write_zip
 from mudg.steps import pipeline
-from mudg.steps.annotate import Annotate
 from mudg.steps.convert import Convert
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
-from mudg.steps.learn import Learn
-from mudg.steps.render import RenderViews
+from mudg.steps.ingest import Annotate, Fuse, Ingest
+from mudg.steps.render import DrawTruth, RenderViews, Score
 from mudg.steps.run import Run
-from mudg.steps.score import DrawTruth, Score
-from mudg.steps.settings.run import RunConfig
-from mudg.steps.synthesize import Synthesize
+from mudg.steps.settings import RunConfig
+from mudg.steps.synthesize import Learn, Synthesize
 
 SMALL = MDMConfig(
     widths=(16, 32),
@@ -159,7 +156,7 @@ VERBS: dict[str, Verb] = {
         ("city",),
     ),
     "film": Verb(
-        lambda g, out, v, o: page.Film(
+        lambda g, out, v, o: chain.Film(
             views={"truth": (g["views"],), **({"b": (g["views"],)} if v == 2 else {})},
             paths=_paths(g["scene"], 1),
             out=out,
@@ -203,7 +200,7 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     config = fit_config(method="street_gaussians", iterations=2, start__gaussians=200)
     given["fitted"] = Fit(scene=given["scene"], fused=given["fused"], out=root / "fitted", settings=config).run()
     torch.manual_seed(0)
-    model_files.save(MDM(SMALL), root / "model", "", {})
+    files.save(MDM(SMALL), root / "model", "", {})
     given["model"] = root / "model"
     given["city"] = Ingest(
         log=ingest.CITY, out=root / "city", settings=IngestConfig(city=CITY, contact_sheet=False)
@@ -403,7 +400,7 @@ HISTORY = {"learn": {"loss.png"}}
 
 @pytest.fixture
 def quick_bench(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A measurement that only writes some model_files."""
+    """A measurement that only writes some files."""
 
     def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
         for number in range(4):

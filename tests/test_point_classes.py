@@ -18,7 +18,7 @@ from mudg.labels.settings import AnnotateConfig
 from mudg.scene.check import image_point_classes
 from mudg.scene.read import read_points, read_scene
 from mudg.scene.write import SceneWriter
-from mudg.steps.annotate import Annotate
+from mudg.steps.ingest import Annotate
 
 pytestmark = roundtrip.needs_native
 PARKED = ToyStreet(panel_x=9.0, car_start=(12.0, 4.0))

@@ -14,8 +14,7 @@ from mudg.base import config as configuration
 from mudg.base.errors import InputError, UsageError
 from mudg.steps import pipeline
 from mudg.steps.run import Run
-from mudg.steps.settings.presets import DEMO_CITY, PRESETS, PresetName, run_preset
-from mudg.steps.settings.run import RunConfig, with_seed
+from mudg.steps.settings import DEMO_CITY, PRESETS, PresetName, RunConfig, run_preset, with_seed
 
 NAMES = get_args(PresetName)
 

@@ -36,7 +36,7 @@ from mudg.networks import clip
 from mudg.networks.clip import ImageTower, TextTower, TowerConfig
 from mudg.scene.observations import read_observations
 from mudg.scene.settings import FuseConfig
-from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Fuse
 from mudg.steps.synthesize import Synthesize
 
 GOLDEN = Path(__file__).parent / "golden"

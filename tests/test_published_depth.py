@@ -23,8 +23,7 @@ from mudg.formats.settings import IngestConfig
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
+from mudg.steps.ingest import Fuse, Ingest
 
 FRAMES = 4
 DISTORTIONS = ((0.5, 0.0), (0.8, 0.0), (1.25, 0.0), (2.0, 0.0), (1.0, 3.0), (1.0, -1.0))

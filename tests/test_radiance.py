@@ -22,7 +22,7 @@ from mudg.baselines.emernerf import fit as loop
 from mudg.baselines.emernerf.field import Budget, Extent, FieldSizes, RadianceField, RayDraws, Rays, aggregated
 from mudg.baselines.emernerf.fit import extent_of, flow_colors, lidar_rays, load_field, view_rays
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import RenderConfig
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import write_fused
 from mudg.scene.observations import read_observations

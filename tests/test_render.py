@@ -17,7 +17,7 @@ from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.editing import render
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import RenderConfig
 from mudg.gaussians import fit
 from mudg.scene.clouds import write_fused
 from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations

@@ -26,8 +26,8 @@ from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Observation
 from mudg.editing.script import read_edits
-from mudg.editing.view_settings import ScoreConfig
-from mudg.steps.score import Score
+from mudg.editing.settings import ScoreConfig
+from mudg.steps.render import Score
 from mudg.viewer import report
 from mudg.viewer import report as report_page
 

@@ -19,8 +19,7 @@ from mudg.base.errors import InputError, IntegrityError, NumericsError, Resource
 from mudg.scoring import score
 from mudg.steps import pipeline
 from mudg.steps.run import Demo, Run
-from mudg.steps.settings.presets import run_preset
-from mudg.steps.settings.run import RunConfig, with_seed
+from mudg.steps.settings import RunConfig, run_preset, with_seed
 from mudg.steps.step import Step
 from mudg.viewer import report
 
@@ -70,16 +69,8 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
 
 CHAIN = [
-    "ingest",
-    "fuse",
-    "fit:street_gaussians",
-    "synthesize",
-    "fit:mudg_s",
-    "render:street_gaussians",
-    "render:mudg_s",
-    "score",
-    "viewer",
-    "report",
+    *("ingest", "fuse", "fit:street_gaussians", "synthesize", "fit:mudg_s", "render:street_gaussians"),
+    *("render:mudg_s", "score", "viewer", "report"),
 ]
 
 

@@ -27,7 +27,7 @@ from mudg.diffusion.shard_sources import (
     is_list,
     read_list,
 )
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 
 @pytest.fixture(scope="module")

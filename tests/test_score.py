@@ -16,11 +16,11 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import FusedCloud, Observation, PointCloud, View
 from mudg.core.metrics import METRICS
 from mudg.core.pictures import resize_nearest
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import featnets
 from mudg.scoring import score
 from mudg.scoring import tables as score_tables
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 
 PLAIN = ScoreConfig(perceptual_views=0)
 

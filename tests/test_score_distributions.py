@@ -16,14 +16,14 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Observation
 from mudg.core import feature_distances
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import inception
 from mudg.scene.read import read_scene
 from mudg.scoring import score
 from mudg.scoring import sets as distributions
 from mudg.scoring import tables as score_tables
 from mudg.scoring.sets import Distributions, FeatureFiles, ImageSet, TrajectorySets
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 from mudg.viewer import report as page
 
 CPU = torch.device("cpu")

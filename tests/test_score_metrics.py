@@ -21,12 +21,12 @@ from mudg.city.world import CityWorld
 from mudg.core import losses as perceptual
 from mudg.core import metrics
 from mudg.core.metrics import Pair
-from mudg.diffusion import model_files
-from mudg.editing.view_settings import ScoreConfig
+from mudg.diffusion import model_files as files
+from mudg.editing.settings import ScoreConfig
 from mudg.networks.featnets import CodecFeatures, LpipsFeatures, PerceptualDistance, lpips_shapes
 from mudg.scoring import score
 from mudg.scoring import tables as score_tables
-from mudg.steps.score import Score
+from mudg.steps.render import Score
 
 
 def pair(**given) -> Pair:
@@ -50,7 +50,7 @@ def pictures():
 
 @pytest.fixture(scope="module")
 def distance():
-    perceptual_of = PerceptualDistance(CodecFeatures(model_files.load("embedded").codec))
+    perceptual_of = PerceptualDistance(CodecFeatures(files.load("embedded").codec))
     return lambda made, truth, mask=None: perceptual_of(pair(rgb=made, truth_rgb=truth, mask=mask))
 
 

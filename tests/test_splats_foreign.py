@@ -21,7 +21,7 @@ from foreign_splats import C1, F_REST, ROWS, rows
 
 from mudg import app
 from mudg.base.errors import InputError
-from mudg.editing.assets import read_asset
+from mudg.editing.apply import read_asset
 from mudg.formats.splats import formats
 from mudg.formats.splats.cloud import SplatCloud
 from mudg.gaussians.rendering import raster_of

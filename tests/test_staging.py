@@ -13,9 +13,9 @@ from mudg import app
 from mudg.base import staging, store
 from mudg.base.errors import ResourceError
 from mudg.base.location import Location
-from mudg.editing.view_settings import ScoreConfig
-from mudg.steps.report import Report
-from mudg.steps.score import Score
+from mudg.editing.settings import ScoreConfig
+from mudg.steps.render import Score
+from mudg.steps.view import Report
 
 fsspec = pytest.importorskip("fsspec", reason="the store in memory is fsspec's")
 
@@ -112,7 +112,7 @@ def test_stopped_in_a_transfer_the_same_command_goes_on(
             raise PermissionError("refused")
         return found(self, *args, **options)
 
-    from mudg.steps.fuse import Fuse
+    from mudg.steps.ingest import Fuse
 
     act = Fuse.act
     monkeypatch.setattr(Fuse, "act", lambda step: computed.append(1) or act(step))

@@ -27,7 +27,7 @@ from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Fuse
 from mudg.steps.synthesize import Synthesize
 
 FRAMES = 7

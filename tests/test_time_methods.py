@@ -45,7 +45,7 @@ from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
+from mudg.steps.ingest import Fuse
 
 SIZE, FRAMES = (60, 40), 6
 OWN = {

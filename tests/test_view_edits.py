@@ -23,14 +23,11 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.core.edit import HeightMap
 from mudg.core.trajectory import at_shift
-from mudg.editing.apply import street_left
-from mudg.editing.carried import carry_out
+from mudg.editing.apply import carry_out, in_weather, street_left, weather_of
 from mudg.editing.model import motion_of
 from mudg.editing.plan import EditPlan
-from mudg.editing.script import parse_edits, read_edits
-from mudg.editing.settings import EditConfig
-from mudg.editing.view_settings import RenderConfig
-from mudg.editing.weathered import conditions_of, in_weather, weather_of
+from mudg.editing.script import conditions_of, parse_edits, read_edits
+from mudg.editing.settings import EditConfig, RenderConfig
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.scene.observations import read_observations
@@ -297,7 +294,7 @@ def test_the_page_moves_objects_as_the_program_does(
     opened: Browser, toy: Toy, script: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model, scene = toy[2], read_scene(toy[0] / "scene")
-    monkeypatch.setattr("mudg.editing.carried.ground_of", lambda cloud, model: hilly())
+    monkeypatch.setattr("mudg.editing.apply.ground_of", lambda cloud, model: hilly())
     drive = carry_out(parse_edits(script, "edits.yaml"), model)
     edited = drive.model(model)
     entries = [

@@ -21,12 +21,12 @@ from mudg.city.world import CityWorld
 from mudg.core import metrics, trajectory, view_metrics
 from mudg.core.metrics import Pair, ViewFacts
 from mudg.core.street_scores import nta_truths
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
 from mudg.scoring import detections
 from mudg.scoring import tables as score_tables
-from mudg.steps.score import DrawTruth, Score
+from mudg.steps.render import DrawTruth, Score
 
 QUICK = ScoreConfig(perceptual_views=0, error_pictures=False)
 Change = Callable[[Observation], Observation]
@@ -128,12 +128,7 @@ def test_a_still_video_does_not_flicker(log_scores: dict) -> None:
 def test_missing_files_name_their_flags(log_scores: dict) -> None:
     text = score_tables.markdown(log_scores)
     for flag in (
-        "--detections",
-        "--lanes",
-        "--dino-weights",
-        "--clip-weights",
-        "--video-features",
-        "--lpips-vgg-weights",
+        *("--detections", "--lanes", "--dino-weights", "--clip-weights", "--video-features", "--lpips-vgg-weights"),
     ):
         assert flag in text
 

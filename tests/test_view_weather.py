@@ -16,8 +16,8 @@ from toy_fitted import STREET, write_toy_run
 from mudg.base import seeds
 from mudg.base.types import View
 from mudg.core.weather import air as particles
+from mudg.editing.apply import SEED
 from mudg.editing.script import read_edits
-from mudg.editing.weathered import SEED
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.viewer import view

@@ -21,7 +21,7 @@ from shared import device_of, finish, flags, work_folder
 from mudg.base import config as configuration
 from mudg.diffusion import model_files
 from mudg.diffusion.settings import LearnCodec, LearnConfig
-from mudg.steps.learn import Learn
+from mudg.steps.synthesize import Learn
 
 NO_LONGER = ("textures",)
 """Of the recipe: photographs that are not part of the repository, unless --textures names them."""

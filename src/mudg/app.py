@@ -45,15 +45,11 @@ def overview() -> str:
         lines += ["", f"{title}:", *_listed(names)]
     lines += [
         "",
-        (
-            "Settings: flags override --config FILE.yaml, which overrides the defaults. Every result holds its settings"
-            " in run.yaml."
-        ),
+        "Settings: flags override --config FILE.yaml, which overrides the defaults. Every result holds its settings in"
+        " run.yaml.",
         "Repeat a command to resume it: finished results are verified and reused, interrupted ones are continued.",
-        (
-            "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerical error, 130"
-            " interrupted;"
-        ),
+        "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerical error, 130"
+        " interrupted;",
         "with --list, and of batch: 10 + number of failed scenes (99: 89 or more); 143 stopped by SIGTERM.",
     ]
     return "\n".join(lines)
@@ -117,10 +113,8 @@ def _require_current_folder() -> None:
     try:
         os.getcwd()
     except OSError as error:
-        remedy = "change to a folder that exists"
-        raise ResourceError(
-            "the current folder is gone, or cannot be entered", got=str(error), remedy=remedy
-        ) from error
+        what, remedy = "the current folder is gone, or cannot be entered", "change to a folder that exists"
+        raise ResourceError(what, got=str(error), remedy=remedy) from error
 
 
 def find_verb(words: Sequence[str]) -> tuple[str, list[str]]:
@@ -141,18 +135,13 @@ def find_verb(words: Sequence[str]) -> tuple[str, list[str]]:
         return name, rest
     if inside:
         near = nearest(rest[0], [verb.split(" ")[1] for verb in inside], 0.5)
-        raise UsageError(
-            f"mudg {name} has no {rest[0]!r}",
-            expected="one of " + ", ".join(f"mudg {verb}" for verb in inside),
-            remedy=f"did you mean `mudg {name} {near}`?" if near else f"see mudg {name} --help",
-        )
+        remedy = f"did you mean `mudg {name} {near}`?" if near else f"see mudg {name} --help"
+        expected = "one of " + ", ".join(f"mudg {verb}" for verb in inside)
+        raise UsageError(f"mudg {name} has no {rest[0]!r}", expected=expected, remedy=remedy)
     known = list(dict.fromkeys(verb.split(" ")[0] for verb in steps.VERBS))
     near = nearest(name, known, 0.5)
-    raise UsageError(
-        f"there is no verb {name!r}",
-        expected="one of " + ", ".join(known),
-        remedy=f"did you mean `mudg {near}`?" if near else "see mudg --help",
-    )
+    remedy = f"did you mean `mudg {near}`?" if near else "see mudg --help"
+    raise UsageError(f"there is no verb {name!r}", expected="one of " + ", ".join(known), remedy=remedy)
 
 
 def _help(verb: str, words: Sequence[str]) -> str | None:
@@ -160,18 +149,11 @@ def _help(verb: str, words: Sequence[str]) -> str | None:
     from mudg import steps
     from mudg.steps import command
 
-    if verb in steps.groups() and {"-h", "--help", "--help-all"} & {*words}:
-        return "\n".join(
-            [
-                f"usage: mudg {verb} WORD [flags]",
-                "",
-                *_listed(steps.groups()[verb]),
-                "",
-                f"mudg {verb} WORD --help lists its flags.",
-            ]
-        )
     if verb in steps.groups():
-        return None
+        if not {"-h", "--help", "--help-all"} & {*words}:
+            return None
+        lines = [f"usage: mudg {verb} WORD [flags]", "", *_listed(steps.groups()[verb])]
+        return "\n".join([*lines, "", f"mudg {verb} WORD --help lists its flags."])
     everything, short = "--help-all" in words, bool({"-h", "--help"} & set(words))
     if not everything and not short:
         return None
@@ -197,9 +179,8 @@ def parse(words: Sequence[str]) -> tuple[Step, Common]:
 
     verb, rest = find_verb(words)
     if verb in steps.groups():
-        raise UsageError(
-            f"mudg {verb} needs one more word", expected=", ".join(f"mudg {one}" for one in steps.groups()[verb])
-        )
+        expected = ", ".join(f"mudg {one}" for one in steps.groups()[verb])
+        raise UsageError(f"mudg {verb} needs one more word", expected=expected)
     return command.parse(steps.step_class(verb), rest)
 
 
@@ -234,11 +215,8 @@ def _say(text: str) -> None:
         raise
     except (OSError, ValueError, AttributeError) as error:
         failures.silence(1)
-        raise ResourceError(
-            "the answer cannot be written to standard output",
-            got=str(error),
-            remedy="what was made is complete; repeat the command to see the answer",
-        ) from error
+        what, remedy = "the answer cannot be written to standard output", "repeat the command to see the answer"
+        raise ResourceError(what, got=str(error), remedy=f"what was made is complete; {remedy}") from error
 
 
 def _complain(text: str) -> None:

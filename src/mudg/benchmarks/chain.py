@@ -1,41 +1,150 @@
-"""The steps of a scene that benchmarks of complete methods share, each in a folder that is verified and reused: what
-``mudg run`` does, a folder per method.
+"""How benchmarks of complete methods run: one loop over logs, side by side; the steps of a scene that they share, each
+in a folder that is verified and reused; and pages that hold all methods side by side.
 
-OUT/fuse  OUT/fit/<row>   every fit       OUT/start/<row>   what a variant with other settings of the first fit goes on
-          with
-OUT/render/<row>  OUT/nearest_fill  OUT/exact
-views to score; those of the diffusion model lie where the benchmark puts them
-OUT/repair/<step>  repaired renders on the way to the places of generated views (difix); OUT/start/difix-<step>
-the fit that has seen them
-"""
+    OUT/fuse  OUT/fit/<row>  OUT/start/<row>   clouds; every fit; what a variant with an own first fit goes on with
+    OUT/render/<row>  OUT/nearest_fill  OUT/exact   views to score (the benchmark says where generated ones lie)
+    OUT/repair/<step>  OUT/start/difix-<step>       repaired renders on the way to generated views; their fit
+    OUT/film/<trajectory>.jpg and .mp4              the pictures of pages of shift and paper, which name them"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import base64
+import math
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
-from mudg.base import log
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg import native
+from mudg.base import html, log, store
+from mudg.base.errors import InputError, UsageError
 from mudg.base.layout import OBSERVATION_FILES, below
-from mudg.base.run_folder import RunDir
+from mudg.base.processes import run_in_processes
+from mudg.base.run_folder import RunDir, is_temporary
 from mudg.base.types import Trajectory
-from mudg.benchmarks.loop import run_step
 from mudg.benchmarks.rows import EXACT, FILL, LONGER, REPAIRED, Row, usual_fit
 from mudg.benchmarks.settings import BenchConfig
+from mudg.core.pictures import resize_area
+from mudg.core.raster.place import drawing_device
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import RenderConfig
+from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import read_fused
-from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations
+from mudg.scene.observations import ObservationSet, ObservationWriter, list_observation_sets, read_observations
 from mudg.scene.read import read_scene
 from mudg.scoring import score
+from mudg.steps.engine import Output, Result
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.outputs import Output
+from mudg.steps.ingest import Fuse
 from mudg.steps.pipeline import WITHOUT_DIFFUSION, fits_of
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
+from mudg.viewer.report import FPS, panel_grid, panel_size, shift_title
+
+
+class BenchJob(Protocol):
+    """What is worked on at a time, in terms that another process understands."""
+
+    @property
+    def title(self) -> str:
+        """For the progress bar."""
+
+    def measure(self) -> dict[str, Any]:
+        """Do the work; values for JSON."""
+
+
+def compare(
+    out: Path,
+    jobs: Sequence[BenchJob],
+    config: BenchConfig,
+    document: Callable[[list[dict[str, Any]]], dict[str, Any]],
+    texts: Mapping[str, Callable[[Mapping[str, Any]], str]],
+) -> Path:
+    """Do all jobs, several at a time with one thread each; write ``bench.json`` and its texts. Results do not depend on
+    how many run at a time; finished steps of an interrupted benchmark are reused. ``document``: what ``bench.json``
+    holds, from what the jobs measured, in their order. ``texts``: file -> its text, from the document."""
+    measured: dict[int, dict[str, Any]] = {}
+    with log.task("logs", len(jobs)) as bar, native.one_thread():
+        for index, facts in run_in_processes(_measure, [(job,) for job in jobs], min(at_once(config), len(jobs))):
+            measured[index] = facts
+            bar.update(jobs[index].title)
+            bar.advance()
+    content = document([measured[index] for index in range(len(jobs))])
+    store.write_json(out / "bench.json", content)
+    for name, text in texts.items():
+        store.write_text(out / name, text(content))
+    return out
+
+
+def _measure(job: BenchJob) -> dict[str, Any]:
+    return job.measure()
+
+
+def at_once(config: BenchConfig) -> int:
+    """Logs that are processed at the same time: as many as asked for, else one per core, or one where they would share
+    a GPU."""
+    if config.processes:
+        return config.processes
+    return os.cpu_count() or 1 if drawing_device(config.device, "benchmark").type == "cpu" else 1
+
+
+def run_step(step: Result) -> Path:
+    """Run a step, or reuse its result; what other settings left in its folder is replaced only with ``overwrite``."""
+    try:
+        return replace(step, overwrite=False).run()
+    except UsageError:
+        if not step.overwrite:
+            raise
+        return step.run()
+
+
+def finished(path: Path, measure: Callable[[], Any]) -> Any:
+    """What a part of a benchmark wrote; it is measured if there is no such file yet, so an interrupted benchmark goes
+    on."""
+    if not path.is_file():
+        store.write_json(path, measure())
+    return store.read_json(path)
+
+
+def refuse_foreign(
+    out: Path, pages: Sequence[str], is_own: Callable[[Any], bool], may_be: Callable[[Path], bool] = Path.is_dir
+) -> None:
+    """UsageError if a folder holds anything that a benchmark does not write. ``out``: it need not exist. ``pages``:
+    names of its files at the top; the first is its result, in JSON. ``is_own``: whether that result is this
+    benchmark's. ``may_be``: whether an entry may belong to it, if it is no page."""
+    if not out.exists():
+        return
+    entries = [entry for entry in out.iterdir() if not is_temporary(entry.name)] if out.is_dir() else [out]
+    names = [entry.name for entry in entries]
+    foreign = [entry.name for entry in entries if entry.name not in pages and not may_be(entry)]
+    if not foreign and any(name in pages for name in names):
+        try:
+            foreign = [] if is_own(store.read_json(out / pages[0])) else [pages[0]]
+        except (InputError, KeyError, TypeError):
+            foreign = [name for name in names if name in pages]
+    if foreign:
+        raise UsageError(
+            "the output folder holds files that do not belong to this run",
+            where=str(out),
+            got=", ".join(sorted(foreign)[:8]),
+            remedy="choose an empty --out",
+        )
+
+
+def seconds_of(out: Path) -> dict[str, float]:
+    """Seconds of each finished step, by folder."""
+    steps = sorted(path.relative_to(out) for path in out.glob("**/run.json"))
+    return {
+        path.parent.as_posix(): float(store.read_json(out / path).get("seconds", math.nan))
+        for path in steps
+        if len(path.parts) <= 3 and ".part" not in str(path)
+    }
+
 
 REPAIR_STEPS: Final = 3
 """Steps in which repaired views move from the recorded path to the places of generated views."""
@@ -43,13 +152,9 @@ REPAIR_STEPS: Final = 3
 
 @dataclass(frozen=True)
 class Chain:
-    """The steps of one scene.
-
-    Args:
-        out: folder of all. scene: what methods see. config: its settings of steps, as ``mudg run`` takes them.
-            overwrite: replace what other settings left there.
-        generator: settings of generated views that fits learn from, whose places are those of repaired ones.
-    """
+    """The steps of one scene. ``out``: folder of all. ``scene``: what methods see. ``config``: its settings of steps,
+    as ``mudg run`` takes them. ``overwrite``: replace what other settings left there. ``generator``: settings of
+    generated views that fits learn from, whose places are those of repaired ones."""
 
     out: Path
     scene: Path
@@ -80,12 +185,8 @@ class Chain:
         return self.run(FillViews(scene=self.scene, fused=self.fused, paths=tuple(paths), out=self.out / FILL))
 
     def rendered(self, row: Row, virtual: Sequence[Path], drawn: RenderConfig, scene: Path | None = None) -> Path:
-        """Views of a row's fit.
-
-        Args:
-            virtual: views that it learns from, if its method learns from such. drawn: which views. scene: with their
-                places, if other.
-        """
+        """Views of a row's fit. ``virtual``: views that it learns from, if its method learns from such. ``drawn``:
+        which views. ``scene``: with their places, if other."""
         model, out = self.fitted(row, virtual), self.out / "render" / row.name
         return self.run(RenderViews(scene=scene or self.scene, model=model, out=out, settings=drawn))
 
@@ -129,29 +230,19 @@ class Chain:
         return model
 
     def _fit(self, settings: FitConfig, out: Path, virtual: Sequence[Path] = (), begun: Path | None = None) -> Path:
-        return self.run(
-            Fit(
-                scene=self.scene,
-                fused=self.fused,
-                observations=tuple(virtual),
-                start_from=begun,
-                out=out,
-                settings=settings,
-            )
+        observations = tuple(virtual)
+        step = Fit(
+            scene=self.scene, fused=self.fused, observations=observations, start_from=begun, out=out, settings=settings
         )
+        return self.run(step)
 
 
 def repair_settings(generator: SynthesizeConfig, share: float) -> SynthesizeConfig:
     """How renders are repaired, in one pass from nothing that was measured, after a share of the way to the places of
     generated views. Paths with a name begin at the end of the way."""
     shifts = tuple(round(share * shift, 4) for shift in generator.shifts_m if shift)
-    return replace(
-        generator,
-        condition="repair",
-        steps=1,
-        shifts_m=shifts,
-        paths=generator.paths if share == 1 or not shifts else (),
-    )
+    paths = generator.paths if share == 1 or not shifts else ()
+    return replace(generator, condition="repair", steps=1, shifts_m=shifts, paths=paths)
 
 
 class FillViews(Output):
@@ -193,10 +284,102 @@ class ExactViews(Output):
             views = read_observations(self.truth / name)
             with ObservationWriter(work.path / name, name, EXACT) as writer:
                 for index in range(len(views)):
-                    seen = views[index]
-                    (
-                        writer.skip(seen.view)
-                        if index < writer.done
-                        else writer.add(replace(seen, kind="virtual", source=EXACT))
-                    )
+                    exact = replace(views[index], kind="virtual", source=EXACT)
+                    writer.skip(exact.view) if index < writer.done else writer.add(exact)
         return self.key_settings()
+
+
+PANEL_WIDTH: Final = 320
+ENCODING: Final = Encoding(FPS, first_crf=29, last_crf=41, preset="veryfast")
+VIDEO_BYTES: Final = 900 * 1024
+"""A video larger than this is made anew in lower quality: eight logs of seven trajectories stay under 60 MB."""
+ROWS: Final = {"rgb": "colour", "error": "colour error", "depth": "depth"}
+"""Rows of a video, and their titles."""
+
+
+class Film(Output):
+    """Write one video and one picture per trajectory: columns truth and methods, rows as ``ROWS``."""
+
+    version, files = 1, ("*.mp4", "*.jpg")
+    views: Mapping[str, tuple[Path, ...]]
+    """Column -> folders of observation folders. Where "truth" is among them, it has every trajectory; else there is no
+    row of errors."""
+    paths: tuple[Trajectory, ...]
+    videos: bool = True
+    """Off: only the pictures, of the middle view and in full size."""
+
+    def key_settings(self) -> dict[str, Any]:
+        names = [path.name for path in self.paths]
+        settings = {"columns": list(self.views), "trajectories": names, "panel_width_px": PANEL_WIDTH}
+        return settings if self.videos else {**settings, "videos": False}
+
+    def make(self, work: RunDir) -> dict[str, Any]:
+        sets_of = lambda folders: {k: v for one in folders for k, v in list_observation_sets(one).items()}  # noqa: E731
+        listed = {name: sets_of(folders) for name, folders in self.views.items()}
+        playable = self.videos and bool(video_encoders())
+        for path in self.paths:
+            sets = {name: read_observations(sets[path.name]) for name, sets in listed.items() if path.name in sets}
+            if "truth" in self.views and "truth" not in sets:
+                raise InputError("no ground truth to show", where=f"{self.views['truth'][0]}: {path.name}")
+            if not sets:
+                continue
+            pictures = list(_frames(sets, list(self.views), range(len(path)) if playable else [len(path) // 2]))
+            if playable:
+                video = mp4_within(lambda frames=pictures: frames, ENCODING, VIDEO_BYTES)
+                store.atomic_write(work.path / f"{path.name}.mp4", video)
+            middle = pictures[len(pictures) // 2]
+            poster = resize_area(middle, middle.shape[1] // 2, middle.shape[0] // 2) if self.videos else middle
+            store.atomic_write(work.path / f"{path.name}.jpg", jpeg_bytes(poster, quality=75))
+        return {"columns": list(self.views), "videos": playable}
+
+
+def _frames(
+    sets: Mapping[str, ObservationSet], order: Sequence[str], frames: Sequence[int]
+) -> Iterator[NDArray[np.uint8]]:
+    camera = next(iter(sets.values())).views[0].camera
+    size = panel_size(camera.width, camera.height, PANEL_WIDTH)
+    rows = [row for row in ROWS if row != "error" or "truth" in sets]
+    for frame in frames:
+        seen = {column: sets[column][frame] if column in sets else None for column in order}
+        yield panel_grid(seen, rows, size, seen.get("truth"))
+
+
+def wall(title: str, pictures: Mapping[str, Path], notes: Sequence[str] = ()) -> dict[str, Any]:
+    """Pictures side by side, by title, which a page holds."""
+    inside = lambda path: base64.b64encode(store.read_bytes(path)).decode("ascii")  # noqa: E731
+    cells = [{"title": name, "src": "data:image/jpeg;base64," + inside(path)} for name, path in pictures.items()]
+    return {"title": title, "notes": notes, "cells": cells}
+
+
+def films(
+    doc: Mapping[str, Any], columns: Sequence[str], *, videos: bool, exact: bool = True, choice: bool = False
+) -> dict[str, Any]:
+    """Values of a page's section with the films of all logs; with a choice among them, the largest shift to the left
+    comes first."""
+    named = [(entry["log"], name) for entry in doc["logs"] for name in entry["films"]]
+    titles = {name: shift_title(_shift_of(name), name) if choice else name for _, name in named}
+    names = sorted(titles, key=_shift_of)
+    choices = [{"name": name, "title": titles[name], "selected": name == names[-1]} for name in names]
+    return {
+        "title": "Rendered views",
+        "columns": columns,
+        "videos": videos,
+        "panel_rows": [title for row, title in ROWS.items() if row != "error" or exact],
+        "films": [{"log": log, "name": name, "title": titles[name]} for log, name in named],
+        "log_choices": [entry["log"] for entry in doc["logs"] if entry["films"]] if choice else [],
+        "shift_choices": choices if choice else [],
+    }
+
+
+def _shift_of(name: str) -> float:
+    _, _, shift = name.partition("_shift")
+    return float(shift) if shift else 0.0
+
+
+def render_page(title: str, command: str, lead: str, sections: Sequence[Mapping[str, Any]], footer: str = "") -> str:
+    """A page. ``command``: what makes it. ``lead``: first sentence. ``sections``: each with ``title``, and any of
+    ``tables`` (``report.tables.TextTable``), ``notes`` above and ``below`` them, the values of `films`, and ``walls``.
+    ``footer``: where the pictures lie."""
+    usual = {"tables": (), "notes": (), "below": (), "films": (), "walls": (), "log_choices": (), "shift_choices": ()}
+    whole = [{**usual, **section} for section in sections]
+    return html.render("bench.html.j2", title=title, kicker=command, lead=lead, footer=footer, sections=whole)

@@ -42,9 +42,8 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.html import TextTable, cells, markdown_table
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, Track, View
-from mudg.benchmarks import page as pages
-from mudg.benchmarks.edit import drawn_pixels
-from mudg.benchmarks.loop import finished
+from mudg.benchmarks.chain import finished, render_page, wall
+from mudg.benchmarks.cities import drawn_pixels
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import lidar, metrics, pictures, street_scores, view_metrics
 from mudg.core import metrics as flicker
@@ -52,14 +51,22 @@ from mudg.core.edit import Motion
 from mudg.core.fusion import STATIC
 from mudg.core.lidar import DEPTH_LIMIT_M, OwnedPoints
 from mudg.core.raster.place import drawing_device
-from mudg.editing.apply import ground_of
-from mudg.editing.assets import asset_from, read_asset, write_asset
-from mudg.editing.carried import EditedDrive, background_of, carry_out
+from mudg.editing.apply import (
+    Drawer,
+    EditedDrive,
+    asset_from,
+    background_of,
+    carry_out,
+    ground_of,
+    in_weather,
+    read_asset,
+    weather_of,
+    write_asset,
+)
 from mudg.editing.plan import EditPlan, EditSources, EditWorld, collisions, plan_edits
 from mudg.editing.recorded import boxes_mask, ground_mask, outlines, touched_boxes
 from mudg.editing.runs import RunParts, find_run
-from mudg.editing.script import EditScript, parse_edits
-from mudg.editing.weathered import Drawer, conditions_of, in_weather, weather_of
+from mudg.editing.script import EditScript, conditions_of, parse_edits
 from mudg.formats.exporters.video import jpeg_bytes
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
@@ -68,12 +75,6 @@ from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_image, read_scene
 from mudg.scoring.truth import LogPoints
 
-# edit runs measure --------------------------------------------------------------------------------
-#
-# One edit of a recorded drive, measured against the unedited fit (see ``benchmarks/edit_runs.py`` for what the numbers
-# are).
-
-
 AROUND_SWEEPS: Final = 12
 """Sweeps of each LiDAR whose static points tell what stands behind a vehicle."""
 COLOR_FRAMES: Final = 4
@@ -81,15 +82,13 @@ COLOR_FRAMES: Final = 4
 UNKNOWN_M: Final = 1000.0
 """Depth of pixels without any, for the motion between frames."""
 Shown = Callable[[int, Observation, Observation], None]
+Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunCase:
-    """A recorded drive to edit.
-
-    Args:
-        frames: the recorded frames of its front camera, in order. lead: id of the vehicle that is edited.
-    """
+    """A recorded drive to edit. ``frames``: the recorded frames of its front camera, in order. ``lead``: id of the
+    vehicle that is edited."""
 
     name: str
     scene: Scene
@@ -102,11 +101,8 @@ class RunCase:
 
 @dataclass(slots=True, eq=False)
 class Video:
-    """One of the two videos, frame by frame: the fit, what draws it, and sums over what was seen of it.
-
-    Args:
-        actor: id of the vehicle whose path is followed, or empty. motion: its path. size_m: of its box.
-    """
+    """One of the two videos, frame by frame: the fit, what draws it, and sums over what was seen of it. ``actor``: id
+    of the vehicle whose path is followed, or empty. ``motion``: its path. ``size_m``: of its box."""
 
     model: SceneModel
     draw: Drawer
@@ -193,14 +189,8 @@ class Sums:
 
 
 def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> dict[str, Any]:
-    """The numbers of one edit.
-
-    Args:
-        shown: gets the number of each frame, and its renders without and with the edit.
-
-    Raises:
-        InputError: the script cannot be carried out on this drive.
-    """
+    """The numbers of one edit. ``shown``: gets the number of each frame, and its renders without and with the edit.
+    InputError: the script cannot be carried out on this drive."""
     drive = carry_out(script, case.model, case.scene, case.cloud)
     usual, edited, weather = _videos(case, drive)
     sums = Sums()
@@ -208,13 +198,12 @@ def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> d
         (old, stood), (new, stands) = usual.add(frame.view), edited.add(frame.view)
         touched, freed = _regions(drive.plan, frame.view, stood, stands)
         if weather:
-            sums.structure += [
-                value for value in [view_metrics.gradient_correlation(new.rgb, old.rgb)] if value is not None
-            ]
+            structure = view_metrics.gradient_correlation(new.rgb, old.rgb)
+            sums.structure += [] if structure is None else [structure]
         else:
             sums.away += int((~touched).sum())
             sums.changed += int((view_metrics.changed_pixels(new.rgb, old.rgb) & ~touched).sum())
-        _add_points(case, drive.plan, frame, (old, new), (touched, freed), sums)
+        _add_points(case, drive.plan, frame, old, new, touched, freed, sums)
         if shown is not None:
             shown(number, old, new)
     kinds = [note["kind"] for note in drive.notes]
@@ -245,14 +234,9 @@ def _videos(case: RunCase, drive: EditedDrive) -> tuple[Video, Video, bool]:
     new = next(iter(drive.plan.inserted), case.lead)
     usual, edited = Video(case.model, plain), Video(made, draw)
     for video, world, name in ((usual, drive.plan.before, case.lead), (edited, drive.plan.after, new)):
-        _follow(video, world, name)
+        if actor := world.actors.get(name):
+            video.actor, video.motion, video.size_m = name, actor.motion, actor.size_m
     return usual, edited, conditions is not None
-
-
-def _follow(video: Video, world: EditWorld, name: str) -> None:
-    actor = world.actors.get(name)
-    if actor is not None:
-        video.actor, video.motion, video.size_m = name, actor.motion, actor.size_m
 
 
 def drawer(model: SceneModel) -> Drawer:
@@ -261,9 +245,7 @@ def drawer(model: SceneModel) -> Drawer:
     return lambda view: render_view(model, view, raster)
 
 
-def _regions(
-    plan: EditPlan, view: View, stood: NDArray[np.bool_], stands: NDArray[np.bool_]
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+def _regions(plan: EditPlan, view: View, stood: Mask, stands: Mask) -> tuple[Mask, Mask]:
     """Bool[H, W] each: pixels near the edit (the boxes' old and new places and the ground about them, where shadows
     lie), and those that showed the vehicle and do not any more."""
     before, after = (touched_boxes(plan, view.time_s, when) for when in ("before", "after"))
@@ -275,12 +257,13 @@ def _add_points(
     case: RunCase,
     plan: EditPlan,
     frame: Frame,
-    pair: tuple[Observation, Observation],
-    regions: tuple[NDArray[np.bool_], NDArray[np.bool_]],
+    old: Observation,
+    new: Observation,
+    touched: Mask,
+    freed: Mask,
     sums: Sums,
 ) -> None:
     """Add the errors of depth and of uncovered colours at LiDAR points."""
-    (old, new), (touched, freed) = pair, regions
     truth = case.points.truth_at(frame.view, None)
     if truth is not None:
         where = (truth.depth > 0) & ~touched
@@ -318,9 +301,6 @@ def _recorded_colors(case: RunCase, plan: EditPlan, points: OwnedPoints) -> tupl
     return color, known
 
 
-# edit runs ----------------------------------------------------------------------------------------
-
-
 EDITS: Final = {
     "remove": "- remove: {ids: ['ID'], close_street: false}",
     "remove, street closed": "- remove: {ids: ['ID'], close_street: true}",
@@ -343,24 +323,12 @@ LOOKS: Final = 6
 PICTURES: Final = (1 / 3, 2 / 3)
 """Where in the video the frames of the page lie."""
 HEADS: Final = (
-    "run",
-    "edit",
-    "warp error (lower)",
-    "unedited",
-    "outside changed (lower)",
-    "structure (higher)",
-    "LiDAR AbsRel (lower)",
-    "unedited",
-    "uncovered AbsRel (lower)",
-    "uncovered PSNR dB (higher)",
-    "overlap (higher)",
-    "unedited",
-    "collisions",
-    "warnings",
+    *("run", "edit", "warp error (lower)", "unedited", "outside changed (lower)", "structure (higher)"),
+    *("LiDAR AbsRel (lower)", "unedited", "uncovered AbsRel (lower)", "uncovered PSNR dB (higher)"),
+    *("overlap (higher)", "unedited", "collisions", "warnings"),
 )
 FORMS: Final = {
-    "warp": "{:.4f}",
-    "warp_before": "{:.4f}",
+    **dict.fromkeys(("warp", "warp_before"), "{:.4f}"),
     "outside": "{:.2%}",
     "structure": "{:.3f}",
     "lidar": "{:.4f}",
@@ -369,8 +337,7 @@ FORMS: Final = {
     "uncovered_psnr": "{:.2f}",
     "overlap": "{:.2f}",
     "overlap_before": "{:.2f}",
-    "collisions": "{}",
-    "warnings": "{}",
+    **dict.fromkeys(("collisions", "warnings"), "{}"),
 }
 KINDS: Final = ("unedited", "edited", "difference")
 """Pictures of a frame."""
@@ -381,27 +348,22 @@ OUTPUT: Final = VerbOutput(
 
 def run(config: BenchConfig, sources: Sequence[Path], out: Path, *, overwrite: bool = False) -> Path:
     """Edit recorded drives; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``. What an interrupted
-    one finished is kept.
-
-    Args:
-        sources: folders of finished ``mudg run``.
-
-    Raises:
-        UsageError: ``--harmonize``, which compares with a truth. InputError: a folder is no finished run, its scene has
-            no labels, no LiDAR or no moving vehicle.
-    """
+    one finished is kept. ``sources``: folders of finished ``mudg run``. UsageError: ``--harmonize``, which compares
+    with a truth. InputError: a folder is no finished run, its scene has no labels, no LiDAR or no moving vehicle."""
     if config.harmonize:
-        raise UsageError(
-            "what a diffusion model adds is compared with generated cities alone",
-            where="--harmonize",
-            remedy="leave it out, or name no runs",
-        )
-    runs = {name: _whole(path) for name, path in names_of(sources).items()}
-    refuse_overlap(out, {f"run {name}": path for name, path in names_of(sources).items()})
-    device = drawing_device(config.device, "benchmark")
-    inputs = {
-        f"{name} {part}": store.digest(path) for name, parts in runs.items() for part, path in _inputs(parts).items()
-    }
+        what = "what a diffusion model adds is compared with generated cities alone"
+        raise UsageError(what, where="--harmonize", remedy="leave it out, or name no runs")
+    folders = names_of(sources)
+    runs = {name: find_run(path) for name, path in folders.items()}
+    for name, parts in runs.items():
+        if not parts.whole:
+            what, expected = "of a fit alone the recorded drive is not known", "a folder made by `mudg run`"
+            raise InputError(what, where=str(folders[name]), expected=expected)
+    refuse_overlap(out, {f"run {name}": path for name, path in folders.items()})
+    device, inputs = drawing_device(config.device, "benchmark"), {}
+    for name, parts in runs.items():
+        paths = {"fit": parts.model, "scene": parts.scene, "fused": parts.fused}
+        inputs |= {f"{name} {part}": store.digest(path) for part, path in paths.items() if path is not None}
     folder = RunDir.open(out, OUTPUT, result_settings(config), inputs, overwrite)
     if folder.complete:
         return folder.reused()
@@ -423,27 +385,9 @@ def names_of(sources: Sequence[Path]) -> dict[str, Path]:
     found: dict[str, Path] = {}
     for path in map(Path, sources):
         plain = re.sub(r"[^A-Za-z0-9_.+-]+", "_", path.name or path.resolve().name) or "run"
-        found[
-            next(name for n in range(1, len(found) + 2) if (name := plain if n == 1 else f"{plain}-{n}") not in found)
-        ] = path
+        names = (plain if n == 1 else f"{plain}-{n}" for n in range(1, len(found) + 2))
+        found[next(name for name in names if name not in found)] = path
     return found
-
-
-def _whole(path: Path) -> RunParts:
-    parts = find_run(path)
-    if not parts.whole:
-        raise InputError(
-            "of a fit alone the recorded drive is not known", where=str(path), expected="a folder made by `mudg run`"
-        )
-    return parts
-
-
-def _inputs(parts: RunParts) -> dict[str, Path]:
-    return {
-        key: path
-        for key, path in (("fit", parts.model), ("scene", parts.scene), ("fused", parts.fused))
-        if path is not None
-    }
 
 
 def _document(runs: Mapping[str, RunParts], device: torch.device, out: Path) -> dict[str, Any]:
@@ -461,9 +405,8 @@ def _document(runs: Mapping[str, RunParts], device: torch.device, out: Path) -> 
         write_asset(out / "assets" / f"{name}.safetensors", asset_from(runs[name], lead))
         return {"lead": lead}
 
-    leads = {
-        name: str(finished(out / "rows" / f"{name}_lead.json", partial(lead_found, name))["lead"]) for name in names
-    }
+    lead_files = {name: finished(out / "rows" / f"{name}_lead.json", partial(lead_found, name)) for name in names}
+    leads = {name: str(file["lead"]) for name, file in lead_files.items()}
     with log.task("editing runs", len(names) * len(EDITS)) as bar:
         for number, name in enumerate(names):
             giver = names[(number + 1) % len(names)]
@@ -474,15 +417,8 @@ def _document(runs: Mapping[str, RunParts], device: torch.device, out: Path) -> 
                     drive = case(name, leads[name])
                     script = script_of(drive, edit, out / "assets" / f"{giver}.safetensors")
                     values = measured(drive, script, _pictures(len(drive.frames), out, _stem(name, edit)))
-                    given_by = giver if edit == "insert" else None
-                    return {
-                        "run": name,
-                        "edit": edit,
-                        "object": drive.lead,
-                        "given_by": given_by,
-                        **values,
-                        "script": script.text(),
-                    }
+                    head = {"run": name, "edit": edit, "object": drive.lead}
+                    return {**head, "given_by": giver if edit == "insert" else None, **values, "script": script.text()}
 
                 rows.append(finished(out / "rows" / f"{_stem(name, edit)}.json", row))
                 bar.advance()
@@ -494,25 +430,19 @@ def _stem(name: str, edit: str) -> str:
 
 
 def case_of(name: str, parts: RunParts, device: torch.device, lead: str = "") -> RunCase:
-    """A run, read; ``lead``: the vehicle that is edited, if it is known.
-
-    Raises:
-        InputError: no classes, no LiDAR, or no vehicle that moves.
-    """
+    """A run, read; ``lead``: the vehicle that is edited, if it is known. InputError: no classes, no LiDAR, or no
+    vehicle that moves."""
     if parts.scene is None or parts.fused is None:  # a whole run has both
         raise InputError("a run without its scene", where=name)
     scene, fused = read_scene(parts.scene), read_fused(parts.fused)
     if not scene.sweeps:
-        raise InputError(
-            "this scene has no LiDAR, which tells the depth that edits are held against", where=str(parts.scene)
-        )
+        what = "this scene has no LiDAR, which tells the depth that edits are held against"
+        raise InputError(what, where=str(parts.scene))
     model = model_of_scene(parts.model, scene).to(device)
     if not model.classes:
-        raise InputError(
-            "this scene was fitted without labels, which edits of weather and the warp error need",
-            where=str(parts.model),
-            remedy="label the scene with `mudg annotate` and fit it again",
-        )
+        what = "this scene was fitted without labels, which edits of weather and the warp error need"
+        remedy = "label the scene with `mudg annotate` and fit it again"
+        raise InputError(what, where=str(parts.model), remedy=remedy)
     camera = "front" if "front" in scene.cameras else next(iter(scene.cameras))
     frames = tuple(sorted((f for f in scene.frames if f.view.camera.name == camera), key=lambda f: f.view.time_s))
     points = LogPoints(scene)
@@ -521,11 +451,7 @@ def case_of(name: str, parts: RunParts, device: torch.device, lead: str = "") ->
 
 def lead_of(scene: Scene, model: SceneModel, frames: Sequence[Frame], points: LogPoints) -> str:
     """The moving vehicle with Gaussians of its own that shows the most pixels, of those that are ahead where there are
-    any.
-
-    Raises:
-        InputError: there is none.
-    """
+    any. InputError: there is none."""
     nodes = model.node_names()
     tracks = [t for t in points.dynamic if t.id in nodes and t.label in street_scores.VEHICLE_LABELS]
     chosen = [frames[int(i)].view for i in np.unique(np.linspace(0, len(frames) - 1, min(LOOKS, len(frames))).round())]
@@ -538,19 +464,15 @@ def lead_of(scene: Scene, model: SceneModel, frames: Sequence[Frame], points: Lo
                 edge = np.array([view.camera.width, view.camera.height], np.float64)
                 areas[track.id] += float((np.clip(box[2:], 0, edge) - np.clip(box[:2], 0, edge)).prod())
     ahead = {track.id for track in tracks if any(_is_ahead(track, view) for view in chosen)}
-    seen = sorted(
-        (name for name, area in areas.items() if area > 0), key=lambda name: (name not in ahead, -areas[name])
-    )
+    visible = (name for name, area in areas.items() if area > 0)
+    seen = sorted(visible, key=lambda name: (name not in ahead, -areas[name]))
     nearest = [name for name in seen if name in ahead or not ahead & {*seen}][:CANDIDATES]
     shown = {name: sum(int(drawn_pixels(model, name, view).sum()) for view in chosen) for name in nearest}
     if not any(shown.values()):
-        raise InputError(
-            "no vehicle moves in the view of this drive's front camera",
-            where=scene.id,
-            expected="a moving track of a vehicle with Gaussians of its own",
-            got=f"{len(points.dynamic)} moving tracks of {len(scene.tracks)}",
-            remedy="edit another drive",
-        )
+        what, where = "no vehicle moves in the view of this drive's front camera", scene.id
+        expected = "a moving track of a vehicle with Gaussians of its own"
+        got = f"{len(points.dynamic)} moving tracks of {len(scene.tracks)}"
+        raise InputError(what, where=where, expected=expected, got=got, remedy="edit another drive")
     return max(shown, key=lambda name: shown[name])
 
 
@@ -581,9 +503,8 @@ def _pictures(frames: int, out: Path, name: str) -> Shown:
         if number in chosen:
             images = (pictures.to_bytes(old.rgb), pictures.to_bytes(new.rgb), pictures.error_image(new.rgb, old.rgb))
             for kind, image in zip(KINDS, images, strict=True):
-                store.atomic_write(
-                    out / "pictures" / f"{name}_{chosen[number]}_{kind}.jpg", jpeg_bytes(image, quality=85)
-                )
+                path = out / "pictures" / f"{name}_{chosen[number]}_{kind}.jpg"
+                store.atomic_write(path, jpeg_bytes(image, quality=85))
 
     return shown
 
@@ -610,18 +531,12 @@ def page(doc: Mapping[str, Any], out: Path) -> str:
         stem = out / "pictures" / _stem(row["run"], row["edit"])
         for number in range(len(list(stem.parent.glob(f"{stem.name}_[0-9]_edited.jpg")))):
             images = {kind: stem.with_name(f"{stem.name}_{number}_{kind}.jpg") for kind in KINDS}
-            walls.append(pages.wall(f"{row['run']}: {row['edit']}", images, row["notes"] if number == 0 else ()))
-    return pages.render(
-        "Edited drives",
-        "mudg bench edit",
-        "Recorded drives, edited, against their unedited fits. The pictures show your recordings: share this page with"
-        " care.",
-        [
-            {"title": "Numbers", "tables": [TextTable.of_texts(HEADS, map(_cells, doc["rows"]))]},
-            {
-                "title": "Pictures",
-                "walls": walls,
-                "notes": ["Difference: mean of the channels, black = equal, through red to white = 0.35 or more."],
-            },
-        ],
-    )
+            walls.append(wall(f"{row['run']}: {row['edit']}", images, row["notes"] if number == 0 else ()))
+    lead = "Recorded drives, edited, against their unedited fits."
+    private = "The pictures show your recordings: share this page with care."
+    difference = "Difference: mean of the channels, black = equal, through red to white = 0.35 or more."
+    sections = [
+        {"title": "Numbers", "tables": [TextTable.of_texts(HEADS, map(_cells, doc["rows"]))]},
+        {"title": "Pictures", "walls": walls, "notes": [difference]},
+    ]
+    return render_page("Edited drives", "mudg bench edit", f"{lead} {private}", sections)

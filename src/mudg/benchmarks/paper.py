@@ -9,7 +9,7 @@ number on one log has none in that cell, for means over other logs could not be 
 views of all logs at a place, as one set as in papers, with all recorded frames of their cameras; a mean of the
 distances of small sets is mostly bias.
 
-    OUT/<log>/...   see ``benchmarks/views.py``; views that fits learn from lie in OUT/<log>/virtual
+    OUT/<log>/...   see ``benchmarks/places.py``; views that fits learn from lie in OUT/<log>/virtual
     OUT/bench.json   every number   OUT/bench.md bench.csv bench.tex   the table   OUT/page.html   table and pictures
 """
 
@@ -31,21 +31,39 @@ from mudg.base.errors import InputError
 from mudg.base.html import ARROWS, PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown_table
 from mudg.base.html import markdown as rendered
 from mudg.base.run_folder import refuse_overlap
-from mudg.benchmarks import page as pages
-from mudg.benchmarks.loop import compare, refuse_foreign, seconds_of
-from mudg.benchmarks.papers import PAPERS, TABLES, PaperColumn, PaperTable
-from mudg.benchmarks.places import ListedCity, first_camera, logs_of, missing_scenes
-from mudg.benchmarks.rows import FILL, REPAIRED, Row, chain_settings, generator_of, paper_rows, refuse_unfit
+from mudg.benchmarks.chain import compare, films, refuse_foreign, render_page, seconds_of
+from mudg.benchmarks.places import (
+    TRUTH,
+    ListedCity,
+    Views,
+    first_camera,
+    logs_of,
+    missing_scenes,
+    of_log,
+    score_settings,
+)
+from mudg.benchmarks.rows import (
+    FILL,
+    PAPERS,
+    REPAIRED,
+    TABLES,
+    PaperColumn,
+    PaperTable,
+    Row,
+    chain_settings,
+    generator_of,
+    paper_rows,
+    refuse_unfit,
+)
 from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import standard_error, virtual_fits_of
-from mudg.benchmarks.views import TRUTH, Views, of_log, score_settings
 from mudg.core.metrics import METRICS
-from mudg.diffusion import model_files
-from mudg.editing.view_settings import ScoreConfig
+from mudg.diffusion import model_files as mdm_files
+from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.methods import METHODS
 from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, compared, distances
 from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
-from mudg.steps.settings.presets import PresetName
+from mudg.steps.settings import PresetName
 
 PAGES: Final = ("bench.json", "bench.md", "bench.csv", "bench.tex", "page.html")
 ANCHORS: Final = {TRUTH: "the truth itself", FILL: "fused points, holes filled"}
@@ -82,24 +100,22 @@ class PaperLog(Views):
         scored = {name: self.scores(name, folders) for name, folders in views.items()}
         if truth is not None:
             scored[TRUTH] = self.scores(TRUTH, (truth,))
-        names = {place.name: self.trajectories(place.endings(self.log.side)) for place in self.table.places}
+        places = {place.name: self.trajectories(place.endings(self.log.side)) for place in self.table.places}
         keys = {column.key: column for column in (*self.table.columns, *further_columns(truth is not None))}
-        columns = tuple(keys.values())
-        values = {
-            row: {p: at_place(tuple(of.values()), at, columns) for p, at in names.items()} for row, of in scored.items()
-        }
-        features = {row: {p: files_at(of, at, out) for p, at in names.items()} for row, of in scored.items()}
-        fill = tuple(scored[FILL].values())
+        columns, fill, values, features = tuple(keys.values()), tuple(scored[FILL].values()), {}, {}
+        for row, of in scored.items():
+            values[row] = {place: at_place(tuple(of.values()), names, columns) for place, names in places.items()}
+            features[row] = {place: files_at(of, names, out) for place, names in places.items()}
         for row in self.rows:
             if row.left_out:
                 why = "the model uses no renders" if row.name == REPAIRED else "no model: --freevs-model"
-                values[row.name] = dict.fromkeys(names, {key: {"value": why} for key in keys})
+                values[row.name] = dict.fromkeys(places, {key: {"value": why} for key in keys})
         # it is not known off the path: the scorer's floors, and frames of the reference against others of it
         if truth is None:
-            values[TRUTH] = {p: floors_at(fill, at, columns) for p, at in names.items()}
+            values[TRUTH] = {place: floors_at(fill, names, columns) for place, names in places.items()}
             features[TRUTH] = {
-                p: {entry: {"made": [], "reference": of["reference"]} for entry, of in files.items()}
-                for p, files in features[FILL].items()
+                place: {entry: {"made": [], "reference": of["reference"]} for entry, of in files.items()}
+                for place, files in features[FILL].items()
             }
         films, scene = self.film(shown), self.loaded
         sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in scene.cameras.values())
@@ -144,14 +160,14 @@ def run(
     read = {f"log {log.name}": log.source for log in logs if not isinstance(log, ListedCity)}
     weights = _weights_of(config.score)
     refuse_overlap(
-        out, {"model": model_files.folder_of(config.model), "freevs-model": config.freevs_model, **read, **weights}
+        out, {"model": mdm_files.folder_of(config.model), "freevs-model": config.freevs_model, **read, **weights}
     )
     digests = {name: store.digest(Path(path)) for name, path in weights.items()}  # before any work: one may be missing
-    digests |= {"freevs_model": model_files.digest(config.freevs_model)} if config.freevs_model else {}
+    digests |= {"freevs_model": mdm_files.digest(config.freevs_model)} if config.freevs_model else {}
     refuse_foreign(out, PAGES, lambda doc: doc["bench"] == "paper" and doc["table"]["name"] == table.name)
     generates = [row.changes for row in rows if METHODS[row.method].made_by == "synthesize" and not row.left_out]
     refuse_unfit(config, preset, rows, [replace(generator_of(config), **changes) for changes in generates])
-    measured, renders = score_settings(config, table), model_files.uses_renders(config.model)
+    measured, renders = score_settings(config, table), mdm_files.uses_renders(config.model)
     fill = Row(FILL, ANCHORS[FILL])
     jobs = [
         PaperLog(log, out / log.name, table, (fill, *rows), config, of_log(measured, log.name), renders, overwrite)
@@ -162,16 +178,14 @@ def run(
         "missing_scenes": missing_scenes(table, logs),
         "iterations": config.iterations,
         "seed": config.seed,
-        "model": model_files.digest(config.model),
+        "model": mdm_files.digest(config.model),
         "renders": renders,
         "videos": config.videos,
         "score": configuration.result_settings(measured),
         "digests": digests,
         **chain_settings(config, preset),
     }
-    values = [
-        {"name": row.name, "title": row.title, "method": row.method, "changes": dict(row.changes)} for row in rows
-    ]
+    values = [{"name": r.name, "title": r.title, "method": r.method, "changes": dict(r.changes)} for r in rows]
     texts = {"bench.md": markdown, "bench.csv": as_csv, "bench.tex": as_latex, "page.html": page}
     return compare(out, jobs, config, lambda logs: document(table, logs, values, settings, pooled(logs, out)), texts)
 
@@ -191,12 +205,9 @@ def further_columns(exact: bool) -> tuple[PaperColumn, ...]:
 
 
 def at_place(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
-    """Values of one method on one log at a place.
-
-    Args:
-        documents: contents of ``metrics.json`` that hold its trajectories, one method each.
-        names: trajectories of the place; the mean over them, and the sum of their numbers of views.
-    """
+    """Values of one method on one log at a place. ``documents``: contents of ``metrics.json`` that hold its
+    trajectories, one method each. ``names``: trajectories of the place; the mean over them, and the sum of their
+    numbers of views."""
     results = {row["trajectory"]: row for document in documents for row in document["results"]}
     rows = [results.get(name) for name in names]
     known = {metric["name"] for document in documents for metric in document["metrics"]}
@@ -242,10 +253,8 @@ def _made_of(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     result: dict[str, Any] = {"depth_rule": documents[0]["rules"][3] if len(documents[0]["rules"]) > 3 else ""}
     for document in documents:
         for entry in dict.fromkeys(SET_METRICS.values()):
-            if document.get(entry):
-                result[entry] = {
-                    name: value for name, value in document[entry].items() if name not in ("floors", "sets")
-                }
+            if of := document.get(entry):
+                result[entry] = {name: value for name, value in of.items() if name not in ("floors", "sets")}
     return result
 
 
@@ -254,20 +263,15 @@ def _made_of(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 def files_at(documents: Mapping[Path, Mapping[str, Any]], names: Sequence[str], out: Path) -> Files:
     """Files of features of one method on one log at a place; an entry that lacks a trajectory is left out.
-
-    Args:
-        documents: folder of scores -> its metrics.json, one method each. names: trajectories of the place. out: of the
-            benchmark.
-    """
+    ``documents``: folder of scores -> its metrics.json, one method each. ``names``: trajectories of the place. ``out``:
+    of the benchmark."""
     result: Files = {}
     for entry in POOLED:
-        sets = {
-            record["trajectory"]: [
-                (folder / FEATURES_FOLDER / record[part]).relative_to(out).as_posix() for part in ("made", "reference")
-            ]
-            for folder, document in documents.items()
-            for record in document.get(entry, {}).get("sets", [])
-        }
+        sets: dict[str, list[str]] = {}
+        for folder, document in documents.items():
+            for record in document.get(entry, {}).get("sets", []):
+                paths = (folder / FEATURES_FOLDER / record[part] for part in ("made", "reference"))
+                sets[record["trajectory"]] = [path.relative_to(out).as_posix() for path in paths]
         known = [sets[name] for name in names if name in sets]
         if known and len(known) == len(names):
             made, reference = zip(*known, strict=True)
@@ -277,10 +281,7 @@ def files_at(documents: Mapping[Path, Mapping[str, Any]], names: Sequence[str], 
 
 def pooled(logs: Sequence[Mapping[str, Any]], out: Path) -> dict[str, dict[str, Values]]:
     """Cells of pooled sets, row -> place -> metric -> mean and standard error; only where every log has its features.
-
-    Args:
-        logs: per log its facts, with ``features[row][place]`` as from `files_at`. out: folder of the benchmark.
-    """
+    ``logs``: per log its facts, with ``features[row][place]`` as from `files_at`. ``out``: folder of the benchmark."""
     result: dict[str, dict[str, Values]] = {}
     for row, places in {row: of for entry in logs for row, of in entry["features"].items()}.items():
         for place in places:
@@ -341,10 +342,7 @@ def document(
     exact = all(entry["exact"] for entry in logs)
     every = [*({"name": name, "title": title, "method": "", "changes": {}} for name, title in ANCHORS.items()), *rows]
     columns = further_columns(exact)
-    wanted = [
-        *((p.name, c) for p, c in table.cells()),
-        *((place.name, column) for place in table.places for column in columns),
-    ]
+    wanted = [(p.name, c) for p, c in table.cells()] + [(p.name, c) for p in table.places for c in columns]
     cells: dict[str, dict[str, Values]] = {row["name"]: {} for row in every}
     for row, of in cells.items():
         for place, column in wanted:
@@ -353,15 +351,10 @@ def document(
     best: dict[str, dict[str, list[str]]] = {}
     for place, column in wanted:
         _refuse_other_counts(cells, place, column)
-        numbers = {
-            row: round(of[place][column.key]["mean"], column.digits)
-            for row, of in cells.items()
-            if row != TRUTH and "mean" in of[place][column.key]
-        }
+        results = {row: of[place][column.key] for row, of in cells.items() if row != TRUTH}
+        numbers = {row: round(of["mean"], column.digits) for row, of in results.items() if "mean" in of}
         best.setdefault(place, {})[column.key] = best_of(column.better, numbers)
-    published = [
-        {"title": row.title, "source": row.source, "values": list(map(list, row.values))} for row in table.published
-    ]
+    published = [{"title": r.title, "source": r.source, "values": list(map(list, r.values))} for r in table.published]
     return {
         "schema": 1,
         "bench": "paper",
@@ -398,11 +391,7 @@ def _cell(
 
 def _refuse_other_counts(cells: dict[str, dict[str, Values]], place: str, column: PaperColumn) -> None:
     """Refuse methods with different numbers of views in a column; a floor with another number is left out of the table,
-    with the reason.
-
-    Raises:
-        InputError: they differ.
-    """
+    with the reason. InputError: they differ."""
     counts = {name: of[place][column.key].get("n") for name, of in cells.items()}
     floor = counts.pop(TRUTH)
     wanted = {tuple(n) for n in counts.values() if n is not None}
@@ -425,11 +414,7 @@ def heading(doc: Mapping[str, Any]) -> str:
     """What the table is, and what it is filled with."""
     count, name = len(doc["logs"]), doc["settings"]["list"]
     logs = f"{count} log{'s' if count != 1 else ''}"
-    return (
-        f"{doc['table']['title']}, on {logs} of generated cities ({name})"
-        if name
-        else f"{doc['table']['title']}, on {logs} recorded"
-    )
+    return f"{doc['table']['title']}, on {logs} " + (f"of generated cities ({name})" if name else "recorded")
 
 
 def notes_of(doc: Mapping[str, Any]) -> list[str]:
@@ -437,17 +422,12 @@ def notes_of(doc: Mapping[str, Any]) -> list[str]:
     table, settings = doc["table"], doc["settings"]
     sizes = dict.fromkeys(f"{e['size']}, {e['frames']} frames, {e['held_out']} images held out" for e in doc["logs"])
     ours = "generated cities, not the paper's data" if settings["list"] else "the logs below"
-    missing = ", ".join(settings["missing_scenes"])
+    missing, ranked = ", ".join(settings["missing_scenes"]), "best of ours; truth and published rows are not ranked"
     return [
-        (
-            f"Published rows: {table['data']}. Ours: {ours} ({'; '.join(sizes)}). The two cannot be compared number by"
-            " number."
-        ),
+        f"Published rows: {table['data']}. Ours: {ours} ({'; '.join(sizes)}). The two cannot be compared number by"
+        " number.",
         f"Every fit has {settings['iterations']} iterations, {virtual_fits_of(settings)}; seed {settings['seed']}.",
-        (
-            "Means over logs; in brackets the standard error over logs. Bold: best of ours; truth and published rows"
-            " are not ranked."
-        ),
+        f"Means over logs; in brackets the standard error over logs. Bold: {ranked}.",
         *table["notes"],
         *(f"{', '.join(titles)} ({NONE}): {reason}." for reason, titles in _empty_columns(doc).items()),
         *_notes_of_sets(doc["made"]),
@@ -502,25 +482,17 @@ def main_table(doc: Mapping[str, Any]) -> TextTable:
     for row in doc["published"]:
         values = {(place, key): value for place, key, value in row["values"]}
         if values.keys() & set(wanted):
-            cells = tuple(
-                TextCell(_digits(values[cell], columns[cell[1]]) if cell in values else "") for cell in wanted
-            )
-            lines.append(TextLine(f"{row['title']} ({PUBLISHED}: {row['source']})", cells, PUBLISHED))
+            texts = [_digits(values[cell], columns[cell[1]]) if cell in values else "" for cell in wanted]
+            title = f"{row['title']} ({PUBLISHED}: {row['source']})"
+            lines.append(TextLine(title, tuple(map(TextCell, texts)), PUBLISHED))
     return TextTable(tuple(heads), (*lines, *_ours(doc, wanted)))
 
 
 def further_tables(doc: Mapping[str, Any]) -> list[TextTable]:
     """The further columns, one table per place."""
-    columns = doc["further"]
-    return [
-        TextTable(
-            ("", *map(_headed, columns)),
-            tuple(_ours(doc, [(place["name"], column["key"]) for column in columns])),
-            place["title"],
-        )
-        for place in doc["table"]["places"]
-        if columns
-    ]
+    columns, places = doc["further"], doc["table"]["places"] if doc["further"] else ()
+    lines = {place["name"]: _ours(doc, [(place["name"], column["key"]) for column in columns]) for place in places}
+    return [TextTable(("", *map(_headed, columns)), tuple(lines[p["name"]]), p["title"]) for p in places]
 
 
 def _headed(column: Mapping[str, Any]) -> str:
@@ -530,10 +502,8 @@ def _headed(column: Mapping[str, Any]) -> str:
 def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> Iterator[TextLine]:
     shared = {cell: _shared_reason(doc, *cell) for cell in wanted}
     for row in doc["rows"]:
-        cells = (
-            TextCell(NONE, reason=shared[cell]) if shared[cell] else _printed(doc, row["name"], *cell)
-            for cell in wanted
-        )
+        empty = {cell: TextCell(NONE, reason=reason) for cell, reason in shared.items() if reason}
+        cells = (empty.get(cell) or _printed(doc, row["name"], *cell) for cell in wanted)
         yield TextLine(row["title"], tuple(cells), "ours" if row["method"] else "anchor")
     yield TextLine("n", tuple(TextCell(_count(doc, *cell)) for cell in wanted), "n")
 
@@ -566,13 +536,8 @@ LOG_HEADS: Final = ("log", "dataset", "cameras", "frames", "size", "images held 
 def _log_cells(entry: Mapping[str, Any]) -> list[str]:
     """A log's row under ``LOG_HEADS``."""
     facts = [str(entry[key]) for key in ("frames", "size", "held_out", "tracks")]
-    return [
-        entry["log"],
-        entry["dataset"],
-        ", ".join(entry["cameras"]),
-        *facts,
-        f"{sum(entry['seconds'].values()):.0f}",
-    ]
+    seconds = f"{sum(entry['seconds'].values()):.0f}"
+    return [entry["log"], entry["dataset"], ", ".join(entry["cameras"]), *facts, seconds]
 
 
 def markdown(doc: Mapping[str, Any]) -> str:
@@ -596,24 +561,18 @@ def as_csv(doc: Mapping[str, Any]) -> str:
     """One line per number: ``kind,row,source,place,metric,value,standard_error,logs,n,n_reference,reason,best``."""
     rows: list[list[Any]] = []
     for row in doc["published"]:
-        rows += [
-            [PUBLISHED, row["title"], row["source"], place, key, value, *[""] * 6]
-            for place, key, value in row["values"]
-        ]
+        first = [PUBLISHED, row["title"], row["source"]]
+        rows += [[*first, place, key, value, *[""] * 6] for place, key, value in row["values"]]
     for row in doc["rows"]:
+        first = ["ours" if row["method"] else "anchor", row["name"], ""]
         for place, of in doc["cells"][row["name"]].items():
             for key, result in of.items():
-                numbers = [
-                    "" if (value := result.get(name)) is None else f"{value:.6g}" for name in ("mean", "standard_error")
-                ]
+                values = [result.get(name) for name in ("mean", "standard_error")]
+                numbers = ["" if value is None else f"{value:.6g}" for value in values]
                 counts = [sum(result[name]) if name in result else "" for name in ("n", "n_reference")]
-                last = [
-                    result.get("logs", ""),
-                    *counts,
-                    result.get("reason", ""),
-                    int(row["name"] in doc["best"][place][key]),
-                ]
-                rows.append(["ours" if row["method"] else "anchor", row["name"], "", place, key, *numbers, *last])
+                best = int(row["name"] in doc["best"][place][key])
+                last = [result.get("logs", ""), *counts, result.get("reason", ""), best]
+                rows.append([*first, place, key, *numbers, *last])
     return csv_text("kind row source place metric value standard_error logs n n_reference reason best".split(), rows)
 
 
@@ -621,14 +580,14 @@ def page(doc: Mapping[str, Any]) -> str:
     """The whole page from what ``bench.json`` holds."""
     lead, *notes = notes_of(doc)
     further = [{"title": doc["further_title"], "tables": further_tables(doc)}] if doc["further"] else []
-    return pages.render(
+    return render_page(
         heading(doc),
         f"mudg bench paper --table {doc['table']['name']}",
         lead,
         [
             {"title": "Table", "tables": [main_table(doc)], "below": notes},
             *further,
-            pages.films(doc, doc["logs"][0]["columns"], videos=doc["settings"]["videos"], exact=doc["exact"]),
+            films(doc, doc["logs"][0]["columns"], videos=doc["settings"]["videos"], exact=doc["exact"]),
             {"title": "Logs", "tables": [TextTable.of_texts(LOG_HEADS, map(_log_cells, doc["logs"]))]},
         ],
         "The pictures lie beside this page.",

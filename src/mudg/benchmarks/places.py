@@ -1,41 +1,47 @@
-"""The logs of benchmarks: lists of generated cities and recorded logs, their scenes, and what of a log the methods do
-not see.
+"""The logs of benchmarks: lists of generated cities and recorded logs, their scenes, what of a log the methods do not
+see, and the views of every row at the places of a table, with their scores.
 
-OUT/<log>/imported   a dataset's log as a scene      OUT/<log>/shown   a table's frames, cameras and held-out rule
-OUT/<log>/scene      the same with the labels that it lacks; of a city, the generated log itself
-"""
+    OUT/<log>/imported   a dataset's log as a scene      OUT/<log>/shown   a table's frames, cameras and held-out rule
+    OUT/<log>/scene      the same with the labels that it lacks; of a city, the generated log itself
+    OUT/<log>/truth nearest_fill generated/<row> fit/<row> start/<row> render/<row> score/<row> film"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Literal
 
 import numpy as np
 
+from mudg.base import store
 from mudg.base.devices import DeviceName
 from mudg.base.errors import InputError, UsageError
 from mudg.base.layout import SCENE_FILES
 from mudg.base.run_folder import RunDir, refuse_overlap
-from mudg.base.types import Frame, Scene
-from mudg.benchmarks.loop import run_step
-from mudg.benchmarks.papers import SCENE_LISTS, PaperTable
+from mudg.base.types import Frame, Scene, Trajectory
+from mudg.benchmarks.chain import Chain, ExactViews, Film, run_step
+from mudg.benchmarks.rows import EXACT, FILL, RECORDED, SCENE_LISTS, PaperTable, Row, generator_of
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city import logs as city_logs
 from mudg.city.logs import STANDARD, LogRules
+from mudg.diffusion.settings import SynthesizeConfig
+from mudg.editing import render
+from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.formats import ingest
 from mudg.formats.importers.common import holdout_split, parse_frame_range, parse_resolution
 from mudg.formats.settings import IngestConfig
+from mudg.gaussians.methods import METHODS
 from mudg.labels import annotate
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.read import read_scene
 from mudg.scene.write import write_part
-from mudg.steps.annotate import Annotate
-from mudg.steps.ingest import Ingest
-from mudg.steps.outputs import Output
-from mudg.steps.settings.run import on_device
+from mudg.steps.engine import Output
+from mudg.steps.ingest import Annotate, Ingest
+from mudg.steps.render import DrawTruth, Score
+from mudg.steps.settings import on_device
 
 CITY: Final = "city:"
 """How the name of a list of generated cities begins."""
@@ -60,13 +66,9 @@ class ListedCity:
 
 @dataclass(frozen=True)
 class RecordedLog:
-    """A recorded log.
-
-    Args:
-        name: of its folder. source: a dataset's log or a scene. frames: first and last frame (both included), or None
-            for all. size: of imported images (empty = as recorded). side: of one-sided shifts. note: what is to be said
-            of it.
-    """
+    """A recorded log. ``name``: of its folder. ``source``: a dataset's log or a scene. ``frames``: first and last frame
+    (both included), or None for all. ``size``: of imported images (empty = as recorded). ``side``: of one-sided shifts.
+    ``note``: what is to be said of it."""
 
     name: str
     source: Path
@@ -80,44 +82,31 @@ Log = ListedCity | RecordedLog
 
 
 def logs_of(config: BenchConfig, sources: Sequence[Path], table: PaperTable) -> tuple[Log, ...]:
-    """The logs that a table is filled with.
-
-    Args:
-        sources: ``city:NAME`` alone (see ``city/logs.py``), or folders of recorded logs.
-
-    Raises:
-        UsageError: no log, an unknown list, lists and folders together, or settings that make no sense for them.
-    """
+    """The logs that a table is filled with. ``sources``: ``city:NAME`` alone (see ``city/logs.py``), or folders of
+    recorded logs. UsageError: no log, an unknown list, lists and folders together, or settings that make no sense for
+    them."""
     names = [str(source) for source in sources]
     lists = [name.removeprefix(CITY) for name in names if name.startswith(CITY)]
     if not names or (lists and len(names) > 1):
-        raise UsageError(
-            "a list of cities stands alone" if names else "no logs to fill the table with",
-            where=f"mudg bench paper --table {table.name}",
-            expected=f"{CITY}reported, {CITY}development, or folders of logs",
-            got=" ".join(names),
-        )
+        what = "a list of cities stands alone" if names else "no logs to fill the table with"
+        expected = f"{CITY}reported, {CITY}development, or folders of logs"
+        raise UsageError(what, where=f"mudg bench paper --table {table.name}", expected=expected, got=" ".join(names))
     if lists:
         return _cities(config, lists[0], table)
     if config.logs != BenchConfig().logs:
-        raise UsageError(
-            "recorded logs are counted by naming them", where="--logs", got=str(config.logs), remedy="leave it out"
-        )
+        what = "recorded logs are counted by naming them"
+        raise UsageError(what, where="--logs", got=str(config.logs), remedy="leave it out")
     return tuple(_recorded(config, name, source, table) for name, source in names_of(sources).items())
 
 
 def _cities(config: BenchConfig, name: str, table: PaperTable) -> tuple[Log, ...]:
     if name not in city_logs.LISTS:
-        raise UsageError(
-            "no such list of cities", expected=", ".join(CITY + known for known in city_logs.LISTS), got=CITY + name
-        )
+        known = ", ".join(CITY + one for one in city_logs.LISTS)
+        raise UsageError("no such list of cities", expected=known, got=CITY + name)
     size, frames = parse_resolution(config.resolution), parse_frame_range(config.frames)
     if isinstance(size, int) or (frames is not None and frames[0] != 0):
-        raise UsageError(
-            "a generated city takes a whole size and frames from 0 on",
-            expected="--resolution WIDTHxHEIGHT, --frames 0:END",
-            got=f"{config.resolution} {config.frames}".strip(),
-        )
+        what, got = "a generated city takes a whole size and frames from 0 on", f"{config.resolution} {config.frames}"
+        raise UsageError(what, expected="--resolution WIDTHxHEIGHT, --frames 0:END", got=got.strip())
     width, height = size or (STANDARD.width, STANDARD.height)
     cameras = ("front",) if table.front_only else STANDARD.cameras
     return listed_cities(name, config.logs, LogRules(frames[1] if frames else STANDARD.frames, width, height, cameras))
@@ -140,12 +129,8 @@ def _recorded(config: BenchConfig, name: str, source: Path, table: PaperTable) -
     elif segment is not None and frames != (segment.first, segment.last):
         note = f"the table's frames are {segment.first} to {segment.last}"
     if config.resolution and ingest.is_scene(source):
-        raise UsageError(
-            "a scene's images keep their size",
-            where=str(source),
-            got="--resolution",
-            remedy="leave it out, or give the dataset's own folder",
-        )
+        remedy = "leave it out, or give the dataset's own folder"
+        raise UsageError("a scene's images keep their size", where=str(source), got="--resolution", remedy=remedy)
     size = "" if ingest.is_scene(source) else config.resolution or table.size
     return RecordedLog(name, source, frames, size, 1 if segment is None else segment.side, note)
 
@@ -164,11 +149,8 @@ def missing_scenes(table: PaperTable, logs: Sequence[Log]) -> list[str]:
 def names_of(
     sources: Sequence[Path], pages: Sequence[str] = ("bench.json", "bench.md", "page.html")
 ) -> dict[str, Path]:
-    """Name -> log: the last part of its path, in characters that every file system takes.
-
-    Raises:
-        UsageError: no log, two of one name, or one that is the name of a page.
-    """
+    """Name -> log: the last part of its path, in characters that every file system takes. UsageError: no log, two of
+    one name, or one that is the name of a page."""
     if not sources:
         raise UsageError("no log was given", expected="mudg bench real LOG... --out FOLDER")
     named: dict[str, Path] = {}
@@ -176,12 +158,8 @@ def names_of(
         last = source.resolve().stem if source.suffix == ".zip" else source.resolve().name
         name = _NAME.sub("_", last).strip("._-") or "log"
         if name in named or name in pages:
-            raise UsageError(
-                "two logs have the same name",
-                where=str(source),
-                got=name,
-                remedy="rename one, or prepare it with mudg ingest in a folder of another name",
-            )
+            remedy = "rename one, or prepare it with mudg ingest in a folder of another name"
+            raise UsageError("two logs have the same name", where=str(source), got=name, remedy=remedy)
         named[name] = source
     return named
 
@@ -190,14 +168,9 @@ def names_of(
 
 
 def make_scene(log: Log, table: PaperTable, out: Path, device: DeviceName, overwrite: bool) -> Path:
-    """The scene of a log under the rules of a table, made if need be.
-
-    Args:
-        out: folder of the log. device: of the labeller's network. overwrite: replace what other settings left there.
-
-    Raises:
-        InputError: the log has fewer frames than the table asks for. Whatever a verb raises.
-    """
+    """The scene of a log under the rules of a table, made if need be. ``out``: folder of the log. ``device``: of the
+    labeller's network. ``overwrite``: replace what other settings left there. InputError: the log has fewer frames than
+    the table asks for. Whatever a verb raises."""
     if isinstance(log, ListedCity):
         settings = IngestConfig(test_every=table.held_out_every, city=city_logs.log_config(log.seed, log.rules))
         return run_step(Ingest(log=ingest.CITY, out=out / "scene", overwrite=overwrite, settings=settings))
@@ -206,10 +179,8 @@ def make_scene(log: Log, table: PaperTable, out: Path, device: DeviceName, overw
     if not ingest.is_scene(whole):
         text = "" if frames is None else f"{frames[0]}:{frames[1] + 1}"
         settings = IngestConfig(test_every=0, resolution=log.size, frames=text)
-        whole, frames = (
-            run_step(Ingest(log=str(log.source), out=out / "imported", overwrite=overwrite, settings=settings)),
-            None,
-        )
+        step = Ingest(log=str(log.source), out=out / "imported", overwrite=overwrite, settings=settings)
+        whole, frames = run_step(step), None
     shown = run_step(ShownFrames(scene=whole, frames=frames, table=table, out=out / "shown", overwrite=overwrite))
     return labelled(shown, out / "scene", device, overwrite)
 
@@ -228,12 +199,8 @@ def imported(config: BenchConfig, source: Path, out: Path, overwrite: bool) -> P
         settings = IngestConfig(resolution=config.resolution, frames=config.frames, test_every=0)
         return run_step(Ingest(log=str(source), out=out, overwrite=overwrite, settings=settings))
     if config.resolution or config.frames:
-        raise UsageError(
-            "a scene is taken as it is",
-            where=str(source),
-            got="--resolution or --frames",
-            remedy="leave them out, or give the dataset's own folder",
-        )
+        got, remedy = "--resolution or --frames", "leave them out, or give the dataset's own folder"
+        raise UsageError("a scene is taken as it is", where=str(source), got=got, remedy=remedy)
     return source
 
 
@@ -265,12 +232,9 @@ class ShownFrames(Output):
                 remedy="give the whole log, or choose --frames",
             )
         moment = lambda time_s: int(np.argmin(np.abs(times - time_s)))  # noqa: E731
-        chosen = [
-            frame
-            for frame in scene.frames
-            if first <= moment(frame.view.time_s) <= last
-            and (not self.table.front_only or frame.view.camera.name == camera)
-        ]
+        chosen = [frame for frame in scene.frames if first <= moment(frame.view.time_s) <= last]
+        if self.table.front_only:
+            chosen = [frame for frame in chosen if frame.view.camera.name == camera]
         sweeps = [sweep.id for sweep in scene.sweeps if first <= moment(sweep.time_s) <= last]
         groups = [[f.id for f in chosen if moment(f.view.time_s) == number] for number in range(first, last + 1)]
         held = [name for name, part in holdout_split(groups, self.table.held_out_every).items() if part == "test"]
@@ -335,40 +299,17 @@ SPLITS: Final[dict[str, Split]] = {
 _GAP: Final = ("psnr", "ssim", "perceptual", "psnr_dynamic", "psnr_upper", "abs_rel")
 _CAMERA: Final = ("psnr_seen", "perceptual_seen", "abs_rel_seen", "rmse_seen", "delta1_seen")
 _LIDAR: Final = (
-    "abs_rel_static",
-    "rmse_static",
-    "delta1_static",
-    "abs_rel_dynamic",
-    "rmse_dynamic",
-    "delta1_dynamic",
-    "point_psnr_static",
-    "point_abs_static",
-    "point_psnr_dynamic",
-    "point_abs_dynamic",
+    *("abs_rel_static", "rmse_static", "delta1_static", "abs_rel_dynamic", "rmse_dynamic", "delta1_dynamic"),
+    *("point_psnr_static", "point_abs_static", "point_psnr_dynamic", "point_abs_dynamic"),
 )
+_SEEN: Final = ("photo", "depth", "seen")
+_POINTS: Final = ("depth", "dynamic", "color")
 PROTOCOLS: Final[tuple[Protocol, ...]] = (
     Protocol("gap-1", "gap", "Single held-out frames", "gap-1", ("photo", "depth", "dynamic"), _GAP),
     Protocol("gap-3", "gap", "Blocks of 3 held-out frames", "gap-3", ("photo", "depth", "dynamic"), _GAP),
     Protocol("gap-5", "gap", "Blocks of 5 held-out frames", "gap-5", ("photo", "depth", "dynamic"), _GAP),
-    Protocol(
-        "camera",
-        "camera",
-        "Cameras that the methods never saw",
-        "camera",
-        ("photo", "depth", "seen"),
-        _CAMERA,
-        every=2,
-        pooled=True,
-    ),
-    Protocol(
-        "lidar",
-        "lidar",
-        "LiDAR beside the recorded path",
-        "all",
-        ("depth", "dynamic", "color"),
-        _LIDAR,
-        (2.0, -2.0, 3.0, -3.0),
-    ),
+    Protocol("camera", "camera", "Cameras that the methods never saw", "camera", _SEEN, _CAMERA, every=2, pooled=True),
+    Protocol("lidar", "lidar", "LiDAR beside the recorded path", "all", _POINTS, _LIDAR, (2.0, -2.0, 3.0, -3.0)),
     Protocol("classes", "classes", "Classes of LiDAR points", "all", ("classes",), ("miou", "accuracy")),
 )
 
@@ -452,3 +393,147 @@ def _hidden_blocks(scene: Scene, length: int) -> HeldOut:
         ("held_out_sweeps", len(sweeps)),
     )
     return HeldOut(frames, sweeps, facts)
+
+
+TRUTH: Final = "truth"
+ALL_VIEWS: Final = 1_000_000
+PERCEPTUAL_VIEWS: Final = 12
+PER_LOG: Final = ("detections", "lanes", "video_features")
+"""Settings of a score that name what was made of the views of one log."""
+
+
+@dataclass(frozen=True)
+class Views:
+    """The views of one log at the places of a table.
+
+    Args:
+        out: folder of the log. rows: those that are scored, in order. renders: whether the diffusion model uses those
+            of a fit.
+        score: how every row is scored. overwrite: replace what other settings left there.
+        virtual: folder of the views that fits learn from. on_path: the diffusion model's own rows have views of the
+            recorded path, too.
+    """
+
+    log: Log
+    out: Path
+    table: PaperTable
+    rows: tuple[Row, ...]
+    config: BenchConfig
+    score: ScoreConfig
+    renders: bool
+    overwrite: bool
+    virtual: str = "virtual"
+    on_path: bool = True
+
+    @cached_property
+    def scene(self) -> Path:
+        """The scene, made if need be."""
+        return make_scene(self.log, self.table, self.out, self.config.device, self.overwrite)
+
+    @cached_property
+    def loaded(self) -> Scene:
+        """The scene, read."""
+        return read_scene(self.scene)
+
+    @cached_property
+    def drawn(self) -> RenderConfig:
+        """The views that the table asks for; one-sided shifts go to the side of the log."""
+        cameras = tuple(self.loaded.cameras) if self.table.all_cameras else (first_camera(self.loaded, ()),)
+        sides = [s if len(p.shifts_m) > 1 else self.log.side * s for p in self.table.places for s in p.shifts_m]
+        paths = tuple(dict.fromkeys(name for place in self.table.places for name in place.paths))
+        shifts, device = tuple(dict.fromkeys(sides)), self.config.device
+        return RenderConfig(cameras=cameras, shifts_m=shifts, paths=paths, video=False, device=device)
+
+    @cached_property
+    def paths(self) -> tuple[Trajectory, ...]:
+        """Their trajectories."""
+        return render.trajectories(self.loaded, self.drawn)
+
+    @cached_property
+    def off_path(self) -> SynthesizeConfig:
+        """How views off the recorded path are generated."""
+        shifts = tuple(s for s in self.drawn.shifts_m if s) or tuple(self.table.virtual_shifts_m)
+        return replace(generator_of(self.config), cameras=self.drawn.cameras, shifts_m=shifts, paths=self.drawn.paths)
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The steps."""
+        return Chain(self.out, self.scene, self.config, self.overwrite, self.off_path)
+
+    @cached_property
+    def truth(self) -> Path | None:
+        """Exact truth of a generated log."""
+        if not isinstance(self.log, ListedCity):
+            return None
+        return self.chain.run(DrawTruth(scene=self.scene, trajectories=self.paths, out=self.out / TRUTH))
+
+    def trajectories(self, endings: Sequence[str]) -> tuple[str, ...]:
+        """Names of the trajectories of a place."""
+        return tuple(f"{camera}_{ending}" for camera in self.drawn.cameras for ending in endings)
+
+    def of_rows(self) -> dict[str, tuple[Path, ...]]:
+        """The folders with the views of every row, made if need be."""
+        self.chain.fuse()
+        return {row.name: self._of(row) for row in self.rows if not row.left_out}
+
+    def _of(self, row: Row) -> tuple[Path, ...]:
+        if row.name == FILL:
+            return (self.chain.filled(self.paths),)
+        renders = self.renders and row.changes.get("condition", "full") == "full"
+        if METHODS[row.method].made_by == "synthesize":
+            folders = []
+            if any(path.origin != "recorded" for path in self.paths):
+                folder = self.out / "generated" / row.name if row.changes else self.out / self.virtual
+                folders.append(self.chain.generated(replace(self.off_path, **row.changes), folder, renders=renders))
+            if self.on_path and any(path.origin == "recorded" for path in self.paths):
+                on_path = replace(self.off_path, shifts_m=(0.0,), paths=(), **row.changes)
+                folder = self.out / "generated" / f"{row.name}-{RECORDED}"
+                folders.append(self.chain.generated(on_path, folder, renders=renders))
+            return tuple(folders)
+        virtual: tuple[Path, ...] = ()
+        if row.name == EXACT:
+            virtual = (self.chain.run(ExactViews(truth=self.truth, paths=self.paths, out=self.out / EXACT)),)
+        elif row.learns_virtual:
+            virtual = (self.chain.generated(self.off_path, self.out / self.virtual, renders=self.renders),)
+        return (self.chain.rendered(row, virtual, self.drawn),)
+
+    def scores(self, name: str, folders: Sequence[Path]) -> dict[Path, Mapping[str, Any]]:
+        """What the scorer says of every folder of a row's views, by its own folder; the truth needs no networks that
+        compare view with view."""
+        settings, documents = self.score, {}
+        if name == TRUTH:
+            settings = replace(settings, perceptual_views=0, lpips_weights="")
+        for number, folder in enumerate(folders):
+            scored, views = self.out / "score" / (f"{name}-{number}" if number else name), {name: folder}
+            self.chain.run(Score(scene=self.scene, views=views, truth=self.truth, out=scored, settings=settings))
+            documents[scored] = store.read_json(scored / "metrics.json")
+        return documents
+
+    def film(self, shown: Mapping[str, Path | Sequence[Path]]) -> list[str]:
+        """Make a picture (or video) of every trajectory; returns their names. With another method the old ones are out
+        of date, whatever was asked."""
+        views = {name: (of,) if isinstance(of, Path) else tuple(of) for name, of in shown.items() if of is not None}
+        film = Film(views=views, paths=self.paths, videos=self.config.videos, out=self.out / "film", overwrite=True)
+        run_step(film)
+        return [path.name for path in self.paths]
+
+
+def score_settings(config: BenchConfig, table: PaperTable) -> ScoreConfig:
+    """How every row of a table is scored: the table's resize rule unless another was asked for; LPIPS, if computed, at
+    all views."""
+    settings = config.score
+    resize = table.resize if settings.fid_resize == ScoreConfig().fid_resize else settings.fid_resize
+    views = ALL_VIEWS if settings.lpips_weights else PERCEPTUAL_VIEWS
+    settings = replace(settings, baseline=False, error_pictures=False, fid_resize=resize, perceptual_views=views)
+    return on_device(settings, config.device)
+
+
+def of_log(config: ScoreConfig, log: str) -> ScoreConfig:
+    """How the rows of one log are scored: where a folder of detections, lanes or features has an entry of the log's
+    name (or such a ``.json``), that one is taken."""
+    own: dict[str, Any] = {}
+    for name in PER_LOG:
+        folder = getattr(config, name, "")
+        entries = [path for ending in ("", ".json") if folder and (path := Path(folder) / f"{log}{ending}").exists()]
+        own |= {name: str(entries[0])} if entries else {}
+    return replace(config, **own)

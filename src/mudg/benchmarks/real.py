@@ -2,7 +2,7 @@
 
 A protocol (a row of ``places.PROTOCOLS``) says which frames, sweeps or cameras are hidden and what is scored. Per log
 and way of hiding, the verbs of the chain are run with folders of their own. They are given scenes from which what is
-hidden was removed (``scene/write.py``), so they cannot use it. Whatever is finished is verified and reused.
+hidden was removed (``scene/part.py``), so they cannot use it. Whatever is finished is verified and reused.
 
     OUT/<log>/scene                                         the whole log; read by truth and scores alone
     OUT/<log>/<split>/shown annotate scene asked            what the methods see; with labels; and places of held-out
@@ -28,10 +28,8 @@ from mudg.base.html import markdown as rendered
 from mudg.base.layout import SCENE_FILES
 from mudg.base.run_folder import RunDir, refuse_overlap
 from mudg.base.types import Scene
-from mudg.benchmarks import page as pages
-from mudg.benchmarks.chain import Chain
-from mudg.benchmarks.columns import COLUMNS, ScoreTargets, mean_values
-from mudg.benchmarks.loop import compare, refuse_foreign, run_step
+from mudg.benchmarks.chain import Chain, compare, refuse_foreign, render_page, run_step, wall
+from mudg.benchmarks.columns import COLUMNS, MakeTargets, ScoreTargets, mean_values, read_targets
 from mudg.benchmarks.places import (
     SPLITS,
     HeldOut,
@@ -47,18 +45,16 @@ from mudg.benchmarks.places import (
 from mudg.benchmarks.rows import BASE, FILL, Row, Sees, chain_settings, generator_of, real_rows, refuse_unfit
 from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import virtual_fits_of
-from mudg.benchmarks.truth import MakeTargets, read_targets
-from mudg.diffusion import model_files
+from mudg.diffusion import model_files as mdm_files
 from mudg.diffusion.adapt import why_not
 from mudg.diffusion.settings import AdaptConfig
 from mudg.editing import render
-from mudg.editing.view_settings import RenderConfig
+from mudg.editing.settings import RenderConfig
 from mudg.scene.read import read_scene
 from mudg.scene.write import write_part
-from mudg.steps.adapt import Adapt
-from mudg.steps.outputs import Output
-from mudg.steps.settings.presets import PresetName
-from mudg.steps.settings.run import on_device
+from mudg.steps.engine import Output
+from mudg.steps.settings import PresetName, on_device
+from mudg.steps.synthesize import Adapt
 
 PAGES: Final = ("bench.json", "bench.md", "page.html")
 
@@ -108,35 +104,28 @@ def run(
             holds something else. Whatever a verb raises.
     """
     rows, protocols, logs, out = real_rows(config, preset), protocols_of(config.protocols), names_of(sources), Path(out)
-    refuse_overlap(
-        out, {"model": model_files.folder_of(config.model), **{f"log {name}": path for name, path in logs.items()}}
-    )
+    read = {f"log {name}": path for name, path in logs.items()}
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read})
     refuse_foreign(out, PAGES, lambda document: document["bench"] == "real")
     generates = any(row.sees and row.fit is None for row in rows)
     refuse_unfit(config, preset, rows, [generator_of(config)] * generates)
     training = replace(adaptation or AdaptConfig(), model=config.model, processes=1, seed=config.seed)
-    if model_files.uses_renders(config.model):  # no other model is adapted
+    if mdm_files.uses_renders(config.model):  # no other model is adapted
         training = replace(training, precision=config.precision)
     scenes = {name: imported(config, path, out / name / "scene", overwrite) for name, path in logs.items()}
+    last, own = (rows, config, on_device(training, config.device), overwrite), {}
+    for protocol in protocols:
+        own.setdefault(protocol.split, []).append(protocol)
     jobs = [
-        SplitJob(
-            out / name,
-            scene,
-            SPLITS[split],
-            tuple(p for p in protocols if p.split == split),
-            rows,
-            config,
-            on_device(training, config.device),
-            overwrite,
-        )
+        SplitJob(out / name, scene, SPLITS[split], tuple(of_split), *last)
         for name, scene in scenes.items()
-        for split in dict.fromkeys(protocol.split for protocol in protocols)
+        for split, of_split in own.items()
     ]
     settings = {
         "protocols": list(config.protocols),
         "iterations": config.iterations,
         "seed": config.seed,
-        "model": model_files.digest(config.model),
+        "model": mdm_files.digest(config.model),
         "shown_cameras": list(config.shown),
         "resolution": config.resolution,
         "frames": config.frames,
@@ -146,12 +135,8 @@ def run(
 
     def filled(measured: list[dict[str, Any]]) -> dict[str, Any]:
         of_log = {name: [result for job, result in zip(jobs, measured) if job.out.name == name] for name in scenes}
-        return document(
-            [_entry(name, scenes[name], of_log[name]) for name in scenes],
-            list(map(_row_values, rows)),
-            protocols,
-            settings,
-        )
+        entries = [_entry(name, scenes[name], of_log[name]) for name in scenes]
+        return document(entries, list(map(_row_values, rows)), protocols, settings)
 
     return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": lambda doc: page_of(doc, out)})
 
@@ -209,16 +194,8 @@ class SplitJob:
         chain, cameras = self.chain(), self.cameras(whole, held)
         truths, result = {}, {}
         for protocol in self.protocols:
-            truth = chain.run(
-                MakeTargets(
-                    log=self.source,
-                    shown=chain.scene,
-                    protocol=protocol,
-                    held=tuple(held.frames),
-                    cameras=cameras,
-                    out=self.out / "truth" / protocol.name,
-                )
-            )
+            step = {"log": self.source, "shown": chain.scene, "protocol": protocol, "held": tuple(held.frames)}
+            truth = chain.run(MakeTargets(**step, cameras=cameras, out=self.out / "truth" / protocol.name))
             targets = read_targets(truth)
             result[protocol.name] = {"facts": targets.facts, "pictures": list(targets.pictures), "values": {}}
             if len(targets):
@@ -232,18 +209,12 @@ class SplitJob:
             views, use = self.views(row, chain, cameras)
             if use is not None:
                 used[row.name] = {"sees": use.sees, "note": use.note}
-            for protocol in (p for p in self.protocols if p.name in truths):
-                scored = chain.run(
-                    ScoreTargets(
-                        log=self.source,
-                        truth=truths[protocol.name],
-                        views=views,
-                        protocol=protocol,
-                        device=self.config.device,
-                        out=self.out / "score" / protocol.name / row.name,
-                    )
-                )
-                result[protocol.name]["values"][row.name] = store.read_json(scored / "metrics.json")
+            for name, truth in truths.items():
+                protocol = next(protocol for protocol in self.protocols if protocol.name == name)
+                step = {"log": self.source, "truth": truth, "views": views, "protocol": protocol}
+                out = self.out / "score" / name / row.name
+                scored = chain.run(ScoreTargets(**step, device=self.config.device, out=out))
+                result[name]["values"][row.name] = store.read_json(scored / "metrics.json")
         return {"split": self.split.name, "held_out": dict(held.facts), "diffusion": used, "protocols": result}
 
     def write_seen(self, whole: Scene, held: HeldOut) -> None:
@@ -261,12 +232,8 @@ class SplitJob:
 
     def _write(self, out: Path, inputs: dict[str, str], write: Callable[[Path], Scene]) -> Path:
         """Write a part of a scene as a folder that is verified and reused."""
-        shown = tuple(self.config.shown)
-        return run_step(
-            PartOfScene(
-                split=self.split.name, shown=shown, digests_read=inputs, write=write, out=out, overwrite=self.overwrite
-            )
-        )
+        part = {"split": self.split.name, "shown": tuple(self.config.shown), "digests_read": inputs, "write": write}
+        return run_step(PartOfScene(**part, out=out, overwrite=self.overwrite))
 
     def cameras(self, whole: Scene, held: HeldOut) -> tuple[str, ...]:
         """The cameras whose views are asked for."""
@@ -308,7 +275,7 @@ class SplitJob:
         model = self.config.model
         if sees == "points":
             return DiffusionUse("points", model)
-        if not model_files.uses_renders(model):
+        if not mdm_files.uses_renders(model):
             return DiffusionUse("points", model, "the model does not use renders, so it sees points alone")
         if sees == "renders":
             return DiffusionUse("renders", model)
@@ -335,21 +302,17 @@ class SplitJob:
 
 def _row_values(row: Row) -> dict[str, Any]:
     changes = configuration.result_settings(row.fit) if row.varied else None
-    return {
-        "name": row.name,
-        "title": row.title,
-        "fit": "" if row.fit is None else row.method,
-        "sees": row.sees,
-        "changes": changes,
-    }
+    fit = "" if row.fit is None else row.method
+    return {"name": row.name, "title": row.title, "fit": fit, "sees": row.sees, "changes": changes}
 
 
 def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """A log with its facts and all its values."""
     loaded = read_scene(scene)
-    cameras = {
-        n: {"size_px": [c.width, c.height], "frames": len(loaded.frames_of(n))} for n, c in loaded.cameras.items()
-    }
+    cameras = {}
+    for camera_name, camera in loaded.cameras.items():
+        frames = len(loaded.frames_of(camera_name))
+        cameras[camera_name] = {"size_px": [camera.width, camera.height], "frames": frames}
     return {
         "log": name,
         "id": loaded.id,
@@ -377,26 +340,23 @@ def document(
         entries = {entry["log"]: entry["protocols"][protocol.name] for entry in logs}
         counted = [entry["values"] for entry in entries.values() if "left_out" not in entry]
         pooled = {name: mean_values([values[name]["mean"] for values in counted], protocol.columns) for name in names}
+        against = {}
+        for name in names if BASE in names else ():
+            if name != BASE:
+                of, base = pooled[name], pooled[BASE]
+                against[name] = {
+                    column: COLUMNS[column].compared(of[column], base[column]) for column in protocol.columns
+                }
         result[protocol.name] = {
             "row": asdict(protocol),
             "logs": entries,
             "pooled": pooled,
             "left_out": {log: entry["left_out"] for log, entry in entries.items() if "left_out" in entry},
-            "against": {
-                name: {c: COLUMNS[c].compared(pooled[name][c], pooled[BASE][c]) for c in protocol.columns}
-                for name in names
-                if BASE in names and name != BASE
-            },
+            "against": against,
         }
     facts = [{key: value for key, value in entry.items() if key != "protocols"} for entry in logs]
-    return {
-        "schema": 1,
-        "bench": "real",
-        "settings": dict(settings),
-        "methods": list(rows),
-        "logs": facts,
-        "protocols": result,
-    }
+    head = {"schema": 1, "bench": "real", "settings": dict(settings), "methods": list(rows)}
+    return {**head, "logs": facts, "protocols": result}
 
 
 # ---- text ----
@@ -405,17 +365,12 @@ def document(
 def table_of(doc: Mapping[str, Any], protocol: str, values: Mapping[str, Mapping[str, Any]]) -> TextTable:
     """A method's values, each in brackets with its comparison with the fit without diffusion."""
     columns = doc["protocols"][protocol]["row"]["columns"]
-    rows = []
+    rows, base = [], values.get(BASE)
     for method, of in values.items():
-        cells = [method]
-        for name in columns:
-            more = (
-                ""
-                if method == BASE or BASE not in values
-                else COLUMNS[name].compared_text(of[name], values[BASE][name])
-            )
-            cells.append(COLUMNS[name].text(of[name]) + (f" ({more})" if more else ""))
-        rows.append(cells)
+        against = {} if base is None or method == BASE else base
+        more = {name: COLUMNS[name].compared_text(of[name], against.get(name)) for name in columns}
+        texts = [COLUMNS[name].text(of[name]) + (f" ({more[name]})" if more[name] else "") for name in columns]
+        rows.append([method, *texts])
     return TextTable.of_texts(["method", *(COLUMNS[name].title for name in columns)], rows)
 
 
@@ -434,15 +389,12 @@ def notes_of(doc: Mapping[str, Any], protocol: str) -> list[str]:
             words.append(f"held out of {held['moments']} frames: {blocks}")
         if "shown_cameras" in held:
             words.append("shown: " + ", ".join(held["shown_cameras"]))
-        words += [
-            f"{share:.0%} of {place} was seen, {facts['weight'].get(place, 0):.0%} of all seen pixels"
-            for place, share in facts["seen_share"].items()
-        ]
-        words += [
-            f"colour map of {place}: gain {' '.join(f'{g:.2f}' for g in of['gain'])}, offset"
-            f" {' '.join(f'{o:+.3f}' for o in of['offset'])}"
-            for place, of in facts["color_maps"].items()
-        ]
+        for place, share in facts["seen_share"].items():
+            weight = facts["weight"].get(place, 0)
+            words.append(f"{share:.0%} of {place} was seen, {weight:.0%} of all seen pixels")
+        for place, of in facts["color_maps"].items():
+            gain, offset = " ".join(f"{g:.2f}" for g in of["gain"]), " ".join(f"{o:+.3f}" for o in of["offset"])
+            words.append(f"colour map of {place}: gain {gain}, offset {offset}")
         words += [f"{place} is left out ({reason})" for place, reason in facts["left_out"].items()]
         lines.append(f"{name}: {'; '.join(words)}.")
         notes: dict[str, list[str]] = {}
@@ -460,10 +412,8 @@ def heading_of(doc: Mapping[str, Any], protocol: str) -> str:
 def summary_of(doc: Mapping[str, Any]) -> str:
     """One line about the whole."""
     settings, count = doc["settings"], len(doc["logs"])
-    return (
-        f"{count} log{'s' if count != 1 else ''}, {settings['iterations']} iterations per fit,"
-        f" {virtual_fits_of(settings)}; seed {settings['seed']}."
-    )
+    logs, iterations = f"{count} log{'s' if count != 1 else ''}", f"{settings['iterations']} iterations per fit"
+    return f"{logs}, {iterations}, {virtual_fits_of(settings)}; seed {settings['seed']}."
 
 
 def markdown(doc: Mapping[str, Any]) -> str:
@@ -471,10 +421,7 @@ def markdown(doc: Mapping[str, Any]) -> str:
     lines = [
         "# Real logs",
         "",
-        (
-            f"{summary_of(doc)} In brackets: difference to {BASE}, or the ratio (x) where lower is better. Perceptual:"
-            " features of the shipped codec, not LPIPS."
-        ),
+        f"{summary_of(doc)} {BRACKETS} Perceptual: features of the shipped codec, not LPIPS.",
         "",
         *markdown_table(LOG_HEADS, map(log_cells, doc["logs"])),
         "",
@@ -492,6 +439,7 @@ def markdown(doc: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
+BRACKETS: Final = f"In brackets: difference to {BASE}, or the ratio (x) where lower is better."
 LOG_HEADS: Final = ("log", "dataset", "cameras", "frames", "size", "sweeps", "tracked boxes")
 
 
@@ -505,14 +453,11 @@ def log_cells(log: Mapping[str, Any]) -> list[str]:
 
 
 def page_of(doc: Mapping[str, Any], out: Path) -> str:
-    """The whole page, which holds its pictures: the truth beside every method for some views of each protocol.
-
-    Args:
-        out: folder of the benchmark, with the pictures.
-    """
+    """The whole page, which holds its pictures (those in the benchmark's folder ``out``): the truth beside every method
+    for some views of each protocol."""
     logs = TextTable.of_texts(LOG_HEADS, map(log_cells, doc["logs"]))
     sections = [{"title": "Logs", "tables": [logs]}, *(_section(doc, name, out) for name in doc["protocols"])]
-    return pages.render("Real logs", "mudg bench real", summary_of(doc), sections)
+    return render_page("Real logs", "mudg bench real", summary_of(doc), sections)
 
 
 def _section(doc: Mapping[str, Any], name: str, out: Path) -> dict[str, Any]:
@@ -525,15 +470,14 @@ def _section(doc: Mapping[str, Any], name: str, out: Path) -> dict[str, Any]:
             view = views[number]
             shift = f", {view['shift_m']:+g} m" if view["shift_m"] else ""
             pictures = {title: folder / "pictures" / f"{number:06d}.jpg" for title, folder in folders.items()}
-            walls.append(pages.wall(f"{log}: {view['frame']}{shift}", pictures))
+            walls.append(wall(f"{log}: {view['frame']}{shift}", pictures))
     below = next((text for key, text in BELOW.items() if key in result["row"]["maps"]), BELOW[""])
-    brackets = f"In brackets: difference to {BASE}, or the ratio (x) where lower is better."
     return {
         "title": heading_of(doc, name),
         "notes": notes_of(doc, name),
         "walls": walls,
         "tables": [table_of(doc, name, result["pooled"])] if counted else [],
-        "below": [brackets] * bool(counted) + [below] * bool(walls),
+        "below": [BRACKETS] * bool(counted) + [below] * bool(walls),
     }
 
 

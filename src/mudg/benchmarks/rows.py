@@ -1,16 +1,21 @@
-"""The rows of benchmarks of complete methods: which methods are compared, with what settings of their fits."""
+"""What benchmarks of complete methods compare: the tables of papers (``papers.yaml`` as checked records), and rows:
+which methods, with what settings of their fits."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any, Final, Literal
 
+from pydantic import model_validator
+
 from mudg.base import config as configuration
+from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.plain_yaml import parse_yaml
-from mudg.benchmarks.papers import PaperTable
+from mudg.base.records import StrictRecord, checked_by, parse_record
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files, views
 from mudg.diffusion.published import is_published
@@ -18,10 +23,184 @@ from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.methods import METHODS, PUBLISHED
 from mudg.gaussians.recipes import recipe_of
 from mudg.gaussians.settings import FitConfig
+from mudg.networks.inception import ResizeRule
 from mudg.scoring import score
 from mudg.scoring.tables import title_of
 from mudg.steps.pipeline import CONTINUED_SHARE, WITHOUT_DIFFUSION, refuse_missing
-from mudg.steps.settings.presets import PresetName
+from mudg.steps.settings import PresetName
+
+FILE: Final = Path(__file__).with_name("papers.yaml")
+RECORDED: Final = "0"
+"""Name of the place that is the recorded path."""
+
+
+class SceneRange(StrictRecord):
+    """A segment of a dataset, by a part of its name, with its first and last frame (from 0, both included); ``side``:
+    to which side one-sided shifts go (1 left, -1 right)."""
+
+    segment: str
+    first: int
+    last: int
+    side: int = 1
+
+
+class PaperPlace(StrictRecord):
+    """Where views are scored. ``name``: in result files. ``title``: in headings. ``shifts_m``: lateral shifts, metres,
+    positive to the left (0 = the recorded path). ``paths``: further paths by name (``core.trajectory.named``); their
+    scores are averaged."""
+
+    name: str
+    title: str
+    shifts_m: list[float] = []
+    paths: list[str] = []
+
+    def endings(self, side: int = 1) -> tuple[str, ...]:
+        """How the names of its trajectories end; ``side``: see `SceneRange`."""
+        shifts = self.shifts_m if len(self.shifts_m) > 1 else [side * shift_m for shift_m in self.shifts_m]
+        return (*("recorded" if not s else f"shift{s:+.1f}" for s in shifts), *self.paths)
+
+
+class PaperColumn(StrictRecord):
+    """A number of ``metrics.json``: its name there, heading, better side, digits, the setting of ``mudg score`` that it
+    needs, and the entry of a result that holds its ``n`` (empty: the views that count)."""
+
+    key: str
+    title: str
+    better: Literal["higher", "lower", "one"]
+    digits: int
+    needs: str = ""
+    counts: Literal["", "distribution", "video"] = ""
+
+    def values(self) -> dict[str, Any]:
+        """For JSON."""
+        return {"key": self.key, "title": self.title, "better": self.better, "digits": self.digits, "factor": 1.0}
+
+
+class PaperRow(StrictRecord):
+    """A row that is computed: a method of `METHODS`, with other settings of its fit (or of synthesize) where it is an
+    ablation's."""
+
+    name: str
+    title: str
+    method: str
+    changes: dict[str, Any] = {}
+
+
+class PublishedRow(StrictRecord):
+    """What a paper prints for a method: place, column and number, and where it is printed."""
+
+    title: str
+    source: str
+    values: list[tuple[str, str, float]]
+
+
+class PaperTable(StrictRecord):
+    """A table of a paper; the fields are explained in ``papers.yaml``. Without ``only`` every column stands at every
+    place."""
+
+    name: str
+    title: str = ""
+    data: str = ""
+    scenes: str = ""
+    places: list[PaperPlace]
+    columns: list[PaperColumn]
+    published: list[PublishedRow] = []
+    only: dict[str, list[str]] = {}
+    rows: list[PaperRow] = []
+    front_only: bool = False
+    all_cameras: bool = False
+    held_out_every: int = 4
+    size: str = ""
+    resize: ResizeRule = "pytorch-fid"
+    virtual_shifts_m: list[float] = []
+    notes: list[str] = []
+
+    def cells(self) -> tuple[tuple[PaperPlace, PaperColumn], ...]:
+        """All places and columns, in the order of the table."""
+        return tuple((p, c) for p in self.places for c in self.columns if c.key in self.only.get(p.name, (c.key,)))
+
+    @model_validator(mode="after")
+    @checked_by
+    def _check(self) -> PaperTable:
+        cells = [(place.name, column.key) for place, column in self.cells()]
+        _refuse(set(self.only) - {place.name for place in self.places}, "only: no such place")
+        _refuse({cell for cell in cells if cells.count(cell) > 1}, "a place has a column twice")
+        for row in self.published:
+            wrong = {(place, key) for place, key, _ in row.values} - set(cells)
+            _refuse(wrong, f"published {row.title!r}: not in the table")
+        _refuse({row.method for row in self.rows} - set(METHODS), "rows: no such method")
+        if self.virtual_shifts_m and any(any(place.shifts_m) or place.paths for place in self.places):
+            what = "generated views lie at the places off the path"
+            raise InputError(what, where="virtual_shifts_m", remedy="leave it out")
+        return self
+
+    def values(self) -> dict[str, Any]:
+        """For JSON, without published rows."""
+        pick = lambda *names: {name: getattr(self, name) for name in names}  # noqa: E731
+        return {
+            **pick("name", "title", "data", "scenes", "notes"),
+            "places": [place.model_dump() for place in self.places],
+            "cells": [[place.name, column.key] for place, column in self.cells()],
+            "columns": [column.values() for column in self.columns],
+            **pick("held_out_every", "front_only", "all_cameras"),
+        }
+
+
+class Papers(StrictRecord):
+    """All of ``papers.yaml``."""
+
+    columns: dict[str, PaperColumn]
+    further: dict[Literal["exact", "measured"], list[str]]
+    scene_lists: dict[str, list[SceneRange]]
+    tables: dict[str, PaperTable]
+
+
+def _refuse(unknown: set[Any], what: str) -> None:
+    if unknown:
+        raise InputError(what, got=", ".join(sorted(map(str, unknown))))
+
+
+def read_papers(text: str, where: str) -> Papers:
+    """The tables of a text in the form of ``papers.yaml``; names of columns and places stand for their records, and
+    lines of text for published rows. InputError: it is not YAML, or not such tables."""
+    raw = parse_yaml(text, where)
+    try:
+        columns = {key: {"key": key, **column} for key, column in raw["columns"].items()}
+        tables = {
+            name: {
+                **table,
+                "name": name,
+                "columns": [columns[key] for key in table["columns"]],
+                "places": [raw["places"][place] for place in table["places"]],
+                "published": [row for group in table.get("published", ()) for row in _printed(**group)],
+            }
+            for name, table in raw["tables"].items()
+        }
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        got = f"{type(error).__name__}: {error}"
+        raise InputError("these are no tables of papers", where=where, got=got) from error
+    records = {**{k: v for k, v in raw.items() if k != "places"}, "columns": columns, "tables": tables}
+    papers = parse_record(Papers, records, f"{where}: ")
+    _refuse({table.scenes for table in papers.tables.values()} - {"", *papers.scene_lists}, "scenes: no such list")
+    _refuse({key for keys in papers.further.values() for key in keys} - set(columns), "further: no such column")
+    return papers
+
+
+def _printed(source: str, cells: str, rows: str) -> list[dict[str, Any]]:
+    """Published rows from ``title | numbers`` in the order of ``cells``, each ``place:column``; ``-``: not printed."""
+    keys = [tuple(cell.split(":")) for cell in cells.split()]
+    records = []
+    for line in rows.strip().splitlines():
+        title, _, numbers = line.partition("|")
+        values = [(*key, float(word)) for key, word in zip(keys, numbers.split(), strict=True) if word != "-"]
+        records.append({"title": title.strip(), "source": source, "values": values})
+    return records
+
+
+PAPERS: Final = read_papers(store.read_text(FILE), FILE.name)
+TABLES: Final[Mapping[str, PaperTable]] = PAPERS.tables
+SCENE_LISTS: Final[Mapping[str, Sequence[SceneRange]]] = PAPERS.scene_lists
+
 
 FILL, BASE, DIFFUSION, FULL = score.BASELINE, WITHOUT_DIFFUSION, "mudg_r", "mudg_s"
 LONGER: Final = f"{BASE}-longer"
@@ -51,17 +230,8 @@ LESS: Final[dict[Sees, tuple[str, str]]] = {
 PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
 """Settings of generated views that are the benchmark's matter, not the user's."""
 SAMPLING: Final = (
-    "steps",
-    "sampler",
-    "eta",
-    "overlap",
-    "align_depth",
-    "full_size",
-    "guidance",
-    "guidance_rescale",
-    "memory_budget_gb",
-    "offload",
-    "compiled",
+    *("steps", "sampler", "eta", "overlap", "align_depth", "full_size", "guidance", "guidance_rescale"),
+    *("memory_budget_gb", "offload", "compiled"),
 )
 """Settings of generated views that published-type and small models do not share."""
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
@@ -103,14 +273,8 @@ class Row:
 
 def generator_of(config: BenchConfig) -> SynthesizeConfig:
     """How views are generated, by the benchmark's model, number format, seed and device; one trajectory at a time."""
-    return replace(
-        config.synthesize,
-        model=config.model,
-        precision=config.precision,
-        seed=config.seed,
-        device=config.device,
-        processes=1,
-    )
+    own = {name: getattr(config, name) for name in ("model", "precision", "seed", "device")}
+    return replace(config.synthesize, **own, processes=1)
 
 
 def usual_fit(config: BenchConfig) -> FitConfig:
@@ -120,11 +284,7 @@ def usual_fit(config: BenchConfig) -> FitConfig:
 
 def method_fit(usual: FitConfig, method: str, preset: PresetName) -> FitConfig:
     """The usual settings with a method. What a preset sets and a method for comparison does not know has its default
-    there.
-
-    Raises:
-        UsageError: a setting beyond the preset that the method does not know.
-    """
+    there. UsageError: a setting beyond the preset that the method does not know."""
     recipe, named, plain = recipe_of(method), bench_preset(preset).fit, FitConfig()
     settings = configuration.load(FitConfig, usual, overrides={"method": method})
     for name in (*recipe.unfit, *(f"loss.{weight}" for weight in recipe.own_weights)):
@@ -178,32 +338,23 @@ def refuse_unfit(
     virtual = [fit for fit in fits if {"virtual", "repaired"} & set(METHODS[fit.method].supervision)]
     renders = model_files.uses_renders(config.model)
     if any(fit.method == REPAIRED for fit in fits) and not renders:
-        raise UsageError(
-            f"{REPAIRED} repairs renders, and this diffusion model uses none",
-            where="--methods",
-            got=config.model,
-            remedy=f"leave {REPAIRED} out, or choose another --model",
-        )
+        what, remedy = "repairs renders, and this diffusion model uses none", "choose another --model"
+        remedy = f"leave {REPAIRED} out, or {remedy}"
+        raise UsageError(f"{REPAIRED} {what}", where="--methods", got=config.model, remedy=remedy)
     if fits and not config.continue_fit and LONGER in config.methods:
-        raise UsageError(
-            f"with --no-continue-fit every fit has the same iterations, so this row is that of {BASE}",
-            where="--methods",
-            got=LONGER,
-            remedy="leave it out",
-        )
+        what = f"with --no-continue-fit every fit has the same iterations, so this row is that of {BASE}"
+        raise UsageError(what, where="--methods", got=LONGER, remedy="leave it out")
+    some_fit = fits or (renders and generators)
     idle = {
         "no row of this table generates views": () if generators or virtual else ("synthesize",),
-        "no row of this table fits a scene": (
-            () if fits or (renders and generators) else ("fit", "iterations", "continue_fit")
-        ),
+        "no row of this table fits a scene": () if some_fit else ("fit", "iterations", "continue_fit"),
         "no row of this table learns from virtual views": () if virtual else ("fit.virtual", "continue_fit"),
     }
     for name in changed_settings(config, bench_preset(preset)):
         for reason, unused in idle.items():
             if any(name == one or name.startswith(f"{one}.") for one in unused):
-                raise UsageError(
-                    "this setting would change nothing", where=flag_of(name), got=reason, remedy="leave it out"
-                )
+                what = "this setting would change nothing"
+                raise UsageError(what, where=flag_of(name), got=reason, remedy="leave it out")
     if generators or virtual:
         refuse_missing(generator_of(config), virtual[0] if virtual else FitConfig(), "--model")
     for generator in dict.fromkeys((*generators, *((generator_of(config),) if virtual else ()))):
@@ -214,20 +365,15 @@ def refuse_unfit(
 
 
 def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The methods, ablation rows and variants of ``mudg bench shift``, in the order of the tables.
-
-    Raises:
-        UsageError: an unknown method, one that does not know a setting beyond the preset, or a malformed or repeated
-            variant.
-    """
+    """The methods, ablation rows and variants of ``mudg bench shift``, in the order of the tables. UsageError: an
+    unknown method, one that does not know a setting beyond the preset, or a malformed or repeated variant."""
     known = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
     wanted, usual = {*config.methods, *((BASE, FULL) if config.ablation else ())}, usual_fit(config)
     _refuse_unknown(wanted, known)
     rows = [_method_row(name, usual, preset) for name in known if name in wanted]
     for name, (description, weights) in ABLATION.items() if config.ablation else ():
-        rows.append(
-            Row(name, f"with {description}", FULL, configuration.load(FitConfig, usual, overrides={"virtual": weights}))
-        )
+        ablated = configuration.load(FitConfig, usual, overrides={"virtual": weights})
+        rows.append(Row(name, f"with {description}", FULL, ablated))
     return _without_twins([*rows, *(variant_of(text, usual) for text in config.variant)])
 
 
@@ -255,25 +401,16 @@ def real_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row,
 
 def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "default") -> tuple[Row, ...]:
     """The rows of a paper's table: its own where it has such, else the methods asked for (all of them, where none is
-    named).
-
-    Raises:
-        UsageError: an unknown method, one that does not know a setting beyond the preset, or methods for a table that
-            has rows of its own.
-    """
+    named). UsageError: an unknown method, one that does not know a setting beyond the preset, or methods for a table
+    that has rows of its own."""
     usual_methods, freevs = BenchConfig().methods, config.freevs_model
     if table.rows:
         if config.methods != usual_methods:
-            raise UsageError(
-                "this table has rows of its own", where="--methods", expected="not given", got=", ".join(config.methods)
-            )
+            got, what = ", ".join(config.methods), "this table has rows of its own"
+            raise UsageError(what, where="--methods", expected="not given", got=got)
         if freevs:
-            raise UsageError(
-                "this table has no row freevs",
-                where="--freevs-model",
-                got=f"--table {table.name}",
-                remedy="leave it out",
-            )
+            got, what = f"--table {table.name}", "this table has no row freevs"
+            raise UsageError(what, where="--freevs-model", got=got, remedy="leave it out")
         rows = [Row(row.name, row.title, row.method, changes=row.changes) for row in table.rows]
     else:
         known = [name for method in METHODS for name in ((method, LONGER) if method == BASE else (method,))]
@@ -282,24 +419,16 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
             methods = [name for name in known if config.continue_fit or name != LONGER]
         _refuse_unknown(methods, known, some=False)
         if freevs and "freevs" not in methods:
-            raise UsageError(
-                "no row freevs was asked for",
-                where="--freevs-model",
-                got=f"--methods {' '.join(config.methods)}",
-                remedy="leave it out, or add freevs to --methods",
-            )
+            got, remedy = f"--methods {' '.join(config.methods)}", "leave it out, or add freevs to --methods"
+            raise UsageError("no row freevs was asked for", where="--freevs-model", got=got, remedy=remedy)
         changes: dict[str, dict[str, Any]] = {"freevs": {"condition": "freevs", "model": freevs}}
         if freevs and is_published(config.model):  # the row's own model is a small one, which samples in its own way
             changes["freevs"] |= {name: getattr(SynthesizeConfig(), name) for name in SAMPLING}
         if not model_files.uses_renders(config.model):
             changes[REPAIRED] = {"model": ""}
-        control = Row(LONGER, f"{LONGER_TITLE} ({LONGER})", BASE)
+        titles = {LONGER: LONGER_TITLE, **{name: method.title for name, method in METHODS.items()}}
         rows = [
-            (
-                control
-                if name == LONGER
-                else Row(name, f"{METHODS[name].title} ({name})", name, changes=changes.get(name, {}))
-            )
+            Row(name, f"{titles[name]} ({name})", BASE if name == LONGER else name, changes=changes.get(name, {}))
             for name in methods
         ]
     complete = []

@@ -1,9 +1,9 @@
 """``mudg bench``: measurements that print a table, each from one command.
 
-mdm            the diffusion model on held-out cities, against exact truth (``benchmarks/mdm.py``)
-poses          how much of the error of tracked boxes a fit takes out (``benchmarks/poses.py``); needs no diffusion
+mdm            the diffusion model on held-out cities, against exact truth (``benchmarks/cities.py``)
+poses          how much of the error of tracked boxes a fit takes out (``benchmarks/cities.py``); needs no diffusion
                model
-edit           edits of a fitted scene against the city regenerated with them (``benchmarks/edit.py``); needs no
+edit           edits of a fitted scene against the city regenerated with them (``benchmarks/cities.py``); needs no
                diffusion model. Of finished runs that are given: edits of recorded drives by measures that need no truth
                (``benchmarks/edit_runs.py``)
 shift          whole methods beside the recorded path, on lists of generated logs (``benchmarks/shift.py``)
@@ -12,7 +12,7 @@ paper          a table of a paper, on generated cities or real logs (``benchmark
 
 The first three are one folder, with OUT/clips/ (or cities, fits, ...), OUT/bench.json, OUT/bench.md and pictures; the
 others compare rows (``benchmarks/rows.py``) on logs (``benchmarks/places.py``), worked on in one loop
-(``benchmarks/loop.py``), in folders of their steps.
+(``benchmarks/chain.py``), in folders of their steps.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ from mudg.base.config import result_settings
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
-from mudg.benchmarks import edit, edit_runs, mdm, paper, poses, real, shift
+from mudg.benchmarks import cities, edit_runs, paper, real, shift
 from mudg.benchmarks.rows import changed_settings, flag_of, generator_of
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files
 from mudg.diffusion.published import is_published
 from mudg.gaussians.settings import FitConfig
 from mudg.steps.pipeline import refuse_missing
-from mudg.steps.settings.presets import PresetName
+from mudg.steps.settings import PresetName
 
 _FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "edited/", "fits/", "rows/*.json")
 EDIT, SHIFT, REAL, PAPER = "edit", "shift", "real", "paper"
@@ -44,55 +44,34 @@ CHAINS = (SHIFT, REAL, PAPER)
 RUNS = "edit RUN"
 """The benchmark edit of finished runs."""
 USED: Final[Mapping[str, tuple[str, ...]]] = {
-    "model": ("mdm", EDIT, *CHAINS),
-    "cities": ("mdm", "poses", EDIT),
-    "count": ("mdm", "poses", EDIT),
-    "steps": ("mdm",),
-    "sampler": ("mdm",),
-    "eta": ("mdm",),
-    "precision": ("mdm", *CHAINS),
-    "harmonize": (EDIT, RUNS),
-    "threads": ("mdm", "poses", EDIT, RUNS),
-    "seed": ("mdm", "poses", EDIT, *CHAINS),
-    "list": (SHIFT,),
-    "logs": (SHIFT, PAPER),
-    "methods": CHAINS,
-    "iterations": CHAINS,
-    "continue_fit": CHAINS,
-    "ablation": (SHIFT, REAL),
-    "variant": (SHIFT, REAL),
-    "processes": CHAINS,
-    "videos": (SHIFT, PAPER),
-    "table": (PAPER,),
-    "freevs_model": (PAPER,),
-    "protocols": (REAL,),
-    "shown": (REAL,),
-    "resolution": (REAL, PAPER),
-    "frames": (REAL, PAPER),
-    "pose_iterations": ("poses", EDIT),
-    "device": ("mdm", "poses", EDIT, RUNS, *CHAINS),
-    "fuse": CHAINS,
-    "synthesize": CHAINS,
-    "fit": CHAINS,
-    "score": (PAPER,),
+    setting: tuple(users)
+    for users, names in (
+        (("mdm",), "steps sampler eta"),
+        (("mdm", "poses", EDIT), "cities count"),
+        (("mdm", EDIT, *CHAINS), "model"),
+        (("mdm", *CHAINS), "precision"),
+        ((EDIT, RUNS), "harmonize"),
+        (("poses", EDIT), "pose_iterations"),
+        (("mdm", "poses", EDIT, RUNS), "threads"),
+        (("mdm", "poses", EDIT, *CHAINS), "seed"),
+        (("mdm", "poses", EDIT, RUNS, *CHAINS), "device"),
+        (CHAINS, "methods iterations continue_fit processes fuse synthesize fit"),
+        ((SHIFT,), "list"),
+        ((SHIFT, PAPER), "logs videos"),
+        ((SHIFT, REAL), "ablation variant"),
+        ((REAL,), "protocols shown"),
+        ((REAL, PAPER), "resolution frames"),
+        ((PAPER,), "table freevs_model score"),
+    )
+    for setting in names.split()
 }
 """Setting or group of settings -> the benchmarks that use it; the others refuse it."""
 OWN: Final[Mapping[str, str]] = {
     **{f"synthesize.{name}": f"give --{name}" for name in ("model", "precision", "seed", "device", "processes")},
     **{f"fit.{name}": f"give --{name}" for name in ("iterations", "seed", "device")},
     "fit.method": "give --methods",
-    **dict.fromkeys(
-        (
-            "synthesize.cameras",
-            "synthesize.shifts_m",
-            "synthesize.paths",
-            "synthesize.condition",
-            "score.baseline",
-            "score.error_pictures",
-            "score.perceptual_views",
-        ),
-        "leave it out",
-    ),
+    **dict.fromkeys((f"synthesize.{name}" for name in ("cameras", "shifts_m", "paths", "condition")), "leave it out"),
+    **dict.fromkeys((f"score.{name}" for name in ("baseline", "error_pictures", "perceptual_views")), "leave it out"),
 }
 """Settings of steps that a benchmark of complete methods chooses itself, and what to do instead."""
 
@@ -106,16 +85,9 @@ def run(
     preset: PresetName = "default",
     overwrite: bool = False,
 ) -> Path:
-    """Run one of `BENCHES`, shift, real or paper; returns the folder with `bench.json` and `bench.md`.
-
-    Args:
-        sources: logs, for real; logs or a list of cities, for paper; finished runs, for edit. preset: what the
-            configuration started from, for shift, real and paper.
-
-    Raises:
-        UsageError: there is no such benchmark, a setting that it does not use, or logs were given to one that makes its
-            own.
-    """
+    """Run a benchmark; returns the folder with `bench.json` and `bench.md`. ``sources``: logs, for real; logs or a list
+    of cities, for paper; finished runs, for edit. ``preset``: what the configuration started from, for shift, real and
+    paper. UsageError: no such benchmark, a setting that it does not use, or logs for one that makes its own."""
     if name not in (*BENCHES, *CHAINS):
         raise UsageError("no such benchmark", expected=", ".join((*BENCHES, *CHAINS)), got=name)
     refuse_unused(RUNS if name == EDIT and sources else name, config, preset)
@@ -146,20 +118,11 @@ def run(
 
 
 def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
-    """UsageError for a preset, or a setting that differs from it, of which a benchmark makes no use, and where weights
-    are missing.
-
-    Args:
-        name: of the benchmark; `RUNS` for edits of finished runs.
-    """
+    """UsageError for a preset, or a setting that differs from it, of which a benchmark (`RUNS`: edits of finished runs)
+    makes no use, and where weights are missing."""
     if name not in CHAINS and preset != "default":
-        raise UsageError(
-            "only benchmarks of complete methods have presets",
-            where="--preset",
-            expected=", ".join(CHAINS),
-            got=name,
-            remedy="leave it out",
-        )
+        what = "only benchmarks of complete methods have presets"
+        raise UsageError(what, where="--preset", expected=", ".join(CHAINS), got=name, remedy="leave it out")
     for setting in changed_settings(config, bench_preset(preset)):
         users, group = USED[setting.split(".")[0]], f"synthesize.{setting}"
         if name not in users:
@@ -173,23 +136,21 @@ def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
         if setting in OWN and (setting, name) != ("synthesize.shifts_m", REAL):
             raise UsageError("the benchmark chooses this itself", where=flag_of(setting), remedy=OWN[setting])
     if name == EDIT and config.model != BenchConfig().model and not config.harmonize:
-        raise UsageError(
-            "without --harmonize no diffusion model is used", where="--model", got=config.model, remedy="leave it out"
-        )
+        what = "without --harmonize no diffusion model is used"
+        raise UsageError(what, where="--model", got=config.model, remedy="leave it out")
     if name in CHAINS:
         refuse_missing(generator_of(config), FitConfig(), "--model")
     if name == "mdm" and is_published(config.model):
-        raise UsageError(
+        what, remedy = (
             "mudg bench mdm measures small models",
-            where="--model",
-            got=config.model,
-            remedy="mudg bench paper --table mudg2 measures published-type ones",
+            "mudg bench paper --table mudg2 measures published-type ones",
         )
+        raise UsageError(what, where="--model", got=config.model, remedy=remedy)
 
 
 BENCHES: dict[str, Callable[[BenchConfig, Path], tuple[dict[str, Any], str]]] = {
-    "mdm": mdm.measure,
-    "poses": poses.measure,
-    EDIT: edit.measure,
+    "mdm": cities.measure_mdm,
+    "poses": cities.measure_poses,
+    EDIT: cities.measure_edits,
 }
 """Every measurement that is one folder, by name."""

@@ -7,10 +7,10 @@ from typing import Literal
 from mudg.base.config import changed, setting, settings
 from mudg.base.devices import DeviceName
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.settings import FuseConfig
-from mudg.steps.settings.presets import PresetName, run_preset
+from mudg.steps.settings import PresetName, run_preset
 
 
 @settings
@@ -124,11 +124,8 @@ class BenchConfig(BenchOwn):
 
 def bench_preset(name: PresetName = "default") -> BenchConfig:
     """The settings of ``mudg bench shift``, ``real`` and ``paper`` before any file or flag: those of a preset that say
-    how clouds, views and fits are made. Which logs, and their size, is the benchmark's matter.
-
-    Raises:
-        UsageError: no such preset.
-    """
+    how clouds, views and fits are made. Which logs, and their size, is the benchmark's matter. UsageError: no such
+    preset."""
     run = run_preset(name)
     usual = SynthesizeConfig()
     return changed(

@@ -4,7 +4,7 @@ Every log is ingested, fused and synthesized once; every method is fitted, rende
 ordinary verbs, so that whatever is finished is reused and another variant costs only itself. Fits under virtual views
 go on with the one on recorded views, as in ``mudg run``.
 
-    OUT/<log>/...   see ``benchmarks/views.py``; generated views lie in OUT/<log>/synthesize
+    OUT/<log>/...   see ``benchmarks/places.py``; generated views lie in OUT/<log>/synthesize
     OUT/bench.json   every number        OUT/bench.md   the tables        OUT/page.html   tables and videos
 """
 
@@ -19,27 +19,27 @@ from typing import Any, Final
 from mudg.base import config as configuration
 from mudg.base.html import TextTable, markdown_table
 from mudg.base.run_folder import refuse_overlap
-from mudg.benchmarks import page as pages
-from mudg.benchmarks.loop import compare, refuse_foreign, seconds_of
-from mudg.benchmarks.papers import RECORDED, PaperPlace, PaperTable
-from mudg.benchmarks.places import listed_cities
+from mudg.benchmarks.chain import compare, films, refuse_foreign, render_page, seconds_of
+from mudg.benchmarks.places import Views, listed_cities, score_settings
 from mudg.benchmarks.rows import (
     BASE,
     DIFFUSION,
     EXACT,
     FILL,
     FULL,
+    RECORDED,
+    PaperPlace,
+    PaperTable,
     chain_settings,
     generator_of,
     refuse_unfit,
     shift_rows,
 )
 from mudg.benchmarks.settings import BenchConfig
-from mudg.benchmarks.views import Views, score_settings
 from mudg.city import logs as city_logs
 from mudg.city.logs import STANDARD, LogRules
-from mudg.diffusion import model_files
-from mudg.steps.settings.presets import PresetName
+from mudg.diffusion import model_files as mdm_files
+from mudg.steps.settings import PresetName
 
 SHIFTED: Final = "shifted"
 """The mean over the lateral distances."""
@@ -134,37 +134,21 @@ def run(
             settings. Whatever a verb raises.
     """
     rows, out = shift_rows(config, preset), Path(out)
-    refuse_overlap(out, {"model": model_files.folder_of(config.model)})
-    refuse_foreign(
-        out,
-        _PAGES,
-        lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc,
-        lambda entry: entry.name.isdigit(),
-    )
+    refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
+    own = lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc  # noqa: E731
+    refuse_foreign(out, _PAGES, own, lambda entry: entry.name.isdigit())
     shifts = {RECORDED: [0.0], **{f"{d:g}": [d, -d] for d in distances_m}}
     places = [PaperPlace(name=name, title="", shifts_m=shifts_m) for name, shifts_m in shifts.items()]
-    table, renders = PaperTable(name="shift", places=places, columns=[]), model_files.uses_renders(config.model)
-    jobs = [
-        ShiftLog(
-            log,
-            out / log.name,
-            table,
-            rows,
-            config,
-            score_settings(config, table),
-            renders,
-            overwrite,
-            "synthesize",
-            on_path=False,
-        )
-        for log in listed_cities(config.list, config.logs, rules)
-    ]
+    table, renders = PaperTable(name="shift", places=places, columns=[]), mdm_files.uses_renders(config.model)
+    last = (config, score_settings(config, table), renders, overwrite, "synthesize")
+    logs = listed_cities(config.list, config.logs, rules)
+    jobs = [ShiftLog(log, out / log.name, table, rows, *last, on_path=False) for log in logs]
     refuse_unfit(config, preset, rows, [generator_of(config)] * any(row.method == DIFFUSION for row in rows))
     settings = {
         "list": config.list,
         "iterations": config.iterations,
         "seed": config.seed,
-        "model": model_files.digest(config.model),
+        "model": mdm_files.digest(config.model),
         "renders": renders,
         "frames": rules.frames,
         "size_px": [rules.width, rules.height],
@@ -173,10 +157,8 @@ def run(
         "ablation": config.ablation,
         **chain_settings(config, preset),
     }
-    values = [
-        {"name": r.name, "title": r.title, "fit": None if r.fit is None else configuration.result_settings(r.fit)}
-        for r in rows
-    ]
+    fits = [None if row.fit is None else configuration.result_settings(row.fit) for row in rows]
+    values = [{"name": row.name, "title": row.title, "fit": of} for row, of in zip(rows, fits, strict=True)]
     filled = lambda logs: document(logs, values, list(distances_m), settings)  # noqa: E731
     return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": page})
 
@@ -190,28 +172,20 @@ def document(
     distances_m: Sequence[float],
     settings: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Everything ``bench.json`` holds.
-
-    Args:
-        logs: per log its facts, ``values[method][distance][metric]`` (a number, or why there is none) and seconds.
-        rows: name, title and fit of each method. distances_m: lateral shifts off the recorded path. settings: of the
-            bench.
-    """
+    """Everything ``bench.json`` holds. ``logs``: per log its facts, ``values[method][distance][metric]`` (a number, or
+    why there is none) and seconds. ``rows``: name, title and fit of each method. ``distances_m``: lateral shifts off
+    the recorded path. ``settings``: of the bench."""
     shifted = [f"{d:g}" for d in sorted(distances_m)]
     full = [{**entry, "values": {m: with_mean(of, shifted) for m, of in entry["values"].items()}} for entry in logs]
     names = [row["name"] for row in rows]
+    every = (RECORDED, *shifted, SHIFTED)
+    of = lambda entry, name, p, m: entry["values"][name].get(p, {}).get(m, "not produced")  # noqa: E731
     pooled = {
-        name: {
-            p: {
-                m: _pooled([entry["values"][name].get(p, {}).get(m, "not produced") for entry in full]) for m in COLUMNS
-            }
-            for p in (RECORDED, *shifted, SHIFTED)
-        }
+        name: {p: {m: _pooled([of(entry, name, p, m) for entry in full]) for m in COLUMNS} for p in every}
         for name in names
     }
-    against_full = [
-        r["name"] for r in rows if FULL in names and r["fit"] is not None and r["name"] not in ("gs3d", BASE, FULL)
-    ]
+    fitted = [row["name"] for row in rows if row["fit"] is not None and row["name"] not in ("gs3d", BASE, FULL)]
+    held = lambda a, b, place, metrics: against(full, a, b, place, metrics) if {a, b} <= {*names} else []  # noqa: E731
     return {
         "schema": 1,
         "settings": dict(settings),
@@ -220,19 +194,16 @@ def document(
         "metrics": list(COLUMNS),
         "logs": full,
         "pooled": pooled,
-        "comparisons": [
-            c for a, b, place, metrics in COMPARISONS if {a, b} <= {*names} for c in against(full, a, b, place, metrics)
-        ],
+        "comparisons": [comparison for comparison_of in COMPARISONS for comparison in held(*comparison_of)],
         "variants": [
             {
                 "name": name,
                 "against_mudg_s": [
-                    c
-                    for place in (SHIFTED, RECORDED)
-                    for c in against(full, name, FULL, place, "psnr perceptual abs_rel miou")
+                    c for p in (SHIFTED, RECORDED) for c in held(name, FULL, p, "psnr perceptual abs_rel miou")
                 ],
             }
-            for name in against_full
+            for name in fitted
+            if FULL in names
         ],
     }
 
@@ -329,15 +300,13 @@ def markdown(doc: Mapping[str, Any]) -> str:
     """The tables for people."""
     settings = doc["settings"]
     width, height = settings["size_px"]
+    size = f"{width}x{height}, {len(settings['cameras'])} cameras"
     lines = [
         f"# Off the recorded path: {_logs_text(doc)} of the {settings['list']} list",
         "",
-        (
-            f"{settings['frames']} frames at 10 Hz, {width}x{height}, {len(settings['cameras'])} cameras, every"
-            f" {settings['held_out_every']}th frame held out; {_summary(settings)}; seed {settings['seed']}. Means over"
-            " both sides and all logs, +- the standard error over logs. Flicker: 1 = as steady as the truth."
-            " Perceptual: features of the shipped codec, not LPIPS."
-        ),
+        f"{settings['frames']} frames at 10 Hz, {size}, every {settings['held_out_every']}th frame held out;"
+        f" {_summary(settings)}; seed {settings['seed']}. Means over both sides and all logs, +- the standard error"
+        " over logs. Flicker: 1 = as steady as the truth. Perceptual: features of the shipped codec, not LPIPS.",
         "",
         *markdown_table(FACTS, map(_facts, doc["logs"])),
         "",
@@ -351,26 +320,18 @@ def markdown(doc: Mapping[str, Any]) -> str:
     if "only_I" in names:
         metrics = ("psnr", "ssim", "perceptual", "abs_rel", "delta1", "miou")
         heads = ["virtual terms", *(COLUMNS[metric][0] for metric in metrics)]
-        rows = [
-            [title, *_cells(doc["pooled"][name][SHIFTED], metrics, with_error=True)]
-            for name, title in ABLATION_ROWS.items()
-        ]
+        shown = {title: doc["pooled"][name][SHIFTED] for name, title in ABLATION_ROWS.items()}
+        rows = [[title, *_cells(values, metrics, with_error=True)] for title, values in shown.items()]
         lines += ["## Which virtual term does what", "", *markdown_table(heads, rows), ""]
     for variant in doc["variants"]:
         lines += [f"## {variant['name']} against mudg_s", "", *_comparison_table(variant["against_mudg_s"]), ""]
-    rows = [
-        [str(entry["log"]), name, *_cells(entry["values"][name][SHIFTED])] for entry in doc["logs"] for name in names
-    ]
-    steps = dict.fromkeys(step for entry in doc["logs"] for step in entry["seconds"])
-    seconds = [[step, *(f"{entry['seconds'].get(step, math.nan):.0f}" for entry in doc["logs"])] for step in steps]
+    logs = doc["logs"]
+    rows = [[str(entry["log"]), name, *_cells(entry["values"][name][SHIFTED])] for entry in logs for name in names]
+    steps = dict.fromkeys(step for entry in logs for step in entry["seconds"])
+    seconds = [[step, *(f"{entry['seconds'].get(step, math.nan):.0f}" for entry in logs)] for step in steps]
     lines += ["## Each log, mean off the recorded path", "", *markdown_table(["log", "method", *headings], rows), ""]
-    lines += [
-        "## Seconds per log",
-        "",
-        *markdown_table(["step", *(str(entry["log"]) for entry in doc["logs"])], seconds),
-        "",
-    ]
-    return "\n".join(lines)
+    heads = ["step", *(str(entry["log"]) for entry in logs)]
+    return "\n".join([*lines, "## Seconds per log", "", *markdown_table(heads, seconds), ""])
 
 
 def page(doc: Mapping[str, Any]) -> str:
@@ -379,26 +340,18 @@ def page(doc: Mapping[str, Any]) -> str:
     *places, mean = _places(doc)
     heads = ["method", *(heading for heading, _ in COLUMNS.values())]
     compared = [[c["title"], *_compared(c), c["kind"], str(c["logs"])] for c in doc["comparisons"]]
-    scores = [
-        TextTable.of_texts(
-            heads,
-            [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names],
-            _place_title(doc, place),
-        )
-        for place in (mean, *places)
-    ]
-    videos = pages.films(doc, ["truth", *(name for name in names if name in SHOWN)], videos=True, choice=True)
-    return pages.render(
+    rows = lambda place: [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names]  # noqa: E731
+    scores = [TextTable.of_texts(heads, rows(place), _place_title(doc, place)) for place in (mean, *places)]
+    videos = films(doc, ["truth", *(name for name in names if name in SHOWN)], videos=True, choice=True)
+    table = TextTable.of_texts(["", "value", "standard error", "as", "logs"], compared)
+    return render_page(
         f"Off the recorded path: {_logs_text(doc)}, {settings['list']} list",
         "mudg bench shift",
         f"Generated logs of {settings['frames']} frames with exact ground truth at every view; {_summary(settings)}."
         " Means over logs and both sides of the path.",
         [
             *([videos] if videos["films"] else []),
-            {
-                "title": "Comparisons",
-                "tables": [TextTable.of_texts(["", "value", "standard error", "as", "logs"], compared)],
-            },
+            {"title": "Comparisons", "tables": [table]},
             {"title": "Scores", "tables": scores},
             {"title": "Logs", "tables": [TextTable.of_texts(FACTS, map(_facts, doc["logs"]))]},
         ],
@@ -444,14 +397,8 @@ FACTS: Final = ("log", "turn, degrees", "length, m", "dynamic vehicles in view",
 
 def _facts(entry: Mapping[str, Any]) -> list[str]:
     """Cells of a log's row under ``FACTS``."""
-    return [
-        str(entry["log"]),
-        f"{entry['turn_deg']:.1f}",
-        f"{entry['length_m']:.0f}",
-        str(entry["movers"]),
-        f"{entry['mover_share']:.1%}",
-        entry["words"],
-    ]
+    numbers = [f"{entry['turn_deg']:.1f}", f"{entry['length_m']:.0f}", str(entry["movers"])]
+    return [str(entry["log"]), *numbers, f"{entry['mover_share']:.1%}", entry["words"]]
 
 
 def _compared(comparison: Mapping[str, Any]) -> tuple[str, str]:

@@ -7,12 +7,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from mudg.steps.outputs import Output
+from mudg.steps.engine import Output
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
     from mudg.benchmarks.settings import BenchConfig
-    from mudg.steps.settings.presets import PresetName
+    from mudg.steps.settings import PresetName
 
 
 class Bench(Output):
@@ -21,14 +21,12 @@ class Bench(Output):
 
     section = "benchmarks"
     examples = (
-        "mudg bench mdm --out runs/bench",
-        "mudg bench poses --out runs/poses",
-        "mudg bench edit --out runs/edits",
-        "mudg bench edit runs/a runs/b --out runs/edited",
-        "mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",
-        "mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",
-        "mudg bench paper city:reported --table mudg1 --out runs/mudg1",
-        "mudg bench paper logs/* --table mudg2 --preset paper --model models/mudg_1024 --out runs/mudg2",
+        *("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses"),
+        *("mudg bench edit --out runs/edits", "mudg bench edit runs/a runs/b --out runs/edited"),
+        *("mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",),
+        *("mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",),
+        *("mudg bench paper city:reported --table mudg1 --out runs/mudg1",),
+        *("mudg bench paper logs/* --table mudg2 --preset paper --model models/mudg_1024 --out runs/mudg2",),
     )
     short = ("model", "seed", "device")
     parts = {

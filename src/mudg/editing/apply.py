@@ -1,31 +1,73 @@
-"""A plan carried out: on a fitted scene, on fused clouds, on what a scene says of boxes and of the vehicle."""
+"""A script carried out: on a fitted scene, on fused clouds, on what a scene says of boxes and of the vehicle; with the
+objects, the light and the weather that it brings.
+
+An object of a fitted scene is a file of its own, one safetensors file with the description as JSON in its header:
+
+    means f32[n, 3]  quats f32[n, 4]  log_scales f32[n, 3]  logits f32[n]  sh_dc f32[n, 1, 3]   raw, in the frame of the
+    box; class_ids u8[n] (255 = unknown)   certainty f16[n], if it is known
+    header "mudg_asset": {schema, label, size_m, light_rgb, seen_deg, origin}"""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from PIL import Image
+from pydantic import Field
 
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
-from mudg.base.types import EgoPath, FusedCloud, PointCloud, Scene, Track, View
+from mudg.base.palette import CLASSES, UNLABELLED
+from mudg.base.processes import one_torch_thread
+from mudg.base.records import Number, StrictRecord, parse_record
+from mudg.base.run_folder import ResultFile
+from mudg.base.types import EgoPath, FusedCloud, Observation, PointCloud, Scene, Track, View
+from mudg.base.weather_settings import Conditions
+from mudg.core import trajectory
 from mudg.core.edit import HeightMap, Motion
+from mudg.core.weather import ShownView, drive_facts, edited_view
+from mudg.core.weather.light import curve_of
+from mudg.diffusion.inputs import InWeather
 from mudg.editing import model as edited
-from mudg.editing.model import Asset
-from mudg.editing.plan import Actor, Background, EditPlan
+from mudg.editing.model import (
+    GROUND_CLASSES,
+    Asset,
+    asset_of,
+    ground_points,
+    light_gain,
+    linear_of,
+    lowest_points,
+    matched_light,
+    motion_of,
+)
+from mudg.editing.plan import (
+    Actor,
+    Background,
+    EditPlan,
+    EditSources,
+    EditWorld,
+    check,
+    plan_edits,
+    shown_anew,
+    sides_seen,
+)
+from mudg.editing.runs import RunParts, find_run
+from mudg.editing.script import AssetSource, EditScript, conditions_of
 from mudg.editing.street import MOST_VIEWS, Hidden, noted, with_closed_sides, without_traces
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode
-from mudg.gaussians.rendering import raster_of
+from mudg.gaussians.rendering import raster_of, render_view
 from mudg.gaussians.sky import SkyNode
 from mudg.gaussians.start import SH_C0
-from mudg.scene.read import decode_image
+from mudg.gaussians.storage import load_model
+from mudg.scene.clouds import read_fused
+from mudg.scene.read import decode_image, read_scene
 
 EGO_FACT: Final = "edited_ego"
 """Fact of a fitted scene that was edited by itself: the vehicle's path, keys as rows [time, 16 numbers of the pose]."""
@@ -56,9 +98,8 @@ def street_left(model: SceneModel, plan: EditPlan, *, close: bool = True) -> Sce
         model = without_traces(model, hidden, views, raster_of(model))
     sides = tuple(name for name in sides if close and name in model.node_names())
     if sides:
-        model = with_closed_sides(
-            model, sides, views_of([plan.before.actors[name] for name in sides], plan.views), raster_of(model)
-        )
+        seen_from = views_of([plan.before.actors[name] for name in sides], plan.views)
+        model = with_closed_sides(model, sides, seen_from, raster_of(model))
     return model
 
 
@@ -80,11 +121,8 @@ def _some(names: Sequence[str]) -> str:
 def edited_model(
     model: SceneModel, plan: EditPlan, sky: Path | None = None, street_of: StreetOf = street_left
 ) -> SceneModel:
-    """A fitted scene with a plan carried out.
-
-    Args:
-        sky: panorama of the plan's ``sky``. street_of: makes the street that objects left, or remembers it.
-    """
+    """A fitted scene with a plan carried out. ``sky``: panorama of the plan's ``sky``. ``street_of``: makes the street
+    that objects left, or remembers it."""
     model = street_of(model, plan)
     if plan.background is not None:
         other, pose = plan.background
@@ -125,29 +163,21 @@ def views_of(actors: Sequence[Actor], views: Sequence[View]) -> list[View]:
 
 def hidden_by(actor: Actor, views: Sequence[View]) -> Hidden:
     """An object and the views at whose times it is there, at most `MOST_VIEWS`."""
-    there = sorted(
-        (view for view in views if actor.motion.pose_at(view.time_s) is not None), key=lambda view: view.time_s
-    )
+    there = [view for view in views if actor.motion.pose_at(view.time_s) is not None]
+    there.sort(key=lambda view: view.time_s)
     return Hidden(actor.size_m, actor.motion, actor.moves, tuple(spread(there)))
 
 
 def _cut_out(model: SceneModel, names: Sequence[str], plan: EditPlan) -> SceneModel:
     """A copy with objects of their own for what stands in boxes. What the fit does not show is named, if it is only to
-    be removed.
-
-    Raises:
-        UsageError: an object that is to be moved does not show in the fit.
-    """
+    be removed. UsageError: an object that is to be moved does not show in the fit."""
     missing: dict[str, str] = {}
     for name in names:
         actor = plan.before.actors[name]
         try:
             if actor.moves:
-                raise UsageError(
-                    "this object has no Gaussians of its own in the fit: the recording hardly saw it",
-                    where=f"track {name!r}",
-                    remedy="leave it out of the script",
-                )
+                what = "this object has no Gaussians of its own in the fit: the recording hardly saw it"
+                raise UsageError(what, where=f"track {name!r}", remedy="leave it out of the script")
             cut = edited.cut_out(model, _track(name, actor))
         except UsageError as problem:
             if name not in plan.removed:
@@ -156,11 +186,8 @@ def _cut_out(model: SceneModel, names: Sequence[str], plan: EditPlan) -> SceneMo
             continue
         model = cut if name in plan.removed else edited.with_shadow(cut, name, CUT_SHADOW)
     if missing:
-        why = (
-            next(iter(missing.values()))
-            if len(missing) == 1
-            else "they have no Gaussians of their own, and none are in their boxes"
-        )
+        each = "they have no Gaussians of their own, and none are in their boxes"
+        why = next(iter(missing.values())) if len(missing) == 1 else each
         log.info(f"edit: {_some(list(missing))}: not in the fit: {why}")
     return model
 
@@ -172,9 +199,8 @@ def panorama(path: Path, yaw_deg: float, model: SceneModel) -> SkyNode:
     rgb = decode_image(store.read_bytes(path), str(path))
     height, width = rgb.shape[:2]
     if width != 2 * height:
-        raise InputError(
-            "a panorama of the sky is twice as wide as it is high", where=str(path), got=f"{width}x{height}"
-        )
+        what, got = "a panorama of the sky is twice as wide as it is high", f"{width}x{height}"
+        raise InputError(what, where=str(path), got=got)
     small = np.asarray(Image.fromarray(rgb).resize((2 * rows, rows), Image.Resampling.BOX), np.float32) / 255
     turned = np.roll(small[:, ::-1], round(yaw_deg / 360 * 2 * rows), axis=1)  # columns of ``SkyNode`` grow to the left
     sky = SkyNode.uniform(rows)
@@ -194,24 +220,15 @@ def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
         static, objects[name] = _cut_points(static, _track(name, plan.before.actors[name]))
     objects = {name: points for name, points in objects.items() if name not in plan.removed}
     if plan.background is not None:
-        static = _other_street(*plan.background)
-        objects = {
-            name: _relit_points(points, plan.objects_gain) for name, points in objects.items() if name not in standing
-        }
+        other, world_from_other = plan.background
+        if other.points is None:
+            raise UsageError("the other run has no fused points", remedy="name a folder made by `mudg run`")
+        xyz = geometry.transform_points(world_from_other, other.points.xyz.astype(np.float64))
+        static = replace(other.points, xyz=xyz.astype(np.float32))
+        kept = {name: points for name, points in objects.items() if name not in standing}
+        objects = {name: _relit_points(points, plan.objects_gain) for name, points in kept.items()}
     objects |= {name: asset_points(insertion.asset) for name, insertion in plan.inserted.items()}
     return FusedCloud(static, objects, cloud.colors)
-
-
-def _other_street(other: Background, world_from_other: NDArray[np.float64]) -> PointCloud:
-    """The static points of another run at their place in this one.
-
-    Raises:
-        UsageError: it has none.
-    """
-    if other.points is None:
-        raise UsageError("the other run has no fused points", remedy="name a folder made by `mudg run`")
-    xyz = geometry.transform_points(world_from_other, other.points.xyz.astype(np.float64))
-    return replace(other.points, xyz=xyz.astype(np.float32))
 
 
 def _relit_points(points: PointCloud, gain: NDArray[np.float64] | None) -> PointCloud:
@@ -232,9 +249,8 @@ def _cut_points(static: PointCloud, track: Track) -> tuple[PointCloud, PointClou
     inside &= ~ground
 
     def part(rows: NDArray[np.bool_], xyz: NDArray[np.float32], frame: Any) -> PointCloud:
-        return PointCloud(
-            xyz[rows], static.rgb[rows], frame, None if static.semantics is None else static.semantics[rows]
-        )
+        ids = None if static.semantics is None else static.semantics[rows]
+        return PointCloud(xyz[rows], static.rgb[rows], frame, ids)
 
     return part(~inside, static.xyz, "world"), part(inside, local.astype(np.float32), "object")
 
@@ -244,9 +260,8 @@ def asset_points(asset: Asset) -> PointCloud:
     solid = torch.sigmoid(asset.columns["logits"]).numpy() > edited.SOLID_OPACITY
     rgb = (0.5 + SH_C0 * asset.columns["sh_dc"].numpy()[:, 0]).clip(0, 1)
     ids = np.where(asset.class_ids < 0, 255, asset.class_ids).astype(np.uint8)
-    return PointCloud(
-        asset.columns["means"].numpy()[solid], (rgb[solid] * 255 + 0.5).astype(np.uint8), "object", ids[solid]
-    )
+    shown = (rgb[solid] * 255 + 0.5).astype(np.uint8)
+    return PointCloud(asset.columns["means"].numpy()[solid], shown, "object", ids[solid])
 
 
 def ground_of(cloud: FusedCloud | None, model: SceneModel) -> HeightMap | None:
@@ -286,9 +301,8 @@ def _carried(view: View, before: EgoPath, after: Motion) -> View:
     time_s = float(np.clip(view.time_s, before.times_s[0], before.times_s[-1]))
     old, new = before.pose_at(time_s), after.pose_at(float(np.clip(time_s, after.times_s[0], after.times_s[-1])))
     if old is None or new is None:
-        raise InputError(
-            "the vehicle has no pose at the time of a frame", where=f"camera {view.camera.name}", got=f"{view.time_s} s"
-        )
+        what, where = "the vehicle has no pose at the time of a frame", f"camera {view.camera.name}"
+        raise InputError(what, where=where, got=f"{view.time_s} s")
     return View(view.camera, new @ geometry.invert(old) @ view.world_from_cam, view.time_s)
 
 
@@ -307,3 +321,278 @@ def scene_seen_by(scene: Scene, facts: Mapping[str, Any]) -> Scene:
 
 def _track(name: str, actor: Actor) -> Track:
     return Track(name, actor.label, np.array(actor.size_m), actor.motion.times_s, actor.motion.poses)
+
+
+# -- a script carried out ---------------------------------------------------------------------------
+
+IMPORTED = "imported"
+"""Method of a scene that was read from a file of another program."""
+FACT = "edits"
+"""Fact of an edited fitted scene: the script, its digest, and what its checks found."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class EditedDrive:
+    """What a script made of a drive. ``plan``: what was done. ``scene``, ``cloud``: edited; None where they were not
+    given. ``notes``: what the reader should know (``checks.check``)."""
+
+    script: EditScript
+    plan: EditPlan
+    scene: Scene | None
+    cloud: FusedCloud | None
+    notes: list[dict[str, Any]]
+
+    def model(self, model: SceneModel, keep_ego: bool = False, street_of: StreetOf = street_left) -> SceneModel:
+        """A fitted scene of this drive, edited. ``keep_ego``: note the vehicle's new path in the scene's facts, for
+        those who know the recorded path alone. ``street_of``: makes the street that objects left
+        (``apply.street_left``), or remembers it."""
+        sky = None if self.plan.sky is None else self.script.path_of(self.plan.sky.image)
+        made = edited_model(model, self.plan, sky, street_of)
+        facts = {**made.facts, FACT: {"script": self.script.canonical(), "notes": self.notes}}
+        if keep_ego and self.plan.moves_ego and self.plan.after.ego is not None:
+            facts[EGO_FACT] = ego_fact(self.plan.after.ego)
+        return replace(made, facts=facts)
+
+
+def carry_out(
+    script: EditScript, model: SceneModel, scene: Scene | None = None, cloud: FusedCloud | None = None
+) -> EditedDrive:
+    """Carry out a script on a drive, but for its fitted scenes (``EditedDrive.model``). ``model``: a fit of the drive:
+    its objects are those that a script can name where there is no scene; its ground where there is no cloud.
+    InputError: something in the script that cannot be done here."""
+    if conditions_of(script.canonical()) is not None and not model.classes:
+        what = "weather, light and season need the classes of surfaces, and this scene was fitted without"
+        remedy = "fit a scene with labels (`mudg annotate` makes them), or take them out of the script"
+        raise InputError(what, where="weather, light, season", remedy=remedy)
+    ground = ground_of(cloud, model)
+    world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
+    background = lambda name: background_of(find_run(script.path_of(name)), name)  # noqa: E731
+    closes = scene is not None and is_recording(scene)
+    plan = plan_edits(script, world, EditSources(opener(script), background, close_street=closes))
+    plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
+    take_light(plan, model)
+    if scene is None and plan.closed:
+        names, why = sorted(plan.closed), "what recorded views show of it is not known (give --scene)"
+        text = f"the street behind {', '.join(names)} stays as it was fitted: {why}"
+        plan.notes.append({"kind": "street not closed", "ids": names, "text": text})
+    made = None if scene is None else edited_scene(scene, plan)
+    views = tuple([frame.view for frame in s.frames] if s else [] for s in (scene, made))
+    plan.sides &= shown_anew(plan, *views)
+    notes = check(plan, *views)
+    for note in notes:
+        (log.info if note["kind"] == "lateral acceleration" else log.warn)(f"edit: {note['text']}")
+    return EditedDrive(script, plan, made, None if cloud is None else edited_cloud(cloud, plan), notes)
+
+
+def is_recording(scene: Scene) -> bool:
+    """Whether a scene comes from sensors and not from the city generator, which has exact pictures of what an object
+    hid."""
+    return scene.source.recipe is None
+
+
+def background_of(parts: RunParts, name: str) -> Background:
+    """The street of a run; or of a file, which begins at its origin and leads along x. InputError: a fit by itself, of
+    which the path of the vehicle is not known, or one without ground."""
+    if parts.scene is None:
+        model = load_model(parts.model)
+        if model.facts.get("method") != IMPORTED:
+            what, expected = "of a fit alone it is not known where its street lies", "a folder made by `mudg run`"
+            raise InputError(what, where="run", got=name, expected=f"{expected} or by `mudg asset import --kind scene`")
+        known = ground_points(model)
+        return Background(model, Motion.recorded([0.0], np.eye(4)[None]), known if len(known) else lowest_points(model))
+    scene, model = read_scene(parts.scene), load_model(parts.model)
+    ground, cloud = ground_points(model), None if parts.fused is None else read_fused(parts.fused).static
+    if cloud is not None and cloud.semantics is not None:
+        ground = cloud.xyz[np.isin(cloud.semantics, GROUND_CLASSES)]
+    if not len(ground):
+        raise InputError("the other street has no ground: its fit knows no classes", where="run", got=name)
+    light = surface_light(model, [frame.view for frame in scene.frames])
+    return Background(model, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground, cloud, light)
+
+
+def opener(script: EditScript) -> Callable[[AssetSource], Asset]:
+    """What reads the objects that a script names."""
+    from_run = lambda source: asset_from(find_run(script.path_of(source.run or "")), source.id or "")  # noqa: E731
+    return lambda source: from_run(source) if source.file is None else read_asset(script.path_of(source.file))
+
+
+# -- objects as files --------------------------------------------------------------------------------
+
+HEADER: Final = "mudg_asset"
+_SHAPES: Final = {"means": (3,), "quats": (4,), "log_scales": (3,), "logits": (), "sh_dc": (1, 3)}
+Size = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class AssetHeader(StrictRecord):
+    """Description of an asset file."""
+
+    schema_: Literal[2] = Field(alias="schema")
+    label: str
+    size_m: Annotated[list[Size], Field(min_length=3, max_length=3)]
+    light_rgb: Annotated[list[Number], Field(min_length=3, max_length=3)] | None
+    seen_deg: list[Number]
+    origin: str
+
+
+def write_asset_from(parts: RunParts, name: str, file: ResultFile) -> dict[str, Any]:
+    """Write one object of a fit, or of a run, to a file; returns what it is. UsageError where there is no such
+    object."""
+    asset = asset_from(parts, name)
+    write_asset(file.path, asset)
+    log.info(f"asset: {name} ({asset.label}, {len(asset)} Gaussians, seen from {len(asset.seen_rad)} directions)")
+    return {"id": name}
+
+
+def asset_from(parts: RunParts, name: str) -> Asset:
+    """An object of a run, with the sides from which its scene shows it; those that it never shows are closed."""
+    model = load_model(parts.model)
+    if parts.scene is None:
+        return asset_of(model, name)
+    recorded = read_scene(parts.scene)
+    return complete_asset(model, name, [frame.view for frame in recorded.frames])
+
+
+@one_torch_thread()
+def complete_asset(model: SceneModel, name: str, views: Sequence[View]) -> Asset:
+    """An object of a fitted scene, with the sides from which views show it; the others are closed
+    (``editing/street.py``)."""
+    node = model.dynamic_object(name)
+    actor = Actor(node.label, (node.size_m[0], node.size_m[1], node.size_m[2]), motion_of(node))
+    closed = with_closed_sides(model, [name], views_of([actor], views), raster_of(model))
+    return asset_of(closed, name, sides_seen(actor, views).tolist(), light_rgb=surface_light(model, views))
+
+
+def write_asset(path: Path, asset: Asset) -> None:
+    """Write an asset file."""
+    arrays = {key: asset.columns[key].numpy() for key in _SHAPES}
+    arrays["class_ids"] = np.where(asset.class_ids < 0, UNLABELLED, asset.class_ids).astype(np.uint8)
+    if asset.certainty is not None:
+        arrays["certainty"] = asset.certainty.astype(np.float16)
+    header = {
+        "schema": 2,
+        "label": asset.label,
+        "size_m": list(asset.size_m),
+        "origin": asset.origin,
+        "light_rgb": None if asset.light_rgb is None else list(asset.light_rgb),
+        "seen_deg": [round(float(np.degrees(a)), 2) for a in asset.seen_rad],
+    }
+    store.write_safetensors(path, arrays, {HEADER: store.json_text(header, indent=None)})
+
+
+def read_asset(path: Path) -> Asset:
+    """Read an asset file. InputError: it is missing, damaged, or no asset."""
+    content = store.read_bytes(path)
+    arrays = store.parse_safetensors(content, str(path))
+    text = store.safetensors_metadata(content, str(path)).get(HEADER)
+    if text is None:
+        raise InputError("this file is no asset", where=str(path), expected="a file written by `mudg asset export`")
+    facts = store.parse_json(text, f"{path}: header")
+    header = parse_record(AssetHeader, facts, f"{path}: header: ")
+    count = len(arrays["means"]) if "means" in arrays else 0
+    wanted = {**{key: (count, *shape) for key, shape in _SHAPES.items()}, "class_ids": (count,)}
+    for name, shape in wanted.items():
+        kind = np.uint8 if name == "class_ids" else np.float32
+        if name not in arrays or arrays[name].shape != shape or arrays[name].dtype != kind or not count:
+            got = f"{arrays[name].dtype} {arrays[name].shape}" if name in arrays else "nothing"
+            what, expected = f"tensor {name!r} of an asset has the wrong form", f"{kind.__name__} {shape}"
+            raise InputError(what, where=str(path), expected=expected, got=got)
+        if not np.isfinite(arrays[name]).all():
+            raise InputError(f"tensor {name!r} of an asset holds values that are not finite", where=str(path))
+    ids, known = arrays["class_ids"].astype(np.int64), arrays.get("certainty")
+    length, width, height = header.size_m
+    return Asset(
+        {key: torch.from_numpy(arrays[key].copy()) for key in _SHAPES},
+        np.where(ids < len(CLASSES), ids, -1),
+        None if known is None or known.shape != (count,) else known.astype(np.float32),
+        header.label,
+        (length, width, height),
+        None if header.light_rgb is None else (header.light_rgb[0], header.light_rgb[1], header.light_rgb[2]),
+        tuple(float(a) for a in np.radians(header.seen_deg)),
+        header.origin,
+    )
+
+
+# -- light of the street -----------------------------------------------------------------------------
+
+LIGHT_VIEWS: Final = 8
+LIGHT_WIDTH_PX: Final = 160
+
+
+def surface_light(model: SceneModel, views: Sequence[View]) -> NDArray[np.float64] | None:
+    """Mean light f64[3] of the surfaces that a fitted scene shows, linear: of all pixels but sky, in some recorded
+    views, drawn small. None without views, or where they show nothing."""
+    total, count = np.zeros(3), 0
+    for view in spread(views, LIGHT_VIEWS):
+        width = min(LIGHT_WIDTH_PX, view.camera.width)
+        small = view.resized(width, max(1, round(view.camera.height * width / view.camera.width)))
+        seen = render_view(model, small, raster_of(model))
+        if seen.depth is not None:
+            surface = seen.rgb[:, seen.depth[0] > 0].numpy().astype(np.float64)
+            total, count = total + linear_of(surface).sum(1), count + surface.shape[1]
+    return total / count if count else None
+
+
+def take_light(plan: EditPlan, model: SceneModel) -> None:
+    """Give a plan's new objects, and those that are kept in another street, the light of the street where they will be.
+    ``plan``: with the views of the recording. ``model``: the fitted scene to be edited."""
+    wanting = [name for name, insertion in plan.inserted.items() if insertion.match_light]
+    if not wanting and not plan.match_objects:
+        return
+    here = surface_light(model, plan.views)
+    there = here if plan.background is None else plan.background[0].light_rgb
+    unknown = []
+    for name in wanting:
+        asset = plan.inserted[name].asset
+        unknown += [name] if there is None or asset.light_rgb is None else []
+        plan.inserted[name] = replace(plan.inserted[name], asset=matched_light(asset, there)[0], match_light=False)
+    if plan.match_objects:
+        plan.objects_gain = light_gain(here, there)
+        unknown += [] if here is not None and there is not None else ["what was recorded"]
+    if unknown:
+        why = "for the light of one of the two streets is not known"
+        how = "it takes recorded views: give --scene; export assets with --scene"
+        text = f"{', '.join(unknown)}: the colours stay as they were recorded, {why} ({how})"
+        plan.notes.append({"kind": "light not matched", "ids": unknown, "text": text})
+
+
+# -- weather and light of other times --------------------------------------------------------------
+
+WITNESSES: Final = 8
+"""Recorded views by which the light of a drive is estimated, spread over cameras and time."""
+SEED: Final = 0
+"""Drops and flakes are functions of place, time and this seed: the same in every render of a drive."""
+Drawer = Callable[[View], Observation]
+
+
+def weather_of(draw: Drawer, conditions: Conditions, scene: Scene) -> InWeather:
+    """Weather for all views of a drive, with its light and ground. ``draw``: the views as they are, with depth and
+    classes. ``scene``: its recorded views tell the light of the drive, its path where wheels went and how fast the
+    cameras are. InputError: views without depth or classes."""
+    frames = sorted(scene.frames, key=lambda frame: (frame.view.time_s, frame.view.camera.name))
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(WITNESSES, len(frames))).round().astype(int))
+    witnesses = [_shown(draw(frames[int(index)].view)) for index in chosen]
+    poses = scene.ego.world_from_ego
+    path = np.column_stack([poses[:, 0, 3], poses[:, 1, 3], np.arctan2(poses[:, 1, 0], poses[:, 0, 0])])  # x, y, yaw
+    drive = drive_facts(witnesses, curve_of(conditions.response), path)
+    return InWeather(conditions, drive, SEED, functools.partial(trajectory.velocity, scene.ego))
+
+
+def in_weather(draw: Drawer, how: InWeather) -> Drawer:
+    """What draws a view with the colours of other weather or light; depth, classes and confidence stay as they are.
+    ``draw``: the views as they are, with depth and classes."""
+
+    def drawn(view: View) -> Observation:
+        seen = draw(view)
+        rgb, _ = edited_view(_shown(seen), how.settings, how.seed, how.drive, how.velocity_at(view.time_s))
+        return replace(seen, rgb=torch.from_numpy(np.ascontiguousarray(rgb.transpose(2, 0, 1), np.float32)).clamp(0, 1))
+
+    return drawn
+
+
+def _shown(seen: Observation) -> ShownView:
+    if seen.depth is None or seen.semantics is None:
+        what, got = "weather and light need depth and classes of every view", "views without them"
+        remedy = "fit a scene with labels, or take weather and light out of the script"
+        raise InputError(what, where=seen.source, got=got, remedy=remedy)
+    depth = seen.depth[0].nan_to_num(0.0).numpy().astype(np.float32)
+    return ShownView(seen.view, seen.rgb.permute(1, 2, 0).numpy(), depth, seen.semantics.numpy().astype(np.uint8))

@@ -1,14 +1,14 @@
 """edit: a drive changed as a script says -> an edited fit, or an edited run that every other command takes like any
-other.
+other; and the drive that ``synthesize --edits`` reads in place of the recorded one.
 
-of a fit:              OUT/model.json ... (as ``fit`` writes)
-of a ``mudg run``:     OUT/scene  OUT/fuse  OUT/fit/<method>  OUT/lidar.json what became of LiDAR returns
-of both:               OUT/edits.yaml the script with all defaults   OUT/edit.json what was done, collisions,
-                       seldom-seen sides
-"""
+    of a fit:              OUT/model.json ... (as ``fit`` writes)
+    of a ``mudg run``:     OUT/scene  OUT/fuse  OUT/fit/<method>  OUT/lidar.json what became of LiDAR returns
+    of both:               OUT/edits.yaml the script with all defaults   OUT/edit.json what was done, collisions,
+                           seldom-seen sides"""
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,14 +19,25 @@ from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.raster.place import drawing_device
-from mudg.editing.carried import EditedDrive, carry_out
+from mudg.diffusion.published import is_published
+from mudg.diffusion.settings import SynthesizeConfig
+from mudg.diffusion.synthesize import Drive, JobInputs
+from mudg.diffusion.views import FREEVS, recorded_images
+from mudg.editing.apply import EditedDrive, carry_out, weather_of
 from mudg.editing.harmonised import check_paths, repairing
-from mudg.editing.recorded import DriveChange, EditedImages, write_edited_scene
+from mudg.editing.recorded import (
+    DriveChange,
+    EditedImages,
+    drive_of_edits,
+    photos_of_edited,
+    vacated_at,
+    write_edited_scene,
+)
 from mudg.editing.runs import RunParts
-from mudg.editing.script import EditScript
+from mudg.editing.script import EditScript, conditions_of
 from mudg.editing.settings import EditConfig
-from mudg.editing.weathered import conditions_of
 from mudg.gaussians.model import SceneModel
+from mudg.gaussians.rendering import raster_of, render_view
 from mudg.gaussians.storage import load_model, model_of_scene, save_model
 from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.read import read_scene
@@ -45,66 +56,43 @@ class PlannedEdit:
 
     @classmethod
     def of(cls, config: EditConfig, script: EditScript, parts: RunParts) -> PlannedEdit:
-        """Carry out a script on the parts of a run; nothing is written.
-
-        Raises:
-            InputError: the script asks for what cannot be done. UsageError: repairs of images that there are not.
-        """
+        """Carry out a script on the parts of a run; nothing is written. InputError: the script asks for what cannot be
+        done. UsageError: repairs of images that there are not."""
         loaded = None if parts.scene is None else read_scene(parts.scene)
         model = load_model(parts.model) if loaded is None else model_of_scene(parts.model, loaded)
         drive = carry_out(script, model, loaded, None if parts.fused is None else read_fused(parts.fused))
         if parts.whole and conditions_of(script.canonical()) is not None:
             beams = "its LiDAR sweeps are in fog and rain" if drive.plan.weather_of_beams else "so do its LiDAR sweeps"
-            log.info(
-                f"edit: `mudg render` shows weather and light; images of the edited scene stay as recorded, {beams}"
-            )
+            stay = f"images of the edited scene stay as recorded, {beams}"
+            log.info(f"edit: `mudg render` shows weather and light; {stay}")
         if parts.whole and drive.plan.background is not None:
-            log.info(
-                "edit: all pixels of the edited images are renders; its scene has no LiDAR sweeps, for nobody measured"
-                " that street"
-            )
+            sweeps = "its scene has no LiDAR sweeps, for nobody measured that street"
+            log.info(f"edit: all pixels of the edited images are renders; {sweeps}")
         if config.harmonize.on and not parts.whole:
-            raise UsageError(
-                "a fit by itself has no images to repair",
-                where="--harmonize.on",
-                remedy="edit a whole run, or render the fit with `mudg render --edits ... --harmonize.on`",
-            )
+            remedy = "edit a whole run, or render the fit with `mudg render --edits ... --harmonize.on`"
+            raise UsageError("a fit by itself has no images to repair", where="--harmonize.on", remedy=remedy)
         if config.harmonize.on and loaded is not None:
-            check_paths(
-                config.harmonize,
-                {name: len(loaded.frames_of(name)) for name in loaded.cameras if loaded.frames_of(name)},
-            )
+            frames = {name: len(loaded.frames_of(name)) for name in loaded.cameras}
+            check_paths(config.harmonize, {name: count for name, count in frames.items() if count})
         return cls(script, parts, loaded, model, drive, drive.model(model, keep_ego=not parts.whole))
 
     def write(self, config: EditConfig, work: RunDir) -> dict[str, Any]:
         """Write the edited fit or run, and what was done; returns a summary."""
         out, plan, device = work.path, self.drive.plan, drawing_device(config.device, "render", config.raster)
-        changed: dict[str, Any] = {
-            "changed": list(plan.changes),
-            "removed": plan.removed,
-            "inserted": list(plan.inserted),
-        }
+        changed: dict[str, Any] = {"changed": list(plan.changes), "removed": plan.removed}
+        changed["inserted"] = list(plan.inserted)
         if self.parts.whole and self.scene is not None:
-            images = EditedImages(
-                self.model.to(device), self.edited.to(device), config, plan.moves_ego or plan.background is not None
-            )
+            whole = plan.moves_ego or plan.background is not None
+            images = EditedImages(self.model.to(device), self.edited.to(device), config, whole)
             images = repairing(images, self.drive, self.scene) if config.harmonize.on else images
             changed["lidar"] = _write_run(self.drive, self.parts, self.scene, images, out)
         else:
             save_model(self.edited, out)
         store.write_text(out / "edits.yaml", self.script.text())
         conditions = {verb: settings.model_dump(mode="json") for verb, settings in plan.conditions.items()}
-        store.write_json(
-            out / "edit.json",
-            {
-                "schema": 1,
-                "digest": work.inputs["edits"],
-                **changed,
-                "ego": plan.moves_ego,
-                "conditions": conditions,
-                "notes": self.drive.notes,
-            },
-        )
+        last = {"ego": plan.moves_ego, "conditions": conditions, "notes": self.drive.notes}
+        document = {"schema": 1, "digest": work.inputs["edits"], **changed, **last}
+        store.write_json(out / "edit.json", document)
         return {**changed, "notes": len(self.drive.notes)}
 
 
@@ -135,3 +123,37 @@ def _report_of(parts: RunParts, cloud: FusedCloud) -> dict[str, object]:
     with understood("a report of fused clouds", str(parts.fused / "fuse.json")):
         kept = {key: value for key, value in report.items() if key not in own}
         return {**kept, "tracks": {key: value for key, value in kept.get("tracks", {}).items() if key in cloud.objects}}
+
+
+def edited_scene(script: EditScript, config: SynthesizeConfig, given: JobInputs, scene: Scene) -> Scene:
+    """The scene as the script leaves it. What cannot be done is told here, before anything is written. UsageError: a
+    condition that shows no edits, or an edit that the drive does not allow."""
+    if config.condition == FREEVS:
+        what = "this condition is made of recorded sweeps, which show no edits"
+        remedy = "edit a whole run with `mudg edit` and give its scene"
+        raise UsageError(what, where="--condition", got=FREEVS, remedy=remedy)
+    told = not shows_weather(config, script, given.fitted is not None)
+    fitted = None if given.fitted is None else load_model(given.fitted)
+    return drive_of_edits(script, scene, read_fused(given.fused), fitted, told=told).scene
+
+
+def edited_drive(script: EditScript, config: SynthesizeConfig, given: JobInputs) -> Drive:
+    """The drive as the script leaves it: its scene, clouds and fit, recorded images without what they show wrongly, and
+    its weather."""
+    scene, cloud = read_scene(given.scene), read_fused(given.fused)
+    fit = None if given.fitted is None else load_model(given.fitted)
+    drive = drive_of_edits(script, scene, cloud, fit)
+    conditions, weather = conditions_of(script.canonical()), None
+    if conditions is not None and drive.model is not None and shows_weather(config, script, True):
+        draw = functools.partial(render_view, drive.model, raster=raster_of(drive.model))
+        weather = weather_of(draw, conditions, drive.scene)
+    recorded = photos_of_edited(recorded_images(scene, config), drive.plan)
+    return Drive(drive.scene, drive.cloud, recorded, drive.model, vacated_at(drive.plan), weather)
+
+
+def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:
+    """Whether views are generated in the weather and light of a script: by a published-type model, from points and a
+    reference in that weather, whose distances a fit tells."""
+    conditions = conditions_of(script.canonical())
+    wanted = conditions is not None and conditions.changes_air_ground_or_light and fitted and config.condition == "full"
+    return wanted and is_published(config.model)

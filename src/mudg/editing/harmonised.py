@@ -32,28 +32,20 @@ from mudg.base import log
 from mudg.base.errors import UsageError
 from mudg.base.palette import DYNAMIC_IDS
 from mudg.base.types import FusedCloud, Observation, Photo, Scene, Track, Trajectory, View
-from mudg.diffusion.condition import GROUND_IDS, ConditionRules, determined
-from mudg.diffusion.inputs import ConditionSources, InWeather
+from mudg.diffusion import views as loading
+from mudg.diffusion.condition import GROUND_IDS, ConditionRules, WarpSource, determined
+from mudg.diffusion.inputs import ConditionSources, InWeather, conditions_of
 from mudg.diffusion.published import is_published, window_of
-from mudg.diffusion.requests import StartClip
+from mudg.diffusion.requests import StartClip, generated
 from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
-from mudg.diffusion.views import EDITED_IMAGES_PER_VIEW, ViewMaker, check_config, load_any, recorded_images
-from mudg.editing.carried import EditedDrive
+from mudg.diffusion.views import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_at_pose, recorded_images, windows
+from mudg.editing import recorded as records
+from mudg.editing.apply import EditedDrive
 from mudg.editing.plan import EditPlan
-from mudg.editing.recorded import (
-    CHANGED_ABOVE,
-    GROWN_PX,
-    EditedImages,
-    boxes_mask,
-    cleared_cloud,
-    ground_mask,
-    others,
-    photos_of_edited,
-    touched_boxes,
-    vacated_at,
-)
+from mudg.editing.recorded import EditedImages, boxes_mask, ground_mask, others, touched_boxes, vacated_at
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import FAR_M, raster_of, render_planes, render_view
+from mudg.networks.codec import Modality
 
 DYNAMIC: Final = torch.tensor(sorted(DYNAMIC_IDS), dtype=torch.uint8)
 FEATHER_PX: Final = 3
@@ -70,40 +62,27 @@ PUBLISHED_OVERLAP: Final = 8
 
 
 def settings_of(config: HarmonizeConfig, device: str) -> SynthesizeConfig:
-    """How the model of a configuration samples.
-
-    Raises:
-        UsageError: a published-type model is to leave a render part of the way: it makes its clips from noise alone.
-    """
+    """How the model of a configuration samples. UsageError: a published-type model is to leave a render part of the
+    way: it makes its clips from noise alone."""
     strengths = {"uncovered": config.uncovered, "objects": config.objects, "weather": config.weather}
     partial = [f"--harmonize.{name} {value:g}" for name, value in strengths.items() if 0 < value < 1]
     if partial and is_published(config.model):
-        raise UsageError(
-            "a published-type model makes views from noise: it cannot stay near a render",
-            where=partial[0].split()[0],
-            expected="0 or 1",
-            got=partial[0].split()[1],
-        )
-    return SynthesizeConfig(
-        model=config.model, steps=config.steps, precision=config.precision, seed=config.seed, device=device, processes=1
-    )
+        name, value = partial[0].split()
+        what = "a published-type model makes views from noise: it cannot stay near a render"
+        raise UsageError(what, where=name, expected="0 or 1", got=value)
+    own = {name: getattr(config, name) for name in ("model", "steps", "precision", "seed")}
+    return SynthesizeConfig(**own, device=device, processes=1)
 
 
 def check_paths(config: HarmonizeConfig, frames: Mapping[str, int]) -> None:
     """UsageError for what a published-type model cannot do with paths of so many frames, by name, before anything is
     written."""
     settings_of(config, "cpu")
-    short = {
-        name: count for name, count in frames.items() if is_published(config.model) and count < window_of(config.model)
-    }
-    for name, count in short.items():
-        raise UsageError(
-            "a path is too short for a published-type model, whose clips have a fixed number of frames",
-            where=name,
-            expected=f"at least {window_of(config.model)} frames",
-            got=str(count),
-            remedy="harmonise with a small model",
-        )
+    for name, count in frames.items() if is_published(config.model) else ():
+        if count < (window := window_of(config.model)):
+            what = "a path is too short for a published-type model, whose clips have a fixed number of frames"
+            expected, remedy = f"at least {window} frames", "harmonise with a small model"
+            raise UsageError(what, where=name, expected=expected, got=str(count), remedy=remedy)
 
 
 DrawPair = Callable[[View], tuple[Observation, Observation]]
@@ -128,12 +107,9 @@ class Touched:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EditedSources:
-    """What the diffusion model is told of an edited drive.
-
-    Args:
-        fitted: its fitted scene. cloud: edited clouds, without what was left behind (``cleared_cloud``).
-        tracks: edited boxes. photos: recorded images with the pixels marked that do not show the edited drive.
-    """
+    """What the diffusion model is told of an edited drive. ``fitted``: its fitted scene. ``cloud``: edited clouds,
+    without what was left behind (``cleared_cloud``). ``tracks``: edited boxes. ``photos``: recorded images with the
+    pixels marked that do not show the edited drive."""
 
     fitted: SceneModel
     plan: EditPlan
@@ -143,31 +119,27 @@ class EditedSources:
 
     @classmethod
     def of(cls, drive: EditedDrive, fitted: SceneModel, recorded: Scene) -> EditedSources:
-        """Of a script that was carried out on a scene with its clouds.
-
-        Args:
-            fitted: edited. recorded: the scene as it was.
-        """
+        """Of a script that was carried out on a scene with its clouds; ``fitted``: edited, ``recorded``: as it was."""
         if drive.scene is None or drive.cloud is None:
-            raise UsageError(
-                "the diffusion model needs the fused clouds of the drive",
-                remedy="give --fused, as `mudg fuse` wrote it",
-            )
-        plan, edited, cloud = drive.plan, drive.scene, drive.cloud
-        photos = photos_of_edited(recorded_images(recorded, SynthesizeConfig()), plan)
-        return cls(fitted, plan, cleared_cloud(cloud, plan), edited.tracks, photos)
+            what = "the diffusion model needs the fused clouds of the drive"
+            raise UsageError(what, remedy="give --fused, as `mudg fuse` wrote it")
+        plan, cloud = drive.plan, records.cleared_cloud(drive.cloud, drive.plan)
+        photos = records.photos_of_edited(recorded_images(recorded, SynthesizeConfig()), plan)
+        return cls(fitted, plan, cloud, drive.scene.tracks, photos)
+
+    def conditions(self, rules: ConditionRules, *how: InWeather) -> ConditionSources:
+        """What conditions of views of the drive are made of, in weather if there is some."""
+        render, vacated = functools.partial(render_planes, self.fitted), vacated_at(self.plan)
+        return ConditionSources(self.cloud, self.tracks, self.photos, rules, render, None, vacated, *how)
 
 
 def touched_pixels(plan: EditPlan, view: View, pictures: tuple[Observation, Observation]) -> Touched:
-    """What edits touch in a view.
-
-    Args:
-        pictures: renders of the view without and with the edits.
-    """
+    """What edits touch in a view, of which there are renders without and with the edits."""
     usual, made = pictures
     before, after = (touched_boxes(plan, view.time_s, when) for when in ("before", "after"))
-    differs = ((made.rgb - usual.rgb).abs().amax(0) > CHANGED_ABOVE).numpy()
-    differs = np.asarray(ndimage.binary_dilation(differs, iterations=GROWN_PX), bool) if differs.any() else differs
+    differs = ((made.rgb - usual.rgb).abs().amax(0) > records.CHANGED_ABOVE).numpy()
+    if differs.any():
+        differs = np.asarray(ndimage.binary_dilation(differs, iterations=records.GROWN_PX), bool)
     old_ground, new_box, new_ground = ground_mask(view, before), boxes_mask(view, after), ground_mask(view, after)
     near = new_box | ground_mask(view, after, CONTACT_REACH)
     uncovered = differs & (boxes_mask(view, before) | old_ground) & ~near
@@ -235,50 +207,40 @@ class Harmoniser:
         self, sources: EditedSources, config: HarmonizeConfig, size: tuple[int, int], device: str = "auto"
     ) -> None:
         """``size``: width and height of the views."""
-        self._settings = check_config(settings_of(config, device), fitted=not is_published(config.model))
+        self._settings = loading.check_config(settings_of(config, device), fitted=not is_published(config.model))
         self._sources, self._config = sources, config
-        model = load_any(self._settings)
-        self._overlap = PUBLISHED_OVERLAP if model.points_alone else OVERLAP
+        model = loading.load_any(self._settings)
+        self.window, overlap = model.config.window, PUBLISHED_OVERLAP if model.points_alone else OVERLAP
+        self._overlap = min(overlap, self.window - 1)
         width, height = model.image_size(*size, 0)
-        rules = ConditionRules(
-            width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=model.points_alone
-        )
-        given = ConditionSources(
-            sources.cloud,
-            sources.tracks,
-            sources.photos,
-            rules,
-            functools.partial(render_planes, sources.fitted),
-            None,
-            vacated_at(sources.plan),
-        )
-        self._maker = ViewMaker(model, given, self._settings, None if model.points_alone else self._start_at)
+        alone = model.points_alone
+        rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=alone)
+        self._maker = ViewMaker(model, sources.conditions(rules), self._settings, None if alone else self._start_at)
         self._parts: list[tuple[Observation, Touched]] = []
 
     def _start_at(self, views: Sequence[View]) -> StartClip:
         """The renders of the window that is being made, at the size that the model works at."""
-        size = views[0].camera.height, views[0].camera.width
+        size, config = (views[0].camera.height, views[0].camera.width), self._config
         renders, touched = [part[0] for part in self._parts], [part[1] for part in self._parts]
-        freedom = [
-            self._config.uncovered * (t.uncovered | t.shaded) + self._config.objects * t.objects for t in touched
-        ]
+        freedom = [config.uncovered * (t.uncovered | t.shaded) + config.objects * t.objects for t in touched]
         return start_clip(renders, freedom, size)
 
     def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
         """The views of a path, in order, with the touched pixels repaired. Nothing is generated for a window that edits
         do not touch."""
+        done, tail = 0, dict[Modality, Tensor]()
         parts: dict[int, tuple[Observation, Touched]] = {}
-
-        def touched(span: range) -> bool:
-            nonlocal parts
+        for number, span in enumerate(windows(len(views), self.window, self._overlap)):
             parts = {i: parts[i] if i in parts else self._part(views[i], draw) for i in span}
+            if not any(bool((touched.objects | touched.uncovered).any()) for _, touched in parts.values()):
+                yield from (parts[i][0] for i in span if i >= done)
+                done, tail = span.stop, {}
+                continue
             self._parts = list(parts.values())
-            return any(bool((touched.objects | touched.uncovered).any()) for _, touched in parts.values())
-
-        spans = self._maker.spans(len(views), self._overlap)
-        for number, fresh, made in self._maker.along(views, spans, wanted=touched):
-            start = spans[number].start
-            yield from [parts[i][0] if made is None else self._repaired(*parts[i], made[2][i - start]) for i in fresh]
+            known = {m: z[-(done - span.start) :] for m, z in tail.items()} if tail and done > span.start else None
+            sample, _, generated = self._maker.make([views[i] for i in span], number, known)
+            yield from [self._repaired(*parts[i], generated[i - span.start]) for i in span if i >= done]
+            done, tail = span.stop, sample.latents
 
     def _part(self, view: View, draw: DrawPair) -> tuple[Observation, Touched]:
         usual, made = draw(view)
@@ -299,27 +261,19 @@ class Harmoniser:
 
 
 def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> EditedImages:
-    """The same with every image of an edited run repaired, camera by camera.
-
-    Args:
-        recorded: the scene as it was; the views are those of the edited one.
-    """
+    """The same with every image of an edited run repaired, camera by camera. ``recorded``: the scene as it was; the
+    views are those of the edited one."""
     raster, edited = raster_of(images.before, images.config.raster), drive.scene or recorded
     sources, config = EditedSources.of(drive, images.after, recorded), images.config.harmonize
 
     def draw(view: View) -> tuple[Observation, Observation]:
         return render_view(images.before, view, raster), render_view(images.after, view, raster)
 
-    views = {name: [f.view for f in edited.frames if f.view.camera.name == name] for name in edited.cameras}
-    made = {
-        name: (
-            Harmoniser(sources, config, (mine[0].camera.width, mine[0].camera.height), images.config.device).along(
-                mine, draw
-            )
-        )
-        for name, mine in views.items()
-        if mine
-    }
+    made = {}
+    for name in edited.cameras:
+        if views := [frame.view for frame in edited.frames if frame.view.camera.name == name]:
+            size = views[0].camera.width, views[0].camera.height
+            made[name] = Harmoniser(sources, config, size, images.config.device).along(views, draw)
     return replace(images, repaired=made)
 
 
@@ -351,10 +305,9 @@ class RepairedViews:
         return next(made for own, made in self._left if own is view)
 
 
-# harmonised weather -------------------------------------------------------------------------------
+# -- weather ---------------------------------------------------------------------------------------
 #
 # Views in other weather or light that a published-type diffusion model makes, after the formulas of `core.weather`.
-#
 # The model is given points and a reference image in that weather, as in the paper's figure of edited backgrounds, and
 # makes the view from noise. It works at its own size: what it changes there is enlarged and added to the render, which
 # so keeps its detail. Depth, classes and confidence stay as rendered.
@@ -384,30 +337,30 @@ class WeatherHarmoniser:
         device: str = "auto",
     ) -> None:
         """``size``: width and height of the views."""
-        settings = check_config(replace(settings_of(config, device), full_size=False), fitted=False)
-        model = load_any(settings)
-        width, height = model.image_size(*size, 0)
+        settings = loading.check_config(settings_of(config, device), fitted=False)
+        self._model = loading.load_any(settings)
+        self._request = loading.request_of(settings, loading.half_of(settings) == torch.bfloat16)
+        width, height = self._model.image_size(*size, 0)
         rules = ConditionRules(width, height, *size, images_per_view=EDITED_IMAGES_PER_VIEW, published=True)
-        given = ConditionSources(
-            sources.cloud,
-            sources.tracks,
-            sources.photos,
-            rules,
-            functools.partial(render_planes, sources.fitted),
-            None,
-            vacated_at(sources.plan),
-            how,
-        )
-        self._maker = ViewMaker(model, given, settings)
+        self._given = sources.conditions(rules, how)
+        self._kept: dict[int, WarpSource] = {}
 
     def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
         """The views of a path, in order, corrected; ``draw`` makes each without and with the weather."""
-        spans = self._maker.spans(len(views), PUBLISHED_OVERLAP)
-        for number, fresh, (clip, _, made) in self._maker.along(views, spans):
-            for i in fresh:
-                place, render = i - spans[number].start, draw(views[i])[1]
-                # frame 0 may be the reference, from elsewhere
-                yield corrected(render, clip.rgb[place]) if bool(made[place].mask.all()) else render
+        done, tail = 0, dict[Modality, Tensor]()
+        renders: dict[int, Observation] = {}
+        window = self._model.config.window
+        for number, span in enumerate(windows(len(views), window, min(PUBLISHED_OVERLAP, window - 1))):
+            renders = {i: renders[i] if i in renders else draw(views[i])[1] for i in span}
+            condition = conditions_of(self._given, "full", [views[i] for i in span], self._kept)[0]
+            known = {m: z[-(done - span.start) :] for m, z in tail.items()} if tail and done > span.start else None
+            clip = generated(self._model, condition, replace(self._request, index=number, known=known))
+            elsewhere = not recorded_at_pose(views[span.start], self._given.recorded)  # frame 0 is the reference
+            for i in span:
+                if i >= done:
+                    stays = elsewhere and i == span.start
+                    yield renders[i] if stays else corrected(renders[i], clip.rgb[i - span.start])
+            done, tail = span.stop, clip.latents
 
 
 def corrected(render: Observation, made: Tensor) -> Observation:

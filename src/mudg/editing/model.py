@@ -55,23 +55,15 @@ def motion_of(node: RigidNode) -> Motion:
 
 def node_along(node: RigidNode, motion: Motion) -> RigidNode:
     """The same object on another path; what its rows do inside the box is that of the moments that the path shows (a
-    ``DeformedNode``: of the time itself).
-
-    Raises:
-        InputError: an object on curves, whose Gaussians have places along the recorded path.
-    """
+    ``DeformedNode``: of the time itself). InputError: an object on curves, whose Gaussians have places along the
+    recorded path."""
     if isinstance(node, BezierNode):
-        raise InputError(
-            "an object that was fitted on curves cannot take another path",
-            got=node.name,
-            remedy="remove or replace it, or use a fit with boxes (mudg_s, street_gaussians)",
-        )
+        what = "an object that was fitted on curves cannot take another path"
+        remedy = "remove or replace it, or use a fit with boxes (mudg_s, street_gaussians)"
+        raise InputError(what, got=node.name, remedy=remedy)
     shown = np.interp(motion.source_s, node.times_s, np.arange(len(node.times_s), dtype=np.float64))
-    columns = {
-        name: _at_keys(node.offsets[name].detach(), shown)
-        for name in node.offsets.columns
-        if name not in ("shift", "yaw")
-    }
+    names = [name for name in node.offsets.columns if name not in ("shift", "yaw")]
+    columns = {name: _at_keys(node.offsets[name].detach(), shown) for name in names}
     zero = torch.zeros(len(shown), device=node.offsets.device)
     offsets = Table({"shift": zero[:, None].repeat(1, 3), "yaw": zero, **columns})
     made = type(node)(node.name, node.label, node.size_m, motion.times_s, motion.poses, offsets, node.learn_pose)
@@ -89,16 +81,11 @@ def _at_keys(values: Tensor, shown: NDArray[np.float64]) -> Tensor:
 
 
 def with_motions(model: SceneModel, motions: Mapping[str, Motion]) -> SceneModel:
-    """A copy with some objects on other paths; it shares the table of Gaussians.
-
-    Raises:
-        UsageError: an object that the scene has no node for.
-    """
+    """A copy with some objects on other paths; it shares the table of Gaussians. UsageError: an object that the scene
+    has no node for."""
     wanted = {model.dynamic_object(name).name for name in motions}
-    nodes = tuple(
-        node_along(node, motions[node.name]) if isinstance(node, RigidNode) and node.name in wanted else node
-        for node in model.nodes
-    )
+    other = lambda node: isinstance(node, RigidNode) and node.name in wanted  # noqa: E731
+    nodes = tuple(node_along(node, motions[node.name]) if other(node) else node for node in model.nodes)
     return replace(model, nodes=nodes, facts=dict(model.facts))
 
 
@@ -124,9 +111,8 @@ def ground_points(model: SceneModel) -> NDArray[np.float32]:
 def lowest_points(model: SceneModel) -> NDArray[np.float32]:
     """Centres f32[M, 3] of the solid Gaussians of the background that are the lowest fifth of their square metre: the
     ground, where no class says what it is."""
-    rows = (model.table.labels["node"] == 0).cpu().numpy() & (
-        torch.sigmoid(model.table["logits"].detach()).cpu().numpy() > SOLID_OPACITY
-    )
+    solid = torch.sigmoid(model.table["logits"].detach()).cpu().numpy() > SOLID_OPACITY
+    rows = (model.table.labels["node"] == 0).cpu().numpy() & solid
     means = model.table["means"].detach().cpu().numpy()[rows]
     cells = np.floor(means[:, :2]).astype(np.int64)
     order = np.lexsort((means[:, 2], cells[:, 1], cells[:, 0]))
@@ -137,36 +123,22 @@ def lowest_points(model: SceneModel) -> NDArray[np.float32]:
 
 def cut_out(model: SceneModel, track: Track) -> SceneModel:
     """A copy in which what stands in a box of the background is an object of its own, which can be moved or taken away.
-
-    Args:
-        track: a box that stands; its middle pose counts.
-
-    Raises:
-        UsageError: nothing of the background lies in the box, or the background changes with time.
-    """
+    ``track``: a box that stands; its middle pose counts. UsageError: nothing of the background lies in the box, or the
+    background changes with time."""
     if model.nodes[0].kind != "static":
-        raise UsageError(
-            "nothing can be cut out of a background that changes with time",
-            where=f"track {track.id!r}",
-            expected="a fit of mudg_s or street_gaussians",
-            got=f"a background of kind {model.nodes[0].kind}",
-        )
+        what, where = "nothing can be cut out of a background that changes with time", f"track {track.id!r}"
+        got = f"a background of kind {model.nodes[0].kind}"
+        raise UsageError(what, where=where, expected="a fit of mudg_s or street_gaussians", got=got)
     pose = track.world_from_object[len(track.times_s) // 2]
     table = model.table
     local = geometry.transform_points(geometry.invert(pose), table["means"].detach().cpu().numpy().astype(np.float64))
-    half = track.size_m / 2 + CUT_MARGIN_M
-    inside = (
-        (np.abs(local[:, :2]) <= half[:2]).all(1) & (local[:, 2] <= half[2]) & (local[:, 2] >= -track.size_m[2] / 2)
-    )
-    low = local[:, 2] < -track.size_m[2] / 2 + CUT_FLOOR_M
-    ids = classes_of_rows(model)
+    half, floor = track.size_m / 2 + CUT_MARGIN_M, -track.size_m[2] / 2
+    inside = (np.abs(local[:, :2]) <= half[:2]).all(1) & (local[:, 2] <= half[2]) & (local[:, 2] >= floor)
+    low, ids = local[:, 2] < floor + CUT_FLOOR_M, classes_of_rows(model)
     inside &= ~np.isin(ids, GROUND_CLASSES) & ~(low & (ids < 0)) & (table.labels["node"] == 0).cpu().numpy()
     if not inside.any():
-        raise UsageError(
-            "nothing of the fitted background lies in this box",
-            where=f"track {track.id!r}",
-            remedy="the fit did not see it; leave it out of the script",
-        )
+        what, remedy = "nothing of the fitted background lies in this box", "leave it out of the script"
+        raise UsageError(what, where=f"track {track.id!r}", remedy=f"the fit did not see it; {remedy}")
     rows = torch.from_numpy(np.flatnonzero(inside)).to(model.device)
     columns = {name: value.detach().clone() for name, value in table.columns.items()}
     turn = torch.from_numpy(geometry.quaternion_from_matrix(geometry.invert(pose))).float().to(model.device)
@@ -178,12 +150,8 @@ def cut_out(model: SceneModel, track: Track) -> SceneModel:
     owner = table.labels["node"].clone()
     owner[rows] = len(model.nodes)
     node = RigidNode(track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object)
-    made = replace(
-        model,
-        table=Table(columns, {**table.labels, "node": owner}),
-        nodes=(*model.nodes, node.to(model.device)),
-        facts=dict(model.facts),
-    )
+    nodes = (*model.nodes, node.to(model.device))
+    made = replace(model, table=Table(columns, {**table.labels, "node": owner}), nodes=nodes, facts=dict(model.facts))
     made.sort_rows()
     return made
 
@@ -204,9 +172,8 @@ def with_background(model: SceneModel, other: SceneModel, world_from_other: NDAr
     """
     for scene in (model, other):
         if scene.nodes[0].kind != "static":
-            raise UsageError(
-                "a background that changes with time cannot be exchanged", got=f"kind {scene.nodes[0].kind}"
-            )
+            what = "a background that changes with time cannot be exchanged"
+            raise UsageError(what, got=f"kind {scene.nodes[0].kind}")
     there, mine = model.device, (model.table.labels["node"] > 0).nonzero()[:, 0]
     rows = (other.table.labels["node"] == 0).nonzero()[:, 0]
     given = {name: value.detach()[rows].cpu() for name, value in other.table.columns.items()}
@@ -220,20 +187,16 @@ def with_background(model: SceneModel, other: SceneModel, world_from_other: NDAr
             if train_id in other.classes:
                 channels[:, channel] = given["semantics"][:, other.classes.index(train_id)]
         columns["semantics"] = channels
-    labels = {
-        key: torch.zeros(len(rows), *value.shape[1:], dtype=value.dtype) for key, value in model.table.labels.items()
-    }
+    blank = lambda value, **kind: torch.zeros(len(rows), *value.shape[1:], **kind)  # noqa: E731
+    labels = {key: blank(value, dtype=value.dtype) for key, value in model.table.labels.items()}
     if CERTAINTY in labels and other.certainty is not None:
         labels[CERTAINTY] = other.certainty[rows].cpu().to(labels[CERTAINTY].dtype)
-    table = Table(
-        {
-            name: torch.cat(
-                [columns.get(name, torch.zeros(len(rows), *value.shape[1:])).to(there), value.detach()[mine]]
-            )
-            for name, value in model.table.columns.items()
-        },
-        {key: torch.cat([labels[key].to(there), value[mine]]) for key, value in model.table.labels.items()},
-    )
+    joined = {}
+    for name, value in model.table.columns.items():
+        street = columns[name] if name in columns else blank(value)
+        joined[name] = torch.cat([street.to(there), value.detach()[mine]])
+    joined_labels = {key: torch.cat([labels[key].to(there), v[mine]]) for key, v in model.table.labels.items()}
+    table = Table(joined, joined_labels)
     sky = None
     if other.sky is not None:
         shift = round(geometry.yaw_of(world_from_other) / np.pi * other.sky.rows)
@@ -280,17 +243,13 @@ def asset_of(
     origin: str = "",
     light_rgb: NDArray[np.float64] | None = None,
 ) -> Asset:
-    """An object of a fitted scene. What deforms is taken as it is in the middle of its track.
-
-    Raises:
-        UsageError: no such object.
-    """
+    """An object of a fitted scene. What deforms is taken as it is in the middle of its track. UsageError: no such
+    object."""
     node = model.dynamic_object(name)
     index = model.nodes.index(node)
     rows = (model.table.labels["node"] == index).nonzero()[:, 0]
-    columns = {
-        key: model.table[key].detach()[rows].cpu() for key in ("means", "quats", "log_scales", "logits", "sh_dc")
-    }
+    names = ("means", "quats", "log_scales", "logits", "sh_dc")
+    columns = {key: model.table[key].detach()[rows].cpu() for key in names}
     if type(node) is not RigidNode:
         columns |= _shape_at_middle(model, node, rows)
     known = model.certainty
@@ -312,13 +271,8 @@ def _shape_at_middle(model: SceneModel, node: RigidNode, rows: Tensor) -> dict[s
     """Places and rotations of an object's Gaussians in the middle of its track, in the frame of its box, on the CPU."""
     own = {name: value.detach()[rows] for name, value in model.table.columns.items()}
     time_s = float(node.times_s[len(node.times_s) // 2])
-    given = NodeRows(
-        own["means"],
-        own["quats"],
-        torch.sigmoid(own["logits"]),
-        own["sh_dc"],
-        {name: value for name, value in own.items() if name not in COLUMNS},
-    )
+    further = {name: value for name, value in own.items() if name not in COLUMNS}
+    given = NodeRows(own["means"], own["quats"], torch.sigmoid(own["logits"]), own["sh_dc"], further)
     now, pose = node.at_time(given, time_s), node.pose_matrix(time_s)
     if now is None or pose is None:
         return {}
@@ -378,23 +332,16 @@ def with_relit_objects(model: SceneModel, gain: NDArray[np.float64]) -> SceneMod
     new = torch.where(mine[:, None, None], relit(old, gain), old)
     columns = {**{name: value.detach() for name, value in table.columns.items()}, "sh_dc": new}
     if "sh_rest" in columns:
-        shown = [(0.5 + SH_C0 * value).clamp(min=1 / 255) for value in (old, new)]
-        columns["sh_rest"] = torch.where(
-            mine[:, None, None], columns["sh_rest"] * (shown[1] / shown[0]), columns["sh_rest"]
-        )
+        shown, rest = [(0.5 + SH_C0 * value).clamp(min=1 / 255) for value in (old, new)], columns["sh_rest"]
+        columns["sh_rest"] = torch.where(mine[:, None, None], rest * (shown[1] / shown[0]), rest)
     return replace(model, table=Table(columns, dict(table.labels)), facts=dict(model.facts))
 
 
 def with_asset(model: SceneModel, asset: Asset, name: str, motion: Motion, label: str = "") -> SceneModel:
-    """A copy with an object more, on a path.
-
-    Raises:
-        UsageError: the scene has an object of that name.
-    """
+    """A copy with an object more, on a path. UsageError: the scene has an object of that name."""
     if name in model.node_names():
-        raise UsageError(
-            "there is an object of this name already", got=name, remedy="give the inserted object another id"
-        )
+        what, remedy = "there is an object of this name already", "give the inserted object another id"
+        raise UsageError(what, got=name, remedy=remedy)
     table, count = model.table, len(asset)
     columns: dict[str, Tensor] = dict(asset.columns)
     if "semantics" in table.columns:
@@ -445,11 +392,9 @@ def with_shadow(model: SceneModel, name: str, strength: float, sun: NDArray[np.f
     """
     node = model.dynamic_object(name)
     index, (length, width, height) = model.nodes.index(node), node.size_m
-    toward = (
-        None
-        if sun is None
-        else node.corrected_keys(slice(len(node.times_s) // 2, len(node.times_s) // 2 + 1))[0, :3, :3].T @ sun
-    )
+    toward, middle = None, len(node.times_s) // 2
+    if sun is not None:
+        toward = node.corrected_keys(slice(middle, middle + 1))[0, :3, :3].T @ sun
     xy, share = _covered(np.array([length, width, height]), toward)
     spread = SHADOW_STEP_M
     # Overlapping Gaussians of opacity a on a grid of step s and spread s pass exp(-2 pi a) of the light, nearly.
@@ -487,17 +432,13 @@ def _covered(
     share = (edge / (2 * blur + 1e-6)).clip(0, 1).prod(1)
     if sun is None:
         return xy, share
-    around = (
-        np.array([[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [0.7, 0.7], [-0.7, 0.7], [0.7, -0.7], [-0.7, -0.7]])
-        * blur
-    )
+    around = [[0.0, 0], [1, 0], [-1, 0], [0, 1], [0, -1], [0.7, 0.7], [-0.7, 0.7], [0.7, -0.7], [-0.7, -0.7]]
     hidden = np.zeros(len(xy))
     beam = (sun / np.linalg.norm(sun))[None]
-    for x, y in around:
-        place = np.column_stack([xy + [x, y], np.full(len(xy), -height / 2)])
-        hidden += [
-            np.isfinite(met_box(beam, geometry.from_rotation_translation(np.eye(3), -at), size)[0]) for at in place
-        ]
+    for x, y in np.array(around) * blur:
+        places = np.column_stack([xy + [x, y], np.full(len(xy), -height / 2)])
+        poses = (geometry.from_rotation_translation(np.eye(3), -place) for place in places)
+        hidden += [np.isfinite(met_box(beam, pose, size)[0]) for pose in poses]
     share = np.maximum(share, hidden / len(around))
     return xy[share > 0], share[share > 0]
 

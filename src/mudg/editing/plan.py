@@ -76,24 +76,22 @@ class Actor:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EditWorld:
-    """What a script can speak of.
-
-    Args:
-        actors: by id. ego: path of the vehicle, None where only a fitted scene is given. ground: None = heights are not
-            known.
-    """
+    """What a script can speak of. ``actors``: by id. ``ego``: path of the vehicle, None where only a fitted scene is
+    given. ``ground``: None = heights are not known."""
 
     actors: Mapping[str, Actor]
     ego: Motion | None = None
     ground: HeightMap | None = None
 
+    def pose_of(self, name: str, time_s: float) -> NDArray[np.float64] | None:
+        """world_from_box f64[4, 4] of an actor at a time; None where it is not there."""
+        return self.actors[name].motion.pose_at(time_s) if name in self.actors else None
+
     @classmethod
     def of_scene(cls, scene: Scene, ground: HeightMap | None) -> EditWorld:
         """All boxes of a scene and its vehicle."""
-        actors = {
-            track.id: Actor(track.label, _three(track.size_m), Motion.recorded(track.times_s, track.world_from_object))
-            for track in scene.tracks
-        }
+        motion = lambda track: Motion.recorded(track.times_s, track.world_from_object)  # noqa: E731
+        actors = {track.id: Actor(track.label, _three(track.size_m), motion(track)) for track in scene.tracks}
         return cls(actors, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground)
 
     @classmethod
@@ -168,12 +166,8 @@ _DISPLACING: Final = frozenset({"move", "stop", "speed", "lane_change", "path"})
 
 
 def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> EditPlan:
-    """Carry out a script on paths.
-
-    Raises:
-        InputError: an id that does not exist, or something that cannot be done; the message names the line and the
-            verb.
-    """
+    """Carry out a script on paths. InputError: an id that does not exist, or something that cannot be done; the message
+    names the line and the verb."""
     plan = EditPlan(world, world, conditions=script.conditions())
     for edit in script.edits:
         if edit.verb in plan.conditions:
@@ -186,12 +180,10 @@ def plan_edits(script: EditScript, world: EditWorld, sources: EditSources) -> Ed
         except (InputError, UsageError) as problem:
             raise _located(problem, edit) from problem
     plan.closed = {name for name in plan.closed if _left_its_place(plan, name)}
-    others = (
-        set(plan.before.actors) & set(plan.after.actors) - set(plan.changes) - set(plan.inserted)
-        if EGO in plan.sides
-        else set()
-    )
-    plan.sides = plan.sides & set(plan.changes) - {EGO} | others  # from another path of the vehicle, all are seen anew
+    others = set[str]()
+    if EGO in plan.sides:  # from another path of the vehicle, all are seen anew
+        others = set(plan.before.actors) & set(plan.after.actors) - set(plan.changes) - set(plan.inserted)
+    plan.sides = plan.sides & set(plan.changes) - {EGO} | others
     return plan
 
 
@@ -243,19 +235,15 @@ def _chosen(world: EditWorld, given: Any) -> list[str]:
             names.append(name)
     if not names:
         labels = ", ".join(sorted({actor.label for actor in world.actors.values()}))
-        raise InputError(
-            "no object is of this kind",
-            expected=f"class among {labels or 'none'}",
-            got=str(given.model_dump(exclude_none=True, by_alias=True)),
-        )
+        got = str(given.model_dump(exclude_none=True, by_alias=True))
+        raise InputError("no object is of this kind", expected=f"class among {labels or 'none'}", got=got)
     return names
 
 
 def _nearest_m(world: EditWorld, actor: Actor) -> float:
     if world.ego is None:
-        raise InputError(
-            "the vehicle's path is not known, so nothing is near it", where="within_m", remedy="give --scene"
-        )
+        what = "the vehicle's path is not known, so nothing is near it"
+        raise InputError(what, where="within_m", remedy="give --scene")
     apart = actor.motion.poses[:, None, :2, 3] - world.ego.poses[None, :, :2, 3]
     return float(np.linalg.norm(apart, axis=-1).min())
 
@@ -274,14 +262,8 @@ def _speed(plan: EditPlan, given: Any, _: EditSources) -> None:
     begin = float(motion.times_s[0]) if given.from_s is None else max(given.from_s, float(motion.times_s[0]))
     ahead = max(0.0, (given.factor - 1) * (float(motion.times_s[-1]) - begin))
     if ahead > 0:
-        plan.notes.append(
-            {
-                "kind": "beyond the recording",
-                "id": given.id,
-                "seconds": round(ahead, 3),
-                "text": f"{given.id} goes on straight for {ahead:.1f} s of its recording that do not exist",
-            }
-        )
+        text = f"{given.id} goes on straight for {ahead:.1f} s of its recording that do not exist"
+        plan.notes.append({"kind": "beyond the recording", "id": given.id, "seconds": round(ahead, 3), "text": text})
     _change(plan, given.id, functools.partial(paths.sped, factor=given.factor, from_s=given.from_s))
 
 
@@ -289,29 +271,15 @@ def _lane_change(plan: EditPlan, given: Any, _: EditSources) -> None:
     peak = paths.QUINTIC_PEAK * abs(given.left_m) / given.duration_s**2
     if peak > given.most_lateral_m_s2:
         least = math.sqrt(paths.QUINTIC_PEAK * abs(given.left_m) / given.most_lateral_m_s2)
-        raise InputError(
-            "the lane change is too sharp",
-            where="duration_s",
-            expected=f"at most {given.most_lateral_m_s2:g} m/s^2 sideways",
-            got=f"{peak:.2f} m/s^2 ({given.left_m:g} m in {given.duration_s:g} s)",
-            remedy=f"a duration_s of {math.ceil(least * 100) / 100:g} or more, or a larger most_lateral_m_s2",
-        )
-    plan.notes.append(
-        {
-            "kind": "lateral acceleration",
-            "id": given.id,
-            "m_s2": round(peak, 3),
-            "text": f"{given.id} changes lanes with at most {peak:.2f} m/s^2 sideways",
-        }
-    )
+        expected = f"at most {given.most_lateral_m_s2:g} m/s^2 sideways"
+        got = f"{peak:.2f} m/s^2 ({given.left_m:g} m in {given.duration_s:g} s)"
+        remedy = f"a duration_s of {math.ceil(least * 100) / 100:g} or more, or a larger most_lateral_m_s2"
+        raise InputError("the lane change is too sharp", where="duration_s", expected=expected, got=got, remedy=remedy)
+    text = f"{given.id} changes lanes with at most {peak:.2f} m/s^2 sideways"
+    plan.notes.append({"kind": "lateral acceleration", "id": given.id, "m_s2": round(peak, 3), "text": text})
+    by = {name: getattr(given, name) for name in ("left_m", "start_s", "duration_s")}
     ground = plan.after.ground if given.ground else None
-    _change(
-        plan,
-        given.id,
-        functools.partial(
-            paths.lane_changed, left_m=given.left_m, start_s=given.start_s, duration_s=given.duration_s, ground=ground
-        ),
-    )
+    _change(plan, given.id, functools.partial(paths.lane_changed, **by, ground=ground))
 
 
 def _path(plan: EditPlan, given: Any, _: EditSources) -> None:
@@ -351,11 +319,9 @@ def _insert(plan: EditPlan, given: Any, sources: EditSources) -> None:
     asset, world = sources.asset(given.asset), plan.after
     name = given.id or _free_name(world, given.class_ or asset.label)
     if name in world.actors:
-        raise InputError(
-            "there is an object of this id already", where="id", got=name, remedy="give the new one another id"
-        )
-    ground = world.ground if given.ground else None
-    height = asset.size_m[2] / 2
+        what, remedy = "there is an object of this id already", "give the new one another id"
+        raise InputError(what, where="id", got=name, remedy=remedy)
+    ground, height = world.ground if given.ground else None, asset.size_m[2] / 2
     if given.path is not None:
         points = _points(given.path)
         if len(points) == 1:
@@ -363,9 +329,8 @@ def _insert(plan: EditPlan, given: Any, sources: EditSources) -> None:
         motion = paths.along_points(points, height, ground, _floor(world))
     else:
         motion = _near(world, given.near, height, ground)
-    plan.inserted[name] = Insertion(
-        asset, given.shadow, given.match_light, None if given.sun is None else _toward(given.sun)
-    )
+    sun = None if given.sun is None else _toward(given.sun)
+    plan.inserted[name] = Insertion(asset, given.shadow, given.match_light, sun)
     plan.after = replace(world, actors={**world.actors, name: Actor(given.class_ or asset.label, asset.size_m, motion)})
 
 
@@ -373,16 +338,12 @@ def _free_name(world: EditWorld, label: str) -> str:
     return next(name for i in range(1, len(world.actors) + 2) if (name := f"{label}-new{i}") not in world.actors)
 
 
-def _span(world: EditWorld) -> tuple[float, float]:
+def _at_all_times(point: np.ndarray, world: EditWorld) -> np.ndarray:
+    """A place with a heading, from the first to the last moment of the drive."""
     motions = [*(actor.motion for actor in world.actors.values()), *([] if world.ego is None else [world.ego])]
     if not motions:
         raise InputError("the times of the drive are not known", remedy="give --scene")
-    return min(float(m.times_s[0]) for m in motions), max(float(m.times_s[-1]) for m in motions)
-
-
-def _at_all_times(point: np.ndarray, world: EditWorld) -> np.ndarray:
-    """A place with a heading, from the first to the last moment of the drive."""
-    first, last = _span(world)
+    first, last = min(float(m.times_s[0]) for m in motions), max(float(m.times_s[-1]) for m in motions)
     still = np.tile(point, (2, 1))
     still[:, 0], still[:, 3] = (first, max(last, first + 1e-3)), np.nan_to_num(point[3])
     return still
@@ -401,12 +362,8 @@ def _near(world: EditWorld, given: Any, height: float, ground: HeightMap | None)
     if given.at_s is not None:
         pose = placed.pose_at(given.at_s)
         if pose is None:
-            raise InputError(
-                "nobody is there at this time",
-                where="near.at_s",
-                got=f"{given.at_s} s",
-                expected=f"{leader.times_s[0]:.2f}..{leader.times_s[-1]:.2f} s",
-            )
+            got, expected = f"{given.at_s} s", f"{leader.times_s[0]:.2f}..{leader.times_s[-1]:.2f} s"
+            raise InputError("nobody is there at this time", where="near.at_s", got=got, expected=expected)
         points = np.array([[0.0, *pose[:2, 3], geometry.yaw_of(pose)]])
         return paths.along_points(_at_all_times(points[0], world), height, ground, _floor(world))
     yaws = np.unwrap([geometry.yaw_of(pose) for pose in placed.poses])
@@ -443,35 +400,24 @@ def place_background(world: EditWorld, other: Background) -> np.ndarray:
     path of ours."""
     if world.ego is None or world.ground is None:
         raise InputError("where the other street belongs is not known", remedy="give --scene")
-    mine, theirs = (_level(motion.poses[0]) for motion in (world.ego, other.ego))
-    pose = mine @ geometry.invert(theirs)
+    # without pitch and roll
+    level = lambda pose: geometry.yaw_matrix(geometry.yaw_of(pose), pose[:3, 3])  # noqa: E731
+    pose = level(world.ego.poses[0]) @ geometry.invert(level(other.ego.poses[0]))
     xy = world.ego.poses[:, :2, 3]
     there = HeightMap.from_points(geometry.transform_points(pose, other.ground_xyz))
     pose[2, 3] += float(np.nan_to_num(np.nanmedian(np.append(world.ground.height(xy) - there.height(xy), np.nan))))
     return pose
 
 
-def _level(pose: np.ndarray) -> np.ndarray:
-    """A pose without pitch and roll."""
-    return geometry.yaw_matrix(geometry.yaw_of(pose), pose[:3, 3])
-
-
 def _seams(world: EditWorld, ground: HeightMap) -> list[dict[str, Any]]:
     """Paths that leave the known ground of the other street."""
-    motions = {
-        **{name: actor.motion for name, actor in world.actors.items()},
-        **({} if world.ego is None else {EGO: world.ego}),
-    }
+    motions = {name: actor.motion for name, actor in world.actors.items()}
+    motions |= {} if world.ego is None else {EGO: world.ego}
     shares = {name: float(np.isnan(ground.height(motion.poses[:, :2, 3])).mean()) for name, motion in motions.items()}
     off = {name: round(share, 3) for name, share in shares.items() if share > 0.05}
     text = ", ".join(f"{name} ({share:.0%})" for name, share in off.items())
-    note = {
-        "kind": "off the ground",
-        "ids": list(off),
-        "shares": off,
-        "text": f"part of a path is off the other street's ground: {text}",
-    }
-    return [note] if off else []
+    text = f"part of a path is off the other street's ground: {text}"
+    return [{"kind": "off the ground", "ids": list(off), "shares": off, "text": text}] if off else []
 
 
 def _sky(plan: EditPlan, given: Any, _: EditSources) -> None:
@@ -498,15 +444,10 @@ _VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
 def _actor(world: EditWorld, name: str) -> Actor:
     if name in world.actors:
         return world.actors[name]
-    near = nearest(name, world.actors)
-    known = ", ".join(list(world.actors)[:20]) + (", ..." if len(world.actors) > 20 else "")
-    raise InputError(
-        "there is no object of this id",
-        where="id",
-        expected=f"ego, or one of {known or 'none'}",
-        got=name,
-        remedy=f"did you mean {near!r}?" if near else "tracks.json of the scene lists them",
-    )
+    near, shown = nearest(name, world.actors), ", ".join(list(world.actors)[:20])
+    expected = f"ego, or one of {shown or 'none'}" + (", ..." if len(world.actors) > 20 else "")
+    remedy = f"did you mean {near!r}?" if near else "tracks.json of the scene lists them"
+    raise InputError("there is no object of this id", where="id", expected=expected, got=name, remedy=remedy)
 
 
 def _motion(world: EditWorld, name: str) -> Motion:
@@ -530,9 +471,8 @@ def _change(plan: EditPlan, name: str, change: Change) -> None:
 def _toward(sun: Any) -> np.ndarray:
     """Unit vector f64[3] towards the sun."""
     azimuth, elevation = math.radians(sun.azimuth_deg), math.radians(sun.elevation_deg)
-    return np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
-    )
+    flat = math.cos(elevation)
+    return np.array([flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)])
 
 
 def _three(size_m: Any) -> tuple[float, float, float]:
@@ -540,12 +480,7 @@ def _three(size_m: Any) -> tuple[float, float, float]:
     return length, width, height
 
 
-# checks -------------------------------------------------------------------------------------------
-#
-# What a reader of an edited drive should know: collisions, and sides of objects that the recording hardly saw. With
-# numbers.
-
-
+# -- checks ----------------------------------------------------------------------------------------
 Array = NDArray[np.float64]
 STEP_S: Final = 0.1
 LEAST_OVERLAP_M: Final = 0.05
@@ -562,10 +497,7 @@ ANOTHER_SIDE_RAD: Final = np.radians(3.0)
 
 def check(plan: EditPlan, views_before: Sequence[View], views_after: Sequence[View]) -> list[dict[str, Any]]:
     """Notes of a plan and what its checks found, each with ``kind``, ids, numbers and a sentence ``text``.
-
-    Args:
-        views_before: recorded views. views_after: the same with the edited path of the vehicle.
-    """
+    ``views_before``: recorded views. ``views_after``: the same with the edited path of the vehicle."""
     return [*plan.notes, *collisions(plan), *unseen_sides(plan, views_before, views_after)]
 
 
@@ -582,19 +514,12 @@ def collisions(plan: EditPlan) -> list[dict[str, Any]]:
             done.add(frozenset((name, other)))
             depth, at_s = _deepest(after[name], after[other])
             known = name in before and other in before and name not in plan.inserted and other not in plan.inserted
-            if depth < LEAST_OVERLAP_M or (
-                known and depth <= _deepest(before[name], before[other])[0] + LEAST_OVERLAP_M
-            ):
+            before_m = _deepest(before[name], before[other])[0] if known else -np.inf
+            if depth < LEAST_OVERLAP_M or depth <= before_m + LEAST_OVERLAP_M:
                 continue
-            found.append(
-                {
-                    "kind": "collision",
-                    "ids": [name, other],
-                    "overlap_m": round(depth, 3),
-                    "at_s": round(at_s, 3),
-                    "text": f"{name} and {other} overlap by {depth:.2f} m at {at_s:.2f} s",
-                }
-            )
+            text = f"{name} and {other} overlap by {depth:.2f} m at {at_s:.2f} s"
+            numbers = {"overlap_m": round(depth, 3), "at_s": round(at_s, 3)}
+            found.append({"kind": "collision", "ids": [name, other], **numbers, "text": text})
     return found
 
 
@@ -645,20 +570,10 @@ def unseen_sides(plan: EditPlan, views_before: Sequence[View], views_after: Sequ
         if share < LEAST_SHARE:
             continue
         largest = float(np.degrees(apart.max()))
-        found.append(
-            {
-                "kind": "seldom-seen side",
-                "ids": [name],
-                "share": round(share, 3),
-                "largest_deg": round(largest, 1),
-                "text": (
-                    f"{name}: {share:.0%} of its views look at sides that the recording saw from more than 30 degrees"
-                    f" away (up to {largest:.0f})"
-                    if len(seen)
-                    else f"{name}: the recording never shows it"
-                ),
-            }
-        )
+        sides = f"{share:.0%} of its views look at sides that the recording saw from more than 30 degrees away"
+        text = f"{name}: {sides} (up to {largest:.0f})" if len(seen) else f"{name}: the recording never shows it"
+        numbers = {"share": round(share, 3), "largest_deg": round(largest, 1)}
+        found.append({"kind": "seldom-seen side", "ids": [name], **numbers, "text": text})
     return found
 
 

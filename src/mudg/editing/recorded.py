@@ -27,29 +27,23 @@ from mudg.core.edit import HeightMap, Motion
 from mudg.core.pictures import to_bytes
 from mudg.core.weather.lidar import SOFT, sweep_in_weather
 from mudg.diffusion.condition import Vacated, VacatedAt, ray_directions
-from mudg.editing.apply import edited_cloud, edited_scene
-from mudg.editing.carried import carry_out, opener
+from mudg.editing.apply import SEED, carry_out, edited_cloud, edited_scene, opener
 from mudg.editing.model import GROUND_CLASSES
 from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, plan_edits
-from mudg.editing.script import EditScript
+from mudg.editing.script import EditScript, conditions_of
 from mudg.editing.settings import EditConfig
 from mudg.editing.street import FLOOR_M, STRAY_M
-from mudg.editing.weathered import SEED, conditions_of
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points
 from mudg.scene.write import SceneWriter
 
-# swept --------------------------------------------------------------------------------------------
+# -- LiDAR sweeps ----------------------------------------------------------------------------------
 #
-# LiDAR sweeps of an edited drive: beams that met what is gone go on, and meet what is new.
-#
-# The beams of a sweep are those that came back in the recording, from the place of the sensor at the sweep's time.
-# Directions from which nothing came back (the sky) are not known, so an object in front of the sky gets no returns
-# there.
-
-
+# Beams that met what is gone go on, and meet what is new. The beams of a sweep are those that came back in the
+# recording, from the place of the sensor at the sweep's time. Directions from which nothing came back (the sky) are not
+# known, so an object in front of the sky gets no returns there.
 BOX_MARGIN_M: Final = 0.1
 BEHIND_M: Final = 20.0
 """Ground is taken to go on behind a removed object this far; what stands farther behind it is not known."""
@@ -84,11 +78,8 @@ class SweptCounts:
 def edited_points(
     points: SweepPoints, sweep: Sweep, plan: EditPlan, cloud: FusedCloud
 ) -> tuple[SweepPoints, SweptCounts]:
-    """The points of a sweep as the sensor would see the edited drive.
-
-    Args:
-        cloud: edited fused clouds: they hold the surfaces of objects, in the frames of their boxes.
-    """
+    """The points of a sweep as the sensor would see the edited drive. ``cloud``: edited fused clouds: they hold the
+    surfaces of objects, in the frames of their boxes."""
     xyz = points.xyz.astype(np.float64)
     ranges = np.linalg.norm(xyz, axis=1)
     usable = ranges > 1e-3
@@ -118,18 +109,11 @@ def edited_points(
     changed = back & (fallen | taken)
     made = points.xyz.copy()
     made[changed] = (directions[changed] * met[changed, None]).astype(np.float32)
-    counts = SweptCounts(
-        int(cleared.sum()),
-        int((fallen & ~taken & back).sum()),
-        int((taken & back).sum()),
-        int((taken & np.isfinite(before)).sum()),
-        int((usable & ~back).sum()),
-    )
+    kinds = (cleared, fallen & ~taken & back, taken & back, taken & np.isfinite(before), usable & ~back)
     kept = back | ~(usable | cleared)
-    return (
-        SweepPoints(made[kept], intensity[kept], points.dt_s[kept], None if classes is None else classes[kept]),
-        counts,
-    )
+    classes = None if classes is None else classes[kept]
+    points = SweepPoints(made[kept], intensity[kept], points.dt_s[kept], classes)
+    return points, SweptCounts(*(int(kind.sum()) for kind in kinds))
 
 
 def _pose(motion: Motion, sweep: Sweep) -> NDArray[np.float64] | None:
@@ -220,15 +204,11 @@ def _object_intensity(points: SweepPoints, own: Mapping[str, Rows], name: str, s
     return float(np.median(chosen)) if len(chosen) else float("nan")
 
 
-# vacated ------------------------------------------------------------------------------------------
+# -- what photographs do not show ------------------------------------------------------------------
 #
-# Where recorded photographs do not show an edited drive: the boxes of what was removed, moved or put in, and the ground
-# about them.
-#
-# The ground about a box holds its shadow. The direction of the sun is not known on a recorded log, so as much as the
-# box is high counts on every side: other photographs show that ground without it.
-
-
+# The boxes of what was removed, moved or put in, and the ground about them, which holds their shadow. The direction of
+# the sun is not known on a recorded log, so as much as the box is high counts on every side: other photographs show
+# that ground without it.
 Box = tuple[NDArray[np.float64], NDArray[np.float64]]
 """Pose world_from_box f64[4, 4] and size f64[3] in metres."""
 Boxes = Sequence[Box]
@@ -256,24 +236,15 @@ class DriveOfEdits:
 def drive_of_edits(
     script: EditScript, scene: Scene, cloud: FusedCloud, model: SceneModel | None, *, told: bool = False
 ) -> DriveOfEdits:
-    """Carry out a script on a scene and its clouds, and on its fit where there is one.
-
-    Args:
-        told: warn of what the script says and the conditions do not show.
-
-    Raises:
-        InputError: something in the script that cannot be done here.
-    """
+    """Carry out a script on a scene and its clouds, and on its fit where there is one. ``told``: warn of what the
+    script says and the conditions do not show. InputError: something in the script that cannot be done here."""
     if told and conditions_of(script.canonical()) is not None:
-        log.info(
-            "generated views show no weather and light (that takes --fitted and a published-type model); `mudg render`"
-            " does"
-        )
+        takes = "that takes --fitted and a published-type model"
+        log.info(f"generated views show no weather and light ({takes}); `mudg render` does")
     if model is not None:
         drive = carry_out(script, model, scene, cloud)
-        return DriveOfEdits(
-            drive.plan, drive.scene or scene, cleared_cloud(drive.cloud or cloud, drive.plan), drive.model(model)
-        )
+        cleared = cleared_cloud(drive.cloud or cloud, drive.plan)
+        return DriveOfEdits(drive.plan, drive.scene or scene, cleared, drive.model(model))
     xyz = cloud.static.xyz
     xyz = xyz[:0] if cloud.static.semantics is None else xyz[np.isin(cloud.static.semantics, GROUND_CLASSES)]
     world = EditWorld.of_scene(scene, HeightMap.from_points(xyz) if len(xyz) else None)
@@ -282,9 +253,8 @@ def drive_of_edits(
 
 
 def _no_background(name: str) -> Background:
-    raise InputError(
-        "points alone cannot get another background", where="run", got=name, remedy="give a fit (--fitted)"
-    )
+    what, remedy = "points alone cannot get another background", "give a fit (--fitted)"
+    raise InputError(what, where="run", got=name, remedy=remedy)
 
 
 def photos_of_edited(photos: Iterable[Photo], plan: EditPlan) -> list[Photo]:
@@ -317,7 +287,7 @@ def touched_boxes(plan: EditPlan, time_s: float, when: str) -> list[Box]:
     same at this time `before` and `after` the edits. An object on its recorded place is left out."""
     found = []
     for name in dict.fromkeys((*plan.removed, *plan.changes, *plan.inserted)):
-        old, new = (_pose_vacated(world.actors.get(name), time_s) for world in (plan.before, plan.after))
+        old, new = plan.before.pose_of(name, time_s), plan.after.pose_of(name, time_s)
         kept = name in plan.changes and name not in plan.inserted
         if kept and old is not None and new is not None and np.abs(old - new).max() < SAME_M:
             continue
@@ -337,10 +307,9 @@ def vacated_at(plan: EditPlan) -> VacatedAt:
         mask = _hidden_by(view, before, plan) & ~shown
         ground = np.full(mask.shape, np.nan, np.float32)
         for pose, size in before:
-            depth = _plane_depth(view, pose, size)
-            ground = np.where(
-                boxes_mask(view, [(pose, size)]) | ground_mask(view, [(pose, size)]), np.fmin(ground, depth), ground
-            )
+            box = [(pose, size)]
+            under, depth = boxes_mask(view, box) | ground_mask(view, box), _plane_depth(view, pose, size)
+            ground = np.where(under, np.fmin(ground, depth), ground)
         stood = mask & boxes_mask(view, before)
         return Vacated(*(torch.from_numpy(plane) for plane in (mask, ground, shown, stood)))
 
@@ -370,25 +339,16 @@ def cleared_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
             inside = (np.abs(local[:, :2]) <= half[:2] + STRAY_M).all(1) & (local[:, 2] <= half[2] + STRAY_M)
             stray |= inside & (local[:, 2] > FLOOR_M - half[2])
     kept = ~(stray & ~low_of)
-    part = lambda values: None if values is None else values[kept]  # noqa: E731
-    return replace(
-        cloud, static=replace(static, xyz=static.xyz[kept], rgb=static.rgb[kept], semantics=part(static.semantics))
-    )
+    semantics = None if static.semantics is None else static.semantics[kept]
+    return replace(cloud, static=replace(static, xyz=static.xyz[kept], rgb=static.rgb[kept], semantics=semantics))
 
 
 def others(plan: EditPlan, time_s: float) -> list[Box]:
     """Poses and sizes of the moving objects that a plan leaves alone."""
     touched = {*plan.removed, *plan.changes, *plan.inserted}
-    found = [
-        (actor, _pose_vacated(actor, time_s))
-        for name, actor in plan.after.actors.items()
-        if name not in touched and actor.moves
-    ]
-    return [(pose, np.asarray(actor.size_m, np.float64)) for actor, pose in found if pose is not None]
-
-
-def _pose_vacated(actor: Actor | None, time_s: float) -> NDArray[np.float64] | None:
-    return None if actor is None else actor.motion.pose_at(time_s)
+    moving = [actor for name, actor in plan.after.actors.items() if name not in touched and actor.moves]
+    poses = ((actor.motion.pose_at(time_s), actor.size_m) for actor in moving)
+    return [(pose, np.asarray(size_m, np.float64)) for pose, size_m in poses if pose is not None]
 
 
 def boxes_mask(view: View, boxes: Boxes) -> NDArray[np.bool_]:
@@ -421,9 +381,7 @@ def outlines(view: View, boxes: Boxes) -> NDArray[np.bool_]:
     return covered
 
 
-# written ------------------------------------------------------------------------------------------
-
-
+# -- written ---------------------------------------------------------------------------------------
 NOTE: Final = "edited: parts of the images are renders of a fitted scene"
 CHANGED_ABOVE: Final = 4 / 255
 """Pixels whose renders with and without the edits differ by less than this, 0 to 1, stay as recorded or rendered."""
@@ -436,12 +394,8 @@ RENDERED: Final = "rendered"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class EditedImages:
-    """Makes images of an edited drive.
-
-    Args:
-        before, after: a fitted scene without and with the edits.
-        whole: every pixel is rendered: the vehicle drives another path, or through another street.
-    """
+    """Makes images of an edited drive. ``before``, ``after``: a fitted scene without and with the edits. ``whole``:
+    every pixel is rendered: the vehicle drives another path, or through another street."""
 
     before: SceneModel
     after: SceneModel
@@ -453,11 +407,8 @@ class EditedImages:
     def of(self, recorded: NDArray[np.uint8], frame: Frame) -> tuple[NDArray[np.uint8], NDArray[np.bool_], Observation]:
         """The image u8[H, W, 3] of a frame, which of its pixels [H, W] are rendered, and the render."""
         raster = raster_of(self.before, self.config.raster)
-        made = (
-            render_view(self.after, frame.view, raster)
-            if self.repaired is None
-            else next(self.repaired[frame.view.camera.name])
-        )
+        name = frame.view.camera.name
+        made = render_view(self.after, frame.view, raster) if self.repaired is None else next(self.repaired[name])
         if self.whole:
             return to_bytes(made.rgb), np.ones(recorded.shape[:2], bool), made
         usual = render_view(self.before, frame.view, raster)
@@ -468,11 +419,8 @@ class EditedImages:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DriveChange:
-    """What is to be written.
-
-    Args:
-        plan: what was done. scene: with the edited boxes, path and poses (``apply.edited_scene``). cloud: edited.
-    """
+    """What is to be written. ``plan``: what was done. ``scene``: with the edited boxes, path and poses
+    (``apply.edited_scene``). ``cloud``: edited."""
 
     plan: EditPlan
     scene: Scene
@@ -480,11 +428,7 @@ class DriveChange:
 
 
 def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, root: Path) -> SweptCounts:
-    """Write a scene whose files show the edits; returns what became of LiDAR returns.
-
-    Args:
-        scene: as recorded.
-    """
+    """Write a scene whose files show the edits; returns what became of LiDAR returns. ``scene``: as recorded."""
     edited, counts = drive.scene, SweptCounts()
     source = replace(scene.source, recipe=None, notes=(*scene.source.notes, NOTE))
     with SceneWriter(root, scene.id, source) as writer:
@@ -503,9 +447,8 @@ def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, r
             writer.add_track(track)
         writer.set_ego(edited.ego)
         writer.set_split(scene.split)
-        for old, new in log.progress(
-            list(zip(scene.frames, edited.frames, strict=True)), len(scene.frames), "editing images"
-        ):
+        pairs = list(zip(scene.frames, edited.frames, strict=True))
+        for old, new in log.progress(pairs, len(pairs), "editing images"):
             image, changed, made = images.of(read_image(scene, old), new)
             if not changed.any():
                 writer.copy_frame(scene, old)
@@ -522,10 +465,6 @@ def _labels(scene: Scene, frame: Frame, changed: NDArray[np.bool_], made: Observ
     if made.semantics is None or made.depth is None:
         return ours
     ids = made.semantics.numpy().astype(np.uint8)
-    rendered = {
-        "semantics": ids,
-        "sky": ids == ID["sky"],
-        "dynamic": np.isin(ids, DYNAMIC_IDS),
-        "depth": np.nan_to_num(made.depth[0].numpy(), nan=np.inf),
-    }
+    rendered = {"semantics": ids, "sky": ids == ID["sky"], "dynamic": np.isin(ids, DYNAMIC_IDS)}
+    rendered["depth"] = np.nan_to_num(made.depth[0].numpy(), nan=np.inf)
     return ours | {name: np.where(changed, rendered[name].astype(old.dtype), old) for name, old in found.items()}

@@ -28,19 +28,11 @@ from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.place import drawing_device
 from mudg.diffusion.inputs import InWeather
-from mudg.editing.apply import scene_seen_by
-from mudg.editing.carried import FACT, EditedDrive, carry_out
-from mudg.editing.harmonised import (
-    EditedSources,
-    Harmoniser,
-    RepairedViews,
-    WeatherHarmoniser,
-    check_paths,
-    harmonises_weather,
-)
-from mudg.editing.script import EditScript
-from mudg.editing.view_settings import RenderConfig
-from mudg.editing.weathered import Drawer, conditions_of, in_weather, weather_of
+from mudg.editing import harmonised
+from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, scene_seen_by, weather_of
+from mudg.editing.harmonised import EditedSources, RepairedViews
+from mudg.editing.script import EditScript, conditions_of
+from mudg.editing.settings import RenderConfig
 from mudg.formats.exporters.video import write_mp4
 from mudg.gaussians.fit import load_model, render_view
 from mudg.gaussians.model import SceneModel
@@ -67,33 +59,23 @@ Edited = tuple[Scene, SceneModel, EditedDrive | None]
 def prepare(
     config: RenderConfig, scene: Path, model: Path, script: EditScript | None, fused: Path | None
 ) -> Edited | None:
-    """Carry out the edit script, if there is one: what cannot be done is told before anything is written.
-
-    Args:
-        fused: fused clouds of the scene, for ``config.harmonize``.
-    """
+    """Carry out the edit script, if there is one: what cannot be done is told before anything is written. ``fused``:
+    fused clouds of the scene, for ``config.harmonize``."""
     radiance = kind_of(model) == RADIANCE
     if radiance and (config.remove_tracks or script is not None):
-        raise UsageError(
-            "a radiance field has no objects to leave out or to edit",
-            where=str(model),
-            remedy="leave --remove-tracks and --edits out",
-        )
+        what = "a radiance field has no objects to leave out or to edit"
+        raise UsageError(what, where=str(model), remedy="leave --remove-tracks and --edits out")
     choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
     edited = None if script is None else _edited(scene, model, script, fused if config.harmonize.on else None)
     if edited is not None and config.harmonize.on:
-        check_paths(config.harmonize, {path.name: len(path) for path in trajectories(edited[0], config)})
+        harmonised.check_paths(config.harmonize, {path.name: len(path) for path in trajectories(edited[0], config)})
     return edited
 
 
 def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited | None, work: RunDir) -> dict[str, Any]:
     """Render every camera and shift of the configuration, one observation folder (and video) per trajectory; returns a
-    summary. An interrupted run continues with the next missing view.
-
-    Args:
-        scene: gives cameras, times and the path of the vehicle. model: folder made by fit. edited: what ``prepare``
-            made of them.
-    """
+    summary. An interrupted run continues with the next missing view. ``scene``: gives cameras, times and the path of
+    the vehicle. ``model``: folder made by fit. ``edited``: what ``prepare`` made of them."""
     followers, out = list[RepairedViews](), work.path
     if kind_of(model) == RADIANCE:
         device = choose_device(config.device, "render")
@@ -103,14 +85,14 @@ def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited |
         loaded, fitted, drive = edited or _edited(scene, model, None)
         draw, source = _scene_drawer(config, fitted.to(device))
         if config.harmonize.on and drive is not None:
-            draw = _repaired(config, (drive, fitted), (scene, model), draw)
+            draw = _repaired(config, drive, fitted, scene, model, draw)
             followers.append(draw)
         conditions = conditions_of(fitted.facts.get(FACT, {}).get("script", ()))
         if conditions is not None:
             how = weather_of(draw, conditions, loaded)
             draw = in_weather(draw, how)
-            if config.harmonize.on and drive is not None and harmonises_weather(config.harmonize, how):
-                draw = _corrected(config, (drive, fitted), scene, (draw, how))
+            if config.harmonize.on and drive is not None and harmonised.harmonises_weather(config.harmonize, how):
+                draw = _corrected(config, drive, fitted, scene, draw, how)
                 followers.append(draw)
     paths = trajectories(loaded, config)
     _require_memory(paths)
@@ -153,42 +135,32 @@ def _edited(
 
 
 def _repaired(
-    config: RenderConfig, edited: tuple[EditedDrive, SceneModel], given: tuple[Path, Path], draw: Drawer
+    config: RenderConfig, drive: EditedDrive, fitted: SceneModel, scene: Path, model: Path, draw: Drawer
 ) -> RepairedViews:
-    """What draws views with the touched pixels repaired.
-
-    Args:
-        edited: what was done, and the edited fit. given: folders of scene and fit, as they are without the edits.
-    """
-    (drive, fitted), (scene, model) = edited, given
+    """What draws views of an edited fit with the touched pixels repaired; ``scene`` and ``model``: folders, as they are
+    without the edits."""
     before = load_model(model)
-    recorded, (usual, _) = (
-        scene_seen_by(read_scene(scene), before.facts),
-        _scene_drawer(config, before.to(fitted.device)),
-    )
-    camera = trajectories(recorded, config)[0].views[0].camera
-    harmoniser = Harmoniser(
-        EditedSources.of(drive, fitted, recorded), config.harmonize, (camera.width, camera.height), config.device
-    )
-    return RepairedViews(harmoniser, lambda view: (usual(view), draw(view)))
+    recorded = scene_seen_by(read_scene(scene), before.facts)
+    usual, _ = _scene_drawer(config, before.to(fitted.device))
+    sources = EditedSources.of(drive, fitted, recorded)
+    repair = harmonised.Harmoniser(sources, config.harmonize, _size(recorded, config), config.device)
+    return RepairedViews(repair, lambda view: (usual(view), draw(view)))
 
 
 def _corrected(
-    config: RenderConfig, edited: tuple[EditedDrive, SceneModel], scene: Path, drawn: tuple[Drawer, InWeather]
+    config: RenderConfig, drive: EditedDrive, fitted: SceneModel, scene: Path, draw: Drawer, how: InWeather
 ) -> RepairedViews:
-    """What draws views in other weather, corrected by the diffusion model; ``drawn``: what draws them by the
-    formulas."""
-    (drive, fitted), (draw, how) = edited, drawn
+    """What draws views in other weather, which ``draw`` makes by the formulas, corrected by the diffusion model."""
     recorded = scene_seen_by(read_scene(scene), fitted.facts)
-    camera = trajectories(recorded, config)[0].views[0].camera
-    sources = EditedSources.of(drive, fitted, recorded)
-    harmoniser = WeatherHarmoniser(sources, how, config.harmonize, (camera.width, camera.height), config.device)
+    sources, size = EditedSources.of(drive, fitted, recorded), _size(recorded, config)
+    correct = harmonised.WeatherHarmoniser(sources, how, config.harmonize, size, config.device)
+    return RepairedViews(correct, lambda view: (draw(view),) * 2)
 
-    def pair(view: View) -> tuple[Observation, Observation]:
-        made = draw(view)
-        return made, made
 
-    return RepairedViews(harmoniser, pair)
+def _size(scene: Scene, config: RenderConfig) -> tuple[int, int]:
+    """Width and height of the views."""
+    camera = trajectories(scene, config)[0].views[0].camera
+    return camera.width, camera.height
 
 
 def _scene_drawer(config: RenderConfig, fitted: SceneModel) -> tuple[Drawer, str]:
@@ -208,23 +180,17 @@ def _field_drawer(config: RenderConfig, model: Path, device: torch.device) -> tu
 
 def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
     """The trajectories a configuration names: every camera at every shift (0 = recorded), and on every further path.
-
-    Raises:
-        UsageError: an unknown camera, or nothing to render.
-    """
+    UsageError: an unknown camera, or nothing to render."""
     cameras = config.cameras or tuple(scene.cameras)[:1]
     if not config.shifts_m and not config.paths:
-        raise UsageError(
-            "nothing to render: no shifts were given", remedy="at least one of --shifts-m; 0 is the recorded path"
-        )
+        what, remedy = "nothing to render: no shifts were given", "at least one of --shifts-m; 0 is the recorded path"
+        raise UsageError(what, remedy=remedy)
     paths = []
     for camera in cameras:
-        found = [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
-        for path in (*found, *(trajectory.named(scene, camera, name) for name in config.paths)):
-            paths.append(
-                Trajectory(path.name, tuple(resized_view(view, config.width_px) for view in path.views), path.origin)
-            )
-    return tuple(paths)
+        paths += [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
+        paths += [trajectory.named(scene, camera, name) for name in config.paths]
+    small = lambda path: tuple(resized_view(view, config.width_px) for view in path.views)  # noqa: E731
+    return tuple(Trajectory(path.name, small(path), path.origin) for path in paths)
 
 
 def _several(draw: Drawer, threads: int) -> Drawers:

@@ -14,16 +14,13 @@ from mudg.base.run_folder import known_input
 
 BEST_FIRST: Final = ("mudg_s", "street_gaussians")
 """Fits that ``mudg run`` makes; where one has to speak for all, the first that is there."""
+NO_FIT: Final = "this folder holds no fitted scene"
 
 
 @dataclass(frozen=True, slots=True)
 class RunParts:
-    """Where the parts of a run lie.
-
-    Args:
-        fits: folders of fitted scenes by method, the best one first. scene, fused: None where they are not known.
-        whole: a folder of ``mudg run``, not a fit by itself.
-    """
+    """Where the parts of a run lie. ``fits``: folders of fitted scenes by method, the best one first. ``scene``,
+    ``fused``: None where they are not known. ``whole``: a folder of ``mudg run``, not a fit by itself."""
 
     fits: dict[str, Path]
     scene: Path | None
@@ -37,14 +34,8 @@ class RunParts:
 
 
 def find_run(folder: Path, scene: Path | None = None, fused: Path | None = None) -> RunParts:
-    """What a folder holds.
-
-    Args:
-        scene, fused: count in place of its own.
-
-    Raises:
-        InputError: neither a fit nor a folder of ``mudg run``, or one that is not finished.
-    """
+    """What a folder holds. ``scene``, ``fused``: count in place of its own. InputError: neither a fit nor a folder of
+    ``mudg run``, or one that is not finished."""
     folder = Path(folder)
     if (folder / "model.json").is_file():
         return RunParts({"": folder}, scene or known_input(folder, "scene"), fused, False)
@@ -53,13 +44,9 @@ def find_run(folder: Path, scene: Path | None = None, fused: Path | None = None)
     there = {"fit": bool(fits), "scene": own_scene is not None, "fuse": (own_fused / "fuse.json").is_file()}
     if not all(there.values()):
         missing = [name for name, found in there.items() if not found]
-        raise InputError(
-            "this folder holds no fitted scene",
-            where=str(folder),
-            expected="a folder made by `mudg fit`, or by a finished `mudg run` or `mudg demo`",
-            got=f"no {', no '.join(missing)}" if folder.is_dir() else "no such folder",
-            remedy=similar_path(folder),
-        )
+        expected = "a folder made by `mudg fit`, or by a finished `mudg run` or `mudg demo`"
+        got = f"no {', no '.join(missing)}" if folder.is_dir() else "no such folder"
+        raise InputError(NO_FIT, where=str(folder), expected=expected, got=got, remedy=similar_path(folder))
     return RunParts(fits, scene or own_scene, fused or own_fused, True)
 
 
@@ -81,22 +68,14 @@ def scene_of_run(folder: Path) -> Path | None:
 
 
 def scene_at(path: Path) -> Path:
-    """The scene at a path: itself, or that of a run.
-
-    Raises:
-        InputError: nothing is there, or something else.
-    """
+    """The scene at a path: itself, or that of a run. InputError: nothing is there, or something else."""
     if (path / "scene.json").is_file() or path.is_file():
         return path
     found = scene_of_run(path)
     if found is None:
         what = "folder is not a scene: it has no scene.json" if path.is_dir() else "no such file or folder"
-        raise InputError(
-            what,
-            where=str(path),
-            expected="a scene made by `mudg ingest` or `mudg annotate`, or a folder made by `mudg run`",
-            remedy=similar_path(path),
-        )
+        expected = "a scene made by `mudg ingest` or `mudg annotate`, or a folder made by `mudg run`"
+        raise InputError(what, where=str(path), expected=expected, remedy=similar_path(path))
     return found
 
 
@@ -105,12 +84,8 @@ def fused_at(path: Path) -> Path:
     for folder in (path, path / "fuse", known_input(path, "fused") or path):
         if (folder / "fuse.json").is_file():
             return folder
-    raise InputError(
-        "file not found",
-        where=str(path / "fuse.json"),
-        expected="a folder made by `mudg fuse`, or by `mudg run`",
-        remedy=similar_path(path),
-    )
+    where, expected = str(path / "fuse.json"), "a folder made by `mudg fuse`, or by `mudg run`"
+    raise InputError("file not found", where=where, expected=expected, remedy=similar_path(path))
 
 
 def fit_at(path: Path, order: Sequence[str] = BEST_FIRST) -> Path:
@@ -118,13 +93,8 @@ def fit_at(path: Path, order: Sequence[str] = BEST_FIRST) -> Path:
     for folder in (path, *(path / "fit" / name for name in order)):
         if (folder / "model.json").is_file():
             return folder
-    raise InputError(
-        "this folder holds no fitted scene",
-        where=str(path),
-        expected="a folder made by `mudg fit`, or by `mudg run`",
-        got="" if path.is_dir() else "no such folder",
-        remedy=similar_path(path),
-    )
+    expected, got = "a folder made by `mudg fit`, or by `mudg run`", "" if path.is_dir() else "no such folder"
+    raise InputError(NO_FIT, where=str(path), expected=expected, got=got, remedy=similar_path(path))
 
 
 def plain_fit_at(path: Path) -> Path:
@@ -140,40 +110,27 @@ def views_at(path: Path, name: str = "") -> Path:
     return next((folder for folder in folders if is_run and folder.is_dir()), path)
 
 
-PARTS: Final = {
-    "scene": scene_at,
-    "fused": fused_at,
-    "model": fit_at,
-    "fitted": plain_fit_at,
-    "start_from": plain_fit_at,
-}
+_PLAIN: Final = {"fitted": plain_fit_at, "start_from": plain_fit_at}
+PARTS: Final = {"scene": scene_at, "fused": fused_at, "model": fit_at, **_PLAIN}
 """Inputs of commands, and how each is found at a path."""
 _WORDS: Final = {
     "fused": "point clouds made by `mudg fuse`",
-    "model": "a folder made by `mudg fit`",
-    "fitted": "a folder made by `mudg fit`",
+    **dict.fromkeys(("model", "fitted"), "a folder made by `mudg fit`"),
 }
 
 
 def parts_of(given: Mapping[str, Any], required: Sequence[str] = ()) -> dict[str, Any]:
-    """The inputs of a command, each as the part that it stands for; before anything heavy is loaded.
-
-    Args:
-        given: name -> path, or None; names that are not in ``PARTS`` are left as they are. required: those that a run
-            at ``scene`` gives where they are None.
-
-    Raises:
-        UsageError: one is missing. InputError: one is not there, or something else.
-    """
+    """The inputs of a command, each as the part that it stands for; before anything heavy is loaded. ``given``: name ->
+    path, or None; names that are not in ``PARTS`` are left as they are. ``required``: those that a run at ``scene``
+    gives where they are None. UsageError: one is missing. InputError: one is not there, or something else."""
     scene = given.get("scene")
     is_run = scene is not None and not (Path(scene) / "scene.json").is_file() and scene_of_run(Path(scene)) is not None
     found = dict(given)
     for name, path in given.items():
         if path is None and name in required:
             if not is_run:
-                raise UsageError(
-                    f"no --{name} was given", expected=f"{_WORDS[name]}, or the folder of a run in the place of SCENE"
-                )
+                expected = f"{_WORDS[name]}, or the folder of a run in the place of SCENE"
+                raise UsageError(f"no --{name} was given", expected=expected)
             path = scene
         if path is not None and name in PARTS:
             found[name] = PARTS[name](Path(path))

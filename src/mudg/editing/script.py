@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal, Self
@@ -17,12 +17,7 @@ from mudg.base import store
 from mudg.base.errors import InputError, nearest, short
 from mudg.base.plain_yaml import Lines, parse_with_lines
 from mudg.base.records import Number, StrictRecord, after, checked_by, first_problem, place
-from mudg.base.weather_settings import LightSettings, SeasonSettings, WeatherSettings
-
-# records ------------------------------------------------------------------------------------------
-#
-# What each verb of an edit script says. Distances in metres, times in seconds on the scene's clock, angles in degrees.
-
+from mudg.base.weather_settings import Conditions, LightSettings, SeasonSettings, WeatherSettings
 
 EGO: Final = "ego"
 """The id of the recording vehicle in edit scripts."""
@@ -43,12 +38,8 @@ Name = Annotated[str, after(_named)]
 
 def _not_ego(value: str) -> str:
     if value == EGO:
-        raise InputError(
-            "the recording vehicle cannot be edited so",
-            expected="the id of a track",
-            got=EGO,
-            remedy="ego takes lane_change, speed, stop, move and path",
-        )
+        what, remedy = "the recording vehicle cannot be edited so", "ego takes lane_change, speed, stop, move and path"
+        raise InputError(what, expected="the id of a track", got=EGO, remedy=remedy)
     return value
 
 
@@ -64,19 +55,13 @@ class AssetSource(StrictRecord):
     file: Name | None = None
 
     @model_validator(mode="after")
+    @checked_by
     def _one_source(self) -> Self:
         if (self.file is None) == (self.run is None) or (self.run is None) != (self.id is None):
-            checked_by(_refuse_source)(self)
+            got = " and ".join(name for name in ("run", "id", "file") if getattr(self, name) is not None)
+            what = "it is not clear where the object comes from"
+            raise InputError(what, expected="run and id, or file alone", got=got or "none of them")
         return self
-
-
-def _refuse_source(source: AssetSource) -> None:
-    given = [name for name in ("run", "id", "file") if getattr(source, name) is not None]
-    raise InputError(
-        "it is not clear where the object comes from",
-        expected="run and id, or file alone",
-        got=" and ".join(given) or "none of them",
-    )
 
 
 class RemoveEdit(StrictRecord):
@@ -90,19 +75,13 @@ class RemoveEdit(StrictRecord):
     close_street: bool | None = None
 
     @model_validator(mode="after")
+    @checked_by
     def _either(self) -> Self:
         by_kind = self.class_ is not None or self.moving is not None or self.within_m is not None
         if (self.ids is None) != by_kind:
-            checked_by(_refuse_selection)(by_kind)
+            expected, got = "ids, or any of class, moving, within_m", "both" if by_kind else "nothing"
+            raise InputError("objects are chosen by ids or by kind", expected=expected, got=got)
         return self
-
-
-def _refuse_selection(both: bool) -> None:
-    raise InputError(
-        "objects are chosen by ids or by kind",
-        expected="ids, or any of class, moving, within_m",
-        got="both" if both else "nothing",
-    )
 
 
 class MoveEdit(StrictRecord):
@@ -156,19 +135,11 @@ class LaneChangeEdit(StrictRecord):
 def _path_points(points: list[list[float]]) -> list[list[float]]:
     for index, point in enumerate(points):
         if len(point) not in (3, 4):
-            raise InputError(
-                "a point of a path has the wrong length",
-                where=f"[{index}]",
-                expected="[t, x, y] or [t, x, y, yaw_deg]",
-                got=str(point)[:80],
-            )
+            what, expected = "a point of a path has the wrong length", "[t, x, y] or [t, x, y, yaw_deg]"
+            raise InputError(what, where=f"[{index}]", expected=expected, got=str(point)[:80])
         if index and point[0] <= points[index - 1][0]:
-            raise InputError(
-                "the times of a path do not increase",
-                where=f"[{index}]",
-                expected=f"more than {points[index - 1][0]} s",
-                got=f"{point[0]} s",
-            )
+            what, expected = "the times of a path do not increase", f"more than {points[index - 1][0]} s"
+            raise InputError(what, where=f"[{index}]", expected=expected, got=f"{point[0]} s")
     if len({len(point) for point in points}) > 1:
         raise InputError("some points of a path have a yaw and others have none", expected="all or none")
     return points
@@ -187,14 +158,11 @@ class PathEdit(StrictRecord):
     close_sides: bool = True
 
     @model_validator(mode="after")
+    @checked_by
     def _drives(self) -> Self:
         if len(self.points) < 2:
-            checked_by(_refuse_point)(self.points)
+            raise InputError("a path needs two points", where="points", got=str(self.points))
         return self
-
-
-def _refuse_point(points: list[list[float]]) -> None:
-    raise InputError("a path needs two points", where="points", got=str(points))
 
 
 class ReplaceEdit(StrictRecord):
@@ -236,16 +204,12 @@ class InsertEdit(StrictRecord):
     match_light: bool = True
 
     @model_validator(mode="after")
+    @checked_by
     def _placed(self) -> Self:
         if (self.path is None) == (self.near is None):
-            checked_by(_refuse_place)(self)
+            got = "both" if self.path else "neither"
+            raise InputError("an object to insert needs one place", expected="path or near", got=got)
         return self
-
-
-def _refuse_place(edit: InsertEdit) -> None:
-    raise InputError(
-        "an object to insert needs one place", expected="path or near", got="both" if edit.path else "neither"
-    )
 
 
 def _with_ego(keep: list[str]) -> list[str]:
@@ -298,9 +262,6 @@ def files_of(edit: Any) -> list[str]:
     return named + [value for name in ("run", "image") if isinstance(value := getattr(edit, name, None), str)]
 
 
-# script -------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, slots=True)
 class ScriptEdit:
     """One entry of a script: its verb, its settings (the record of `VERBS`), and where it stands."""
@@ -312,12 +273,8 @@ class ScriptEdit:
 
 @dataclass(frozen=True, slots=True)
 class EditScript:
-    """A checked script.
-
-    Args:
-        edits: in the order in which they apply.
-        folder: what relative paths in it are relative to.
-    """
+    """A checked script. ``edits``: in the order in which they apply. ``folder``: what relative paths in it are relative
+    to."""
 
     edits: tuple[ScriptEdit, ...]
     folder: Path
@@ -335,23 +292,17 @@ class EditScript:
         return [{edit.verb: edit.settings.model_dump(mode="json", by_alias=True)} for edit in self.edits]
 
     def digest(self) -> str:
-        """Hash of what the script says and of what it reads; part of the key of everything made with it.
-
-        Raises:
-            InputError: a file or folder that it names does not exist. IntegrityError: one was altered.
-        """
+        """Hash of what the script says and of what it reads; part of the key of everything made with it. InputError: a
+        file or folder that it names does not exist. IntegrityError: one was altered."""
         contents = {}
         for edit in self.edits:
             for name in files_of(edit.settings):
                 try:
                     contents[name] = store.digest(self.path_of(name))
                 except InputError as problem:
-                    raise InputError(
-                        "the script names a file that is not there",
-                        where=f"{edit.where}: {edit.verb}",
-                        got=str(self.path_of(name)),
-                        remedy="paths are relative to the script's folder",
-                    ) from problem
+                    what, where = "the script names a file that is not there", f"{edit.where}: {edit.verb}"
+                    got, remedy = str(self.path_of(name)), "paths are relative to the script's folder"
+                    raise InputError(what, where=where, got=got, remedy=remedy) from problem
         text = store.json_text(_with_contents(self.canonical(), contents), indent=None)
         return hashlib.sha256(text.encode()).hexdigest()
 
@@ -365,6 +316,13 @@ class EditScript:
         return yaml.safe_dump(_with_contents(self.canonical(), named), sort_keys=False)
 
 
+def conditions_of(script: Sequence[Mapping[str, Any]]) -> Conditions | None:
+    """Weather, light and season that a script (``EditScript.canonical``) asks for, each as its last verb says; None: it
+    asks for none."""
+    asked = {verb: settings for edit in script for verb, settings in edit.items() if verb in CONDITIONS}
+    return Conditions.model_validate(asked) if asked else None
+
+
 def _with_contents(value: Any, names: Mapping[str, str]) -> Any:
     """The values of ``file``, ``run`` and ``image`` replaced."""
     if isinstance(value, list):
@@ -376,50 +334,31 @@ def _with_contents(value: Any, names: Mapping[str, str]) -> Any:
 
 
 def read_edits(path: Path | str) -> EditScript:
-    """Read a script.
-
-    Raises:
-        InputError: it is missing, no YAML, or says something that no verb understands.
-    """
+    """Read a script. InputError: it is missing, no YAML, or says something that no verb understands."""
     path = Path(path)
     return parse_edits(store.read_bytes(path), str(path), path.parent)
 
 
 def parse_edits(text: str | bytes, where: str, folder: Path = Path()) -> EditScript:
-    """Check a script.
-
-    Args:
-        where: name of the file for messages. folder: what its paths are relative to.
-    """
+    """Check a script. ``where``: name of the file for messages. ``folder``: what its paths are relative to."""
     entries, lines = parse_with_lines(text, where)
     if not isinstance(entries, list) or not entries:
-        raise InputError(
-            "an edit script is a list of edits",
-            where=where,
-            expected="lines such as `- remove: {ids: [car-003]}`",
-            got="nothing" if entries in (None, []) else type(entries).__name__,
-        )
+        got = "nothing" if entries in (None, []) else type(entries).__name__
+        expected = "lines such as `- remove: {ids: [car-003]}`"
+        raise InputError("an edit script is a list of edits", where=where, expected=expected, got=got)
     return EditScript(tuple(_one(index, value, lines, where) for index, value in enumerate(entries)), Path(folder))
 
 
 def _one(index: int, value: Any, lines: Lines, where: str) -> ScriptEdit:
     at = f"{where}, line {lines[(index,)]}"
     if not isinstance(value, dict) or len(value) != 1:
-        raise InputError(
-            "an edit is one verb with its settings",
-            where=at,
-            expected="e.g. `- remove: {ids: [car-003]}`",
-            got=short(value, 80),
-        )
+        expected = "e.g. `- remove: {ids: [car-003]}`"
+        raise InputError("an edit is one verb with its settings", where=at, expected=expected, got=short(value, 80))
     ((verb, settings),) = value.items()
     if verb not in VERBS:
         near = nearest(verb, VERBS)
-        raise InputError(
-            f"there is no verb {verb!r}",
-            where=at,
-            expected=f"one of {', '.join(VERBS)}",
-            remedy=f"did you mean {near!r}?" if near else "see docs/edit.md",
-        )
+        remedy = f"did you mean {near!r}?" if near else "see docs/edit.md"
+        raise InputError(f"there is no verb {verb!r}", where=at, expected=f"one of {', '.join(VERBS)}", remedy=remedy)
     try:
         return ScriptEdit(verb, VERBS[verb].model_validate({} if settings is None else settings), at)
     except ValidationError as error:

@@ -1,4 +1,4 @@
-"""Settings of ``mudg edit``."""
+"""Settings of ``mudg edit``, ``mudg render`` and ``mudg score``."""
 
 from __future__ import annotations
 
@@ -25,3 +25,99 @@ class EditConfig:
     """Rasteriser backend. auto picks the fastest one available and prints its name."""
     device: DeviceName = "auto"
     """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""
+
+
+@settings
+class RenderConfig:
+    """Render a fitted scene on recorded and shifted trajectories."""
+
+    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
+        "height_m": ("width_px", 0.0),
+        "yaw_deg": ("width_px", 0.0),
+        "sky_below_alpha": ("video", 0.5),
+        "fps": ("harmonize", 10.0),
+    }
+
+    cameras: tuple[str, ...] = ("front",)
+    """Cameras to render (empty = the first camera). A name that the scene lacks is an error."""
+    shifts_m: tuple[float, ...] = (0.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
+    """Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path."""
+    paths: tuple[str, ...] = ()
+    """Further paths by name. up+1: raised by 1 m. lane+0.1: a lane change, 0.1 m further to the left with every frame.
+    speed+0.1: 0.1 m further ahead with every frame. A minus means down, right, slower."""
+    width_px: int = setting(default=0, ge=0)
+    """Image width in pixels (0 = as recorded); the height follows."""
+    remove_tracks: tuple[str, ...] = ()
+    """Ids of tracked objects to leave out, as listed in the scene."""
+    video: bool = True
+    """Also write one MP4 video per trajectory."""
+    harmonize: HarmonizeConfig = setting(default_factory=HarmonizeConfig)
+    """With an edit script: let the diffusion model repair what the edits touch."""
+    raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"
+    """Rasteriser backend. auto picks the fastest one available and prints its name."""
+    device: DeviceName = "auto"
+    """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""
+
+
+@settings
+class ScoreConfig:
+    """Score rendered and generated views against ground truth where it exists."""
+
+    width_px: int = setting(default=0, ge=0)
+    """Image width in pixels at which everything is compared; the height follows (0 = the size of the scene's
+    camera)."""
+    baseline: bool = True
+    """Also score a baseline without learning: the fused points, with every hole filled by the nearest point."""
+    perceptual_views: int = setting(default=8, ge=0)
+    """Number of views per trajectory, evenly spread, at which the perceptual distance is computed (0 = none). It costs
+    more than all other metrics together."""
+    lpips_weights: str = ""
+    """Safetensors file with LPIPS weights (AlexNet, version 0.1, tensor names of the lpips package). LPIPS is computed
+    at the same views as the perceptual distance (empty = not computed)."""
+    lpips_vgg_weights: str = ""
+    """The same for LPIPS with VGG-16 (empty = not computed)."""
+    lpips_squeeze_weights: str = ""
+    """The same for LPIPS with SqueezeNet 1.1 (empty = not computed)."""
+    lpips_input: Literal["correct", "unscaled"] = "correct"
+    """Range of the colours that LPIPS gets. unscaled: 0 to 1 where -1 to 1 belongs, as much published code of Gaussian
+    scenes has it; only to compare with its numbers."""
+    fid_weights: str = ""
+    """File with the weights of FID's Inception-v3 network (`pt_inception-2015-12-05-6726825d.pth`, or its tensors as
+    safetensors). FID and KID then compare all views with the recorded frames of the same camera (empty = not
+    computed)."""
+    fid_resize: Literal["pytorch-fid", "tf1", "clean", "tm", "neurad"] = "pytorch-fid"
+    """How FID's network gets its 299 x 299 pixels: as pytorch-fid, torch-fidelity (tf1), clean-fid (clean),
+    torchmetrics (tm) or neurad-studio (neurad) do it. Numbers of different rules cannot be compared."""
+    fvd_weights: str = ""
+    """File with the weights of FVD's I3D network (Kinetics-400), as safetensors, a state dict or the TorchScript
+    archive. FVD then compares clips of 16 views with those of the recorded video of the same camera (empty = not
+    computed)."""
+    fvd_resize: Literal["videogpt", "google", "stylegan-v"] = "videogpt"
+    """How FVD's network gets its 224 x 224 pixels: shorter side and crop (videogpt), or squashed (google,
+    stylegan-v)."""
+    dino_weights: str = ""
+    """File with the weights of DINOv2, ViT-S/14 or ViT-L/14 (`dinov2_vits14_pretrain.pth`,
+    `dinov2_vitl14_pretrain.pth`, or their tensors as safetensors). FD-DINOv2 and the consistency of a video are then
+    computed (empty = not computed)."""
+    clip_weights: str = ""
+    """File with the image tower of CLIP ViT-L/14 at 336 pixels (`model.safetensors` of
+    openai/clip-vit-large-patch14-336, or OpenAI's names). CMMD, CLIP-F and CLIP-V are then computed (empty = not
+    computed)."""
+    video_features: str = ""
+    """Folder with features of clips that an extractor of your own made: METHOD/TRAJECTORY.safetensors and
+    recorded/CAMERA.safetensors, each with a tensor `features` of [clips, values]. Frechet and polynomial distances are
+    then computed (empty = not computed)."""
+    detections: str = ""
+    """File with boxes that a detector found in the views, as COCO results. NTA-IoU is then computed (empty = not
+    computed)."""
+    lanes: str = ""
+    """Folder with lane masks that a detector made of the views, METHOD/TRAJECTORY/000000.png. NTL-IoU is then computed
+    (empty = not computed). Generated cities only: prepared logs have no lane lines."""
+    as_published: bool = False
+    """NTA-IoU: project true boxes as the published score does, corners behind the camera included, instead of cutting
+    them at the near plane."""
+    error_pictures: bool = True
+    """Write an image of the colour error at the middle view of every trajectory."""
+    device: DeviceName = "auto"
+    """Device of the networks behind perceptual distance, LPIPS, FID, FVD, DINOv2 and CLIP: auto (CUDA if there is one),
+    cpu, cuda, cuda:N. All other metrics run on the CPU."""

@@ -41,14 +41,14 @@ from mudg.gaussians.nodes import SYMMETRIC_LABELS, RigidNode
 from mudg.gaussians.sky import SkyNode
 from mudg.gaussians.start import SH_C0
 
-# shadows ------------------------------------------------------------------------------------------
-#
-# The shadow of what stood in a box, found by its darkness on the ground, and taken away.
+Array = NDArray[np.float64]
+Rows = NDArray[np.bool_]
+
+# -- shadows ---------------------------------------------------------------------------------------
 #
 # On a grid of the ground, a cell is dark that has clearly less light than lit ground of its class about it. Dark cells
 # are the object's shadow if they lie behind it in one direction, that of the light, with no lit cell between. They get
 # the colours of the lit ground around, continued, and keep a little of their texture.
-
 
 SHADOW_CELL_M: Final = 0.25
 REACH: Final = 2.0
@@ -125,11 +125,8 @@ class _Cells:
 
     def centres(self) -> Array:
         """Places f64[X * Y, 2]."""
-        return (
-            self.low
-            + (np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), -1).reshape(-1, 2) + 0.5)
-            * SHADOW_CELL_M
-        )
+        cells = np.stack(np.meshgrid(*map(np.arange, self.shape), indexing="ij"), -1).reshape(-1, 2)
+        return self.low + (cells + 0.5) * SHADOW_CELL_M
 
     def below(self, size_m: tuple[float, float, float], poses: Array) -> Rows:
         """Cells bool[X, Y] below boxes."""
@@ -157,21 +154,16 @@ class _Cells:
         """Weighted mean luminance f64[X, Y] of the places near each cell; NaN where there are none."""
         index = np.floor((xy - self.low) / SHADOW_CELL_M).astype(np.int64)
         flat = np.ravel_multi_index(tuple(index.T), self.shape)
-        sums = [
-            np.bincount(flat, values, int(np.prod(self.shape))).reshape(self.shape)
-            for values in (weights, weights * luminance)
-        ]
+        count, both = int(np.prod(self.shape)), (weights, weights * luminance)
+        sums = [np.bincount(flat, values, count).reshape(self.shape) for values in both]
         total, shown = (ndimage.gaussian_filter(values, 0.7, truncate=2.0) for values in sums)
         return np.where(total > LEAST_PX, shown / np.maximum(total, 1e-12), np.nan)
 
 
 def shaded_cells(light: Array, below: Rows, reach_m: float) -> Rows:
     """Cells bool[X, Y] of the shadow of what stood on some: those darker than lit ground about them that lie behind it,
-    and behind each other, in one direction: the one in which there are most.
-
-    Args:
-        light: luminance f64[X, Y] in linear light, NaN = not known. below: where it stood, bool[X, Y].
-    """
+    and behind each other, in one direction: the one in which there are most. ``light``: luminance f64[X, Y] in linear
+    light, NaN = not known. ``below``: where it stood, bool[X, Y]."""
     known = np.isfinite(light)
     size = 2 * round(AROUND_M / SHADOW_CELL_M) + 1
     lit = ndimage.generic_filter(np.where(known, light, np.nan), _upper, size=size, mode="constant", cval=np.nan)
@@ -196,12 +188,9 @@ def _upper(values: Array) -> float:
 def brightened(
     model: SceneModel, size_m: tuple[float, float, float], poses: Array, ground: Mapping[int, Rows], weights: Array
 ) -> SceneModel:
-    """A copy without the shadow of what stood in boxes; the model itself where none is found.
-
-    Args:
-        poses: world_from_box f64[V, 4, 4]. ground: rows bool[N] of each class of ground. weights: pixels that views
-            show of each, f64[N].
-    """
+    """A copy without the shadow of what stood in boxes; the model itself where none is found. ``poses``: world_from_box
+    f64[V, 4, 4]. ``ground``: rows bool[N] of each class of ground. ``weights``: pixels that views show of each,
+    f64[N]."""
     means = model.table["means"].detach().cpu().numpy().astype(np.float64)[:, :2]
     shown = colors_of(model)
     luminance = linear_of(shown) @ LUMINANCE
@@ -232,11 +221,7 @@ def brightened(
     return replace(model, table=Table({**columns, "sh_dc": changed}, dict(model.table.labels)), facts=dict(model.facts))
 
 
-# uncovered ----------------------------------------------------------------------------------------
-
-
-Array = NDArray[np.float64]
-Rows = NDArray[np.bool_]
+# -- what nobody saw -------------------------------------------------------------------------------
 SHOWN: Final = "shown"
 """Label column, f32[N]: what that recorded view shows of a Gaussian that shows most of it, in pixels of views
 `WEIGHED_PX` wide."""
@@ -270,11 +255,8 @@ BELOW_M: Final = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Hidden:
-    """An object of the recording and the views of it.
-
-    Args:
-        size_m: of its box. motion: of its box. moves: whether it leaves its place. views: at whose times it is there.
-    """
+    """An object of the recording and the views of it. ``size_m``: of its box. ``motion``: of its box. ``moves``:
+    whether it leaves its place. ``views``: at whose times it is there."""
 
     size_m: tuple[float, float, float]
     motion: Motion
@@ -407,11 +389,8 @@ def without_rows(model: SceneModel, gone: Rows) -> SceneModel:
     """A copy without some rows, bool[N]."""
     kept = torch.from_numpy(np.flatnonzero(~gone)).to(model.device)
     columns = {name: value.detach()[kept] for name, value in model.table.columns.items()}
-    return replace(
-        model,
-        table=Table(columns, {key: value[kept] for key, value in model.table.labels.items()}),
-        facts=dict(model.facts),
-    )
+    table = Table(columns, {key: value[kept] for key, value in model.table.labels.items()})
+    return replace(model, table=table, facts=dict(model.facts))
 
 
 def _without_unseen(
@@ -475,9 +454,8 @@ def _hidden(one: Hidden, places: Array) -> Rows:
         distance = np.maximum(np.linalg.norm(toward, axis=1), 1e-6)
         from_eye = pose.copy()
         from_eye[:3, 3] -= view.center_world
-        hides[rows] = inside & (
-            met_box(toward / distance[:, None], from_eye, np.array(one.size_m) + BOX_GROWTH_M) < distance
-        )
+        met = met_box(toward / distance[:, None], from_eye, np.array(one.size_m) + BOX_GROWTH_M)
+        hides[rows] = inside & (met < distance)
     return hides
 
 
@@ -492,9 +470,9 @@ def _cells_around(one: Hidden, seen_ground: Array) -> Array:
     xy = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, 2)
     tree = KDTree(seen_ground[:, :2])
     xy = xy[tree.query(xy)[0] < KNOWN_WITHIN_M]
-    return (
-        np.column_stack([xy, np.median(seen_ground[tree.query(xy, NEAREST)[1], 2], 1)]) if len(xy) else np.zeros((0, 3))
-    )
+    if not len(xy):
+        return np.zeros((0, 3))
+    return np.column_stack([xy, np.median(seen_ground[tree.query(xy, NEAREST)[1], 2], 1)])
 
 
 def _gaps(cells: Array, kept: Array, lost: Array) -> Rows:
@@ -519,22 +497,25 @@ def _closed(model: SceneModel, one: Hidden, lost: Array) -> SceneModel:
     if not count or len(seen) < LEAST_GROUND:
         return model
     colors, near = continued(cells[:, :2], means[seen, :2], colors_of(model)[seen], weights[seen])
-    changed = {
-        "means": cells - [0, 0, BELOW_M],
+    changed = _flat(cells - [0, 0, BELOW_M], [0.75 * CELL_M, 0.75 * CELL_M, 0.02], FILL_OPACITY, colors)
+    return with_copies(model, seen[near], changed)
+
+
+def _flat(places: Array, scales_m: Sequence[float], opacity: float, colors: Array) -> dict[str, Array]:
+    """Columns of Gaussians at places f64[C, 3], not turned, of colours f64[C, 3]."""
+    count = len(places)
+    return {
+        "means": places,
         "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
-        "log_scales": np.tile(np.log([0.75 * CELL_M, 0.75 * CELL_M, 0.02]), (count, 1)),
-        "logits": np.full(count, np.log(FILL_OPACITY / (1 - FILL_OPACITY))),
+        "log_scales": np.tile(np.log(scales_m), (count, 1)),
+        "logits": np.full(count, np.log(opacity / (1 - opacity))),
         "sh_dc": ((colors - 0.5) / SH_C0)[:, None],
     }
-    return with_copies(model, seen[near], changed)
 
 
 def with_copies(model: SceneModel, likeness: NDArray[np.int64], changed: Mapping[str, Array]) -> SceneModel:
     """With copies of some rows, appended, that differ from them in some columns; nobody saw what they show.
-
-    Args:
-        likeness: rows i64[M]. changed: columns f64[M, ...] by name.
-    """
+    ``likeness``: rows i64[M]. ``changed``: columns f64[M, ...] by name."""
     rows = torch.from_numpy(likeness).to(model.device)
     columns = {name: value.detach()[rows].clone() for name, value in model.table.columns.items()}
     for name, values in changed.items():
@@ -552,16 +533,12 @@ def with_copies(model: SceneModel, likeness: NDArray[np.int64], changed: Mapping
     return replace(model, table=made, facts=dict(model.facts))
 
 
-# sides --------------------------------------------------------------------------------------------
-#
-# Sides of a vehicle that no view showed: they are closed with flat Gaussians that continue the colours of what was
-# seen.
+# -- sides -----------------------------------------------------------------------------------------
 #
 # Who follows a car records its rear. Turned, or seen from another lane, its flanks are holes through which the street
-# shows. So the two flanks of a vehicle are covered with Gaussians wherever it has none: as far out as it reaches at
-# that height, in the colours that it, or its mirror image, has at that height. What recorded views would show of them
-# is taken away again: there the recording knows better.
-
+# shows. So the two flanks of a vehicle are covered with flat Gaussians wherever it has none: as far out as it reaches
+# at that height, in the colours that it, or its mirror image, has at that height. What recorded views would show of
+# them is taken away again: there the recording knows better.
 
 CLOSED_LABELS: Final = SYMMETRIC_LABELS - {"motorcycle"}
 CABIN_LABELS: Final = frozenset({"car", "vehicle"})
@@ -593,11 +570,8 @@ def with_closed_sides(
     model: SceneModel, names: Collection[str], views: Sequence[View], raster: RasterConfig
 ) -> SceneModel:
     """A copy in which some vehicles have flanks where the recording showed none; other objects stay as they are.
-
-    Args:
-        model: with the objects on their recorded paths. names: of objects. views: recorded ones, from which nothing new
-            is to be seen.
-    """
+    ``model``: with the objects on their recorded paths. ``names``: of objects. ``views``: recorded ones, from which
+    nothing new is to be seen."""
     first = len(model.table)
     for name in names:
         node = model.dynamic_object(name)
@@ -640,35 +614,23 @@ def _with_flanks(model: SceneModel, node: RigidNode) -> SceneModel:
         return model
     both = np.concatenate([places, places * [1, -1, 1]]) * ALIKE
     near = KDTree(both).query(flanks * ALIKE, min(LIKE, len(both)))[1] % len(rows)
-    color, count = np.median(colors_of(model)[rows][near], 1), len(flanks)
-    return with_copies(
-        model,
-        rows[near[:, 0]],
-        {
-            "means": flanks,
-            "quats": np.tile([1.0, 0, 0, 0], (count, 1)),
-            "log_scales": np.tile(np.log([SPREAD * STEP_M, 0.02, SPREAD * STEP_M]), (count, 1)),
-            "logits": np.full(count, np.log(OPACITY / (1 - OPACITY))),
-            "sh_dc": ((color - 0.5) / SH_C0)[:, None],
-        },
-    )
+    color = np.median(colors_of(model)[rows][near], 1)
+    changed = _flat(flanks, [SPREAD * STEP_M, 0.02, SPREAD * STEP_M], OPACITY, color)
+    return with_copies(model, rows[near[:, 0]], changed)
 
 
 def _flanks(places: Array, half: Array, cabin: bool) -> Array:
-    """Places f64[M, 3] on a grid over both flanks of a vehicle, in the frame of its box.
-
-    Args:
-        places: f64[N, 3] of its Gaussians, which say how wide it is at each height. half: of the size of its box.
-            cabin: a car, of the usual shape; else a box.
-    """
+    """Places f64[M, 3] on a grid over both flanks of a vehicle, in the frame of its box. ``places``: f64[N, 3] of its
+    Gaussians, which say how wide it is at each height. ``half``: of the size of its box. ``cabin``: a car, of the usual
+    shape; else a box."""
     found = []
     for z in np.arange(SIDE_FLOOR_M + STEP_M / 2, 2 * half[2] - 0.02, STEP_M) - half[2]:
         level = np.abs(places[np.abs(places[:, 2] - z) < SAME_HEIGHT_M, 1])
         wide = float(np.quantile(level, WIDTH_QUANTILE)) if len(level) > SIDE_LEAST_ROWS else 0.9 * half[1]
         up = (z / half[2] + 1) / 2 - CABIN_FROM
-        rear, front = (
-            (-half[0], half[0]) if up < 0 or not cabin else (half[0] * (0.5 * up - 0.8), half[0] * (0.4 - 0.7 * up))
-        )
+        rear, front = -half[0], half[0]
+        if cabin and up >= 0:
+            rear, front = half[0] * (0.5 * up - 0.8), half[0] * (0.4 - 0.7 * up)
         along = np.arange(rear + STEP_M / 2, front, STEP_M)
         side = np.full(len(along), min(wide, half[1]) - INSET_M)
         found += [np.column_stack([along, sign * side, np.full(len(along), z)]) for sign in (-1, 1)]

@@ -30,9 +30,7 @@ from mudg.core import harmonics
 from mudg.core.edit import HeightMap
 from mudg.core.harmonics import C0
 from mudg.core.table import Table
-from mudg.editing.apply import ground_of
-from mudg.editing.assets import write_asset
-from mudg.editing.carried import IMPORTED, carry_out
+from mudg.editing.apply import IMPORTED, carry_out, ground_of, write_asset
 from mudg.editing.model import Asset, classes_of_rows, lowest_points
 from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import EditScript

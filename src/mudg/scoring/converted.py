@@ -6,7 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from torch import Tensor
 
@@ -41,31 +41,21 @@ class ScoreNetwork:
     published: Names
 
 
-def _only(shapes: Mapping[str, Any]) -> Callable[[Mapping[str, Tensor]], dict[str, Tensor]]:
-    return lambda found: {name: found[name] for name in shapes if name in found}
-
-
 def _lpips(trunk: LpipsTrunk, flag: str) -> ScoreNetwork:
-    return ScoreNetwork(flag, lambda state, where: LpipsFeatures(state, where, trunk), _only(lpips_shapes(trunk)), {})
+    named = lambda found: {name: found[name] for name in lpips_shapes(trunk) if name in found}  # noqa: E731
+    return ScoreNetwork(flag, lambda state, where: LpipsFeatures(state, where, trunk), named, {})
 
 
 def _without_counts(found: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name: value for name, value in found.items() if not name.endswith("num_batches_tracked")}
 
 
+_I3D_SHA256: Final = "bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2"
+_FID_FILES: Final = {inception.KNOWN_SHA256: "pt_inception-2015-12-05-6726825d.pth"}
+
 NETWORKS: Final[Mapping[str, ScoreNetwork]] = {
-    "inception": ScoreNetwork(
-        "--fid-weights",
-        inception.InceptionFeatures,
-        _without_counts,
-        {inception.KNOWN_SHA256: "pt_inception-2015-12-05-6726825d.pth"},
-    ),
-    "i3d": ScoreNetwork(
-        "--fvd-weights",
-        i3d.I3DFeatures,
-        i3d.with_known_names,
-        {"bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2": "i3d_torchscript.pt"},
-    ),
+    "inception": ScoreNetwork("--fid-weights", inception.InceptionFeatures, _without_counts, _FID_FILES),
+    "i3d": ScoreNetwork("--fvd-weights", i3d.I3DFeatures, i3d.with_known_names, {_I3D_SHA256: "i3d_torchscript.pt"}),
     "dinov2": ScoreNetwork("--dino-weights", dinov2.DinoFeatures, dict, {}),
     "clip": ScoreNetwork("--clip-weights", clip_image.ClipImageFeatures, clip_image.with_openai_names, {}),
     "lpips": _lpips("alex", "--lpips-weights"),
@@ -76,48 +66,32 @@ NETWORKS: Final[Mapping[str, ScoreNetwork]] = {
 
 
 def convert_weights(network: str, checkpoint: Path, to: Path) -> None:
-    """Write the folder ``to``: ``weights.safetensors`` in float32, and ``model.json`` with its origin.
-
-    Raises:
-        InputError: the file is missing, damaged, or holds another network; nothing is written.
-    """
-    kind = NETWORKS[network]
-    found = read_checkpoint(checkpoint)
+    """Write the folder ``to``: ``weights.safetensors`` in float32, and ``model.json`` with its origin. InputError: the
+    file is missing, damaged, or holds another network; nothing is written."""
+    kind, found = NETWORKS[network], read_checkpoint(checkpoint)
     tensors = kind.named(found)
     kind.check(tensors, str(checkpoint))
     sha256 = store.sha256_file(checkpoint)
     known = kind.published.get(sha256)
     with store.atomic_directory(to) as partial:
-        store.write_safetensors(
-            partial / WEIGHTS_FILE, {name: value.detach().float() for name, value in tensors.items()}
-        )
+        written = {name: value.detach().float() for name, value in tensors.items()}
+        store.write_safetensors(partial / WEIGHTS_FILE, written)
         files = {WEIGHTS_FILE: store.sha256_file(partial / WEIGHTS_FILE)}
         source = {"file": checkpoint.name, "bytes": checkpoint.stat().st_size, "sha256": sha256, "published_as": known}
-        store.write_json(
-            partial / DESCRIPTION_FILE,
-            {"schema": 1, "kind": KIND, "network": network, "files": files, "source": source},
-        )
+        description = {"schema": 1, "kind": KIND, "network": network, "files": files, "source": source}
+        store.write_json(partial / DESCRIPTION_FILE, description)
         store.sync_tree(partial)
-    renamed = _renamed(found, tensors)
+    # names that changed, where one tensor became one
+    places = {value.data_ptr(): name for name, value in found.items()}
+    pairs = ((places.get(value.data_ptr(), ours), ours) for ours, value in tensors.items())
+    renamed = [(theirs, ours) for theirs, ours in pairs if theirs != ours]
     for theirs, ours in renamed[:_LISTED]:
         log.info(f"convert: {theirs} -> {ours}")
     more = f" ({len(renamed) - _LISTED} more names changed)" if len(renamed) > _LISTED else ""
-    origin = (
-        f"the published {known}"
-        if known
-        else "not a file whose hash is known"
-        if kind.published
-        else "no hash is on record"
-    )
+    other = "not a file whose hash is known" if kind.published else "no hash is on record"
+    origin = f"the published {known}" if known else other
     log.info(f"convert: {len(tensors)} tensors{more}; SHA-256 of {checkpoint.name}: {sha256} ({origin})")
     log.info(f"convert: use it with mudg score {kind.flag} {to / WEIGHTS_FILE}")
-
-
-def _renamed(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor]) -> list[tuple[str, str]]:
-    """Names that changed, where one tensor became one."""
-    places = {value.data_ptr(): name for name, value in found.items()}
-    pairs = ((places.get(value.data_ptr(), ours), ours) for ours, value in tensors.items())
-    return [(theirs, ours) for theirs, ours in pairs if theirs != ours]
 
 
 def source_sha256(weights: Path) -> str:
@@ -132,7 +106,6 @@ def source_sha256(weights: Path) -> str:
     try:
         fits, source = content["files"][WEIGHTS_FILE] == own, str(content["source"]["sha256"])
     except (KeyError, TypeError) as error:
-        raise InputError(
-            "the description of converted weights is malformed", where=str(description), got=repr(error)
-        ) from error
+        what, got = "the description of converted weights is malformed", repr(error)
+        raise InputError(what, where=str(description), got=got) from error
     return source if fits else own

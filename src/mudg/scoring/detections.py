@@ -33,7 +33,7 @@ from mudg.core.street_scores import (
     VEHICLE_LABELS,
     ImageBox,
 )
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.scene.read import read_points
 from mudg.scoring import tables as score_tables
 from mudg.scoring.truth import SAME_SWEEP_S
@@ -57,11 +57,8 @@ class Detection:
 
 @dataclass(frozen=True)
 class ViewImages:
-    """Images of one method on one trajectory.
-
-    Args:
-        key: first part of their names. numbers: of the images that count. views: of these.
-    """
+    """Images of one method on one trajectory. ``key``: first part of their names. ``numbers``: of the images that
+    count. ``views``: of these."""
 
     key: str
     numbers: tuple[int, ...]
@@ -91,12 +88,8 @@ def read_detections(path: Path) -> dict[str, list[Detection]]:
                 sizes[image["id"]] = (str(image["file_name"]), *scale)
             content = content["annotations"]
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
-            raise InputError(
-                "malformed file of boxes",
-                where=str(path),
-                expected="images (id, file_name, width, height) and annotations",
-                got=repr(error),
-            ) from error
+            expected, got = "images (id, file_name, width, height) and annotations", repr(error)
+            raise InputError("malformed file of boxes", where=str(path), expected=expected, got=got) from error
     if not isinstance(content, list):
         raise InputError("a file of boxes holds no list", where=str(path), expected=_BOXES, got=type(content).__name__)
     found: dict[str, list[Detection]] = {}
@@ -118,19 +111,13 @@ def _parsed(record: Any, sizes: Mapping[Any, tuple[str, float, float]], where: s
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError("a detected box is malformed", where=where, expected=_BOXES, got=repr(record)[:120]) from error
     if not all(map(math.isfinite, (x, y, width, height, score))) or width < 0 or height < 0 or not 0 <= score <= 1:
-        raise InputError(
-            "a detected box is impossible",
-            where=where,
-            expected="finite numbers, sizes of at least 0, a score in 0..1",
-            got=repr(record)[:120],
-        )
+        expected = "finite numbers, sizes of at least 0, a score in 0..1"
+        raise InputError("a detected box is impossible", where=where, expected=expected, got=repr(record)[:120])
     if sizes and given not in sizes:
-        raise InputError(
-            "a detected box belongs to no image", where=where, got=str(given), expected="an id of the images"
-        )
-    return image_name(name), Detection(
-        np.array([x * across, y * down, (x + width) * across, (y + height) * down]), category, score
-    )
+        what, got = "a detected box belongs to no image", str(given)
+        raise InputError(what, where=where, got=got, expected="an id of the images")
+    box = np.array([x * across, y * down, (x + width) * across, (y + height) * down])
+    return image_name(name), Detection(box, category, score)
 
 
 def image_name(given: str) -> str:
@@ -139,12 +126,8 @@ def image_name(given: str) -> str:
 
 
 class BoxDetections:
-    """NTA-IoU of methods.
-
-    Args:
-        scene: whose tracked boxes are the truth. path: file of boxes. as_published: true boxes also of corners behind
-            the camera.
-    """
+    """NTA-IoU of methods. ``scene``: whose tracked boxes are the truth. ``path``: file of boxes. ``as_published``: true
+    boxes also of corners behind the camera."""
 
     def __init__(self, scene: Scene, path: Path, as_published: bool) -> None:
         self._scene, self._as_published = scene, as_published
@@ -168,23 +151,17 @@ class BoxDetections:
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, for metrics.json."""
+        published, sweeps = "as published: corners behind the camera are not cut off", bool(self._scene.sweeps)
+        counted = "counted in the sweeps taken with the view"
         return {
             "file_sha256": self.sha256,
             "confidence_above": NTA_CONFIDENCE,
             "reach_px": street_scores.NTA_REACH_PX,
             "size": [NTA_WIDTH_PX, NTA_HEIGHT_PX],
             "classes": "all; beside it COCO's car and bus alone (2 and 5)",
-            "boxes": (
-                "as published: corners behind the camera are not cut off"
-                if self._as_published
-                else "cut at the near plane"
-            ),
-            "fewest_points": NTA_FEWEST_POINTS if self._scene.sweeps else None,
-            "points": (
-                "counted in the sweeps taken with the view"
-                if self._scene.sweeps
-                else "no sweeps: boxes of any number count"
-            ),
+            "boxes": published if self._as_published else "cut at the near plane",
+            "fewest_points": NTA_FEWEST_POINTS if sweeps else None,
+            "points": counted if sweeps else "no sweeps: boxes of any number count",
         }
 
     def _tracks_at(self, view: View) -> Sequence[Track]:
@@ -209,36 +186,22 @@ class BoxDetections:
 
 
 class LaneDetections:
-    """NTL-IoU of methods.
-
-    Args:
-        scene: a generated city, whose markings and kerbs take the place of a map. folder: masks
-            ``METHOD/TRAJECTORY/000003.png``.
-
-    Raises:
-        InputError: the scene has no lane lines, or the folder is missing.
-    """
+    """NTL-IoU of methods. ``scene``: a generated city, whose markings and kerbs take the place of a map. ``folder``:
+    masks ``METHOD/TRAJECTORY/000003.png``. InputError: the scene has no lane lines, or the folder is missing."""
 
     def __init__(self, scene: Scene, folder: Path) -> None:
         if scene.source.recipe is None:
-            raise InputError(
-                "the log has no lane lines to hold detected lanes against",
-                where=scene.root,
-                got=scene.source.dataset,
-                expected="a generated city: prepared logs keep no map",
-                remedy="leave out --lanes",
-            )
+            what = "the log has no lane lines to hold detected lanes against"
+            got, expected = scene.source.dataset, "a generated city: prepared logs keep no map"
+            raise InputError(what, where=scene.root, got=got, expected=expected, remedy="leave out --lanes")
         if not folder.is_dir():
             raise InputError("no such folder of lane masks", where=str(folder))
         self._lines = CityWorld.from_source(scene.source).lane_lines()
         self._folder = folder
 
     def of(self, images: ViewImages) -> dict[str, Any] | str:
-        """``value``, IoU of ``lanes`` alone, and number of ``frames``; or why there is none.
-
-        Raises:
-            InputError: some masks of a set are missing, or one cannot be read.
-        """
+        """``value``, IoU of ``lanes`` alone, and number of ``frames``; or why there is none. InputError: some masks of
+        a set are missing, or one cannot be read."""
         files = [self._folder / f"{name}.png" for name in images.names()]
         if not any(path.is_file() for path in files):
             return score_tables.NO_DETECTIONS
@@ -248,19 +211,14 @@ class LaneDetections:
             values.append(street_scores.ntl_iou(found, true))
             union = int((found | true).sum())
             lanes.append(float((found & true).sum() / union) if union else 0.0)
-        return {
-            "frames": len(values),
-            "value": round(sum(values) / len(values), 6),
-            "lanes": round(sum(lanes) / len(lanes), 6),
-        }
+        mean = lambda numbers: round(sum(numbers) / len(numbers), 6)  # noqa: E731
+        return {"frames": len(values), "value": mean(values), "lanes": mean(lanes)}
 
     def against(self, images: ViewImages, true: ViewImages) -> float | None:
         """The second convention: masks of the images against the detector's own masks of the true images; None where
         those are missing."""
-        pairs = [
-            (self._folder / f"{a}.png", self._folder / f"{b}.png")
-            for a, b in zip(images.names(), true.names(), strict=True)
-        ]
+        names = zip(images.names(), true.names(), strict=True)
+        pairs = [[self._folder / f"{name}.png" for name in pair] for pair in names]
         if not pairs or not all(path.is_file() for pair in pairs for path in pair):
             return None
         masks = [[street_scores.at_lane_size(read_mask(path)) for path in pair] for pair in pairs]
@@ -306,10 +264,7 @@ class Detections:
 
 
 def detections_of(config: ScoreConfig, scene: Scene) -> Detections:
-    """What reads the files that a configuration names.
-
-    Raises:
-        InputError: a file is missing or malformed, or the log has no lane lines.
-    """
+    """What reads the files that a configuration names. InputError: a file is missing or malformed, or the log has no
+    lane lines."""
     boxes = BoxDetections(scene, Path(config.detections), config.as_published) if config.detections else None
     return Detections(boxes, LaneDetections(scene, Path(config.lanes)) if config.lanes else None)

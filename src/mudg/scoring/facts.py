@@ -23,7 +23,7 @@ from mudg.core.fusion import STATIC
 from mudg.core.metrics import LaneFacts, Pair, ViewFacts
 from mudg.core.street_scores import VEHICLE_LABELS, visible_agents
 from mudg.core.view_metrics import AgentIou, LaneIou
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.labels.ground import driven_path, ground_near
 from mudg.labels.inputs import box_outline
 from mudg.scene.labels import read_label
@@ -57,9 +57,8 @@ class FactMaker:
         frame = self._frame_at(view)
         points = self._points.truth_at(view, frame)
         if truth is not None and truth.instance is not None:
-            return ViewFacts(
-                points, visible_agents(view, self._vehicles, truth.instance), exact_lanes(truth), truth.instance
-            )
+            agents = visible_agents(view, self._vehicles, truth.instance)
+            return ViewFacts(points, agents, exact_lanes(truth), truth.instance)
         return ViewFacts(points, None, None if frame is None else self._carried_lanes(view, frame))
 
     def recorded(self, camera: str) -> dict[str, float]:
@@ -75,9 +74,8 @@ class FactMaker:
 
     def _frame_at(self, view: View) -> Frame | None:
         """The image that the view's camera recorded at its time."""
-        return next(
-            (f for f in self.frames_of(view.camera.name) if abs(f.view.time_s - view.time_s) <= SAME_TIME_S), None
-        )
+        near = (f for f in self.frames_of(view.camera.name) if abs(f.view.time_s - view.time_s) <= SAME_TIME_S)
+        return next(near, None)
 
     def _carried_lanes(self, view: View, frame: Frame) -> LaneFacts | None:
         """Markings of a recorded image where the ground shows them in another view. Without LiDAR there is no
@@ -165,11 +163,7 @@ def known_of(facts: ViewFacts) -> set[str]:
     return names
 
 
-# trajectories -------------------------------------------------------------------------------------
-#
-# What a score is about: trajectories with the methods that have them, and what the methods are held against.
-
-
+# -- trajectories ----------------------------------------------------------------------------------
 _NAME: Final = re.compile(r"(?P<camera>.+?)_(?:recorded|shift(?P<shift>[+-]\d+(?:\.\d+)?))(?P<more>.*)")
 
 Baseline = Callable[[View], Observation]
@@ -237,25 +231,16 @@ class Reference:
 
 
 def trajectories_of(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]) -> list[ScoredTrajectory]:
-    """The trajectories that some method has, by camera and distance.
-
-    Raises:
-        InputError: there are none, or methods disagree about a trajectory's views.
-    """
-    sets = {
-        method: {name: read_observations(path) for name, path in list_observation_sets(folder).items()}
-        for method, folder in methods.items()
-    }
+    """The trajectories that some method has, by camera and distance. InputError: there are none, or methods disagree
+    about a trajectory's views."""
+    read = lambda folder: {n: read_observations(path) for n, path in list_observation_sets(folder).items()}  # noqa: E731
+    sets = {method: read(folder) for method, folder in methods.items()}
     names = sorted({name for found in sets.values() for name in found}, key=_order)
     if not names:
-        raise InputError(
-            "none of the folders holds rendered views",
-            where=", ".join(str(p) for p in methods.values()),
-            expected="output of mudg render or mudg synthesize",
-        )
-    return [
-        _matched(config, scene, name, {m: found[name] for m, found in sets.items() if name in found}) for name in names
-    ]
+        where, expected = ", ".join(map(str, methods.values())), "output of mudg render or mudg synthesize"
+        raise InputError("none of the folders holds rendered views", where=where, expected=expected)
+    having = {name: {m: found[name] for m, found in sets.items() if name in found} for name in names}
+    return [_matched(config, scene, name, of) for name, of in having.items()]
 
 
 def _order(name: str) -> tuple[str, float, str]:
@@ -275,11 +260,8 @@ def _matched(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, Ob
         for method, index in nearest.items():
             distance_m = apart_m(sets[method].views[index], view)
             if distance_m > SAME_PLACE_M:
-                raise InputError(
-                    "two methods rendered the same trajectory from different positions",
-                    where=f"{name}: {method}, view {index}",
-                    got=f"{distance_m:.3f} m apart",
-                )
+                what, where = "two methods rendered the same trajectory from different positions", f"{name}: {method}"
+                raise InputError(what, where=f"{where}, view {index}", got=f"{distance_m:.3f} m apart")
             indices[method].append(index)
         camera = scene.cameras.get(view.camera.name, view.camera)
         width = config.width_px or camera.width
@@ -289,11 +271,7 @@ def _matched(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, Ob
     found = _NAME.fullmatch(name)
     shift_m = float(found["shift"] or 0.0) if found is not None and not found["more"] else None
     camera_name = views[0].camera.name
-    frames = tuple(_frame_of(scene, camera_name, view) if shift_m == 0.0 else None for view in views)
-    return ScoredTrajectory(
-        name, camera_name, shift_m, tuple(views), frames, sets, {m: tuple(i) for m, i in indices.items()}
-    )
-
-
-def _frame_of(scene: Scene, camera: str, view: View) -> Frame | None:
-    return next((f for f in scene.frames_of(camera) if abs(f.view.time_s - view.time_s) <= SAME_TIME_S), None)
+    frames = scene.frames_of(camera_name) if shift_m == 0.0 else ()
+    at = lambda view: next((f for f in frames if abs(f.view.time_s - view.time_s) <= SAME_TIME_S), None)  # noqa: E731
+    kept = {method: tuple(own) for method, own in indices.items()}
+    return ScoredTrajectory(name, camera_name, shift_m, tuple(views), tuple(map(at, views)), sets, kept)

@@ -31,8 +31,8 @@ from mudg.core import metrics, project, view_metrics
 from mudg.core.losses import LPIPS_EPSILON
 from mudg.core.metrics import ViewFacts
 from mudg.core.pictures import error_image, resize_nearest, resize_rgb, to_bytes
-from mudg.diffusion import model_files
-from mudg.editing.view_settings import ScoreConfig
+from mudg.diffusion import model_files as mdm_files
+from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.perception import lpips_network
 from mudg.networks.featnets import WHOLE_PIXELS, CodecFeatures, LpipsTrunk, PerceptualDistance
 from mudg.scene.clouds import read_fused
@@ -108,17 +108,10 @@ def write_scores(
         name: {"title": row.title, "unit": row.unit, "better": row.better, "needs": list(row.needs)}
         for name, row in metrics.METRICS.items()
     }
-    anchors = anchors_of(results, trajectories, reference)
-    records = [trajectory.record() for trajectory in trajectories]
-    document = score_tables.document(
-        recorded,
-        reference.truth.exact,
-        records,
-        names,
-        results,
-        rows,
-        {"depth_limit_m": DEPTH_LIMIT_M, "anchors": anchors, "lpips": _lpips_record(config), **sets.records()},
-    )
+    made = {"depth_limit_m": DEPTH_LIMIT_M, "anchors": anchors_of(results, trajectories, reference)}
+    made |= {"lpips": _lpips_record(config), **sets.records()}
+    records, exact = [trajectory.record() for trajectory in trajectories], reference.truth.exact
+    document = score_tables.document(recorded, exact, records, names, results, rows, made)
     store.write_json(out / "metrics.json", document)
     store.write_text(out / "metrics.md", score_tables.markdown(document))
     return {"trajectories": len(trajectories), "methods": names}
@@ -131,7 +124,7 @@ def _distances(config: ScoreConfig) -> dict[str, PairDistance]:
         return found
     device = choose_device(config.device, "networks of the scores")
     if config.perceptual_views:
-        found["perceptual"] = PerceptualDistance(CodecFeatures(model_files.load("embedded").codec), device=device)
+        found["perceptual"] = PerceptualDistance(CodecFeatures(mdm_files.load("embedded").codec), device=device)
     for flag, (row, trunk) in LPIPS_FILES.items():
         if getattr(config, flag):
             network = lpips_network(getattr(config, flag), trunk, config.lpips_input)
@@ -217,30 +210,26 @@ def _score(
     """Score all methods on one trajectory; writes its truth, its baseline and its error picture."""
     names = [*([BASELINE] if reference.baseline is not None else []), *trajectory.sets]
     motion, exact_motion = metrics.StaticMotion(), view_metrics.ExactMotion(reference.vehicles)
-    sums = {
-        name: metrics.build_all(reference.distances, motion, view_metrics.build_facts(exact_motion)) for name in names
-    }
-    sums[TRUTH] = view_metrics.build_facts(exact_motion)
+    build = lambda: metrics.build_all(reference.distances, motion, view_metrics.build_facts(exact_motion))  # noqa: E731
+    sums = {name: build() for name in names} | {TRUTH: view_metrics.build_facts(exact_motion)}
     counted = trajectory.counted(reference.held_out)
     wanted = _wanted(trajectory, reference, counted)
     truth_has: set[str] = set()
     scored = 0
 
     def measure(number: int) -> MeasuredView:
-        return _measured(
-            trajectory, reference, number, {m: {k: of[k] for k in wanted[number] if k in of} for m, of in sums.items()}
-        )
+        own = {method: {k: of[k] for k in wanted[number] if k in of} for method, of in sums.items()}
+        return _measured(trajectory, reference, number, own)
 
     threads = native.threads()
     with native.one_thread() if _is_small(trajectory) else contextlib.nullcontext(), contextlib.ExitStack() as stack:
         truths = fills = None
         exact = reference.truth.exact
+        writer = lambda folder, *kind: ObservationWriter(out / folder / trajectory.name, trajectory.name, *kind)  # noqa: E731
         if not reference.truth.stored and (exact or all(frame is not None for frame in trajectory.frames)):
-            truths = stack.enter_context(
-                ObservationWriter(out / "truth" / trajectory.name, trajectory.name, "truth", "recorded")
-            )
+            truths = stack.enter_context(writer("truth", "truth", "recorded"))
         if reference.baseline is not None:
-            fills = stack.enter_context(ObservationWriter(out / BASELINE / trajectory.name, trajectory.name, BASELINE))
+            fills = stack.enter_context(writer(BASELINE, BASELINE))
         views = _in_order(measure, trajectory, threads)
         # not over `views`: the last one would stay in memory while the next is made
         for number in range(len(trajectory.views)):
@@ -295,13 +284,10 @@ def _is_small(trajectory: ScoredTrajectory) -> bool:
 def _wanted(trajectory: ScoredTrajectory, reference: Reference, counted: Sequence[int]) -> list[set[str]]:
     """The metrics that each view of a trajectory enters."""
     sampled = set(evenly(counted, reference.distance_views or len(counted)))
-    # wants all, in order
     every_frame = {"temporal_flickering"} | ({"flicker", "warp_error"} if reference.truth.exact else set())
-    needs_weights = reference.distances.keys()
-    usual = {name for name, row in metrics.METRICS.items() if row.build is not None} | {
-        *view_metrics.FACTS,
-        *view_metrics.PARTS,
-    }
+    needs_weights = reference.distances.keys()  # "flicker" and "temporal_flickering" want all views, in order
+    usual = {name for name, row in metrics.METRICS.items() if row.build is not None}
+    usual |= {*view_metrics.FACTS, *view_metrics.PARTS}
     usual -= {*needs_weights, "flicker", "temporal_flickering"}
     return [
         every_frame | (usual if n in counted else set()) | (needs_weights if n in sampled else set())
@@ -324,15 +310,10 @@ def _measured(
     else:
         facts = reference.facts.of(view, truth)
     compared = {**seen, **({} if truth is None else {TRUTH: truth.seen})}
-
-    if _is_small(trajectory):  # whose views are measured at the same time
-        return MeasuredView(
-            truth,
-            facts,
-            seen,
-            {name: metrics.measure(pair_of(one, truth, view, facts), wanted[name]) for name, one in compared.items()},
-        )
     pairs = {name: pair_of(one, truth, view, facts) for name, one in compared.items()}
+    if _is_small(trajectory):  # whose views are measured at the same time
+        measured = {name: metrics.measure(pair, wanted[name]) for name, pair in pairs.items()}
+        return MeasuredView(truth, facts, seen, measured)
     known = _in_bands(pairs, wanted)
     with ThreadPoolExecutor(native.threads()) as pool:
         found = pool.map(lambda name: metrics.measure(pairs[name], wanted[name], known.get(name)), pairs)
@@ -349,12 +330,10 @@ def _in_bands(
     for source in sources:
         if not isinstance(source, PerceptualDistance):
             continue
-        asked = [
-            n for n, pair in pairs.items() if source in {m.source for m in wanted[n].values()} and source.in_bands(pair)
-        ]
-        for name, value in zip(
-            asked, source.of_all([pairs[n] for n in asked], native.threads()) if asked else (), strict=True
-        ):
+        asks = {name: source in {metric.source for metric in wanted[name].values()} for name in pairs}
+        asked = [name for name, pair in pairs.items() if asks[name] and source.in_bands(pair)]
+        values = source.of_all([pairs[name] for name in asked], native.threads()) if asked else ()
+        for name, value in zip(asked, values, strict=True):
             found[name][source] = value
     return found
 
@@ -397,10 +376,7 @@ def pair_of(
     seen: Observation, truth: ViewTruth | None, view: View | None = None, facts: ViewFacts | None = None
 ) -> metrics.Pair:
     """Bring a method's view to the truth's size; where it gives no depth, it counts as the depth limit (80 m).
-
-    Args:
-        view: of both; without it, the truth's. facts: what is known of the view beside the truth.
-    """
+    ``view``: of both; without it, the truth's. ``facts``: what is known of the view beside the truth."""
     true = None if truth is None else truth.seen
     view = view or (seen.view if true is None else true.view)
     height, width = view.camera.height, view.camera.width

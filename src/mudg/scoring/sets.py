@@ -10,9 +10,10 @@ interrupted run does not compute a set again.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -29,7 +30,7 @@ from mudg.base.weights import read_checkpoint
 from mudg.core import feature_distances
 from mudg.core.feature_distances import cmmd_distance, frechet_distance, polynomial_distance
 from mudg.core.pictures import resize_rgb, to_bytes
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.networks import clip_image, dinov2, i3d, inception
 from mudg.scene.read import read_image
 from mudg.scoring import tables as score_tables
@@ -67,13 +68,9 @@ class ImageSet:
 
 @dataclass(frozen=True)
 class TrajectorySets:
-    """What is compared on one trajectory.
-
-    Args:
-        name, camera: of the trajectory. width, height: common size, pixels.
-        methods: the counted images of every method.
-        truth: the true images of the same views where they are known and are not the recorded ones, else None.
-    """
+    """What is compared on one trajectory. ``name``, ``camera``: of the trajectory. ``width``, ``height``: common size,
+    pixels. ``methods``: the counted images of every method. ``truth``: the true images of the same views where they are
+    known and are not the recorded ones, else None."""
 
     name: str
     camera: str
@@ -97,27 +94,16 @@ class SetDistances:
 
     def record(self) -> dict[str, Any]:
         """As JSON values, rounded to 6 digits after the point."""
-        values = {
-            "kid_standard_error": self.kid_standard_error,
-            "mind": self.mind,
-            "fid_at_infinity": self.fid_at_infinity,
-        }
-        return {
-            "n": self.n,
-            "n_reference": self.n_reference,
-            **{k: None if v is None else round(v, 6) for k, v in values.items()},
-        }
+        values = {name: getattr(self, name) for name in ("kid_standard_error", "mind", "fid_at_infinity")}
+        rounded = {name: None if value is None else round(value, 6) for name, value in values.items()}
+        return {"n": self.n, "n_reference": self.n_reference, **rounded}
 
 
-@dataclass(frozen=True)
+@dataclass
 class EmbeddingFiles:
-    """Embeddings of sets of images by a network, kept in a folder.
-
-    Args:
-        network: images ``[n, 3, h, w]`` -> ``[n, width]``. prepare: an image u8[H, W, 3] as the network wants it.
-            width: of the embedding.
-        key: weights and rules, by which kept files are found. folder: where they lie. device: of the network.
-    """
+    """Embeddings of sets of images by a network, kept in a folder. ``network``: images ``[n, 3, h, w]`` -> ``[n,
+    width]``. ``prepare``: an image u8[H, W, 3] as the network wants it. ``width``: of the embedding. ``key``: weights
+    and rules, by which kept files are found. ``folder``: where they lie. ``device``: of the network."""
 
     network: Callable[[Tensor], Tensor]
     prepare: Callable[[NDArray[np.uint8]], Tensor]
@@ -145,50 +131,27 @@ class EmbeddingFiles:
         return np.concatenate(batches)
 
 
-class FeatureFiles:
-    """Features of sets of images by FID's network, kept in a folder.
-
-    Args:
-        weights: file with the network's weights. rule: how images get its size. folder: where features are kept.
-            device: of the network.
-
-    Raises:
-        InputError: the file is missing, damaged, or holds another network.
-    """
+class FeatureFiles(EmbeddingFiles):
+    """Features f32[n, 2048] of sets of images by FID's network, kept in a folder. ``weights``: file with the network's
+    weights. ``rule``: how images get its size. ``folder``: where features are kept. ``device``: of the network.
+    InputError: the file is missing, damaged, or holds another network."""
 
     def __init__(self, weights: Path, rule: inception.ResizeRule, folder: Path, device: torch.device) -> None:
-        self.rule: inception.ResizeRule = rule
-        state = read_checkpoint(weights)
-        self.sha256, self.source_sha256 = store.sha256_file(weights), source_sha256(weights)
+        state, sha256 = read_checkpoint(weights), store.sha256_file(weights)
         network = inception.InceptionFeatures(state, str(weights)).to(device)
-        self._files = EmbeddingFiles(
-            lambda batch: network(batch)["2048"],
-            lambda rgb: inception.prepared(rgb, rule),
-            inception.WIDTH,
-            f"Inception {self.sha256} {rule}",
-            folder,
-            device,
-        )
-
-    def of(self, images: ImageSet) -> NDArray[np.float32]:
-        """Features f32[n, 2048] of a set."""
-        return self._files.of(images)
-
-    def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
-        """The name of the file that holds the features of a set, and the features."""
-        return self._files.named(images)
+        prepare = functools.partial(inception.prepared, rule=rule)
+        key = f"Inception {sha256} {rule}"
+        super().__init__(lambda batch: network(batch)["2048"], prepare, inception.WIDTH, key, folder, device)
+        self.rule: inception.ResizeRule = rule
+        self.sha256, self.source_sha256 = sha256, source_sha256(weights)
 
 
 def kept_features(
     folder: Path, key: str, images: ImageSet, shape: tuple[int, int], compute: Callable[[], NDArray[np.float32]]
 ) -> tuple[str, NDArray[np.float32]]:
     """The name of the file with the features of a set, and the features: from a folder if these very pixels went
-    through the same network before, else computed and kept there.
-
-    Args:
-        folder: where files lie. key: weights and rules. images: what is described. shape: of the features. compute:
-            makes them.
-    """
+    through the same network before, else computed and kept there. ``folder``: where files lie. ``key``: weights and
+    rules. ``images``: what is described. ``shape``: of the features. ``compute``: makes them."""
     content = hashlib.sha256(f"{key} {images.count}".encode())
     for number in range(images.count):
         picture = images.image(number)
@@ -210,45 +173,44 @@ def recorded_images(scene: Scene, sets: TrajectorySets) -> ImageSet:
     return ImageSet(len(frames), lambda number: read_image(scene, frames[number])).resized(sets.width, sets.height)
 
 
-@dataclass(frozen=True)
-class FeatureSets:
-    """Which files of features were compared, so that sets of several logs can be pooled: one record per method and
-    trajectory."""
+class SetNotes:
+    """Which files of features were compared, so that sets of several logs can be pooled, one record per method and
+    trajectory; and the floors."""
 
-    records: list[dict[str, str]] = field(default_factory=list)
+    def __init__(self) -> None:
+        self.sets: list[dict[str, str]] = []
+        self.floors: list[dict[str, Any]] = []
 
     def note(self, trajectory: str, method: str, made: str, reference: str) -> None:
         """Note the names of two files in the folder of features."""
-        self.records.append({"trajectory": trajectory, "method": method, "made": made, "reference": reference})
+        self.sets.append({"trajectory": trajectory, "method": method, "made": made, "reference": reference})
+
+    def note_floor(self, trajectory: str, how: str, values: Mapping[str, Any]) -> None:
+        """Note what the truth itself scores."""
+        self.floors.append({"trajectory": trajectory, "how": how, **values})
+
+    def record(self) -> dict[str, Any]:
+        """For metrics.json."""
+        return {"floors": self.floors, "sets": self.sets}
 
 
 class Distributions:
-    """FID and KID of every trajectory of a scene.
-
-    Args:
-        scene: whose recorded frames are the reference. features: how images become features.
-    """
+    """FID and KID of every trajectory of a scene. ``scene``: whose recorded frames are the reference. ``features``: how
+    images become features."""
 
     def __init__(self, scene: Scene, features: FeatureFiles) -> None:
         self._scene, self._features = scene, features
         self._recorded: dict[tuple[str, int, int], tuple[str, NDArray[np.float32]]] = {}
-        self._floors: list[dict[str, Any]] = []
-        self._sets = FeatureSets()
+        self._notes = SetNotes()
 
     def of(self, sets: TrajectorySets) -> dict[str, SetDistances | str]:
-        """Distances by method, or why there are none; the floor of the trajectory is noted for ``record``.
-
-        Raises:
-            InputError: methods have different numbers of images.
-        """
+        """Distances by method, or why there are none; the floor of the trajectory is noted for ``record``. InputError:
+        methods have different numbers of images."""
         counts = {method: images.count for method, images in sets.methods.items()}
         if len(set(counts.values())) > 1:
-            raise InputError(
-                "FID of sets of different size cannot be compared",
-                where=sets.name,
-                expected="the same views for all methods",
-                got=", ".join(f"{method}: {count}" for method, count in counts.items()),
-            )
+            what, expected = "FID of sets of different size cannot be compared", "the same views for all methods"
+            got = ", ".join(f"{method}: {count}" for method, count in counts.items())
+            raise InputError(what, where=sets.name, expected=expected, got=got)
         name, reference = self._reference(sets)
         if not len(reference):
             return dict.fromkeys(counts, score_tables.NO_TRUTH)
@@ -257,7 +219,7 @@ class Distributions:
         found: dict[str, SetDistances | str] = {}
         for method, images in sets.methods.items():
             own, made = self._features.named(images.resized(sets.width, sets.height))
-            self._sets.note(sets.name, method, own, name)
+            self._notes.note(sets.name, method, own, name)
             found[method] = distances(made, reference)
         self._note_floor(sets, reference)
         return found
@@ -271,8 +233,7 @@ class Distributions:
             "resize": self._features.rule,
             "reference": "recorded frames of the same camera",
             "covariance": "n - 1",
-            "floors": self._floors,
-            "sets": self._sets.records,
+            **self._notes.record(),
         }
 
     def _reference(self, sets: TrajectorySets) -> tuple[str, NDArray[np.float32]]:
@@ -290,67 +251,48 @@ class Distributions:
         else:
             return
         values = {"fid": round(found.fid, 6), "kid": round(found.kid, 6), **found.record()}
-        self._floors.append({"trajectory": sets.name, "how": how, **values})
+        self._notes.note_floor(sets.name, how, values)
 
 
-def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> Distributions | None:
-    """What computes FID and KID, or None where no weights are given.
-
-    Raises:
-        InputError: the file of weights is missing, damaged, or holds another network.
-    """
-    if not config.fid_weights:
-        return None
-    device = choose_device(config.device, "networks of the scores")
-    return Distributions(
-        scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, out / FEATURES_FOLDER, device)
-    )
+def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> Distributions:
+    """What computes FID and KID."""
+    device, folder = choose_device(config.device, "networks of the scores"), out / FEATURES_FOLDER
+    return Distributions(scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, folder, device))
 
 
 def distances(made: NDArray[np.float32], reference: NDArray[np.float32]) -> SetDistances:
     """All distances of two sets of features ``[n, d]``, at least two rows each; rows in order of time."""
     blocks = tuple(np.arange(len(rows)) // BLOCK_FRAMES for rows in (made, reference))
-    error = None
+    error, at_infinity, rng = None, None, lambda purpose: seeds.numpy_rng(0, 0, purpose)
     if all(len(set(numbers.tolist())) >= FEWEST_BLOCKS for numbers in blocks):
-        error = feature_distances.kernel_distance_error(made, reference, blocks, seeds.numpy_rng(0, 0, "blocks of KID"))
-    many = min(len(made), len(reference)) >= FEWEST_TO_EXTRAPOLATE
+        error = feature_distances.kernel_distance_error(made, reference, blocks, rng("blocks of KID"))
+    if min(len(made), len(reference)) >= FEWEST_TO_EXTRAPOLATE:
+        at_infinity = feature_distances.frechet_at_infinity(made, reference, rng("sizes of FID"))
     return SetDistances(
         n=len(made),
         n_reference=len(reference),
         fid=feature_distances.frechet_distance(made, reference),
         kid=feature_distances.kernel_distance(made, reference),
         kid_standard_error=error,
-        mind=feature_distances.mind_distance(made, reference, seeds.numpy_rng(0, 0, "directions of MIND")),
-        fid_at_infinity=(
-            feature_distances.frechet_at_infinity(made, reference, seeds.numpy_rng(0, 0, "sizes of FID"))
-            if many
-            else None
-        ),
+        mind=feature_distances.mind_distance(made, reference, rng("directions of MIND")),
+        fid_at_infinity=at_infinity,
     )
 
 
-# videos -------------------------------------------------------------------------------------------
+# -- videos ----------------------------------------------------------------------------------------
 #
-# FVD of a method on a trajectory: its clips as a set, against the clips of the recorded video of the same camera.
-#
-# All views count, in order: held-out frames alone are no video. Clips have 16 frames and begin at every eighth, so that
-# a drive of 40 frames gives four.
-
+# FVD of a method on a trajectory: its clips as a set, against the clips of the recorded video of the same camera. All
+# views count, in order: held-out frames alone are no video. Clips have 16 frames and begin at every eighth, so that a
+# drive of 40 frames gives four.
 
 CLIP_FRAMES: Final = 16
 HOP_FRAMES: Final = 8
 
 
 class ClipFiles:
-    """Features of the clips of a video by FVD's network, kept in a folder.
-
-    Args:
-        weights: file with the network's weights. rule: how frames get its size. folder: where features are kept.
-            device: of the network.
-
-    Raises:
-        InputError: the file is missing, damaged, or holds another network.
-    """
+    """Features of the clips of a video by FVD's network, kept in a folder. ``weights``: file with the network's
+    weights. ``rule``: how frames get its size. ``folder``: where features are kept. ``device``: of the network.
+    InputError: the file is missing, damaged, or holds another network."""
 
     def __init__(self, weights: Path, rule: i3d.VideoRule, folder: Path, device: torch.device) -> None:
         self.rule: i3d.VideoRule = rule
@@ -394,24 +336,16 @@ def clip_count(frames: int) -> int:
 
 
 class VideoDistances:
-    """FVD of every trajectory of a scene.
-
-    Args:
-        scene: whose recorded video is the reference. clips: how videos become features.
-    """
+    """FVD of every trajectory of a scene. ``scene``: whose recorded video is the reference. ``clips``: how videos
+    become features."""
 
     def __init__(self, scene: Scene, clips: ClipFiles) -> None:
         self._scene, self._clips = scene, clips
-        self._floors: list[dict[str, Any]] = []
-        self._sets = FeatureSets()
+        self._notes = SetNotes()
 
     def of(self, sets: TrajectorySets) -> dict[str, dict[str, Any] | str]:
         """By method ``{"fvd", "n", "n_reference"}``, or why there is none; the floor of the trajectory is noted for
-        ``record``.
-
-        Args:
-            sets: with all views of every method, in order of time.
-        """
+        ``record``. ``sets``: with all views of every method, in order of time."""
         recorded = recorded_images(self._scene, sets)
         if not recorded.count:
             return dict.fromkeys(sets.methods, score_tables.NO_TRUTH)
@@ -421,17 +355,15 @@ class VideoDistances:
         found: dict[str, dict[str, Any] | str] = {}
         for method, images in sets.methods.items():
             own, made = self._clips.named(images.resized(sets.width, sets.height))
-            self._sets.note(sets.name, method, own, name)
+            self._notes.note(sets.name, method, own, name)
             found[method] = compared(made, reference)
         half = len(reference) // 2
         if sets.truth is not None:
             floor = compared(self._clips.of(sets.truth.resized(sets.width, sets.height)), reference)
-            self._floors.append({"trajectory": sets.name, "how": "true images of the same views", **floor})
+            self._notes.note_floor(sets.name, "true images of the same views", floor)
         elif half >= FEWEST:
             floor = compared(reference[:half], reference[half:])
-            self._floors.append(
-                {"trajectory": sets.name, "how": "first half of the recorded video against the second", **floor}
-            )
+            self._notes.note_floor(sets.name, "first half of the recorded video against the second", floor)
         return found
 
     def record(self) -> dict[str, Any]:
@@ -445,8 +377,7 @@ class VideoDistances:
             "hop_frames": HOP_FRAMES,
             "reference": "recorded video of the same camera",
             "covariance": "n - 1",
-            "floors": self._floors,
-            "sets": self._sets.records,
+            **self._notes.record(),
         }
 
 
@@ -455,26 +386,18 @@ def compared(made: NDArray[np.float32], reference: NDArray[np.float32]) -> dict[
     return {"fvd": round(frechet_distance(made, reference), 6), "n": len(made), "n_reference": len(reference)}
 
 
-def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> VideoDistances | None:
-    """What computes FVD, or None where no weights are given.
-
-    Raises:
-        InputError: the file of weights is missing, damaged, or holds another network.
-    """
-    if not config.fvd_weights:
-        return None
+def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> VideoDistances:
+    """What computes FVD."""
     device = choose_device(config.device, "networks of the scores")
     return VideoDistances(scene, ClipFiles(Path(config.fvd_weights), config.fvd_resize, out / FEATURES_FOLDER, device))
 
 
-# video features -----------------------------------------------------------------------------------
+# -- video features --------------------------------------------------------------------------------
 #
 # Distances of videos in features that an extractor elsewhere made of their clips, such as V-JEPA (JEDi) or VideoMAE.
-#
-# Extractors are not run here: a saved program (TorchScript, or an exported one) would be code from a file, and this
-# package executes no data. What they give is a table of numbers, and that is what is read:
-# ``METHOD/TRAJECTORY.safetensors`` and ``recorded/CAMERA.safetensors``, each with one tensor ``features`` [clips,
-# values].
+# Extractors are not run here: a saved program (TorchScript, or an exported one) would be code from a file. What they
+# give is read: ``METHOD/TRAJECTORY.safetensors`` and ``recorded/CAMERA.safetensors``, each with one tensor ``features``
+# [clips, values].
 
 
 RECORDED: Final = "recorded"
@@ -482,26 +405,15 @@ TRUTH: Final = "truth"
 
 
 class VideoFeatures:
-    """Frechet and polynomial distances of every trajectory.
-
-    Args:
-        folder: of the tables.
-
-    Raises:
-        InputError: there is no such folder.
-    """
+    """Frechet and polynomial distances of every trajectory. ``folder``: of the tables. InputError: there is no such
+    folder."""
 
     def __init__(self, folder: Path) -> None:
         if not folder.is_dir():
-            raise InputError(
-                "no such folder of features",
-                where=str(folder),
-                expected=(
-                    "METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors, each with a tensor features [clips,"
-                    " values]"
-                ),
-                remedy="run the extractor yourself and save what it gives; programs (TorchScript) are not read",
-            )
+            tables = "METHOD/TRAJECTORY.safetensors and recorded/CAMERA.safetensors"
+            expected = f"{tables}, each with a tensor features [clips, values]"
+            remedy = "run the extractor yourself and save what it gives; programs (TorchScript) are not read"
+            raise InputError("no such folder of features", where=str(folder), expected=expected, remedy=remedy)
         self._folder = folder
         self._floors: list[dict[str, Any]] = []
         self._width: int | None = None
@@ -540,12 +452,9 @@ class VideoFeatures:
             return None
         found = store.read_safetensors(path).get("features")
         if found is None or found.ndim != 2 or not np.issubdtype(found.dtype, np.floating):
-            raise InputError(
-                "a table of video features is malformed",
-                where=str(path),
-                expected="one tensor features [clips, values]",
-                got="no such tensor" if found is None else f"{found.dtype} {found.shape}",
-            )
+            what, expected = "a table of video features is malformed", "one tensor features [clips, values]"
+            got = "no such tensor" if found is None else f"{found.dtype} {found.shape}"
+            raise InputError(what, where=str(path), expected=expected, got=got)
         self._width = int(found.shape[1])
         return found.astype(np.float64)
 
@@ -557,123 +466,82 @@ def _compared(made: NDArray[np.float64], reference: NDArray[np.float64]) -> dict
     return {"values": {k: round(v, 6) for k, v in values.items()}, "n": len(made), "n_reference": len(reference)}
 
 
-# embeddings ---------------------------------------------------------------------------------------
+# -- embeddings ------------------------------------------------------------------------------------
 #
 # Scores of images through one embedding each: FD-DINOv2 and consistency with DINOv2, CMMD, CLIP-F and CLIP-V with CLIP.
-#
 # Distances of sets compare the counted views of a trajectory with the recorded frames of the same camera, as FID does.
 # CLIP-F and consistency follow the video, so all views count.
-
 
 Rows = NDArray[np.float32]
 
 
-class SetDistance:
-    """A distance of counted views from the recorded frames, with its floors.
+class EmbeddingScores:
+    """A distance of counted views from the recorded frames, with its floors, and what else an embedding tells of a
+    video, for every trajectory of a scene.
 
     Args:
         scene: whose recorded frames are the reference. files: makes embeddings. name: of the metric. distance: of two
             sets.
+        further: other values by name, or why there is none, from the embeddings of all views and of the recorded
+            frames, and pairs of both at the same time.
+        made: how the numbers are made.
     """
 
-    def __init__(self, scene: Scene, files: EmbeddingFiles, name: str, distance: Callable[[Rows, Rows], float]) -> None:
-        self.scene, self.files, self._name, self._distance = scene, files, name, distance
-        self.floors: list[dict[str, Any]] = []
-
-    def recorded(self, sets: TrajectorySets) -> Rows:
-        """Embeddings of the recorded frames of a trajectory's camera."""
-        return self.files.of(recorded_images(self.scene, sets))
-
-    def note_floor(self, sets: TrajectorySets, reference: Rows, counted: Sequence[int]) -> None:
-        """Note what the truth itself scores."""
-        if sets.truth is not None:
-            how, made, against = (
-                "true images of the same views",
-                self.files.of(_sized(sets.truth, sets))[list(counted)],
-                reference,
-            )
-        elif len(reference) >= 2 * FEWEST:
-            how, made, against = "every second recorded frame against the others", reference[::2], reference[1::2]
-        else:
-            return
-        floor = {self._name: round(self._distance(made, against), 6), "n": len(made), "n_reference": len(against)}
-        self.floors.append({"trajectory": sets.name, "how": how, **floor})
-
-    def value(self, made: Rows, reference: Rows) -> dict[str, Any]:
-        """The distance and the sizes of both sets; or why there is none."""
-        if not len(reference):
-            return {"values": {self._name: score_tables.NO_TRUTH}}
-        if min(len(made), len(reference)) < FEWEST:
-            return {"values": {self._name: score_tables.TOO_FEW}}
-        found = {self._name: round(self._distance(made, reference), 6)}
-        return {"values": found, "n": len(made), "n_reference": len(reference)}
-
-
-def _sized(images: ImageSet, sets: TrajectorySets) -> ImageSet:
-    return images.resized(sets.width, sets.height)
-
-
-class DinoScores:
-    """FD-DINOv2 and the consistency of the video, of every trajectory of a scene."""
-
-    def __init__(self, scene: Scene, files: EmbeddingFiles, made: dict[str, Any]) -> None:
-        self._sets, self._made = SetDistance(scene, files, "fd_dinov2", frechet_distance), made
-
-    def of(
-        self, sets: TrajectorySets, counted: Sequence[int], _views: Sequence[View]
-    ) -> dict[str, dict[str, Any] | str]:
-        """By method ``values`` and sizes; ``sets`` holds all views, of which those ``counted`` enter the distance."""
-        reference, found = self._sets.recorded(sets), {}
-        for method, images in sets.methods.items():
-            rows = self._sets.files.of(_sized(images, sets))
-            of = self._sets.value(rows[list(counted)], reference)
-            steady = subject_consistency(rows)
-            of["values"]["subject_consistency"] = score_tables.TOO_FEW if steady is None else round(steady, 6)
-            found[method] = of
-        self._sets.note_floor(sets, reference, counted)
-        return found
-
-    def record(self) -> dict[str, Any]:
-        """How the numbers were made, and the floors."""
-        return {**self._made, "floors": self._sets.floors}
-
-
-class ClipScores:
-    """CMMD, CLIP-F and CLIP-V of every trajectory of a scene."""
-
-    def __init__(self, scene: Scene, files: EmbeddingFiles, made: dict[str, Any]) -> None:
-        self._scene, self._made = scene, made
-        self._sets = SetDistance(scene, files, "cmmd", cmmd_distance)
+    def __init__(
+        self,
+        scene: Scene,
+        files: EmbeddingFiles,
+        name: str,
+        distance: Callable[[Rows, Rows], float],
+        further: Callable[[Rows, Rows, Sequence[tuple[int, int]]], dict[str, float | str]],
+        made: dict[str, Any],
+    ) -> None:
+        self._scene, self._files, self._name, self._distance = scene, files, name, distance
+        self._further, self._made, self._floors = further, made, list[dict[str, Any]]()
 
     def of(
         self, sets: TrajectorySets, counted: Sequence[int], views: Sequence[View]
     ) -> dict[str, dict[str, Any] | str]:
-        """By method ``values`` and sizes; ``sets`` holds all views, of which those ``counted`` enter the distance and
-        CLIP-V."""
-        reference, found = self._sets.recorded(sets), {}
+        """By method ``values`` and sizes; ``sets`` holds all ``views``, of which those ``counted`` enter the
+        distance."""
+        reference, found = self._files.of(recorded_images(self._scene, sets)), {}
         frames = self._scene.frames_of(sets.camera) if sets.camera in self._scene.cameras else ()
-        times = np.array([frame.view.time_s for frame in frames])
-        pairs = []
+        times, pairs = np.array([frame.view.time_s for frame in frames]), []
         for place in counted if len(times) else ():
             nearest = int(np.argmin(np.abs(times - views[place].time_s)))
             if abs(times[nearest] - views[place].time_s) <= SAME_TIME_S:
                 pairs.append((place, nearest))
+        embedded = lambda images: self._files.of(images.resized(sets.width, sets.height))  # noqa: E731
         for method, images in sets.methods.items():
-            rows = self._sets.files.of(_sized(images, sets))
-            of = self._sets.value(rows[list(counted)], reference)
-            units = _units(rows)
-            steps = (units[1:] * units[:-1]).sum(1)
-            of["values"]["clip_f"] = round(float(steps.mean()), 6) if len(steps) else score_tables.TOO_FEW
-            sources = _units(reference)
-            same = [float(units[a] @ sources[b]) for a, b in pairs]
-            of["values"]["clip_v"] = round(sum(same) / len(same), 6) if same else score_tables.NO_TRUTH
-            found[method] = of
-        self._sets.note_floor(sets, reference, counted)
+            rows = embedded(images)
+            found[method] = self._compared(rows[list(counted)], reference)
+            found[method]["values"] |= {
+                name: value if isinstance(value, str) else round(value, 6)
+                for name, value in self._further(rows, reference, pairs).items()
+            }
+        if sets.truth is not None:
+            floor = self._compared(embedded(sets.truth)[list(counted)], reference, fewest=0)
+            self._note_floor(sets.name, "true images of the same views", floor)
+        elif len(reference) >= 2 * FEWEST:
+            floor = self._compared(reference[::2], reference[1::2])
+            self._note_floor(sets.name, "every second recorded frame against the others", floor)
         return found
+
+    def _note_floor(self, trajectory: str, how: str, floor: dict[str, Any]) -> None:
+        self._floors.append({"trajectory": trajectory, "how": how, **floor.pop("values"), **floor})
+
+    def _compared(self, made: Rows, reference: Rows, fewest: int = FEWEST) -> dict[str, Any]:
+        """The distance and the sizes of both sets; or why there is none."""
+        if fewest and not len(reference):
+            return {"values": {self._name: score_tables.NO_TRUTH}}
+        if min(len(made), len(reference)) < fewest:
+            return {"values": {self._name: score_tables.TOO_FEW}}
+        value = round(self._distance(made, reference), 6)
+        return {"values": {self._name: value}, "n": len(made), "n_reference": len(reference)}
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors."""
-        return {**self._made, "floors": self._sets.floors}
+        return {**self._made, "floors": self._floors}
 
 
 def _units(rows: Rows) -> NDArray[np.float64]:
@@ -691,14 +559,18 @@ def subject_consistency(rows: NDArray[np.floating]) -> float | None:
     return float(((np.maximum(before, 0) + np.maximum(first, 0)) / 2).mean())
 
 
-def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> DinoScores | None:
-    """What computes FD-DINOv2, or None where no weights are given.
+def _clip_values(rows: Rows, reference: Rows, pairs: Sequence[tuple[int, int]]) -> dict[str, float | str]:
+    """CLIP-F and CLIP-V."""
+    units, sources = _units(rows), _units(reference)
+    steps, same = (units[1:] * units[:-1]).sum(1), [float(units[a] @ sources[b]) for a, b in pairs]
+    return {
+        "clip_f": float(steps.mean()) if len(steps) else score_tables.TOO_FEW,
+        "clip_v": sum(same) / len(same) if same else score_tables.NO_TRUTH,
+    }
 
-    Raises:
-        InputError: the file of weights is missing, damaged, or holds another network.
-    """
-    if not config.dino_weights:
-        return None
+
+def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> EmbeddingScores:
+    """What computes FD-DINOv2 and the consistency of the video."""
     path, device = Path(config.dino_weights), choose_device(config.device, "networks of the scores")
     network = dinov2.DinoFeatures(read_checkpoint(path), str(path)).to(device)
     sha256 = store.sha256_file(path)
@@ -711,24 +583,20 @@ def dino_of(config: ScoreConfig, scene: Scene, out: Path) -> DinoScores | None:
         "reference": "recorded frames of the same camera",
         "covariance": "n - 1",
     }
-    return DinoScores(scene, files, made)
+
+    def further(rows: Rows, _reference: Rows, _pairs: Sequence[tuple[int, int]]) -> dict[str, float | str]:
+        steady = subject_consistency(rows)
+        return {"subject_consistency": score_tables.TOO_FEW if steady is None else steady}
+
+    return EmbeddingScores(scene, files, "fd_dinov2", frechet_distance, further, made)
 
 
-def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> ClipScores | None:
-    """What computes CMMD, or None where no weights are given.
-
-    Raises:
-        InputError: the file of weights is missing, damaged, or holds another network.
-    """
-    if not config.clip_weights:
-        return None
+def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> EmbeddingScores:
+    """What computes CMMD, CLIP-F and CLIP-V."""
     path, device = Path(config.clip_weights), choose_device(config.device, "networks of the scores")
     network = clip_image.ClipImageFeatures(read_checkpoint(path), str(path)).to(device)
     sha256 = store.sha256_file(path)
-
-    def prepare(rgb: NDArray[np.uint8]) -> Tensor:
-        return clip_image.prepared(rgb, network.side)
-
+    prepare = functools.partial(clip_image.prepared, side=network.side)
     files = EmbeddingFiles(network, prepare, network.out, f"CLIP {sha256}", out / FEATURES_FOLDER, device)
     made = {
         "network": f"CLIP {network.name}, projected, {network.out} values",
@@ -737,4 +605,4 @@ def clip_of(config: ScoreConfig, scene: Scene, out: Path) -> ClipScores | None:
         "kernel": "Gaussian, sigma 10, biased, times 1000",
         "reference": "recorded frames of the same camera",
     }
-    return ClipScores(scene, files, made)
+    return EmbeddingScores(scene, files, "cmmd", cmmd_distance, _clip_values, made)

@@ -18,33 +18,22 @@ UNEQUAL: Final = "unequal n"
 NO_DETECTIONS: Final = "no detections"
 NO_FEATURES: Final = "no features"
 WEIGHT_FLAGS: Final = {
-    "lpips": "--lpips-weights",
-    "lpips_vgg": "--lpips-vgg-weights",
-    "lpips_squeeze": "--lpips-squeeze-weights",
-    "fid": "--fid-weights",
-    "kid": "--fid-weights",
-    "fvd": "--fvd-weights",
-    "fd_dinov2": "--dino-weights",
-    "subject_consistency": "--dino-weights",
-    "cmmd": "--clip-weights",
-    "clip_f": "--clip-weights",
-    "clip_v": "--clip-weights",
-    "video_frechet": "--video-features",
-    "video_mmd": "--video-features",
-    "nta_iou": "--detections",
-    "ntl_iou": "--lanes",
+    metric: flag
+    for flag, metrics in (
+        ("--lpips-weights", "lpips"),
+        ("--lpips-vgg-weights", "lpips_vgg"),
+        ("--lpips-squeeze-weights", "lpips_squeeze"),
+        ("--fid-weights", "fid kid"),
+        ("--fvd-weights", "fvd"),
+        ("--dino-weights", "fd_dinov2 subject_consistency"),
+        ("--clip-weights", "cmmd clip_f clip_v"),
+        ("--video-features", "video_frechet video_mmd"),
+        ("--detections", "nta_iou"),
+        ("--lanes", "ntl_iou"),
+    )
+    for metric in metrics.split()
 }
 """Metric -> the flag of ``mudg score`` that names the weights or files it needs."""
-SET_METRICS: Final = {
-    "fid": "distributions",
-    "kid": "distributions",
-    "fvd": "videos",
-    "fd_dinov2": "dinov2",
-    "cmmd": "clip",
-    "video_frechet": "video_features",
-    "video_mmd": "video_features",
-}
-"""Metric of sets of images or clips -> the entry of metrics.json that says how it was made."""
 SET_SIZES: Final = {
     "distribution": ("fid", "kid"),
     "video": ("fvd",),
@@ -53,6 +42,9 @@ SET_SIZES: Final = {
     "video_features": ("video_frechet", "video_mmd"),
 }
 """Entry of a result with the sizes of its sets -> their metrics."""
+_MADE: Final = {"distribution": "distributions", "video": "videos"}
+SET_METRICS: Final = {metric: _MADE.get(entry, entry) for entry, metrics in SET_SIZES.items() for metric in metrics}
+"""Metric of sets of images or clips -> the entry of metrics.json that says how it was made."""
 FLOOR: Final = "Floor: the truth itself"
 TITLES: Final[dict[str, str]] = {
     "truth": "Truth",
@@ -63,24 +55,12 @@ TERMINAL_METRICS: Final = ("psnr", "ssim", "perceptual", "abs_rel", "rmse_m", "d
 WITHOUT_TRUTH: Final = ("lidar_abs_rel", "lidar_rmse_m", "lidar_psnr", "agreement", "lane_correlation")
 """Shown in a terminal where no true image exists."""
 _DIGITS: Final = {
-    "psnr": 2,
-    "psnr_movers": 2,
-    "flicker": 2,
-    "rmse_m": 2,
-    "fid": 1,
-    "kid": 4,
-    "fvd": 1,
-    "lidar_rmse_m": 2,
-    "lidar_psnr": 2,
-    "lane_psnr": 2,
-    "warp_error": 4,
-    "temporal_flickering": 4,
-    "ntl_iou": 2,
-    "fd_dinov2": 1,
-    "clip_f": 4,
-    "clip_v": 4,
-    "subject_consistency": 4,
+    **dict.fromkeys(("fid", "fvd", "fd_dinov2"), 1),
+    **dict.fromkeys(("psnr", "psnr_movers", "flicker", "rmse_m"), 2),
+    **dict.fromkeys(("lidar_rmse_m", "lidar_psnr", "lane_psnr", "ntl_iou"), 2),
+    **dict.fromkeys(("kid", "warp_error", "temporal_flickering", "clip_f", "clip_v", "subject_consistency"), 4),
 }
+"""Digits of metrics that do not have 3."""
 
 
 def title_of(method: str) -> str:
@@ -117,25 +97,15 @@ def document(
     """
     depth_limit_m, distributions, videos = made["depth_limit_m"], made.get("distributions"), made.get("videos")
     held_out = len(scene.frames_in("test"))
+    limit = f"{depth_limit_m:g} m"
+    off = "A recorded log has no ground truth off its path: shifted views are shown, not scored."
+    no_split = "No frame was held out: on the recorded path the frames that were learned from are scored."
     rules = [
-        (
-            "All methods are scored at one size, that of the scene's camera unless another was requested; "
-            "colour is resized bilinearly, depth and classes take the nearest pixel."
-        ),
-        (
-            "On the recorded path only held-out frames count."
-            if held_out
-            else "No frame was held out: on the recorded path the frames that were learned from are scored."
-        ),
-        (
-            "Views off the recorded path were never seen by any method."
-            if exact
-            else "A recorded log has no ground truth off its path: shifted views are shown, not scored."
-        ),
-        (
-            f"Depth counts where the truth is known and at most {depth_limit_m:g} m; "
-            f"where a method gives none, it counts as {depth_limit_m:g} m."
-        ),
+        "All methods are scored at one size, that of the scene's camera unless another was requested; "
+        "colour is resized bilinearly, depth and classes take the nearest pixel.",
+        "On the recorded path only held-out frames count." if held_out else no_split,
+        "Views off the recorded path were never seen by any method." if exact else off,
+        f"Depth counts where the truth is known and at most {limit}; where a method gives none, it counts as {limit}.",
         "Class scores are pooled over all views of a trajectory; mIoU is the mean over the classes in its truth.",
         *([_rule_of_sets(distributions)] if distributions else []),
         *([_rule_of_videos(videos)] if videos else []),
@@ -186,21 +156,17 @@ def _further_rules(made: Mapping[str, Any]) -> list[str]:
     """One sentence for each other metric whose definition has variants."""
     rules = []
     if made.get("lpips"):
-        rules.append(
-            f"LPIPS gets its colours {'in -1..1' if made['lpips']['input'] == 'correct' else 'unscaled, in 0..1'}."
-        )
+        how = "in -1..1" if made["lpips"]["input"] == "correct" else "unscaled, in 0..1"
+        rules.append(f"LPIPS gets its colours {how}.")
     if made.get("dinov2"):
         rules.append(f"FD-DINOv2 is made with {made['dinov2']['network']}; read it beside the floor.")
     if made.get("clip"):
         pairs = "CLIP-F (neighbouring views) and CLIP-V (recorded frame of the same time)"
         rules.append(f"CMMD, {pairs} are made with {made['clip']['network']}.")
     detections = made.get("detections", {})
-    if "nta_iou" in detections:
-        of = detections["nta_iou"]
-        rules.append(
-            f"NTA-IoU: true boxes {of['boxes']}; classes: {of['classes']}; points: {of['points']}. What hides a box is"
-            " not asked."
-        )
+    if of := detections.get("nta_iou"):
+        of = f"true boxes {of['boxes']}; classes: {of['classes']}; points: {of['points']}"
+        rules.append(f"NTA-IoU: {of}. What hides a box is not asked.")
     if "ntl_iou" in detections:
         rules.append(f"NTL-IoU: {detections['ntl_iou']['lines']}. An image without any lane scores 47 to 50.")
     return rules
@@ -226,15 +192,9 @@ def by_distance(
         for method in methods:
             rows = [r for r in results if r["method"] == method and r["trajectory"] in here]
             values = {name: _mean([r["values"].get(name) for r in rows]) for name in names}
-            table.append(
-                {
-                    "method": method,
-                    "distance_m": distance,
-                    "sides": sides,
-                    "trajectories": [r["trajectory"] for r in rows],
-                    "values": {**values, **uneven},
-                }
-            )
+            row = {"method": method, "distance_m": distance, "sides": sides}
+            here_too = [r["trajectory"] for r in rows]
+            table.append({**row, "trajectories": here_too, "values": {**values, **uneven}})
     return table
 
 
@@ -273,10 +233,8 @@ def floors_by_distance(document: Mapping[str, Any]) -> dict[float, dict[str, flo
             floors = document.get(entry, {}).get("floors", [])
             here = [floor for floor in floors if floor["trajectory"] in row["trajectories"]]
             if here:
-                equal = len({floor["n"] for floor in here}) == 1
-                found.setdefault(float(row["distance_m"]), {})[name] = (
-                    _mean([f[name] for f in here]) if equal else UNEQUAL
-                )
+                value = _mean([f[name] for f in here]) if len({floor["n"] for floor in here}) == 1 else UNEQUAL
+                found.setdefault(float(row["distance_m"]), {})[name] = value
     return found
 
 
@@ -303,9 +261,8 @@ def plain(document: Mapping[str, Any]) -> str:
             values = values_of.get((method["name"], distance), {})
             cells = []
             for metric, width in zip(columns, widths, strict=True):
-                across = {
-                    m["name"]: values_of.get((m["name"], distance), {}).get(metric["name"]) for m in document["methods"]
-                }
+                of_methods = {m["name"]: values_of.get((m["name"], distance), {}) for m in document["methods"]}
+                across = {name: of.get(metric["name"]) for name, of in of_methods.items()}
                 star = "*" if method["name"] in best_of(metric["better"], across, metric["name"]) else " "
                 cells.append(f"{number_text(metric['name'], values.get(metric['name'])) + star:>{width}}")
             lines.append(f"  {method['title']:<28}" + "".join(cells))
@@ -324,25 +281,21 @@ def _has_numbers(values: Sequence[Mapping[str, Any]], metrics: Sequence[Mapping[
 def markdown(document: Mapping[str, Any]) -> str:
     """All trajectories and metrics as Markdown, with the rules."""
     lines = [f"# Scores of {document['scene']['id']}", "", *(f"* {rule}" for rule in document["rules"])]
-    absent = [
-        m for m in document["metrics"] if all(r["values"].get(m["name"]) == NOT_COMPUTED for r in document["results"])
-    ]
+    missing = lambda metric: all(r["values"].get(metric["name"]) == NOT_COMPUTED for r in document["results"])  # noqa: E731
+    absent = [metric for metric in document["metrics"] if missing(metric)]
     names = [m["name"] for m in document["metrics"] if m not in absent]
     if absent and document["results"]:
-        flags = dict.fromkeys(WEIGHT_FLAGS.get(m["name"], "") for m in absent)
-        of_flag = {f: ", ".join(m["title"] for m in absent if WEIGHT_FLAGS.get(m["name"], "") == f) for f in flags}
-        lines.append(
-            "* Not computed:"
-            f" {'; '.join(f'{titles} ({flag})' if flag else titles for flag, titles in of_flag.items())}."
-        )
+        of_flag: dict[str, list[str]] = {}
+        for metric in absent:
+            of_flag.setdefault(WEIGHT_FLAGS.get(metric["name"], ""), []).append(metric["title"])
+        texts = (f"{', '.join(titles)} ({flag})" if flag else ", ".join(titles) for flag, titles in of_flag.items())
+        lines.append(f"* Not computed: {'; '.join(texts)}.")
     for trajectory in document["trajectories"]:
         results = [r for r in document["results"] if r["trajectory"] == trajectory["name"]]
         unknown = [n for n in names if results and all(r["values"].get(n) == NO_TRUTH for r in results)]
         shown = [n for n in names if n not in unknown]
-        rows = [
-            [title_of(r["method"]), str(r["views"]), *(number_text(n, r["values"].get(n)) for n in shown)]
-            for r in results
-        ]
+        texts = lambda values: (number_text(name, values.get(name)) for name in shown)  # noqa: B023, E731
+        rows = [[title_of(r["method"]), str(r["views"]), *texts(r["values"])] for r in results]
         lines += ["", f"## {trajectory['name']}", ""]
         if any(isinstance(r["values"].get(n), float) for r in results for n in shown):
             lines += html.markdown_table(["method", "views", *shown], rows)
@@ -360,44 +313,31 @@ def _lines_of_sets(document: Mapping[str, Any], trajectory: str) -> list[str]:
     for row in rows[:1]:
         of = row["distribution"]
         lines += ["", f"* FID and KID: {of['n']} views of every method against {of['n_reference']} recorded frames."]
-    errors = [
-        f"{title_of(r['method'])} {r['distribution']['kid_standard_error']:.4f}"
-        for r in rows
-        if r["distribution"]["kid_standard_error"] is not None
-    ]
-    lines += [f"* Standard error of KID: {', '.join(errors)}."] if errors else []
+    errors = {title_of(r["method"]): r["distribution"]["kid_standard_error"] for r in rows}
+    known = [f"{title} {error:.4f}" for title, error in errors.items() if error is not None]
+    lines += [f"* Standard error of KID: {', '.join(known)}."] if known else []
     for row in [r for r in document["results"] if r["trajectory"] == trajectory and "video" in r][:1]:
-        of = row["video"]
-        lines += [
-            *([] if lines else [""]),
-            f"* FVD: {of['n']} clips of every method against {of['n_reference']} recorded clips.",
-        ]
+        of, first = row["video"], [] if lines else [""]
+        lines += [*first, f"* FVD: {of['n']} clips of every method against {of['n_reference']} recorded clips."]
     titles = {m["name"]: m["title"] for m in document["metrics"]}
-    floors = [
-        floor for entry in dict.fromkeys(SET_METRICS.values()) for floor in document.get(entry, {}).get("floors", [])
-    ]
-    for floor in floors:
-        if floor["trajectory"] == trajectory:
-            values = ", ".join(
-                f"{titles[name]} {number_text(name, floor[name])}" for name in SET_METRICS if name in floor
-            )
-            lines.append(f"* {FLOOR}: {values} ({floor['how']}, {floor['n']} against {floor['n_reference']}).")
+    for entry in dict.fromkeys(SET_METRICS.values()):
+        for floor in document.get(entry, {}).get("floors", []):
+            if floor["trajectory"] == trajectory:
+                texts = [f"{titles[name]} {number_text(name, floor[name])}" for name in SET_METRICS if name in floor]
+                sizes = f"{floor['how']}, {floor['n']} against {floor['n_reference']}"
+                lines.append(f"* {FLOOR}: {', '.join(texts)} ({sizes}).")
     return lines
 
 
 def _lines_of_anchors(document: Mapping[str, Any], trajectory: str) -> list[str]:
     """What true and recorded images and the baseline score on a trajectory."""
     titles = {m["name"]: m["title"] for m in document["metrics"]}
-    places = {
-        "truth": "true images",
-        "recorded": "recorded images at their own views",
-        "nearest_fill": title_of("nearest_fill").lower(),
-    }
+    places = {"truth": "true images", "recorded": "recorded images at their own views"}
+    places["nearest_fill"] = title_of("nearest_fill").lower()
     lines = []
     for anchor in document.get("anchors", []):
-        found = [
-            f"{title} {number_text(anchor['metric'], anchor[key])}" for key, title in places.items() if key in anchor
-        ]
+        texts = {key: number_text(anchor["metric"], anchor[key]) for key in places if key in anchor}
+        found = [f"{places[key]} {text}" for key, text in texts.items()]
         if anchor["trajectory"] == trajectory and found:
             lines.append(f"* {titles[anchor['metric']]}: {', '.join(found)}.")
     return ["", *lines] if lines else []

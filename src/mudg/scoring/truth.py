@@ -56,11 +56,8 @@ class ViewTruth:
 
 @dataclass(frozen=True)
 class Truth:
-    """Where truth comes from: ``at_view(view, frame, trajectory)`` is None where there is none.
-
-    Args:
-        exact: truth exists at every pixel of every view. stored: it lies on disk already and need not be written again.
-    """
+    """Where truth comes from: ``at_view(view, frame, trajectory)`` is None where there is none. ``exact``: truth exists
+    at every pixel of every view. ``stored``: it lies on disk already and need not be written again."""
 
     exact: bool
     at_view: Callable[[View, Frame | None, str], ViewTruth | None]
@@ -79,12 +76,11 @@ def truth_of(scene: Scene) -> Truth:
         for frame in scene.frames:
             there, stated = world.ego_path().pose_at(frame.view.time_s), scene.ego.pose_at(frame.view.time_s)
             if there is None or stated is None or not np.allclose(there, stated, atol=1e-3):
-                raise InputError(
-                    "the scene is not the generated city that its recipe names, so its truth would be another street's",
-                    where=f"{scene.root}: source.recipe, frame {frame.id}",
-                    expected="the path of the vehicle that the recipe makes",
-                    remedy="generate the city again; in scenes of other origin, leave the recipe out",
-                )
+                what = "the scene is not the generated city that its recipe names"
+                what += ", so its truth would be another street's"
+                where, expected = f"{scene.root}: source.recipe, frame {frame.id}", "the path that the recipe makes"
+                remedy = "generate the city again; in scenes of other origin, leave the recipe out"
+                raise InputError(what, where=where, expected=expected, remedy=remedy)
         moving = np.array(city_logs.moving_instances(world), np.int32)
         return Truth(True, lambda view, _frame, _name: _city_view(world, moving, view))
     return Truth(False, lambda view, frame, _name: None if frame is None else ViewTruth(_recorded(scene, frame, view)))
@@ -97,11 +93,8 @@ def _city_view(world: CityWorld, moving: NDArray[np.int32], view: View) -> ViewT
 
 
 def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path) -> None:
-    """Draw the truth of a generated city on some trajectories once, for many scores.
-
-    Raises:
-        InputError: the scene was not generated.
-    """
+    """Draw the truth of a generated city on some trajectories once, for many scores. InputError: the scene was not
+    generated."""
     truth = truth_of(read_scene(scene))
     if not truth.exact:
         raise InputError("only a generated city has ground truth at every view", where=str(scene))
@@ -112,9 +105,8 @@ def write_truth(scene: Path, trajectories: Sequence[Trajectory], out: Path) -> N
                 for view in path.views:
                     true = truth.at_view(view, None, path.name)
                     if true is None or true.moving is None or true.instance is None or true.marking is None:
-                        raise InputError(
-                            "the city has no ground truth at this view", where=f"{path.name}, {view.time_s:g} s"
-                        )
+                        where = f"{path.name}, {view.time_s:g} s"
+                        raise InputError("the city has no ground truth at this view", where=where)
                     own = (true.moving[0].numpy().astype(np.uint8), true.instance, true.marking.astype(np.uint8))
                     for found, value in zip(maps.values(), own, strict=True):
                         found.append(value)
@@ -134,20 +126,17 @@ def stored_truth(folder: Path) -> Truth:
     def find(view: View, _frame: Frame | None, name: str) -> ViewTruth:
         stored = sets.get(name)
         if stored is None:
-            raise InputError(
-                "the folder of ground truth lacks a trajectory", where=str(folder), expected=name, got=", ".join(sets)
-            )
+            what, got = "the folder of ground truth lacks a trajectory", ", ".join(sets)
+            raise InputError(what, where=str(folder), expected=name, got=got)
         index = min(range(len(stored)), key=lambda i: abs(stored.views[i].time_s - view.time_s))
         there = stored.views[index]
         distance_m = apart_m(there, view)
         same_size = (there.camera.width, there.camera.height) == (view.camera.width, view.camera.height)
         if abs(there.time_s - view.time_s) > SAME_TIME_S or distance_m > SAME_PLACE_M or not same_size:
-            raise InputError(
-                "the stored ground truth shows another view",
-                where=f"{folder / name}, view {index}",
-                expected=f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}",
-                got=f"{there.time_s:.4f} s, {there.camera.width}x{there.camera.height}, {distance_m:.3f} m apart",
-            )
+            size = lambda view: f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}"  # noqa: E731
+            what, where = "the stored ground truth shows another view", f"{folder / name}, view {index}"
+            got = f"{size(there)}, {distance_m:.3f} m apart"
+            raise InputError(what, where=where, expected=size(view), got=got)
         own = maps[name]
         moving = torch.from_numpy(own["moving"][index].astype(bool))[None]
         return ViewTruth(stored[index], moving, own["instance"][index], own["marking"][index].astype(bool))
@@ -160,9 +149,8 @@ def _recorded(scene: Scene, frame: Frame, view: View) -> Observation:
     height, width = view.camera.height, view.camera.width
 
     def label(name: str) -> NDArray[Any] | None:
-        if (
-            name not in frame.labels or f"{name}_confidence" in frame.labels
-        ):  # a label with a confidence is a labeller's
+        # a label with a confidence is a labeller's
+        if name not in frame.labels or f"{name}_confidence" in frame.labels:
             return None
         return resize_nearest(read_label(scene, frame, name), height, width)
 
@@ -185,16 +173,13 @@ def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
     if not sweeps:
         return None
     clouds = [(sweep, read_points(scene, sweep).xyz) for sweep in sweeps]
-    world = np.concatenate([geometry.transform_points(sweep.world_from_lidar, xyz) for sweep, xyz in clouds]).astype(
-        np.float32
-    )
+    placed = [geometry.transform_points(sweep.world_from_lidar, xyz) for sweep, xyz in clouds]
+    world = np.concatenate(placed).astype(np.float32)
     gap_deg = max(largest_beam_gap(xyz) for _, xyz in clouds)
     return torch.from_numpy(visible_depth(view, world, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=MAX_LIDAR_M))[None]
 
 
-# the LiDAR points of a log, for truth at views that no camera recorded ----------------------------
-
-
+# -- the LiDAR points of a log, for truth at views that no camera recorded -------------------------
 MERGED_SWEEPS: Final = 6
 """Sweeps of each LiDAR whose points tell what the shown cameras saw."""
 KEPT_SWEEPS: Final = 96
@@ -234,11 +219,8 @@ class LogPoints:
         return lidar.carried(frame.view, read_image(self.scene, frame), world, points.gap_deg)
 
     def truth_at(self, view: View, frame: Frame | None) -> PointTruth | None:
-        """What the points of the sweeps taken with a view say about it; None without such sweeps.
-
-        Args:
-            frame: the recorded image of that time, which gives the points' colours and classes, or None.
-        """
+        """What the points of the sweeps taken with a view say about it; None without such sweeps. ``frame``: the
+        recorded image of that time, which gives the points' colours and classes, or None."""
         points = self.of_moment(view.time_s)
         if points is None or not len(points.xyz):
             return None
@@ -268,9 +250,8 @@ class LogPoints:
         kept = self._kept.get(sweep.id)
         if kept is None:
             points = read_points(self.scene, sweep)
-            owner, owned = separate(
-                SweepShots(sweep.time_s, sweep.world_from_lidar, points, ()), self.dynamic, self._rules
-            )
+            shots = SweepShots(sweep.time_s, sweep.world_from_lidar, points, ())
+            owner, owned = separate(shots, self.dynamic, self._rules)
             xyz = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
             for number, local in owned.items():
                 xyz[owner == number] = local

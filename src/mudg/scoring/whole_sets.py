@@ -15,26 +15,15 @@ from mudg.base import log
 from mudg.base.errors import InputError
 from mudg.base.types import Scene
 from mudg.core.pictures import to_bytes
-from mudg.editing.view_settings import ScoreConfig
+from mudg.editing.settings import ScoreConfig
 from mudg.scene.observations import ObservationSet, read_observations
-from mudg.scoring import detections
+from mudg.scoring import detections, sets
 from mudg.scoring.detections import Detections, ViewImages, detections_of
 from mudg.scoring.facts import ANCHORED, Reference, ScoredTrajectory
-from mudg.scoring.sets import (
-    ClipScores,
-    DinoScores,
-    Distributions,
-    ImageSet,
-    TrajectorySets,
-    VideoDistances,
-    VideoFeatures,
-    clip_of,
-    dino_of,
-    distributions_of,
-    videos_of,
-)
+from mudg.scoring.sets import ImageSet, TrajectorySets
 
 BASELINE: Final = "nearest_fill"
+Rows = Sequence[dict[str, Any]]
 OF_ENTRY: Final[Mapping[str, tuple[str, ...]]] = {
     "dinov2": ("fd_dinov2", "subject_consistency"),
     "clip": ("cmmd", "clip_f", "clip_v"),
@@ -47,81 +36,73 @@ OF_ENTRY: Final[Mapping[str, tuple[str, ...]]] = {
 class SetScores:
     """What is computed of whole sets; None where its weights or files were not given."""
 
-    distributions: Distributions | None
-    videos: VideoDistances | None
-    dinov2: DinoScores | None
-    clip: ClipScores | None
-    video_features: VideoFeatures | None
+    distributions: sets.Distributions | None
+    videos: sets.VideoDistances | None
+    dinov2: sets.EmbeddingScores | None
+    clip: sets.EmbeddingScores | None
+    video_features: sets.VideoFeatures | None
     detections: Detections
 
-    def add_to(
-        self,
-        results: Sequence[dict[str, Any]],
-        trajectories: Sequence[ScoredTrajectory],
-        reference: Reference,
-        out: Path,
-    ) -> None:
+    def add_to(self, results: Rows, trajectories: Sequence[ScoredTrajectory], reference: Reference, out: Path) -> None:
         """Add to the results what compares whole sets of views."""
         if not self.records():
             return
         with log.task("features", len(results)) as bar:
             for trajectory in trajectories:
+                rows = [row for row in results if row["trajectory"] == trajectory.name]
                 bar.update(trajectory.name)
-                self._add(trajectory, [r for r in results if r["trajectory"] == trajectory.name], reference, out)
-                bar.advance(sum(r["trajectory"] == trajectory.name for r in results))
+                self._add(trajectory, rows, reference, out)
+                bar.advance(len(rows))
 
-    def _add(
-        self, trajectory: ScoredTrajectory, rows: Sequence[dict[str, Any]], reference: Reference, out: Path
-    ) -> None:
+    def _add(self, trajectory: ScoredTrajectory, rows: Rows, reference: Reference, out: Path) -> None:
         counted = trajectory.counted(reference.held_out)
         if self.distributions is not None:
-            _add_distributions(rows, self.distributions, _sets_of(trajectory, reference, out, counted))
+            distances = self.distributions.of(_sets_of(trajectory, reference, out, counted))
+            for row in rows:
+                value = distances[row["method"]]
+                if isinstance(value, str):
+                    row["values"] |= {"fid": value, "kid": value}
+                else:
+                    row["values"] |= {"fid": round(value.fid, 6), "kid": round(value.kid, 6)}
+                    row["distribution"] = value.record()
         every = _sets_of(trajectory, reference, out, range(len(trajectory.views)))
         if self.videos is not None:
-            _add_videos(rows, self.videos, every)
+            distances = self.videos.of(every)
+            for row in rows:
+                value = distances[row["method"]]
+                row["values"]["fvd"] = value if isinstance(value, str) else value["fvd"]
+                if not isinstance(value, str):
+                    row["video"] = {"n": value["n"], "n_reference": value["n_reference"]}
         for name, embedded in (("dinov2", self.dinov2), ("clip", self.clip)):
             if embedded is not None:
                 _add_named(rows, name, embedded.of(every, counted, trajectory.views))
         if self.video_features is not None:
-            _add_named(
-                rows,
-                "video_features",
-                self.video_features.of(trajectory.name, trajectory.camera, [r["method"] for r in rows]),
-            )
+            methods = [row["method"] for row in rows]
+            _add_named(rows, "video_features", self.video_features.of(trajectory.name, trajectory.camera, methods))
         _add_detections(rows, self.detections, trajectory, counted, reference)
 
     def records(self) -> dict[str, Any]:
         """How the numbers were made, by entry of metrics.json."""
-        given = {
-            "distributions": self.distributions,
-            "videos": self.videos,
-            "dinov2": self.dinov2,
-            "clip": self.clip,
-            "video_features": self.video_features,
-        }
-        found = {name: source.record() for name, source in given.items() if source is not None}
+        names = ("distributions", "videos", "dinov2", "clip", "video_features")
+        sources = {name: getattr(self, name) for name in names}
+        found = {name: source.record() for name, source in sources.items() if source is not None}
         return {**found, **({"detections": made} if (made := self.detections.record()) else {})}
 
 
 def set_scores_of(config: ScoreConfig, scene: Scene, out: Path) -> SetScores:
-    """What the given weights and files allow to compute.
-
-    Raises:
-        InputError: a file is missing, damaged, or holds another network.
-    """
+    """What the given weights and files allow to compute. InputError: a file is missing, damaged, or holds another
+    network."""
     return SetScores(
-        distributions_of(config, scene, out),
-        videos_of(config, scene, out),
-        dino_of(config, scene, out),
-        clip_of(config, scene, out),
-        VideoFeatures(Path(config.video_features)) if config.video_features else None,
+        sets.distributions_of(config, scene, out) if config.fid_weights else None,
+        sets.videos_of(config, scene, out) if config.fvd_weights else None,
+        sets.dino_of(config, scene, out) if config.dino_weights else None,
+        sets.clip_of(config, scene, out) if config.clip_weights else None,
+        sets.VideoFeatures(Path(config.video_features)) if config.video_features else None,
         detections_of(config, scene),
     )
 
 
-def anchors_of(
-    results: Sequence[dict[str, Any]], trajectories: Sequence[ScoredTrajectory], reference: Reference
-) -> list[dict[str, Any]]:
+def anchors_of(results: Rows, trajectories: Sequence[ScoredTrajectory], reference: Reference) -> list[dict[str, Any]]:
     """What stands beside a metric's values on a trajectory: the same of the true images (``truth``), of the recorded
     images at their own views (``recorded``), and of ``nearest_fill``. Taken out of the results."""
     found = []
@@ -133,11 +114,9 @@ def anchors_of(
                 anchors.setdefault(name, {})["truth"] = value
             for name, own in row.pop("anchors", {}).items():
                 anchors.setdefault(name, {}).update(own)
-        for name, value in (
-            reference.facts.recorded(trajectory.camera) if set(ANCHORED) & anchors.keys() else {}
-        ).items():
-            if name in anchors:
-                anchors[name]["recorded"] = value
+        recorded = reference.facts.recorded(trajectory.camera) if set(ANCHORED) & anchors.keys() else {}
+        for name in recorded.keys() & anchors.keys():
+            anchors[name]["recorded"] = recorded[name]
         for row in rows:
             if row["method"] == BASELINE:
                 for name, own in anchors.items():
@@ -166,37 +145,15 @@ def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path, coun
         methods = {BASELINE: chosen(read_observations(out / BASELINE / trajectory.name), every), **methods}
     truth = None
     if reference.truth.exact and trajectory.shift_m != 0.0:
-        drawn = out / "truth" / trajectory.name
-        truth = (
-            ImageSet(len(counted), true_image) if reference.truth.stored else chosen(read_observations(drawn), every)
-        )
+        if reference.truth.stored:
+            truth = ImageSet(len(counted), true_image)
+        else:
+            truth = chosen(read_observations(out / "truth" / trajectory.name), every)
     camera = trajectory.views[0].camera
     return TrajectorySets(trajectory.name, trajectory.camera, camera.width, camera.height, methods, truth)
 
 
-def _add_videos(rows: Sequence[dict[str, Any]], videos: VideoDistances, here: TrajectorySets) -> None:
-    """FVD into the results of one trajectory."""
-    found = videos.of(here)
-    for row in rows:
-        value = found[row["method"]]
-        row["values"]["fvd"] = value if isinstance(value, str) else value["fvd"]
-        if not isinstance(value, str):
-            row["video"] = {"n": value["n"], "n_reference": value["n_reference"]}
-
-
-def _add_distributions(rows: Sequence[dict[str, Any]], sets: Distributions, here: TrajectorySets) -> None:
-    """FID and KID into the results of one trajectory."""
-    found = sets.of(here)
-    for row in rows:
-        value = found[row["method"]]
-        if isinstance(value, str):
-            row["values"] |= {"fid": value, "kid": value}
-        else:
-            row["values"] |= {"fid": round(value.fid, 6), "kid": round(value.kid, 6)}
-            row["distribution"] = value.record()
-
-
-def _add_named(rows: Sequence[dict[str, Any]], entry: str, found: Mapping[str, dict[str, Any] | str]) -> None:
+def _add_named(rows: Rows, entry: str, found: Mapping[str, dict[str, Any] | str]) -> None:
     """Values of several metrics by method, and what stands beside them, into the results of one trajectory."""
     for row in rows:
         of = found[row["method"]]
@@ -206,20 +163,15 @@ def _add_named(rows: Sequence[dict[str, Any]], entry: str, found: Mapping[str, d
 
 
 def _add_detections(
-    rows: Sequence[dict[str, Any]],
-    found: Detections,
-    trajectory: ScoredTrajectory,
-    counted: Sequence[int],
-    reference: Reference,
+    rows: Rows, found: Detections, trajectory: ScoredTrajectory, counted: Sequence[int], reference: Reference
 ) -> None:
     """NTA-IoU and NTL-IoU into the results of one trajectory, with their anchors."""
     views = tuple(trajectory.views[n] for n in counted)
     frames = reference.facts.frames_of(trajectory.camera)
+    recorded = f"{detections.RECORDED}/{trajectory.camera}"
     there = {
         "truth": ViewImages(f"{detections.TRUTH}/{trajectory.name}", tuple(counted), views),
-        "recorded": ViewImages(
-            f"{detections.RECORDED}/{trajectory.camera}", tuple(range(len(frames))), tuple(f.view for f in frames)
-        ),
+        "recorded": ViewImages(recorded, tuple(range(len(frames))), tuple(frame.view for frame in frames)),
     }
     for metric, (entry, of) in found.rows.items():
         beside = {name: value["value"] for name, images in there.items() if not isinstance(value := of(images), str)}

@@ -36,6 +36,9 @@ from mudg.viewer.server import is_loopback, token_for
 
 THREADS: Final = 16
 GRACE_S: Final = 5.0
+WAITING: Final = 64
+"""Most requests at a time; more are refused at once."""
+MESSAGE_MB: Final = 64
 MOST_OBJECTS: Final = 10_000
 LATEST_US: Final = 10**15
 LIDARS: Final[dict[int, Callable[[], BeamTable]]] = {
@@ -357,11 +360,11 @@ def serving(session: Session, name: str, config: ServeConfig) -> Iterator[tuple[
     """
     grpc, metrics = wire.package(), Metrics()
     token = token_for(config.host, config.token) if config.token or not is_loopback(config.host) else ""
-    most = config.message_mb * 2**20
+    most = MESSAGE_MB * 2**20
     server = grpc.server(
         ThreadPoolExecutor(THREADS, "serve"),
         handlers=handlers(Renderer(session, name), metrics, token),
-        maximum_concurrent_rpcs=config.waiting,
+        maximum_concurrent_rpcs=WAITING,
         options=[
             ("grpc.max_receive_message_length", most),
             ("grpc.max_send_message_length", most),

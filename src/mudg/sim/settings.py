@@ -18,9 +18,5 @@ class ServeConfig:
     """Secret that clients send as `authorization: Bearer TOKEN` (empty: none, on the loopback address alone)."""
     metrics_port: int = setting(default=-1, ge=-1, le=65535)
     """Port on the loopback address for metrics in Prometheus' format (-1 = none, 0 = any free one)."""
-    waiting: int = setting(default=64, ge=1, le=10_000)
-    """Most requests at a time; more are refused at once (RESOURCE_EXHAUSTED)."""
-    message_mb: int = setting(default=64, ge=1, le=1024)
-    """Largest message, megabytes."""
     device: DeviceName = "auto"
     """Device: auto (CUDA if there is one), cpu, cuda, cuda:N."""

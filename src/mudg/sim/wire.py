@@ -125,7 +125,8 @@ def messages() -> SimpleNamespace:
             own = message.field.add(name=field, number=int(number))
             own.label = kinds.LABEL_REPEATED if repeated else kinds.LABEL_OPTIONAL
             own.type = kinds.TYPE_MESSAGE if kind in MESSAGES else getattr(kinds, f"TYPE_{kind.upper()}")
-            own.type_name = f".mudg.sensorsim.{kind}" if kind in MESSAGES else ""
+            if kind in MESSAGES:
+                own.type_name = f".mudg.sensorsim.{kind}"
     pool = descriptor_pool.DescriptorPool()
     pool.Add(file)
     find = pool.FindMessageTypeByName

@@ -6,19 +6,16 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from mudg.steps.annotate import Annotate
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
-from mudg.steps.render import RenderViews
+from mudg.steps.ingest import Annotate, Fuse, Ingest
+from mudg.steps.render import RenderViews, Score
 from mudg.steps.run import Run
-from mudg.steps.score import Score
 from mudg.steps.step import Flag, Step
 from mudg.steps.synthesize import Synthesize
 
 if TYPE_CHECKING:
     from mudg.fleet.settings import BatchConfig
-    from mudg.steps.settings.presets import PresetName
+    from mudg.steps.settings import PresetName
 
 OUT = Flag("OUT", "first")
 

@@ -27,8 +27,7 @@ from mudg.fleet.plan import CITY, COMMAND, OF_A_LINE, REVISION, BatchPlan, Entry
 from mudg.fleet.records import BatchFolder, Ended, slurm_tasks_left
 from mudg.fleet.settings import BatchConfig
 from mudg.fleet.work import DONE, STOPPED, Job, is_open
-from mudg.steps.settings.presets import PresetName, run_preset
-from mudg.steps.settings.run import RunConfig
+from mudg.steps.settings import PresetName, RunConfig, run_preset
 
 _POLL_S = 10.0
 
@@ -75,20 +74,14 @@ def run(
     entries = [entry for entry in ours if is_open(plan, entry, done, failed)]
     if dry:
         keys = [unit.key for entry in ours for unit in plan.units(entry)]
-        counts = {
-            "scenes": len(ours),
-            "steps": len(keys),
-            DONE: len(done.intersection(keys)),
-            "failed": len(failed.intersection(keys)),
-        }
+        counts = {"scenes": len(ours), "steps": len(keys)}
+        counts |= {DONE: len(done.intersection(keys)), "failed": len(failed.intersection(keys))}
         left = counts["steps"] - counts[DONE] - counts["failed"]
         text = f"{len(ours)} scenes: {' -> '.join(stage.name for stage in plan.stages)}"
-        return {
-            **counts,
-            "left": left,
-            "text": f"{text}\n{counts[DONE]} steps done, {counts['failed']} failed, {left} to do",
-        }
-    job = Job(folder, plan, max(1, round(batch.cpus)), batch.grace_s, _absolute(scratch))
+        text += f"\n{counts[DONE]} steps done, {counts['failed']} failed, {left} to do"
+        return {**counts, "left": left, "text": text}
+    unfinished = None if scratch is None else scratch.absolute()
+    job = Job(folder, plan, max(1, round(batch.cpus)), batch.grace_s, unfinished)
     with folder.owned(part, numbered=shard_text.startswith("env"), take_over=take_over) as owner:
         if batch.engine == "slurm" and entries:
             number, messages = engines.submit_to_slurm(job, entries, batch)
@@ -97,16 +90,8 @@ def run(
             return _submitted(folder, plan, entries, number, messages, wait)
         counts = _run(job, entries, batch)
     text = ", ".join(f"{count} {state}" for state, count in sorted(counts.items())) or "nothing was left to do here"
-    return {
-        "counts": dict(counts),
-        "out": str(folder.out),
-        "text": f"{text}\nmudg batch status {folder.out}",
-        "exit_code": exit_code(counts.total() - counts[DONE]),
-    }
-
-
-def _absolute(path: Path | None) -> Path | None:
-    return None if path is None else path.absolute()
+    text, code = f"{text}\nmudg batch status {folder.out}", exit_code(counts.total() - counts[DONE])
+    return {"counts": dict(counts), "out": str(folder.out), "text": text, "exit_code": code}
 
 
 def _run(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> Counter[str]:
@@ -134,11 +119,8 @@ def _run(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> Counter[str]
 def _submitted(
     folder: BatchFolder, plan: BatchPlan, entries: Sequence[Entry], number: str, messages: Path, wait: bool
 ) -> dict[str, Any]:
-    result = {
-        "job": number,
-        "out": str(folder.out),
-        "text": f"job {number}; its messages: {messages}\nmudg batch status {folder.out}",
-    }
+    text = f"job {number}; its messages: {messages}\nmudg batch status {folder.out}"
+    result = {"job": number, "out": str(folder.out), "text": text}
     if not wait:
         return result
     try:
@@ -147,10 +129,8 @@ def _submitted(
     except OSError as error:
         raise ResourceError("Slurm does not answer", where="squeue", got=str(error)) from error
     done = folder.keys("done")
-    return {
-        **result,
-        "exit_code": exit_code(sum(any(unit.key not in done for unit in plan.units(entry)) for entry in entries)),
-    }
+    left = sum(any(unit.key not in done for unit in plan.units(entry)) for entry in entries)
+    return {**result, "exit_code": exit_code(left)}
 
 
 def plan_for(batch: BatchConfig, settings: RunConfig, lines: Mapping[str, Sequence[str]]) -> BatchPlan:
@@ -158,47 +138,32 @@ def plan_for(batch: BatchConfig, settings: RunConfig, lines: Mapping[str, Sequen
     elsewhere."""
     values = _with_absolute_paths(configuration.to_dict(settings))
     own = bool(batch.command) and batch.stages == BatchConfig().stages
-    command = tuple(
-        os.path.abspath(word) if "/" in word and "{" not in word and os.path.isfile(word) else word
-        for word in batch.command
-    )
+    is_file = lambda word: "/" in word and "{" not in word and os.path.isfile(word)  # noqa: E731
+    command = tuple(os.path.abspath(word) if is_file(word) else word for word in batch.command)
     names = () if own else tuple(name for name in batch.stages if name != COMMAND or command)
     return plan_of(names, lines, values, command)
 
 
-def _with_absolute_paths(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {
-        name: (
-            _with_absolute_paths(value)
-            if isinstance(value, Mapping)
-            else os.path.abspath(value)
-            if isinstance(value, str) and "/" in value and os.path.exists(value)
-            else value
-        )
-        for name, value in values.items()
-    }
+def _with_absolute_paths(values: Any) -> Any:
+    if isinstance(values, Mapping):
+        return {name: _with_absolute_paths(value) for name, value in values.items()}
+    is_path = isinstance(values, str) and "/" in values and os.path.exists(values)
+    return os.path.abspath(values) if is_path else values
 
 
 def _refuse_overlap(entries: Sequence[Entry], folder: BatchFolder, listed: str) -> None:
     out, place = folder.out.local, Location.of(listed).local
     if out is None:
         return
-    read: dict[str, Path | str | None] = {
-        f"source of {entry.name}": entry.source
-        for entry in entries
-        if entry.source != CITY and "://" not in entry.source
-    }
+    local = [entry for entry in entries if entry.source != CITY and "://" not in entry.source]
+    read: dict[str, Path | str | None] = {f"source of {entry.name}": entry.source for entry in local}
     read["list"] = place if place is not None and place.is_file() else None
     refuse_overlaps([out], read)
 
 
 def show_status(out: str, html: bool = False, price: float = 0.0, every_s: float = 0.0) -> dict[str, Any]:
-    """How far a batch is, what has failed and what it took.
-
-    Args:
-        html: also write ``status.html`` in its folder. price: of a core-hour. every_s: show it again until nothing is
-            left (0: once).
-    """
+    """How far a batch is, what has failed and what it took. ``html``: also write ``status.html`` in its folder.
+    ``price``: of a core-hour. ``every_s``: show it again until nothing is left (0: once)."""
     while True:
         state = status.read_status(BatchFolder(Location.of(out)), price)
         result: dict[str, Any] = {**state.record(), "text": status.text_of(state)}
@@ -213,29 +178,21 @@ def show_status(out: str, html: bool = False, price: float = 0.0, every_s: float
 
 
 def settings_of(preset: PresetName, config: Path | None, given: Sequence[str]) -> RunConfig:
-    """Settings of the steps: a preset, then a file of ``mudg run``, then ``STEP.NAME=VALUE``.
-
-    Raises:
-        UsageError: an unknown setting or a value out of range.
-    """
+    """Settings of the steps: a preset, then a file of ``mudg run``, then ``STEP.NAME=VALUE``. UsageError: an unknown
+    setting or a value out of range."""
     values: dict[str, Any] = {}
     for text in given:
         name, separator, value = text.partition("=")
         if not separator or not name:
-            raise UsageError(
-                "not a setting", where="--set", got=text, expected="STEP.NAME=VALUE, as fit.iterations=500"
-            )
+            expected = "STEP.NAME=VALUE, as fit.iterations=500"
+            raise UsageError("not a setting", where="--set", got=text, expected=expected)
         values[name] = parse_yaml(value.encode(), f"--set {name}") if value else ""
     return configuration.load(RunConfig, run_preset(preset), config, configuration.nested(values))
 
 
 def retry(out: str, reason: str = "") -> dict[str, Any]:
     """Forget failures, so that the next ``mudg batch run`` tries them again. reason: exit codes with commas (empty:
-    all).
-
-    Raises:
-        InputError: no batch is here, or nothing failed for this reason. UsageError: not a list of exit codes.
-    """
+    all). InputError: no batch is here, or nothing failed for this reason. UsageError: not a list of exit codes."""
     folder, words = BatchFolder(Location.of(out)), reason.replace(",", " ").split()
     if not all(word.isdecimal() for word in words):
         raise UsageError("unknown reason", where="--reason", got=reason, expected="exit codes with commas, as 5,137")
@@ -245,13 +202,7 @@ def retry(out: str, reason: str = "") -> dict[str, Any]:
     for one in chosen:
         folder.record("failed", one.key).remove()
     if words and not chosen:
-        raise InputError(
-            "nothing failed for this reason",
-            where=str(folder.out),
-            got=reason,
-            expected=", ".join(sorted({str(one.code) for one in failures})) or "no failures at all",
-        )
-    return {
-        "forgotten": len(chosen),
-        "text": f"{len(chosen)} failed steps will be tried again by the next mudg batch run",
-    }
+        expected = ", ".join(sorted({str(one.code) for one in failures})) or "no failures at all"
+        raise InputError("nothing failed for this reason", where=str(folder.out), got=reason, expected=expected)
+    text = f"{len(chosen)} failed steps will be tried again by the next mudg batch run"
+    return {"forgotten": len(chosen), "text": text}

@@ -41,12 +41,8 @@ class _Parser(argparse.ArgumentParser):
 
 
 def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
-    """The words behind a verb as its step, and the flags that every command has.
-
-    Raises:
-        UsageError: an unknown flag (the nearest is named), a missing or wrong value. InputError: --config cannot be
-            read.
-    """
+    """The words behind a verb as its step, and the flags that every command has. UsageError: an unknown flag (the
+    nearest is named), a missing or wrong value. InputError: --config cannot be read."""
     listed = {option.name: option for option in _all_options(cls)}
     parser = _Parser(prog=f"mudg {cls.verb()}", add_help=False, allow_abbrev=False)
     for option in listed.values():
@@ -58,18 +54,14 @@ def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
     given: dict[str, Any] = {name: value for name, value in vars(found).items() if name in listed}
     own = {name: _value(listed[name].kind, given.pop(name)) for name in list(given) if listed[name].own}
     its_own = {field.name for field in dataclasses.fields(cls)}
-    common = Common(
-        **{f.name: own.pop(f.name) for f in dataclasses.fields(Common) if f.name in own and f.name not in its_own}
-    )
+    of_all = {f.name: own.pop(f.name) for f in dataclasses.fields(Common) if f.name in own and f.name not in its_own}
+    of_all |= {name: Path(of_all[name]) for name in ("config", "scratch") if isinstance(of_all.get(name), str)}
+    common = Common(**of_all)
     by_words = cls.from_words(found.words, own)
     for name in by_words.keys() & (own.keys() | given.keys()):
         twice = f"{by_words[name]!r} and {(own | given)[name]!r}"
         raise UsageError(f"{flag_name(name)} was given twice", got=twice, expected=usage(cls))
     given |= {name: by_words.pop(name) for name in by_words.keys() - its_own}
-    common = dataclasses.replace(
-        common,
-        **{name: Path(value) for name in ("config", "scratch") if isinstance(value := getattr(common, name), str)},
-    )
     settings = configuration.nested({name: _value(listed[name].kind, value) for name, value in given.items()})
     return cls.build({**by_words, **own}, settings, common.config), common
 
@@ -126,13 +118,10 @@ def _second_named(cls: type[Step], words: list[str]) -> list[str]:
 def _refuse_unknown(cls: type[Step], word: str, listed: dict[str, Option]) -> NoReturn:
     flag = word.partition("=")[0]
     known = [flag_name(name) for name in listed]
-    near = nearest(flag, known, 0.6) or next(
-        (one for one in known if one.endswith(flag.removeprefix("--")) and len(flag) > 4), None
-    )
-    raise UsageError(
-        f"mudg {cls.verb()} has no flag {flag}",
-        remedy=f"did you mean {near}?" if near else f"see mudg {cls.verb()} --help-all",
-    )
+    ends = (one for one in known if one.endswith(flag.removeprefix("--")) and len(flag) > 4)
+    near = nearest(flag, known, 0.6) or next(ends, None)
+    remedy = f"did you mean {near}?" if near else f"see mudg {cls.verb()} --help-all"
+    raise UsageError(f"mudg {cls.verb()} has no flag {flag}", remedy=remedy)
 
 
 def _value(kind: Any, value: Any) -> Any:
@@ -147,11 +136,8 @@ def _value(kind: Any, value: Any) -> Any:
         pairs = [word.partition("=") for word in value]
         for name, equals, folder in pairs:
             if not equals or not name or not folder:
-                raise UsageError(
-                    "a value is not a name and a folder",
-                    expected="NAME=FOLDER",
-                    got="=".join(filter(None, (name, folder))),
-                )
+                got = "=".join(filter(None, (name, folder)))
+                raise UsageError("a value is not a name and a folder", expected="NAME=FOLDER", got=got)
         return {name: folder for name, _, folder in pairs}
     if isinstance(value, str):
         if value == "None" and type(None) in get_args(kind):
@@ -189,27 +175,18 @@ def _flag_words(name: str, value: Any) -> list[str]:
     return [flag_name(name), *(map(str, value) if isinstance(value, tuple | list) else [str(value)])]
 
 
-# help ---------------------------------------------------------------------------------------------
-
+# -- help ------------------------------------------------------------------------------------------
 _FLAG_COLUMNS = 26
 
 
 def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
-    """A verb's page of help.
-
-    Args:
-        everything: all settings with their whole texts; else those that most people need, with the first sentence of
-            each.
-        part: only what this part of the verb takes.
-    """
+    """A verb's page of help. ``everything``: all settings with their whole texts; else those that most people need,
+    with the first sentence of each. ``part``: only what this part of the verb takes."""
     head = f"mudg {cls.verb()}{f' {part}' if part else ''}"
     examples = [line for line in cls.examples if line.startswith(f"{head} ") or not part]
     shown = examples if everything or part else examples[:3]
-    lines = [
-        f"{cls.parts[part] if part else cls.summary()}",
-        "",
-        f"usage: {usage(cls) if not part else f'{head} [words] [flags]'}",
-    ]
+    lines = [cls.parts[part] if part else cls.summary(), ""]
+    lines.append(f"usage: {usage(cls) if not part else f'{head} [words] [flags]'}")
     if shown:
         lines += ["", "examples:", *(f"  {line}" for line in shown)]
     if cls.parts and not part:
@@ -225,20 +202,14 @@ def help_page(cls: type[Step], *, everything: bool, part: str = "") -> str:
         hidden, settings = len(settings) - len(chosen), chosen
     names = {one.name for one in own}
     common = [one for one in common_options() if one.name not in names]
-    for title, rows in (
-        ("inputs and outputs:", own),
-        ("settings:", settings),
-        ("every command:", common if everything else []),
-    ):
+    tables = {"inputs and outputs:": own, "settings:": settings, "every command:": common if everything else []}
+    for title, rows in tables.items():
         if rows:
             lines += ["", title, *(line for one in rows for line in _row(cls, one, everything))]
     if not everything:
         short = " ".join(flag_name(one.name) + (" PATH" if one.kind is not bool else "") for one in common)
-        lines += [
-            "",
-            f"every command: {short}",
-            *([f"{hidden} more settings, and longer texts: mudg {cls.verb()} --help-all"] if hidden else []),
-        ]
+        lines += ["", f"every command: {short}"]
+        lines += [f"{hidden} more settings, and longer texts: mudg {cls.verb()} --help-all"] * bool(hidden)
     return "\n".join(lines)
 
 

@@ -51,24 +51,18 @@ class Convert(Step):
         config, source = self.settings, self.checkpoint
         if config.network != "diffusion":
             if config.resolution != "auto" or config.towers or config.dtype != "keep":
-                raise UsageError(
-                    "--resolution, --towers and --dtype apply to diffusion models only",
-                    where=f"--network {config.network}",
-                )
+                what = "--resolution, --towers and --dtype apply to diffusion models only"
+                raise UsageError(what, where=f"--network {config.network}")
             if not source.is_file():
                 raise InputError("no such checkpoint", where=str(source))
             # read, and converted to float32
-            return functools.partial(convert_weights, config.network, source, to), convert.memory_limit(
-                config, source, source
-            )
+            limit = convert.memory_limit(config, source, source)
+            return functools.partial(convert_weights, config.network, source, to), limit
         if not source.is_dir():
             return convert.of_diffusion(config, source, to)
         if config.resolution != "auto" or config.towers:
-            raise UsageError(
-                "--resolution and --towers do not apply to a DepthLab folder",
-                where=str(source),
-                remedy="leave them out, or give a checkpoint file",
-            )
+            what, remedy = "--resolution and --towers do not apply to a DepthLab folder", "give a checkpoint file"
+            raise UsageError(what, where=str(source), remedy=f"leave them out, or {remedy}")
         files = depthlab.find(source).files()
         work = functools.partial(depthlab.convert_folder, source, to, convert.DTYPES[config.dtype], convert.SHARD_BYTES)
         return work, convert.memory_limit(config, *files)

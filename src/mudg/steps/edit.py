@@ -1,22 +1,21 @@
-"""``mudg edit``."""
+"""Verbs that change a drive: ``mudg edit``, ``asset export``, ``asset import``."""
 
 from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
+from mudg.base.errors import UsageError
 from mudg.base.layout import MODEL_FILES, SCENE_FILES, below
-from mudg.steps.engine import Make
-from mudg.steps.outputs import Output
+from mudg.steps.engine import Make, Output, Result
 from mudg.steps.step import RUN, Flag
 
 if TYPE_CHECKING:
+    from mudg.base.run_folder import VerbOutput
     from mudg.editing.runs import RunParts
     from mudg.editing.settings import EditConfig
-
-_MODELS = (*MODEL_FILES, *below("fit/*", MODEL_FILES))
-_CLOUDS = ("static.safetensors", "objects/*.safetensors", "fuse.json")
+    from mudg.exporting.settings import ImportConfig
 
 
 class Edit(Output):
@@ -30,12 +29,9 @@ class Edit(Output):
     result = "edited"
     version = 3
     files = (
-        "edits.yaml",
-        "edit.json",
-        "lidar.json",
-        *_MODELS,
+        *("edits.yaml", "edit.json", "lidar.json", *MODEL_FILES, *below("fit/*", MODEL_FILES)),
         *below("scene", (*SCENE_FILES, "manifest.json")),
-        *below("fuse", _CLOUDS),
+        *below("fuse", ("static.safetensors", "objects/*.safetensors", "fuse.json")),
     )
     short = ("device", "harmonize.on", "harmonize.model", "harmonize.steps")
     source: Annotated[Path, RUN]
@@ -63,11 +59,9 @@ class Edit(Output):
     def inputs(self) -> dict[str, str]:
         from mudg.editing.script import read_edits
 
-        parts = self.run_parts()
+        parts, script = self.run_parts(), read_edits(self.script)
         fits = {f"fit {name}".strip(): path for name, path in parts.fits.items()}
-        return {"edits": read_edits(self.script).digest()} | self.digests(
-            {**fits, "scene": parts.scene, "fused": parts.fused}
-        )
+        return {"edits": script.digest()} | self.digests({**fits, "scene": parts.scene, "fused": parts.fused})
 
     def places(self) -> dict[str, Path | None]:
         parts = self.run_parts()
@@ -83,3 +77,97 @@ class Edit(Output):
         if planned.parts.whole and planned.drive.plan.weather_of_beams is not None:
             inputs["weather of beams"] = "fog, rain"  # another result than before sweeps showed them
         return partial(planned.write, self.settings)
+
+
+class AssetExport(Result):
+    """Write one object of a fitted scene to a file that edit scripts can insert."""
+
+    verb_name = "asset export"
+    section = "change a drive"
+    examples = ("mudg asset export runs/kitti car-003 --out assets/van.safetensors",)
+    result = "asset"
+    source: Annotated[Path, RUN]
+    """Gaussian scene written by fit, or folder of a finished mudg run."""
+    track_id: Annotated[str, Flag("ID", "first")]
+    """Track id of a dynamic object."""
+    out: Annotated[Path, Flag("FILE.safetensors")]
+    """File to write."""
+    scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None
+    """Scene directory that a Gaussian scene was fitted to; it tells from which sides the object was seen. A run has its
+    own."""
+    overwrite: bool = False
+    """Replace the output if it exists."""
+
+    @property
+    def is_file(self) -> bool:
+        return True
+
+    def checked(self) -> Self:
+        refuse_other_name(self.out)
+        return self
+
+    def inputs(self) -> dict[str, str]:
+        from mudg.editing.runs import find_run
+
+        parts = find_run(self.source, self.scene)
+        return self.digests({"fit": parts.model, "scene": parts.scene})
+
+    def key_settings(self) -> dict[str, Any]:
+        return {"id": self.track_id}
+
+    def prepare(self, inputs: dict[str, str]) -> Make:
+        from mudg.editing import apply, runs
+
+        return partial(apply.write_asset_from, runs.find_run(self.source, self.scene), self.track_id)
+
+
+def refuse_other_name(out: Path) -> None:
+    """UsageError for a file with another suffix than assets have."""
+    if out.suffix != ".safetensors":
+        raise UsageError(
+            "an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out)
+        )
+
+
+class AssetImport(Result):
+    """Make an object, or a scene, of a file of Gaussians from another program."""
+
+    verb_name = "asset import"
+    section = "change a drive"
+    examples = ("mudg asset import van.ply --label van --length-m 5.2 --out assets/van.safetensors",)
+    result = "asset"
+    file: Annotated[Path, Flag("FILE", "first")]
+    """File of Gaussians (.ply, .spz, .splat, .sog, .glb)."""
+    out: Annotated[Path, Flag("FILE.safetensors")]
+    """File to write; with --kind scene, folder to write."""
+    overwrite: bool = False
+    """Replace the output if it exists."""
+    settings: ImportConfig
+
+    @property
+    def is_file(self) -> bool:
+        return self.settings.kind != "scene"
+
+    def output(self) -> VerbOutput:
+        from mudg.base.run_folder import VerbOutput
+
+        return VerbOutput("asset", 1, MODEL_FILES)
+
+    def checked(self) -> Self:
+        from mudg.exporting import export as imports
+
+        imports.refuse_other_settings(self.settings)
+        if self.is_file:
+            refuse_other_name(self.out)
+            imports.bounded(self.file)
+        return self
+
+    def key_settings(self) -> dict[str, Any]:
+        return super().key_settings() | ({"name": self.file.name} if self.is_file else {})
+
+    def prepare(self, inputs: dict[str, str]) -> Make:
+        from mudg.exporting import export as imports
+
+        if self.is_file:
+            return partial(imports.write_object, self.settings, self.file)
+        return partial(imports.write_scene, self.settings, self.file, *imports.read_file(self.file, self.settings))

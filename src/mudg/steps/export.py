@@ -20,13 +20,10 @@ class Export(Result):
 
     section = "other programs"
     examples = (
-        "mudg export ply runs/kitti --out kitti.ply --time-s 1.5",
-        "mudg export usdz runs/kitti --out kitti.usdz",
-        "mudg export glb runs/mudg_s --scene scenes/city --edits edits.yaml --out city.glb",
-        "mudg export alpasim runs/kitti --out kitti_sim.usdz",
-        "mudg export colmap scenes/city --out city_colmap",
-        "mudg export ros2 scenes/city --out city_bag",
-        "mudg export ncore scenes/city --out city_ncore",
+        *("mudg export ply runs/kitti --out kitti.ply --time-s 1.5", "mudg export usdz runs/kitti --out kitti.usdz"),
+        *("mudg export glb runs/mudg_s --scene scenes/city --edits edits.yaml --out city.glb",),
+        *("mudg export alpasim runs/kitti --out kitti_sim.usdz", "mudg export colmap scenes/city --out city_colmap"),
+        *("mudg export ros2 scenes/city --out city_bag", "mudg export ncore scenes/city --out city_ncore"),
     )
     result = "exported"
     format: Annotated[str, Flag("FORMAT", "first")]

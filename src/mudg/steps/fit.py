@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Self, cast
 
 from mudg.base.errors import UsageError
 from mudg.base.layout import MODEL_FILES
-from mudg.steps.engine import Make, paths_of
-from mudg.steps.outputs import Output
+from mudg.steps.engine import Make, Output, paths_of
 from mudg.steps.step import SCENE, Flag
 
 if TYPE_CHECKING:
@@ -32,10 +31,8 @@ class Fit(Output):
     )
     smaller = "smaller images (mudg ingest --resolution), fewer Gaussians (--start.gaussians, --densify.max-gaussians)"
     result = "model"
-    version, files = (
-        3,
-        (*MODEL_FILES, "appearance.json", "appearance.safetensors", "field.safetensors", "preview/*.png", "steps/"),
-    )
+    version = 3
+    files = (*MODEL_FILES, "appearance.json", "appearance.safetensors", "field.safetensors", "preview/*.png", "steps/")
     short = ("method", "iterations", "cameras", "width_px", "sh_degree", "seed", "device", "densify.max_gaussians")
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
@@ -66,18 +63,15 @@ class Fit(Output):
         from mudg.gaussians.methods import METHODS
 
         own = super().output()
-        return (
-            own
-            if self.reads_scene_alone or METHODS[self.settings.method].boxes
-            else replace(own, version=own.version + 1)
-        )
+        if self.reads_scene_alone or METHODS[self.settings.method].boxes:
+            return own
+        return replace(own, version=own.version + 1)
 
     def checked(self) -> Self:
         if self.reads_scene_alone:
             if self.start_from is not None:
-                raise UsageError(
-                    f"{self.settings.method} cannot go on with a finished fit", remedy="leave --start-from out"
-                )
+                what = f"{self.settings.method} cannot go on with a finished fit"
+                raise UsageError(what, remedy="leave --start-from out")
             return self
         from mudg.gaussians import fit
 
@@ -91,9 +85,7 @@ class Fit(Output):
         return super().reads() | {"virtual.lpips-weights": self.settings.virtual.lpips_weights}
 
     def inputs(self) -> dict[str, str]:
-        return self.digests(
-            {"scene": self.scene} if self.reads_scene_alone else {"scene": self.scene, "fused": self.fused}
-        )
+        return self.digests(self.places())
 
     def places(self) -> dict[str, Path | None]:
         return {"scene": self.scene} if self.reads_scene_alone else {"scene": self.scene, "fused": self.fused}
@@ -112,11 +104,9 @@ class Fit(Output):
         inputs |= {} if begun is None else {"start": begun.digest}
         if fit.learns_virtual(self.settings.method):
             virtual = virtual_sets(self.observations)
-            inputs |= self.digests(
-                {name: path for name, path in paths_of(self).items() if name.startswith("observations")}
-            )
+            named = {name: path for name, path in paths_of(self).items() if name.startswith("observations")}
+            inputs |= self.digests(named)
         inputs |= self.digests({"lpips_weights": self.settings.virtual.lpips_weights})
         fit.check_device(self.settings)
-        return partial(
-            fit.write_fit, self.settings, fit.FitInputs(self.scene, cast("Path", self.fused), virtual, begun)
-        )
+        given = fit.FitInputs(self.scene, cast("Path", self.fused), virtual, begun)
+        return partial(fit.write_fit, self.settings, given)

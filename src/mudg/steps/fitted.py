@@ -125,7 +125,7 @@ class FittedScene:
         Raises:
             InputError: the script is not valid, or asks for what cannot be done here.
         """
-        from mudg.editing.carried import carry_out
+        from mudg.editing.apply import carry_out
         from mudg.editing.script import read_edits
 
         drive = carry_out(read_edits(script), self._model, scene)
@@ -139,7 +139,7 @@ class FittedScene:
                 it was seen.
         """
         from mudg.base.run_folder import ResultFile
-        from mudg.editing.assets import complete_asset, write_asset
+        from mudg.editing.apply import complete_asset, write_asset
         from mudg.editing.model import asset_of
 
         model, views = self._model, () if scene is None else tuple(frame.view for frame in scene.frames)
@@ -167,11 +167,8 @@ class FittedScene:
         from mudg.gaussians.rendering import raster_of, render_view
 
         if not isinstance(camera, Camera):
-            raise UsageError(
-                "the camera is not a mudg.Camera",
-                expected='e.g. scene.frames_of("front")[0].view.camera',
-                got=repr(camera),
-            )
+            expected = 'e.g. scene.frames_of("front")[0].view.camera'
+            raise UsageError("the camera is not a mudg.Camera", expected=expected, got=repr(camera))
         view = View(camera, np.asarray(world_from_cam, np.float64), float(time_s))
         with torch.no_grad():
             seen = render_view(self._model, view, raster_of(self._model, backend))  # type: ignore[arg-type]

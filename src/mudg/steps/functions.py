@@ -10,26 +10,12 @@ from mudg import steps
 from mudg.steps.step import python_function
 
 VERBS: Final = {
-    "adapt": "adapt",
-    "annotate": "annotate",
-    "bench": "bench",
-    "convert": "convert",
-    "demo": "demo",
-    "doctor": "doctor",
-    "edit": "edit",
-    "export": "export",
+    **{name: name for name in "adapt annotate bench convert demo doctor edit export".split()},
     "export_asset": "asset export",
     "fit": "fit",
     "fuse": "fuse",
     "import_asset": "asset import",
-    "ingest": "ingest",
-    "learn": "learn",
-    "page": "page",
-    "render": "render",
-    "report": "report",
-    "run": "run",
-    "score": "score",
-    "synthesize": "synthesize",
+    **{name: name for name in "ingest learn page render report run score synthesize".split()},
 }
 """Functions, and the verbs that they are."""
 

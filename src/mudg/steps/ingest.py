@@ -1,22 +1,24 @@
-"""``mudg ingest``."""
+"""Verbs that prepare a log: ``mudg ingest``, ``annotate``, ``fuse``."""
 
 from __future__ import annotations
 
 import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
 from mudg.base.errors import InputError, UsageError, similar_path
 from mudg.base.layout import SCENE_FILES
 from mudg.base.plugins import plugins
-from mudg.steps.engine import Make
-from mudg.steps.outputs import Listed
+from mudg.steps.engine import Listed, Make
 from mudg.steps.step import Flag, usage
 
 if TYPE_CHECKING:
     from mudg.formats.settings import IngestConfig
+    from mudg.labels.settings import AnnotateConfig
+    from mudg.scene.settings import FuseConfig
 
 FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom", "kitti")
 
@@ -44,15 +46,8 @@ class Ingest(Listed):
     version, files = 1, (*SCENE_FILES, "contact_sheet.jpg")
     idle = ("workers",)
     short = (
-        "resolution",
-        "frames",
-        "cameras",
-        "sequence",
-        "test_every",
-        "city.seed",
-        "city.n_frames",
-        "city.width",
-        "city.height",
+        *("resolution", "frames", "cameras", "sequence", "test_every"),
+        *("city.seed", "city.n_frames", "city.width", "city.height"),
     )
     parts = {"city": "Generate a city: a scene with exact truth."} | {
         name: f"Convert a log in the format {name} to a scene directory." for name in FORMATS
@@ -67,8 +62,8 @@ class Ingest(Listed):
     def from_words(cls, words: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
         """``[FORMAT] LOG [OUT]``, with ``--list`` ``[FORMAT] [OUT]``; the format is a setting."""
         left, values, many, named = list(words), dict[str, Any](), "list" in given, "out" in given
-        many_words = len(left) > (not many) + (not named)
-        if left and _is_format(left[0]) and (many_words or not Path(left[0]).exists()):
+        of_a_log = (not many) + (not named)
+        if left and _is_format(left[0]) and (len(left) > of_a_log or not Path(left[0]).exists()):
             values["format"] = left.pop(0)
         if not many and not left:
             raise UsageError("no log was given", expected=usage(cls))
@@ -77,8 +72,8 @@ class Ingest(Listed):
         if left and not named:
             values["out"] = left.pop(0)
         if left and not many and values["log"] != "city" and not Path(values["log"]).exists():
-            expected = ", ".join(("auto", *FORMATS, *plugins("importer")))
-            raise UsageError("no such format and no such log", expected=expected, got=values["log"])
+            formats = ", ".join(("auto", *FORMATS, *plugins("importer")))
+            raise UsageError("no such format and no such log", expected=formats, got=values["log"])
         if left:
             raise UsageError("too many words", expected=usage(cls), got=" ".join(words))
         return values
@@ -101,12 +96,9 @@ class Ingest(Listed):
 
     def reads(self) -> dict[str, Path | str | None]:
         if self.log != "city" and not Path(self.log).exists():
-            raise InputError(
-                "driving log does not exist",
-                where=str(self.log),
-                expected="a folder, a scene zip, or the word city",
-                remedy=similar_path(self.log),
-            )
+            where, expected = str(self.log), "a folder, a scene zip, or the word city"
+            remedy = similar_path(self.log)
+            raise InputError("driving log does not exist", where=where, expected=expected, remedy=remedy)
         from mudg.formats import ingest
 
         log = "" if self.log == "city" else self.log
@@ -125,3 +117,62 @@ class Ingest(Listed):
         from mudg.formats import ingest
 
         return functools.partial(ingest.write_scene, self.settings, Path(self.log), self.kind)
+
+
+class Annotate(Listed):
+    """Add missing labels to a scene: semantics, sky and depth, with confidences."""
+
+    section = "single steps, in the order of use"
+    examples = ("mudg annotate scenes/kitti --out scenes/kitti_labelled", "mudg annotate --list scenes --out labelled")
+    smaller = "one process (--processes 1), or smaller images (mudg ingest --resolution)"
+    result = "scene"
+    version, files = 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", "labelled/")
+    idle = ("processes",)
+    short = ("labeller", "weights", "depth_network", "device", "sweeps", "ego", "processes")
+    scene: Annotated[Path | None, Flag("[SCENE]", "first", "scene")] = None
+    """Scene directory written by ingest, or folder of mudg run."""
+    settings: AnnotateConfig
+
+    def settings_in_list(self) -> AnnotateConfig:
+        return replace(self.settings, processes=1)
+
+    def checked(self) -> Self:
+        from mudg.labels import annotate as depth
+
+        return replace(self, settings=depth.placed(self.settings))
+
+    def reads(self) -> dict[str, Path | str | None]:
+        from mudg.labels import annotate as depth
+
+        return super().reads() | depth.folders(self.settings)
+
+    def inputs(self) -> dict[str, str]:
+        from mudg.labels import annotate as depth
+
+        return super().inputs() | depth.digests(self.settings)
+
+    def prepare(self, inputs: dict[str, str]) -> Make:
+        from mudg.labels import annotate
+
+        return partial(annotate.write_labelled, self.settings, cast("Path", self.scene))
+
+
+class Fuse(Listed):
+    """Fuse LiDAR and images: a static coloured point cloud, one more per dynamic object."""
+
+    section = "single steps, in the order of use"
+    examples = ("mudg fuse scenes/city --out runs/fused", "mudg fuse --list labelled --out fused --jobs 2")
+    smaller = "larger voxels (--voxel-m), or a shorter log (mudg ingest --frames)"
+    result = "fused"
+    version, files = 2, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png")
+    scene: Annotated[Path | None, Flag("[SCENE]", "first", "scene")] = None
+    """Scene directory written by ingest or annotate, or folder of mudg run."""
+    settings: FuseConfig
+
+    def prepare(self, inputs: dict[str, str]) -> Make:
+        from mudg.scene import fuse
+        from mudg.scene.read import read_scene
+
+        scene = read_scene(cast("Path", self.scene))
+        fuse.refuse_without_lidar(scene)
+        return partial(fuse.write_fusion, self.settings, scene)

@@ -8,7 +8,7 @@ OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,22 +21,18 @@ from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.versions import environment, version
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.settings import FitConfig
-from mudg.steps.adapt import Adapt
-from mudg.steps.annotate import Annotate
+from mudg.steps.engine import Output
 from mudg.steps.fit import Fit
-from mudg.steps.fuse import Fuse
-from mudg.steps.ingest import Ingest
-from mudg.steps.outputs import Output
-from mudg.steps.render import RenderViews
-from mudg.steps.score import Score
-from mudg.steps.settings.presets import NO_MODEL, PRESETS
-from mudg.steps.settings.run import RunConfig, with_device
-from mudg.steps.synthesize import Synthesize
+from mudg.steps.ingest import Annotate, Fuse, Ingest
+from mudg.steps.render import RenderViews, Score
+from mudg.steps.settings import NO_MODEL, PRESETS, RunConfig, with_device
+from mudg.steps.synthesize import Adapt, Synthesize
 
 CITY = "city"
 WITHOUT_DIFFUSION = "street_gaussians"
 DIFFUSION = "mudg_r"
 WITH_DIFFUSION = "mudg_s"
+CONVERTED = "a folder written by mudg convert"
 CONTINUED_SHARE = 0.5
 """Further steps of the fit with diffusion, as a share of those of the fit that it continues."""
 
@@ -74,12 +70,8 @@ def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bo
 
     out = Path(out)
     if str(source) != CITY and not Path(source).exists():
-        raise InputError(
-            "no such driving log",
-            where=str(source),
-            expected=f"a folder, or the word {CITY}",
-            remedy=similar_path(source),
-        )
+        where, expected = str(source), f"a folder, or the word {CITY}"
+        raise InputError("no such driving log", where=where, expected=expected, remedy=similar_path(source))
     _refuse_overlap(config, source, out)
     refuse_missing(config.synthesize, config.fit)
     torch.set_num_threads(native.default_threads())
@@ -113,12 +105,8 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
     if reels is not None:  # written last, when the seconds of all steps are known
         run_report.write_page(out, reels)
         ledger.remember_report(key)
-    return {
-        "report": page,
-        "metrics": out / "score" / "metrics.json",
-        "seconds": ledger.seconds(),
-        "text": _closing_text(out, page, ledger),
-    }
+    text = _closing_text(out, page, ledger)
+    return {"report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(), "text": text}
 
 
 def _write_viewer(out: Path) -> Path:
@@ -136,36 +124,23 @@ def _write_viewer(out: Path) -> Path:
 
 def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--synthesize.model") -> None:
     """UsageError where weights that are not shipped are asked for and not given; InputError where there is no diffusion
-    model. Before anything is written: the first of these is needed only after a fit.
-
-    Args:
-        flag: what names the diffusion model on this command line.
-    """
+    model. Before anything is written: the first of these is needed only after a fit. ``flag``: what names the diffusion
+    model on this command line."""
     from mudg.diffusion.model_files import read_description
     from mudg.diffusion.published import is_published
 
     if generator.model == NO_MODEL:
-        raise UsageError(
-            "the preset paper needs a published-type diffusion model, which mudg does not ship",
-            where=flag,
-            expected="a folder written by mudg convert",
-            remedy="convert a checkpoint that you have (docs/published.md)",
-        )
+        what = "the preset paper needs a published-type diffusion model, which mudg does not ship"
+        remedy = "convert a checkpoint that you have (docs/published.md)"
+        raise UsageError(what, where=flag, expected=CONVERTED, remedy=remedy)
     if fit.virtual.perception == "lpips" and not fit.virtual.lpips_weights:
-        raise UsageError(
-            "LPIPS needs a weight file, which mudg does not ship",
-            where="--fit.virtual.lpips-weights",
-            expected="a safetensors file",
-            remedy="give one, or --fit.virtual.perception filters",
-        )
+        what, where = "LPIPS needs a weight file, which mudg does not ship", "--fit.virtual.lpips-weights"
+        remedy = "give one, or --fit.virtual.perception filters"
+        raise UsageError(what, where=where, expected="a safetensors file", remedy=remedy)
     read_description(generator.model)
     if generator.guidance is not None and not is_published(generator.model):
-        raise UsageError(
-            "guidance applies to published-type models only",
-            where=flag,
-            got=generator.model,
-            expected="a folder written by mudg convert",
-        )
+        what = "guidance applies to published-type models only"
+        raise UsageError(what, where=flag, got=generator.model, expected=CONVERTED)
 
 
 def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
@@ -173,21 +148,17 @@ def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
     scene as source it writes none."""
     from mudg.diffusion.model_files import folder_of
 
-    refuse_overlap(
-        out,
-        {
-            "log": None if str(source) == CITY or _is_own_scene(source, out) else source,
-            "ingest.poses": config.ingest.poses,
-            "ingest.boxes": config.ingest.boxes,
-            "annotate.weights": config.annotate.weights,
-            "annotate.depth-network": config.annotate.depth_network,
-            "synthesize.model": folder_of(config.synthesize.model),
-            "fit.virtual.lpips-weights": config.fit.virtual.lpips_weights,
-            "score.lpips-weights": config.score.lpips_weights,
-            "score.fid-weights": config.score.fid_weights,
-            "score.fvd-weights": config.score.fvd_weights,
-        },
-    )
+    score = {f"score.{name}-weights": getattr(config.score, f"{name}_weights") for name in ("lpips", "fid", "fvd")}
+    read = {
+        "log": None if str(source) == CITY or _is_own_scene(source, out) else source,
+        "ingest.poses": config.ingest.poses,
+        "ingest.boxes": config.ingest.boxes,
+        "annotate.weights": config.annotate.weights,
+        "annotate.depth-network": config.annotate.depth_network,
+        "synthesize.model": folder_of(config.synthesize.model),
+        "fit.virtual.lpips-weights": config.fit.virtual.lpips_weights,
+    }
+    refuse_overlap(out, read | score)
 
 
 def _is_scene(source: str | Path) -> bool:
@@ -223,8 +194,8 @@ def _forecast(config: RunConfig, scene: Path) -> str:
     from mudg.base import devices
     from mudg.core.raster import probe
     from mudg.scene.read import read_scene
-    from mudg.steps.diagnosis import scene_size
-    from mudg.steps.settings import cost
+    from mudg.steps import cost
+    from mudg.steps.doctor import scene_size
 
     size, cores, speed = scene_size(read_scene(scene), config), native.default_threads(), probe.speed()
     kind = "cpu" if config.device == "cpu" or devices.usual_device() == "cpu" else "cuda"
@@ -242,40 +213,25 @@ def _has_semantics(scene: Path) -> bool:
     return all("semantics" in frame.labels for frame in loaded.frames)
 
 
-@dataclass(frozen=True)
-class _DiffusionUse:
-    """How the chain uses its diffusion model: with renders of the first fit in its input, and adapted to the log."""
-
-    renders: bool
-    adapts: bool
-
-
-def _diffusion_of(config: RunConfig, scene: Path) -> _DiffusionUse:
-    """How the chain is to use its diffusion model, said in a line where that is not what the settings say at first
-    sight.
-
-    Raises:
-        UsageError: adaptation is asked for, but the model cannot be adapted or the log is too short.
-    """
+def _diffusion_of(config: RunConfig, scene: Path) -> tuple[bool, bool]:
+    """Whether the chain's diffusion model has renders of the first fit in its input, and whether it is adapted to the
+    log; said in a line where that is not what the settings say at first sight. UsageError: adaptation is asked for, but
+    the model cannot be adapted or the log is too short."""
     from mudg.diffusion.model_files import uses_renders
 
     renders = uses_renders(config.synthesize.model)
     if config.adaptation == "off" or (config.adaptation == "auto" and not renders):
-        return _DiffusionUse(renders, False)
+        return renders, False
     generated, reason = _teaches(config, scene)
     if config.adaptation == "auto" and generated:
-        return _DiffusionUse(renders, False)  # what the model was trained on
+        return renders, False  # what the model was trained on
     reason = reason if renders else "the model does not use renders"
     if reason and config.adaptation == "on":
-        raise UsageError(
-            "the diffusion model cannot be adapted to this log",
-            where="--adaptation",
-            got=reason,
-            remedy="leave it at auto",
-        )
+        what = "the diffusion model cannot be adapted to this log"
+        raise UsageError(what, where="--adaptation", got=reason, remedy="leave it at auto")
     if reason:
         log.info(f"adapt: left out, {reason}")
-    return _DiffusionUse(renders, not reason)
+    return renders, not reason
 
 
 def _teaches(config: RunConfig, scene: Path) -> tuple[bool, str]:
@@ -290,43 +246,29 @@ def _teaches(config: RunConfig, scene: Path) -> tuple[bool, str]:
 def steps_of(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> dict[str, Output]:
     """The pipeline on a labelled scene, by the names that tables give its steps: each reads what others before it
     write."""
-    diffusion = _diffusion_of(config, scene)
+    renders, adapts = _diffusion_of(config, scene)
     plain, guided = fits_of(config.fit, config.continue_fit)
     first, last = out / "fit" / WITHOUT_DIFFUSION, out / "fit" / WITH_DIFFUSION
-    fused, adapted, virtual, render = out / "fuse", out / "adapt", out / "synthesize", out / "render"
+    fused, adapted, virtual = out / "fuse", out / "adapt", out / "synthesize"
+    render = {method: out / "render" / method for method in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
     adaptation = replace(config.adapt, model=config.synthesize.model, cameras=config.synthesize.cameras)
-    generator = replace(config.synthesize, model=str(adapted / "model")) if diffusion.adapts else config.synthesize
-    compared = {
-        WITHOUT_DIFFUSION: render / WITHOUT_DIFFUSION,
-        DIFFUSION: virtual,
-        WITH_DIFFUSION: render / WITH_DIFFUSION,
-    }
+    generator = replace(config.synthesize, model=str(adapted / "model")) if adapts else config.synthesize
+    views = {WITHOUT_DIFFUSION: render[WITHOUT_DIFFUSION], DIFFUSION: virtual, WITH_DIFFUSION: render[WITH_DIFFUSION]}
+    seen, begun = first if renders else None, first if config.continue_fit else None
+    drawn = {"scene": scene, "settings": config.render}
     steps: dict[str, Output] = {
         "fuse": Fuse(scene=scene, out=fused, settings=config.fuse),
         "fit without diffusion": Fit(scene=scene, fused=fused, out=first, settings=plain),
         "adapt": Adapt(scene=scene, fused=fused, fitted=first, out=adapted, settings=adaptation),
-        "synthesize": Synthesize(
-            scene=scene, fused=fused, fitted=first if diffusion.renders else None, out=virtual, settings=generator
-        ),
+        "synthesize": Synthesize(scene=scene, fused=fused, fitted=seen, out=virtual, settings=generator),
         "fit with diffusion": Fit(
-            scene=scene,
-            fused=fused,
-            observations=(virtual,),
-            start_from=first if config.continue_fit else None,
-            out=last,
-            settings=guided,
+            scene=scene, fused=fused, observations=(virtual,), start_from=begun, out=last, settings=guided
         ),
-        "render without diffusion": RenderViews(
-            scene=scene, model=first, out=render / WITHOUT_DIFFUSION, settings=config.render
-        ),
-        "render with diffusion": RenderViews(
-            scene=scene, model=last, out=render / WITH_DIFFUSION, settings=config.render
-        ),
-        "score": Score(scene=scene, views=compared, fused=fused, out=out / "score", settings=config.score),
+        "render without diffusion": RenderViews(model=first, out=render[WITHOUT_DIFFUSION], **drawn),
+        "render with diffusion": RenderViews(model=last, out=render[WITH_DIFFUSION], **drawn),
+        "score": Score(scene=scene, views=views, fused=fused, out=out / "score", settings=config.score),
     }
-    return {
-        name: replace(step, overwrite=overwrite) for name, step in steps.items() if name != "adapt" or diffusion.adapts
-    }
+    return {name: replace(step, overwrite=overwrite) for name, step in steps.items() if name != "adapt" or adapts}
 
 
 def _report_key(out: Path) -> str:
@@ -343,16 +285,14 @@ def _digests(out: Path) -> dict[str, str]:
 def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     from mudg.scoring import score
 
-    rows = "\n".join(
-        f"  {name:<26}{seconds:8.1f} s{processor_s:11.1f} s{in_words(peak) if peak else '':>12}{in_words(size):>12}"
+    form = "  {:<26}{:8.1f} s{:11.1f} s{:>12}{:>12}"
+    rows = [
+        form.format(name, seconds, processor_s, in_words(peak) if peak else "", in_words(size))
         for name, (seconds, processor_s, peak, size) in ledger.rows().items()
-    )
-    total = sum(ledger.seconds().values())
-    return (
-        f"{score.summary_table(out / 'score')}\n\n "
-        f" {'step':<26}{'time':>10}{'processor':>13}{'memory':>12}{'written':>12}\n{rows}\n  {'total':<26}{total:8.1f}"
-        f" s\n\nreport: {report.resolve()}"
-    )
+    ]
+    head = f"  {'step':<26}{'time':>10}{'processor':>13}{'memory':>12}{'written':>12}"
+    total = f"  {'total':<26}{sum(ledger.seconds().values()):8.1f} s"
+    return "\n".join([score.summary_table(out / "score"), "", head, *rows, total, "", f"report: {report.resolve()}"])
 
 
 class _StepRecord(ForeignRecord):
@@ -395,12 +335,10 @@ class _Ledger:
             elif overwrite:
                 before = {}
             else:
-                raise UsageError(
-                    "the output folder holds a run with other settings",
-                    where=str(out),
-                    got="; ".join(configuration.differences(before["asked"], asked)[:8]) or "another program version",
-                    remedy="choose another --out, or add --overwrite to replace it",
-                )
+                differences = configuration.differences(before["asked"], asked)[:8]
+                what, remedy = "the output folder holds a run with other settings", "add --overwrite to replace it"
+                got = "; ".join(differences) or "another program version"
+                raise UsageError(what, where=str(out), got=got, remedy=f"choose another --out, or {remedy}")
         ledger = cls(out, asked, before)
         ledger.save("running")
         store.write_text(out / "run.yaml", configuration.dump_yaml(config))
@@ -426,27 +364,19 @@ class _Ledger:
         if not own:
             raise cls._foreign(path.parent)
         if not store.check_holds(content):
-            raise IntegrityError(
-                "the record of the run was altered after it was written",
-                where=str(path),
-                remedy="choose another --out, or restore the file",
-            )
+            what, remedy = "the record of the run was altered after it was written", "restore the file"
+            raise IntegrityError(what, where=str(path), remedy=f"choose another --out, or {remedy}")
         return dict(content)
 
     @staticmethod
     def _foreign(out: Path) -> UsageError:
-        return UsageError(
-            "the output folder holds files that do not belong to this run",
-            where=str(out),
-            remedy="choose an empty --out",
-        )
+        what = "the output folder holds files that do not belong to this run"
+        return UsageError(what, where=str(out), remedy="choose an empty --out")
 
     def has_report(self, key: str) -> bool:
         """Whether report.html was made of just this and is unchanged."""
-        page = self._out / "report.html"
-        return (
-            self._report.get("key") == key and page.is_file() and self._report.get("sha256") == store.sha256_file(page)
-        )
+        page, known = self._out / "report.html", self._report
+        return known.get("key") == key and page.is_file() and known.get("sha256") == store.sha256_file(page)
 
     def remember_report(self, key: str) -> None:
         """Note what the page was made of, and its size: it is written after its step was noted."""

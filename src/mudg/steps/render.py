@@ -1,19 +1,20 @@
-"""``mudg render``."""
+"""Verbs that draw and judge: ``mudg render``, ``score``."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self, cast
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
 from mudg.base.errors import UsageError
 from mudg.base.layout import OBSERVATION_FILES, below
-from mudg.steps.engine import Make, script_of
-from mudg.steps.outputs import Output
-from mudg.steps.step import FILE_YAML, Flag
+from mudg.steps.engine import Make, Output, script_of
+from mudg.steps.step import FILE_YAML, SCENE, Flag
 
 if TYPE_CHECKING:
-    from mudg.editing.view_settings import RenderConfig
+    from mudg.base.run_folder import RunDir
+    from mudg.editing.settings import RenderConfig, ScoreConfig
 
 
 class RenderViews(Output):
@@ -30,15 +31,8 @@ class RenderViews(Output):
     from_run = ("model",)
     version, files = 2, ("*.mp4", *below("*", OBSERVATION_FILES))
     short = (
-        "cameras",
-        "shifts_m",
-        "paths",
-        "width_px",
-        "video",
-        "remove_tracks",
-        "device",
-        "harmonize.on",
-        "harmonize.model",
+        *("cameras", "shifts_m", "paths", "width_px", "video", "remove_tracks", "device"),
+        *("harmonize.on", "harmonize.model"),
     )
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
     """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
@@ -53,12 +47,10 @@ class RenderViews(Output):
 
     def checked(self) -> Self:
         if self.settings.harmonize.on and (self.edits is None or self.fused is None):
-            raise UsageError(
-                "harmonising repairs what an edit script touched, from the fused clouds",
-                where="--harmonize.on",
-                got=f"no --{'edits' if self.edits is None else 'fused'}",
-                remedy="give --edits and --fused, or leave it out",
-            )
+            what = "harmonising repairs what an edit script touched, from the fused clouds"
+            got = f"no --{'edits' if self.edits is None else 'fused'}"
+            remedy = "give --edits and --fused, or leave it out"
+            raise UsageError(what, where="--harmonize.on", got=got, remedy=remedy)
         return self
 
     def inputs(self) -> dict[str, str]:
@@ -75,3 +67,81 @@ class RenderViews(Output):
         model, script = cast("Path", self.model), script_of(self.edits)
         edited = render.prepare(self.settings, self.scene, model, script, self.fused)
         return partial(render.write_views, self.settings, self.scene, model, edited)
+
+
+_FILES = (
+    *("lpips_weights", "lpips_vgg_weights", "lpips_squeeze_weights", "fid_weights", "fvd_weights", "dino_weights"),
+    *("clip_weights", "video_features", "detections", "lanes"),
+)
+"""Settings that name files and folders to read."""
+
+
+class Score(Output):
+    """Compare views with ground truth: metrics, tables, error images."""
+
+    section = "single steps, in the order of use"
+    examples = ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",)
+    smaller = "smaller views (--width-px), fewer --views"
+    version = 6
+    files = (
+        *("metrics.json", "metrics.md", "errors/*.png", "features/*.safetensors"),
+        *below("truth/*", OBSERVATION_FILES),
+        *below("nearest_fill/*", OBSERVATION_FILES),
+    )
+    short = ("baseline", "lpips_weights", "fid_weights", "fvd_weights", "perceptual_views", "device")
+    scene: Annotated[Path, SCENE]
+    """Scene directory that the views belong to, or folder of mudg run."""
+    fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
+    """Point clouds written by fuse. They are needed for the baseline without learning (not given: no baseline)."""
+    views: Annotated[Mapping[str, Path], Flag("NAME=FOLDER ...", "second", "views")]
+    """Methods to compare: a name and the folder that render or synthesize wrote, e.g. mudg_s=runs/render. They may also
+    stand after SCENE without the flag."""
+    settings: ScoreConfig
+    truth: Annotated[Path | None, Flag(hidden=True)] = None
+    """Folder of `DrawTruth` for the scene, read instead of drawing the truth again."""
+
+    def checked(self) -> Self:
+        if not self.views:
+            raise UsageError("no views were given", where="--views", expected="NAME=FOLDER ...")
+        return self
+
+    def reads(self) -> dict[str, Path | str | None]:
+        return super().reads() | {name.replace("_", "-"): getattr(self.settings, name) for name in _FILES}
+
+    def inputs(self) -> dict[str, str]:
+        files = {name: getattr(self.settings, name) for name in _FILES}
+        fused = self.fused if self.settings.baseline else None
+        return self.digests({"scene": self.scene, **self.views, "fused": fused, **files, "truth": self.truth})
+
+    def prepare(self, inputs: dict[str, str]) -> Make:
+        from mudg.base.devices import choose_device
+        from mudg.scoring import score
+
+        choose_device(self.settings.device, "networks of the scores")
+        return partial(score.write_scores, self.settings, self.scene, self.views, fused=self.fused, truth=self.truth)
+
+    def answer(self, outcome: Any) -> dict[str, Any]:
+        from mudg.scoring import score
+
+        return {"metrics": outcome / "metrics.json", "text": score.summary_table(outcome)}
+
+
+class DrawTruth(Output):
+    """Draw the truth of a generated city on some trajectories once, for many scores."""
+
+    verb_name = "truth"
+    version, files = 2, below("*", (*OBSERVATION_FILES, "moving.safetensors"))
+    scene: Path
+    trajectories: tuple[Any, ...]
+    """Each a `Trajectory`."""
+
+    def key_settings(self) -> dict[str, Any]:
+        seen = [view for path in self.trajectories for view in path.views]
+        views = [[view.time_s, *view.world_from_cam.ravel().tolist(), view.camera.width] for view in seen]
+        return {"trajectories": [path.name for path in self.trajectories], "views": views}
+
+    def make(self, work: RunDir) -> dict[str, Any]:
+        from mudg.scoring import truth as score_truth
+
+        score_truth.write_truth(self.scene, self.trajectories, work.path)
+        return {"trajectories": [path.name for path in self.trajectories]}

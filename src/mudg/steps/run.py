@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from mudg.steps.outputs import Output
+from mudg.steps.engine import Output
 from mudg.steps.step import Flag
 
 if TYPE_CHECKING:
-    from mudg.steps.settings.presets import PresetName
-    from mudg.steps.settings.run import RunConfig
+    from mudg.steps.settings import PresetName, RunConfig
 
 
 class Run(Output):
@@ -45,8 +44,7 @@ class Run(Output):
     def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> RunConfig:
         """Preset, then the file, then seed, cameras and shifts, then settings of single steps."""
         from mudg.base import config as configuration
-        from mudg.steps.settings.presets import chosen_preset, run_preset
-        from mudg.steps.settings.run import RunConfig, with_lines, with_seed
+        from mudg.steps.settings import RunConfig, chosen_preset, run_preset, with_lines, with_seed
 
         config = configuration.load(RunConfig, run_preset(chosen_preset(inputs["preset"], inputs["fast"])), file)
         config = config if inputs["seed"] is None else with_seed(config, inputs["seed"])

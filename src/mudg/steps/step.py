@@ -7,14 +7,25 @@ import ast
 import contextlib
 import dataclasses
 import functools
+import importlib
 import inspect
-import pkgutil
 import sys
 import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self, dataclass_transform, get_args, get_origin, get_type_hints
+from typing import (
+    Annotated,
+    Any,
+    ClassVar,
+    Final,
+    Literal,
+    Self,
+    dataclass_transform,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
 
 from mudg.base.errors import UsageError, nearest
 
@@ -85,17 +96,14 @@ class Step:
         from mudg.editing import runs
 
         given = {name: getattr(self, name) for name in names}
-        found = runs.parts_of(
-            {name: path for name, path in given.items() if flag_of(type(self), name).part != "views"}, self.required()
-        )
+        parts = {name: path for name, path in given.items() if flag_of(type(self), name).part != "views"}
+        found = runs.parts_of(parts, self.required())
         for name in given.keys() - found.keys():
             views = given[name]
-            named = isinstance(views, Mapping)
-            found[name] = (
-                {key: runs.views_at(path, key) for key, path in views.items()}
-                if named
-                else tuple(map(runs.views_at, views))
-            )
+            if isinstance(views, Mapping):
+                found[name] = {key: runs.views_at(path, key) for key, path in views.items()}
+            else:
+                found[name] = tuple(map(runs.views_at, views))
         return replace(self, **found)
 
     def act(self) -> Any:
@@ -129,12 +137,8 @@ class Step:
             else:
                 values[name] = left.pop(0)
         if left:
-            raise UsageError(
-                "too many words",
-                expected=usage(cls),
-                got=" ".join(map(repr, left)),
-                remedy="a value needs its flag before it",
-            )
+            got, remedy = " ".join(map(repr, left)), "a value needs its flag before it"
+            raise UsageError("too many words", expected=usage(cls), got=got, remedy=remedy)
         return values
 
     @classmethod
@@ -182,11 +186,8 @@ class Step:
                 raise refused(cls, name, error) from error
         missing = [name for name, field in known.items() if name not in checked and field.default is MISSING]
         if missing:
-            raise UsageError(
-                f"no {shown_name(cls, missing[0])} was given",
-                expected=usage(cls),
-                remedy=f"see mudg {cls.verb()} --help",
-            )
+            what, remedy = f"no {shown_name(cls, missing[0])} was given", f"see mudg {cls.verb()} --help"
+            raise UsageError(what, expected=usage(cls), remedy=remedy)
         if cls.settings_type() is not None:
             defaults = {name: field.default for name, field in known.items()} | checked
             checked["settings"] = cls.settings_from(defaults, file, settings or {})
@@ -203,7 +204,27 @@ class Step:
         return (cls.__doc__ or "").strip().splitlines()[0]
 
 
-# what a declaration says --------------------------------------------------------------------------
+# -- what a declaration says -----------------------------------------------------------------------
+
+HOMES: Final[Mapping[str, str]] = {
+    "AdaptConfig": "mudg.diffusion.settings",
+    "AnnotateConfig": "mudg.labels.settings",
+    "BatchConfig": "mudg.fleet.settings",
+    "ConvertConfig": "mudg.diffusion.settings",
+    "FitConfig": "mudg.gaussians.settings",
+    "FuseConfig": "mudg.scene.settings",
+    "HarmonizeConfig": "mudg.diffusion.settings",
+    "IngestConfig": "mudg.formats.settings",
+    "LearnConfig": "mudg.diffusion.settings",
+    "ServeConfig": "mudg.sim.settings",
+    "SynthesizeConfig": "mudg.diffusion.settings",
+    **dict.fromkeys(("BenchConfig", "BenchOwn"), "mudg.benchmarks.settings"),
+    **dict.fromkeys(("EditConfig", "RenderConfig", "ScoreConfig"), "mudg.editing.settings"),
+    **dict.fromkeys(("ExportConfig", "ImportConfig"), "mudg.exporting.settings"),
+    **dict.fromkeys(("PageConfig", "ViewConfig"), "mudg.viewer.settings"),
+    **dict.fromkeys(("PresetName", "RunConfig"), "mudg.steps.settings"),
+}
+"""Names that annotations of steps use, and their modules: each is imported when its verb is."""
 
 
 class _Settings(dict[str, Any]):
@@ -211,9 +232,7 @@ class _Settings(dict[str, Any]):
     needed."""
 
     def __missing__(self, name: str) -> Any:
-        from mudg.steps.settings import HOMES
-
-        return pkgutil.resolve_name(HOMES[name])
+        return getattr(importlib.import_module(HOMES[name]), name)
 
 
 @functools.cache
@@ -225,21 +244,16 @@ def hints(cls: type[Any]) -> dict[str, Any]:
 def hint_of(cls: type[Any], name: str) -> Any:
     """Type of a field, without its `Flag`."""
     kind = hints(cls)[name]
-    return (
-        get_args(kind)[0]
-        if get_origin(kind) is Annotated and any(isinstance(item, Flag) for item in get_args(kind)[1:])
-        else kind
-    )
+    return get_args(kind)[0] if any(isinstance(item, Flag) for item in _notes(kind)) else kind
 
 
 def flag_of(cls: type[Any], name: str) -> Flag:
     """What the command line knows of a field."""
-    kind = hints(cls)[name]
-    return (
-        next((item for item in get_args(kind)[1:] if isinstance(item, Flag)), Flag(""))
-        if get_origin(kind) is Annotated
-        else Flag("")
-    )
+    return next((item for item in _notes(hints(cls)[name]) if isinstance(item, Flag)), Flag(""))
+
+
+def _notes(kind: Any) -> tuple[Any, ...]:
+    return get_args(kind)[1:] if get_origin(kind) is Annotated else ()
 
 
 def field_of(cls: type[Any], name: str) -> Any:
@@ -292,27 +306,19 @@ def in_reading_order(cls: type[Any]) -> list[dataclasses.Field[Any]]:
     own = [field for field in fields(cls) if field.name != "settings" and not flag_of(cls, field.name).hidden]
 
     def rank(field: dataclasses.Field[Any]) -> int:
-        if flag_of(cls, field.name).position in ("first", "rest"):
+        position = flag_of(cls, field.name).position
+        if position in ("first", "rest"):
             return 0
-        return (
-            1
-            + (flag_of(cls, field.name).position != "second")
-            + (field.default is not MISSING or field.name == "overwrite")
-        )
+        return 1 + (position != "second") + (field.default is not MISSING or field.name == "overwrite")
 
     return sorted(own, key=rank)
 
 
 def refused(cls: type[Step], name: str, error: ValidationError) -> UsageError:
     """The first wrong value of a field in words."""
-    first = error.errors(include_url=False)[0]
-    return UsageError(
-        "a value is not valid",
-        where=shown_name(cls, name),
-        expected=first["msg"],
-        got=repr(first.get("input"))[:120],
-        remedy=f"see mudg {cls.verb()} --help",
-    )
+    first, remedy = error.errors(include_url=False)[0], f"see mudg {cls.verb()} --help"
+    where, got = shown_name(cls, name), repr(first.get("input"))[:120]
+    return UsageError("a value is not valid", where=where, expected=first["msg"], got=got, remedy=remedy)
 
 
 @dataclass(frozen=True, slots=True)
@@ -364,9 +370,8 @@ def texts_of(kind: type[Any]) -> dict[str, str]:
     texts: dict[str, str] = {}
     for base in reversed(kind.__mro__):
         if base.__dict__.get("__annotations__"):
-            texts |= _texts_of_module(getattr(sys.modules[base.__module__], "__file__", None) or "").get(
-                base.__qualname__, {}
-            )
+            source = getattr(sys.modules[base.__module__], "__file__", None) or ""
+            texts |= _texts_of_module(source).get(base.__qualname__, {})
     return texts
 
 
@@ -391,9 +396,7 @@ def _texts_of_class(node: ast.ClassDef) -> Iterator[tuple[str, str]]:
                 yield field.target.id, " ".join(below.value.value.split())
 
 
-# the function of a verb ---------------------------------------------------------------------------
-
-
+# -- the function of a verb ------------------------------------------------------------------------
 def python_function(cls: type[Step], name: str) -> Callable[..., Any]:
     """``mudg.fit(...)`` of a step: its inputs and settings as arguments, its result returned.
 
@@ -402,17 +405,11 @@ def python_function(cls: type[Step], name: str) -> Callable[..., Any]:
     """
 
     def call(*args: Any, config: str | Path | None = None, **given: Any) -> Any:
-        names = [
-            parameter.name
-            for parameter in inspect.signature(call).parameters.values()
-            if parameter.kind != inspect.Parameter.KEYWORD_ONLY
-        ]
+        parameters = inspect.signature(call).parameters.values()
+        names = [one.name for one in parameters if one.kind != inspect.Parameter.KEYWORD_ONLY]
         if len(args) > len(names):
-            raise UsageError(
-                f"mudg.{name} takes {len(names)} arguments without a name",
-                expected=", ".join(names),
-                got=f"{len(args)} of them",
-            )
+            what = f"mudg.{name} takes {len(names)} arguments without a name"
+            raise UsageError(what, expected=", ".join(names), got=f"{len(args)} of them")
         values = dict(zip(names, args, strict=False))
         twice = sorted(values.keys() & given.keys())
         if twice:
@@ -421,12 +418,10 @@ def python_function(cls: type[Step], name: str) -> Callable[..., Any]:
         values |= {key: value for key, value in given.items() if key in own}
         settings = {key: _plain(value) for key, value in given.items() if key not in own}
         if settings and cls.settings_type() is None:
-            near = nearest(next(iter(settings)), own, 0.5)
-            raise UsageError(
-                f"mudg.{name} has no argument {next(iter(settings))!r}",
-                expected=", ".join(sorted(own)),
-                remedy=f"did you mean {near}?" if near else "",
-            )
+            wrong = next(iter(settings))
+            near = nearest(wrong, own, 0.5)
+            what, remedy = f"mudg.{name} has no argument {wrong!r}", f"did you mean {near}?" if near else ""
+            raise UsageError(what, expected=", ".join(sorted(own)), remedy=remedy)
         outcome = cls.build(values, settings, None if config is None else Path(config)).run()
         return outcome[cls.result] if isinstance(outcome, dict) and cls.result in outcome else outcome
 
@@ -453,28 +448,23 @@ def _plain(value: Any) -> Any:
 def signature(cls: type[Step]) -> inspect.Signature:
     """Arguments of the function: inputs in order, then by name alone the output, other inputs, the YAML file and every
     setting."""
-    kinds = inspect.Parameter
-    first, later = [], []
+    kinds, first, later = inspect.Parameter, [], []
     for field in fields(cls):
         if field.name == "settings" or flag_of(cls, field.name).hidden:
             continue
         at = kinds.POSITIONAL_OR_KEYWORD if flag_of(cls, field.name).position else kinds.KEYWORD_ONLY
         default = kinds.empty if field.default is MISSING else field.default
-        (first if at == kinds.POSITIONAL_OR_KEYWORD else later).append(
-            kinds(field.name, at, default=default, annotation=hint_of(cls, field.name))
-        )
+        parameter = kinds(field.name, at, default=default, annotation=hint_of(cls, field.name))
+        (first if at == kinds.POSITIONAL_OR_KEYWORD else later).append(parameter)
     kind = cls.settings_type()
-    names = {one.name for one in (*first, *later)}
     if kind is not None:
-        if "config" not in names:
+        if "config" not in {one.name for one in (*first, *later)}:
             later.append(kinds("config", kinds.KEYWORD_ONLY, default=None, annotation=Path | None))
         types, values = hints(kind), kind()
-        later += [
-            kinds(field.name, kinds.KEYWORD_ONLY, default=getattr(values, field.name), annotation=types[field.name])
-            for field in dataclasses.fields(kind)
-        ]
-    first.sort(key=lambda one: one.default is not kinds.empty)
-    later.sort(key=lambda one: one.default is not kinds.empty)
+        for name in (field.name for field in dataclasses.fields(kind)):
+            later.append(kinds(name, kinds.KEYWORD_ONLY, default=getattr(values, name), annotation=types[name]))
+    for parameters in (first, later):
+        parameters.sort(key=lambda one: one.default is not kinds.empty)
     return inspect.Signature([*first, *later])
 
 

@@ -1,19 +1,141 @@
-"""``mudg synthesize``."""
+"""Verbs of the diffusion model: ``mudg learn``, ``adapt``, ``synthesize``."""
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self, cast
+from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
 from mudg.base.layout import OBSERVATION_FILES, below
-from mudg.steps.engine import Make, script_of
-from mudg.steps.outputs import Output
+from mudg.steps.engine import Make, Output, opened, script_of
+from mudg.steps.fit import Fit
+from mudg.steps.ingest import Fuse
 from mudg.steps.step import FILE_YAML, SCENE, Flag
 
 if TYPE_CHECKING:
-    from mudg.diffusion.settings import SynthesizeConfig
+    from mudg.base.run_folder import RunDir
+    from mudg.diffusion.adapt import PlannedAdaptation
+    from mudg.diffusion.settings import AdaptConfig, LearnConfig, SynthesizeConfig
+    from mudg.gaussians.settings import FitConfig
+
+
+class Learn(Output):
+    """Train a diffusion model on generated cities, or fine-tune one on your own logs."""
+
+    section = "single steps, in the order of use"
+    examples = (
+        "mudg learn --out runs/mdm",
+        "mudg learn --config recipe.yaml --out runs/mdm",
+        "mudg learn --data.scenes runs/kitti --start embedded --optimizer.lr 1e-4 --steps 500 --out runs/tuned",
+        "torchrun --nproc-per-node 8 -m mudg learn --compute.parallel fsdp --config recipe.yaml --out runs/mdm",
+    )
+    smaller = "smaller clips (--data.width, --data.height), a smaller batch, fewer --compute.workers"
+    result = "model"
+    version, idle = 1, ("compute",)
+    files = (
+        *("clips/*.safetensors", "clips/log_clips.json", "codec/", "steps/", "cache/", "samples/*.png"),
+        *("tensorboard/", "loss.png", "metrics.json", "model/*", "model.part/"),
+    )
+    short = (
+        *("start", "steps", "seed", "precision", "data.scenes", "data.clips", "data.cities", "data.width"),
+        *("data.height", "data.window", "optimizer.lr", "optimizer.batch_frames", "compute.device", "compute.workers"),
+    )
+    settings: LearnConfig
+
+    def act(self) -> Path:
+        from mudg.diffusion import learn
+
+        learn.train(learn.check(self.settings), self.out, self.output(), lambda: opened(self)[1])
+        return self.out / "model"
+
+    def checked(self) -> Self:
+        from mudg.diffusion import learn
+
+        return replace(self, settings=learn.check(self.settings))
+
+    def reads(self) -> dict[str, Path | str | None]:
+        from mudg.diffusion import learn
+
+        return learn.files_read(self.settings, self.out, self.overwrite)
+
+    def inputs(self) -> dict[str, str]:
+        from mudg.diffusion import learn
+
+        return learn.inputs_of(self.settings)
+
+
+class Adapt(Output):
+    """Adapt the diffusion model to one recorded log, with the log's own photographs."""
+
+    section = "single steps, in the order of use"
+    examples = (
+        "mudg adapt scenes/kitti --fused runs/fused --fitted runs/plain --out runs/adapted",
+        (
+            "mudg synthesize scenes/kitti --fused runs/fused --fitted runs/plain --model runs/adapted/model --out"
+            " runs/virtual"
+        ),
+    )
+    smaller = "one process (--processes 1), or smaller images (mudg ingest --resolution)"
+    result = "model"
+    from_run = ("fused", "fitted")
+    version, files = 2, ("model/*", "model.part/", "adapt.json", "before.png", "after.png", "work/")
+    idle = ("processes",)
+    short = (
+        *("model", "cameras", "shifts_m", "steps", "lr", "fit_iterations", "precision", "device", "processes", "seed"),
+    )
+    scene: Annotated[Path, SCENE]
+    """Scene directory written by ingest or annotate, or folder of mudg run."""
+    fused: Annotated[Path | None, Flag("FOLDER", "second", "fused")] = None
+    """Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at
+    SCENE)."""
+    fitted: Annotated[Path | None, Flag("FOLDER", "", "fitted")] = None
+    """Gaussian scene written by fit, without virtual views (not given: that of the run at SCENE)."""
+    settings: AdaptConfig
+
+    def checked(self) -> Self:
+        from mudg.base.devices import NETWORK_KINDS, choose_device
+
+        device = choose_device(self.settings.device, "diffusion model", NETWORK_KINDS)
+        return replace(self, settings=replace(self.settings, device=str(device)))
+
+    def reads(self) -> dict[str, Path | str | None]:
+        from mudg.diffusion.model_files import folder_of
+
+        return super().reads() | {"model": folder_of(self.settings.model)}
+
+    def inputs(self) -> dict[str, str]:
+        from mudg.diffusion.model_files import digest
+
+        return super().inputs() | {"model": digest(self.settings.model)}
+
+    def prepare(self, inputs: dict[str, str]) -> Make:
+        from mudg.diffusion.adapt import PlannedAdaptation
+
+        fused, fitted = cast("Path", self.fused), cast("Path", self.fitted)
+        return partial(adapt_model, PlannedAdaptation.of(self.settings, self.scene, fused, fitted))
+
+    def resulting(self, folder: Path) -> Path:
+        return folder / "model"
+
+
+def adapt_model(plan: PlannedAdaptation, work: RunDir) -> dict[str, Any]:
+    """Fits and clips of all lessons, some steps of training, and the better of both models."""
+    folder = work.path / "work"
+    plan.make_clips(fit_scene, folder)
+    model = Learn(out=folder / "learn", settings=plan.training(folder)).run()
+    summary = plan.write_model(model, folder, work.path)
+    shutil.rmtree(folder, ignore_errors=True)
+    return summary
+
+
+def fit_scene(settings: FitConfig, scene: Path, fused: Path | None, out: Path) -> None:
+    """Fuse a scene, unless it has clouds, and fit it."""
+    from mudg.scene.settings import FuseConfig
+
+    fused = fused or Fuse(scene=scene, out=out / "fuse", settings=FuseConfig()).run()
+    Fit(scene=scene, fused=fused, out=out / "fit", settings=settings).run()
 
 
 class Synthesize(Output):
@@ -27,18 +149,8 @@ class Synthesize(Output):
     version, files = 2, below("*", (*OBSERVATION_FILES, "overview.png", "depth_fits.json", "state/"))
     idle = ("offload", "compiled")
     short = (
-        "model",
-        "cameras",
-        "shifts_m",
-        "paths",
-        "steps",
-        "width_px",
-        "condition",
-        "align_depth",
-        "precision",
-        "seed",
-        "device",
-        "processes",
+        *("model", "cameras", "shifts_m", "paths", "steps", "width_px", "condition", "align_depth", "precision"),
+        *("seed", "device", "processes"),
     )
     scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
@@ -54,7 +166,7 @@ class Synthesize(Output):
 
     def checked(self) -> Self:
         from mudg.diffusion.views import check_config
-        from mudg.editing.generated import shows_weather
+        from mudg.editing.edit import shows_weather
 
         script, renders = script_of(self.edits), self.fitted is not None
         weather = script is not None and shows_weather(self.settings, script, renders)
@@ -69,13 +181,12 @@ class Synthesize(Output):
         from mudg.diffusion.model_files import digest
 
         first = self.digests({"scene": self.scene, "fused": self.fused})
-        return (
-            first | {"model": digest(self.settings.model)} | self.digests({"edits": self.edits, "fitted": self.fitted})
-        )
+        model = {"model": digest(self.settings.model)}
+        return first | model | self.digests({"edits": self.edits, "fitted": self.fitted})
 
     def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.diffusion.synthesize import JobInputs, write_views
-        from mudg.editing.generated import edited_drive, edited_scene
+        from mudg.editing.edit import edited_drive, edited_scene
         from mudg.gaussians.storage import model_of_scene
         from mudg.scene.read import read_scene
 
@@ -84,8 +195,6 @@ class Synthesize(Output):
             model_of_scene(self.fitted, scene)  # refuses the fit of another scene
         job = JobInputs(self.scene, cast("Path", self.fused), self.fitted)
         if script is not None:
-            scene, job = (
-                edited_scene(script, self.settings, job, scene),
-                replace(job, edited=partial(edited_drive, script)),
-            )
+            scene = edited_scene(script, self.settings, job, scene)
+            job = replace(job, edited=partial(edited_drive, script))
         return partial(write_views, self.settings, job, scene)

@@ -1,4 +1,4 @@
-"""``mudg view``."""
+"""Verbs that show a drive: ``mudg view``, ``page``, ``report``, ``serve``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 from mudg.steps.step import FILE_YAML, RUN, Flag, Step
 
 if TYPE_CHECKING:
-    from mudg.viewer.settings import ViewConfig
+    from mudg.sim.settings import ServeConfig
+    from mudg.viewer.settings import PageConfig, ViewConfig
 
 
 class ViewScene(Step):
@@ -41,3 +42,71 @@ class ViewScene(Step):
 
         files = edits.EditFiles(self.edits, self.edits_out, self.overwrite)
         return view.run_view(self.settings, self.source, self.compare, scene=self.scene, files=files)
+
+
+class Page(Step):
+    """Write a fitted scene as one HTML page: fly through it, any layer, any time, without a network."""
+
+    section = "look at a drive"
+    result = "page"
+    examples = (
+        "mudg page runs/kitti --out kitti.html",
+        "mudg page runs/kitti --compare runs/kitti --out both.html",
+        "mudg page runs/mudg_s --scene scenes/city --out city.html",
+    )
+    source: Annotated[Path, RUN]
+    """Folder of a finished mudg run, or Gaussian scene written by fit."""
+    out: Annotated[Path, Flag("FILE.html")]
+    """Page to write: one file. Above 32 MB, a folder FILE_page beside it, for a web server."""
+    scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None
+    """Scene directory that a Gaussian scene was fitted to. A run has its own."""
+    compare: Annotated[Path | None, Flag("RUN2")] = None
+    """A second run or fit of the same log, to compare with. The same run: its two fits."""
+    overwrite: bool = False
+    """Replace the page if it exists."""
+    settings: PageConfig
+
+    def act(self) -> dict[str, Any]:
+        from mudg.viewer import view
+
+        return view.run_page(
+            self.settings, self.source, self.out, scene=self.scene, compare=self.compare, overwrite=self.overwrite
+        )
+
+
+class Report(Step):
+    """Write one page over many finished runs: pictures, links, and a table of all scores to sort and filter."""
+
+    section = "look at a drive"
+    result = "page"
+    examples = ("mudg report runs/kitti runs/city --out runs.html", "mudg report runs --out runs.html")
+    runs: Annotated[tuple[Path, ...], Flag("RUN ...", "rest")]
+    """Folders of mudg run, score or bench; of any other folder, the folders in it."""
+    out: Annotated[Path, Flag("FILE.html")]
+    """Page to write."""
+    overwrite: bool = False
+    """Replace the page if it exists."""
+
+    def act(self) -> dict[str, Any]:
+        from mudg.viewer import gallery
+
+        return gallery.run(self.runs, self.out, overwrite=self.overwrite)
+
+
+class Serve(Step):
+    """Serve a fitted scene to driving simulators over gRPC, as a renderer of cameras and LiDAR."""
+
+    section = "look at a drive"
+    examples = ("mudg serve runs/kitti --port 50051", "mudg serve runs/kitti --edits cut_in.yaml --metrics-port 9100")
+    source: Annotated[Path, RUN]
+    """Folder of a finished mudg run, or Gaussian scene written by fit."""
+    scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None
+    """Scene directory that a Gaussian scene was fitted to. A run has its own."""
+    edits: Annotated[Path | None, FILE_YAML] = None
+    """Edit script (docs/edit.md) to carry out before."""
+    settings: ServeConfig
+
+    def act(self) -> dict[str, Any]:
+        from mudg.sim import server
+
+        return server.serve(self.settings, self.source, self.edits, self.scene)

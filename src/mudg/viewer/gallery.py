@@ -22,11 +22,6 @@ from mudg.base.run_folder import ResultFile
 from mudg.scoring.tables import TERMINAL_METRICS, number_text
 from mudg.viewer.report import viewer_address
 
-# gallery ------------------------------------------------------------------------------------------
-#
-# The gallery of ``mudg report``: one page over many finished runs, with a card per run and one table of all scores.
-
-
 THUMBNAIL_PX: Final = 320, 120
 """Width of the pictures on cards, and where there are more than `MANY` runs."""
 MANY: Final = 200
@@ -34,12 +29,9 @@ MANY: Final = 200
 
 @dataclass(frozen=True)
 class GalleryEntry:
-    """A finished folder on the page.
-
-    Args:
-        folder: of the run. kind: what made it: run, score or bench. scores: its metrics.json, None of a benchmark.
-        facts: words below its name. picture: of a rendered view, if there is one. pages: title -> file.
-    """
+    """A finished folder on the page. ``folder``: of the run. ``kind``: what made it: run, score or bench. ``scores``:
+    its metrics.json, None of a benchmark. ``facts``: words below its name. ``picture``: of a rendered view, if there is
+    one. ``pages``: title -> file."""
 
     folder: Path
     kind: str
@@ -58,11 +50,8 @@ class Unread:
 
 
 def read_shown(folder: Path) -> GalleryEntry:
-    """What a folder of ``mudg run``, ``mudg score`` or ``mudg bench`` holds.
-
-    Raises:
-        InputError: it is none of them, unfinished, or damaged.
-    """
+    """What a folder of ``mudg run``, ``mudg score`` or ``mudg bench`` holds. InputError: it is none of them,
+    unfinished, or damaged."""
     if not folder.is_dir():
         raise InputError("no such folder", where=str(folder))
     with understood("a finished run", str(folder)):
@@ -84,23 +73,16 @@ def _run_or_scores(folder: Path) -> GalleryEntry:
 
 def _require_finished(folder: Path, state: Mapping[str, Any]) -> None:
     if state.get("state") != "complete":
-        raise InputError(
-            "the run is not finished",
-            where=str(folder),
-            got=str(state.get("state"))[:40],
-            remedy="repeat its command: it resumes",
-        )
+        got, remedy = str(state.get("state"))[:40], "repeat its command: it resumes"
+        raise InputError("the run is not finished", where=str(folder), got=got, remedy=remedy)
 
 
 def _run(folder: Path, state: Mapping[str, Any]) -> GalleryEntry:
     _require_finished(folder, state)
     scores = _scores(folder / "score" / "metrics.json")
     seconds = sum(float(step.get("seconds", 0)) for step in state.get("steps", {}).values())
-    known = {
-        "report": folder / "report.html",
-        "viewer": folder / viewer_address(folder),
-        "scores": folder / "score" / "metrics.md",
-    }
+    known = {"report": folder / "report.html", "viewer": folder / viewer_address(folder)}
+    known["scores"] = folder / "score" / "metrics.md"
     pages = {title: path for title, path in known.items() if path.is_file()}
     minutes, rest = divmod(round(seconds), 60)
     return GalleryEntry(folder, "run", scores, f"{minutes} min {rest} s", _picture(folder), pages)
@@ -109,20 +91,16 @@ def _run(folder: Path, state: Mapping[str, Any]) -> GalleryEntry:
 def _bench(folder: Path) -> GalleryEntry:
     found = store.read_json(folder / "bench.json")
     name = str(found.get("bench", "")) if isinstance(found, dict) else ""
-    pages = {
-        title: folder / file
-        for title, file in (("page", "page.html"), ("tables", "bench.md"))
-        if (folder / file).is_file()
-    }
+    known = {"page": folder / "page.html", "tables": folder / "bench.md"}
+    pages = {title: path for title, path in known.items() if path.is_file()}
     return GalleryEntry(folder, f"bench {name}".strip(), None, "", None, pages)
 
 
 def _scores(path: Path) -> Mapping[str, Any]:
     found = store.read_json(path)
     if not isinstance(found, dict) or not {"scene", "methods", "metrics", "by_distance"} <= found.keys():
-        raise InputError(
-            "the scores are malformed", where=str(path), expected="what mudg score wrote", remedy="score the run again"
-        )
+        expected, remedy = "what mudg score wrote", "score the run again"
+        raise InputError("the scores are malformed", where=str(path), expected=expected, remedy=remedy)
     return found
 
 
@@ -140,11 +118,8 @@ def _picture(folder: Path) -> Path | None:
 
 
 def page(shown: Sequence[GalleryEntry], unread: Sequence[Unread], out: Path) -> str:
-    """The whole page. Links are relative to ``out``, the file that it becomes; pictures lie inside.
-
-    Args:
-        shown: in this order. unread: listed with their reasons.
-    """
+    """The whole page. Links are relative to ``out``, the file that it becomes; pictures lie inside. ``shown``: in this
+    order. ``unread``: listed with their reasons."""
     names = _names([one.folder for one in shown])
     width = THUMBNAIL_PX[len(shown) > MANY]
     cards = [_card(one, name, out, width) for one, name in zip(shown, names, strict=True)]
@@ -174,23 +149,12 @@ def _names(folders: Sequence[Path]) -> list[str]:
 
 def _card(one: GalleryEntry, name: str, out: Path, width: int) -> dict[str, Any]:
     scene = {} if one.scores is None else one.scores["scene"]
-    facts = [
-        one.kind,
-        scene.get("id", ""),
-        scene.get("dataset", ""),
-        f"{scene['frames']} frames of {len(scene['cameras'])} cameras" if scene else "",
-        one.facts,
-    ]
-    links = [
-        {"title": title, "href": quote(os.path.relpath(path, out.parent).replace(os.sep, "/"))}
-        for title, path in one.pages.items()
-    ]
-    return {
-        "name": name,
-        "facts": [str(fact) for fact in facts if fact],
-        "links": links,
-        "picture": _thumbnail(one.picture, width),
-    }
+    frames = f"{scene['frames']} frames of {len(scene['cameras'])} cameras" if scene else ""
+    facts = [one.kind, scene.get("id", ""), scene.get("dataset", ""), frames, one.facts]
+    address = lambda path: quote(os.path.relpath(path, out.parent).replace(os.sep, "/"))  # noqa: E731
+    links = [{"title": title, "href": address(path)} for title, path in one.pages.items()]
+    shown = [str(fact) for fact in facts if fact]
+    return {"name": name, "facts": shown, "links": links, "picture": _thumbnail(one.picture, width)}
 
 
 def _thumbnail(picture: Path | None, width: int) -> str:
@@ -223,25 +187,18 @@ def _rows(one: GalleryEntry, name: str, metrics: Sequence[Mapping[str, Any]]) ->
         values = [entry["values"].get(metric["name"]) for metric in metrics]
         if not any(isinstance(value, float) for value in values):
             continue
+        numbers = {m["name"]: v for m, v in zip(metrics, values, strict=True) if isinstance(v, float)}
+        texts = {name: number_text(name, value) for name, value in numbers.items()}
         rows.append(
             {
                 "run": name,
                 "scene": str(one.scores["scene"]["id"]),
                 "method": str(titles.get(entry["method"], entry["method"])),
                 "place": "recorded path" if distance == 0 else f"{distance:g} m aside",
-                "cells": [
-                    {
-                        "text": number_text(m["name"], v) if isinstance(v, float) else "",
-                        "value": v if isinstance(v, float) else "",
-                    }
-                    for m, v in zip(metrics, values, strict=True)
-                ],
+                "cells": [{"text": texts.get(m["name"], ""), "value": numbers.get(m["name"], "")} for m in metrics],
             }
         )
     return rows
-
-
-# gallery ------------------------------------------------------------------------------------------
 
 
 def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str, Any]:
@@ -272,12 +229,9 @@ def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str
             log.warn(f"{folder}: access was refused")
             unread.append(Unread(folder, f"access was refused: {error.filename}"))
     if not shown:
-        raise InputError(
-            "no finished run to show",
-            where=", ".join(str(one.folder) for one in unread[:4]),
-            got="; ".join(dict.fromkeys(one.reason for one in unread[:4])),
-            expected="folders of mudg run, score or bench",
-        )
+        where, got = ", ".join(str(one.folder) for one in unread[:4]), dict.fromkeys(one.reason for one in unread[:4])
+        expected = "folders of mudg run, score or bench"
+        raise InputError("no finished run to show", where=where, got="; ".join(got), expected=expected)
     content = page(shown, unread, out.resolve()).encode()
     with ResultFile.open(out, "report", {}, {"page": hashlib.sha256(content).hexdigest()}, overwrite=overwrite) as file:
         if file.complete:

@@ -24,13 +24,11 @@ from mudg.base.types import Camera, FusedCloud, Observation, Scene, View
 from mudg.core.edit import Motion
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.diffusion.inputs import InWeather
-from mudg.editing.apply import left_behind, street_left
-from mudg.editing.carried import FACT, EditedDrive, carry_out
+from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, left_behind, street_left, weather_of
 from mudg.editing.model import motion_of
 from mudg.editing.plan import EditPlan
 from mudg.editing.runs import find_run
-from mudg.editing.script import EditScript, parse_edits, read_edits
-from mudg.editing.weathered import Drawer, conditions_of, in_weather, weather_of
+from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edits
 from mudg.formats.exporters.video import mp4_bytes
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode
@@ -38,12 +36,9 @@ from mudg.gaussians.rendering import raster_of, render_view
 from mudg.viewer.page import begin_of, key_rows
 from mudg.viewer.report import FAR_M, NEAR_M
 
-# edits --------------------------------------------------------------------------------------------
+# -- edits -----------------------------------------------------------------------------------------
 #
-# Edits made on the viewer's page: checked and carried out by the functions that ``mudg edit`` uses, and saved as a
-# script.
-
-
+# Made on the viewer's page: checked and carried out by the functions that ``mudg edit`` uses, and saved as a script.
 MARK: Final = "# Edits made in mudg view. For mudg edit, mudg render --edits and mudg view --edits.\n"
 """First line of a saved script; a file without it belongs to somebody else."""
 NAME: Final = "edits.yaml"
@@ -97,24 +92,17 @@ class EditDesk:
     _making: threading.Lock = field(default_factory=threading.Lock)
 
     def entries(self) -> list[dict[str, Any]]:
-        """The edits that the page begins with, as [{verb: settings}] with absolute paths."""
+        """The edits that the page begins with, as [{verb: settings}] with absolute paths: they may be saved
+        elsewhere."""
         if self.begin is None:
             return []
-        return [
-            {e.verb: e.settings.model_dump(mode="json", by_alias=True, exclude_unset=True)}
-            for e in self._absolute(self.begin).edits
-        ]
-
-    def _absolute(self, script: EditScript) -> EditScript:
-        """The script with absolute paths: it may be saved elsewhere."""
-        return parse_edits(script.text(), "edits", Path()) if script.files() else script
+        script = parse_edits(self.begin.text(), "edits", Path()) if self.begin.files() else self.begin
+        said = lambda settings: settings.model_dump(mode="json", by_alias=True, exclude_unset=True)  # noqa: E731
+        return [{edit.verb: said(edit.settings)} for edit in script.edits]
 
     def edited(self, text: str) -> list[SceneModel]:
-        """The fits with a script carried out; as they are where it is empty.
-
-        Raises:
-            InputError: it cannot be carried out; the message names line, verb and field.
-        """
+        """The fits with a script carried out; as they are where it is empty. InputError: it cannot be carried out; the
+        message names line, verb and field."""
         if not text.strip():
             return list(self.models)
         drive = self._carried(text)
@@ -136,17 +124,11 @@ class EditDesk:
         script = parse_edits(text, NAME)  # others need not wait while a long text is read
         with self._lock:
             if text not in self._planned:
-                known = (
-                    {str(path.resolve()) for path in self.begin.files().values()} if self.begin is not None else set()
-                )
-                foreign = sorted(set(script.files()) - known - {self.run})
-                if foreign:
-                    raise InputError(
-                        "a page may name no files but those of --edits",
-                        where=NAME,
-                        got=foreign[0],
-                        remedy="write them into the script by hand",
-                    )
+                files = {} if self.begin is None else self.begin.files()
+                known = {str(path.resolve()) for path in files.values()}
+                if foreign := sorted(set(script.files()) - known - {self.run}):
+                    what, remedy = "a page may name no files but those of --edits", "write them into the script by hand"
+                    raise InputError(what, where=NAME, got=foreign[0], remedy=remedy)
                 drive = carry_out(script, self.models[0], self.scene, self.cloud)
                 self._planned = {**_last(self._planned, KEPT - 1), text: drive}
             return self._planned[text]
@@ -156,12 +138,9 @@ class EditDesk:
         said: dict[str, Any] = {"paths": {}, "removed": [], "inserted": [], "notes": [], "saved": None}
         if asked.script.strip():
             drive = self._checked(asked.script)
-            said |= {
-                "paths": self._paths(drive),
-                "removed": list(drive.plan.removed),
-                "inserted": list(drive.plan.inserted),
-                "notes": [note["text"] for note in drive.notes] + _unseen(drive),
-            }
+            notes = [note["text"] for note in drive.notes] + _unseen(drive)
+            said |= {"paths": self._paths(drive), "removed": list(drive.plan.removed)}
+            said |= {"inserted": list(drive.plan.inserted), "notes": notes}
         if asked.save:
             said["saved"] = str(self.save(asked.script))
         return store.json_text(said, indent=None).encode(), "application/json"
@@ -184,31 +163,21 @@ class EditDesk:
         nodes = {node.name: node for node in self.models[0].nodes if isinstance(node, RigidNode)}
 
         def record(motion: Motion) -> dict[str, Any]:
-            return {
-                "rows": key_rows(motion.times_s - begin, motion.poses).tolist(),
-                "source": (motion.source_s - begin).tolist(),
-            }
+            rows = key_rows(motion.times_s - begin, motion.poses).tolist()
+            return {"rows": rows, "source": (motion.source_s - begin).tolist()}
 
-        changed = {
-            name: drive.plan.changed(name, motion_of(nodes[name])) for name in drive.plan.changes if name in nodes
-        }
+        own = [name for name in drive.plan.changes if name in nodes]
+        changed = {name: drive.plan.changed(name, motion_of(nodes[name])) for name in own}
         standing = {name: drive.plan.after.actors[name].motion for name in drive.plan.touched() if name not in changed}
         return {name: record(motion) for name, motion in {**changed, **standing}.items()}
 
     def save(self, text: str) -> Path:
-        """Write the script.
-
-        Raises:
-            InputError: there is nothing to save, or the file belongs to somebody else.
-        """
+        """Write the script. InputError: there is nothing to save, or the file belongs to somebody else."""
         if not text.strip():
             raise InputError("there are no edits to save", remedy="hide, move or remove an object first")
         if self.place.exists() and not self.overwrite and not store.read_bytes(self.place).startswith(MARK.encode()):
-            raise InputError(
-                "the file was not written by mudg view",
-                where=str(self.place),
-                remedy="start mudg view with another --edits-out, or add --overwrite",
-            )
+            remedy = "start mudg view with another --edits-out, or add --overwrite"
+            raise InputError("the file was not written by mudg view", where=str(self.place), remedy=remedy)
         store.atomic_write(self.place, (MARK + text).encode())
         return self.place
 
@@ -222,25 +191,19 @@ def _unseen(drive: EditedDrive) -> list[str]:
     """What the page, or its exact frames, do not show of a script."""
     found = []
     if drive.plan.closed and drive.plan.views:
-        found.append(
-            "exact frames close the street that objects leave (close_street), the first one after some seconds; the"
-            " page's own picture shows it as it was fitted"
-        )
+        later = "the first one after some seconds; the page's own picture shows it as it was fitted"
+        found.append(f"exact frames close the street that objects leave (close_street), {later}")
     if drive.plan.moves_ego:
-        found.append(
-            "the recorded cameras of this page stay on the recorded path; mudg render moves them with the vehicle"
-        )
+        moved = "mudg render moves them with the vehicle"
+        found.append(f"the recorded cameras of this page stay on the recorded path; {moved}")
     return found
 
 
 def desk_for(
     models: Sequence[SceneModel], scene: Scene, cloud: FusedCloud | None, run: Path, files: EditFiles
 ) -> EditDesk:
-    """What carries out the edits of a page.
-
-    Raises:
-        InputError: the script cannot be carried out. UsageError: edits would be saved into a finished result.
-    """
+    """What carries out the edits of a page. InputError: the script cannot be carried out. UsageError: edits would be
+    saved into a finished result."""
     begin = None if files.script is None else read_edits(files.script)
     own = str(Path(run).resolve()) if find_run(run).whole else ""
     desk = EditDesk(models, scene, cloud, place_for(run, files.out), begin, files.overwrite, own)
@@ -250,19 +213,12 @@ def desk_for(
 
 
 def place_for(run: Path, given: Path | None) -> Path:
-    """Where edits of a run are saved: the given file, else beside the run, else in the current folder.
-
-    Raises:
-        UsageError: the given file lies in the result of a command.
-    """
+    """Where edits of a run are saved: the given file, else beside the run, else in the current folder. UsageError: the
+    given file lies in the result of a command."""
     if given is not None:
         if _sealed(given) or given.is_dir():
-            raise UsageError(
-                "edits are not saved into the result of a command",
-                where="--edits-out",
-                got=str(given),
-                expected="a file outside of runs",
-            )
+            what, expected = "edits are not saved into the result of a command", "a file outside of runs"
+            raise UsageError(what, where="--edits-out", got=str(given), expected=expected)
         return given
     beside = Path(run).resolve().parent / NAME
     return Path(NAME) if _sealed(beside) else beside
@@ -272,9 +228,7 @@ def _sealed(path: Path) -> bool:
     return any((folder / name).is_file() for folder in path.resolve().parents for name in SEALED)
 
 
-# frames -------------------------------------------------------------------------------------------
-
-
+# -- frames ----------------------------------------------------------------------------------------
 LAYERS: Final = ("color", "depth", "class")
 VIDEO_CRF: Final = 18
 """x264's quality of videos; lower is better."""
@@ -335,59 +289,37 @@ def _drawer_of(model: SceneModel) -> Drawer:
 
 
 class FrameSource:
-    """Draws frames of one or two fitted scenes, one at a time.
-
-    Args:
-        edited: the scenes with a script carried out; "" = as they are. scene: the log; its recorded views tell the
-            light of the drive, where a script asks for other weather or light.
-        widest: pixels of the widest frame.
-    """
+    """Draws frames of one or two fitted scenes, one at a time. ``edited``: the scenes with a script carried out; "" =
+    as they are. ``scene``: the log; its recorded views tell the light of the drive, where a script asks for other
+    weather or light. ``widest``: pixels of the widest frame."""
 
     def __init__(
         self, edited: Callable[[str], Sequence[SceneModel]], scene: Scene, widest: int, device: torch.device
     ) -> None:
-        self._edited = edited
-        self._scene = scene
-        self._device = device
+        self._edited, self._scene, self._widest, self._device = edited, scene, widest, device
         self._shown: _Shown | None = None
-        self._widest = widest
-        self._lock = threading.Lock()
-        self._filming = threading.Lock()
+        self._lock, self._filming = threading.Lock(), threading.Lock()
 
     def png(self, asked: FrameRequest) -> bytes:
-        """A frame as PNG bytes.
-
-        Raises:
-            InputError: a camera that is none, or edits that cannot be carried out.
-        """
-        content = io.BytesIO()
-        picture = self._picture(
-            asked.layer, self._drawer(asked), View(self._camera(asked), _pose(asked), float(asked.time_s))
-        )
+        """A frame as PNG bytes. InputError: a camera that is none, or edits that cannot be carried out."""
+        content, view = io.BytesIO(), View(self._camera(asked), _pose(asked), float(asked.time_s))
+        picture = self._picture(asked.layer, self._drawer(asked), view)
         Image.fromarray(picture).save(content, "PNG", compress_level=1)
         return content.getvalue()
 
     def film(self, asked: VideoRequest, send: Callable[[bytes], None]) -> None:
         """Make a video and send it: after each frame a line of JSON with its number, then one with the number of bytes,
-        then the MP4 file. Frames that are asked for meanwhile are drawn in between.
-
-        Raises:
-            InputError: as ``png``, or too many pixels. ResourceError: another video is being made. OSError: of
-                ``send``; nothing is left.
-        """
+        then the MP4 file. Frames that are asked for meanwhile are drawn in between. InputError: as ``png``, or too many
+        pixels. ResourceError: another video is being made. OSError: of ``send``; nothing is left."""
         camera, count = self._camera(asked), len(asked.moments)
         if camera.width * camera.height * count > MOST_PIXELS:
-            raise InputError(
-                "the video is too large",
-                where="video",
-                expected=f"at most {MOST_PIXELS:,} pixels in all frames together",
-                got=f"{count} frames of {camera.width} x {camera.height}",
-                remedy="start mudg view with a smaller --width-px, or use mudg render",
-            )
+            expected = f"at most {MOST_PIXELS:,} pixels in all frames together"
+            got = f"{count} frames of {camera.width} x {camera.height}"
+            remedy = "start mudg view with a smaller --width-px, or use mudg render"
+            raise InputError("the video is too large", where="video", expected=expected, got=got, remedy=remedy)
         if not self._filming.acquire(blocking=False):
-            raise ResourceError(
-                "another video is being made", remedy="wait for it, or cancel it where it was asked for"
-            )
+            remedy = "wait for it, or cancel it where it was asked for"
+            raise ResourceError("another video is being made", remedy=remedy)
         try:
             content = mp4_bytes(self._pictures(asked, camera, send), asked.fps, crf=VIDEO_CRF)
         finally:

@@ -35,19 +35,15 @@ from mudg.gaussians.nodes import DeformableNode, RigidNode
 from mudg.scene.read import read_image, read_points
 from mudg.viewer.report import FAR_M, NEAR_M
 
-# chunks -------------------------------------------------------------------------------------------
+# -- chunks ----------------------------------------------------------------------------------------
 #
 # Which Gaussians a page keeps, and how they are cut into chunks, so that the first one alone is a coarse picture of the
-# whole scene.
-#
-# The Gaussians are ranked by what they cover in the recorded views. Chunk 0 holds the first `CHUNK` of them, from
-# everywhere in the scene, the two chunks after it the next 2 `CHUNK`, then 4, 8, ...: one level of detail after
-# another, each as large as all before it and one chunk more. Within a level the rows are ordered by node, within a node
-# along a Morton curve, and cut into chunks: each is a region, and a page fetches those near its camera first. Every
-# chunk is full except for the last. A scene of at most `SMALL` chunks is cut into halves of chunks, because its first
-# picture, of one chunk, comes sooner that way.
-
-
+# whole scene. The Gaussians are ranked by what they cover in the recorded views. Chunk 0 holds the first `CHUNK` of
+# them, from everywhere in the scene, the two chunks after it the next 2 `CHUNK`, then 4, 8, ...: one level of detail
+# after another, each as large as all before it and one chunk more. Within a level the rows are ordered by node, within
+# a node along a Morton curve, and cut into chunks: each is a region, and a page fetches those near its camera first.
+# Every chunk is full except for the last. A scene of at most `SMALL` chunks is cut into halves of chunks, because its
+# first picture, of one chunk, comes sooner that way.
 CHUNK: Final = 65_536
 """Gaussians per chunk."""
 SMALL: Final = 2
@@ -64,13 +60,9 @@ _SLICE: Final = 1 << 18
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """The rows of a page.
-
-    Args:
-        rows: of the scene, in the order of the page, intp[n]. size: rows per chunk.
-        given: rows of the scene. visible: of these, rows that can be drawn.
-        lost: what was left out for the budget covers this share of what all of them cover, 0 to 1.
-    """
+    """The rows of a page. ``rows``: of the scene, in the order of the page, intp[n]. ``size``: rows per chunk.
+    ``given``: rows of the scene. ``visible``: of these, rows that can be drawn. ``lost``: what was left out for the
+    budget covers this share of what all of them cover, 0 to 1."""
 
     rows: NDArray[np.intp]
     size: int
@@ -98,16 +90,9 @@ def lay_out(
     most: int = 0,
     size: int = CHUNK,
 ) -> Layout:
-    """Choose and order rows.
-
-    Args:
-        columns: of the scene's table. node: of each row.
-        path: positions of the cameras f64[m, 3]. most: rows to keep (0 = all that can be drawn). size: rows per chunk
-            of a scene that is not small.
-
-    Raises:
-        UsageError: more rows than a page can hold.
-    """
+    """Choose and order rows. ``columns``: of the scene's table. ``node``: of each row. ``path``: positions of the
+    cameras f64[m, 3]. ``most``: rows to keep (0 = all that can be drawn). ``size``: rows per chunk of a scene that is
+    not small. UsageError: more rows than a page can hold."""
     rows = np.flatnonzero(opacity_of(columns["logits"]) >= ALPHA_MIN)
     visible, lost = len(rows), 0.0
     worth = coverage(columns, node, path)[rows]
@@ -116,13 +101,9 @@ def lay_out(
         lost = float(worth[ranks[most:]].sum() / max(worth.sum(), 1e-300))
         ranks = ranks[:most]
     if len(ranks) > MOST_CHUNKS * size:
-        raise UsageError(
-            "more Gaussians than a page can hold",
-            where="--budget",
-            got=f"{len(ranks):,}",
-            expected=f"at most {MOST_CHUNKS * size:,}",
-            remedy="set --budget to keep those that cover most",
-        )
+        what, expected = "more Gaussians than a page can hold", f"at most {MOST_CHUNKS * size:,}"
+        remedy = "set --budget to keep those that cover most"
+        raise UsageError(what, where="--budget", got=f"{len(ranks):,}", expected=expected, remedy=remedy)
     rows, size = rows[ranks], chunk_rows(len(ranks), size)
     level = np.repeat([np.int8(level_of(k)) for k in range(-(-len(rows) // size))], size)[: len(rows)]
     order = np.lexsort((morton_codes(columns["means"], node, rows), node[rows], level))
@@ -182,33 +163,26 @@ def morton_codes(
     return codes
 
 
-# packed -------------------------------------------------------------------------------------------
+# -- packed ----------------------------------------------------------------------------------------
 #
 # A fitted scene as few bytes as a browser needs to draw it: quantised per block of neighbours, laid out as planes, a
-# blob per chunk.
-#
-# ``page.py`` says which rows a chunk holds. Its rows are cut into blocks of at most `BLOCK` rows of one node. Sections
-# of its blob (little-endian; every one starts at a multiple of 4; n rows, b blocks):
+# blob per chunk, whose rows are cut into blocks of at most `BLOCK` rows of one node. Sections of a chunk's blob
+# (little-endian; every one starts at a multiple of 4; n rows, b blocks):
 #
 #     block     f32[b, 12]   least position [3], step [3]; least natural logarithm of the scale [3], step [3]
 #     block_of  u32[b, 2]    node and rows of each block
 #     position  u8[6, n]     x y z low bytes, then x y z high bytes: least + value * step, metres, frame of the node
 #     scale     u8[3, n]     least + value * step, natural logarithm of metres
 #     rotation  u8[4, n]     bytes of a u32: the three smaller parts of the unit quaternion (w x y z) as 10 bits each,
-#               offset 512, and in
-#                            the highest two bits which part is left out; it is positive
+#                            offset 512, and in the highest two bits which part is left out; it is positive
 #     color     u8[4, n]     r - g, g, b - g of the constant band (modulo 256: most surfaces are nearly grey, so this
-#               compresses better);
-#                            r g b are between ``color_low`` and ``color_high``; then opacity of 255
+#                            compresses better); r g b are between ``color_low`` and ``color_high``; opacity of 255
 #     class     u8[2, n]     channel of the likeliest class (255: none), and its lead over the second in `LEAD_STEP`
 #     certainty u8[n]        of 255 (only if it was measured)
 #     harmonics u8[3 (K - 1), n]   further bands, (value - 128) * ``harmonic_step`` (only above degree 0)
 #
-# and of the blob that belongs to all chunks:
-#
-#     sky       u8[rows, 2 rows, 3]   panorama between 0 and 1 (only if there is one)
-#     keys, deform: see ``motion_sections``
-
+# and of the blob that belongs to all chunks: sky u8[rows, 2 rows, 3], panorama between 0 and 1 (only if there is one);
+# keys and deform: see ``motion_sections``.
 
 BLOCK: Final = 256
 LEAD_STEP: Final = 0.1
@@ -254,9 +228,8 @@ class Packed:
         rows, columns, facts = self.layout.chunk(index), _columns(self.model), self.facts
         node = self.model.table.labels["node"].numpy()[rows].astype(np.int64)
         blocks = list(_blocks(node))
-        sections = _geometry(columns, rows, blocks) | {
-            "block_of": np.array([(n, len(b)) for n, b in blocks], np.uint32)
-        }
+        owners = np.array([(node, len(own)) for node, own in blocks], np.uint32)
+        sections = _geometry(columns, rows, blocks) | {"block_of": owners}
         sections["color"] = _colors(columns, rows, facts["color_low"], facts["color_high"])
         sections["class"] = _classes(columns.get("semantics"), rows)
         if self.model.certainty is not None:
@@ -320,10 +293,8 @@ def _drawing(model: SceneModel) -> Mapping[str, Any]:
 def _notes(model: SceneModel) -> tuple[str, ...]:
     notes = []
     if any(isinstance(node, (VibrationNode, HexPlaneNode, DeformedNode, BezierNode)) for node in model.nodes):
-        notes.append(
-            "Gaussians of this method change on their own with time. The page shows them at rest; boxes still carry"
-            " them."
-        )
+        rest = "The page shows them at rest; boxes still carry them."
+        notes.append(f"Gaussians of this method change on their own with time. {rest}")
     if set(_drawing(model)) - {"antialias", "packed"}:
         notes.append("This scene was fitted to be drawn along rays or as discs. The page draws the usual ellipsoids.")
     return tuple(notes)
@@ -346,12 +317,8 @@ def _geometry(columns: Mapping[str, Any], rows: Any, blocks: list[tuple[int, Any
         bounds[index, 6:9], bounds[index, 9:], sizes[own] = _quantised(scales[own], 255, SCALE_STEP)
     bytes_of = np.concatenate([(places & 255).T, (places >> 8).T]).astype(np.uint8)
     turns = smallest_three(columns["quats"][rows].astype(np.float64))
-    return {
-        "block": bounds,
-        "position": bytes_of,
-        "scale": sizes.T.copy(),
-        "rotation": turns.view(np.uint8).reshape(-1, 4).T.copy(),
-    }
+    rotation = turns.view(np.uint8).reshape(-1, 4).T.copy()
+    return {"block": bounds, "position": bytes_of, "scale": sizes.T.copy(), "rotation": rotation}
 
 
 def _quantised(values: NDArray[np.float64], levels: int, least_step: float) -> tuple[Any, Any, Any]:
@@ -411,9 +378,7 @@ def to_u8(values: NDArray[np.floating]) -> NDArray[np.uint8]:
     return np.rint(np.clip(values, 0, 1) * 255).astype(np.uint8)
 
 
-# motion -------------------------------------------------------------------------------------------
-
-
+# -- motion ----------------------------------------------------------------------------------------
 def motion_sections(model: SceneModel, begin_s: float) -> tuple[list[dict[str, Any]], Sections]:
     """What carries the rows of each node.
 
@@ -427,11 +392,8 @@ def motion_sections(model: SceneModel, begin_s: float) -> tuple[list[dict[str, A
     for node in model.nodes:
         record: dict[str, Any] = {"name": node.name, "kind": node.kind}
         if isinstance(node, RigidNode):
-            record |= {
-                "label": node.label,
-                "size_m": [round(float(v), 4) for v in node.size_m],
-                "keys": [sum(map(len, keys)), len(node.times_s)],
-            }
+            size_m, keyed = [round(float(v), 4) for v in node.size_m], [sum(map(len, keys)), len(node.times_s)]
+            record |= {"label": node.label, "size_m": size_m, "keys": keyed}
             keys.append(key_rows(node.times_s - begin_s, node.corrected_keys()))
             if isinstance(node, DeformableNode):
                 grid = node.offsets["deform"].detach().float().numpy()
@@ -447,9 +409,7 @@ def key_rows(times_s: NDArray[np.floating], poses: NDArray[np.float64]) -> NDArr
     return np.column_stack([np.asarray(times_s), poses[:, :3, 3], turns]).astype(np.float32)
 
 
-# the blob -----------------------------------------------------------------------------------------
-
-
+# -- the blob --------------------------------------------------------------------------------------
 def blob_of(sections: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, list[Any]]]:
     """All sections behind one another, and the directory: name -> offset in bytes, type, number of values."""
     parts, directory, at = [], {}, 0
@@ -462,16 +422,12 @@ def blob_of(sections: Mapping[str, NDArray[Any]]) -> tuple[bytes, dict[str, list
     return b"".join(parts), directory
 
 
-# facts --------------------------------------------------------------------------------------------
+# -- facts -----------------------------------------------------------------------------------------
 #
 # What the viewer page knows about a log besides Gaussians: cameras, frames with small images, boxes, the vehicle's
-# path, LiDAR points.
-#
-# Times on the page are seconds since the first frame. Sections of the log's blob (see ``page.py``): ``keys`` f32[k, 8]
-# and ``lidar`` u16[3, m], places in the world as ``lidar_low + value * lidar_step``, ``ground`` u16[x, y] (see
+# path, LiDAR points. Times on the page are seconds since the first frame. Sections of the log's blob: ``keys`` f32[k,
+# 8], ``lidar`` u16[3, m], places in the world as ``lidar_low + value * lidar_step``, ``ground`` u16[x, y] (see
 # ``with_ground``).
-
-
 WEBP_QUALITY: Final = 50
 REACH_M: Final = 80.0
 MOST_CELLS: Final = 4_000_000
@@ -485,11 +441,8 @@ UNKNOWN: Final = 65535
 
 @dataclass(frozen=True, slots=True)
 class PageFacts:
-    """The log for the page.
-
-    Args:
-        facts: JSON values. sections: see the module's docstring. images: all WebP files behind one another.
-    """
+    """The log for the page. ``facts``: JSON values. ``sections``: see the module's docstring. ``images``: all WebP
+    files behind one another."""
 
     facts: dict[str, Any]
     sections: Sections
@@ -502,23 +455,19 @@ def begin_of(scene: Scene) -> float:
 
 
 def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images: int) -> PageFacts:
-    """Everything but the Gaussians.
-
-    Args:
-        scene: the log. colors: of the fit. image_width: of recorded images on the page, pixels.
-        most_images: how many images the page may hold; taken evenly.
-    """
+    """Everything but the Gaussians. ``scene``: the log. ``colors``: of the fit. ``image_width``: of recorded images on
+    the page, pixels. ``most_images``: how many images the page may hold; taken evenly."""
     begin = begin_of(scene)
     frames = sorted(scene.frames, key=lambda frame: (frame.view.camera.name, frame.view.time_s))
     keys, tracks = [key_rows(scene.ego.times_s - begin, scene.ego.world_from_ego)], []
     for track in scene.tracks:
         first = sum(map(len, keys))
-        tracks.append(
-            {"id": track.id, "label": track.label, "size_m": track.size_m.tolist(), "keys": [first, len(track.times_s)]}
-        )
+        size_m = track.size_m.tolist()
+        tracks.append({"id": track.id, "label": track.label, "size_m": size_m, "keys": [first, len(track.times_s)]})
         keys.append(key_rows(track.times_s - begin, track.world_from_object))
     places, images = _images(scene, frames, image_width, most_images)
     sweeps, points = _lidar(scene, begin)
+    ramp = depth_colors(np.geomspace(NEAR_M, FAR_M, 256).astype(np.float32)[None], NEAR_M, FAR_M)[0].tolist()
     facts = {
         "title": scene.id,
         "end_s": max(frame.view.time_s for frame in frames) - begin,
@@ -542,9 +491,7 @@ def log_facts(scene: Scene, colors: CameraColors, image_width: int, most_images:
         "class_names": list(palette.CLASSES),
         "class_colors": palette.DISPLAY_COLORS.tolist(),
         "depth_range_m": [NEAR_M, FAR_M],
-        "depth_colors": (
-            depth_colors(np.geomspace(NEAR_M, FAR_M, 256).astype(np.float32)[None], NEAR_M, FAR_M)[0].tolist()
-        ),
+        "depth_colors": ramp,
     }
     return PageFacts(facts, {"keys": np.concatenate(keys), "lidar": points}, images)
 
@@ -556,23 +503,16 @@ def with_ground(page: PageFacts, ground: HeightMap | None) -> PageFacts:
     Section ``ground``: world z as ``low + value * step``, steps of `LEAST_STEP_M`, larger where heights span more than
     33 m; `UNKNOWN` where it is not known.
     """
-    if (
-        ground is None
-        or ground.heights.size > MOST_CELLS
-        or not np.isfinite(ground.heights).any()
-        or min(ground.heights.shape) < 2
-    ):
+    heights = None if ground is None else ground.heights
+    if ground is None or heights is None or heights.size > MOST_CELLS or min(heights.shape) < 2:
         return replace(page, facts=page.facts | {"ground": None})
-    low, high = float(np.nanmin(ground.heights)), float(np.nanmax(ground.heights))
+    if not np.isfinite(heights).any():
+        return replace(page, facts=page.facts | {"ground": None})
+    low, high = float(np.nanmin(heights)), float(np.nanmax(heights))
     step = max((high - low) / (UNKNOWN - 1), LEAST_STEP_M)
-    levels = np.where(np.isfinite(ground.heights), np.rint((ground.heights - low) / step), UNKNOWN).astype(np.uint16)
-    record = {
-        "origin": ground.origin.tolist(),
-        "cell_m": ground.cell_m,
-        "shape": list(levels.shape),
-        "low": low,
-        "step": step,
-    }
+    levels = np.where(np.isfinite(heights), np.rint((heights - low) / step), UNKNOWN).astype(np.uint16)
+    record = {"origin": ground.origin.tolist(), "cell_m": ground.cell_m, "shape": list(levels.shape), "low": low}
+    record["step"] = step
     return replace(page, facts=page.facts | {"ground": record}, sections=page.sections | {"ground": levels})
 
 
@@ -588,16 +528,9 @@ def with_particles(page: PageFacts, seed: int) -> PageFacts:
 def _camera(camera: Camera, colors: CameraColors) -> dict[str, Any]:
     known = colors.to_common.get(camera.name)
     shown = None if known is None else known.inverse()
-    return {
-        "width": camera.width,
-        "height": camera.height,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "gain": [1, 1, 1] if shown is None else list(shown.gain),
-        "offset": [0, 0, 0] if shown is None else list(shown.offset),
-    }
+    sizes = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    gain, offset = ([1, 1, 1], [0, 0, 0]) if shown is None else (list(shown.gain), list(shown.offset))
+    return {**sizes, "gain": gain, "offset": offset}
 
 
 def _images(scene: Scene, frames: Sequence[Frame], width: int, most: int) -> tuple[list[list[int] | None], bytes]:
@@ -639,9 +572,7 @@ def _lidar(scene: Scene, begin: float) -> tuple[dict[str, Any], NDArray[np.uint1
     return {"lidar": records, "lidar_low": low.tolist(), "lidar_step": step.tolist()}, levels
 
 
-# page ---------------------------------------------------------------------------------------------
-
-
+# -- the page --------------------------------------------------------------------------------------
 ONE_FILE_BYTES: Final = 32 * 2**20
 """A page larger than this becomes a folder: not every browser opens larger ones."""
 TEXELS: Final = (2, 3, 4, 5)
@@ -649,37 +580,15 @@ TEXELS: Final = (2, 3, 4, 5)
 SORT_BYTES: Final = 38
 """Per Gaussian in the sorter of a page (`assets/viewer/sorter.js`)."""
 MODULES: Final = (
-    "math",
-    "data",
-    "sorter",
-    "shaders",
-    "edits",
-    "particles",
-    "weather",
-    "renderer",
-    "cameras",
-    "state",
-    "overlay",
-    "arrival",
-    "app",
-    "zip",
-    "share",
-    "gizmo",
-    "editor",
-    "ui",
-    "input",
-    "exact",
-    "main",
+    *("math", "data", "sorter", "shaders", "edits", "particles", "weather", "renderer", "cameras", "state", "overlay"),
+    *("arrival", "app", "zip", "share", "gizmo", "editor", "ui", "input", "exact", "main"),
 )
 
 
 @dataclass(frozen=True, slots=True)
 class PageFile:
-    """One data file of a page, gzipped where that helps.
-
-    Args:
-        name: of the element that holds it in a page of one file. content: bytes.
-    """
+    """One data file of a page, gzipped where that helps. ``name``: of the element that holds it in a page of one file.
+    ``content``: bytes."""
 
     name: str
     content: bytes
@@ -697,14 +606,9 @@ class PageFile:
 
 @dataclass(frozen=True, slots=True)
 class ViewerPage:
-    """What is to be written.
-
-    Args:
-        title, subtitle, about: texts. report: relative address of the report, or empty.
-        scenes: (name, scene), the one that is shown first; at most two.
-        log: everything else. live: settings of a server behind the page, or None.
-        effort: of gzip, 1 to 9.
-    """
+    """What is to be written. ``title``, ``subtitle``, ``about``: texts. ``report``: relative address of the report, or
+    empty. ``scenes``: (name, scene), the one that is shown first; at most two. ``log``: everything else. ``live``:
+    settings of a server behind the page, or None. ``effort``: of gzip, 1 to 9."""
 
     title: str
     subtitle: str
@@ -792,12 +696,8 @@ def scene_bytes(rows: int, size: int, degree: int) -> tuple[int, int]:
 def most_within(limit_bytes: float, degree: int, size: int) -> int:
     """The most rows whose graphics memory and memory for sorting are together within a limit."""
     most = int(limit_bytes // (16 * TEXELS[degree] + 4 + SORT_BYTES))
-    return (
-        bisect.bisect_right(
-            range(most + 1), limit_bytes, key=lambda n: sum(scene_bytes(n, chunk_rows(n, size), degree))
-        )
-        - 1
-    )
+    needed = lambda rows: sum(scene_bytes(rows, chunk_rows(rows, size), degree))  # noqa: E731
+    return bisect.bisect_right(range(most + 1), limit_bytes, key=needed) - 1
 
 
 def asset(name: str) -> str:
@@ -808,19 +708,15 @@ def asset(name: str) -> str:
 def import_map() -> str:
     """The viewer's modules as an import map of data addresses: a page opened by double click may not load files beside
     it."""
-    sources = {f"mudg/{name}": asset(f"{name}.js") for name in MODULES}
-    coded = {
-        name: "data:text/javascript;base64," + base64.b64encode(text.encode()).decode()
-        for name, text in sources.items()
-    }
-    return script_json({"imports": coded})
+    coded = lambda name: base64.b64encode(asset(f"{name}.js").encode()).decode()  # noqa: E731
+    addresses = {f"mudg/{name}": "data:text/javascript;base64," + coded(name) for name in MODULES}
+    return script_json({"imports": addresses})
 
 
 def policy(*scripts: str) -> str:
     """A content security policy under which only these inline scripts run, and nothing is loaded from elsewhere."""
-    hashes = " ".join(
-        f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()}'" for text in scripts
-    )
+    digest = lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()  # noqa: E731
+    hashes = " ".join(f"'sha256-{digest(text)}'" for text in scripts)
     return (
         f"default-src 'none'; script-src {hashes} data: blob:; worker-src blob:; style-src 'unsafe-inline'; img-src"
         " 'self' data: blob:; media-src blob:; connect-src 'self' data: blob:; base-uri 'none'; form-action 'none'"

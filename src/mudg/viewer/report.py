@@ -13,7 +13,7 @@ import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,22 +42,13 @@ from mudg.scoring.tables import (
     values_by_distance,
 )
 
-# command lines for the report of a run: what to do with it next, and its steps one by one ---------
-
+# -- command lines: what to do with a run next, and its steps one by one ---------------------------
 
 PLAIN: Final = "fit/street_gaussians"
 GUIDED: Final = "fit/mudg_s"
 STEPS: Final = (
-    "scene",
-    "annotate",
-    "fuse",
-    PLAIN,
-    "adapt",
-    "synthesize",
-    GUIDED,
-    "render/street_gaussians",
-    "render/mudg_s",
-    "score",
+    *("scene", "annotate", "fuse", PLAIN, "adapt", "synthesize", GUIDED),
+    *("render/street_gaussians", "render/mudg_s", "score"),
 )
 """Folders of the chain, in the order in which they are made."""
 INPUTS: Final = {
@@ -70,44 +61,30 @@ INPUTS: Final = {
 VIEWS: Final = {"street_gaussians": "render/street_gaussians", "mudg_r": "synthesize", "mudg_s": "render/mudg_s"}
 
 
-class CommandBlock(NamedTuple):
-    """Command lines that belong together, with a sentence on what they do."""
-
-    title: str
-    lines: tuple[str, ...]
-
-
-def next_commands(out: Path, source: str) -> list[CommandBlock]:
-    """What a run can be used for. Each block works by itself, in the folder from which the run was started."""
+def next_commands(out: Path, source: str) -> list[tuple[str, tuple[str, ...]]]:
+    """What a run can be used for, as (title, lines). Each block works by itself, in the folder from which the run was
+    started."""
     run = str(out)
     scene, movable = scene_of(out, source), _first_object(out)
     edit = f"- remove: {{ids: [{json.dumps(movable)}]}}" if movable else "- weather: {fog: {visibility_m: 60}}"
+    changes = [
+        [f"printf '%s\\n' {shlex.quote(edit)} > edits.yaml"],
+        ["edit", run, "edits.yaml", "--out", f"{run}_edited"],
+        ["view", run, "--edits", "edits.yaml"],
+    ]
+    files = [["export", kind, run, "--out", f"{run}.{kind}"] for kind in ("ply", "usdz")]
+    if movable:
+        files.append(["asset", "export", run, movable, "--out", f"{run}_object.safetensors"])
+    views = ["render", scene, "--model", f"{run}/{GUIDED}", "--shifts-m", "1.5", "--out", f"{run}_views"]
     blocks = [
         ("Fly through the scene in a browser; the second line compares both fits", [["view", run], ["view", run, run]]),
         ("One page to send to others", [["page", run, "--out", f"{run}.html"]]),
-        (
-            "Change the drive, and look at it",
-            [
-                [f"printf '%s\\n' {shlex.quote(edit)} > edits.yaml"],
-                ["edit", run, "edits.yaml", "--out", f"{run}_edited"],
-                ["view", run, "--edits", "edits.yaml"],
-            ],
-        ),
-        (
-            "Pictures, depth and classes of another path",
-            [["render", scene, "--model", f"{run}/{GUIDED}", "--shifts-m", "1.5", "--out", f"{run}_views"]],
-        ),
-        (
-            "Files for other programs (docs: export)",
-            [
-                ["export", "ply", run, "--out", f"{run}.ply"],
-                ["export", "usdz", run, "--out", f"{run}.usdz"],
-                *([["asset", "export", run, movable, "--out", f"{run}_object.safetensors"]] if movable else []),
-            ],
-        ),
+        ("Change the drive, and look at it", changes),
+        ("Pictures, depth and classes of another path", [views]),
+        ("Files for other programs (docs: export)", files),
         ("The same on your own log", [["run", "LOG", "--out", "runs/mine"]]),
     ]
-    return [CommandBlock(title, tuple(_line(words) for words in lines)) for title, lines in blocks]
+    return [(title, tuple(map(_line, lines))) for title, lines in blocks]
 
 
 def step_commands(out: Path, source: str) -> list[str]:
@@ -151,11 +128,7 @@ def _first_object(out: Path) -> str:
         return ""
 
 
-# page ---------------------------------------------------------------------------------------------
-#
-# The report page: what ``templates/report.html.j2`` shows, worked out from plain values. No torch, no files.
-
-
+# -- the page: what ``templates/report.html.j2`` shows, worked out from plain values ---------------
 GROUPS: Final = (
     ("Colour", ("psnr", "ssim", "perceptual")),
     ("Motion", ("psnr_movers", "flicker")),
@@ -181,12 +154,9 @@ PANEL_ROWS: Final = (("rgb", "Colour"), ("depth", "Depth"), ("semantics", "Class
 
 @dataclass(frozen=True)
 class TrajectoryVideo:
-    """The video of one trajectory.
-
-    Args:
-        name, camera, shift_m: as in the scores. width, height: of one panel, pixels. frames: number of pictures.
-        panels: column name -> rows it has. video, poster: data URIs (video may be empty: no encoder).
-    """
+    """The video of one trajectory. ``name``, ``camera``, ``shift_m``: as in the scores. ``width``, ``height``: of one
+    panel, pixels. ``frames``: number of pictures. ``panels``: column name -> rows it has. ``video``, ``poster``: data
+    URIs (video may be empty: no encoder)."""
 
     name: str
     camera: str
@@ -270,10 +240,8 @@ def headline(scores: Mapping[str, Any]) -> tuple[str, str]:
         held_out = f"held-out frames score {recorded[0]:.1f} dB with diffusion and {recorded[1]:.1f} dB without."
     if not shifted:
         text = "There is no ground truth off the recorded path: views there are shown below, not scored."
-        return (
-            f"{scores['scene']['id']}: views off the recorded path",
-            f"{text} On the path, {held_out}" if held_out else text,
-        )
+        text += f" On the path, {held_out}" if held_out else ""
+        return f"{scores['scene']['id']}: views off the recorded path", text
     far = shifted[-1]
     with_, without = values[WITH, far], values.get((WITHOUT, far), {})
     if not isinstance(without.get("psnr"), float):
@@ -329,38 +297,27 @@ def _player_values(
     ordered = sorted(videos, key=lambda v: (v.camera, -(v.shift_m if v.shift_m is not None else -1e9)))
     first = max((v for v in videos if v.shift_m), key=lambda v: v.shift_m or 0.0, default=next(iter(videos), None))
     steps = np.geomspace(NEAR_M, FAR_M, 8).astype(np.float32)[None]
+    stops = ", ".join("#{:02x}{:02x}{:02x}".format(*c) for c in depth_colors(steps, NEAR_M, FAR_M)[0])
+    choice = lambda v: {"camera": v.camera, "name": v.name, "title": v.place, "checked": v is first}  # noqa: E731
+    trajectories = []
+    for index, v in enumerate(videos):
+        if v.video:
+            size = {"width": v.width, "height": v.height, "frames": v.frames}
+            where = {"index": index, "name": v.name, "camera": v.camera, "title": v.place}
+            trajectories.append({**where, **size, "panels": {c: list(p) for c, p in v.panels.items()}})
     return {
         "exact": exact,
         "videos": [{"label": f"{v.camera}, {v.place}", "source": v.video, "poster": v.poster} for v in videos],
         "cameras": list(dict.fromkeys(v.camera for v in videos)),
-        "shift_choices": [
-            {"camera": v.camera, "name": v.name, "title": v.place, "checked": v is first} for v in ordered
-        ],
-        "depth_scale": {
-            "near": f"{NEAR_M:g}",
-            "far": f"{FAR_M:g}",
-            "stops": ", ".join("#{:02x}{:02x}{:02x}".format(*c) for c in depth_colors(steps, NEAR_M, FAR_M)[0]),
-        },
+        "shift_choices": list(map(choice, ordered)),
+        "depth_scale": {"near": f"{NEAR_M:g}", "far": f"{FAR_M:g}", "stops": stops},
         "class_legend": html.class_legend(),
         "player": {
             "fps": FPS,
             "columns": list(columns),
             "rows": [{"name": name, "title": title} for name, title in PANEL_ROWS],
             "titles": {c: title_of(c) if exact or c != "truth" else "Recorded path" for c in columns},
-            "trajectories": [
-                {
-                    "index": i,
-                    "name": v.name,
-                    "camera": v.camera,
-                    "title": v.place,
-                    "width": v.width,
-                    "height": v.height,
-                    "frames": v.frames,
-                    "panels": {c: list(p) for c, p in v.panels.items()},
-                }
-                for i, v in enumerate(videos)
-                if v.video
-            ],
+            "trajectories": trajectories,
         },
     }
 
@@ -393,25 +350,19 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
         cells = [{"text": number_text(m["name"], NOT_COMPUTED), "classes": "absent"} for m in shown]
         rows = [{"method": m["name"], "title": m["title"], "cells": cells} for m in scores["methods"]]
         groups.append({"title": "Perceptual", "distances": [], "metrics": shown, "rows": rows})
-    numeric = [
-        m for m in metrics.values() if any(isinstance(r["values"].get(m["name"]), float) for r in scores["results"])
-    ]
+    has_number = lambda name: any(isinstance(r["values"].get(name), float) for r in scores["results"])  # noqa: E731
+    numeric = [metric for metric in metrics.values() if has_number(metric["name"])]
+    results = []
+    for trajectory in scores["trajectories"]:
+        for r in (r for r in scores["results"] if r["trajectory"] == trajectory["name"]):
+            texts = [number_text(metric["name"], r["values"].get(metric["name"])) for metric in numeric]
+            results.append([r["trajectory"], title_of(r["method"]), r["views"], *texts])
     return {
         "score_groups": groups if distances or any(group["title"] in OPTIONAL for group in groups) else [],
         "not_computed": ", ".join(f"{m['title']} ({_remedy_of(m)})" for m in absent),
         "charts": [c for c in (_chart(scores, metrics[n]) for n in CHARTED if n in metrics) if c],
         "result_metrics": numeric,
-        "results": [
-            [
-                r["trajectory"],
-                title_of(r["method"]),
-                r["views"],
-                *(number_text(m["name"], r["values"].get(m["name"])) for m in numeric),
-            ]
-            for t in scores["trajectories"]
-            for r in scores["results"]
-            if r["trajectory"] == t["name"]
-        ],
+        "results": results,
     }
 
 
@@ -430,19 +381,14 @@ def _score_group(
         for distance in distances:
             for number, metric in enumerate(metrics):
                 across = {m: values.get((m, distance), {}).get(metric["name"]) for m in methods}
-                classes = ["edge"] * (number == 0) + ["best"] * (
-                    method in best_of(metric["better"], across, metric["name"])
-                )
-                classes += ["absent"] * isinstance(across[method], str)
+                is_best = method in best_of(metric["better"], across, metric["name"])
+                absent = isinstance(across[method], str)
+                classes = ["edge"] * (number == 0) + ["best"] * is_best + ["absent"] * absent
                 yield {"text": number_text(metric["name"], across[method]), "classes": " ".join(classes)}
 
     rows = [{"method": m["name"], "title": m["title"], "cells": list(cells(m["name"]))} for m in scores["methods"]]
-    return {
-        "title": title,
-        "distances": [distance_title(scores, d) for d in distances],
-        "metrics": metrics,
-        "rows": rows,
-    }
+    titles = [distance_title(scores, distance) for distance in distances]
+    return {"title": title, "distances": titles, "metrics": metrics, "rows": rows}
 
 
 def _remedy_of(metric: Mapping[str, Any]) -> str:
@@ -453,11 +399,8 @@ def _remedy_of(metric: Mapping[str, Any]) -> str:
 def _with_floor(scores: Mapping[str, Any], group: dict[str, Any], distances: Sequence[float]) -> dict[str, Any]:
     """The group with a last row: what the truth itself scores."""
     floors = floors_by_distance(scores)
-    cells = [
-        {"text": number_text(m["name"], floors.get(d, {}).get(m["name"])), "classes": ""}
-        for d in distances
-        for m in group["metrics"]
-    ]
+    values = [(m["name"], floors.get(distance, {}).get(m["name"])) for distance in distances for m in group["metrics"]]
+    cells = [{"text": number_text(name, value), "classes": ""} for name, value in values]
     return {**group, "rows": [*group["rows"], {"method": "truth", "title": FLOOR, "cells": cells}]}
 
 
@@ -560,9 +503,7 @@ def _provenance(scores: Mapping[str, Any], ledger: Mapping[str, Any]) -> list[tu
     return [(name, value) for name, value in rows if value]
 
 
-# panels of a video: several methods' views of one moment side by side, one row per modality -------
-
-
+# -- panels of a video: several methods' views of one moment side by side, one row per modality ----
 BLANK: Final = 24
 """Grey value of a panel that a method does not produce."""
 
@@ -576,13 +517,9 @@ def panel_size(camera_width: int, camera_height: int, widest: int) -> tuple[int,
 def panel_grid(
     views: Mapping[str, Observation | None], rows: Sequence[str], size: tuple[int, int], truth: Observation | None
 ) -> NDArray[np.uint8]:
-    """One picture u8[rows * height, columns * width, 3] of one moment; what a method lacks stays grey.
-
-    Args:
-        views: column -> what it shows. rows: of ``rgb``, ``depth``, ``semantics``, ``error``.
-        size: width and height of a panel, pixels. truth: what colour errors are measured against; its own column has
-            none.
-    """
+    """One picture u8[rows * height, columns * width, 3] of one moment; what a method lacks stays grey. ``views``:
+    column -> what it shows. ``rows``: of ``rgb``, ``depth``, ``semantics``, ``error``. ``size``: width and height of a
+    panel, pixels. ``truth``: what colour errors are measured against; its own column has none."""
     width, height = size
     grid = np.full((height * len(rows), width * len(views), 3), BLANK, np.uint8)
     true_rgb = None if truth is None else resize_rgb(truth.rgb, height, width).clamp(0, 1)
@@ -600,11 +537,9 @@ def panel_grid(
 def _panel(seen: Observation, row: str, size: tuple[int, int], true_rgb: Tensor | None) -> NDArray[np.uint8] | None:
     width, height = size
     if row == "depth":
-        return (
-            None
-            if seen.depth is None
-            else depth_colors(resize_nearest(seen.depth, height, width)[0].numpy(), NEAR_M, FAR_M)
-        )
+        if seen.depth is None:
+            return None
+        return depth_colors(resize_nearest(seen.depth, height, width)[0].numpy(), NEAR_M, FAR_M)
     if row == "semantics":
         return None if seen.semantics is None else class_colors(resize_nearest(seen.semantics, height, width).numpy())
     rgb = resize_rgb(seen.rgb, height, width)
@@ -613,9 +548,7 @@ def _panel(seen: Observation, row: str, size: tuple[int, int], true_rgb: Tensor 
     return to_bytes(rgb)
 
 
-# run report ---------------------------------------------------------------------------------------
-
-
+# -- the report of a run ---------------------------------------------------------------------------
 PANEL_WIDTH: Final = 320
 BUDGET_BYTES: Final = 9 * 2**19
 """For all videos together, before base64; with the posters the page stays under 8 MB."""
@@ -641,11 +574,7 @@ class Columns:
 
 def film(out: Path) -> list[TrajectoryVideo]:
     """The costly half of ``OUT/report.html``: one video per trajectory, from what the chain left in ``out`` (see
-    ``steps.pipeline``).
-
-    Raises:
-        InputError: the run is not scored yet, or a folder of views is damaged.
-    """
+    ``steps.pipeline``). InputError: the run is not scored yet, or a folder of views is damaged."""
     out = Path(out)
     with understood("a scored run", str(out)):
         scores = store.read_json(out / "score" / "metrics.json")
@@ -655,9 +584,8 @@ def film(out: Path) -> list[TrajectoryVideo]:
     if not playable:
         log.warn("PyAV has no H.264 encoder here: the report shows one picture per trajectory instead of a video")
     budget = BUDGET_BYTES // max(1, len(trajectories)) if playable else 0
-    videos = computed_ahead(
-        lambda n: _video(trajectories[n], folders, budget), len(trajectories), native.default_threads()
-    )
+    threads = native.default_threads()
+    videos = computed_ahead(lambda n: _video(trajectories[n], folders, budget), len(trajectories), threads)
     return list(log.progress(videos, len(trajectories), "report"))
 
 
@@ -668,16 +596,8 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     text = store.read_text(settings) if settings.is_file() else ""
     with understood("a scored run", str(out)):
         scores, ledger = store.read_json(out / "score" / "metrics.json"), store.read_json(out / "run.json")
-        content = page(
-            scores,
-            ledger,
-            text,
-            videos,
-            list(_folders(out, scores)),
-            _adaptation(out / "adapt"),
-            viewer_address(out),
-            out,
-        )
+        columns, adaptation = list(_folders(out, scores)), _adaptation(out / "adapt")
+        content = page(scores, ledger, text, videos, columns, adaptation, viewer_address(out), out)
     store.write_text(out / "report.html", content)
     return out / "report.html"
 
@@ -756,13 +676,9 @@ def _columns(trajectory: Mapping[str, Any], folders: Mapping[str, Mapping[str, P
 def _rows(columns: Columns, column: str) -> tuple[str, ...]:
     """The rows that a column has, as its first view says."""
     first = columns.sets[column][columns.indices[column][0]]
-    there = {
-        "rgb": True,
-        "depth": first.depth is not None,
-        "semantics": first.semantics is not None,
-        "error": columns.has_truth and column != "truth",
-    }
-    return tuple(row for row in ROWS if there[row])
+    has = {"rgb": True, "depth": first.depth is not None, "semantics": first.semantics is not None}
+    has["error"] = columns.has_truth and column != "truth"
+    return tuple(row for row in ROWS if has[row])
 
 
 def _frames(

@@ -55,14 +55,9 @@ TYPES: Final = {"html": "text/html; charset=utf-8", "bin": "application/octet-st
 
 @dataclass(frozen=True)
 class Site:
-    """What is served.
-
-    Args:
-        files: name -> content; "" is the page. answers: name -> what answers a POST with JSON there: bytes and their
-            type.
-        streams: the same for answers that take long. token: secret that every request must bring, in the address, a
-            cookie or a header.
-    """
+    """What is served. ``files``: name -> content; "" is the page. ``answers``: name -> what answers a POST with JSON
+    there: bytes and their type. ``streams``: the same for answers that take long. ``token``: secret that every request
+    must bring, in the address, a cookie or a header."""
 
     files: Mapping[str, bytes]
     answers: Mapping[str, Answer]
@@ -71,19 +66,12 @@ class Site:
 
 
 def token_for(host: str, token: str) -> str:
-    """The secret of a page: the given one, or on the loopback address a random one.
-
-    Raises:
-        UsageError: another address without a token, or a token that is too short.
-    """
+    """The secret of a page: the given one, or on the loopback address a random one. UsageError: another address without
+    a token, or a token that is too short."""
     if not is_loopback(host) and not token:
-        raise UsageError(
-            "this address can be reached by other machines",
-            where="--host",
-            got=host,
-            expected="127.0.0.1",
-            remedy="leave --host out and use an ssh tunnel, or add --token SECRET",
-        )
+        what, expected = "this address can be reached by other machines", "127.0.0.1"
+        remedy = "leave --host out and use an ssh tunnel, or add --token SECRET"
+        raise UsageError(what, where="--host", got=host, expected=expected, remedy=remedy)
     if token and len(token) < 12:
         raise UsageError("the token is too short to be a secret", where="--token", expected="at least 12 characters")
     return token or secrets.token_urlsafe(16)
@@ -143,10 +131,8 @@ class SiteServer(ThreadingHTTPServer):
     def _make_room(self, count: int) -> bool:
         """Cut off so many of the connections that wait, those first whose patience ends first; whether any was."""
         with self._lock:
-            waiting = sorted(
-                (one for one, until in self._until.items() if until < math.inf), key=self._until.__getitem__
-            )
-            self._cut_off(waiting[:count])
+            waiting = [one for one, until in self._until.items() if until < math.inf]
+            self._cut_off(sorted(waiting, key=self._until.__getitem__)[:count])
             return bool(waiting)
 
     def service_actions(self) -> None:
@@ -174,17 +160,13 @@ class SiteServer(ThreadingHTTPServer):
 
 
 def open_server(site: Site, host: str, port: int) -> SiteServer:
-    """A server that listens; ``serve_forever`` is the caller's.
-
-    Raises:
-        ResourceError: the port is taken, or the address is none of this machine.
-    """
+    """A server that listens; ``serve_forever`` is the caller's. ResourceError: the port is taken, or the address is
+    none of this machine."""
     try:
         return SiteServer((host, port), type("OwnSiteRequest", (SiteRequest,), {"site": site}))
     except (OSError, OverflowError, UnicodeError) as error:  # a port, a name that cannot be
-        raise ResourceError(
-            "cannot listen", where=f"{host}:{port}", got=str(error), remedy="choose another --port"
-        ) from error
+        remedy = "choose another --port"
+        raise ResourceError("cannot listen", where=f"{host}:{port}", got=str(error), remedy=remedy) from error
 
 
 def address_of(server: SiteServer, site: Site) -> str:
@@ -195,12 +177,8 @@ def address_of(server: SiteServer, site: Site) -> str:
 
 def show(address: str, port: int, wanted: bool) -> bool:
     """Open a browser, or say how to reach the page from another machine; whether one was opened."""
-    graphical = (
-        os.environ.get("DISPLAY")
-        or os.environ.get("WAYLAND_DISPLAY")
-        or os.name == "nt"
-        or os.uname().sysname == "Darwin"
-    )
+    graphical = any(map(os.environ.get, ("DISPLAY", "WAYLAND_DISPLAY"))) or os.name == "nt"
+    graphical = graphical or os.uname().sysname == "Darwin"
     if wanted and graphical and webbrowser.open(address):
         return True
     log.info(f"no browser here. From your own machine: ssh -N -L {port}:127.0.0.1:{port} {os.uname().nodename}")
@@ -321,11 +299,9 @@ class SiteRequest(BaseHTTPRequestHandler):
         if given not in names and (is_loopback(str(host)) or str(host) not in ("0.0.0.0", "::")):  # noqa: S104
             self._answer(HTTPStatus.FORBIDDEN, b"this server has another name")
             return True
-        brought = [
-            *query.get("token", []),
-            self.headers.get("X-Mudg-Token", ""),
-            *_cookies(self.headers.get("Cookie", "")),
-        ]
+        cookies = (part.strip().partition("=") for part in self.headers.get("Cookie", "").split(";"))
+        brought = [*query.get("token", []), self.headers.get("X-Mudg-Token", "")]
+        brought += [value for name, _, value in cookies if name == COOKIE]
         if not any(hmac.compare_digest(one.encode(), self.site.token.encode()) for one in brought):
             self._answer(HTTPStatus.FORBIDDEN, b"open the address that mudg view printed: it carries a token")
             return True
@@ -358,8 +334,3 @@ class SiteRequest(BaseHTTPRequestHandler):
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing: a line per request would hide what matters."""
-
-
-def _cookies(text: str) -> list[str]:
-    pairs = (part.strip().partition("=") for part in text.split(";"))
-    return [value for name, _, value in pairs if name == COOKIE]

@@ -20,27 +20,15 @@ from mudg.base.run_folder import ResultFile, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import HeightMap
 from mudg.core.raster.place import drawing_device
-from mudg.editing.apply import ground_of
+from mudg.editing.apply import SEED, ground_of
 from mudg.editing.runs import RunParts, find_run
-from mudg.editing.weathered import SEED
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.storage import load_model, model_of_scene
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_scene
+from mudg.viewer import page as pages
 from mudg.viewer.live import LAYERS, EditFiles, EditRequest, FrameRequest, FrameSource, VideoRequest, desk_for
-from mudg.viewer.page import (
-    CHUNK,
-    ONE_FILE_BYTES,
-    Packed,
-    PageFile,
-    ViewerPage,
-    begin_of,
-    log_facts,
-    most_within,
-    pack_scene,
-    with_ground,
-    with_particles,
-)
+from mudg.viewer.page import CHUNK, ONE_FILE_BYTES, Packed, PageFile, ViewerPage
 from mudg.viewer.server import Answer, Site, SiteServer, Stream, address_of, open_server, show, token_for
 from mudg.viewer.settings import PageConfig, ViewConfig
 
@@ -106,16 +94,10 @@ def run_page(
             place = file.finish({"bytes": made["bytes"], "gaussians": made["gaussians"], "inputs": inputs}, form)
     size = f"{made['bytes'] / 1e6:.1f} MB"
     if place == folder:
-        place, size = (
-            folder / "index.html",
-            f"{size}; needs a web server: python -m http.server --directory {folder.name}",
-        )
-    return {
-        "page": place,
-        "bytes": made["bytes"],
-        "gaussians": made["gaussians"],
-        "text": f"page: {place.resolve()} ({size})",
-    }
+        place, serve = folder / "index.html", f"python -m http.server --directory {folder.name}"
+        size = f"{size}; needs a web server: {serve}"
+    text = f"page: {place.resolve()} ({size})"
+    return {"page": place, "bytes": made["bytes"], "gaussians": made["gaussians"], "text": text}
 
 
 def write_page(page: ViewerPage, out: Path, folder: Path) -> dict[str, Any]:
@@ -152,9 +134,8 @@ def _write_folder(
     """Write a page as a folder, file by file, completely or not at all; its ``index.html`` and the bytes of
     everything."""
     page = replace(page, report=f"../{page.report}") if page.report else page  # the run's report lies beside the folder
-    log.info(
-        needs_text(page, "to be written", f"about {_forecast(page, begun) / 1e6:.0f} MB in {page.chunks()} chunks")
-    )
+    size = f"about {_forecast(page, begun) / 1e6:.0f} MB in {page.chunks()} chunks"
+    log.info(needs_text(page, "to be written", size))
     size = 0
     with store.atomic_directory(folder) as place:
         for file in chain(begun, more):
@@ -189,36 +170,25 @@ class ShownSources:
 
     def digests(self) -> dict[str, str]:
         """Digests of everything that is read."""
-        named = {"scene": self.scene, "fused": self.cloud} | {
-            f"fit {n}": folder for n, (folder, _) in enumerate(self.fits)
-        }
+        named = {"scene": self.scene, "fused": self.cloud}
+        named |= {f"fit {number}": folder for number, (folder, _) in enumerate(self.fits)}
         return {name: store.digest(path) for name, path in named.items() if path is not None}
 
     def read(self) -> Shown:
-        """What is there.
-
-        Raises:
-            InputError: it cannot be read, or the fits are of different logs.
-        """
+        """What is there. InputError: it cannot be read, or the fits are of different logs."""
         loaded = read_scene(self.scene)
         fits = tuple(_read_fit(folder, whole, loaded) for folder, whole in self.fits)
         return Shown(loaded, fits, None if self.cloud is None else read_fused(self.cloud))
 
 
 def find_sources(config: PageConfig, run: Path, scene: Path | None, compare: Path | None) -> ShownSources:
-    """The log and the fits that a page is to show.
-
-    Raises:
-        InputError: no fitted scene. UsageError: a fit has no scene of its own and none was given, or a run no such fit.
-    """
+    """The log and the fits that a page is to show. InputError: no fitted scene. UsageError: a fit has no scene of its
+    own and none was given, or a run no such fit."""
     parts = find_run(run)
     place = scene or parts.scene
     if place is None:
-        raise UsageError(
-            "the scene of this fit is not known, is gone or has changed",
-            where=str(run),
-            remedy="add --scene FOLDER, or give the folder of a run",
-        )
+        what, remedy = "the scene of this fit is not known, is gone or has changed", "add --scene FOLDER"
+        raise UsageError(what, where=str(run), remedy=f"{remedy}, or give the folder of a run")
     name, fits = config.method, [_fit_of(parts, config.method)]
     if compare is not None:
         others = find_run(compare)
@@ -241,26 +211,21 @@ def _fit_of(parts: RunParts, method: str) -> tuple[Path, bool]:
 
 def _read_fit(folder: Path, whole: bool, scene: Scene) -> tuple[str, SceneModel]:
     model = load_model(folder) if whole else model_of_scene(folder, scene)
-    if model.facts.get("scene", scene.id) != scene.id:
-        raise InputError(
-            "fits of different logs cannot be compared",
-            where=str(folder),
-            expected=scene.id,
-            got=str(model.facts["scene"]),
-        )
+    if (other := model.facts.get("scene", scene.id)) != scene.id:
+        what = "fits of different logs cannot be compared"
+        raise InputError(what, where=str(folder), expected=scene.id, got=str(other))
     return str(model.facts.get("method", "fit")), model
 
 
 def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, Any] | None = None) -> ViewerPage:
     """The page of what is shown."""
-    scene, begin = shown.scene, begin_of(shown.scene)
+    scene, begin = shown.scene, pages.begin_of(shown.scene)
     path = np.stack([frame.view.center_world for frame in scene.frames])
-    packed = [
-        (name, pack_scene(model, begin, path, _most(config, model, len(shown.fits)), CHUNK))
-        for name, model in shown.fits
-    ]
-    facts = log_facts(scene, shown.fits[0][1].colors, PAGE_IMAGE_PX if live is None else LIVE_IMAGE_PX, config.images)
-    facts = with_particles(with_ground(facts, shown.ground()), SEED)
+    most = lambda model: _most(config, model, len(shown.fits))  # noqa: E731
+    packed = [(name, pages.pack_scene(model, begin, path, most(model), CHUNK)) for name, model in shown.fits]
+    width = PAGE_IMAGE_PX if live is None else LIVE_IMAGE_PX
+    facts = pages.log_facts(scene, shown.fits[0][1].colors, width, config.images)
+    facts = pages.with_particles(pages.with_ground(facts, shown.ground()), SEED)
     first = packed[0][1]
     return ViewerPage(
         title=scene.id,
@@ -277,7 +242,7 @@ def _most(config: PageConfig, model: SceneModel, fits: int) -> int:
     """Gaussians of each fit that budget and memory allow; 0 = all."""
     if not config.memory_mb:
         return config.budget
-    most = most_within(MEGABYTE * config.memory_mb / fits, model.sh_degree, CHUNK)
+    most = pages.most_within(MEGABYTE * config.memory_mb / fits, model.sh_degree, CHUNK)
     return min(config.budget, most) if config.budget else most
 
 
@@ -322,15 +287,9 @@ def run_view(
     scene: Path | None = None,
     files: EditFiles | None = None,
 ) -> dict[str, Any]:
-    """Serve the page of a run until it is interrupted.
-
-    Args:
-        files: the script that it begins with, and where edits are saved.
-
-    Raises:
-        UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As
-            ``run_page``.
-    """
+    """Serve the page of a run until it is interrupted. ``files``: the script that it begins with, and where edits are
+    saved. UsageError: an address that other machines reach, without a token. ResourceError: the port is taken. As
+    ``run_page``."""
     server, site = server_of(config, run, compare, scene, files)
     address = address_of(server, site)
     log.info(f"viewer: {address}   (Ctrl-C ends it)")

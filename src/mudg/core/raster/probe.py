@@ -15,7 +15,7 @@ from mudg.core.raster.rasterize import RasterConfig, rasterize
 
 GAUSSIANS, WIDTH, HEIGHT = 20_000, 240, 160
 REFERENCE_S: Final = 0.0108
-"""Seconds of one pass, forward and backward, on one undisturbed core of the machine on which `steps/settings/cost.py`
+"""Seconds of one pass, forward and backward, on one undisturbed core of the machine on which `steps/cost.py`
 was measured."""
 
 

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Final
 
 from mudg.base import memory
 from mudg.base.palette import CLASSES
-from mudg.steps.settings.presets import PRESETS, PresetName, run_preset
+from mudg.steps.settings import PRESETS, PresetName, run_preset
 
 if TYPE_CHECKING:
-    from mudg.steps.settings.run import RunConfig
+    from mudg.steps.settings import RunConfig
 
 FACTOR: Final = 1.5
 """The time of a whole run is within this factor of its forecast (tests/test_cost.py)."""
@@ -91,17 +91,13 @@ class Estimate:
 
     def fits(self, free_bytes: int, free_disk_bytes: int) -> bool:
         """Whether memory and disk that are free suffice; 0 = not known, and then not asked."""
-        return self.memory_bytes <= (free_bytes or self.memory_bytes) and self.written_bytes <= (
-            free_disk_bytes or self.written_bytes
-        )
+        enough = self.memory_bytes <= (free_bytes or self.memory_bytes)
+        return enough and self.written_bytes <= (free_disk_bytes or self.written_bytes)
 
 
 def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0, device: str = "cpu") -> Estimate:
-    """Forecast ``mudg run SCENE``.
-
-    Args:
-        cores: that the steps may use. speed: 1 = the machine of the unit costs. device: ``cpu`` or ``cuda``.
-    """
+    """Forecast ``mudg run SCENE``. ``cores``: that the steps may use. ``speed``: 1 = the machine of the unit costs.
+    ``device``: ``cpu`` or ``cuda``."""
     fit, pixels, published = config.fit, size.width * size.height, config.synthesize.guidance is not None
     lines, adapts = len(config.synthesize.shifts_m), size.adapts and config.adaptation != "off" and not published
     made, rendered = size.path_images * lines, size.path_images * len(config.render.shifts_m)
@@ -114,10 +110,8 @@ def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0,
     step_s, part = FIT_S * (gaussians + fit_pixels), 0.5 if config.continue_fit else 1.0
     share = fit.virtual.continued_probability if config.continue_fit else fit.virtual.probability
     view_s = NETWORK_VIEW_S * (1 + config.synthesize.steps / 10) + NETWORK_PIXEL_S * pixels
-    lessons, trained = (
-        2 * config.adapt.gaps + len(config.adapt.shifts_m),
-        config.adapt.steps * config.adapt.batch_frames,
-    )
+    lessons = 2 * config.adapt.gaps + len(config.adapt.shifts_m)
+    trained = config.adapt.steps * config.adapt.batch_frames
     work = {  # core-seconds, and processes among which they are divided (0: threads)
         "annotate": (size.images * (NETWORK_VIEW_S + NETWORK_PIXEL_S * pixels), cores),
         "fuse": (size.images * size.points * POINT_S, 0),
@@ -137,19 +131,16 @@ def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0,
             continue
         known = device == "cpu" and not (name == "synthesize" and published)
         spread = 1 / min(among, cores) if among else 1 - SHARED + SHARED / cores
-        seconds[name], processor_s[name] = (
-            (core_s * held + START_S) / speed if known else None for held in (spread, 1.0)
-        )
+        times = ((core_s * held + START_S) / speed if known else None for held in (spread, 1.0))
+        seconds[name], processor_s[name] = times
     columns = 11 + 3 * (fit.sh_degree + 1) ** 2 + len(CLASSES) * fit.semantics
     views = min(VIEW_PIXEL_BYTES * (size.images + made) * fit_pixels, VIEWS_BYTES) if device == "cpu" else 0
     networks = max(processes * (NETWORK_BYTES + NETWORK_PIXEL_BYTES * pixels), adapts * (processes + 1) * NETWORK_BYTES)
-    memory_bytes = max(
-        PARAMETER_BYTES * columns * gaussians + views, PUBLISHED_BYTES[device] if published else networks
-    )
+    held = PUBLISHED_BYTES[device] if published else networks
+    memory_bytes = max(PARAMETER_BYTES * columns * gaussians + views, held)
     judged = (rendered if size.exact else size.path_images) + (0 if size.labelled else size.images)
-    written = (
-        pixels * (VIEW_PIXEL_BYTES * (made + 2 * rendered) + SCORED_PIXEL_BYTES * judged) + GAUSSIAN_BYTES * gaussians
-    )
+    shown = VIEW_PIXEL_BYTES * (made + 2 * rendered) + SCORED_PIXEL_BYTES * judged
+    written = pixels * shown + GAUSSIAN_BYTES * gaussians
     return Estimate(seconds, processor_s, round(PROGRAM_BYTES + memory_bytes), round(written))
 
 
@@ -172,9 +163,8 @@ def in_words(
         lines.append(f"  --preset {name:<8} {_time(one)}; {space}")
     if free_bytes:
         able = [name for name, one in found.items() if one.fits(free_bytes, free_disk_bytes)]
-        lines.append(
-            f"  memory and disk of this machine suffice for: {', '.join(able) or 'none (smaller images, fewer frames)'}"
-        )
+        names = ", ".join(able) or "none (smaller images, fewer frames)"
+        lines.append(f"  memory and disk of this machine suffice for: {names}")
     lines.append(f"  {'time per step':<30}" + "".join(f"{name:>12}" for name in found))
     for step in max((one.seconds for one in found.values()), key=len):
         cells = ["not taken" if step not in one.seconds else _duration(one.seconds[step]) for one in found.values()]
@@ -203,10 +193,6 @@ def _time(one: Estimate) -> str:
 def _duration(seconds: float | None) -> str:
     if seconds is None:
         return "-"
-    return (
-        f"{seconds:.0f} s"
-        if seconds < 90
-        else f"{seconds / 60:.0f} min"
-        if seconds < 5400
-        else f"{seconds / 3600:.1f} h"
-    )
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
