@@ -24,6 +24,8 @@ from mudg.formats.importers.waymo import records as waymo_log
 from mudg.formats.importers.waymo.logs import ParquetTable
 from mudg.scene.read import read_points
 
+pytestmark = roundtrip.needs_native
+
 
 @pytest.fixture
 def bare(tmp_path_factory: pytest.TempPathFactory) -> made.Log:
@@ -69,7 +71,6 @@ BOTH: dict[str, tuple[Callable[[made.Log], object], str]] = {
 }
 
 
-@roundtrip.needs_native
 @pytest.mark.parametrize("form", ["v1", "v2"])
 @pytest.mark.parametrize("case", BOTH)
 def test_what_makes_no_sense_is_refused(case: str, form: str, bare: made.Log, tmp_path: Path) -> None:
@@ -80,7 +81,6 @@ def test_what_makes_no_sense_is_refused(case: str, form: str, bare: made.Log, tm
     assert list(tmp_path.iterdir()) == [tmp_path / "log"]
 
 
-@roundtrip.needs_native
 def test_frames_out_of_order_are_refused_in_one_file_and_sorted_in_tables(bare: made.Log, tmp_path: Path) -> None:
     bare.frames[1], bare.frames[2] = bare.frames[2], bare.frames[1]
     refused("timestamps do not increase", ingest, write(bare, "v1", tmp_path / "one"), tmp_path / "a")
@@ -90,7 +90,6 @@ def test_frames_out_of_order_are_refused_in_one_file_and_sorted_in_tables(bare: 
     refused("a frame twice", ingest, write(bare, "v2", tmp_path / "three"), tmp_path / "c")
 
 
-@roundtrip.needs_native
 @pytest.mark.parametrize("form", ["v1", "v2"])
 def test_incomplete_frames_are_left_out_when_asked(form: str, bare: made.Log, tmp_path: Path) -> None:
     lacks_an_image(bare)
@@ -102,7 +101,6 @@ def test_incomplete_frames_are_left_out_when_asked(form: str, bare: made.Log, tm
     assert len(only.frames) == 4  # the missing image is of a camera that was not asked for
 
 
-@roundtrip.needs_native
 @pytest.mark.parametrize("form", ["v1", "v2"])
 def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
     form: str, bare: made.Log, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -122,7 +120,6 @@ def test_empty_scans_unknown_sensors_and_classes_are_taken_as_they_are(
     assert len(scene.sweeps) == 5
 
 
-@roundtrip.needs_native
 def test_damaged_files_are_named_with_record_and_byte(bare: made.Log, tmp_path: Path) -> None:
     path = write(bare, "v1", tmp_path / "log")
     content = path.read_bytes()
@@ -146,7 +143,6 @@ def test_damaged_files_are_named_with_record_and_byte(bare: made.Log, tmp_path: 
     assert len(ingest(path, tmp_path / "scene", frames=(0, 2)).sweeps) == 2  # what is not asked for need not be whole
 
 
-@roundtrip.needs_native
 def test_files_of_another_kind_are_refused(bare: made.Log, tmp_path: Path) -> None:
     path = tmp_path / "a.tfrecord"
     for content, word in (
@@ -179,7 +175,6 @@ def test_range_images_are_unpacked_within_bounds(monkeypatch: pytest.MonkeyPatch
     refused("wrong shape", float_image, zlib.compress(lying), 4, "x")
 
 
-@roundtrip.needs_native
 def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     root = write(bare, "v2", tmp_path / "log")
     table = root / "lidar" / f"{bare.name}.parquet"
@@ -203,7 +198,6 @@ def test_tables_that_are_missing_or_damaged(bare: made.Log, tmp_path: Path, monk
     assert "mudg[data]" in refused("pyarrow", ParquetTable, pose, raises=ResourceError).remedy
 
 
-@roundtrip.needs_native
 def test_one_log_of_a_folder_is_chosen_by_name(bare: made.Log, tmp_path: Path) -> None:
     folder = tmp_path / "logs"
     names = [f"segment-{n}_with_camera_labels" for n in ("111_2", "222_3")]
