@@ -110,11 +110,8 @@ def write_calibration_text(path: Path, odometry: bool = False) -> None:
     if odometry:
         lines.append(f"Tr: {numbers(RECT0_FROM_VELO[:3])}")
     else:
-        lines += [
-            f"R0_rect: {numbers(np.eye(3))}",
-            f"Tr_velo_to_cam: {numbers(RECT0_FROM_VELO[:3])}",
-            f"Tr_imu_to_velo: {numbers(VELO_FROM_IMU[:3])}",
-        ]
+        lines += [f"R0_rect: {numbers(np.eye(3))}", f"Tr_velo_to_cam: {numbers(RECT0_FROM_VELO[:3])}"]
+        lines.append(f"Tr_imu_to_velo: {numbers(VELO_FROM_IMU[:3])}")
     path.write_text("\n".join(lines) + "\n")
 
 
@@ -124,9 +121,8 @@ def write_calibration_day(folder: Path) -> None:
     lines += [f"P_rect_0{n}: {numbers(projection(n))}" for n in range(4)]
     (folder / "calib_cam_to_cam.txt").write_text("\n".join(lines) + "\n")
     for name, pose in (("velo_to_cam", RECT0_FROM_VELO), ("imu_to_velo", VELO_FROM_IMU)):
-        (folder / f"calib_{name}.txt").write_text(
-            f"calib_time: 15-Mar-2012 11:37:16\nR: {numbers(pose[:3, :3])}\nT: {numbers(pose[:3, 3])}\n"
-        )
+        text = f"calib_time: 15-Mar-2012 11:37:16\nR: {numbers(pose[:3, :3])}\nT: {numbers(pose[:3, 3])}\n"
+        (folder / f"calib_{name}.txt").write_text(text)
 
 
 def oxts_line(time_s: float) -> str:
@@ -157,18 +153,13 @@ def tracklet_xml(drive: Drive, twisted: bool) -> str:
             box = invert(world_from_velo(time_s + late)) @ world_from_car(time_s + late)
             late = np.arctan2(box[1, 3], box[0, 3]) / (2 * np.pi) * 0.1 if twisted else 0.0
         yaw = np.arctan2(box[1, 0], box[0, 0])
-        poses.append(
-            f"<item><tx>{box[0, 3]:.9f}</tx><ty>{box[1, 3]:.9f}</ty><tz>{box[2, 3] - CAR_SIZE_M[2] / 2:.9f}</tz>"
-            f"<rx>0</rx><ry>0</ry><rz>{yaw:.9f}</rz></item>"
-        )
-    return (
-        '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n<!DOCTYPE'
-        " boost_serialization>\n<boost_serialization><tracklets>"
-        f"<count>1</count><item><objectType>Car</objectType>"
-        f"<h>{CAR_SIZE_M[2]}</h><w>{CAR_SIZE_M[1]}</w><l>{CAR_SIZE_M[0]}</l>"
-        f"<first_frame>{drive.frames[0]}</first_frame><poses><count>{len(poses)}</count>{''.join(poses)}</poses></item>"
-        "</tracklets></boost_serialization>\n"
-    )
+        place = {"tx": box[0, 3], "ty": box[1, 3], "tz": box[2, 3] - CAR_SIZE_M[2] / 2, "rx": 0.0, "ry": 0.0, "rz": yaw}
+        poses.append("<item>" + "".join(f"<{name}>{value:.9f}</{name}>" for name, value in place.items()) + "</item>")
+    size = "".join(f"<{name}>{value}</{name}>" for name, value in zip("lwh", CAR_SIZE_M, strict=True))
+    item = f"<objectType>Car</objectType>{size}<first_frame>{drive.frames[0]}</first_frame>"
+    item += f"<poses><count>{len(poses)}</count>{''.join(poses)}</poses>"
+    head = '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n<!DOCTYPE boost_serialization>\n'
+    return f"{head}<boost_serialization><tracklets><count>1</count><item>{item}</item></tracklets></boost_serialization>\n"
 
 
 def label_line(time_s: float, prefix: str, track: Matrix | None = None) -> str:
@@ -222,9 +213,8 @@ def write_derived(root: Path, drive: Drive | None = None) -> Path:
     first = invert(world_from_velo(drive.times()[0]))
     rows = [f"{n} {numbers((first @ world_from_velo(0.1 * n))[:3])}" for n in drive.frames]
     (root / "derived" / "poses_velo.txt").write_text("\n".join(rows) + "\n")
-    (root / "derived" / "label_02.txt").write_text(
-        "\n".join(label_line(0.1 * n, f"{n} 7 ") for n in drive.frames) + "\n"
-    )
+    rows = [label_line(0.1 * n, f"{n} 7 ") for n in drive.frames]
+    (root / "derived" / "label_02.txt").write_text("\n".join(rows) + "\n")
     return root
 
 
@@ -247,10 +237,8 @@ def write_tracking(root: Path, sequence: str = "0003", drive: Drive | None = Non
     write_images(root / "image_02" / sequence, drive.frames, 6)
     write_scans(root / "velodyne" / sequence, {n: still_scan(drive, 0.1 * n) for n in drive.frames}, 6)
     write_calibration_text(root / "calib" / f"{sequence}.txt")
-    for name, rows in (
-        ("label_02", [label_line(0.1 * n, f"{n} 7 ") for n in drive.frames]),
-        ("oxts", [oxts_line(t) for t in drive.times()]),
-    ):
+    labels, packets = [label_line(0.1 * n, f"{n} 7 ") for n in drive.frames], [oxts_line(t) for t in drive.times()]
+    for name, rows in (("label_02", labels), ("oxts", packets)):
         (root / name).mkdir(parents=True)
         (root / name / f"{sequence}.txt").write_text("\n".join(rows) + "\n")
     return root

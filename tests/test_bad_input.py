@@ -191,7 +191,7 @@ def test_incomplete_frames_can_be_left_out_on_request(drive: Path, tmp_path: Pat
 
 
 def test_unknown_camera_and_missing_files_named_by_flags(drive: Path, tmp_path: Path) -> None:
-    caught = refused("no such camera", ingest, drive, tmp_path / "out", cameras=("rear"), raises=UsageError)
+    caught = refused("no such camera", ingest, drive, tmp_path / "out", cameras=("rear",), raises=UsageError)
     assert "front" in caught.expected
     for option in ("poses", "boxes"):
         with pytest.raises(InputError, match=f"{option[:-1]} file does not exist|box file does not exist"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import struct
 import zipfile
 from pathlib import Path
 
@@ -36,9 +37,8 @@ def lzf_literals(data: bytes) -> bytes:
 
 def pcd(kind: str) -> bytes:
     if kind == "ascii":
-        rows = "".join(
-            f"{x} {y} {z} 0 0 0 0 0 0 {v}\n" for (x, y, z), v in zip(XYZ.tolist(), LEVEL.tolist(), strict=True)
-        )
+        points = zip(XYZ.tolist(), LEVEL.tolist(), strict=True)
+        rows = "".join(f"{x} {y} {z} 0 0 0 0 0 0 {v}\n" for (x, y, z), v in points)
         return pcd_header(kind, 3) + rows.encode()
     rows = [p.tobytes() + bytes(6) + v.tobytes() for p, v in zip(XYZ, LEVEL, strict=True)]
     if kind == "binary":
@@ -49,17 +49,15 @@ def pcd(kind: str) -> bytes:
 
 
 def ply(order: str) -> bytes:
-    header = f"ply\nformat {order} 1.0\ncomment made by hand\nelement vertex 3\nproperty float x\nproperty float y\n"
-    header += (
-        "property float z\nproperty ushort level\nelement face 1\nproperty list uchar int vertex_indices\nend_header\n"
-    )
+    properties = "".join(f"property {kind}\n" for kind in ("float x", "float y", "float z", "ushort level"))
+    header = f"ply\nformat {order} 1.0\ncomment made by hand\nelement vertex 3\n{properties}"
+    header += "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
     if order == "ascii":
         rows = "".join(f"{x} {y} {z} {v}\n" for (x, y, z), v in zip(XYZ.tolist(), LEVEL.tolist(), strict=True))
         return (header + rows + "3 0 1 2\n").encode()
     mark = "<" if "little" in order else ">"
-    rows = b"".join(
-        p.astype(f"{mark}f4").tobytes() + np.array([v], f"{mark}u2").tobytes() for p, v in zip(XYZ, LEVEL, strict=True)
-    )
+    layout = np.dtype([("xyz", f"{mark}f4", 3), ("level", f"{mark}u2")])
+    rows = np.array([(tuple(p), v) for p, v in zip(XYZ, LEVEL, strict=True)], layout).tobytes()
     return header.encode() + rows + b"\3" + np.arange(3, dtype=f"{mark}i4").tobytes()
 
 
@@ -122,6 +120,9 @@ def test_missing_returns_are_left_out_and_half_missing_ones_refused(tmp_path: Pa
     refused("not finite", clouds.read_cloud, tmp_path / "a.npz")
 
 
+ASCII = b"ply\nformat ascii 1.0\n"
+
+
 def npy_lie() -> bytes:
     """An archive whose array says it has 10^12 rows."""
     honest = npz(xyz=np.zeros((1, 3)))
@@ -140,26 +141,14 @@ def npy_lie() -> bytes:
         (".pcd", pcd_header("binary", 10**7), "cut off"),
         (".pcd", pcd_header("ascii", 10**7), "cut off"),
         (".pcd", pcd_header("binary", 10**30), "count makes no sense"),
-        (
-            ".pcd",
-            pcd_header("binary_compressed", 10**7) + np.array([4, 26 * 10**7], "<u4").tobytes() + bytes(4),
-            "contradicts",
-        ),
+        (".pcd", pcd_header("binary_compressed", 10**7) + struct.pack("<3I", 4, 26 * 10**7, 0), "contradicts"),
         (".pcd", pcd_header("binary", 3).replace(b"WIDTH 3", b"WIDTH 4") + bytes(99), "contradicts"),
         (".pcd", pcd_header("zipped", 3) + bytes(99), "no known kind"),
         (".pcd", pcd_header("binary", 3, "a b", "1 1").replace(b"TYPE F F", b"TYPE Q F") + bytes(99), "unknown type"),
         (".pcd", b"not a cloud at all", "not a PCD file"),
-        (
-            ".ply",
-            b"ply\nformat ascii 1.0\nelement vertex 999999999\nproperty float x\nend_header\n1 2\n",
-            "count makes no sense",
-        ),
-        (
-            ".ply",
-            b"ply\nformat ascii 1.0\nelement vertex 9\nproperty list uchar int x\nend_header\n1 2\n",
-            "no known type",
-        ),
-        (".ply", b"ply\nformat ascii 1.0\nelement face 9\nelement vertex 9\nend_header\n", "do not come first"),
+        (".ply", ASCII + b"element vertex 999999999\nproperty float x\nend_header\n1 2\n", "count makes no sense"),
+        (".ply", ASCII + b"element vertex 9\nproperty list uchar int x\nend_header\n1 2\n", "no known type"),
+        (".ply", ASCII + b"element face 9\nelement vertex 9\nend_header\n", "do not come first"),
         (".npz", npy_lie(), "declared size"),
         (".npz", npz(xyz=np.array([[1, 2, object()]], object)), "plain numbers"),
         (".npz", npz(points=XYZ), "no coordinates"),

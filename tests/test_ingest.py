@@ -6,6 +6,7 @@ import os
 import shutil
 import socket
 from pathlib import Path
+from typing import Any
 
 import kitti_folders as made
 import numpy as np
@@ -34,9 +35,13 @@ TINY_CITY = CityConfig(
 )
 
 
+def run(log: Path | str, out: Path, overwrite: bool = False, **settings: Any) -> Path:
+    return Ingest(log=log, out=out, overwrite=overwrite, settings=IngestConfig(**settings)).run()
+
+
 def test_a_kitti_folder_is_recognised_and_equals_a_direct_import(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    scene = read_scene(Ingest(log=str(drive), out=tmp_path / "out", settings=IngestConfig()).run())
+    scene = read_scene(run(str(drive), tmp_path / "out"))
     direct = IMPORTERS["kitti"](drive, tmp_path / "direct", ImportOptions())
     assert scene_to_json_text(scene) == scene_to_json_text(direct)
     summary = store.read_json(tmp_path / "out" / "run.json")["summary"]
@@ -47,9 +52,7 @@ def test_a_kitti_folder_is_recognised_and_equals_a_direct_import(tmp_path: Path)
 
 def test_flags_reach_the_importer(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    scene = read_scene(
-        Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig(frames="1:6", test_every=2, untwist="no")).run()
-    )
+    scene = read_scene(run(drive, tmp_path / "out", frames="1:6", test_every=2, untwist="no"))
     assert len(scene.frames) == 5
     assert sorted(i for i, s in scene.split.items() if s == "test") == ["front/000002", "front/000004"]
     assert not read_points(scene, scene.sweeps[0]).dt_s.any()
@@ -58,7 +61,7 @@ def test_flags_reach_the_importer(tmp_path: Path) -> None:
 def test_images_are_resized_with_their_camera_and_points_stay_on_them(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
     full = IMPORTERS["kitti"](drive, tmp_path / "full", ImportOptions())
-    small = read_scene(Ingest(log=drive, out=tmp_path / "small", settings=IngestConfig(resolution="31")).run())
+    small = read_scene(run(drive, tmp_path / "small", resolution="31"))
     a, b = full.cameras["front"], small.cameras["front"]
     assert max(b.width, b.height) == 31
     assert b == a.resized(b.width, b.height)
@@ -69,16 +72,14 @@ def test_images_are_resized_with_their_camera_and_points_stay_on_them(tmp_path: 
 
 def test_the_number_of_workers_changes_nothing_and_is_no_other_configuration(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    out = Ingest(log=drive, out=tmp_path / "one", settings=IngestConfig(workers=1)).run()
+    out = run(drive, tmp_path / "one", workers=1)
     listed = store.read_json(out / "manifest.json")["files"]
-    again = store.read_json(
-        Ingest(log=drive, out=tmp_path / "three", settings=IngestConfig(workers=3)).run() / "manifest.json"
-    )["files"]
+    again = store.read_json(run(drive, tmp_path / "three", workers=3) / "manifest.json")["files"]
     assert {n: f for n, f in listed.items() if not n.startswith("run.")} == {
         n: f for n, f in again.items() if not n.startswith("run.")
     }
     made_ns = (out / "scene.json").stat().st_mtime_ns
-    Ingest(log=drive, out=out, settings=IngestConfig(workers=2)).run()
+    run(drive, out, workers=2)
     assert (out / "scene.json").stat().st_mtime_ns == made_ns
 
 
@@ -121,28 +122,26 @@ def test_unknown_folders_and_missing_ones_are_named(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "a.jpg").write_bytes(b"x")
     with pytest.raises(InputError, match="not recognised") as caught:
-        Ingest(log=str(tmp_path / "photos"), out=tmp_path / "out", settings=IngestConfig()).run()
+        run(str(tmp_path / "photos"), tmp_path / "out")
     assert "a.jpg" in caught.value.got
-    refused("does not exist", Ingest(log=str(tmp_path / "nowhere"), out=tmp_path / "out", settings=IngestConfig()).run)
+    refused("does not exist", run, str(tmp_path / "nowhere"), tmp_path / "out")
     assert not (tmp_path / "out").exists()
     (tmp_path / "photos" / "image_02").mkdir()
     with pytest.raises(InputError, match="no KITTI images"):
-        Ingest(log=str(tmp_path / "photos"), out=tmp_path / "out", settings=IngestConfig(format="kitti")).run()
+        run(str(tmp_path / "photos"), tmp_path / "out", format="kitti")
 
 
 def test_finished_work_is_reused_and_other_settings_are_refused(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    out = Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run()
+    out = run(drive, tmp_path / "out")
     made_ns = (out / "scene.json").stat().st_mtime_ns
-    assert (
-        Ingest(log=drive, out=out, settings=IngestConfig(city=CityConfig(seed=5))).run() == out
-    )  # the city's settings do not matter here
+    assert run(drive, out, city=CityConfig(seed=5)) == out  # the city's settings do not matter here
     assert (out / "scene.json").stat().st_mtime_ns == made_ns
     with pytest.raises(UsageError, match="another configuration"):
-        Ingest(log=drive, out=out, settings=IngestConfig(test_every=3)).run()
+        run(drive, out, test_every=3)
     (drive / "tracklet_labels.xml").unlink()  # the log changed
-    refused("another configuration", Ingest(log=drive, out=out, settings=IngestConfig()).run, raises=UsageError)
-    assert len(read_scene(Ingest(log=drive, out=out, overwrite=True, settings=IngestConfig()).run()).tracks) == 0
+    refused("another configuration", run, drive, out, raises=UsageError)
+    assert len(read_scene(run(drive, out, overwrite=True)).tracks) == 0
 
 
 def test_of_a_folder_with_many_logs_only_the_chosen_one_counts(tmp_path: Path) -> None:
@@ -158,22 +157,13 @@ def test_of_a_folder_with_many_logs_only_the_chosen_one_counts(tmp_path: Path) -
     caught = refused("another configuration", Ingest(log=root, out=out, settings=config).run, raises=UsageError)
     assert "input 'source' changed" in caught.got
     listed = files_of("kitti", root, ImportOptions(sequence="0003")).files
-    assert {path.relative_to(root).as_posix() for path in listed} == {
-        "image_02/0003",
-        "velodyne/0003",
-        "label_02/0003.txt",
-        "calib/0003.txt",
-        "oxts/0003.txt",
-    }
+    names = {"image_02/0003", "velodyne/0003", "label_02/0003.txt", "calib/0003.txt", "oxts/0003.txt"}
+    assert {path.relative_to(root).as_posix() for path in listed} == names
 
 
 def test_of_large_releases_the_tables_and_the_names_of_files_count(tmp_path: Path) -> None:
-    for name in (
-        "v1.0-mini/scene.json",
-        "v1.0-mini/sample_data.json",
-        "samples/CAM_FRONT/a.jpg",
-        "sweeps/LIDAR_TOP/b.bin",
-    ):
+    tables = ("v1.0-mini/scene.json", "v1.0-mini/sample_data.json")
+    for name in (*tables, "samples/CAM_FRONT/a.jpg", "sweeps/LIDAR_TOP/b.bin"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_text("[]")
     found = files_of("nuscenes", tmp_path, ImportOptions())
@@ -193,7 +183,7 @@ def test_what_is_odd_about_a_scene_is_said_when_it_is_made(tmp_path: Path, capsy
     for row in rows:
         row[-1] = str(float(row[-1]) + np.pi / 2)
     labels.write_text("\n".join(" ".join(row) for row in rows) + "\n")
-    Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig(contact_sheet=False)).run()
+    run(drive, tmp_path / "out", contact_sheet=False)
     assert "track 7 (car): it moves sideways" in capsys.readouterr().err
 
 
@@ -207,10 +197,10 @@ def test_a_failed_import_leaves_nothing_and_a_repeat_finishes(tmp_path: Path) ->
             Ingest(log=drive, out=tmp_path / "out", settings=config).run()
         assert [path.name for path in tmp_path.iterdir()] == ["day"]
     (tmp_path / "out").mkdir()
-    refused("cut off", Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run)
+    refused("cut off", run, drive, tmp_path / "out")
     assert list((tmp_path / "out").iterdir()) == []
     scan.write_bytes(content)
-    assert len(read_scene(Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run()).frames) == 6
+    assert len(read_scene(run(drive, tmp_path / "out")).frames) == 6
 
 
 def test_what_a_killed_import_left_is_replaced_and_a_live_one_is_not(tmp_path: Path) -> None:
@@ -229,11 +219,11 @@ def test_what_a_killed_import_left_is_replaced_and_a_live_one_is_not(tmp_path: P
 
 def test_a_run_stopped_after_the_scene_was_made_is_finished_without_making_it_again(tmp_path: Path) -> None:
     drive = made.write_raw_drive(tmp_path / "day")
-    out = Ingest(log=drive, out=tmp_path / "out", settings=IngestConfig()).run()
+    out = run(drive, tmp_path / "out")
     state = store.read_json(out / "run.json")
     store.write_json(out / "run.json", {**state, "state": "running"})
     made_ns = (out / "scene.json").stat().st_mtime_ns
-    Ingest(log=drive, out=out, settings=IngestConfig()).run()
+    run(drive, out)
     assert store.read_json(out / "run.json")["state"] == "complete"
     assert (out / "scene.json").stat().st_mtime_ns == made_ns
 
@@ -242,15 +232,14 @@ def test_a_run_stopped_after_the_scene_was_made_is_finished_without_making_it_ag
 def test_a_scene_or_its_zip_is_checked_and_copied(tmp_path: Path, packed: bool) -> None:
     scene = ToyStreet(car_start=(12, 0), car_velocity=(3, 0)).write(tmp_path / "scene")
     source = write_zip(tmp_path / "scene", tmp_path / "scene.zip") if packed else tmp_path / "scene"
-    copy = read_scene(Ingest(log=source, out=tmp_path / "out", settings=IngestConfig()).run())
+    copy = read_scene(run(source, tmp_path / "out"))
     assert scene_to_json_text(copy) == scene_to_json_text(scene)
     assert (copy.tracks[0].world_from_object == scene.tracks[0].world_from_object).all()
     for frame in scene.frames:
         assert (read_image(copy, frame) == read_image(scene, frame)).all()
         for name in frame.labels:
-            assert np.array_equal(
-                read_label(copy, frame, name), read_label(scene, frame, name), equal_nan=name == "depth"
-            )
+            one, other = read_label(copy, frame, name), read_label(scene, frame, name)
+            assert np.array_equal(one, other, equal_nan=name == "depth")
     for index, config in enumerate(
         (IngestConfig(frames="0:2"), IngestConfig(cameras=("front",)), IngestConfig(resolution="60"))
     ):

@@ -413,7 +413,7 @@ def test_missing_frames_can_be_skipped_and_choices_are_checked(source: Path, tmp
     (source / SCAN).write_bytes(b"")
     scene = ingest(source, tmp_path / "out", skip_missing=True, untwist="auto")
     assert [len(read_points(scene, sweep).xyz) > 0 for sweep in scene.sweeps] == [True, False, True, True]
-    caught = refused("no such camera", ingest, source, tmp_path / "no", cameras=("side_left"), raises=UsageError)
+    caught = refused("no such camera", ingest, source, tmp_path / "no", cameras=("side_left",), raises=UsageError)
     assert "front (image_00)" in caught.expected
     refused("no such drive", ingest, source, tmp_path / "no", sequence="0007", raises=UsageError)
     (source / "data_2d_raw" / "2013_05_28_drive_0004_sync").mkdir()
@@ -428,5 +428,5 @@ def test_a_fisheye_calibration_of_another_model_is_refused(source: Path, tmp_pat
     for old, new, words in (("MEI", "KANNALA_BRANDT", "another camera model"), ("gamma2", "gamma3", "incomplete")):
         text = path.read_text()
         path.write_text(text.replace(old, new))
-        refused(words, ingest, source, tmp_path / "out", cameras=("image_02"))
+        refused(words, ingest, source, tmp_path / "out", cameras=("image_02",))
         path.write_text(text)

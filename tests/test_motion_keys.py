@@ -18,7 +18,7 @@ import write_nuplan
 from bad_logs import refused
 
 from mudg.base.geometry import yaw_matrix
-from mudg.base.types import EgoPath, Scene, Track
+from mudg.base.types import EgoPath, Scene, Sweep, Track, View
 from mudg.formats.importers import IMPORTERS, custom
 from mudg.formats.importers.common import ImportOptions
 from mudg.scene import motion
@@ -54,10 +54,8 @@ def curve_log(truth: Scene, root: Path, path: EgoPath) -> Path:
 
     def edit(log: dict[str, Any]) -> None:
         start = write_custom.ns(0.0)
-        log["ego"] = [
-            {"time": write_custom.ns(float(t)), "world_from_ego": write_custom.far(pose).tolist()}
-            for t, pose in zip(path.times_s, path.world_from_ego, strict=True)
-        ]
+        keys = ((write_custom.ns(t), write_custom.far(p).tolist()) for t, p in zip(path.times_s, path.world_from_ego))
+        log["ego"] = [{"time": time, "world_from_ego": pose} for time, pose in keys]
         log["tracks"] = []
         for record in (*log["images"], *log["sweeps"]):
             record["time"] = start + 5 * (record["time"] - start)
@@ -73,9 +71,8 @@ def test_frames_in_a_gap_of_a_curve_are_refused_left_out_or_bridged(truth: Scene
     assert any("vehicle poses have a gap" in f.message for f in custom.check_log(log))
 
     left = IMPORTERS["custom"](log, tmp_path / "left", ImportOptions(skip_missing=True))
-    whole = IMPORTERS["custom"](
-        curve_log(truth, tmp_path / "all", arc(-0.5, 2.5, 0.05)), tmp_path / "whole", ImportOptions()
-    )
+    every = curve_log(truth, tmp_path / "all", arc(-0.5, 2.5, 0.05))
+    whole = IMPORTERS["custom"](every, tmp_path / "whole", ImportOptions())
     times = {round(f.view.time_s, 6) for f in whole.frames}
     # seconds count from the first pose, 0.5 s before
     inside = {t for t in times if LOST_S[0] + 0.3 < t - 0.5 < LOST_S[1] - 0.3}
@@ -129,16 +126,13 @@ def test_lost_rows_of_argoverse2_and_nuplan(truth: Scene, tmp_path: Path) -> Non
     def moved(time_s: float) -> np.ndarray:
         return on_arc(5 * time_s) @ invert(truth.ego.pose_at(time_s))
 
-    frames = tuple(
-        replace(
-            f,
-            view=replace(f.view, world_from_cam=moved(f.view.time_s) @ f.view.world_from_cam, time_s=5 * f.view.time_s),
-        )
-        for f in truth.frames
-    )
-    sweeps = tuple(
-        replace(s, time_s=5 * s.time_s, world_from_lidar=moved(s.time_s) @ s.world_from_lidar) for s in truth.sweeps
-    )
+    def later(view: View) -> View:
+        return replace(view, world_from_cam=moved(view.time_s) @ view.world_from_cam, time_s=5 * view.time_s)
+
+    def swept(one: Sweep) -> Sweep:
+        return replace(one, time_s=5 * one.time_s, world_from_lidar=moved(one.time_s) @ one.world_from_lidar)
+
+    frames, sweeps = tuple(replace(f, view=later(f.view)) for f in truth.frames), tuple(map(swept, truth.sweeps))
     curve = replace(truth, frames=frames, sweeps=sweeps, tracks=(), ego=arc(-0.5, 2.5, 0.05))
     log = write_av2.write_av2(curve, tmp_path / "av2")
     (log / "annotations.feather").unlink()
@@ -224,15 +218,12 @@ def test_flips_of_boxes_in_another_format(truth: Scene, tmp_path: Path) -> None:
 
     database = write_nuplan.write_nuplan(truth, tmp_path / "log")
     with sqlite3.connect(database) as connection:
-        connection.execute(
-            "UPDATE lidar_box SET yaw = yaw + 3.14159265358979 WHERE rowid IN (SELECT max(rowid) FROM lidar_box GROUP"
-            " BY track_token)"
-        )
+        last = "SELECT max(rowid) FROM lidar_box GROUP BY track_token"
+        connection.execute(f"UPDATE lidar_box SET yaw = yaw + 3.14159265358979 WHERE rowid IN ({last})")
     connection.close()
     scene = IMPORTERS["nuplan"](database, tmp_path / "scene", ImportOptions())
-    plain = IMPORTERS["nuplan"](
-        write_nuplan.write_nuplan(truth, tmp_path / "plain"), tmp_path / "other", ImportOptions()
-    )
+    unflipped = write_nuplan.write_nuplan(truth, tmp_path / "plain")
+    plain = IMPORTERS["nuplan"](unflipped, tmp_path / "other", ImportOptions())
     assert len(scene.tracks) == len(plain.tracks) > 3
     for one, other in zip(scene.tracks, plain.tracks, strict=True):
         assert np.allclose(one.world_from_object, other.world_from_object, atol=1e-8)
@@ -255,12 +246,9 @@ def test_doctor_names_what_no_vehicle_does(tmp_path: Path) -> None:
 
     assert "it jumps by 1.5 m after 0.900 s (key 9" in changed(lambda p: p[10:, :3, 3].__iadd__([0, 0, 1.5]))
     turn = yaw_matrix(np.pi / 2 - SPEED_M_S * 0.1 / RADIUS_M)[:3, :3]  # with what the curve has anyway
-    assert "it turns by 90 degrees within 0.10 s after 0.900 s (key 9" in changed(
-        lambda p: p[10:, :3, :3].__imatmul__(turn)
-    )
-    assert "heading flips by 180 degrees 2 times, first after 0.900 s (key 9)" in changed(
-        lambda p: p[10, :3, :2].__imul__(-1)
-    )
+    turned, flipped = (lambda p: p[10:, :3, :3].__imatmul__(turn)), (lambda p: p[10, :3, :2].__imul__(-1))
+    assert "it turns by 90 degrees within 0.10 s after 0.900 s (key 9" in changed(turned)
+    assert "heading flips by 180 degrees 2 times, first after 0.900 s (key 9)" in changed(flipped)
     times = plain.times_s
     faster = np.stack([yaw_matrix(0.0, (8 * t + 15 * max(0.0, t - 1.0) ** 2, 0, 0)) for t in times])
     words = warnings(replace(scene, ego=EgoPath(times, faster)), "ego path")
@@ -279,10 +267,8 @@ def test_earth_centred_coordinates_keep_their_digits(truth: Scene, tmp_path: Pat
     far = np.array([6_378_137.25, -4_200_000.5, 310.0])
 
     def move(log: dict[str, Any]) -> None:
-        for record in (
-            *(e["world_from_ego"] for e in log["ego"]),
-            *(b["world_from_object"] for t in log["tracks"] for b in t["boxes"]),
-        ):
+        boxes = (b["world_from_object"] for t in log["tracks"] for b in t["boxes"])
+        for record in (*(e["world_from_ego"] for e in log["ego"]), *boxes):
             for row, value in zip(record, far, strict=False):
                 row[3] += value
 
@@ -292,7 +278,6 @@ def test_earth_centred_coordinates_keep_their_digits(truth: Scene, tmp_path: Pat
     first = json.loads((log / "log.json").read_text())["ego"][0]["world_from_ego"]
     assert f"({first[0][3]:.3f}, {first[1][3]:.3f}, {first[2][3]:.3f})" in "\n".join(scene.source.notes)
     assert not warnings(scene, "world")
-    away = replace(
-        scene, ego=EgoPath(scene.ego.times_s, np.stack([write_custom.far(p) for p in scene.ego.world_from_ego]))
-    )
+    moved = np.stack([write_custom.far(pose) for pose in scene.ego.world_from_ego])
+    away = replace(scene, ego=EgoPath(scene.ego.times_s, moved))
     assert "float32 rounds points there to 500 mm" in warnings(away, "world")

@@ -10,8 +10,9 @@ import os
 import shutil
 import struct
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -46,15 +47,15 @@ try:
     REASON = ""
 except ResourceError as missing:
     REASON = str(missing)
+Sides = tuple[tuple[int, int], tuple[int, int], Any]
+"""Size, principal point and shutter of a camera."""
 needs_package = pytest.mark.skipif(bool(REASON), reason="the package nvidia-ncore is not installed")
 pytestmark = [needs_native, pytest.mark.filterwarnings("ignore::DeprecationWarning")]
 
 
 def records(scene: Scene, **changes: Any) -> LogRecords:
-    files = open_files(scene.root)
-    return LogRecords(
-        replace(scene, **changes), lambda frame: files.read(frame.image.path), lambda sweep: read_points(scene, sweep)
-    )
+    files, changed = open_files(scene.root), replace(scene, **changes)
+    return LogRecords(changed, lambda frame: files.read(frame.image.path), lambda sweep: read_points(scene, sweep))
 
 
 @pytest.fixture(scope="module")
@@ -81,9 +82,8 @@ def test_points_fall_on_their_pixels_by_the_packages_own_projection(truth: Scene
     points = np.random.default_rng(0).uniform([8, -12, -1], [30, 12, 4], (200, 3))
     for index, frame in enumerate(truth.frames_of("front_left")):
         sensor = loaded.get_camera_sensor("front_left")
-        model = package().sensors.CameraModel.from_parameters(
-            sensor.model_parameters, device="cpu", dtype=torch.float64
-        )
+        parameters = sensor.model_parameters
+        model = package().sensors.CameraModel.from_parameters(parameters, device="cpu", dtype=torch.float64)
         at = sensor.frames_timestamps_us[index].astype(np.uint64)
         assert at[0] == at[1] == round(frame.view.time_s * 1e6) - round(truth.ego.times_s[0] * 1e6) + 1_000_000
         pose = loaded.pose_graph.evaluate_poses("world", "front_left", at[1])
@@ -122,9 +122,8 @@ def test_boxes_stand_where_the_package_puts_them(truth: Scene, loaded: Any) -> N
         expected = track.pose_at((one.timestamp_us - zero) / 1e6)
         assert expected is not None
         assert one.class_id == track.label and one.bbox3.dim == tuple(track.size_m)
-        assert (
-            np.abs(bbox_pose(np.array([*one.bbox3.centroid, *one.bbox3.dim, *one.bbox3.rot])) - expected).max() < 1e-9
-        )
+        placed = bbox_pose(np.array([*one.bbox3.centroid, *one.bbox3.dim, *one.bbox3.rot]))
+        assert np.abs(placed - expected).max() < 1e-9
         assert one.source.name == "GT_SYNTHETIC"
 
 
@@ -222,19 +221,9 @@ def test_other_peoples_recordings(truth: Scene, tmp_path: Path) -> None:
     poses.store_static_pose("camera:front wide", "rig", mount)
     poses.store_static_pose("top", "rig", geometry.from_rotation_translation(np.eye(3), (0, 0, 2.0)).astype(np.float32))
     intrinsics = writer.register_component_writer(v4.IntrinsicsComponent.Writer, "mine")
-    intrinsics.store_camera_intrinsics(
-        "camera:front wide",
-        data.OpenCVPinholeCameraModelParameters(
-            resolution=np.array([96, 64], np.uint64),
-            shutter_type=data.ShutterType.ROLLING_LEFT_TO_RIGHT,
-            external_distortion_parameters=None,
-            principal_point=np.array([48, 32], np.float32),
-            focal_length=np.array([80, 80], np.float32),
-            radial_coeffs=np.array([-0.2, 0.02, 0, 0, 0, 0], np.float32),
-            tangential_coeffs=np.zeros(2, np.float32),
-            thin_prism_coeffs=np.zeros(4, np.float32),
-        ),
-    )
+    sides = (96, 64), (48, 32), data.ShutterType.ROLLING_LEFT_TO_RIGHT
+    lens = opencv_pinhole(sides, (80, 80), (-0.2, 0.02, 0, 0, 0, 0), (0, 0))
+    intrinsics.store_camera_intrinsics("camera:front wide", lens)
     camera = writer.register_component_writer(v4.CameraSensorComponent.Writer, "camera:front wide", "front")
     image = open_files(truth.root).read(truth.frames[0].image.path)
     for end in (1_100_000, 1_300_000):
@@ -245,29 +234,23 @@ def test_other_peoples_recordings(truth: Scene, tmp_path: Path) -> None:
     times, span = np.array([1_200_000, 1_250_000, 1_300_000], np.uint64), np.array([1_200_000, 1_300_000], np.uint64)
     lidar.store_frame(rays, times, None, distance, (0 * distance + 0.5).astype(np.float32), span, {}, {})
     box = data.BBox3((8.0, 1.0, -1.0), (4.5, 1.9, 1.6), (0.0, 0.0, 0.3))
-    writer.register_component_writer(v4.CuboidsComponent.Writer, "mine").store_observations(
-        [
-            data.CuboidTrackObservation("a", "automobile", at, "top", at, box, data.LabelSource.AUTOLABEL)
-            for at in (1_100_000, 1_300_000)
-        ]
-    )
+    made = partial(data.CuboidTrackObservation, "a", "automobile")
+    seen = [made(at, "top", at, box, data.LabelSource.AUTOLABEL) for at in (1_100_000, 1_300_000)]
+    writer.register_component_writer(v4.CuboidsComponent.Writer, "mine").store_observations(seen)
     writer.finalize()
 
     scene = ingest(tmp_path, tmp_path / "back", test_every=0)
     name = "camera_front_wide"
     assert list(scene.cameras) == [name] and scene.cameras[name].readout_s == pytest.approx(0.02)
-    assert any("rectified" in note for note in scene.source.notes) and any(
-        "left to right" in note for note in scene.source.notes
-    )
+    assert all(word in "\n".join(scene.source.notes) for word in ("rectified", "left to right"))
     assert scene.source.licence.startswith("not stated")
     tree = package().transformations.PoseGraphInterpolator
     roof = geometry.from_rotation_translation(np.eye(3), (0, 0, 2.0))
     graph = tree([tree.Edge("rig", "world", path.astype(np.float64), keys), tree.Edge("top", "rig", roof, None)])
     turned = [graph.evaluate_poses("top", "world", np.array(at)) for at in (1_200_000, 1_250_000, 1_100_000, 1_300_000)]
     world = geometry.invert(_origin(scene, path, keys))
-    expected = np.stack(
-        [(turned[0] @ [10, 0, 0, 1])[:3], (turned[1] @ [0, 20, 0, 1])[:3], (turned[0] @ [12, 0, 0, 1])[:3]]
-    )
+    returns = ((turned[0], (10, 0, 0, 1)), (turned[1], (0, 20, 0, 1)), (turned[0], (12, 0, 0, 1)))
+    expected = np.stack([(pose @ place)[:3] for pose, place in returns])
     sweep = scene.sweeps[0]
     found = geometry.transform_points(sweep.world_from_lidar, read_points(scene, sweep).xyz.astype(np.float64))
     assert np.abs(found - geometry.transform_points(world, expected)).max() < 1e-5
@@ -279,44 +262,43 @@ def test_other_peoples_recordings(truth: Scene, tmp_path: Path) -> None:
         assert stands is not None and np.abs(stands - placed).max() < 1e-5
 
 
+def geometry_of(sides: Sides) -> dict[str, Any]:
+    size, point, shutter = sides
+    point = np.array(point, np.float32)
+    return {"resolution": np.array(size, np.uint64), "shutter_type": shutter, "principal_point": point} | {
+        "external_distortion_parameters": None
+    }
+
+
+def opencv_pinhole(sides: Sides, focal: Sequence[float], radial: Sequence[float], tangential: Sequence[float]) -> Any:
+    names = ("focal_length", "radial_coeffs", "tangential_coeffs", "thin_prism_coeffs")
+    values = (np.array(one, np.float32) for one in (focal, radial, tangential, (0, 0, 0, 0)))
+    return package().data.OpenCVPinholeCameraModelParameters(
+        **geometry_of(sides), **dict(zip(names, values, strict=True))
+    )
+
+
 @needs_package
 @pytest.mark.parametrize("kind", ["opencv-pinhole", "opencv-fisheye", "ftheta"])
 def test_lenses_are_the_packages_own_and_fit_a_pinhole_camera(kind: str) -> None:
     """Projections against this program's own formulas; a lens of 120 degrees loses its rim, not its scale."""
     data = package().data
-    size, point, focal = (
-        np.array([960, 604], np.uint64),
-        np.array([470, 310], np.float32),
-        np.array([440, 442], np.float32),
-    )
-    common = {
-        "resolution": size,
-        "shutter_type": data.ShutterType.GLOBAL,
-        "external_distortion_parameters": None,
-        "principal_point": point,
-    }
+    sides = (960, 604), (470, 310), data.ShutterType.GLOBAL
+    focal = np.array([440, 442], np.float32)
     if kind == "opencv-pinhole":
-        radial, tangential = np.array([-0.1, 0.01, 0, 0, 0, 0], np.float32), np.array([1e-3, -2e-3], np.float32)
-        model = data.OpenCVPinholeCameraModelParameters(
-            **common,
-            focal_length=focal,
-            radial_coeffs=radial,
-            tangential_coeffs=tangential,
-            thin_prism_coeffs=np.zeros(4, np.float32),
-        )
-        wanted = brown_conrady(*map(float, radial[:2]), *map(float, tangential))
+        radial, tangential = (-0.1, 0.01, 0, 0, 0, 0), (1e-3, -2e-3)
+        model = opencv_pinhole(sides, focal, radial, tangential)
+        wanted = brown_conrady(*map(float, np.array([*radial[:2], *tangential], np.float32)))
     elif kind == "opencv-fisheye":
-        bend = np.array([0.02, -0.003, 0, 0], np.float32)
+        common, bend = geometry_of(sides), np.array([0.02, -0.003, 0, 0], np.float32)
         model = data.OpenCVFisheyeCameraModelParameters(**common, focal_length=focal, radial_coeffs=bend, max_angle=1.3)
         wanted = equidistant(*map(float, bend))
     else:
-        model = data.FThetaCameraModelParameters(
-            **common,
-            reference_poly=data.FThetaCameraModelParameters.PolynomialType.ANGLE_TO_PIXELDIST,
-            max_angle=1.2,
-            pixeldist_to_angle_poly=np.array([0, 1 / 442, 0, 0, 0, 0], np.float32),
-            angle_to_pixeldist_poly=np.array([0, 442, 0, 0, 0, 0], np.float32),
-        )
+        theta = data.FThetaCameraModelParameters
+        way, there, back = theta.PolynomialType.ANGLE_TO_PIXELDIST, np.zeros(6, np.float32), np.zeros(6, np.float32)
+        there[1], back[1] = 442, 1 / 442
+        polynomials = {"pixeldist_to_angle_poly": back, "angle_to_pixeldist_poly": there}
+        model = theta(**geometry_of(sides), reference_poly=way, max_angle=1.2, **polynomials)
         wanted = equidistant()
     like = model.paraxial_pinhole_geometry()
     (fx, fy), (cx, cy) = like.focal_length.tolist(), like.principal_point.tolist()
@@ -338,13 +320,8 @@ def _origin(scene: Scene, path: np.ndarray, keys: np.ndarray) -> np.ndarray:
 
 
 def test_names_of_sensors_are_apart() -> None:
-    assert sensor_ids(["front", "rig"], ["front", "world", "top"]) == {
-        "camera/front": "front",
-        "camera/rig": "camera_rig",
-        "lidar/front": "lidar_front",
-        "lidar/world": "lidar_world",
-        "lidar/top": "top",
-    }
+    ids = {"camera/front": "front", "camera/rig": "camera_rig", "lidar/front": "lidar_front", "lidar/top": "top"}
+    assert sensor_ids(["front", "rig"], ["front", "world", "top"]) == ids | {"lidar/world": "lidar_world"}
 
 
 def test_a_path_that_is_too_short_goes_on_and_then_stands() -> None:
@@ -376,9 +353,11 @@ def test_what_cannot_be_written_is_refused(truth: Scene, tmp_path: Path) -> None
     refused("front/000099", write_ncore, tmp_path, records(truth, frames=(*truth.frames, twice)))
     early = replace(truth, sweeps=truth.sweeps[:1])
     reads = records(early)
-    late = LogRecords(
-        early, reads.picture, lambda sweep: replace(reads.points(sweep), dt_s=reads.points(sweep).dt_s - 3)
-    )
+
+    def late_points(sweep: Any) -> SweepPoints:
+        return replace(reads.points(sweep), dt_s=reads.points(sweep).dt_s - 3)
+
+    late = LogRecords(early, reads.picture, late_points)
     refused("more than a second", write_ncore, tmp_path, late)
     assert not list(tmp_path.iterdir())
 
@@ -423,44 +402,23 @@ def _itar(members: dict[str, bytes], metadata: dict[str, Any], index: dict[str, 
     """A store made by hand."""
     import cbor2
 
-    members = {
-        **members,
-        ".zmetadata.cbor.xz": lzma.compress(cbor2.dumps({"zarr_consolidated_format": 1, "metadata": metadata})),
-    }
+    packed = lzma.compress(cbor2.dumps({"zarr_consolidated_format": 1, "metadata": metadata}))
+    members = {**members, ".zmetadata.cbor.xz": packed}
     content, places = b"", []
     for name, body in members.items():
         places.append((name, len(content) + 512, len(body)))
         content += b"\0" * 512 + body + b"\0" * (-len(body) % 512)
-    table = index or {
-        "items": [p[0] for p in places],
-        "offset_datas": [p[1] for p in places],
-        "sizes": [p[2] for p in places],
-    }
+    names, offsets, sizes = zip(*places, strict=True)
+    table = index or {"items": list(names), "offset_datas": list(offsets), "sizes": list(sizes)}
     packed = lzma.compress(cbor2.dumps(table))
     end = struct.pack("<4sIQI", b"itar", 1, len(content), len(packed)).ljust(512, b"\0")
     return content + packed + b"\0" * (-len(packed) % 512) + end
 
 
-ROOT = {
-    ".zgroup": {"zarr_format": 2},
-    ".zattrs": {
-        "version": "v4",
-        "sequence_id": "a",
-        "sequence_timestamp_interval_us": {"start": 0, "stop": 9},
-        "generic_meta_data": {},
-        "component_group_name": "",
-    },
-}
-ARRAY = {
-    "zarr_format": 2,
-    "shape": [4],
-    "chunks": [4],
-    "dtype": "<f4",
-    "compressor": None,
-    "fill_value": 0,
-    "order": "C",
-    "filters": None,
-}
+ABOUT = {"version": "v4", "sequence_id": "a", "generic_meta_data": {}, "component_group_name": ""}
+ROOT = {".zgroup": {"zarr_format": 2}, ".zattrs": ABOUT | {"sequence_timestamp_interval_us": {"start": 0, "stop": 9}}}
+ARRAY = {"zarr_format": 2, "shape": [4], "chunks": [4], "dtype": "<f4", "order": "C", "fill_value": 0}
+ARRAY |= {"compressor": None, "filters": None}
 
 
 def _hostile(kind: str) -> bytes:
@@ -483,10 +441,8 @@ def _hostile(kind: str) -> bytes:
     elif kind == "another codec":
         metadata["x/.zarray"] = {**ARRAY, "compressor": {"id": "zlib", "level": 9}}
     elif kind == "chunk that says it is larger":
-        metadata["x/.zarray"] = {
-            **ARRAY,
-            "compressor": {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 2, "blocksize": 0},
-        }
+        blosc = {"id": "blosc", "cname": "lz4", "clevel": 5, "shuffle": 2, "blocksize": 0}
+        metadata["x/.zarray"] = {**ARRAY, "compressor": blosc}
         members = {"x/0": struct.pack("<4B3I", 2, 1, 0x21, 4, 1 << 31, 1 << 20, 64).ljust(64, b"\0")}
     elif kind == "member outside":
         return _itar(members, metadata, {"items": ["a"], "offset_datas": [1 << 50], "sizes": [10]})
@@ -576,8 +532,7 @@ def test_every_chunk_of_the_grid_must_be_there(
     about = {**ARRAY, "shape": shape, "chunks": chunks}
     (tmp_path / "chunk").write_bytes(bytes(4 * int(np.prod(chunks))))
     stored = container._StoredMember(tmp_path / "chunk", 0, 4 * int(np.prod(chunks)))
-    problem = contextlib.nullcontext() if not lost else pytest.raises(InputError, match=f"missing(?s:.*)x/{lost}")
-    with problem:
+    with pytest.raises(InputError, match=f"missing(?s:.*)x/{lost}") if lost else contextlib.nullcontext():
         container._check_array(about, dict.fromkeys(there, stored), "x")
 
 
@@ -602,9 +557,8 @@ def test_components_and_entries_of_others_are_named_once(
     assert "passed over" not in capsys.readouterr().err
     folder = tmp_path / "log"
     folder.mkdir()
-    altered(
-        recording, folder, lambda metadata: metadata.update({f"thermal/{n}/.zgroup": {"zarr_format": 2} for n in "ab"})
-    )
+    thermal = {f"thermal/{n}/.zgroup": {"zarr_format": 2} for n in "ab"}
+    altered(recording, folder, lambda metadata: metadata.update(thermal))
     listed = json.loads(next(recording.glob("*.json")).read_text())
     listed["component_stores"][0]["sha256"] = ""
     (folder / "a.json").write_text(json.dumps(listed))
@@ -695,10 +649,8 @@ def test_rays_of_distance_0_are_no_points_and_are_counted(recording: Path, tmp_p
     values[:, :100] = 0.0
     distance[:] = values
     scene = ingest(tmp_path, tmp_path / "out")
-    assert (
-        sum(len(read_points(scene, sweep).xyz) for sweep in scene.sweeps)
-        == sum(len(read_points(whole, sweep).xyz) for sweep in whole.sweeps) - 100
-    )
+    left, all_points = (sum(len(read_points(one, sweep).xyz) for sweep in one.sweeps) for one in (scene, whole))
+    assert left == all_points - 100
     assert any("100 " in note and "return" in note for note in scene.source.notes), scene.source.notes
 
 
@@ -713,11 +665,8 @@ def test_every_cut_and_flipped_bytes_end_in_words(recording: Path, tmp_path: Pat
     for length in [0, 1, 511, 512, len(content) - 512, len(content) - 1, *rng.integers(513, len(content), 8).tolist()]:
         target.write_bytes(content[:length])
         roundtrip.assert_refused(ingest, target.parent, tmp_path / "cut", ".")
-    places = [
-        *rng.integers(0, len(content), 12).tolist(),
-        *rng.integers(len(content) - 6000, len(content) - 400, 12).tolist(),
-    ]
-    for number, at in enumerate(places):
+    places = (rng.integers(0, len(content), 12), rng.integers(len(content) - 6000, len(content) - 400, 12))
+    for number, at in enumerate(np.concatenate(places).tolist()):
         flipped = bytearray(content)
         flipped[at] ^= 1 << int(rng.integers(8))
         target.write_bytes(bytes(flipped))

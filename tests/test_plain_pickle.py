@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pandas_pickles
 import pytest
-from bad_logs import refused
+from bad_logs import Asks, refused
 
 from mudg.base import plain_pickle
 from mudg.base.errors import InputError
@@ -25,15 +25,8 @@ GOLDEN = Path(__file__).parent / "golden"
 def made(rng: np.random.Generator, depth: int) -> Any:
     """Some plain value."""
     kind = int(rng.integers(0, 10 if depth else 7))
-    leaves = (
-        None,
-        bool(rng.integers(2)),
-        int(rng.integers(-(2**62), 2**62)) ** 3,
-        float(rng.normal()),
-        "gr\u00fcn\U0001f697",
-        b"\x00\xff",
-        int(rng.integers(-300, 70000)),
-    )
+    flag, long, real = bool(rng.integers(2)), int(rng.integers(-(2**62), 2**62)) ** 3, float(rng.normal())
+    leaves = (None, flag, long, real, "gr\u00fcn\U0001f697", b"\x00\xff", int(rng.integers(-300, 70000)))
     if kind < 7:
         return leaves[kind]
     inner = [made(rng, depth - 1) for _ in range(int(rng.integers(0, 4)))]
@@ -100,16 +93,6 @@ def test_the_writer_of_these_tests_writes_what_pandas_does(new: bool) -> None:
 
 
 # --- nothing is run -------------------------------------------------------------------------------
-
-
-class Asks:
-    """Pickles as a call of ``function``."""
-
-    def __init__(self, function: Any, *arguments: Any) -> None:
-        self.call = (function, arguments)
-
-    def __reduce__(self) -> Any:
-        return self.call
 
 
 @pytest.mark.parametrize("protocol", range(6))
@@ -189,18 +172,12 @@ def test_flipped_bytes_give_a_table_or_an_error_in_words() -> None:
 
 def array_pickle(shape: bytes, kind: bytes, data: bytes) -> bytes:
     """An array in protocol 4 with any shape (as opcodes) and bytes."""
-    return (
-        b"\x80\x04\x8c\x15numpy.core.multiarray\x8c\x0c_reconstruct\x93"
-        b"\x8c\x05numpy\x8c\x07ndarray\x93K\x00\x85C\x01b\x87R"
-        b"(K\x01"
-        + shape
-        + b"\x8c\x05numpy\x8c\x05dtype\x93\x8c\x02"
-        + kind
-        + b"\x89\x88\x87R(K\x03\x8c\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89C"
-        + bytes([len(data)])
-        + data
-        + b"tb."
+    head = (
+        b"\x80\x04\x8c\x15numpy.core.multiarray\x8c\x0c_reconstruct\x93\x8c\x05numpy\x8c\x07ndarray\x93K\x00\x85C\x01b"
     )
+    head += b"\x87R(K\x01" + shape + b"\x8c\x05numpy\x8c\x05dtype\x93\x8c\x02" + kind
+    order = b"\x89\x88\x87R(K\x03\x8c\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89C"
+    return head + order + bytes([len(data)]) + data + b"tb."
 
 
 def test_the_array_of_this_test_is_one() -> None:

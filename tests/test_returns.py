@@ -181,10 +181,8 @@ def test_zeros_in_every_form_of_cloud(suffix: str, tmp_path: Path, tmp_path_fact
     truth = bad_logs.city(bad_logs.shared(tmp_path_factory) / "truth")
     log = write_custom.write_log(truth, tmp_path / "log", suffix)
     points = read_points(truth, truth.sweeps[0])
-    half = np.zeros((len(points.xyz), 3), np.float32)
-    with_zeros = SweepPoints(
-        np.stack([points.xyz, half], 1).reshape(-1, 3), np.repeat(points.intensity, 2), np.repeat(points.dt_s, 2)
-    )
+    xyz = np.stack([points.xyz, np.zeros_like(points.xyz)], 1).reshape(-1, 3)
+    with_zeros = SweepPoints(xyz, np.repeat(points.intensity, 2), np.repeat(points.dt_s, 2))
     (log / "lidar" / f"{truth.sweeps[0].id}{suffix}").write_bytes(write_custom.CLOUDS[suffix](with_zeros))
     scene = bad_logs.ingest("custom", log, tmp_path / "scene", bad_logs.ImportOptions())
     assert np.allclose(read_points(scene, scene.sweeps[0]).xyz, points.xyz, atol=1e-5)
@@ -232,10 +230,8 @@ def test_zeros_of_merged_lidars_lie_at_their_mounts(tmp_path: Path, tmp_path_fac
     mount = invert(ego) @ truth.sweeps[0].world_from_lidar
     side = mount[:3, 3] + [0.5, 0.8, -1.0]
     with sqlite3.connect(database) as connection:
-        connection.execute(
-            "INSERT INTO lidar (token, channel, translation, rotation) VALUES (?, ?, ?, ?)",
-            (b"side", "side", pickle.dumps(side.tolist()), pickle.dumps([1.0, 0.0, 0.0, 0.0])),
-        )
+        values = b"side", "side", pickle.dumps(side.tolist()), pickle.dumps([1.0, 0.0, 0.0, 0.0])
+        connection.execute("INSERT INTO lidar (token, channel, translation, rotation) VALUES (?, ?, ?, ?)", values)
     connection.close()
     cloud = bad_logs.second(tmp_path / "log" / "sensor_blobs" / write_nuplan.LOG / "MergedPointCloud")
     pcd(mount[:3, :3].T @ (side - mount[:3, 3]))(cloud)

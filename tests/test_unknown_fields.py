@@ -37,6 +37,10 @@ Adder = Callable[[Path, Sequence[str]], object]
 pytestmark = needs_native
 
 
+def passed_over(names: str, kind: str) -> str:
+    return f"passed over: {names} in {kind}, which this program does not know"
+
+
 def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
     """Lines on stderr about what was passed over."""
     return [line for line in capsys.readouterr().err.splitlines() if "passed over" in line]
@@ -63,9 +67,8 @@ def to_frames(root: Path, names: Sequence[str]) -> None:
     while place < len(content):
         (size,) = struct.unpack_from("<Q", content, place)
         payload = content[place + 12 : place + 12 + size]
-        records.append(
-            write_waymo.record(payload + b"".join(write_waymo.text(int(name.split()[-1]), b"") for name in names))
-        )
+        more = b"".join(write_waymo.text(int(name.split()[-1]), b"") for name in names)
+        records.append(write_waymo.record(payload + more))
         place += 16 + size
     path.write_bytes(b"".join(records))
 
@@ -122,26 +125,14 @@ def to_clouds(root: Path, names: Sequence[str]) -> None:
         np.savez(path, **{**arrays, **dict.fromkeys(names, np.zeros(len(arrays["xyz"])))})
 
 
+OBJECT_FIELDS = ("category", "semanticId_orig", "dynamicSeq", "dynamicIdx", "level_min", "level_max", "color")
+BOX_COLUMNS = ("num_lidar_points_in_box", "speed.x", "difficulty_level.detection")
+BOX_COLUMNS = (*(f"[LiDARBoxComponent].{name}" for name in BOX_COLUMNS), "index")
 CASES: dict[str, tuple[Adder, Sequence[str], str, str]] = {
     "kitti": (to_calibration, ("calib_time",), "foo", "calib.txt"),
-    "kitti360": (
-        to_objects,
-        ("category", "semanticId_orig", "dynamicSeq", "dynamicIdx", "level_min", "level_max", "color"),
-        "foo",
-        "2013_05_28_drive_0003_sync.xml",
-    ),
+    "kitti360": (to_objects, OBJECT_FIELDS, "foo", "2013_05_28_drive_0003_sync.xml"),
     "waymo v1": (to_frames, ("7", "8", "9", "10", "11"), "field 1000", "Frame messages"),
-    "waymo v2": (
-        to_boxes_of_waymo,
-        (
-            "[LiDARBoxComponent].num_lidar_points_in_box",
-            "[LiDARBoxComponent].speed.x",
-            "[LiDARBoxComponent].difficulty_level.detection",
-            "index",
-        ),
-        "[LiDARBoxComponent].foo",
-        "lidar_box/*.parquet",
-    ),
+    "waymo v2": (to_boxes_of_waymo, BOX_COLUMNS, "[LiDARBoxComponent].foo", "lidar_box/*.parquet"),
     "nuscenes": (to_rows, ("visibility_token", "num_radar_pts", "next", "prev"), "foo", "sample_annotation.json"),
     "argoverse2": (to_sweeps, ("laser_number",), "foo", "sensors/lidar/*.feather"),
     "pandaset": (to_poses, (), "foo", "poses.json"),
@@ -167,18 +158,14 @@ def copied(kind: str, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) 
     if not isinstance(files, bad_logs.Files):
         bad_logs.write_waymo_log(files, kind, tmp_path / "log")
         return tmp_path / "log", options
-    folder = (
-        files.source
-        if files.source.is_dir()
-        else next(p for p in files.source.parents if (p / "sensor_blobs").is_dir())
-    )
+    folders = (files.source, *files.source.parents)
+    folder = next(p for p in folders if (p / "sensor_blobs" if kind == "nuplan" else p).is_dir())
     return Path(shutil.copytree(folder, tmp_path / "log")), options
 
 
 def source_of(kind: str, root: Path) -> Path:
-    return (
-        next(root.rglob("*.db")) if kind == "nuplan" else next(root.glob("*.tfrecord")) if kind == "waymo v1" else root
-    )
+    pattern = {"nuplan": "**/*.db", "waymo v1": "*.tfrecord"}.get(kind)
+    return next(root.glob(pattern)) if pattern else root
 
 
 def test_an_official_log_is_imported_without_a_word_and_an_unknown_field_is_named_once(
@@ -191,7 +178,7 @@ def test_an_official_log_is_imported_without_a_word_and_an_unknown_field_is_name
     add(root, [unknown])
     for name in ("once", "again"):  # each import of a process says it
         bad_logs.ingest(kind, source_of(kind, root), tmp_path / name, options)
-        assert said(capsys) == [f"passed over: '{unknown}' in {called}, which this program does not know"]
+        assert said(capsys) == [passed_over(f"'{unknown}'", called)]
 
 
 @pytest.mark.parametrize("kind", ["nuscenes"], indirect=True)
@@ -203,10 +190,7 @@ def test_each_kind_of_file_has_its_line_also_where_the_import_fails(
     to_rows(root, ["translatoin"], "ego_pose")
     write_nuscenes.edit(root, "ego_pose", lambda rows: rows[0].pop("translation"))
     refused("'translation' is missing", bad_logs.ingest, "nuscenes", root, tmp_path / "out", options)
-    assert said(capsys) == [
-        "passed over: 'foo' in sample_data.json, which this program does not know",
-        "passed over: 'translatoin' in ego_pose.json, which this program does not know",
-    ]
+    assert said(capsys) == [passed_over("'foo'", "sample_data.json"), passed_over("'translatoin'", "ego_pose.json")]
 
 
 @pytest.mark.parametrize("kind", ["nuscenes"], indirect=True)
@@ -214,9 +198,8 @@ def test_hostile_names_are_short_plain_and_few(
     copied: tuple[Path, ImportOptions], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root, options = copied
-    to_rows(
-        root, ["\x1b]0;title\x07\nwarning: forged\u202e", "a" * 100_000, *(f"field{number}" for number in range(5000))]
-    )
+    many = (f"field{number}" for number in range(5000))
+    to_rows(root, ["\x1b]0;title\x07\nwarning: forged\u202e", "a" * 100_000, *many])
     bad_logs.ingest("nuscenes", root, tmp_path / "out", options)
     (line,) = said(capsys)
     assert line.startswith(r"passed over: '\x1b]0;title\x07\nwarning: forged\u202e', 'aaaa")
@@ -251,16 +234,11 @@ def test_fields_that_a_custom_log_names_are_known_whatever_they_are_called(
 def test_tracklets_of_a_raw_drive(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     drive = kitti_folders.write_raw_drive(tmp_path / "2011_09_26")
     path = drive / "tracklet_labels.xml"
-    official = (
-        path.read_text()
-        .replace("</poses>", "<item_version>2</item_version></poses><finished>1</finished>")
-        .replace(
-            "</rz>",
-            "</rz><state>2</state><occlusion>0</occlusion><occlusion_kf>0</occlusion_kf><truncation>0</truncation>"
-            "<amt_occlusion>-1</amt_occlusion><amt_occlusion_kf>-1</amt_occlusion_kf><amt_border_l>-1</amt_border_l>"
-            "<amt_border_r>-1</amt_border_r><amt_border_kf>-1</amt_border_kf>",
-        )
+    fields = (
+        "state occlusion occlusion_kf truncation amt_occlusion amt_occlusion_kf amt_border_l amt_border_r amt_border_kf"
     )
+    official = path.read_text().replace("</rz>", "</rz>" + "".join(f"<{name}>0</{name}>" for name in fields.split()))
+    official = official.replace("</poses>", "<item_version>2</item_version></poses><finished>1</finished>")
     path.write_text(official)
     IMPORTERS["kitti"](drive, tmp_path / "official", ImportOptions())
     assert said(capsys) == []
