@@ -22,6 +22,7 @@ from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES, DISPLAY_COLORS, ID
 from mudg.base.types import Frame, PointCloud, Scene, Sweep, SweepPoints, Track, View
 from mudg.base.versions import version
+from mudg.formats.splats.cloud import each_once
 
 NANO: Final = 1_000_000_000
 CHUNK_BYTES: Final = 4 << 20
@@ -514,18 +515,10 @@ def bag_metadata(topics: Mapping[str, tuple[str, int]], span: tuple[int, int]) -
     """
     start, length = {"nanoseconds_since_epoch": span[0]}, {"nanoseconds": span[1] - span[0]}
     total = sum(count for _, count in topics.values())
-    listed = [
-        {
-            "topic_metadata": {
-                "name": topic,
-                "type": kind,
-                "serialization_format": "cdr",
-                "offered_qos_profiles": _qos(topic),
-            },
-            "message_count": count,
-        }
-        for topic, (kind, count) in topics.items()
-    ]
+    listed = []
+    for topic, (kind, count) in topics.items():
+        about = {"name": topic, "type": kind, "serialization_format": "cdr", "offered_qos_profiles": _qos(topic)}
+        listed.append({"topic_metadata": about, "message_count": count})
     about = {
         "version": 5,
         "storage_identifier": "mcap",
@@ -561,16 +554,9 @@ def _qos(topic: str) -> str:
 
 def ros_names(names: Iterable[str]) -> dict[str, str]:
     """Names that ROS accepts as a part of topics (letters, digits, single underscores, a letter first), each once."""
-    made: dict[str, str] = {}
-    for name in names:
-        plain = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "sensor"
-        plain = f"n{plain}" if plain[0].isdigit() else plain
-        chosen, count = plain, 1
-        while chosen in made.values():
-            count += 1
-            chosen = f"{plain}_{count}"
-        made[name] = chosen
-    return made
+    names = list(names)
+    plain = (re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "sensor" for name in names)
+    return dict(zip(names, each_once(f"n{name}" if name[0].isdigit() else name for name in plain)))
 
 
 def ros_types() -> Any:

@@ -60,12 +60,8 @@ class _Buffer:
         content = rows.tobytes()
         view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(content)}
         self.views.append(view | ({"target": 34962} if vertices else {}))
-        accessor = {
-            "bufferView": len(self.views) - 1,
-            "componentType": FLOAT,
-            "count": len(rows),
-            "type": _SHAPES[width],
-        }
+        accessor: dict[str, Any] = {"bufferView": len(self.views) - 1, "componentType": FLOAT, "count": len(rows)}
+        accessor["type"] = _SHAPES[width]
         if bounds:
             low, high = rows.reshape(len(rows), -1).min(0), rows.reshape(len(rows), -1).max(0)
             accessor |= {"min": low.astype(float).tolist(), "max": high.astype(float).tolist()}
@@ -127,12 +123,8 @@ def _primitive(buffer: _Buffer, cloud: SplatCloud) -> dict[str, Any]:
     for degree in range(cloud.degree + 1):
         for order in range(2 * degree + 1):
             attributes[f"{PREFIX}SH_DEGREE_{degree}_COEF_{order}"] = buffer.add(cloud.sh[:, degree**2 + order])
-    kind = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "projection": "perspective",
-        "sortingMethod": "cameraDistance",
-    }
+    kind = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    kind |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
     return {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kind}}
 
 
@@ -260,7 +252,10 @@ def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
     if np.array_equal(matrix, np.eye(4)):
         return cloud
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    if not np.isfinite(scale) or scale <= 0 or geometry.rigid_problem(rigid := _without_scale(matrix, scale), 1e-3):
+    rigid = matrix.copy()
+    if np.isfinite(scale) and scale > 0:
+        rigid[:3, :3] /= scale
+    if not np.isfinite(scale) or scale <= 0 or geometry.rigid_problem(rigid, 1e-3):
         what = "a node of the GLB file is mirrored or scaled unevenly"
         remedy = "apply the scale of the node to its Gaussians in the program that wrote the file"
         raise InputError(what, where=where, got=str(matrix[:3, :3].tolist()), remedy=remedy)
@@ -268,12 +263,6 @@ def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
         logs = (cloud.log_scales + np.float32(np.log(scale))).astype(np.float32)
         cloud = checked(replace(cloud, means=cloud.means * scale, log_scales=logs), where)
     return cloud.moved(rigid)
-
-
-def _without_scale(matrix: Array, scale: float) -> Array:
-    rigid = matrix.copy()
-    rigid[:3, :3] /= scale
-    return rigid
 
 
 class _GlbFile:
@@ -474,14 +463,8 @@ class _GlbFile:
         if degrees != list(range(len(degrees))) or not degrees:
             what = "the harmonics of a primitive leave a degree out"
             raise InputError(what, where=f"{self.where}: JSON", got=str(degrees))
-        sh = np.stack(
-            [
-                self.values(attributes, f"{PREFIX}SH_DEGREE_{d}_COEF_{n}", 3, count)
-                for d in degrees
-                for n in range(2 * d + 1)
-            ],
-            1,
-        )
+        bands = [f"{PREFIX}SH_DEGREE_{degree}_COEF_{order}" for degree in degrees for order in range(2 * degree + 1)]
+        sh = np.stack([self.values(attributes, band, 3, count) for band in bands], 1)
         if _LINEAR.get(str(space), False):
             sh = _of_display(sh)
         read = tuple(f"{PREFIX}SH_DEGREE_{d}_" for d in degrees)
@@ -489,10 +472,8 @@ class _GlbFile:
         if beyond:
             self.warnings[f"harmonics beyond degree 3 were dropped: {listed(beyond)}"] = None
         self.step_m = max(self.step_m, spacing_m(means))
-        quats, logs, logits, sh = (
-            values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)
-        )
-        return checked(SplatCloud(means, quats, logs, logits, sh), self.where)
+        columns = [values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)]
+        return checked(SplatCloud(means, *columns), self.where)
 
     def _logits_and_logs(self, opacity: Array, scale: Array) -> tuple[NDArray[np.floating], Array]:
         """Logits f64[n] and logarithms f64[n, 3]; a program that is known for it wrote these in place of opacities and

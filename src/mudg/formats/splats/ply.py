@@ -64,7 +64,7 @@ _REST: Final = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 """Number of ``f_rest`` columns: degree."""
 
 
-def to_bytes(cloud: SplatCloud, *, classes: bool = False, marks: Sequence[str] = ()) -> bytes:
+def to_bytes(cloud: SplatCloud, classes: bool = False, marks: Sequence[str] = ()) -> bytes:
     """A cloud as a PLY file; ``classes`` adds the column of our own, ``marks`` are comments (``marks_of``)."""
     with_classes = classes and cloud.class_ids is not None
     columns = [cloud.means, np.zeros_like(cloud.means), cloud.sh[:, 0], channel_major(cloud.sh)]
