@@ -267,17 +267,8 @@ class SceneWriter:
         frames = sorted(self._frames.values(), key=lambda f: (f.view.time_s, order[f.view.camera.name]))
         sweeps = sorted(self._sweeps.values(), key=lambda s: (s.time_s, s.sensor))
         split: dict[str, Literal["train", "test"]] = {**dict.fromkeys((f.id for f in frames), "train"), **self._split}
-        scene = Scene(
-            self._scene_id,
-            str(self.root),
-            self._cameras,
-            tuple(frames),
-            tuple(sweeps),
-            tuple(self._tracks.values()),
-            self._ego,
-            split,
-            self._source,
-        )
+        records = (self._cameras, tuple(frames), tuple(sweeps), tuple(self._tracks.values()))
+        scene = Scene(self._scene_id, str(self.root), *records, self._ego, split, self._source)
         schema.check_relations(scene, where)
         self._write("tracks.json", schema.tracks_to_json_text(scene.tracks).encode())
         self._write("scene.json", schema.scene_to_json_text(scene).encode())
