@@ -33,7 +33,6 @@ ROWS: list[dict[str, float]] = [
 F_REST = [0.25, 0.0, -0.25, 0.5, 0.0, 0.0, 0.0, 0.125, 0.375]
 """Harmonics of degree 1 of each of them: red, green, blue, three values each."""
 KINDS = {"float": "f", "double": "d", "uchar": "B", "char": "b", "int": "i", "uint": "I", "ushort": "H"}
-OLD_PREFIX = "splat-transform "
 
 
 def rows(**changes: Any) -> list[dict[str, float]]:

@@ -376,20 +376,14 @@ def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCl
     for warning in (*file.warnings, *doubts):
         log.warn(f"{name}: {warning}")
     if file.axes and file.axes != chosen:
-        log.warn(
-            f"{name}: {file.axes_by} says {axes.in_words(file.axes)}; --axes {choice} reads it as"
-            f" {axes.in_words(chosen)}"
-        )
+        stated = f"{file.axes_by} says {axes.in_words(file.axes)}"
+        log.warn(f"{name}: {stated}; --axes {choice} reads it as {axes.in_words(chosen)}")
     elif choice == "file" and file.axes and file.axes != FORMATS[found].axes:
-        log.info(
-            f"{name}: read as {axes.in_words(chosen)}, as {file.axes_by} says; --axes viewer reads it as viewers of its"
-            " format do"
-        )
+        choices = f"as {file.axes_by} says; --axes viewer reads it as viewers of its format do"
+        log.info(f"{name}: read as {axes.in_words(chosen)}, {choices}")
     if file.step_m > COARSE_M:
-        log.warn(
-            f"{name}: its places are stored in steps of {file.step_m * 1000:.3g} mm: take an offset away before the"
-            " file is written"
-        )
+        steps = f"its places are stored in steps of {file.step_m * 1000:.3g} mm"
+        log.warn(f"{name}: {steps}: take an offset away before the file is written")
     return in_world(file.cloud, chosen), found
 
 

@@ -233,18 +233,17 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         what, expected = "the GLB file holds no Gaussians", f"meshes with {EXTENSION}"
         raise InputError(what, where=where, expected=expected, remedy="triangles and points cannot be imported")
     if triangles:
-        file.warnings[f"{triangles} meshes without Gaussians were passed over"] = None
+        file.warn(f"{triangles} meshes without Gaussians were passed over")
     if file.entries(file.document, "animations"):
-        file.warnings["its animations are not read: everything is where the nodes put it at rest"] = None
+        file.warn("its animations are not read: everything is where the nodes put it at rest")
+    notes: tuple[str, ...] = ()
     if file.passed:
-        file.notes[sentence(sorted(file.passed), "the document")] = None
+        notes = (sentence(sorted(file.passed), "the document"),)
     axes = "RDF" if file.of_old_transform(2) else ""
     if axes:
-        file.warnings[
-            f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so; --axes viewer reads as glTF"
-        ] = None
+        file.warn(f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so; --axes viewer reads as glTF")
     cloud = replace(joined(clouds), antialias=file.antialias)
-    return SplatFile(cloud, axes, f"its program {file.generator}", file.step_m, tuple(file.notes), tuple(file.warnings))
+    return SplatFile(cloud, axes, f"its program {file.generator}", file.step_m, notes, tuple(file.warnings))
 
 
 def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
@@ -290,7 +289,7 @@ class _GlbFile:
         self.binary = memoryview(b"")
         self.total, self.step_m = 0, 0.0
         self.passed: set[str] = set()
-        self.notes, self.warnings = dict[str, None](), dict[str, None]()  # each once, in order
+        self.warnings = dict[str, None]()  # each once, in order
         asset = document.get("asset")
         asset = asset if isinstance(asset, dict) else {}
         self.generator = "".join(c for c in str(asset.get("generator", ""))[:60] if c.isprintable())
@@ -304,6 +303,10 @@ class _GlbFile:
             length, kind = binary.unpacked("<II", content, place, "the second chunk", where)
             if kind == BIN_CHUNK:
                 self.binary = binary.part(content, place + 8, length, "the binary chunk", where)
+
+    def warn(self, sentence: str) -> None:
+        """Say something of the file once."""
+        self.warnings[sentence] = None
 
     def _note(self, within: str, owner: dict[str, Any]) -> None:
         """Note the fields of an object of the document that glTF does not have."""
@@ -388,10 +391,10 @@ class _GlbFile:
             extensions = extensions if isinstance(extensions, dict) else {}
             visible = extensions.get("KHR_node_visibility")
             if isinstance(visible, dict) and visible.get("visible") is False:
-                self.warnings["nodes that the file hides were left out"] = None
+                self.warn("nodes that the file hides were left out")
                 continue
             if "EXT_mesh_gpu_instancing" in extensions:
-                self.warnings["instances (EXT_mesh_gpu_instancing) are not read: their mesh is there once"] = None
+                self.warn("instances (EXT_mesh_gpu_instancing) are not read: their mesh is there once")
             if "mesh" in node:
                 yield matrix, self.entry("meshes", node["mesh"])
             waiting += [(matrix, child, depth + 1) for child in self._indices(node, "children")]
@@ -427,7 +430,7 @@ class _GlbFile:
             raise InputError(what, where=f"{self.where}: {EXTENSION}", got=repr(kind.get("kernel"))[:40])
         space = kind.get("colorSpace")
         if space is None:
-            self.warnings["it names no colorSpace, which the standard requires: read as sRGB"] = None
+            self.warn("it names no colorSpace, which the standard requires: read as sRGB")
         elif not isinstance(space, str) or space not in _LINEAR:
             what, where = "the colour space of the Gaussians is not known", f"{self.where}: {EXTENSION}: colorSpace"
             remedy = "convert the colours to sRGB"
@@ -444,7 +447,7 @@ class _GlbFile:
         self.passed.update(f"{EXTENSION}.extensions.{name}" for name in (inner if isinstance(inner, dict) else ()))
         for name, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
             if kind.get(name, usual) != usual:
-                self.warnings[f"{name} {kind[name]!r:.40} is not drawn: {usual} instead"] = None
+                self.warn(f"{name} {kind[name]!r:.40} is not drawn: {usual} instead")
         means = self.values(attributes, "POSITION", 3)
         count = len(means)
         self.total += count
@@ -453,7 +456,7 @@ class _GlbFile:
             raise InputError(what, where=self.where, got=f"{self.total} Gaussians")
         rotation = self.values(attributes, PREFIX + "ROTATION", 4, count)
         if np.abs(np.linalg.norm(rotation, axis=1) - 1).max(initial=0) > 0.05:
-            self.warnings["rotations are not of length 1, as the standard requires: they were brought to it"] = None
+            self.warn("rotations are not of length 1, as the standard requires: they were brought to it")
         scale = self.values(attributes, PREFIX + "SCALE", 3, count)
         opacity = self.values(attributes, PREFIX + "OPACITY", 1, count)[:, 0]
         if not np.isfinite(opacity).all():
@@ -470,7 +473,7 @@ class _GlbFile:
         read = tuple(f"{PREFIX}SH_DEGREE_{d}_" for d in degrees)
         beyond = [name for name in attributes if name.startswith(f"{PREFIX}SH_DEGREE_") and not name.startswith(read)]
         if beyond:
-            self.warnings[f"harmonics beyond degree 3 were dropped: {listed(beyond)}"] = None
+            self.warn(f"harmonics beyond degree 3 were dropped: {listed(beyond)}")
         self.step_m = max(self.step_m, spacing_m(means))
         columns = [values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)]
         return checked(SplatCloud(means, *columns), self.where)
@@ -480,9 +483,7 @@ class _GlbFile:
         sizes."""
         raw = (scale < 0).any() or (opacity < -_ROUNDING).any() or (opacity > 1 + _ROUNDING).any()
         if raw and self.of_old_transform(3):
-            self.warnings[
-                f"{self.generator} wrote logits and logarithms, where glTF has opacities and sizes: read so"
-            ] = None
+            self.warn(f"{self.generator} wrote logits and logarithms, where glTF has opacities and sizes: read so")
             return opacity, scale
         if (bad := (opacity < -_ROUNDING) | (opacity > 1 + _ROUNDING)).any():
             row = int(bad.argmax())
