@@ -20,61 +20,19 @@ from PIL import Image
 C1 = 0.4886025119029199
 """Factor of the harmonics of degree 1: of -y, z and -x of the direction."""
 HALF = math.sqrt(0.5)
+NAMES = "x y z f_dc_0 f_dc_1 f_dc_2 opacity scale_0 scale_1 scale_2 rot_0 rot_1 rot_2 rot_3".split()
 ROWS: list[dict[str, float]] = [
-    {
-        "x": 1.0,
-        "y": 2.0,
-        "z": 3.0,
-        "f_dc_0": 0.5,
-        "f_dc_1": -0.25,
-        "f_dc_2": 0.0,
-        "opacity": 2.0,
-        "scale_0": -1.0,
-        "scale_1": -2.0,
-        "scale_2": -3.0,
-        "rot_0": HALF,
-        "rot_1": HALF,
-        "rot_2": 0.0,
-        "rot_3": 0.0,
-    },
-    {
-        "x": -4.0,
-        "y": 0.5,
-        "z": 0.25,
-        "f_dc_0": -0.5,
-        "f_dc_1": 0.75,
-        "f_dc_2": 1.0,
-        "opacity": -1.0,
-        "scale_0": -2.5,
-        "scale_1": -0.5,
-        "scale_2": -4.0,
-        "rot_0": 0.5,
-        "rot_1": 0.5,
-        "rot_2": 0.5,
-        "rot_3": 0.5,
-    },
-    {
-        "x": 2.0,
-        "y": -3.0,
-        "z": -1.0,
-        "f_dc_0": 0.25,
-        "f_dc_1": 0.25,
-        "f_dc_2": -1.0,
-        "opacity": 0.5,
-        "scale_0": -1.5,
-        "scale_1": -3.5,
-        "scale_2": 0.25,
-        "rot_0": HALF,
-        "rot_1": 0.0,
-        "rot_2": 0.0,
-        "rot_3": HALF,
-    },
+    dict(zip(NAMES, values, strict=True))
+    for values in (
+        (1.0, 2.0, 3.0, 0.5, -0.25, 0.0, 2.0, -1.0, -2.0, -3.0, HALF, HALF, 0.0, 0.0),
+        (-4.0, 0.5, 0.25, -0.5, 0.75, 1.0, -1.0, -2.5, -0.5, -4.0, 0.5, 0.5, 0.5, 0.5),
+        (2.0, -3.0, -1.0, 0.25, 0.25, -1.0, 0.5, -1.5, -3.5, 0.25, HALF, 0.0, 0.0, HALF),
+    )
 ]
 """Values as the PLY stores them: opacities as logits, sizes as natural logarithms, rotations w, x, y, z."""
 F_REST = [0.25, 0.0, -0.25, 0.5, 0.0, 0.0, 0.0, 0.125, 0.375]
 """Harmonics of degree 1 of each of them: red, green, blue, three values each."""
 KINDS = {"float": "f", "double": "d", "uchar": "B", "char": "b", "int": "i", "uint": "I", "ushort": "H"}
-OLD_PREFIX = "splat-transform "
 
 
 def rows(**changes: Any) -> list[dict[str, float]]:
@@ -98,12 +56,8 @@ def ply(
     elements."""
     kinds = kinds or {}
     names = list(table[0])
-    lines = [
-        "ply",
-        f"format binary_{'little' if order == '<' else 'big'}_endian 1.0",
-        *head,
-        *filter(None, before[0].split("\n")),
-    ]
+    lines = ["ply", f"format binary_{'little' if order == '<' else 'big'}_endian 1.0", *head]
+    lines += filter(None, before[0].split("\n"))
     lines += [f"element vertex {len(table)}", *(f"property {kinds.get(name, 'float')} {name}" for name in names)]
     lines += [*filter(None, after[0].split("\n")), "end_header\n"]
     packed = struct.Struct(order + "".join(KINDS[kinds.get(name, "float")] for name in names))
@@ -115,17 +69,9 @@ def compressed_ply(low: float, high: float, kind: str = "float", head: Iterable[
     """Two Gaussians at both ends of a chunk that reaches from ``low`` to ``high`` metres on every axis."""
     groups = (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
     bounds = [f"{side}_{name}" for names in groups for side in ("min", "max") for name in names]
-    lines = [
-        "ply",
-        "format binary_little_endian 1.0",
-        *head,
-        "element chunk 1",
-        *(f"property {kind} {name}" for name in bounds),
-    ]
-    lines += [
-        "element vertex 2",
-        *(f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")),
-    ]
+    lines = ["ply", "format binary_little_endian 1.0", *head, "element chunk 1"]
+    lines += [*(f"property {kind} {name}" for name in bounds), "element vertex 2"]
+    lines += [f"property uint packed_{name}" for name in ("position", "rotation", "scale", "color")]
     lines += [*([f"property uchar {more}"] if more else []), "end_header\n"]
     chunk = struct.pack(f"<18{KINDS[kind]}", *[low] * 3, *[high] * 3, *[-4] * 3, *[-1] * 3, *[0] * 3, *[1] * 3)
     half = (1 << 9) | (1 << 19) | (1 << 29)  # three components near 0, the largest is w
@@ -166,10 +112,8 @@ def spz(
     if version < 4:
         return gzip.compress(head + b"".join(planes) + zone + more, mtime=0)
     planes = [plane for plane in planes if plane]
-    frames = [
-        b"\x28\xb5\x2f\xfd\xa0" + struct.pack("<I", len(p)) + (len(p) << 3 | 1).to_bytes(3, "little") + p
-        for p in planes
-    ]
+    magic = b"\x28\xb5\x2f\xfd\xa0"
+    frames = [magic + struct.pack("<I", len(p)) + (len(p) << 3 | 1).to_bytes(3, "little") + p for p in planes]
     head = head[:15] + bytes([len(frames)]) + struct.pack("<I12x", 32 + len(zone))
     toc = b"".join(struct.pack("<QQ", len(frame), len(plane)) for frame, plane in zip(frames, planes))
     return head + zone + toc + b"".join(frames)
@@ -191,13 +135,8 @@ def sog(lossy: str = "", **fields: Any) -> bytes:
         owner, _, inner = name.rpartition(".")
         (meta[owner] if owner else meta)[inner] = value
     black, white = (0, 0, 0, 255), (255, 255, 255, 255)
-    pixels = {
-        "l": (black, white),
-        "u": (black, white),
-        "s": (black, white),
-        "q": ((128, 128, 128, 252),) * 2,
-        "c": ((9, 9, 9, 230),) * 2,
-    }
+    pixels = dict.fromkeys("lus", (black, white))
+    pixels |= {"q": ((128, 128, 128, 252),) * 2, "c": ((9, 9, 9, 230),) * 2}
     target = io.BytesIO()
     with zipfile.ZipFile(target, "w") as archive:
         archive.writestr("meta.json", json.dumps(meta))
@@ -225,14 +164,8 @@ def glb(
     fields of the extension. node, document, view: further fields of the node, the document, the first buffer view.
     more: name of a further attribute."""
     prefix = "KHR_gaussian_splatting:"
-    width = {
-        "POSITION": 3,
-        "ROTATION": 4,
-        "SCALE": 3,
-        "OPACITY": 1,
-        "SH_DEGREE_0_COEF_0": 3,
-        **({more: 3} if more else {}),
-    }
+    width = {"POSITION": 3, "ROTATION": 4, "SCALE": 3, "OPACITY": 1, "SH_DEGREE_0_COEF_0": 3}
+    width |= {more: 3} if more else {}
     parts = dict.fromkeys(width, b"")
     for row in table:
         size = [row[f"scale_{c}"] for c in range(3)]
@@ -246,50 +179,28 @@ def glb(
         if more:
             parts[more] += bytes(12)
     offsets = [sum(len(p) for p in list(parts.values())[:n]) for n in range(len(parts))]
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display", **(kind or {})}
+    extension = {name: value for name, value in extension.items() if value is not None}
+    attributes = {name if name == "POSITION" else prefix + name: n for n, name in enumerate(width)}
+    primitive = {"mode": 0, "attributes": attributes, "extensions": {"KHR_gaussian_splatting": extension}}
+    types = [{1: "SCALAR", 3: "VEC3", 4: "VEC4"}[w] for w in width.values()]
     made: dict[str, Any] = {
         "asset": {"version": "2.0"},
         "extensionsUsed": ["KHR_gaussian_splatting"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, **(node or {})}],
-        "meshes": [
-            {
-                "primitives": [
-                    {
-                        "mode": 0,
-                        "attributes": {
-                            name if name == "POSITION" else prefix + name: n for n, name in enumerate(width)
-                        },
-                        "extensions": {
-                            "KHR_gaussian_splatting": {
-                                "kernel": "ellipse",
-                                "colorSpace": "srgb_rec709_display",
-                                **(kind or {}),
-                            }
-                        },
-                    }
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [primitive]}],
         "buffers": [{"byteLength": sum(map(len, parts.values()))}],
         "bufferViews": [
             {"buffer": 0, "byteOffset": at, "byteLength": len(p)} for at, p in zip(offsets, parts.values())
         ],
         "accessors": [
-            {
-                "bufferView": n,
-                "componentType": 5126,
-                "count": len(table),
-                "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[w],
-            }
-            for n, w in enumerate(width.values())
+            {"bufferView": n, "componentType": 5126, "count": len(table), "type": kind} for n, kind in enumerate(types)
         ],
         **(document or {}),
     }
     made["bufferViews"][0] |= view or {}
-    extension = made["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
-    for name in [name for name, value in extension.items() if value is None]:
-        del extension[name]
     text = json.dumps(made).encode()
     text += b" " * (-len(text) % 4)
     content = b"".join(parts.values())
@@ -303,7 +214,6 @@ def splat(table: Sequence[Mapping[str, float]] = ROWS, logs: bool = False) -> by
     for row in table:
         size = [row[f"scale_{c}"] for c in range(3)]
         turn = [round((row[f"rot_{c}"] + 1) / 2 * 255) for c in range(4)]
-        made += struct.pack(
-            "<6f8B", row["x"], row["y"], row["z"], *(size if logs else map(math.exp, size)), 99, 99, 99, 200, *turn
-        )
+        place, size = [row[axis] for axis in "xyz"], size if logs else map(math.exp, size)
+        made += struct.pack("<6f8B", *place, *size, 99, 99, 99, 200, *turn)
     return made

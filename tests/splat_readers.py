@@ -52,15 +52,8 @@ def read_ply(content: bytes) -> list[Splat]:
             [at[f"f_rest_{c * rest + k}"] for c in range(3)] for k in range(rest)
         ]
         assert at["nx"] == at["ny"] == at["nz"] == 0
-        found.append(
-            Splat(
-                [at["x"], at["y"], at["z"]],
-                [at[f"rot_{i}"] for i in range(4)],
-                [math.exp(at[f"scale_{i}"]) for i in range(3)],
-                sigmoid(at["opacity"]),
-                sh,
-            )
-        )
+        turn, size = [at[f"rot_{i}"] for i in range(4)], [math.exp(at[f"scale_{i}"]) for i in range(3)]
+        found.append(Splat([at["x"], at["y"], at["z"]], turn, size, sigmoid(at["opacity"]), sh))
     return found
 
 
@@ -94,30 +87,16 @@ def read_compressed(content: bytes) -> list[Splat]:
             raw = body[start + 16 * counts["vertex"] + rest * row :][:rest]
             values = [-4.0 if u == 0 else 4.0 if u == 255 else ((u + 0.5) / 256 - 0.5) * 8 for u in raw]
             sh += [[values[channel * (rest // 3) + k] for channel in range(3)] for k in range(rest // 3)]
-        found.append(
-            Splat(
-                between(position, c[:3], c[3:6]),
-                three_and_largest(rotation >> 30, three),
-                [math.exp(v) for v in between(scale, c[6:9], c[9:12])],
-                (color & 255) / 255,
-                sh,
-            )
-        )
+        turn, size = three_and_largest(rotation >> 30, three), map(math.exp, between(scale, c[6:9], c[9:12]))
+        found.append(Splat(between(position, c[:3], c[3:6]), turn, list(size), (color & 255) / 255, sh))
     return found
 
 
 def read_splat(content: bytes) -> list[Splat]:
     found = []
     for row in struct.iter_unpack("<6f8B", content):
-        found.append(
-            Splat(
-                list(row[:3]),
-                [u / 255 * 2 - 1 for u in row[10:14]],
-                list(row[3:6]),
-                row[9] / 255,
-                [[(u / 255 - 0.5) / C0 for u in row[6:9]]],
-            )
-        )
+        turn, sh = [u / 255 * 2 - 1 for u in row[10:14]], [[(u / 255 - 0.5) / C0 for u in row[6:9]]]
+        found.append(Splat(list(row[:3]), turn, list(row[3:6]), row[9] / 255, sh))
     return found
 
 
@@ -141,15 +120,8 @@ def read_spz(content: bytes) -> list[Splat]:
         sh = [[(raw[colors + 3 * n + i] / 255 - 0.5) / 0.15 for i in range(3)]]
         at = rest + 3 * coefficients * n
         sh += [[(raw[at + 3 * k + i] - 128) / 128 for i in range(3)] for k in range(coefficients)]
-        found.append(
-            Splat(
-                place,
-                [w, x, y, z],
-                [math.exp(raw[scales + 3 * n + i] / 16 - 10) for i in range(3)],
-                raw[opacities + n] / 255,
-                sh,
-            )
-        )
+        size = [math.exp(raw[scales + 3 * n + i] / 16 - 10) for i in range(3)]
+        found.append(Splat(place, [w, x, y, z], size, raw[opacities + n] / 255, sh))
     return found
 
 

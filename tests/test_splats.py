@@ -41,13 +41,7 @@ def content_of(name: str, cloud: SplatCloud) -> bytes:
 
 
 def as_cloud(splats: list[slow.Splat]) -> SplatCloud:
-    columns = (
-        [s.place for s in splats],
-        [s.turn for s in splats],
-        np.log([s.size for s in splats]),
-        [s.opacity for s in splats],
-        [s.sh for s in splats],
-    )
+    columns = zip(*((s.place, s.turn, np.log(s.size), s.opacity, s.sh) for s in splats), strict=True)
     return SplatCloud(*(np.asarray(values, np.float32) for values in columns))
 
 
@@ -61,48 +55,21 @@ def in_step(splats: SplatCloud, cloud: SplatCloud) -> np.ndarray:
 def steps(name: str, cloud: SplatCloud) -> dict[str, np.ndarray | float]:
     """One step of each value in a format."""
     exact = 2e-6 * np.abs(cloud.means).max()
-    kinds: dict[str, dict[str, np.ndarray | float]] = {
-        "spz": {
-            "means": 2.0**-12,
-            "scales": 1 / 16,
-            "opacity": 1 / 255,
-            "dc": 1 / (255 * 0.15),
-            "rest": 1 / 8,
-            "turn": 0.004,
-        },
-        "splat": {
-            "means": exact,
-            "scales": 1e-5,
-            "opacity": 1 / 255,
-            "dc": 1 / (255 * slow.C0),
-            "rest": 0,
-            "turn": 0.02,
-        },
-    }
     span = cloud.means.max(0) - cloud.means.min(0)
     size = cloud.log_scales.max(0) - cloud.log_scales.min(0)
     tint = (cloud.sh[:, 0].max(0) - cloud.sh[:, 0].min(0)) / 255
-    kinds["compressed-ply"] = {
-        "means": span / np.array([2047, 1023, 2047]),
-        "scales": size / 1023,
-        "opacity": 1 / 255,
-        "dc": tint + 1e-5,
-        "rest": 8 / 256,
-        "turn": 0.004,
-    }
     log_span = np.sign(cloud.means) * np.log1p(np.abs(cloud.means))
     grown = (1 + np.abs(cloud.means).max()) * (log_span.max(0) - log_span.min(0)) / 65535
     rough = 0.06 if len(cloud) > 256 else 1e-5  # tables are fine where many values are, and coarse at their ends
-    kinds["sog"] = {
-        "means": grown + exact,
-        "scales": rough * 2,
-        "opacity": 1 / 255,
-        "dc": rough,
-        "rest": rough * 3,
-        "turn": 0.02,
+    byte = 1 / 255
+    kinds: dict[str, tuple[np.ndarray | float, ...]] = {
+        "spz": (2.0**-12, 1 / 16, byte, byte / 0.15, 1 / 8, 0.004),
+        "splat": (exact, 1e-5, byte, byte / slow.C0, 0, 0.02),
+        "compressed-ply": (span / np.array([2047, 1023, 2047]), size / 1023, byte, tint + 1e-5, 8 / 256, 0.004),
+        "sog": (grown + exact, rough * 2, byte, rough, rough * 3, 0.02),
     }
-    plain = {"means": exact, "scales": 1e-5, "opacity": 1e-5, "dc": 1e-5, "rest": 1e-5, "turn": 1e-5}
-    return kinds.get(name, plain)
+    plain = (exact, 1e-5, 1e-5, 1e-5, 1e-5, 1e-5)
+    return dict(zip(("means", "scales", "opacity", "dc", "rest", "turn"), kinds.get(name, plain), strict=True))
 
 
 def assert_close(

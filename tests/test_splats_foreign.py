@@ -13,11 +13,11 @@ import zipfile
 from pathlib import Path
 from typing import Any
 
-import foreign_splats as foreign
 import numpy as np
 import pytest
 import toy_splats
-from foreign_splats import C1, F_REST, ROWS, rows
+from foreign_splats import C1, F_REST, ROWS, compressed_ply, glb, ply, rows, sog, splat, spz
+from scipy.spatial.transform import Rotation
 
 from mudg import app
 from mudg.base.errors import InputError
@@ -41,14 +41,7 @@ def world(places: np.ndarray, axes: str) -> np.ndarray:
 
 def covariance(row: dict[str, float]) -> np.ndarray:
     """Of a row of `ROWS`, in the file's axes."""
-    w, x, y, z = (row[f"rot_{n}"] for n in range(4))
-    turn = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    turn = Rotation.from_quat([row[f"rot_{n}"] for n in range(4)], scalar_first=True).as_matrix()
     return turn @ np.diag([math.exp(2 * row[f"scale_{n}"]) for n in range(3)]) @ turn.T
 
 
@@ -73,56 +66,44 @@ def read(content: bytes, name: str = "a.ply", axes: str = "file") -> SplatCloud:
 def command(tmp_path: Path, content: bytes, suffix: str, *flags: str) -> int:
     (tmp_path / f"in{suffix}").write_bytes(content)
     out = str(tmp_path / "out")
-    return app.main(
-        [
-            "asset",
-            "import",
-            str(tmp_path / f"in{suffix}"),
-            "--kind",
-            "scene",
-            "--out",
-            out,
-            "--overwrite",
-            "--quiet",
-            *flags,
-        ]
-    )
+    options = ["--kind", "scene", "--out", out, "--overwrite", "--quiet", *flags]
+    return app.main(["asset", "import", str(tmp_path / f"in{suffix}"), *options])
 
 
 # -- drawing ---------------------------------------------------------------------------------------
 
 MARKED: dict[str, tuple[bytes, str, bool]] = {
-    "ply Brush": (foreign.ply(head=["comment Exported from Brush", "comment SplatRenderMode: mip"]), ".ply", True),
-    "ply gsplat, default": (foreign.ply(head=["comment SplatRenderMode: default"]), ".ply", False),
+    "ply Brush": (ply(head=["comment Exported from Brush", "comment SplatRenderMode: mip"]), ".ply", True),
+    "ply gsplat, default": (ply(head=["comment SplatRenderMode: default"]), ".ply", False),
     "ply, the last one counts": (
-        foreign.ply(head=["comment SplatRenderMode: mip", "comment splatrendermode: DEFAULT"]),
+        ply(head=["comment SplatRenderMode: mip", "comment splatrendermode: DEFAULT"]),
         ".ply",
         False,
     ),
-    "ply, small letters": (foreign.ply(head=["comment splatrendermode: Mip"]), ".ply", True),
-    "ply Postshot 1": (foreign.ply(head=["comment antialiased 1"]), ".ply", True),
-    "ply Postshot 0": (foreign.ply(head=["comment antialiased 0"]), ".ply", False),
-    "ply flags": (foreign.ply(head=["comment train_flags antialiasing"]), ".ply", True),
-    "ply nerfstudio": (foreign.ply(head=["comment rasterize_mode: antialiased"]), ".ply", True),
-    "ply obj_info": (foreign.ply(head=["obj_info anti_aliased: true"]), ".ply", True),
-    "ply negated": (foreign.ply(head=["comment not antialiased"]), ".ply", False),
-    "ply disabled": (foreign.ply(head=["comment antialiasing: disabled"]), ".ply", False),
-    "sog number": (foreign.sog(antialias=1), ".sog", True),
-    "ply silent": (foreign.ply(head=["comment made elsewhere"]), ".ply", False),
-    "compressed ply": (foreign.compressed_ply(-1, 1, head=["comment SplatRenderMode: mip"]), ".ply", True),
-    "compressed ply silent": (foreign.compressed_ply(-1, 1), ".ply", False),
-    **{f"spz {v} {flags}": (foreign.spz(v, flags), ".spz", bool(flags)) for v in (1, 2, 3) for flags in (0, 1)},
-    "sog antialias": (foreign.sog(antialias=True), ".sog", True),
-    "sog no antialias": (foreign.sog(antialias=False), ".sog", False),
-    "sog model": (foreign.sog(model="antialiased"), ".sog", True),
-    "sog model default": (foreign.sog(model="default", antialias=True), ".sog", False),
-    "sog 2dgs": (foreign.sog(model="2dgs"), ".sog", False),
+    "ply, small letters": (ply(head=["comment splatrendermode: Mip"]), ".ply", True),
+    "ply Postshot 1": (ply(head=["comment antialiased 1"]), ".ply", True),
+    "ply Postshot 0": (ply(head=["comment antialiased 0"]), ".ply", False),
+    "ply flags": (ply(head=["comment train_flags antialiasing"]), ".ply", True),
+    "ply nerfstudio": (ply(head=["comment rasterize_mode: antialiased"]), ".ply", True),
+    "ply obj_info": (ply(head=["obj_info anti_aliased: true"]), ".ply", True),
+    "ply negated": (ply(head=["comment not antialiased"]), ".ply", False),
+    "ply disabled": (ply(head=["comment antialiasing: disabled"]), ".ply", False),
+    "sog number": (sog(antialias=1), ".sog", True),
+    "ply silent": (ply(head=["comment made elsewhere"]), ".ply", False),
+    "compressed ply": (compressed_ply(-1, 1, head=["comment SplatRenderMode: mip"]), ".ply", True),
+    "compressed ply silent": (compressed_ply(-1, 1), ".ply", False),
+    **{f"spz {v} {flags}": (spz(v, flags), ".spz", bool(flags)) for v in (1, 2, 3) for flags in (0, 1)},
+    "sog antialias": (sog(antialias=True), ".sog", True),
+    "sog no antialias": (sog(antialias=False), ".sog", False),
+    "sog model": (sog(model="antialiased"), ".sog", True),
+    "sog model default": (sog(model="default", antialias=True), ".sog", False),
+    "sog 2dgs": (sog(model="2dgs"), ".sog", False),
     "glb facts": (
-        foreign.glb(document={"asset": {"version": "2.0", "extras": {"drawing": {"antialias": True}}}}),
+        glb(document={"asset": {"version": "2.0", "extras": {"drawing": {"antialias": True}}}}),
         ".glb",
         True,
     ),
-    "glb silent": (foreign.glb(), ".glb", False),
+    "glb silent": (glb(), ".glb", False),
 }
 
 
@@ -135,7 +116,7 @@ def test_marks_of_antialiasing_are_read(name: str) -> None:
 @zstandard
 @pytest.mark.parametrize("flags", [0, 1])
 def test_marks_of_spz_4_are_read(flags: int) -> None:
-    assert read(foreign.spz(4, flags), "a.spz").antialias is bool(flags)
+    assert read(spz(4, flags), "a.spz").antialias is bool(flags)
 
 
 @pytest.mark.parametrize("name", ["ply Brush", "spz 3 1", "sog model", "glb facts", "ply silent"])
@@ -200,7 +181,7 @@ def test_an_object_of_antialiased_gaussians_says_that_it_is_drawn_otherwise(
 @pytest.mark.parametrize("kind", ["float", "double"])
 def test_the_filter_of_mip_splatting_goes_into_sizes_and_opacities(column: str, kind: str) -> None:
     filters = [0.2, 0.0, 3.0]
-    cloud = read(foreign.ply(rows(**{column: filters}), kinds={column: kind}))
+    cloud = read(ply(rows(**{column: filters}), kinds={column: kind}))
     for n, (row, filter_m) in enumerate(zip(ROWS, filters, strict=True)):
         sizes = [math.exp(row[f"scale_{c}"]) for c in range(3)]
         grown = [math.hypot(size, filter_m) for size in sizes]
@@ -212,30 +193,26 @@ def test_the_filter_of_mip_splatting_goes_into_sizes_and_opacities(column: str, 
 @pytest.mark.parametrize("value", [math.nan, math.inf])
 def test_a_filter_that_is_no_number_is_refused(value: float) -> None:
     with pytest.raises(InputError, match="filter_3D"):
-        read(foreign.ply(rows(filter_3D=[0.1, value, 0.1])))
+        read(ply(rows(filter_3D=[0.1, value, 0.1])))
 
 
 def test_flat_gaussians_of_2dgs_are_read_flat() -> None:
-    cloud = read(foreign.ply(rows(scale_2=None)), axes="world")
+    cloud = read(ply(rows(scale_2=None)), axes="world")
     assert np.allclose(cloud.log_scales[:, :2], [[row["scale_0"], row["scale_1"]] for row in ROWS])
     assert (np.exp(cloud.log_scales[:, 2]) <= 1e-6).all()
     normal = shape(cloud, 1) @ [1, 0, 0]  # the second is turned so that z becomes x
     assert np.abs(normal).max() < 1e-11
 
 
-LINEAR = {
-    "opacity": [0.9, 0.2, 0.7],
-    "scale_0": [0.1, 0.3, 0.2],
-    "scale_1": [0.2, 0.1, 0.3],
-    "scale_2": [0.01, 0.05, 0.2],
-}
+LINEAR = {"opacity": [0.9, 0.2, 0.7], "scale_0": [0.1, 0.3, 0.2], "scale_1": [0.2, 0.1, 0.3]}
+LINEAR["scale_2"] = [0.01, 0.05, 0.2]
 
 
 def test_plain_sizes_and_opacities_are_refused_where_logarithms_and_logits_are_due() -> None:
     with pytest.raises(InputError, match=r"plain values[\s\S]*log\(scale\)"):
-        read(foreign.ply(rows(**LINEAR)))
+        read(ply(rows(**LINEAR)))
     with pytest.raises(InputError, match="plain values"):
-        read(foreign.ply(rows(**LINEAR | {"scale_2": None})))
+        read(ply(rows(**LINEAR | {"scale_2": None})))
 
 
 @pytest.mark.parametrize(
@@ -252,40 +229,40 @@ def test_plain_sizes_and_opacities_are_refused_where_logarithms_and_logits_are_d
 def test_values_and_columns_of_another_kind_are_named(
     changes: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    read(foreign.ply(rows(**changes)))
+    read(ply(rows(**changes)))
     assert said in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_usual_values_are_not_worth_a_word(capsys: pytest.CaptureFixture[str]) -> None:
     for content, name in (
-        (foreign.ply(), "a.ply"),
-        (foreign.spz(), "a.spz"),
-        (foreign.glb(), "a.glb"),
-        (foreign.splat(), "a.splat"),
-        (foreign.sog(), "a.sog"),
-        (foreign.ply(rows(opacity=0.0, scale_0=0.0, scale_1=0.0)), "zero.ply"),
-        (foreign.compressed_ply(-9, 9), "c.ply"),
+        (ply(), "a.ply"),
+        (spz(), "a.spz"),
+        (glb(), "a.glb"),
+        (splat(), "a.splat"),
+        (sog(), "a.sog"),
+        (ply(rows(opacity=0.0, scale_0=0.0, scale_1=0.0)), "zero.ply"),
+        (compressed_ply(-9, 9), "c.ply"),
     ):
         read(content, name)
     assert "warning" not in capsys.readouterr().err
 
 
 def test_colours_of_another_space_and_pictures_with_loss_are_named(capsys: pytest.CaptureFixture[str]) -> None:
-    read(foreign.ply(after=("element color_space 1\nproperty uchar color_space", b"\1")))
+    read(ply(after=("element color_space 1\nproperty uchar color_space", b"\1")))
     assert "'color_space' is not read" in capsys.readouterr().err.replace("\n", " ")
-    read(foreign.sog(lossy="c"), "a.sog")
+    read(sog(lossy="c"), "a.sog")
     assert "with loss" in capsys.readouterr().err.replace("\n", " ")
 
 
 @pytest.mark.parametrize("column", ["opacity", "scale_1", "f_dc_0", "rot_2"])
 def test_whole_numbers_are_refused(column: str) -> None:
     with pytest.raises(InputError, match=rf"whole numbers[\s\S]*{column}"):
-        read(foreign.ply(rows(**{column: 1}), kinds={column: "uchar"}))
+        read(ply(rows(**{column: 1}), kinds={column: "uchar"}))
 
 
 def test_a_splat_file_of_logarithms_says_what_to_do() -> None:
     with pytest.raises(InputError, match=r"negative[\s\S]*exp\(scale\)"):
-        read(foreign.splat(logs=True), "a.splat")
+        read(splat(logs=True), "a.splat")
 
 
 @pytest.mark.parametrize(
@@ -301,12 +278,12 @@ def test_a_splat_file_of_logarithms_says_what_to_do() -> None:
 )
 def test_damaged_gaussians_are_counted_and_the_remedy_named(changes: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        read(foreign.ply(rows(**changes)))
+        read(ply(rows(**changes)))
 
 
 def test_rotations_of_any_length_are_brought_to_1() -> None:
     long = {f"rot_{n}": [7.5 * row[f"rot_{n}"] for row in ROWS] for n in range(4)}
-    assert np.allclose(read(foreign.ply(rows(**long))).quats, read(foreign.ply()).quats, atol=1e-6)
+    assert np.allclose(read(ply(rows(**long))).quats, read(ply()).quats, atol=1e-6)
 
 
 # -- other elements and columns --------------------------------------------------------------------
@@ -325,14 +302,14 @@ def test_rotations_of_any_length_are_brought_to_1() -> None:
     ],
 )
 def test_other_elements_of_a_ply_are_passed_over(around: dict[str, Any], order: str) -> None:
-    assert np.array_equal(read(foreign.ply(order=order, **around), axes="world").means, PLACES)
+    assert np.array_equal(read(ply(order=order, **around), axes="world").means, PLACES)
 
 
 def test_lists_before_the_gaussians_are_walked_over() -> None:
     lines = "element face 3\nproperty uchar flag\nproperty list ushort double weights\nproperty list uchar uchar more"
     body = b"\1" + struct.pack("<Hd", 1, 2.5) + b"\0" + b"\2" + struct.pack("<H", 0) + b"\3abc"
     body += b"\3" + struct.pack("<H2d", 2, 1, 1) + b"\0"
-    assert np.array_equal(read(foreign.ply(before=(lines, body)), axes="world").means, PLACES)
+    assert np.array_equal(read(ply(before=(lines, body)), axes="world").means, PLACES)
 
 
 @pytest.mark.parametrize(
@@ -346,11 +323,11 @@ def test_lists_before_the_gaussians_are_walked_over() -> None:
 )
 def test_lists_that_cannot_be_passed_over_are_refused(around: dict[str, Any], said: str) -> None:
     with pytest.raises(InputError, match=said):
-        read(foreign.ply(**around), "in.ply")
+        read(ply(**around), "in.ply")
 
 
 def test_unknown_columns_are_listed_once_and_without_control_characters(capsys: pytest.CaptureFixture[str]) -> None:
-    read(foreign.ply(rows(confidence=1.0, **{"a\x1b[31m": 0.0}, **{f"extra_{n:02}": 0.0 for n in range(20)})))
+    read(ply(rows(confidence=1.0, **{"a\x1b[31m": 0.0}, **{f"extra_{n:02}": 0.0 for n in range(20)})))
     said = capsys.readouterr().err
     assert said.count("confidence") == 1 and "\x1b[31m" not in said and "more" in said
 
@@ -366,50 +343,46 @@ def test_unknown_columns_are_listed_once_and_without_control_characters(capsys: 
 )
 def test_gaussians_with_columns_of_other_names_get_the_right_remedy(changes: dict[str, Any], missing: str) -> None:
     with pytest.raises(InputError, match=rf"missing[\s\S]*'{missing}'[\s\S]*name the columns"):
-        read(foreign.ply(rows(**changes)))
+        read(ply(rows(**changes)))
 
 
 def test_classes_of_others_are_no_train_ids() -> None:
-    assert read(foreign.ply(rows(**{"class": [2, 5, 6]}), kinds={"class": "uchar"})).class_ids is None
-    ids = read(foreign.ply(rows(**{"class": [2.0, 255.0, 6.0]}))).class_ids
+    assert read(ply(rows(**{"class": [2, 5, 6]}), kinds={"class": "uchar"})).class_ids is None
+    ids = read(ply(rows(**{"class": [2.0, 255.0, 6.0]}))).class_ids
     assert ids is not None and ids.tolist() == [2, 255, 6]
 
 
 def test_harmonics_of_degree_4_lose_what_is_beyond_3(capsys: pytest.CaptureFixture[str]) -> None:
     table = rows(**{f"f_rest_{n}": float(n) for n in range(72)})
-    cloud = read(foreign.ply(table), axes="world")
+    cloud = read(ply(table), axes="world")
     assert np.allclose(cloud.sh[0, 1:], [[float(k), 24.0 + k, 48.0 + k] for k in range(15)])
     assert "beyond degree 3" in capsys.readouterr().err.replace("\n", " ")
 
 
 def test_points_are_still_called_points() -> None:
     with pytest.raises(InputError, match="points or meshes"):
-        read(foreign.ply([{"x": 0.0, "y": 0.0, "z": 0.0, "red": 1.0}]))
+        read(ply([{"x": 0.0, "y": 0.0, "z": 0.0, "red": 1.0}]))
 
 
 def test_fields_of_others_are_passed_over_and_listed_once(capsys: pytest.CaptureFixture[str]) -> None:
-    cloud = read(foreign.sog(extras={"a": 1}, lod=3, **{"means.order": "morton", "sh0.gamma": 2}), "a.sog")
+    cloud = read(sog(extras={"a": 1}, lod=3, **{"means.order": "morton", "sh0.gamma": 2}), "a.sog")
     said = capsys.readouterr().err.replace("\n", " ")
     assert "'extras', 'lod', 'means.order', 'sh0.gamma' in meta.json" in said and "warning" not in said
     assert np.allclose(sorted(np.abs(cloud.means).max(1)), [0, math.e - 1])
-    assert read(foreign.compressed_ply(-1, 1, more="state"), "a.ply").opacity[0] == pytest.approx(200 / 255, abs=1e-6)
+    assert read(compressed_ply(-1, 1, more="state"), "a.ply").opacity[0] == pytest.approx(200 / 255, abs=1e-6)
     read(
-        foreign.glb(
-            kind={"lod": 2, "extras": {}}, document={"extensionsUsed": ["KHR_gaussian_splatting", "EXT_other"]}
-        ),
+        glb(kind={"lod": 2, "extras": {}}, document={"extensionsUsed": ["KHR_gaussian_splatting", "EXT_other"]}),
         "a.glb",
     )
     assert "'EXT_other', 'KHR_gaussian_splatting.lod' in the document" in capsys.readouterr().err.replace("\n", " ")
 
 
 OFFICIAL = {
-    "a.ply": foreign.ply(rows(nx=0.0, ny=0.0, nz=0.0, red=1.0)),
-    "flat.ply": foreign.ply(rows(scale_2=None)),
-    "packed.ply": foreign.compressed_ply(-1, 1),
-    "a.sog": foreign.sog(asset={"generator": "x"}, model="default", antialias=False),
-    "a.glb": foreign.glb(
-        node={"name": "n", "extras": {"a": 1}}, document={"extras": {}, "materials": [], "cameras": []}
-    ),
+    "a.ply": ply(rows(nx=0.0, ny=0.0, nz=0.0, red=1.0)),
+    "flat.ply": ply(rows(scale_2=None)),
+    "packed.ply": compressed_ply(-1, 1),
+    "a.sog": sog(asset={"generator": "x"}, model="default", antialias=False),
+    "a.glb": glb(node={"name": "n", "extras": {"a": 1}}, document={"extras": {}, "materials": [], "cameras": []}),
 }
 
 
@@ -426,23 +399,19 @@ MANY = {f"field{number}": 1.0 for number in range(100)}
 @pytest.mark.parametrize(
     ("name", "content", "line"),
     [
-        ("a.ply", foreign.ply(rows(foo=1.0)), "passed over: 'foo' in element vertex, which"),
+        ("a.ply", ply(rows(foo=1.0)), "passed over: 'foo' in element vertex, which"),
+        ("a.ply", ply(after=("element foo 1\nproperty float x", b"\0" * 4)), "passed over: 'foo' in the header, which"),
         (
             "a.ply",
-            foreign.ply(after=("element foo 1\nproperty float x", b"\0" * 4)),
+            ply(before=("element foo 1\nproperty float x", b"\0" * 4)),
             "passed over: 'foo' in the header, which",
         ),
-        (
-            "a.ply",
-            foreign.ply(before=("element foo 1\nproperty float x", b"\0" * 4)),
-            "passed over: 'foo' in the header, which",
-        ),
-        ("a.ply", foreign.ply(rows(**MANY)), "'field7' and 92 more in element vertex, which"),
-        ("a.ply", foreign.compressed_ply(-1, 1, more="state"), "passed over: 'state' in element vertex, which"),
-        ("a.sog", foreign.sog(**{ODD: 1}), r"passed over: '\x1b]0;t\x07nnnnnn"),
-        ("a.sog", foreign.sog(**MANY), "'field7' and 92 more in meta.json, which"),
-        ("a.glb", foreign.glb(node={"foo": 1}), "passed over: 'nodes.foo' in the document, which"),
-        ("a.glb", foreign.glb(document={ODD: 1, "foo": 2}), r"passed over: '\x1b]0;t\x07nnnnnn"),
+        ("a.ply", ply(rows(**MANY)), "'field7' and 92 more in element vertex, which"),
+        ("a.ply", compressed_ply(-1, 1, more="state"), "passed over: 'state' in element vertex, which"),
+        ("a.sog", sog(**{ODD: 1}), r"passed over: '\x1b]0;t\x07nnnnnn"),
+        ("a.sog", sog(**MANY), "'field7' and 92 more in meta.json, which"),
+        ("a.glb", glb(node={"foo": 1}), "passed over: 'nodes.foo' in the document, which"),
+        ("a.glb", glb(document={ODD: 1, "foo": 2}), r"passed over: '\x1b]0;t\x07nnnnnn"),
     ],
 )
 def test_fields_of_others_are_named_shortly(
@@ -455,7 +424,7 @@ def test_fields_of_others_are_named_shortly(
 
 @pytest.mark.parametrize("model", ["gabor", 7, {"name": "x"}])
 def test_an_unknown_model_of_sog_is_read_with_a_word(model: Any, capsys: pytest.CaptureFixture[str]) -> None:
-    assert len(read(foreign.sog(model=model), "a.sog")) == 2
+    assert len(read(sog(model=model), "a.sog")) == 2
     assert "not known" in capsys.readouterr().err
 
 
@@ -480,36 +449,18 @@ def test_an_unknown_model_of_sog_is_read_with_a_word(model: Any, capsys: pytest.
     ],
 )
 def test_axes_of_a_ply_are_those_that_its_comments_state(comment: str, axes: str) -> None:
-    cloud = read(foreign.ply(head=["comment Generated by Nerfstudio 1.1.5", comment]))
+    cloud = read(ply(head=["comment Generated by Nerfstudio 1.1.5", comment]))
     assert np.allclose(cloud.means, world(PLACES, axes))
 
 
 def test_a_vertical_axis_y_that_may_mean_down_is_said_unless_brush_wrote_it(capsys: pytest.CaptureFixture[str]) -> None:
-    read(foreign.ply(head=["comment Vertical Axis: y"]))
+    read(ply(head=["comment Vertical Axis: y"]))
     assert "--axes RUB" in capsys.readouterr().err
-    read(foreign.ply(head=["comment Exported from Brush", "comment Vertical axis: y"]))
+    read(ply(head=["comment Exported from Brush", "comment Vertical axis: y"]))
     assert "--axes" not in capsys.readouterr().err
 
 
-SPZ_AXES = [
-    "RUB",
-    "LDB",
-    "RDB",
-    "LUB",
-    "RUB",
-    "LDF",
-    "RDF",
-    "LUF",
-    "RUF",
-    "LFD",
-    "RFD",
-    "LFU",
-    "RFU",
-    "LBD",
-    "RBD",
-    "LBU",
-    "RBU",
-]
+SPZ_AXES = "RUB LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split()
 """By the number in the extension; 0 is unspecified."""
 
 
@@ -517,7 +468,7 @@ SPZ_AXES = [
 @pytest.mark.parametrize("code", range(17))
 def test_axes_of_spz_are_those_of_its_extension(code: int, version: int) -> None:
     axes = SPZ_AXES[code]
-    cloud = read(foreign.spz(version, 2, [(0xADBE0002, bytes(12)), (0xADBE0003, struct.pack("<I", code))]), "a.spz")
+    cloud = read(spz(version, 2, [(0xADBE0002, bytes(12)), (0xADBE0003, struct.pack("<I", code))]), "a.spz")
     assert np.allclose(cloud.means, world(PLACES, axes), atol=2e-3 if version == 1 else 2e-4)
     turn = np.array([UNIT[letter] for letter in axes]).T
     ways = np.array([[1, 0, 0], [0, 1, 0], [0, 0, 1], [0.6, 0, 0.8], [-0.48, 0.6, 0.64]])
@@ -533,22 +484,22 @@ def test_axes_of_spz_are_those_of_its_extension(code: int, version: int) -> None
 )
 def test_axes_of_spz_that_are_not_known_are_refused(payload: bytes, said: str) -> None:
     with pytest.raises(InputError, match=said):
-        read(foreign.spz(3, 2, [(0xADBE0003, payload)]), "a.spz")
+        read(spz(3, 2, [(0xADBE0003, payload)]), "a.spz")
 
 
 def test_an_extension_longer_than_the_file_is_refused() -> None:
     with pytest.raises(InputError, match="a.spz"):
-        read(foreign.spz(3, 2, more=struct.pack("<II", 0xADBE0003, 400)), "a.spz")
+        read(spz(3, 2, more=struct.pack("<II", 0xADBE0003, 400)), "a.spz")
 
 
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (foreign.spz(3, 2, [(0x4E490001, bytes(64))]), "0x4e490001 (64 bytes)"),
-        (foreign.spz(3, 0x80, more=bytes(999)), "flags that are not known"),
-        (foreign.spz(3, 0, degree=4), "degree 3"),
-        (foreign.spz(3, 0, bits=8), "steps of 3.91 mm"),
-        pytest.param(foreign.spz(4), "--axes RDF", marks=zstandard),
+        (spz(3, 2, [(0x4E490001, bytes(64))]), "0x4e490001 (64 bytes)"),
+        (spz(3, 0x80, more=bytes(999)), "flags that are not known"),
+        (spz(3, 0, degree=4), "degree 3"),
+        (spz(3, 0, bits=8), "steps of 3.91 mm"),
+        pytest.param(spz(4), "--axes RDF", marks=zstandard),
     ],
 )
 def test_what_an_spz_file_means_besides_is_said(content: bytes, said: str, capsys: pytest.CaptureFixture[str]) -> None:
@@ -559,7 +510,7 @@ def test_what_an_spz_file_means_besides_is_said(content: bytes, said: str, capsy
 
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_values_of_spz_of_every_version(version: int) -> None:
-    cloud = read(foreign.spz(version), "a.spz", "world")
+    cloud = read(spz(version), "a.spz", "world")
     assert np.allclose(cloud.means, PLACES, atol=2e-3)
     for n, row in enumerate(ROWS):
         assert abs(cloud.quats[n] @ [row[f"rot_{c}"] for c in range(4)]) > 0.99995
@@ -571,14 +522,14 @@ def test_values_of_spz_of_every_version(version: int) -> None:
 @pytest.mark.parametrize(
     ("content", "suffix", "flag", "axes", "warned"),
     [
-        (foreign.ply(head=["comment Vertical Axis: z"]), ".ply", "viewer", "RDF", True),
-        (foreign.ply(head=["comment Vertical Axis: z"]), ".ply", "world", "FLU", False),
-        (foreign.ply(head=["comment Vertical Axis: z"]), ".ply", "file", "FLU", False),
-        (foreign.ply(head=["comment Vertical Axis: z"]), ".ply", "RUB", "RUB", True),
-        (foreign.ply(), ".ply", "RUF", "RUF", False),
-        (foreign.spz(3, 2, [(0xADBE0003, struct.pack("<I", 6))]), ".spz", "viewer", "RUB", True),
-        (foreign.spz(), ".spz", "RDF", "RDF", False),
-        (foreign.glb(), ".glb", "LUF", "LUF", False),
+        (ply(head=["comment Vertical Axis: z"]), ".ply", "viewer", "RDF", True),
+        (ply(head=["comment Vertical Axis: z"]), ".ply", "world", "FLU", False),
+        (ply(head=["comment Vertical Axis: z"]), ".ply", "file", "FLU", False),
+        (ply(head=["comment Vertical Axis: z"]), ".ply", "RUB", "RUB", True),
+        (ply(), ".ply", "RUF", "RUF", False),
+        (spz(3, 2, [(0xADBE0003, struct.pack("<I", 6))]), ".spz", "viewer", "RUB", True),
+        (spz(), ".spz", "RDF", "RDF", False),
+        (glb(), ".glb", "LUF", "LUF", False),
     ],
 )
 def test_axes_that_are_set_win_and_a_contradiction_is_said(
@@ -591,7 +542,7 @@ def test_axes_that_are_set_win_and_a_contradiction_is_said(
 
 @pytest.mark.parametrize("flag", ["RRU", "XYZ", "rdf", "RDFB", "LRU", ""])
 def test_letters_that_are_no_axes_are_refused(flag: str, tmp_path: Path) -> None:
-    assert command(tmp_path, foreign.ply(), ".ply", "--axes", flag) == 2
+    assert command(tmp_path, ply(), ".ply", "--axes", flag) == 2
 
 
 # -- glTF ------------------------------------------------------------------------------------------
@@ -614,7 +565,7 @@ def by(generator: str) -> dict[str, Any]:
 def test_a_program_that_disagrees_with_gltf_is_named_and_read_as_it_writes(
     generator: str, plain: bool, axes: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    cloud = read(foreign.glb(plain=plain, document=by(generator)), "a.glb")
+    cloud = read(glb(plain=plain, document=by(generator)), "a.glb")
     assert np.allclose(cloud.means, world(PLACES, axes))
     assert np.allclose(cloud.log_scales, [[row[f"scale_{c}"] for c in range(3)] for row in ROWS], atol=1e-5)
     assert np.allclose(cloud.logits, [row["opacity"] for row in ROWS], atol=1e-5)
@@ -622,31 +573,25 @@ def test_a_program_that_disagrees_with_gltf_is_named_and_read_as_it_writes(
 
 
 def test_the_axes_of_a_program_that_disagrees_can_be_overridden() -> None:
-    content = foreign.glb(plain=False, document=by("splat-transform 1.10.1"))
+    content = glb(plain=False, document=by("splat-transform 1.10.1"))
     assert np.allclose(read(content, "a.glb", "viewer").means, world(PLACES, "FUR"))
 
 
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (foreign.glb(plain=False), r"opacity[\s\S]*between 0 and 1[\s\S]*logits"),
-        (foreign.glb(rows(opacity=-9.0), plain=False, document=by("splat-transform 3.7.0")), "logits"),
-        (foreign.glb(rows(opacity=0.5), plain=False), r"size[\s\S]*negative[\s\S]*exp\(scale\)"),
-        (foreign.glb(kind={"colorSpace": "ACEScg"}), r"colour space[\s\S]*srgb_rec709_display[\s\S]*ACEScg"),
-        (foreign.glb(kind={"colorSpace": 3}), "colour space"),
-        (foreign.glb(kind={"kernel": "gabor"}), "ellipsoids"),
-        (
-            foreign.glb(kind={"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}),
-            "compressed",
-        ),
-        (
-            foreign.glb(document={"extensionsRequired": ["KHR_gaussian_splatting", "KHR_draco_mesh_compression"]}),
-            "KHR_draco",
-        ),
-        (foreign.glb(document={"extensionsRequired": "all"}), "no list"),
-        (foreign.glb(view={"extensions": {"EXT_meshopt_compression": {}}}), "EXT_meshopt_compression"),
-        (foreign.glb(view={"buffer": 1}), "outside the file"),
-        (foreign.glb(document={"buffers": [{"byteLength": 9, "uri": "a.bin"}]}), "outside the file"),
+        (glb(plain=False), r"opacity[\s\S]*between 0 and 1[\s\S]*logits"),
+        (glb(rows(opacity=-9.0), plain=False, document=by("splat-transform 3.7.0")), "logits"),
+        (glb(rows(opacity=0.5), plain=False), r"size[\s\S]*negative[\s\S]*exp\(scale\)"),
+        (glb(kind={"colorSpace": "ACEScg"}), r"colour space[\s\S]*srgb_rec709_display[\s\S]*ACEScg"),
+        (glb(kind={"colorSpace": 3}), "colour space"),
+        (glb(kind={"kernel": "gabor"}), "ellipsoids"),
+        (glb(kind={"extensions": {"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}}), "compressed"),
+        (glb(document={"extensionsRequired": ["KHR_gaussian_splatting", "KHR_draco_mesh_compression"]}), "KHR_draco"),
+        (glb(document={"extensionsRequired": "all"}), "no list"),
+        (glb(view={"extensions": {"EXT_meshopt_compression": {}}}), "EXT_meshopt_compression"),
+        (glb(view={"buffer": 1}), "outside the file"),
+        (glb(document={"buffers": [{"byteLength": 9, "uri": "a.bin"}]}), "outside the file"),
     ],
 )
 def test_what_gltf_does_not_allow_or_cannot_be_read_is_refused(content: bytes, said: str) -> None:
@@ -666,7 +611,7 @@ def test_what_gltf_does_not_allow_or_cannot_be_read_is_refused(content: bytes, s
 )
 def test_colour_spaces_of_the_standard_and_of_its_drafts(space: str | None, linear: bool) -> None:
     table = rows(f_dc_0=[-1.0, 0.0, 1.0], f_dc_1=[-0.5, 0.5, 1.5], f_dc_2=[0.25, -0.25, 0.75])
-    cloud = read(foreign.glb(table, kind={"colorSpace": space}), "a.glb")
+    cloud = read(glb(table, kind={"colorSpace": space}), "a.glb")
     for n, row in enumerate(table):
         for c in range(3):
             color = 0.5 + 0.28209479177387814 * row[f"f_dc_{c}"]
@@ -677,15 +622,15 @@ def test_colour_spaces_of_the_standard_and_of_its_drafts(space: str | None, line
 @pytest.mark.parametrize(
     ("content", "said"),
     [
-        (foreign.glb(kind={"colorSpace": None}), "names no colorSpace"),
-        (foreign.glb(kind={"sortingMethod": "zDepth"}), "zDepth"),
-        (foreign.glb(kind={"projection": "orthographic"}), "orthographic"),
-        (foreign.glb(document={"animations": [{"channels": [], "samplers": []}]}), "animations"),
-        (foreign.glb(node={"extensions": {"EXT_mesh_gpu_instancing": {}}}), "instances"),
-        (foreign.glb(turn_length=3.0), "length 1"),
-        (foreign.glb(more="SH_DEGREE_4_COEF_0"), "degree 3"),
+        (glb(kind={"colorSpace": None}), "names no colorSpace"),
+        (glb(kind={"sortingMethod": "zDepth"}), "zDepth"),
+        (glb(kind={"projection": "orthographic"}), "orthographic"),
+        (glb(document={"animations": [{"channels": [], "samplers": []}]}), "animations"),
+        (glb(node={"extensions": {"EXT_mesh_gpu_instancing": {}}}), "instances"),
+        (glb(turn_length=3.0), "length 1"),
+        (glb(more="SH_DEGREE_4_COEF_0"), "degree 3"),
         (
-            foreign.glb(
+            glb(
                 document={
                     "nodes": [{"mesh": 0}, {"mesh": 0, "extensions": {"KHR_node_visibility": {"visible": False}}}],
                     "scenes": [{"nodes": [0, 1]}],
@@ -710,9 +655,7 @@ NEAR = np.array([[0.0, 0.0, 0.0], [0.0123, -0.0456, 0.0789], [3.0017, 1.0029, -2
 
 def far_ply(offset: np.ndarray, kind: str = "double") -> bytes:
     places = offset + NEAR
-    return foreign.ply(
-        rows(**{name: places[:, n].tolist() for n, name in enumerate("xyz")}), kinds=dict.fromkeys("xyz", kind)
-    )
+    return ply(rows(**{name: places[:, n].tolist() for n, name in enumerate("xyz")}), kinds=dict.fromkeys("xyz", kind))
 
 
 @pytest.mark.parametrize("offset", [UTM, ECEF], ids=["UTM", "ECEF"])
@@ -741,9 +684,9 @@ def test_an_offset_that_stays_is_said(tmp_path: Path, capsys: pytest.CaptureFixt
     ("content", "name", "step"),
     [
         (far_ply(UTM, "float"), "a.ply", "500 mm"),
-        (foreign.compressed_ply(600_000, 600_010), "a.ply", "62.5 mm"),
-        (foreign.splat(rows(x=40_000.0)), "a.splat", "3.91 mm"),
-        (foreign.glb(rows(x=300_000.0)), "a.glb", "31.2 mm"),
+        (compressed_ply(600_000, 600_010), "a.ply", "62.5 mm"),
+        (splat(rows(x=40_000.0)), "a.splat", "3.91 mm"),
+        (glb(rows(x=300_000.0)), "a.glb", "31.2 mm"),
     ],
 )
 def test_places_that_were_rounded_in_the_file_are_said(
@@ -764,13 +707,13 @@ def test_places_that_were_rounded_in_the_file_are_said(
 def test_translations_of_nodes_are_added_in_double(
     node: dict[str, Any], scale: float, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    means = read(foreign.glb(node=node), "a.glb", "world").means
+    means = read(glb(node=node), "a.glb", "world").means
     assert np.abs(means - UTM - scale * PLACES).max() < 1e-6
     assert "steps" not in capsys.readouterr().err
 
 
 def test_bounds_of_chunks_in_double_keep_their_places() -> None:
-    means = read(foreign.compressed_ply(5_412_345.678, 5_412_346.678, "double"), "a.ply", "world").means
+    means = read(compressed_ply(5_412_345.678, 5_412_346.678, "double"), "a.ply", "world").means
     assert np.abs(means[:, 0] - [5_412_345.678, 5_412_346.678]).max() < 1e-6
 
 
@@ -791,13 +734,13 @@ def test_gaussians_far_out_in_a_scene_that_is_near_move_nothing(
 ) -> None:
     """A sky of Gaussians, 100 km away."""
     table = [row for _ in range(20) for row in ROWS] + rows(x=1e5)[:1]
-    assert command(tmp_path, foreign.ply(table), ".ply", "--axes", "world") == 0
+    assert command(tmp_path, ply(table), ".ply", "--axes", "world") == 0
     means = load_model(tmp_path / "out").table["means"].detach().numpy()
     assert np.array_equal(means[:3], PLACES.astype(np.float32)) and "warning" not in capsys.readouterr().err
 
 
 def test_a_comment_on_an_offset_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    read(foreign.ply(head=["comment offset 500000 5400000 200"]))
+    read(ply(head=["comment offset 500000 5400000 200"]))
     assert "offset 500000 5400000 200" in capsys.readouterr().err.replace("\n", " ")
 
 

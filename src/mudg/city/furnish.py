@@ -16,6 +16,7 @@ from mudg.city.layout import (
     Furnisher,
     Size,
     StreetPlan,
+    colors,
     plant_tree,
 )
 
@@ -33,13 +34,7 @@ BUILDING, WALL, FENCE, POLE, SIGN_CLASS, VEGETATION = 2, 3, 4, 5, 7, 8  # Citysc
 # materials; the same numbers stand in native/city_world.h
 PLAIN, BARK, METAL, BRICK, SIGN, CONCRETE = 0, 3, 4, 10, 12, 19
 GREYS: tuple[Color, ...] = ((0.36, 0.35, 0.33), (0.24, 0.24, 0.24), (0.45, 0.43, 0.39), (0.30, 0.27, 0.23))
-METALS: tuple[Color, ...] = (
-    (0.35, 0.36, 0.37),
-    (0.05, 0.06, 0.06),
-    (0.04, 0.10, 0.07),
-    (0.16, 0.17, 0.2),
-    (0.20, 0.10, 0.06),
-)
+METALS = colors("0.35 0.36 0.37, 0.05 0.06 0.06, 0.04 0.10 0.07, 0.16 0.17 0.2, 0.20 0.10 0.06")
 Point = tuple[float, float, float]
 
 

@@ -50,57 +50,36 @@ def _other_sky(rng: np.random.Generator, plain: Sky) -> Sky:
         return replace(plain, zenith=plain.zenith * k, horizon=plain.horizon * k, cloud=plain.cloud * k)
     if kind == 1:  # white all over, near saturation
         white = np.array([0.97, 1.0, 1.03]) * warm * bright * rng.uniform(1.0, 1.8)
-        return replace(
-            plain,
-            sun=plain.sun * rng.uniform(0, 0.15),
-            zenith=white * rng.uniform(0.75, 1.05),
-            horizon=white,
-            cloud=white * 0.95,
-            ambient=np.array([0.95, 1.0, 1.06]) * rng.uniform(0.7, 1.3),
-            cloudiness=rng.uniform(0.0, 1.0),
-        )
+        sun, zenith = plain.sun * rng.uniform(0, 0.15), white * rng.uniform(0.75, 1.05)
+        ambient, cloudiness = np.array([0.95, 1.0, 1.06]) * rng.uniform(0.7, 1.3), rng.uniform(0.0, 1.0)
+        return Sky(sun, zenith, white, ambient, white * 0.95, cloudiness, plain.elevation)
     if kind == 2:  # graded blue, pale at the horizon
         deep = np.array([rng.uniform(0.08, 0.4), rng.uniform(0.3, 0.62), rng.uniform(0.75, 1.2)])
-        return replace(
-            plain,
-            zenith=deep * rng.uniform(0.6, 1.3),
-            horizon=np.array([0.85, 0.95, 1.05]) * warm * rng.uniform(0.8, 1.8),
-            cloudiness=rng.uniform(0, 0.25),
-        )
+        zenith, pale = deep * rng.uniform(0.6, 1.3), np.array([0.85, 0.95, 1.05]) * warm * rng.uniform(0.8, 1.8)
+        return replace(plain, zenith=zenith, horizon=pale, cloudiness=rng.uniform(0, 0.25))
     if kind == 3:  # scattered bright clouds
         deep = np.array([rng.uniform(0.15, 0.35), rng.uniform(0.4, 0.55), rng.uniform(0.8, 1.1)])
-        return replace(
-            plain,
-            zenith=deep,
-            horizon=np.array([0.8, 0.9, 1.0]) * rng.uniform(0.8, 1.5),
-            cloudiness=rng.uniform(0.35, 1.1),
-            cloud=np.array([1.0, 1.0, 1.02]) * warm * bright,
-        )
+        pale, cloud = np.array([0.8, 0.9, 1.0]) * rng.uniform(0.8, 1.5), np.array([1.0, 1.0, 1.02]) * warm * bright
+        return replace(plain, zenith=deep, horizon=pale, cloudiness=rng.uniform(0.35, 1.1), cloud=cloud)
     if kind == 4:  # haze: white below, bluish above
         white = np.array([1.0, 1.0, 1.0]) * warm * bright
         blue = np.array([0.55, 0.72, 0.95]) * bright
         return replace(plain, horizon=white * 1.2, zenith=blue, cloud=white, cloudiness=rng.uniform(0.1, 0.6))
     if kind == 5:  # low sun
         glow = np.array([1.5, rng.uniform(0.7, 1.1), rng.uniform(0.35, 0.8)]) * rng.uniform(0.8, 1.6)
-        return Sky(
-            np.array([2.8, 1.7, 0.9]) * rng.uniform(0.4, 1.0),
-            np.array([0.25, 0.35, 0.6]) * rng.uniform(0.8, 1.5),
-            glow,
-            np.array([0.55, 0.52, 0.6]) * rng.uniform(0.9, 1.4),
-            glow * rng.uniform(0.5, 0.9),
-            rng.uniform(0.2, 0.9),
-            float(np.deg2rad(rng.uniform(3, 12))),
+        sun, zenith, ambient, clouds = (
+            np.array(rgb) * rng.uniform(*span)
+            for rgb, span in (
+                ([2.8, 1.7, 0.9], (0.4, 1.0)),
+                ([0.25, 0.35, 0.6], (0.8, 1.5)),
+                ([0.55, 0.52, 0.6], (0.9, 1.4)),
+                (glow, (0.5, 0.9)),
+            )
         )
+        return Sky(sun, zenith, glow, ambient, clouds, rng.uniform(0.2, 0.9), float(np.deg2rad(rng.uniform(3, 12))))
     dark = np.array([0.42, 0.46, 0.52]) * rng.uniform(0.6, 1.2)  # before a storm
-    return replace(
-        plain,
-        sun=plain.sun * 0.05,
-        zenith=dark * 0.8,
-        horizon=dark * rng.uniform(1.0, 1.8),
-        cloud=dark * 0.7,
-        ambient=np.array([0.75, 0.8, 0.9]) * rng.uniform(0.6, 1.0),
-        cloudiness=rng.uniform(0.6, 1.1),
-    )
+    horizon, ambient = dark * rng.uniform(1.0, 1.8), np.array([0.75, 0.8, 0.9]) * rng.uniform(0.6, 1.0)
+    return Sky(plain.sun * 0.05, dark * 0.8, horizon, ambient, dark * 0.7, rng.uniform(0.6, 1.1), plain.elevation)
 
 
 def light_numbers(config: CityConfig) -> tuple[str, NDArray[np.float64]]:
@@ -162,9 +141,8 @@ def weather_numbers(config: CityConfig) -> NDArray[np.float64] | None:
         return None
     puddles, snow = (noise_seed(config.seed, purpose) for purpose in ("puddles", "snow"))
     snow_level = patch_threshold(config.snow_cover, snow) if config.snow_cover else 2.0
-    return np.array(
-        [config.wet, patch_threshold(config.puddles, puddles), puddles, snow_level, snow, LAMP_POWER if night else 0.0]
-    )
+    water, lamps = patch_threshold(config.puddles, puddles), LAMP_POWER if night else 0.0
+    return np.array([config.wet, water, puddles, snow_level, snow, lamps])
 
 
 def lamp_places(rows: Sequence[Sequence[float]]) -> NDArray[np.float64]:

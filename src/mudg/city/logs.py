@@ -87,13 +87,8 @@ def write_world(world: CityWorld, out_dir: Path | str, test_every: int = 4) -> S
 
 def _write_frame(writer: SceneWriter, world: CityWorld, frame_id: str, view: View, moving: NDArray[np.bool_]) -> None:
     truth = world.render(view, sensor_noise=world.config.sensor_noise)
-    labels = {
-        "depth": truth.depth,
-        "semantics": truth.semantics,
-        "sky": truth.sky,
-        "dynamic": moving[truth.instance],
-        "instance": truth.instance,
-    }
+    labels = {"depth": truth.depth, "semantics": truth.semantics, "sky": truth.sky}
+    labels |= {"dynamic": moving[truth.instance], "instance": truth.instance}
     writer.add_frame(frame_id, view, truth.rgb_u8, labels)
 
 

@@ -11,33 +11,17 @@ from numpy.typing import NDArray
 from mudg.base import geometry, seeds
 from mudg.city import layout as rec
 from mudg.city.config import CityConfig
-from mudg.city.layout import KERB_M, Color, Draws, StreetPlan, record
+from mudg.city.layout import KERB_M, Color, Draws, StreetPlan, colors, record
 from mudg.city.sensors import pitch_rotation
 
 Array = NDArray[np.float64]
 
-PAINTS: tuple[Color, ...] = (
-    (0.62, 0.62, 0.62),
-    (0.70, 0.70, 0.69),
-    (0.018, 0.018, 0.02),
-    (0.05, 0.052, 0.056),
-    (0.16, 0.165, 0.17),
-    (0.32, 0.33, 0.34),
-    (0.30, 0.018, 0.018),
-    (0.02, 0.05, 0.20),
-    (0.05, 0.10, 0.24),
-    (0.16, 0.12, 0.08),
-    (0.03, 0.09, 0.06),
-    (0.42, 0.18, 0.03),
-    (0.50, 0.42, 0.05),
+PAINTS = colors(
+    "0.62 0.62 0.62, 0.70 0.70 0.69, 0.018 0.018 0.02, 0.05 0.052 0.056, 0.16 0.165 0.17, 0.32 0.33 0.34",
+    "0.30 0.018 0.018, 0.02 0.05 0.20, 0.05 0.10 0.24, 0.16 0.12 0.08, 0.03 0.09 0.06, 0.42 0.18 0.03",
+    "0.50 0.42 0.05",
 )
-BUS_COLORS: tuple[Color, ...] = (
-    (0.45, 0.03, 0.03),
-    (0.55, 0.42, 0.03),
-    (0.6, 0.6, 0.58),
-    (0.03, 0.16, 0.30),
-    (0.05, 0.25, 0.12),
-)
+BUS_COLORS = colors("0.45 0.03 0.03, 0.55 0.42 0.03, 0.6 0.6 0.58, 0.03 0.16 0.30, 0.05 0.25 0.12")
 PAINT_WEIGHTS = np.array([4, 4, 3, 3, 3, 3, 2, 1.5, 1.5, 1, 0.7, 0.5, 0.3])
 KEY_MARGIN_S = 0.5
 RIG_BOX = (-1.2, 3.2)  # where cameras may sit along the vehicle, with clearance, metres

@@ -50,7 +50,7 @@ from mudg.formats.exporters.messages import (
 )
 from mudg.formats.exporters.rerun_file import package, write_rerun
 from mudg.formats.splats.binary import MAX_BYTES
-from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene, logit, spacing_m, unit
+from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene, logit, spacing_m, turned, unit
 from mudg.formats.splats.cloud import known as known_axes
 from mudg.formats.splats.formats import COARSE_M, FORMATS, WriteRequest, file_from_world, losses, read_cloud
 from mudg.gaussians.model import COLUMNS, SceneModel
@@ -70,24 +70,6 @@ LOG_FOLDERS: Final = {"ros2": (1, (BAG_METADATA, BAG_FILE)), "ncore": (1, ncore.
 """Formats that are folders: version and files of each."""
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Told:
-    """What is told over time: the records of a log, and Gaussians where the format shows them; either may be None."""
-
-    records: LogRecords | None
-    splats: SplatScene | None = None
-
-    @property
-    def summary(self) -> str:
-        """What there is, for people."""
-        parts = []
-        if self.records is not None:
-            parts.append(f"{len(self.records.scene.frames)} pictures, {len(self.records.scene.sweeps)} sweeps")
-        if self.splats is not None:
-            parts.append(f"{sum(len(node.cloud) for node in self.splats.nodes)} Gaussians")
-        return ", ".join(parts)
-
-
 def records_of(scene: Scene, fused: Any = None) -> LogRecords:
     """The records of a scene on disk; pictures and points are read when they are asked for."""
     files = open_files(scene.root)
@@ -104,41 +86,38 @@ def refuse_missing(name: str) -> None:
         mcap_writer()
 
 
-def write_log(name: str, told: Told, out: Path) -> dict[str, int]:
-    """Write a log as one file, ``mcap`` or ``rerun``; returns its size."""
+def write_log(name: str, records: LogRecords | None, splats: SplatScene | None, out: Path) -> dict[str, int]:
+    """Write a log as one file: ``mcap`` the records, ``rerun`` records and Gaussians; returns its size."""
     if name == "rerun":
-        title = told.records.scene.id if told.records is not None else "scene"
-        write_rerun(out, told.records, told.splats, title)
-    elif told.records is not None:
-        write_mcap(out, FoxgloveMessages(told.records))
+        write_rerun(out, records, splats, records.scene.id if records is not None else "scene")
+    elif records is not None:
+        write_mcap(out, FoxgloveMessages(records))
+    contents = [] if records is None else [_counts(records)]
+    if splats is not None:
+        contents.append(f"{_count(splats)} Gaussians")
     size = out.stat().st_size
-    log.info(f"export: {told.summary}, {size / 1e6:.2f} MB")
+    log.info(f"export: {', '.join(contents)}, {size / 1e6:.2f} MB")
     return {"bytes": size}
+
+
+def _counts(records: LogRecords) -> str:
+    return f"{len(records.scene.frames)} pictures, {len(records.scene.sweeps)} sweeps"
 
 
 def write_messages(name: str, records: LogRecords, out: Path) -> dict[str, Any]:
     """Write a log as a folder, ``ros2`` or ``ncore``; returns a summary."""
-    content, summary = _bag(records, out) if name == "ros2" else _recording(records, out)
-    told = "".join(f", {count} {what}" for what, count in summary.items())
-    log.info(f"export: {Told(records).summary}{told}, {content.stat().st_size / 1e6:.2f} MB in {out}")
-    return {"format": name, **summary}
-
-
-def _bag(records: LogRecords, folder: Path) -> tuple[Path, dict[str, int]]:
-    """A bag of ROS 2: its largest file, and what to say of it."""
-    topics, span = write_mcap(folder / BAG_FILE, Ros2Messages(records))
-    store.atomic_write(folder / BAG_METADATA, bag_metadata(topics, span))
-    return folder / BAG_FILE, {"messages": sum(number for _, number in topics.values())}
-
-
-def _recording(records: LogRecords, folder: Path) -> tuple[Path, dict[str, int]]:
-    """A recording of NCore."""
-    rolling = [name for name, camera in records.scene.cameras.items() if camera.readout_s > 0]
-    if rolling:
-        log.warn(
-            f"export: a scene does not know which way the shutters of {', '.join(rolling)} roll; ncore says downwards"
-        )
-    return ncore.write_ncore(folder, records)[0], {"boxes": len(records.scene.tracks)}
+    if name == "ros2":
+        topics, span = write_mcap(out / BAG_FILE, Ros2Messages(records))
+        store.atomic_write(out / BAG_METADATA, bag_metadata(topics, span))
+        largest, what, count = out / BAG_FILE, "messages", sum(number for _, number in topics.values())
+    else:
+        rolling = ", ".join(name for name, camera in records.scene.cameras.items() if camera.readout_s > 0)
+        if rolling:
+            unknown = f"a scene does not know which way the shutters of {rolling} roll"
+            log.warn(f"export: {unknown}; ncore says downwards")
+        largest, what, count = ncore.write_ncore(out, records)[0], "boxes", len(records.scene.tracks)
+    log.info(f"export: {_counts(records)}, {count} {what}, {largest.stat().st_size / 1e6:.2f} MB in {out}")
+    return {"format": name, what: count}
 
 
 # scenes -------------------------------------------------------------------------------------------
@@ -167,44 +146,36 @@ def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> 
     unknown = [name for name in names if name not in there]
     if unknown:
         raise UsageError(f"the fitted scene has no node {unknown[0]!r}", where="--nodes", expected=", ".join(there))
-    classes, made = classes_of_rows(model), list[SplatNode]()
+    classes, nodes = classes_of_rows(model), list[SplatNode]()
     for index, node in enumerate(model.nodes):
         rows = (model.table.labels["node"] == index).nonzero()[:, 0]
         if (names and node.name not in names) or (index and not len(rows)):
             continue
         ids = classes[rows.cpu().numpy()]
         known = None if not model.classes else np.where(ids < 0, UNLABELLED, ids).astype(np.uint8)
-        made.append(_node(node, _given(model, rows), _sh(model, rows), known, time_s))
+        own = {name: value.detach()[rows] for name, value in model.table.columns.items()}
+        further = {name: value for name, value in own.items() if name not in COLUMNS}
+        parts = NodeRows(own["means"], own["quats"], torch.sigmoid(own["logits"]), own["sh_dc"], further)
+        bands = torch.cat([own[name] for name in ("sh_dc", "sh_rest") if name in own], 1)
+        sh = bands[:, : (model.sh_degree + 1) ** 2].cpu().numpy()
+        nodes.append(_node(node, parts, own["log_scales"], sh, known, time_s))
     facts = {key: model.facts[key] for key in ("method", "scene", "drawing") if key in model.facts}
     name = str(model.facts.get("scene", "scene"))
-    return SplatScene(name, tuple(made), sky=None if model.sky is None else sky_picture(model.sky), facts=facts)
-
-
-def _given(model: SceneModel, rows: Tensor) -> tuple[NodeRows, Tensor]:
-    """Rows of a node as ``at_time`` takes them, and their sizes."""
-    own = {name: value.detach()[rows] for name, value in model.table.columns.items()}
-    further = {name: value for name, value in own.items() if name not in COLUMNS}
-    return NodeRows(own["means"], own["quats"], torch.sigmoid(own["logits"]), own["sh_dc"], further), own["log_scales"]
-
-
-def _sh(model: SceneModel, rows: Tensor) -> NDArray[np.float32]:
-    parts = [model.table[name].detach()[rows] for name in ("sh_dc", "sh_rest") if name in model.table.columns]
-    return torch.cat(parts, 1)[:, : (model.sh_degree + 1) ** 2].cpu().numpy()
+    return SplatScene(name, tuple(nodes), sky=None if model.sky is None else sky_picture(model.sky), facts=facts)
 
 
 def _node(
     node: StaticNode | RigidNode,
-    given: tuple[NodeRows, Tensor],
+    rows: NodeRows,
+    log_scales: Tensor,
     sh: NDArray[np.float32],
     classes: NDArray[np.uint8] | None,
     time_s: float,
 ) -> SplatNode:
-    rows, log_scales = given
     if not isinstance(node, RigidNode):
         now = rows if type(node) is StaticNode else node.at_time(rows, time_s)
-        return SplatNode(
-            node.name, _cloud(replace(rows, opacity=rows.opacity * 0) if now is None else now, log_scales, sh, classes)
-        )
+        now = replace(rows, opacity=rows.opacity * 0) if now is None else now
+        return SplatNode(node.name, _cloud(now, log_scales, sh, classes))
     cloud, displacement = _cloud(rows, log_scales, sh, classes), None
     keys = node.corrected_keys()
     if type(node) is DeformableNode:
@@ -236,10 +207,8 @@ def _sampled(
         box_from_world = geometry.invert(keys[index])
         places.append(geometry.transform_points(box_from_world, now.means.cpu().numpy().astype(np.float64)))
         if index == middle:
-            turn = SplatCloud(
-                cloud.means, unit(now.quats.cpu().numpy(), node.name), cloud.log_scales, cloud.logits, cloud.sh[:, :1]
-            )
-            cloud = replace(cloud, quats=turn.moved(box_from_world).quats)
+            turns = unit(now.quats.cpu().numpy(), node.name)
+            cloud = replace(cloud, quats=turned(geometry.quaternion_from_matrix(box_from_world), turns))
     base = places[middle].astype(np.float32)
     return replace(cloud, means=base), (np.stack(places) - base).astype(np.float32)
 
@@ -280,28 +249,20 @@ def with_sky_sphere(scene: SplatScene) -> SplatScene:
 
 def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
     """The Gaussians of a file as a fitted scene in which nothing moves; classes where the file holds them."""
-    columns = {
-        "means": cloud.means,
-        "quats": cloud.quats,
-        "log_scales": cloud.log_scales,
-        "logits": cloud.logits,
-        "sh_dc": cloud.sh[:, :1],
-    }
+    columns = {name: getattr(cloud, name) for name in ("means", "quats", "log_scales", "logits")}
+    columns["sh_dc"] = cloud.sh[:, :1]
     if cloud.degree:
         columns["sh_rest"] = cloud.sh[:, 1:]
     known: tuple[int, ...] = ()
     if cloud.class_ids is not None:
         known = tuple(int(value) for value in np.unique(cloud.class_ids) if value < 19)
     if known and cloud.class_ids is not None:
-        columns["semantics"] = np.where(cloud.class_ids[:, None] == np.array(known), CLASS_LOGIT, -CLASS_LOGIT).astype(
-            np.float32
-        )
+        columns["semantics"] = np.where(cloud.class_ids[:, None] == np.array(known), CLASS_LOGIT, -CLASS_LOGIT)
     tensors = {key: torch.from_numpy(np.ascontiguousarray(value, np.float32)) for key, value in columns.items()}
     table = Table(tensors, {"node": torch.zeros(len(cloud), dtype=torch.int32)})
     drawing = {DRAWING: {"antialias": True}} if cloud.antialias else {}
-    return SceneModel(
-        table, (StaticNode(),), None, known, cloud.degree, {"method": IMPORTED, "source": name, **drawing}
-    )
+    facts = {"method": IMPORTED, "source": name, **drawing}
+    return SceneModel(table, (StaticNode(),), None, known, cloud.degree, facts)
 
 
 # export -------------------------------------------------------------------------------------------
@@ -315,13 +276,8 @@ CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes
 """Formats of cameras: files beside the pictures."""
 _ALL_MOMENTS: Final = ("bundle", "alpasim")
 MOST_POINTS: Final = 500_000
-FOLDERS: Final = {
-    **{
-        name: (1, ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/"))
-        for name in CAMERAS
-    },
-    **LOG_FOLDERS,
-}
+_CAMERA_FILES: Final = ("transforms.json", "points.ply", *below("sparse/0", ("*.bin", "*.txt")), "images/")
+FOLDERS: Final = {**dict.fromkeys(CAMERAS, (1, _CAMERA_FILES)), **LOG_FOLDERS}
 """Formats that are folders: version and files of each."""
 
 
@@ -411,9 +367,8 @@ def _refuse_settings(config: ExportConfig, name: str) -> None:
     if name in _ALL_MOMENTS and config.time_s is not None:
         what = "a file of this format holds all moments"
         raise UsageError(what, where="--time-s", got=name, remedy="leave it out, or export ply")
-    set_here = [
-        key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(ExportConfig(), key)
-    ]
+    usual = ExportConfig()
+    set_here = [key for key in ("time_s", "nodes", "spz_version") if getattr(config, key) != getattr(usual, key)]
     refused = set_here if name not in FORMATS else [key for key in set_here if key == "spz_version" and name != "spz"]
     if refused:
         flag = refused[0].replace("_", "-")
@@ -506,7 +461,7 @@ def _messages(_config: ExportConfig, name: str, given: Exported, out: Path) -> d
         splats = splat_scene(given.model, middle_s(given.model, given.log))
     if name != "rerun" or given.log is not None:
         records = records_of(recorded_scene(given), _points(given) if splats is None else None)
-    return write_log(name, Told(records, splats), out)
+    return write_log(name, records, splats, out)
 
 
 def recorded_scene(given: Exported) -> Scene:
@@ -515,9 +470,8 @@ def recorded_scene(given: Exported) -> Scene:
         what, where = "cameras belong to a scene, and none is known here", str(given.parts.model)
         raise InputError(what, where=where, remedy="give --scene SCENE, or a folder made by `mudg run`")
     if given.edited:
-        log.warn(
-            "export: an edit script changes boxes and the vehicle's path here; pictures and sweeps stay as recorded"
-        )
+        changes = "an edit script changes boxes and the vehicle's path here"
+        log.warn(f"export: {changes}; pictures and sweeps stay as recorded")
     return given.log
 
 
@@ -542,9 +496,7 @@ def _points(given: Exported) -> PointCloud | None:
 
 
 TRAIN_IDS: Final = {
-    "pedestrian": ID["person"],
-    "adult": ID["person"],
-    "child": ID["person"],
+    **dict.fromkeys(("pedestrian", "adult", "child"), ID["person"]),
     "cyclist": ID["rider"],
     "van": ID["car"],
     "tram": ID["train"],
@@ -624,13 +576,8 @@ def asset_of_cloud(cloud: SplatCloud, config: ImportConfig, origin: str) -> Asse
             " stands in"
         )
     logs = (cloud.log_scales + np.log(scale)).astype(np.float32)
-    columns = {
-        "means": means,
-        "quats": cloud.quats,
-        "log_scales": logs,
-        "logits": cloud.logits,
-        "sh_dc": cloud.sh[:, :1],
-    }
+    columns = {"means": means, "quats": cloud.quats, "log_scales": logs, "logits": cloud.logits}
+    columns["sh_dc"] = cloud.sh[:, :1]
     label = config.label.strip().lower()
     ids = np.full(len(cloud), TRAIN_IDS.get(label, ID.get(label, -1)), np.int64)
     if cloud.class_ids is not None:

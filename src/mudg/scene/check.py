@@ -287,11 +287,8 @@ def _check_cameras(scene: Scene) -> Findings:
                 yield _note(where, "all poses are the same: nothing can be learnt about depth from motion")
         downs = [float(frame.view.world_from_cam[2, 1]) for frame in frames]
         if downs and np.median(downs) > -0.5:
-            yield _warning(
-                where,
-                "its image's down direction does not point to the ground; is the world z up and the camera "
-                "x right, y down, z forward?",
-            )
+            axes = "is the world z up and the camera x right, y down, z forward?"
+            yield _warning(where, f"its image's down direction does not point to the ground; {axes}")
 
 
 def _check_ego(scene: Scene) -> Findings:
@@ -323,11 +320,9 @@ def check_distance(scene: Scene) -> Findings:
     )
     spacing_m = float32_spacing_m(places)
     if spacing_m > FLOAT32_SPACING_M:
-        yield _warning(
-            "world",
-            f"the log reaches {np.linalg.norm(places, axis=1).max():.0f} m from the origin; float32 rounds points there"
-            f" to {spacing_m * 1e3:.3g} mm: put the origin near the first pose, subtracted in float64",
-        )
+        reach = f"the log reaches {np.linalg.norm(places, axis=1).max():.0f} m from the origin"
+        rounds = f"float32 rounds points there to {spacing_m * 1e3:.3g} mm"
+        yield _warning("world", f"{reach}; {rounds}: put the origin near the first pose, subtracted in float64")
 
 
 def _check_keys(
@@ -339,41 +334,28 @@ def _check_keys(
         return
     flips = motion.heading_flips(times_s, poses, most_rad_s)
     if len(flips):
-        mended = (
-            "ingest turns it back"
-            if len(motion.unflipped(times_s, poses, most_rad_s)[1])
-            else "which side is right is not clear"
-        )
-        yield _warning(
-            where,
-            f"its heading flips by 180 degrees {len(flips)} times, first after {times_s[flips[0]]:.3f} s (key"
-            f" {flips[0]}): {mended}",
-        )
+        mended = len(motion.unflipped(times_s, poses, most_rad_s)[1])
+        side = "ingest turns it back" if mended else "which side is right is not clear"
+        first = f"first after {times_s[flips[0]]:.3f} s (key {flips[0]})"
+        yield _warning(where, f"its heading flips by 180 degrees {len(flips)} times, {first}: {side}")
     angle, rate = motion.turns(times_s, poses)
     fast = np.flatnonzero((rate > most_rad_s) & (angle > np.deg2rad(motion.MIN_TURN_DEG)))
     fast = fast[~np.isin(fast, flips)]
     if len(fast):
         key = int(fast[np.argmax(angle[fast])])
-        yield _warning(
-            where,
-            f"it turns by {np.rad2deg(angle[key]):.0f} degrees within {times_s[key + 1] - times_s[key]:.2f} s after "
-            f"{times_s[key]:.3f} s (key {key}; {len(fast)} such turns); check headings and times",
-        )
+        turn = f"{np.rad2deg(angle[key]):.0f} degrees within {times_s[key + 1] - times_s[key]:.2f} s"
+        at = f"after {times_s[key]:.3f} s (key {key}; {len(fast)} such turns)"
+        yield _warning(where, f"it turns by {turn} {at}; check headings and times")
     jumps = motion.jumps(times_s, poses, _TRACK_JUMP_M if of_box else _JUMP_M)
     if jumps:
         key, off_m, acceleration = jumps[0]
-        yield _warning(
-            where,
-            f"it jumps by {off_m:.1f} m after {times_s[key]:.3f} s (key {key}, {acceleration:.0f} m/s^2; {len(jumps)}"
-            " such steps); check poses, times and ids",
-        )
+        at = f"after {times_s[key]:.3f} s (key {key}, {acceleration:.0f} m/s^2; {len(jumps)} such steps)"
+        yield _warning(where, f"it jumps by {off_m:.1f} m {at}; check poses, times and ids")
         return
     key, acceleration = motion.largest_acceleration(times_s, poses)
     if acceleration > (motion.MOST_BOX_ACCELERATION_M_S2 if of_box else motion.MOST_ACCELERATION_M_S2):
-        yield _warning(
-            where,
-            f"it accelerates by {acceleration:.0f} m/s^2 at {times_s[key]:.3f} s (key {key}); check poses and times",
-        )
+        at = f"at {times_s[key]:.3f} s (key {key})"
+        yield _warning(where, f"it accelerates by {acceleration:.0f} m/s^2 {at}; check poses and times")
 
 
 def _check_gaps(scene: Scene) -> Findings:
@@ -389,11 +371,8 @@ def _check_gaps(scene: Scene) -> Findings:
         gaps = np.flatnonzero(steps > MAX_GAP_STEPS * usual)
         if len(gaps):
             missing = int(np.round(steps[gaps] / max(usual, 1e-9) - 1).sum())
-            yield _warning(
-                where,
-                f"about {missing} records are missing: {len(gaps)} gaps, the first of {steps[gaps[0]]:.2f} s after "
-                f"{times[int(gaps[0])]:.2f} s (usual: {usual:.3f} s)",
-            )
+            first = f"the first of {steps[gaps[0]]:.2f} s after {times[int(gaps[0])]:.2f} s (usual: {usual:.3f} s)"
+            yield _warning(where, f"about {missing} records are missing: {len(gaps)} gaps, {first}")
 
 
 def _check_tracks(scene: Scene) -> Findings:
@@ -411,11 +390,8 @@ def _check_tracks(scene: Scene) -> Findings:
         if len(steps):
             gaps = np.where(_moves_between_keys(track), steps, 0.0)
             if gaps.max() > MAX_TRACK_GAP_S:
-                yield _warning(
-                    where,
-                    f"it is not seen for {gaps.max():.1f} s from {track.times_s[int(gaps.argmax())]:.1f} s on; its "
-                    "path across the gap is a guess: split the track",
-                )
+                unseen = f"it is not seen for {gaps.max():.1f} s from {track.times_s[int(gaps.argmax())]:.1f} s on"
+                yield _warning(where, f"{unseen}; its path across the gap is a guess: split the track")
             speed = np.linalg.norm(np.diff(track.world_from_object[:, :3, 3], axis=0), axis=1) / steps
             if speed.max() > MAX_SPEED_M_S:
                 yield _warning(where, f"it moves at {speed.max():.0f} m/s; check ids and poses")
@@ -506,19 +482,13 @@ def check_points(scene: Scene, sweep: Sweep, points: SweepPoints) -> Findings:
         return
     zeros = int(at_sensor(points, sweep.time_s, sweep.world_from_lidar, scene.ego).sum())
     if zeros:
-        yield _warning(
-            where,
-            f"{zeros} of {len(points.xyz)} points lie within {LEAST_RANGE_M:g} m of the LiDAR: beams without a return? "
-            "leave them out, or ingest the log again",
-        )
+        near = f"{zeros} of {len(points.xyz)} points lie within {LEAST_RANGE_M:g} m of the LiDAR"
+        yield _warning(where, f"{near}: beams without a return? leave them out, or ingest the log again")
     ranges = np.linalg.norm(points.xyz, axis=1)
     farthest = int((ranges > ranges.max() * (1 - 1e-5)).sum())
     if farthest >= max(_SAME_RANGE_POINTS, _SAME_RANGE_SHARE * len(ranges)):
-        yield _warning(
-            where,
-            f"{farthest} of {len(ranges)} points lie at the same largest range, {ranges.max():.2f} m: does it mark"
-            " beams without a return? leave them out",
-        )
+        same = f"{farthest} of {len(ranges)} points lie at the same largest range, {ranges.max():.2f} m"
+        yield _warning(where, f"{same}: does it mark beams without a return? leave them out")
     reach = np.median(ranges)
     if reach > 500:
         far = f"half of its points are farther than {reach:.0f} m"

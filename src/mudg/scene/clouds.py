@@ -67,11 +67,9 @@ def at_sensor(
     first, last = float(ego.times_s[0]), float(ego.times_s[-1])
     moments = np.linspace(float(points.dt_s.min()), float(points.dt_s.max()), _MOMENTS)
     lidar_from_world, ego_from_lidar = invert(world_from_lidar), invert(mount) @ world_from_lidar
+    poses = [ego.pose_at(min(max(time_s + float(moment), first), last)) for moment in moments]
     places = np.stack(
-        [
-            (lidar_from_world @ pose @ ego_from_lidar)[:3, 3] if pose is not None else np.zeros(3)
-            for pose in (ego.pose_at(min(max(time_s + float(moment), first), last)) for moment in moments)
-        ]
+        [np.zeros(3) if pose is None else (lidar_from_world @ pose @ ego_from_lidar)[:3, 3] for pose in poses]
     )
     reach = float(np.linalg.norm(places, axis=1).max()) + LEAST_RANGE_M
     # few: the rest is farther away than the sensor ever was

@@ -149,10 +149,8 @@ def mean_around(rgb: NDArray[np.uint8], row: NDArray[np.intp], column: NDArray[n
 
 def describe_colors(cameras: CameraColors) -> list[str]:
     """Which cameras' colours differ, in sentences."""
-    return [
-        f"colours of {name} brought to those of {cameras.reference}: gain {' '.join(f'{g:.2f}' for g in found.gain)}"
-        for name, found in cameras.to_common.items()
-    ]
+    gains = {name: " ".join(f"{gain:.2f}" for gain in found.gain) for name, found in cameras.to_common.items()}
+    return [f"colours of {name} brought to those of {cameras.reference}: gain {gain}" for name, gain in gains.items()]
 
 
 def _nearest(frames: list[Frame], time_s: float) -> Frame:
@@ -180,16 +178,11 @@ def describe(report: FusionReport) -> list[str]:
     """What happened, in sentences."""
     dynamic = [track_id for track_id, verdict in report.verdicts.items() if verdict.moving]
     total = max(report.points_in, 1)
-    lines = [
-        (
-            f"{report.sweeps} sweeps, {report.points_in} points: {report.points_colored / total:.0%} coloured, "
-            f"{report.points_hidden / total:.1%} occluded, {report.points_unseen / total:.0%} in no image"
-        ),
-        (
-            f"{len(dynamic)} of {len(report.verdicts)} tracked boxes are dynamic; {report.points_static} points in the"
-            " static cloud"
-        ),
-    ]
+    colored, hidden, unseen = (n / total for n in (report.points_colored, report.points_hidden, report.points_unseen))
+    shares = f"{colored:.0%} coloured, {hidden:.1%} occluded, {unseen:.0%} in no image"
+    boxes = f"{len(dynamic)} of {len(report.verdicts)} tracked boxes are dynamic"
+    lines = [f"{report.sweeps} sweeps, {report.points_in} points: {shares}"]
+    lines.append(f"{boxes}; {report.points_static} points in the static cloud")
     shown = list(report.left_out.items())[:MOST_NAMED]
     lines += [f"dynamic object {track_id} left out: {words}" for track_id, words in shown]
     if len(report.left_out) > len(shown):

@@ -18,20 +18,7 @@ Matrix = NDArray[np.float64]
 Times = NDArray[np.float64]
 
 VEHICLES: Final = frozenset(
-    (
-        "car",
-        "van",
-        "truck",
-        "bus",
-        "vehicle",
-        "trailer",
-        "towed_object",
-        "construction_vehicle",
-        "tram",
-        "train",
-        "motorcycle",
-        "bicycle",
-    )
+    "car van truck bus vehicle trailer towed_object construction_vehicle tram train motorcycle bicycle".split()
 )
 """Labels of what drives. These are longer than wide; barriers, signs and people need not be."""
 GAP_STEPS: Final = 2.5
@@ -97,17 +84,12 @@ def gaps(times_s: Times, poses: Matrix) -> list[Gap]:
     usual = float(np.sort(steps)[len(steps) // 10])  # not the median: of few keys a gap would be usual
     long = np.flatnonzero(steps > max(GAP_S, GAP_STEPS * usual))
     moved = np.linalg.norm(poses[long + 1, :3, 3] - poses[long, :3, 3], axis=1)
-    return [
-        Gap(
-            key,
-            float(times_s[key]),
-            float(times_s[key + 1]),
-            float(m),
-            max(_off_m(times_s, poses, key, u) for u in (0.25, 0.5, 0.75)),
-        )
-        for key, m in zip(long.tolist(), moved, strict=True)
-        if m >= GAP_M
-    ]
+    found = []
+    for key, metres in zip(long.tolist(), moved.tolist(), strict=True):
+        if metres >= GAP_M:
+            off_m = max(_off_m(times_s, poses, key, u) for u in (0.25, 0.5, 0.75))
+            found.append(Gap(key, float(times_s[key]), float(times_s[key + 1]), metres, off_m))
+    return found
 
 
 def gap_at(path: EgoPath, time_s: float) -> Gap | None:

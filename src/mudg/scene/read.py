@@ -12,7 +12,7 @@ import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple, Protocol
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,25 +35,6 @@ from mudg.scene.schema import parse_object, ref_problem
 
 MAX_FILE_BYTES: Final = 4 * 1024**3
 READABLE: Final = "a readable file inside the scene"
-
-
-class SceneFiles(Protocol):
-    """Read access to the files of one scene."""
-
-    root: str
-
-    def read(self, ref: str) -> bytes:
-        """All bytes of the file ``ref``, checked against the manifest where there is one."""
-        ...
-
-    def is_hashed(self, ref: str) -> bool:
-        """Whether the manifest holds a hash of ``ref``, so that what ``read`` returns is known to be as it was
-        written."""
-        ...
-
-    def problem(self, ref: str) -> str | None:
-        """Say why ``ref`` cannot be read (missing, outside the scene), or None. Cheap: nothing is opened."""
-        ...
 
 
 def open_files(path: Path | str) -> SceneFiles:
@@ -85,51 +66,62 @@ def _open_cached(path: str, _mtime_ns: int, _size: int, _manifest_ns: int) -> Sc
     return FolderFiles(path) if os.path.isdir(path) else ZipFiles(path)
 
 
-class _Manifest:
-    """The sha256 sums that were written with a scene; empty for a scene without any."""
+class SceneFiles:
+    """Read access to the files of one scene, which are compared with the sha256 sums that were written with it."""
 
-    def __init__(self, content: bytes | None, root: str) -> None:
+    expected, remedy = "", ""
+
+    def __init__(self, root: str, manifest: bytes | None) -> None:
         self.root = root
-        self.hashes: dict[str, str] = {}
+        self._hashes: dict[str, str] = {}
         where = f"{root}: {store.MANIFEST}"
         try:
-            if content is not None:
-                files = parse_object(content, where)["files"]
-                self.hashes = {str(name): str(entry["sha256"]) for name, entry in files.items()}
+            if manifest is not None:
+                files = parse_object(manifest, where)["files"]
+                self._hashes = {str(name): str(entry["sha256"]) for name, entry in files.items()}
         except (InputError, KeyError, TypeError, AttributeError) as error:
             remedy = "ingest again, or delete the manifest if you edited the scene on purpose"
             raise IntegrityError("the manifest is damaged", where=where, got=str(error), remedy=remedy) from error
 
-    def checked(self, content: bytes, ref: str) -> bytes:
-        """The content of ``ref``; IntegrityError if it differs from what was written."""
-        expected = self.hashes.get(ref)
+    def read(self, ref: str) -> bytes:
+        """All bytes of the file ``ref``, checked against the manifest where there is one."""
+        problem, where = self.problem(ref), f"{self.root}: {ref}"
+        if problem is not None:
+            raise InputError(problem, where=where, expected=self.expected, remedy=self.remedy)
+        content, expected = self._raw(ref), self._hashes.get(ref)
         if expected is not None and hashlib.sha256(content).hexdigest() != expected:
-            what, where = "a file differs from what was written", f"{self.root}: {ref}"
+            what, expected = "a file differs from what was written", f"sha256 {expected[:16]}..."
             remedy = "restore the file or ingest again; delete manifest.json if you edited the scene on purpose"
-            raise IntegrityError(what, where=where, expected=f"sha256 {expected[:16]}...", remedy=remedy)
+            raise IntegrityError(what, where=where, expected=expected, remedy=remedy)
         return content
 
-
-class FolderFiles:
-    """A scene in a directory."""
-
-    def __init__(self, root: str) -> None:
-        self.root = root
-        self._real_root = os.path.realpath(root)
-        manifest = Path(root) / store.MANIFEST
-        self._manifest = _Manifest(store.read_bytes(manifest) if manifest.is_file() else None, root)
-
-    def read(self, ref: str) -> bytes:
-        problem = self.problem(ref)
-        if problem is not None:
-            remedy = "restore the file or ingest the log again"
-            raise InputError(problem, where=f"{self.root}: {ref}", expected=READABLE, remedy=remedy)
-        return self._manifest.checked(store.read_bytes(Path(self.root) / ref), ref)
-
     def is_hashed(self, ref: str) -> bool:
-        return ref in self._manifest.hashes
+        """Whether the manifest holds a hash of ``ref``, so that what ``read`` returns is known to be as written."""
+        return ref in self._hashes
 
     def problem(self, ref: str) -> str | None:
+        """Say why ``ref`` cannot be read (missing, outside the scene), or None. Cheap: nothing is opened."""
+        raise NotImplementedError
+
+    def _raw(self, ref: str) -> bytes:
+        raise NotImplementedError
+
+
+class FolderFiles(SceneFiles):
+    """A scene in a directory."""
+
+    expected, remedy = READABLE, "restore the file or ingest the log again"
+
+    def __init__(self, root: str) -> None:
+        self._real_root = os.path.realpath(root)
+        manifest = Path(root) / store.MANIFEST
+        super().__init__(root, store.read_bytes(manifest) if manifest.is_file() else None)
+
+    def _raw(self, ref: str) -> bytes:
+        return store.read_bytes(Path(self.root) / ref)
+
+    def problem(self, ref: str) -> str | None:
+        """As above."""
         text_problem = ref_problem(ref)
         if text_problem is not None:
             return f"file reference {text_problem}"
@@ -153,13 +145,14 @@ class _ZipEntry(NamedTuple):
     crc: int
 
 
-class ZipFiles:
+class ZipFiles(SceneFiles):
     """A scene in a stored (not deflated) zip, read by offset: opening a frame costs one seek."""
 
+    expected = "a file inside the zip"
+
     def __init__(self, root: str) -> None:
-        self.root = root
-        self._entries = self._index(root)
-        self._manifest = _Manifest(self._raw(store.MANIFEST) if store.MANIFEST in self._entries else None, root)
+        self.root, self._entries = root, self._index(root)
+        super().__init__(root, self._raw(store.MANIFEST) if store.MANIFEST in self._entries else None)
 
     @staticmethod
     def _index(root: str) -> dict[str, _ZipEntry]:
@@ -207,16 +200,8 @@ class ZipFiles:
             raise InputError("zip is damaged", where=where, expected=expected, got=got, remedy="copy the zip again")
         return content
 
-    def read(self, ref: str) -> bytes:
-        problem = self.problem(ref)
-        if problem is not None:
-            raise InputError(problem, where=f"{self.root}: {ref}", expected="a file inside the zip")
-        return self._manifest.checked(self._raw(ref), ref)
-
-    def is_hashed(self, ref: str) -> bool:
-        return ref in self._manifest.hashes
-
     def problem(self, ref: str) -> str | None:
+        """As above."""
         return None if ref in self._entries else "a file is missing"
 
 

@@ -29,16 +29,8 @@ SCHEMA_VERSION: Final = 1
 MAX_IMAGE_SIDE_PX: Final = 32768
 MAX_BOX_SIDE_M: Final = 200.0
 
-LABEL_NAMES: Final = (
-    "depth",
-    "semantics",
-    "sky",
-    "ego",
-    "dynamic",
-    "instance",
-    "semantics_confidence",
-    "depth_confidence",
-    "rendered",
+LABEL_NAMES: Final = tuple(
+    "depth semantics sky ego dynamic instance semantics_confidence depth_confidence rendered".split()
 )
 """Labels a frame may carry; see ``read_label`` for the array each of them is."""
 
@@ -431,12 +423,8 @@ def scene_to_json_text(scene: Scene) -> str:
             "metres, seconds, pixels; world z up; camera x right, y down, z forward; a_from_b row-major 3x4; "
             "the centre of the top-left pixel is (0.5, 0.5)"
         ),
-        "source": {
-            "dataset": source.dataset,
-            "licence": source.licence,
-            "recipe": source.recipe,
-            "notes": list(source.notes),
-        },
+        "source": {key: getattr(source, key) for key in ("dataset", "licence", "recipe")}
+        | {"notes": list(source.notes)},
     }
     cameras = [f"{json.dumps(name)}: {_dumps(camera_to_json(camera))}" for name, camera in scene.cameras.items()]
     ego = {"times_s": scene.ego.times_s.tolist(), "world_from_ego": _poses_to_json(scene.ego.world_from_ego)}
@@ -451,16 +439,11 @@ def scene_to_json_text(scene: Scene) -> str:
 
 def tracks_to_json_text(tracks: Iterable[Track]) -> str:
     """The text of ``tracks.json``, one track a line."""
-    records = (
-        {
-            "id": track.id,
-            "label": track.label,
-            "size_m": track.size_m.tolist(),
-            "times_s": track.times_s.tolist(),
-            "world_from_object": _poses_to_json(track.world_from_object),
-        }
-        for track in tracks
-    )
+    records = []
+    for track in tracks:
+        record = {"id": track.id, "label": track.label, "size_m": track.size_m.tolist()}
+        poses = _poses_to_json(track.world_from_object)
+        records.append({**record, "times_s": track.times_s.tolist(), "world_from_object": poses})
     head = f'"format": "{TRACKS_FORMAT}",\n "schema_version": {SCHEMA_VERSION}'
     return f'{{\n {head},\n "tracks": [{_record_lines(records)}]\n}}\n'
 
@@ -490,13 +473,8 @@ def _frame_to_json(frame: Frame) -> dict[str, Any]:
 
 def _sweep_to_json(sweep: Sweep) -> dict[str, Any]:
     pose = _poses_to_json(sweep.world_from_lidar[None])[0]
-    return {
-        "id": sweep.id,
-        "sensor": sweep.sensor,
-        "time_s": sweep.time_s,
-        "world_from_lidar": pose,
-        "points": sweep.points.path,
-    }
+    head = {"id": sweep.id, "sensor": sweep.sensor, "time_s": sweep.time_s}
+    return {**head, "world_from_lidar": pose, "points": sweep.points.path}
 
 
 def _record_lines(records: Iterable[dict[str, Any]]) -> str:
@@ -511,8 +489,6 @@ def _dumps(value: object) -> str:
         what, remedy = "a value that is NaN or infinite cannot be written into a scene", "check poses and times"
         raise InputError(what, where="scene.json", got=str(error), remedy=remedy) from error
     except TypeError as error:
-        what, remedy = (
-            "a value that JSON cannot hold",
-            "give plain numbers, texts, lists and dicts in the source recipe",
-        )
+        remedy = "give plain numbers, texts, lists and dicts in the source recipe"
+        what = "a value that JSON cannot hold"
         raise InputError(what, where="scene.json", got=str(error), remedy=remedy) from error

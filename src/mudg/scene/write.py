@@ -13,7 +13,6 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -82,9 +81,7 @@ class SceneWriter:
     def __enter__(self) -> SceneWriter:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if not self._finished:
             self.discard()
 
@@ -267,17 +264,8 @@ class SceneWriter:
         frames = sorted(self._frames.values(), key=lambda f: (f.view.time_s, order[f.view.camera.name]))
         sweeps = sorted(self._sweeps.values(), key=lambda s: (s.time_s, s.sensor))
         split: dict[str, Literal["train", "test"]] = {**dict.fromkeys((f.id for f in frames), "train"), **self._split}
-        scene = Scene(
-            self._scene_id,
-            str(self.root),
-            self._cameras,
-            tuple(frames),
-            tuple(sweeps),
-            tuple(self._tracks.values()),
-            self._ego,
-            split,
-            self._source,
-        )
+        records = (self._cameras, tuple(frames), tuple(sweeps), tuple(self._tracks.values()))
+        scene = Scene(self._scene_id, str(self.root), *records, self._ego, split, self._source)
         schema.check_relations(scene, where)
         self._write("tracks.json", schema.tracks_to_json_text(scene.tracks).encode())
         self._write("scene.json", schema.scene_to_json_text(scene).encode())

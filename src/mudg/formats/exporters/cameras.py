@@ -52,23 +52,10 @@ def nerfstudio_files(scene: Scene, points: PointCloud | None = None) -> dict[str
     names, frames = picture_names(scene), []
     for frame in scene.frames:
         view, camera = frame.view, frame.view.camera
-        frames.append(
-            {
-                "file_path": names[frame.id],
-                "transform_matrix": (view.world_from_cam @ FLIP).tolist(),
-                "time": view.time_s,
-                "fl_x": camera.fx,
-                "fl_y": camera.fy,
-                "cx": camera.cx,
-                "cy": camera.cy,
-                "w": camera.width,
-                "h": camera.height,
-                "k1": 0.0,
-                "k2": 0.0,
-                "p1": 0.0,
-                "p2": 0.0,
-            }
-        )
+        pose = (view.world_from_cam @ FLIP).tolist()
+        lens = {"fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx, "cy": camera.cy}
+        lens |= {"w": camera.width, "h": camera.height, **dict.fromkeys(("k1", "k2", "p1", "p2"), 0.0)}
+        frames.append({"file_path": names[frame.id], "transform_matrix": pose, "time": view.time_s, **lens})
     test = [names[frame.id] for frame in scene.frames if scene.split.get(frame.id) == "test"]
     value = {"camera_model": "OPENCV", "applied_transform": np.eye(4)[:3].tolist(), "frames": frames}
     if test:
@@ -130,12 +117,8 @@ def rig_frames(scene: Scene, sensors: Mapping[str, Matrix]) -> list[RigFrame]:
         last = found[-1] if found else None
         taken = set() if last is None else {other.view.camera.name for other in last.frames}
         together = last is not None and abs(last.frames[0].view.time_s - frame.view.time_s) < 1e-6
-        if (
-            last is not None
-            and together
-            and frame.view.camera.name not in taken
-            and np.abs(last.rig_from_world - pose).max() < AGREE
-        ):
+        free = together and frame.view.camera.name not in taken
+        if last is not None and free and np.abs(last.rig_from_world - pose).max() < AGREE:
             found[-1] = RigFrame(last.rig_from_world, (*last.frames, frame))
         else:
             found.append(RigFrame(pose, (frame,)))
@@ -149,10 +132,8 @@ def colmap_files(scene: Scene, points: PointCloud | None = None, text: bool = Fa
     sensors = sensors_from_rig(scene)
     frames = rig_frames(scene, sensors)
     write = _text if text else _binary
-    return {
-        f"{FOLDER}/{name}": content
-        for name, content in write(scene, (cameras, images, sensors, frames), points).items()
-    }
+    files = write(scene, (cameras, images, sensors, frames), points)
+    return {f"{FOLDER}/{name}": content for name, content in files.items()}
 
 
 Numbered = tuple[Mapping[str, int], Mapping[str, int], Mapping[str, Matrix], list[RigFrame]]
@@ -174,13 +155,10 @@ def _binary(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict
         struct.pack("<IiQQ4d", cameras[c.name], PINHOLE, c.width, c.height, *c.intrinsics)
         for c in scene.cameras.values()
     ]
-    taken = [
-        struct.pack("<I7dI", images[frame.id], *_pose(frame.view.cam_from_world), cameras[frame.view.camera.name])
-        + _name(names, frame).encode()
-        + b"\0"
-        + struct.pack("<Q", 0)
-        for frame in scene.frames
-    ]
+    taken = []
+    for frame in scene.frames:
+        pose = (*_pose(frame.view.cam_from_world), cameras[frame.view.camera.name])
+        taken.append(struct.pack("<I7dI", images[frame.id], *pose) + _name(names, frame).encode() + bytes(9))
     others = list(sensors)[1:]
     first = next(iter(sensors), None)
     rig = b"" if first is None else struct.pack("<IIiI", 1, len(sensors), CAMERA, cameras[first])
@@ -220,16 +198,10 @@ def _text(scene: Scene, numbered: Numbered, points: PointCloud | None) -> dict[s
         first, *others = sensors
         rest = [word for name in others for word in ("CAMERA", cameras[name], 1, *_pose(sensors[name]))]
         rig.append(words(1, len(sensors), "CAMERA", cameras[first], *rest))
-    moments = [
-        words(
-            index + 1,
-            1,
-            *_pose(one.rig_from_world),
-            len(one.frames),
-            *(word for f in one.frames for word in ("CAMERA", cameras[f.view.camera.name], images[f.id])),
-        )
-        for index, one in enumerate(frames)
-    ]
+    moments = []
+    for index, one in enumerate(frames):
+        seen = [word for f in one.frames for word in ("CAMERA", cameras[f.view.camera.name], images[f.id])]
+        moments.append(words(index + 1, 1, *_pose(one.rig_from_world), len(one.frames), *seen))
     rows = [] if points is None else zip(points.xyz.astype(np.float64).tolist(), points.rgb.tolist())
     cloud = [words(index + 1, *xyz, *rgb, 0) for index, (xyz, rgb) in enumerate(rows)]
     parts = {"cameras.txt": lens, "images.txt": taken, "rigs.txt": rig, "frames.txt": moments, "points3D.txt": cloud}

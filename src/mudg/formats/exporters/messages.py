@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath
 from types import SimpleNamespace
 from typing import Any, ClassVar, Final, NamedTuple
@@ -22,6 +22,7 @@ from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES, DISPLAY_COLORS, ID
 from mudg.base.types import Frame, PointCloud, Scene, Sweep, SweepPoints, Track, View
 from mudg.base.versions import version
+from mudg.formats.splats.cloud import each_once
 
 NANO: Final = 1_000_000_000
 CHUNK_BYTES: Final = 4 << 20
@@ -216,14 +217,9 @@ def write_mcap(path: Path, messages: LogMessages) -> tuple[dict[str, tuple[str, 
 #     /tf  /ego  /objects  /camera/NAME/image  /camera/NAME/calibration  /lidar/NAME  /points (fused, once)
 
 
-_NUMBER: Final = {"type": "number"}
-_TEXT: Final = {"type": "string"}
+_NUMBER, _INTEGER, _FLAG, _TEXT = ({"type": name} for name in ("number", "integer", "boolean", "string"))
 _BYTES: Final = {"type": "string", "contentEncoding": "base64"}
-_TIME: Final = {
-    "type": "object",
-    "title": "time",
-    "properties": {"sec": {"type": "integer"}, "nsec": {"type": "integer"}},
-}
+_TIME: Final = {"type": "object", "title": "time", "properties": {"sec": _INTEGER, "nsec": _INTEGER}}
 
 
 def _record(**properties: Any) -> dict[str, Any]:
@@ -234,55 +230,24 @@ def _list(items: Mapping[str, Any]) -> dict[str, Any]:
     return {"type": "array", "items": dict(items)}
 
 
-_VECTOR: Final = _record(x=_NUMBER, y=_NUMBER, z=_NUMBER)
-_TURN: Final = _record(x=_NUMBER, y=_NUMBER, z=_NUMBER, w=_NUMBER)
+_VECTOR, _TURN, _COLOR = (_record(**dict.fromkeys(names, _NUMBER)) for names in ("xyz", "xyzw", "rgba"))
 _POSE: Final = _record(position=_VECTOR, orientation=_TURN)
-_COLOR: Final = _record(r=_NUMBER, g=_NUMBER, b=_NUMBER, a=_NUMBER)
 _STAMPED: Final = {"timestamp": _TIME, "frame_id": _TEXT}
 _CUBE: Final = _record(pose=_POSE, size=_VECTOR, color=_COLOR)
-_LABEL: Final = _record(
-    pose=_POSE,
-    billboard={"type": "boolean"},
-    font_size=_NUMBER,
-    scale_invariant={"type": "boolean"},
-    color=_COLOR,
-    text=_TEXT,
+_LABEL: Final = _record(pose=_POSE, billboard=_FLAG, font_size=_NUMBER, scale_invariant=_FLAG, color=_COLOR, text=_TEXT)
+_TRANSFORM: Final = _record(
+    timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_TURN
 )
-_ENTITY: Final = _record(
-    **_STAMPED,
-    id=_TEXT,
-    lifetime=_TIME,
-    frame_locked={"type": "boolean"},
-    metadata=_list(_record(key=_TEXT, value=_TEXT)),
-    cubes=_list(_CUBE),
-    texts=_list(_LABEL),
-)
-
+_PARTS: Final = {"metadata": _list(_record(key=_TEXT, value=_TEXT)), "cubes": _list(_CUBE), "texts": _list(_LABEL)}
+_ENTITY: Final = _record(**_STAMPED, id=_TEXT, lifetime=_TIME, frame_locked=_FLAG, **_PARTS)
+_FIELDS: Final = _list(_record(name=_TEXT, offset=_INTEGER, type=_INTEGER))
+_LENS: Final = {"distortion_model": _TEXT, **dict.fromkeys("DKRP", _list(_NUMBER))}
 SCHEMAS: Final[Mapping[str, dict[str, Any]]] = {
-    "foxglove.FrameTransforms": _record(
-        transforms=_list(
-            _record(timestamp=_TIME, parent_frame_id=_TEXT, child_frame_id=_TEXT, translation=_VECTOR, rotation=_TURN)
-        )
-    ),
+    "foxglove.FrameTransforms": _record(transforms=_list(_TRANSFORM)),
     "foxglove.PoseInFrame": _record(**_STAMPED, pose=_POSE),
     "foxglove.CompressedImage": _record(**_STAMPED, data=_BYTES, format=_TEXT),
-    "foxglove.CameraCalibration": _record(
-        **_STAMPED,
-        width={"type": "integer"},
-        height={"type": "integer"},
-        distortion_model=_TEXT,
-        D=_list(_NUMBER),
-        K=_list(_NUMBER),
-        R=_list(_NUMBER),
-        P=_list(_NUMBER),
-    ),
-    "foxglove.PointCloud": _record(
-        **_STAMPED,
-        pose=_POSE,
-        point_stride={"type": "integer"},
-        fields=_list(_record(name=_TEXT, offset={"type": "integer"}, type={"type": "integer"})),
-        data=_BYTES,
-    ),
+    "foxglove.CameraCalibration": _record(**_STAMPED, width=_INTEGER, height=_INTEGER, **_LENS),
+    "foxglove.PointCloud": _record(**_STAMPED, pose=_POSE, point_stride=_INTEGER, fields=_FIELDS, data=_BYTES),
     "foxglove.SceneUpdate": _record(deletions=_list(_record(timestamp=_TIME, id=_TEXT)), entities=_list(_ENTITY)),
 }
 
@@ -310,73 +275,43 @@ class FoxgloveMessages(LogMessages):
         nanoseconds = self.nanoseconds(time_s)
         return {"sec": nanoseconds // NANO, "nsec": nanoseconds % NANO}
 
+    def _stamped(self, time_s: float, frame: str) -> dict[str, Any]:
+        return {"timestamp": self._stamp(time_s), "frame_id": frame}
+
     def _of_cameras(self) -> Iterator[LogMessage]:
         for frame in self._scene.frames:
-            name, view = frame.view.camera.name, frame.view
-            yield LogMessage(
-                "/tf",
-                "foxglove.FrameTransforms",
-                view.time_s,
-                lambda v=view: self._transforms(v.time_s, [(f"camera/{v.camera.name}", v.world_from_cam)]),
-            )
-            yield LogMessage(
-                f"/camera/{name}/calibration",
-                "foxglove.CameraCalibration",
-                view.time_s,
-                lambda v=view: self._calibration(v),
-            )
-            yield LogMessage(
-                f"/camera/{name}/image", "foxglove.CompressedImage", view.time_s, lambda f=frame: self._image(f)
-            )
+            view, time_s, topic = frame.view, frame.view.time_s, f"/camera/{frame.view.camera.name}"
+            yield self._tf(time_s, topic[1:], view.world_from_cam)
+            calibration, image = (lambda v=view: self._calibration(v)), (lambda f=frame: self._image(f))
+            yield LogMessage(f"{topic}/calibration", "foxglove.CameraCalibration", time_s, calibration)
+            yield LogMessage(f"{topic}/image", "foxglove.CompressedImage", time_s, image)
 
     def _of_sweeps(self) -> Iterator[LogMessage]:
         for sweep in self._scene.sweeps:
-            place = [(f"lidar/{sweep.sensor}", sweep.world_from_lidar)]
-            yield LogMessage(
-                "/tf", "foxglove.FrameTransforms", sweep.time_s, lambda s=sweep, p=place: self._transforms(s.time_s, p)
-            )
-            yield LogMessage(
-                f"/lidar/{sweep.sensor}", "foxglove.PointCloud", sweep.time_s, lambda s=sweep: self._sweep(s)
-            )
+            yield self._tf(sweep.time_s, f"lidar/{sweep.sensor}", sweep.world_from_lidar)
+            points = lambda s=sweep: self._sweep(s)  # noqa: E731
+            yield LogMessage(f"/lidar/{sweep.sensor}", "foxglove.PointCloud", sweep.time_s, points)
 
     def _of_objects(self) -> Iterator[LogMessage]:
         for moment in self._log.moments():
             yield LogMessage("/objects", "foxglove.SceneUpdate", moment, lambda t=moment: self._boxes(t))
             pose = self._scene.ego.pose_at(moment)
             if pose is not None:
-                yield LogMessage(
-                    "/ego",
-                    "foxglove.PoseInFrame",
-                    moment,
-                    lambda t=moment, p=pose: {"timestamp": self._stamp(t), "frame_id": "world", "pose": _pose(p)},
-                )
-                yield LogMessage(
-                    "/tf",
-                    "foxglove.FrameTransforms",
-                    moment,
-                    lambda t=moment, p=pose: self._transforms(t, [("ego", p)]),
-                )
+                ego = {**self._stamped(moment, "world"), "pose": _pose(pose)}
+                yield LogMessage("/ego", "foxglove.PoseInFrame", moment, lambda value=ego: value)
+                yield self._tf(moment, "ego", pose)
 
-    def _transforms(self, time_s: float, frames: Sequence[tuple[str, NDArray[np.float64]]]) -> dict[str, Any]:
-        return {
-            "transforms": [
-                {
-                    "timestamp": self._stamp(time_s),
-                    "parent_frame_id": "world",
-                    "child_frame_id": name,
-                    "translation": _pose(pose)["position"],
-                    "rotation": _pose(pose)["orientation"],
-                }
-                for name, pose in frames
-            ]
-        }
+    def _tf(self, time_s: float, frame: str, pose: Matrix) -> LogMessage:
+        """The pose of a frame in the world."""
+        place, frames = _pose(pose), {"parent_frame_id": "world", "child_frame_id": frame}
+        value = {"timestamp": self._stamp(time_s), **frames}
+        value |= {"translation": place["position"], "rotation": place["orientation"]}
+        return LogMessage("/tf", "foxglove.FrameTransforms", time_s, lambda: {"transforms": [value]})
 
     def _calibration(self, view: View) -> dict[str, Any]:
-        camera = view.camera
-        k = camera.matrix
+        camera, k = view.camera, view.camera.matrix
         return {
-            "timestamp": self._stamp(view.time_s),
-            "frame_id": f"camera/{camera.name}",
+            **self._stamped(view.time_s, f"camera/{camera.name}"),
             "width": camera.width,
             "height": camera.height,
             "distortion_model": "",
@@ -387,12 +322,8 @@ class FoxgloveMessages(LogMessages):
         }
 
     def _image(self, frame: Frame) -> dict[str, Any]:
-        return {
-            "timestamp": self._stamp(frame.view.time_s),
-            "frame_id": f"camera/{frame.view.camera.name}",
-            "format": picture_format(frame),
-            "data": _base64(self._log.picture(frame)),
-        }
+        picture = {"format": picture_format(frame), "data": _base64(self._log.picture(frame))}
+        return {**self._stamped(frame.view.time_s, f"camera/{frame.view.camera.name}"), **picture}
 
     def _sweep(self, sweep: Sweep) -> dict[str, Any]:
         points = self._log.points(sweep)
@@ -412,8 +343,7 @@ class FoxgloveMessages(LogMessages):
     def _cloud(self, time_s: float, frame: str, rows: NDArray[Any], more: list[tuple[str, int, int]]) -> dict[str, Any]:
         fields = [("x", 0, 7), ("y", 4, 7), ("z", 8, 7), *more]
         return {
-            "timestamp": self._stamp(time_s),
-            "frame_id": frame,
+            **self._stamped(time_s, frame),
             "pose": _pose(np.eye(4)),
             "point_stride": rows.dtype.itemsize,
             "fields": [{"name": name, "offset": offset, "type": kind} for name, offset, kind in fields],
@@ -423,34 +353,14 @@ class FoxgloveMessages(LogMessages):
     def _boxes(self, time_s: float) -> dict[str, Any]:
         entities = []
         for track, pose in self._log.boxes(time_s):
-            red, green, blue = box_color(track.label)
-            entities.append(
-                {
-                    "timestamp": self._stamp(time_s),
-                    "frame_id": "world",
-                    "id": track.id,
-                    "frame_locked": False,
-                    "lifetime": {"sec": 0, "nsec": round(BOX_LIFE_S * NANO)},
-                    "metadata": [{"key": "class", "value": track.label}],
-                    "cubes": [
-                        {
-                            "pose": _pose(pose),
-                            "size": _vector(track.size_m),
-                            "color": {"r": red, "g": green, "b": blue, "a": 0.4},
-                        }
-                    ],
-                    "texts": [
-                        {
-                            "pose": _pose(above(pose, track)),
-                            "billboard": True,
-                            "font_size": 0.5,
-                            "scale_invariant": False,
-                            "color": {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0},
-                            "text": f"{track.id} ({track.label})",
-                        }
-                    ],
-                }
-            )
+            color = dict(zip("rgba", (*box_color(track.label), 0.4)))
+            cube = {"pose": _pose(pose), "size": _vector(track.size_m), "color": color}
+            label = {"pose": _pose(above(pose, track)), "billboard": True, "font_size": 0.5, "scale_invariant": False}
+            label |= {"color": dict.fromkeys("rgba", 1.0), "text": f"{track.id} ({track.label})"}
+            entity = {**self._stamped(time_s, "world"), "id": track.id, "frame_locked": False}
+            entity |= {"lifetime": {"sec": 0, "nsec": round(BOX_LIFE_S * NANO)}}
+            entity |= {"metadata": [{"key": "class", "value": track.label}], "cubes": [cube], "texts": [label]}
+            entities.append(entity)
         return {"deletions": [], "entities": entities}
 
 
@@ -514,18 +424,10 @@ def bag_metadata(topics: Mapping[str, tuple[str, int]], span: tuple[int, int]) -
     """
     start, length = {"nanoseconds_since_epoch": span[0]}, {"nanoseconds": span[1] - span[0]}
     total = sum(count for _, count in topics.values())
-    listed = [
-        {
-            "topic_metadata": {
-                "name": topic,
-                "type": kind,
-                "serialization_format": "cdr",
-                "offered_qos_profiles": _qos(topic),
-            },
-            "message_count": count,
-        }
-        for topic, (kind, count) in topics.items()
-    ]
+    listed = []
+    for topic, (kind, count) in topics.items():
+        about = {"name": topic, "type": kind, "serialization_format": "cdr", "offered_qos_profiles": _qos(topic)}
+        listed.append({"topic_metadata": about, "message_count": count})
     about = {
         "version": 5,
         "storage_identifier": "mcap",
@@ -561,16 +463,9 @@ def _qos(topic: str) -> str:
 
 def ros_names(names: Iterable[str]) -> dict[str, str]:
     """Names that ROS accepts as a part of topics (letters, digits, single underscores, a letter first), each once."""
-    made: dict[str, str] = {}
-    for name in names:
-        plain = re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "sensor"
-        plain = f"n{plain}" if plain[0].isdigit() else plain
-        chosen, count = plain, 1
-        while chosen in made.values():
-            count += 1
-            chosen = f"{plain}_{count}"
-        made[name] = chosen
-    return made
+    names = list(names)
+    plain = (re.sub(r"[^A-Za-z0-9]+", "_", name).strip("_") or "sensor" for name in names)
+    return dict(zip(names, each_once(f"n{name}" if name[0].isdigit() else name for name in plain)))
 
 
 def ros_types() -> Any:

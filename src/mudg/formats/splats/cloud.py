@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
@@ -36,9 +36,8 @@ mean down write it."""
 
 def known(axes: str) -> bool:
     """Whether three letters name three directions at right angles."""
-    return (
-        len(axes) == 3 and all(letter in _WAYS for letter in axes) and abs(np.linalg.det(world_from_axes(axes))) > 0.5
-    )
+    named = len(axes) == 3 and all(letter in _WAYS for letter in axes)
+    return named and abs(np.linalg.det(world_from_axes(axes))) > 0.5
 
 
 def world_from_axes(axes: str) -> NDArray[np.float64]:
@@ -112,9 +111,8 @@ class SplatCloud:
         """The same Gaussians in another frame: places, rotations and harmonics; ``a_from_b`` rigid f64[4, 4]."""
         turn = geometry.quaternion_from_matrix(a_from_b)
         sh = self.sh if self.degree == 0 else harmonics.rotated(self.sh, a_from_b[:3, :3])
-        return replace(
-            self, means=geometry.transform_points(a_from_b, self.means), quats=turned(turn, self.quats), sh=sh
-        )
+        means = geometry.transform_points(a_from_b, self.means)
+        return replace(self, means=means, quats=turned(turn, self.quats), sh=sh)
 
     def mirrored(self) -> SplatCloud:
         """The same Gaussians with y turned round: from left-handed axes to right-handed ones."""
@@ -141,14 +139,13 @@ def joined(clouds: Sequence[SplatCloud]) -> SplatCloud:
     if len(clouds) == 1:
         return clouds[0]
     degree = max(cloud.degree for cloud in clouds)
-    parts = [cloud.of_degree(degree) for cloud in clouds]
-    classes = None
+    parts, classes = [cloud.of_degree(degree) for cloud in clouds], None
     if any(cloud.class_ids is not None for cloud in parts):
-        unknown = [np.full(len(c), 255, np.uint8) if c.class_ids is None else c.class_ids for c in parts]
-        classes = np.concatenate(unknown)
-    columns = [
-        np.concatenate([getattr(c, name) for c in parts]) for name in ("means", "quats", "log_scales", "logits", "sh")
-    ]
+        classes = np.concatenate(
+            [np.full(len(c), 255, np.uint8) if c.class_ids is None else c.class_ids for c in parts]
+        )
+    names = ("means", "quats", "log_scales", "logits", "sh")
+    columns = [np.concatenate([getattr(cloud, name) for cloud in parts]) for name in names]
     return SplatCloud(*columns, class_ids=classes, antialias=any(cloud.antialias for cloud in parts))
 
 
@@ -302,12 +299,8 @@ def checked(cloud: SplatCloud, where: str) -> SplatCloud:
     logits = np.nan_to_num(cloud.logits, nan=np.nan, posinf=MOST_LOGIT, neginf=-MOST_LOGIT)
     logs = np.where(np.isneginf(cloud.log_scales), np.float32(LEAST_LOG), cloud.log_scales)
     cloud = replace(cloud, logits=logits, log_scales=logs)
-    columns = {
-        "position": cloud.means,
-        "scale": cloud.log_scales,
-        "opacity": cloud.logits[:, None],
-        "color": cloud.sh.reshape(len(cloud), -1),
-    }
+    columns = {"position": cloud.means, "scale": cloud.log_scales, "opacity": cloud.logits[:, None]}
+    columns["color"] = cloud.sh.reshape(len(cloud), -1)
     for name, values in columns.items():
         bad = ~np.isfinite(values).all(1)
         if bad.any():
@@ -341,35 +334,34 @@ def doubtful_values(cloud: SplatCloud, where: str) -> list[str]:
     plain_opacity = bool((cloud.logits >= 0).all() and (cloud.logits <= 1).all() and (cloud.logits > 0).any())
     plain_size = bool((cloud.log_scales[:, :2] > 0).all())  # the third is that of flat Gaussians
     if plain_opacity and plain_size:
-        raise InputError(
-            "sizes and opacities are plain values, where files of Gaussians hold logarithms and logits",
-            where=where,
-            expected="negative numbers for sizes below 1 m and opacities below 0.5",
-            got=(
-                f"sizes from {cloud.log_scales[:, :2].min():.3g}, opacities from {cloud.logits.min():.3g} to"
-                f" {cloud.logits.max():.3g}"
-            ),
-            remedy="write log(scale) and log(opacity / (1 - opacity)) into the file",
-        )
-    found = []
+        what = "sizes and opacities are plain values, where files of Gaussians hold logarithms and logits"
+        expected = "negative numbers for sizes below 1 m and opacities below 0.5"
+        got = f"sizes from {cloud.log_scales[:, :2].min():.3g}, opacities from {cloud.logits.min():.3g} to"
+        remedy = "write log(scale) and log(opacity / (1 - opacity)) into the file"
+        raise InputError(what, where=where, expected=expected, got=f"{got} {cloud.logits.max():.3g}", remedy=remedy)
+    found, fog = [], "if it looks like fog, write"
     if plain_opacity:
-        found.append(
-            "all opacities lie between 0.5 and 0.73, as if values from 0 to 1 had been stored where logits are due: if"
-            " it looks like fog, write log(opacity / (1 - opacity)) into the file"
-        )
+        stored = "all opacities lie between 0.5 and 0.73, as if values from 0 to 1 had been stored where logits are due"
+        found.append(f"{stored}: {fog} log(opacity / (1 - opacity)) into the file")
     if plain_size:
-        found.append(
-            "all Gaussians are wider than 1 m, as if sizes had been stored where their logarithms are due: if it looks"
-            " like fog, write log(scale) into the file"
-        )
+        stored = "all Gaussians are wider than 1 m, as if sizes had been stored where their logarithms are due"
+        found.append(f"{stored}: {fog} log(scale) into the file")
     if len(cloud) and (cloud.logits >= 0).all() and cloud.logits.max() > 2 * MOST_LOGIT:
-        found.append(
-            f"opacities reach {cloud.logits.max():.4g}, as if values from 0 to 255 had been stored where logits are"
-            " due: all Gaussians count as solid"
-        )
+        stored = "as if values from 0 to 255 had been stored where logits are due"
+        found.append(f"opacities reach {cloud.logits.max():.4g}, {stored}: all Gaussians count as solid")
     if len(cloud) and np.median(np.abs(cloud.sh[:, 0])) > 8:
-        found.append(
-            "colours lie far beyond black and white, as if values from 0 to 255 had been stored as f_dc: write "
-            "(colour / 255 - 0.5) / 0.2821 into the file"
-        )
+        stored = "colours lie far beyond black and white, as if values from 0 to 255 had been stored as f_dc"
+        found.append(f"{stored}: write (colour / 255 - 0.5) / 0.2821 into the file")
     return found
+
+
+def each_once(names: Iterable[str], key: Callable[[str], str] = str) -> list[str]:
+    """Names that differ, also under ``key``: the second of one name is NAME_2."""
+    chosen: list[str] = []
+    for name in names:
+        candidate, count = name, 1
+        while key(candidate) in map(key, chosen):
+            count += 1
+            candidate = f"{name}_{count}"
+        chosen.append(candidate)
+    return chosen

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import PurePath
 from typing import Any, Final
 
@@ -28,6 +28,7 @@ from mudg.formats.splats.cloud import (
     SplatScene,
     checked,
     doubtful_values,
+    each_once,
     logit,
     spacing_m,
 )
@@ -126,17 +127,8 @@ def tracks_of(scene: SplatScene, listed: list[dict[str, Any]]) -> dict[str, Any]
 
 def cameras_of(log: Scene, scene: SplatScene) -> dict[str, Any]:
     """Intrinsics of the cameras of a log and the poses of its images, in the axes of the file."""
-    cameras = {
-        name: {
-            "width": camera.width,
-            "height": camera.height,
-            "fx": camera.fx,
-            "fy": camera.fy,
-            "cx": camera.cx,
-            "cy": camera.cy,
-        }
-        for name, camera in log.cameras.items()
-    }
+    numbers = ("width", "height", "fx", "fy", "cx", "cy")
+    cameras = {name: {key: getattr(camera, key) for key in numbers} for name, camera in log.cameras.items()}
     frames = [
         {
             "id": frame.id,
@@ -151,15 +143,7 @@ def cameras_of(log: Scene, scene: SplatScene) -> dict[str, Any]:
 
 def file_names(names: list[str]) -> list[str]:
     """Names that every file system accepts, each once."""
-    made: dict[str, None] = {}
-    for name in names:
-        plain = re.sub(r"[^A-Za-z0-9_.-]", "_", name).strip(".") or "node"
-        chosen, count = plain, 1
-        while chosen.lower() in {known.lower() for known in made}:
-            count += 1
-            chosen = f"{plain}_{count}"
-        made[chosen] = None
-    return list(made)
+    return each_once((re.sub(r"[^A-Za-z0-9_.-]", "_", name).strip(".") or "node" for name in names), str.lower)
 
 
 def _safetensors(node: SplatNode) -> bytes:
@@ -275,75 +259,49 @@ class SplatFormat:
     suffixes: tuple[str, ...]
     axes: str
     write: Callable[[WriteRequest], bytes]
-    read: Callable[[bytes, str], SplatFile] | None = None
-    carries: frozenset[str] = field(default_factory=lambda: frozenset({"harmonics"}))
+    read: Callable[[bytes, str], SplatFile] | None
+    carries: frozenset[str]
 
+
+def _format(
+    suffixes: str,
+    letters: str,
+    carries: str,
+    write: Callable[[WriteRequest], bytes],
+    read: Callable[[bytes, str], SplatFile] | None = None,
+) -> SplatFormat:
+    return SplatFormat(tuple(suffixes.split()), letters, write, read, frozenset(carries.split()))
+
+
+_MOVING: Final = "harmonics motion deformation classes"
 
 FORMATS: Final[Mapping[str, SplatFormat]] = {
-    "ply": SplatFormat(
-        (".ply",),
-        "RDF",
-        lambda r: ply.to_bytes(r.cloud, classes=True, marks=r.marks),
-        ply.from_bytes,
-        frozenset({"harmonics", "classes", "antialias"}),
+    "ply": _format(
+        ".ply", "RDF", "harmonics classes antialias", lambda r: ply.to_bytes(r.cloud, True, r.marks), ply.from_bytes
     ),
-    "bundle": SplatFormat(
-        (".zip",),
-        axes.WORLD,
-        lambda r: bundle_bytes(r.scene, r.log),
-        None,
-        frozenset({"harmonics", "motion", "deformation", "classes", "sky", "antialias"}),
-    ),
-    "spz": SplatFormat(
-        (".spz",),
+    "bundle": _format(".zip", axes.WORLD, f"{_MOVING} sky antialias", lambda r: bundle_bytes(r.scene, r.log)),
+    "spz": _format(
+        ".spz",
         "RUB",
+        "harmonics antialias",
         lambda r: spz.to_bytes(r.cloud, r.spz_version, r.antialias),
         spz.from_bytes,
-        frozenset({"harmonics", "antialias"}),
     ),
-    "glb": SplatFormat(
-        (".glb",),
-        "FUR",
-        lambda r: gltf.to_bytes(r.scene, r.time_s),
-        gltf.from_bytes,
-        frozenset({"harmonics", "motion", "antialias"}),
+    "glb": _format(
+        ".glb", "FUR", "harmonics motion antialias", lambda r: gltf.to_bytes(r.scene, r.time_s), gltf.from_bytes
     ),
-    "usda": SplatFormat(
-        (".usda", ".usd"),
-        axes.WORLD,
-        lambda r: usd.to_text(r.scene, r.time_s, log=r.log),
-        None,
-        frozenset({"harmonics", "motion", "deformation", "classes"}),
-    ),
-    "usdz": SplatFormat(
-        (".usdz",),
-        axes.WORLD,
-        lambda r: usd.to_package(r.scene, r.time_s, r.log),
-        None,
-        frozenset({"harmonics", "motion", "deformation", "classes", "sky"}),
-    ),
-    "alpasim": SplatFormat(
-        (".usdz",),
-        axes.WORLD,
-        lambda r: usd.to_alpasim(r.scene, r.log, r.ground),
-        None,
-        frozenset({"harmonics", "motion", "deformation", "classes", "sky"}),
-    ),
-    "compressed-ply": SplatFormat(
-        (".compressed.ply", ".ply"),
+    "usda": _format(".usda .usd", axes.WORLD, _MOVING, lambda r: usd.to_text(r.scene, r.time_s, log=r.log)),
+    "usdz": _format(".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_package(r.scene, r.time_s, r.log)),
+    "alpasim": _format(".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_alpasim(r.scene, r.log, r.ground)),
+    "compressed-ply": _format(
+        ".compressed.ply .ply",
         "RDF",
+        "harmonics antialias",
         lambda r: ply.compressed_to_bytes(r.cloud, r.marks),
         ply.compressed_from_bytes,
-        frozenset({"harmonics", "antialias"}),
     ),
-    "sog": SplatFormat(
-        (".sog",),
-        "RDF",
-        lambda r: sog.to_bytes(r.cloud, r.antialias),
-        sog.from_bytes,
-        frozenset({"harmonics", "antialias"}),
-    ),
-    "splat": SplatFormat((".splat",), "RDF", lambda r: splat_bytes(r.cloud), splat_from_bytes, frozenset()),
+    "sog": _format(".sog", "RDF", "harmonics antialias", lambda r: sog.to_bytes(r.cloud, r.antialias), sog.from_bytes),
+    "splat": _format(".splat", "RDF", "", lambda r: splat_bytes(r.cloud), splat_from_bytes),
 }
 
 
@@ -418,20 +376,14 @@ def read_cloud(content: bytes, name: str, choice: str = "file") -> tuple[SplatCl
     for warning in (*file.warnings, *doubts):
         log.warn(f"{name}: {warning}")
     if file.axes and file.axes != chosen:
-        log.warn(
-            f"{name}: {file.axes_by} says {axes.in_words(file.axes)}; --axes {choice} reads it as"
-            f" {axes.in_words(chosen)}"
-        )
+        stated = f"{file.axes_by} says {axes.in_words(file.axes)}"
+        log.warn(f"{name}: {stated}; --axes {choice} reads it as {axes.in_words(chosen)}")
     elif choice == "file" and file.axes and file.axes != FORMATS[found].axes:
-        log.info(
-            f"{name}: read as {axes.in_words(chosen)}, as {file.axes_by} says; --axes viewer reads it as viewers of its"
-            " format do"
-        )
+        choices = f"as {file.axes_by} says; --axes viewer reads it as viewers of its format do"
+        log.info(f"{name}: read as {axes.in_words(chosen)}, {choices}")
     if file.step_m > COARSE_M:
-        log.warn(
-            f"{name}: its places are stored in steps of {file.step_m * 1000:.3g} mm: take an offset away before the"
-            " file is written"
-        )
+        steps = f"its places are stored in steps of {file.step_m * 1000:.3g} mm"
+        log.warn(f"{name}: {steps}: take an offset away before the file is written")
     return in_world(file.cloud, chosen), found
 
 
@@ -449,10 +401,14 @@ def losses(name: str, request: WriteRequest) -> list[str]:
     moving = [node for node in scene.nodes if node.moves]
     bent = [node for node in moving if node.displacement is not None]
     found = []
+
+    def objects(nodes: list[SplatNode]) -> str:
+        return nodes[0].name if len(nodes) == 1 else f"{len(nodes)} objects"
+
     if moving and request.time_s is not None:
-        found.append(f"motion ({_objects(moving)} as at {request.time_s:g} s)")
+        found.append(f"motion ({objects(moving)} as at {request.time_s:g} s)")
     elif bent and "deformation" not in carries:
-        found.append(f"deformation ({_objects(bent)} in the shape of the middle of the track)")
+        found.append(f"deformation ({objects(bent)} in the shape of the middle of the track)")
     if "classes" not in carries and any(node.cloud.class_ids is not None for node in scene.nodes):
         found.append("classes of the Gaussians")
     if "sky" not in carries and scene.sky is not None:
@@ -462,7 +418,3 @@ def losses(name: str, request: WriteRequest) -> list[str]:
     if kept := {key: value for key, value in request.drawing.items() if key not in carries}:
         found.append("how the fit draws Gaussians (" + ", ".join(f"{key} {value}" for key, value in kept.items()) + ")")
     return found
-
-
-def _objects(nodes: list[SplatNode]) -> str:
-    return nodes[0].name if len(nodes) == 1 else f"{len(nodes)} objects"

@@ -60,12 +60,8 @@ class _Buffer:
         content = rows.tobytes()
         view = {"buffer": 0, "byteOffset": self.size, "byteLength": len(content)}
         self.views.append(view | ({"target": 34962} if vertices else {}))
-        accessor = {
-            "bufferView": len(self.views) - 1,
-            "componentType": FLOAT,
-            "count": len(rows),
-            "type": _SHAPES[width],
-        }
+        accessor: dict[str, Any] = {"bufferView": len(self.views) - 1, "componentType": FLOAT, "count": len(rows)}
+        accessor["type"] = _SHAPES[width]
         if bounds:
             low, high = rows.reshape(len(rows), -1).min(0), rows.reshape(len(rows), -1).max(0)
             accessor |= {"min": low.astype(float).tolist(), "max": high.astype(float).tolist()}
@@ -127,12 +123,8 @@ def _primitive(buffer: _Buffer, cloud: SplatCloud) -> dict[str, Any]:
     for degree in range(cloud.degree + 1):
         for order in range(2 * degree + 1):
             attributes[f"{PREFIX}SH_DEGREE_{degree}_COEF_{order}"] = buffer.add(cloud.sh[:, degree**2 + order])
-    kind = {
-        "kernel": "ellipse",
-        "colorSpace": "srgb_rec709_display",
-        "projection": "perspective",
-        "sortingMethod": "cameraDistance",
-    }
+    kind = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    kind |= {"projection": "perspective", "sortingMethod": "cameraDistance"}
     return {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kind}}
 
 
@@ -241,18 +233,17 @@ def from_bytes(content: bytes, where: str) -> SplatFile:
         what, expected = "the GLB file holds no Gaussians", f"meshes with {EXTENSION}"
         raise InputError(what, where=where, expected=expected, remedy="triangles and points cannot be imported")
     if triangles:
-        file.warnings[f"{triangles} meshes without Gaussians were passed over"] = None
+        file.warn(f"{triangles} meshes without Gaussians were passed over")
     if file.entries(file.document, "animations"):
-        file.warnings["its animations are not read: everything is where the nodes put it at rest"] = None
+        file.warn("its animations are not read: everything is where the nodes put it at rest")
+    notes: tuple[str, ...] = ()
     if file.passed:
-        file.notes[sentence(sorted(file.passed), "the document")] = None
+        notes = (sentence(sorted(file.passed), "the document"),)
     axes = "RDF" if file.of_old_transform(2) else ""
     if axes:
-        file.warnings[
-            f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so; --axes viewer reads as glTF"
-        ] = None
+        file.warn(f"{file.generator} wrote {in_words(axes)}, where glTF has y up: read so; --axes viewer reads as glTF")
     cloud = replace(joined(clouds), antialias=file.antialias)
-    return SplatFile(cloud, axes, f"its program {file.generator}", file.step_m, tuple(file.notes), tuple(file.warnings))
+    return SplatFile(cloud, axes, f"its program {file.generator}", file.step_m, notes, tuple(file.warnings))
 
 
 def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
@@ -260,7 +251,10 @@ def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
     if np.array_equal(matrix, np.eye(4)):
         return cloud
     scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
-    if not np.isfinite(scale) or scale <= 0 or geometry.rigid_problem(rigid := _without_scale(matrix, scale), 1e-3):
+    rigid = matrix.copy()
+    if np.isfinite(scale) and scale > 0:
+        rigid[:3, :3] /= scale
+    if not np.isfinite(scale) or scale <= 0 or geometry.rigid_problem(rigid, 1e-3):
         what = "a node of the GLB file is mirrored or scaled unevenly"
         remedy = "apply the scale of the node to its Gaussians in the program that wrote the file"
         raise InputError(what, where=where, got=str(matrix[:3, :3].tolist()), remedy=remedy)
@@ -268,12 +262,6 @@ def _moved(cloud: SplatCloud, matrix: Array, where: str) -> SplatCloud:
         logs = (cloud.log_scales + np.float32(np.log(scale))).astype(np.float32)
         cloud = checked(replace(cloud, means=cloud.means * scale, log_scales=logs), where)
     return cloud.moved(rigid)
-
-
-def _without_scale(matrix: Array, scale: float) -> Array:
-    rigid = matrix.copy()
-    rigid[:3, :3] /= scale
-    return rigid
 
 
 class _GlbFile:
@@ -301,7 +289,7 @@ class _GlbFile:
         self.binary = memoryview(b"")
         self.total, self.step_m = 0, 0.0
         self.passed: set[str] = set()
-        self.notes, self.warnings = dict[str, None](), dict[str, None]()  # each once, in order
+        self.warnings = dict[str, None]()  # each once, in order
         asset = document.get("asset")
         asset = asset if isinstance(asset, dict) else {}
         self.generator = "".join(c for c in str(asset.get("generator", ""))[:60] if c.isprintable())
@@ -315,6 +303,10 @@ class _GlbFile:
             length, kind = binary.unpacked("<II", content, place, "the second chunk", where)
             if kind == BIN_CHUNK:
                 self.binary = binary.part(content, place + 8, length, "the binary chunk", where)
+
+    def warn(self, sentence: str) -> None:
+        """Say something of the file once."""
+        self.warnings[sentence] = None
 
     def _note(self, within: str, owner: dict[str, Any]) -> None:
         """Note the fields of an object of the document that glTF does not have."""
@@ -399,10 +391,10 @@ class _GlbFile:
             extensions = extensions if isinstance(extensions, dict) else {}
             visible = extensions.get("KHR_node_visibility")
             if isinstance(visible, dict) and visible.get("visible") is False:
-                self.warnings["nodes that the file hides were left out"] = None
+                self.warn("nodes that the file hides were left out")
                 continue
             if "EXT_mesh_gpu_instancing" in extensions:
-                self.warnings["instances (EXT_mesh_gpu_instancing) are not read: their mesh is there once"] = None
+                self.warn("instances (EXT_mesh_gpu_instancing) are not read: their mesh is there once")
             if "mesh" in node:
                 yield matrix, self.entry("meshes", node["mesh"])
             waiting += [(matrix, child, depth + 1) for child in self._indices(node, "children")]
@@ -438,7 +430,7 @@ class _GlbFile:
             raise InputError(what, where=f"{self.where}: {EXTENSION}", got=repr(kind.get("kernel"))[:40])
         space = kind.get("colorSpace")
         if space is None:
-            self.warnings["it names no colorSpace, which the standard requires: read as sRGB"] = None
+            self.warn("it names no colorSpace, which the standard requires: read as sRGB")
         elif not isinstance(space, str) or space not in _LINEAR:
             what, where = "the colour space of the Gaussians is not known", f"{self.where}: {EXTENSION}: colorSpace"
             remedy = "convert the colours to sRGB"
@@ -455,7 +447,7 @@ class _GlbFile:
         self.passed.update(f"{EXTENSION}.extensions.{name}" for name in (inner if isinstance(inner, dict) else ()))
         for name, usual in (("projection", "perspective"), ("sortingMethod", "cameraDistance")):
             if kind.get(name, usual) != usual:
-                self.warnings[f"{name} {kind[name]!r:.40} is not drawn: {usual} instead"] = None
+                self.warn(f"{name} {kind[name]!r:.40} is not drawn: {usual} instead")
         means = self.values(attributes, "POSITION", 3)
         count = len(means)
         self.total += count
@@ -464,7 +456,7 @@ class _GlbFile:
             raise InputError(what, where=self.where, got=f"{self.total} Gaussians")
         rotation = self.values(attributes, PREFIX + "ROTATION", 4, count)
         if np.abs(np.linalg.norm(rotation, axis=1) - 1).max(initial=0) > 0.05:
-            self.warnings["rotations are not of length 1, as the standard requires: they were brought to it"] = None
+            self.warn("rotations are not of length 1, as the standard requires: they were brought to it")
         scale = self.values(attributes, PREFIX + "SCALE", 3, count)
         opacity = self.values(attributes, PREFIX + "OPACITY", 1, count)[:, 0]
         if not np.isfinite(opacity).all():
@@ -474,34 +466,24 @@ class _GlbFile:
         if degrees != list(range(len(degrees))) or not degrees:
             what = "the harmonics of a primitive leave a degree out"
             raise InputError(what, where=f"{self.where}: JSON", got=str(degrees))
-        sh = np.stack(
-            [
-                self.values(attributes, f"{PREFIX}SH_DEGREE_{d}_COEF_{n}", 3, count)
-                for d in degrees
-                for n in range(2 * d + 1)
-            ],
-            1,
-        )
+        bands = [f"{PREFIX}SH_DEGREE_{degree}_COEF_{order}" for degree in degrees for order in range(2 * degree + 1)]
+        sh = np.stack([self.values(attributes, band, 3, count) for band in bands], 1)
         if _LINEAR.get(str(space), False):
             sh = _of_display(sh)
         read = tuple(f"{PREFIX}SH_DEGREE_{d}_" for d in degrees)
         beyond = [name for name in attributes if name.startswith(f"{PREFIX}SH_DEGREE_") and not name.startswith(read)]
         if beyond:
-            self.warnings[f"harmonics beyond degree 3 were dropped: {listed(beyond)}"] = None
+            self.warn(f"harmonics beyond degree 3 were dropped: {listed(beyond)}")
         self.step_m = max(self.step_m, spacing_m(means))
-        quats, logs, logits, sh = (
-            values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)
-        )
-        return checked(SplatCloud(means, quats, logs, logits, sh), self.where)
+        columns = [values.astype(np.float32) for values in (rotation[:, [3, 0, 1, 2]], logs, logits, sh)]
+        return checked(SplatCloud(means, *columns), self.where)
 
     def _logits_and_logs(self, opacity: Array, scale: Array) -> tuple[NDArray[np.floating], Array]:
         """Logits f64[n] and logarithms f64[n, 3]; a program that is known for it wrote these in place of opacities and
         sizes."""
         raw = (scale < 0).any() or (opacity < -_ROUNDING).any() or (opacity > 1 + _ROUNDING).any()
         if raw and self.of_old_transform(3):
-            self.warnings[
-                f"{self.generator} wrote logits and logarithms, where glTF has opacities and sizes: read so"
-            ] = None
+            self.warn(f"{self.generator} wrote logits and logarithms, where glTF has opacities and sizes: read so")
             return opacity, scale
         if (bad := (opacity < -_ROUNDING) | (opacity > 1 + _ROUNDING)).any():
             row = int(bad.argmax())

@@ -64,7 +64,7 @@ _REST: Final = {0: 0, 9: 1, 24: 2, 45: 3, 72: 4}
 """Number of ``f_rest`` columns: degree."""
 
 
-def to_bytes(cloud: SplatCloud, *, classes: bool = False, marks: Sequence[str] = ()) -> bytes:
+def to_bytes(cloud: SplatCloud, classes: bool = False, marks: Sequence[str] = ()) -> bytes:
     """A cloud as a PLY file; ``classes`` adds the column of our own, ``marks`` are comments (``marks_of``)."""
     with_classes = classes and cloud.class_ids is not None
     columns = [cloud.means, np.zeros_like(cloud.means), cloud.sh[:, 0], channel_major(cloud.sh)]
@@ -135,14 +135,10 @@ def _refuse_columns(table: NDArray[Any], wanted: tuple[str, ...], where: str) ->
     names = table.dtype.names or ()
     missing = [name for name in wanted if name not in names]
     if missing:
-        alike = any(
-            name.lower().startswith(("scal", "rot", "quat", "opac", "f_dc", "f_rest", "sh", "feat")) for name in names
-        )
-        remedy = (
-            f"name the columns as 3D Gaussian Splatting does: {', '.join(wanted)}"
-            if alike
-            else "points or meshes cannot be imported"
-        )
+        starts = ("scal", "rot", "quat", "opac", "f_dc", "f_rest", "sh", "feat")
+        alike = any(name.lower().startswith(starts) for name in names)
+        rename = f"name the columns as 3D Gaussian Splatting does: {', '.join(wanted)}"
+        remedy = rename if alike else "points or meshes cannot be imported"
         what = "the PLY file holds no Gaussians" if not alike else "a column of the Gaussians is missing"
         raise InputError(what, where=where, expected=f"a property {missing[0]!r}", got=listed(names), remedy=remedy)
     whole = [name for name in wanted if name not in "xyz" and table.dtype[name].kind != "f"]
@@ -299,10 +295,9 @@ def _after_lists(content: bytes, place: int, element: _Element, order: str, wher
         what, where = "a PLY file has too many lists before its Gaussians", f"{where}: element {element.name!r}"
         remedy = "write the vertices first"
         raise InputError(what, where=where, expected=f"at most {MOST_LISTS}", got=str(element.count), remedy=remedy)
-    columns = [
-        (struct.Struct(order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize)
-        for length, kind, _ in element.columns
-    ]
+    columns = []
+    for length, kind, _ in element.columns:
+        columns.append((struct.Struct(order + np.dtype(length).char) if length else None, np.dtype(kind).itemsize))
     try:
         for _ in range(element.count):
             for length, size in columns:

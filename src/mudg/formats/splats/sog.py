@@ -106,13 +106,9 @@ def to_bytes(cloud: SplatCloud, antialias: bool = False) -> bytes:
     colors, color_index = codebook(cloud.sh[:, 0])
     opacity = np.round(cloud.opacity * 255.0)
     solid = np.full(len(cloud), 255)
-    files = {
-        "means_l.webp": np.column_stack([place & 255, solid]),
-        "means_u.webp": np.column_stack([place >> 8, solid]),
-        "quats.webp": turn,
-        "scales.webp": np.column_stack([size_index, solid]),
-        "sh0.webp": np.column_stack([color_index, opacity]),
-    }
+    columns = [(place & 255, solid), (place >> 8, solid), (turn,), (size_index, solid), (color_index, opacity)]
+    names = ("means_l.webp", "means_u.webp", "quats.webp", "scales.webp", "sh0.webp")
+    files = {name: np.column_stack(parts) for name, parts in zip(names, columns)}
     meta: dict[str, Any] = {
         "version": 2,
         "count": len(cloud),

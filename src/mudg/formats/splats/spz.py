@@ -34,25 +34,7 @@ _COLOR: Final = 0.15
 _PLANES: Final = ("positions", "opacities", "colors", "scales", "rotations", "harmonics")
 _ANTIALIAS, _EXTENSIONS = 1, 2
 _AXES: Final = 0xADBE0003
-_AXES_CODES: Final = (
-    "",
-    "LDB",
-    "RDB",
-    "LUB",
-    "RUB",
-    "LDF",
-    "RDF",
-    "LUF",
-    "RUF",
-    "LFD",
-    "RFD",
-    "LFU",
-    "RFU",
-    "LBD",
-    "RBD",
-    "LBU",
-    "RBU",
-)
+_AXES_CODES: Final = ("", *"LDB RDB LUB RUB LDF RDF LUF RUF LFD RFD LFU RFU LBD RBD LBU RBU".split())
 _MOST_EXTENSIONS: Final = 1 << 20
 _HARMLESS: Final = {0xADBE0002}
 """Extensions that say nothing about the Gaussians: where a viewer's camera may go."""
@@ -190,20 +172,13 @@ def _file(planes: list[bytes], head: _Header, extensions: dict[int, bytes], wher
             expected, remedy = f"a number up to {len(_AXES_CODES) - 1}", "convert it with the program that wrote it"
             raise InputError(what, where=where, expected=expected, got=extensions[_AXES][:8].hex(), remedy=remedy)
         axes = _AXES_CODES[code]
-    elif head.version == 4:
-        warnings.append(
-            "it does not state its axes: read with y up, as the format says; splat-transform from 3 on writes y down:"
-            " if it stands on its head, add --axes RDF"
-        )
     else:
-        notes.append(
-            "it does not state its axes: read with y up, as the format says; if it stands on its head, add --axes RDF"
-        )
-    unknown = [
-        f"{kind:#010x} ({len(part)} bytes)"
-        for kind, part in extensions.items()
-        if kind != _AXES and kind not in _HARMLESS
-    ]
+        newer, remedy = head.version == 4, "if it stands on its head, add --axes RDF"
+        doubt = "splat-transform from 3 on writes y down: " if newer else ""
+        words = f"it does not state its axes: read with y up, as the format says; {doubt}{remedy}"
+        (warnings if newer else notes).append(words)
+    others = [(kind, part) for kind, part in extensions.items() if kind != _AXES and kind not in _HARMLESS]
+    unknown = [f"{kind:#010x} ({len(part)} bytes)" for kind, part in others]
     if unknown:
         warnings.append(f"extensions that are not known were passed over: {listed(unknown)}")
     if head.flags & ~(_ANTIALIAS | _EXTENSIONS):
@@ -236,18 +211,10 @@ def _planes(cloud: SplatCloud, bits: int) -> list[bytes]:
     bucket = np.full(harmonics.shape[1], 16)
     bucket[:3] = 8
     snapped = (harmonics + bucket[:, None] // 2) // bucket[:, None] * bucket[:, None]
-    return [
-        fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes(),
-        _bytes(np.round(cloud.opacity * 255.0)),
-        _bytes(colors),
-        _bytes(scales),
-        _packed_rotations(cloud.quats).tobytes(),
-        _bytes(snapped),
-    ]
-
-
-def _bytes(values: NDArray[np.floating]) -> bytes:
-    return values.clip(0, 255).astype(np.uint8).tobytes()
+    parts = (np.round(cloud.opacity * 255.0), colors, scales, snapped)
+    opacity, color, scale, rest = (part.clip(0, 255).astype(np.uint8).tobytes() for part in parts)
+    places = fixed.view(np.uint8).reshape(-1, 4)[:, :3].tobytes()
+    return [places, opacity, color, scale, _packed_rotations(cloud.quats).tobytes(), rest]
 
 
 def _packed_rotations(quats: Floats) -> NDArray[np.uint32]:

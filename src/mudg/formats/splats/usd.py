@@ -27,7 +27,7 @@ from mudg.base.types import Camera, Scene, View
 from mudg.core.edit import HeightMap
 from mudg.formats.ncore import MICRO, PoseKeys
 from mudg.formats.splats import binary, ply
-from mudg.formats.splats.cloud import Floats, SplatCloud, SplatNode, SplatScene
+from mudg.formats.splats.cloud import Floats, SplatCloud, SplatNode, SplatScene, each_once
 
 CODES_PER_S: Final = 1000
 FOCAL: Final = 24.0
@@ -47,31 +47,20 @@ def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False, l
     static = time_s is not None
     nodes = (SplatNode("scene", scene.at(time_s)),) if time_s is not None else scene.nodes
     first, last = scene.span_s
-    lines = [
-        "#usda 1.0",
-        "(",
-        '    defaultPrim = "World"',
-        '    upAxis = "Z"',
-        "    metersPerUnit = 1",
-        f"    timeCodesPerSecond = {CODES_PER_S}",
-    ]
+    lines = ["#usda 1.0", "(", '    defaultPrim = "World"', '    upAxis = "Z"', "    metersPerUnit = 1"]
+    lines.append(f"    timeCodesPerSecond = {CODES_PER_S}")
     if not static:
         lines += [f"    startTimeCode = {first * CODES_PER_S:.9g}", f"    endTimeCode = {last * CODES_PER_S:.9g}"]
-    lines += [
-        f"    customLayerData = {{ string mudg = {quoted(json.dumps(dict(scene.facts), allow_nan=False))} }}",
-        ")",
-        "",
-    ]
+    facts = quoted(json.dumps(dict(scene.facts), allow_nan=False))
+    lines += [f"    customLayerData = {{ string mudg = {facts} }}", ")", ""]
     lines += ['def Xform "World"', "{"]
     names = prim_names([node.name for node in nodes])
     for name, node in zip(names, nodes):
         lines += _indented(_node(name, node, scene.file_from_world if not static else np.eye(4)))
-    for name, camera in (
-        {} if log is None else zip(prim_names([f"camera_{name}" for name in log.cameras]), log.cameras.values())
-    ):
-        lines += _indented(
-            _camera(name, camera, [frame.view for frame in log.frames_of(camera.name)], scene.file_from_world)
-        )
+    names = [] if log is None else prim_names([f"camera_{name}" for name in log.cameras])
+    for name, camera in zip(names, () if log is None else log.cameras.values()):
+        views = [] if log is None else [frame.view for frame in log.frames_of(camera.name)]
+        lines += _indented(_camera(name, camera, views, scene.file_from_world))
     if sky:
         lines += [
             '    def DomeLight "Sky"',
@@ -120,18 +109,12 @@ def _node(name: str, node: SplatNode, file_from_world: NDArray[np.float64]) -> l
     poses = file_from_world @ node.world_from_node if node.moves else file_from_world[None]
     if node.moves or not np.array_equal(file_from_world, np.eye(4)):
         codes = node.times_s * CODES_PER_S
-        quats = np.stack([geometry.quaternion_from_matrix(pose) for pose in poses])
-        places, turns = tuples(poses[:, :3, 3], 12), tuples(quats)
-        lines += _indented(
-            _over_time("double3 xformOp:translate", codes, places) + _over_time("quatf xformOp:orient", codes, turns)
-        )
-        lines.append('    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]')
+        lines += _indented(_poses_over_time(codes, poses))
     if node.moves:
         first, last = float(codes[0]), float(codes[-1])
         shown = {first - 1: "invisible", first: "inherited", last + 1: "invisible"}
-        lines += _indented(
-            _over_time("token visibility", np.array(list(shown)), [quoted(word) for word in shown.values()])
-        )
+        words = [quoted(word) for word in shown.values()]
+        lines += _indented(_over_time("token visibility", np.array(list(shown)), words))
         lines.append(f"    custom string mudg:track = {quoted(node.name)}")
         lines.append(f"    custom string mudg:label = {quoted(node.label)}")
         lines.append(f"    custom float3 mudg:size = {tuples(np.array([node.size_m]))[0]}")
@@ -156,11 +139,7 @@ def _camera(name: str, camera: Camera, views: Sequence[View], file_from_world: N
     ]
     if views:
         poses = file_from_world @ np.stack([view.world_from_cam for view in views]) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        codes = np.array([view.time_s for view in views]) * CODES_PER_S
-        quats = np.stack([geometry.quaternion_from_matrix(pose) for pose in poses])
-        lines += _indented(_over_time("double3 xformOp:translate", codes, tuples(poses[:, :3, 3], 12)))
-        lines += _indented(_over_time("quatf xformOp:orient", codes, tuples(quats)))
-        lines.append('    uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]')
+        lines += _indented(_poses_over_time(np.array([view.time_s for view in views]) * CODES_PER_S, poses))
     return [*lines, f"    custom string mudg:camera = {quoted(camera.name)}", "}"]
 
 
@@ -211,10 +190,17 @@ def _over_time(name: str, codes: NDArray[np.float64], values: Sequence[str]) -> 
     """An attribute with one value, or with samples over time."""
     if len(values) == 1 and len(codes) < 2:
         return [f"{name} = {values[0]}"]
+    samples = (f"    {code:.9g}: {value}," for code, value in zip(codes.tolist(), values))
+    return [f"{name}.timeSamples = {{", *samples, "}"]
+
+
+def _poses_over_time(codes: NDArray[np.float64], poses: NDArray[np.float64]) -> list[str]:
+    """The transform of a prim: translation and rotation."""
+    quats = np.stack([geometry.quaternion_from_matrix(pose) for pose in poses])
     return [
-        f"{name}.timeSamples = {{",
-        *(f"    {code:.9g}: {value}," for code, value in zip(codes.tolist(), values)),
-        "}",
+        *_over_time("double3 xformOp:translate", codes, tuples(poses[:, :3, 3], 12)),
+        *_over_time("quatf xformOp:orient", codes, tuples(quats)),
+        'uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:orient"]',
     ]
 
 
@@ -242,16 +228,8 @@ def tuples(values: NDArray[np.floating], digits: int = 9) -> list[str]:
 
 def prim_names(names: Sequence[str]) -> list[str]:
     """Names that USD accepts for prims, each once."""
-    made: dict[str, None] = {}
-    for name in names:
-        plain = re.sub(r"[^A-Za-z0-9_]", "_", name) or "node"
-        plain = f"_{plain}" if plain[0].isdigit() else plain
-        chosen, count = plain, 1
-        while chosen in made:
-            count += 1
-            chosen = f"{plain}_{count}"
-        made[chosen] = None
-    return list(made)
+    plain = (re.sub(r"[^A-Za-z0-9_]", "_", name) or "node" for name in names)
+    return each_once(f"_{name}" if name[0].isdigit() else name for name in plain)
 
 
 # alpasim -------------------------------------------------------------------------------------------
@@ -420,29 +398,19 @@ def _tracks(scene: SplatScene, clock: _PackageClock) -> dict[str, Any]:
     """Paths of the objects; one with a single key is there for no time, and is left out."""
     tracks = [node for node in scene.nodes if node.moves and len(node.times_s) > 1]
     poses = [scene.file_from_world @ node.world_from_node for node in tracks]
-    told = {
+    moved_m = [np.linalg.norm(np.ptp(node.world_from_node[:, :3, 3], axis=0)) for node in tracks]
+    turns = [[geometry.quaternion_from_matrix(pose)[[1, 2, 3, 0]].tolist() for pose in keys] for keys in poses]
+    data = {
         "tracks_id": [node.name for node in tracks],
         "tracks_label_class": [NVIDIA_CLASSES.get(node.label, node.label) for node in tracks],
-        "tracks_flags": [_flag(node) for node in tracks],
+        "tracks_flags": [CONTROLLABLE if metres > MOVES_M else STANDING for metres in moved_m],
         "tracks_timestamps_us": [[clock.us(time_s) for time_s in node.times_s] for node in tracks],
-        "tracks_poses": [[_seven(pose) for pose in keys] for keys in poses],
+        "tracks_poses": [
+            [[*pose[:3, 3].tolist(), *turn] for pose, turn in zip(keys, quats)] for keys, quats in zip(poses, turns)
+        ],
     }
-    return {
-        scene.name: {
-            "tracks_data": told,
-            "cuboidtracks_data": {"cuboids_dims": [list(map(float, node.size_m)) for node in tracks]},
-        }
-    }
-
-
-def _flag(node: SplatNode) -> str:
-    places = node.world_from_node[:, :3, 3]
-    return CONTROLLABLE if np.linalg.norm(np.ptp(places, axis=0)) > MOVES_M else STANDING
-
-
-def _seven(pose: NDArray[np.float64]) -> list[float]:
-    """x y z qx qy qz qw."""
-    return [*pose[:3, 3].tolist(), *geometry.quaternion_from_matrix(pose)[[1, 2, 3, 0]].tolist()]
+    sizes = {"cuboids_dims": [list(map(float, node.size_m)) for node in tracks]}
+    return {scene.name: {"tracks_data": data, "cuboidtracks_data": sizes}}
 
 
 def ground_mesh(ground: HeightMap, file_from_world: NDArray[np.float64]) -> bytes:
@@ -457,10 +425,6 @@ def ground_mesh(ground: HeightMap, file_from_world: NDArray[np.float64]) -> byte
     faces = np.concatenate([corners[:, [0, 1, 2]], corners[:, [0, 2, 3]]])
     table = np.empty(len(faces), [("count", "u1"), ("corner", "<i4", 3)])
     table["count"], table["corner"] = 3, faces
-    head = ply.header(
-        [
-            ("vertex", len(xyz), [("float", axis) for axis in "xyz"]),
-            ("face", len(faces), [("list uchar int", "vertex_indices")]),
-        ]
-    )
+    corners_of = ("face", len(faces), [("list uchar int", "vertex_indices")])
+    head = ply.header([("vertex", len(xyz), [("float", axis) for axis in "xyz"]), corners_of])
     return head + geometry.transform_points(file_from_world, xyz).astype("<f4").tobytes() + table.tobytes()
