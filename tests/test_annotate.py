@@ -296,7 +296,7 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
     (tmp_path / "weights").mkdir()
     (tmp_path / "weights" / "config.json").write_text('{"model_type": "depth_anything"}')
     network = lambda given: Prediction(next(answers), "depth")  # noqa: E731
-    monkeypatch.setattr(annotate_depth, "load", lambda config: network if config.depth_network else None)
+    monkeypatch.setattr(annotate_depth, "load_depth_network", lambda *_: network)
     config = AnnotateConfig(depth_network=str(tmp_path / "weights"), processes=1)
     scene = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run())
     by_points = read_scene(
