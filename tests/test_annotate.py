@@ -58,8 +58,7 @@ def overlap(found: np.ndarray, truth: np.ndarray, *names: str) -> float:
 def test_labels_of_a_street_agree_with_the_truth() -> None:
     given, truth = given_at(STREET)
     labels = label_by_geometry(given)
-    assert overlap(labels.semantics, truth, "road") > 0.93
-    assert overlap(labels.semantics, truth, "car") > 0.75
+    assert overlap(labels.semantics, truth, "road") > 0.93 and overlap(labels.semantics, truth, "car") > 0.75
     assert overlap(labels.semantics, truth, "sky") > 0.95
     assert overlap(labels.semantics, truth, "building", "vegetation", "wall") > 0.8
     assert (labels.semantics != UNLABELLED).mean() > 0.95
@@ -71,8 +70,7 @@ def test_labels_of_a_street_agree_with_the_truth() -> None:
 def test_confidence_tells_right_from_wrong() -> None:
     given, truth = given_at(STREET)
     labels = label_by_geometry(given)
-    assert labels.confidence.dtype == np.float32
-    assert ((labels.confidence >= 0) & (labels.confidence <= 1)).all()
+    assert labels.confidence.dtype == np.float32 and ((labels.confidence >= 0) & (labels.confidence <= 1)).all()
     assert (labels.confidence[labels.semantics == UNLABELLED] == 0).all()
     right = labels.semantics == truth
     sure = labels.confidence > 0.7
@@ -85,20 +83,17 @@ def test_depth_is_measured_where_it_says_it_is_sure() -> None:
     labels = label_by_geometry(given)
     _, _, truth = STREET.image(given.view)
     sure = (labels.depth_confidence > 0.6) & ~labels.sky
-    assert sure.mean() > 0.3
-    assert np.isfinite(truth[sure]).mean() > 0.99
+    assert sure.mean() > 0.3 and np.isfinite(truth[sure]).mean() > 0.99
     sure &= np.isfinite(truth)
     error = np.abs(labels.depth[sure] - truth[sure]) / truth[sure]
-    assert np.median(error) < 0.01
-    assert (labels.depth[labels.sky] == 100).all()
+    assert np.median(error) < 0.01 and (labels.depth[labels.sky] == 100).all()
     assert (labels.depth_confidence[np.isnan(labels.depth)] == 0).all()
 
 
 def test_without_lidar_it_says_less_and_without_boxes_it_invents_no_car() -> None:
     given, truth = given_at(STREET, lidar=False)
     blind = label_by_geometry(given)
-    assert overlap(blind.semantics, truth, "sky") > 0.9
-    assert not (blind.semantics == ID["road"]).any()
+    assert overlap(blind.semantics, truth, "sky") > 0.9 and not (blind.semantics == ID["road"]).any()
     assert np.isnan(blind.depth[~blind.sky]).all()
     assert blind.confidence[blind.semantics == ID["car"]].max(initial=0) <= 0.5
     given, _ = given_at(STREET, boxes=False)
@@ -108,8 +103,7 @@ def test_without_lidar_it_says_less_and_without_boxes_it_invents_no_car() -> Non
 def test_a_box_hidden_behind_the_wall_is_not_painted() -> None:
     street = replace(STREET, car_start=(40.0, 0.0))
     given, truth = given_at(street)
-    assert not (truth == ID["car"]).any()
-    assert not (label_by_geometry(given).semantics == ID["car"]).any()
+    assert not (truth == ID["car"]).any() and not (label_by_geometry(given).semantics == ID["car"]).any()
 
 
 def test_all_black_and_all_white_images_do_not_break_it() -> None:
@@ -121,8 +115,7 @@ def test_all_black_and_all_white_images_do_not_break_it() -> None:
 
 
 def test_labels_of_boxes_are_train_ids() -> None:
-    assert set(LABELLERS) == {"embedded", "geometry", "network"}
-    assert TRAIN_ID_OF["van"] == ID["car"]
+    assert set(LABELLERS) == {"embedded", "geometry", "network"} and TRAIN_ID_OF["van"] == ID["car"]
     assert TRAIN_ID_OF["cyclist"] == ID["rider"]
     unknown = replace(STREET.track(), label="shopping trolley")
     given, _ = given_at(STREET)
@@ -175,8 +168,7 @@ def test_sky_is_not_found_where_returns_are_or_below_the_horizon() -> None:
     )  # returns from column 50 on
     sky = find_sky(rgb, elevation, away_px, 6.0)
     assert sky[:28, :48].all()  # grown up to the returns, not into them
-    assert not sky[:, 49:].any()
-    assert not sky[31:].any()
+    assert not sky[:, 49:].any() and not sky[31:].any()
 
 
 # --- the stage ------------------------------------------------------------------------------------
@@ -195,12 +187,9 @@ def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: P
         _, truth, _ = STREET.image(frame.view)
         assert overlap(read_label(scene, frame, "semantics"), truth, "road") > 0.9
     assert (read_points(scene, scene.sweeps[1]).xyz == read_points(plain, plain.sweeps[1]).xyz).all()
-    assert dict(scene.split) == dict(plain.split)
-    assert any("not truth" in note for note in scene.source.notes)
-    assert not [f for f in check_scene(out) if f.level == "error"]
-    assert list((out / "pictures").glob("*.jpg"))
-    assert "not truth" in (out / "labels.html").read_text()
-    assert not (out / "labelled").exists()
+    assert dict(scene.split) == dict(plain.split) and any("not truth" in note for note in scene.source.notes)
+    assert not [f for f in check_scene(out) if f.level == "error"] and list((out / "pictures").glob("*.jpg"))
+    assert "not truth" in (out / "labels.html").read_text() and not (out / "labelled").exists()
     before_ns = (out / "scene.json").stat().st_mtime_ns
     assert Annotate(scene=tmp_path / "plain", out=out, settings=AnnotateConfig(depth=True)).run() == out
     assert (out / "scene.json").stat().st_mtime_ns == before_ns
@@ -296,7 +285,7 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
     (tmp_path / "weights").mkdir()
     (tmp_path / "weights" / "config.json").write_text('{"model_type": "depth_anything"}')
     network = lambda given: Prediction(next(answers), "depth")  # noqa: E731
-    monkeypatch.setattr(annotate_depth, "load", lambda config: network if config.depth_network else None)
+    monkeypatch.setattr(annotate_depth, "load_depth_network", lambda *_: network)
     config = AnnotateConfig(depth_network=str(tmp_path / "weights"), processes=1)
     scene = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run())
     by_points = read_scene(
@@ -308,8 +297,7 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
     assert (first[read_label(scene, scene.frames[0], "sky").astype(bool)] == 100).all()
     assert np.array_equal(second, read_label(by_points, by_points.frames[1], "depth"))
     (note,) = [note for note in scene.source.notes if note.startswith("depth of 2 frames")]
-    assert "network 'depth_anything' in folder 'weights' (sha256 " in note
-    assert "1 of them, where it did not fit" in note
+    assert "network 'depth_anything' in folder 'weights' (sha256 " in note and "1 of them, where it did not fit" in note
     assert not list((tmp_path / "out").rglob("*.filled.json"))
     (tmp_path / "weights" / "model.safetensors").write_bytes(b"other weights")
     with pytest.raises(UsageError, match="depth_network"):

@@ -71,8 +71,7 @@ def test_bad_lists_are_refused_with_their_line(tmp_path: Path, text: str, words:
 def test_shards_are_a_partition_that_growing_lists_keep() -> None:
     entries = [lists.Entry(str(n), str(n)) for n in range(60)]
     parts = [lists.shard(entries, (i, 3)) for i in range(3)]
-    assert sorted(int(e.name) for part in parts for e in part) == list(range(60))
-    assert min(map(len, parts)) >= 10
+    assert sorted(int(e.name) for part in parts for e in part) == list(range(60)) and min(map(len, parts)) >= 10
     for part, fewer in zip(parts, [lists.shard(entries[:20], (i, 3)) for i in range(3)], strict=True):
         assert part[: len(fewer)] == fewer
     for text in ("3/3", "1", "a/b", "-1/3", "1/0"):
@@ -92,8 +91,7 @@ def test_failures_are_told_and_stop_nothing(tmp_path: Path, capfd: pytest.Captur
     assert list(states) == ["bad", "killed", "bug", "good"]
     assert states["bad"] == ("failed", "it is broken; bad; got nothing")
     assert states["killed"][0] == "failed" and "signal 9" in states["killed"][1] and "memory" in states["killed"][1]
-    assert states["bug"][0] == "failed" and "code 1" in states["bug"][1]
-    assert states["good"][0] == "done"
+    assert states["bug"][0] == "failed" and "code 1" in states["bug"][1] and states["good"][0] == "done"
     assert "1 of 4 scenes are there, 3 failed" in result["text"]
     assert "ZeroDivisionError" in states["bug"][1] and "warning" in capfd.readouterr().err
     written = json.loads((tmp_path / "out/status-0-of-1.json").read_text())
@@ -129,8 +127,7 @@ def test_many_logs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
     broken.write_bytes(content)
     assert app.main(words) == 0
     table = capsys.readouterr().out
-    assert "reused" in table and "done" in table
-    assert len(read_scene(tmp_path / "scenes" / "second").frames) == 6
+    assert "reused" in table and "done" in table and len(read_scene(tmp_path / "scenes" / "second").frames) == 6
 
 
 @pytest.mark.slow
@@ -141,10 +138,8 @@ def test_many_scenes_fused_by_shards(tmp_path: Path) -> None:
     first = [name for name in ("one", "two", "three") if lists.shard_of(name, 2) == 0]
     expected = sorted(["status-0-of-2.json", *first])
     words = ["fuse", "--list", str(tmp_path / "scenes"), "--out", str(tmp_path / "fused"), "--quiet", "--shard"]
-    assert app.main([*words, "0/2"]) == 0
-    assert sorted(p.name for p in (tmp_path / "fused").iterdir()) == expected
-    assert app.main([*words, "1/2"]) == 0
-    assert (tmp_path / "fused" / "three" / "static.safetensors").is_file()
+    assert app.main([*words, "0/2"]) == 0 and sorted(p.name for p in (tmp_path / "fused").iterdir()) == expected
+    assert app.main([*words, "1/2"]) == 0 and (tmp_path / "fused" / "three" / "static.safetensors").is_file()
 
 
 def test_a_folder_as_list_leaves_out_what_an_earlier_list_wrote_there(tmp_path: Path) -> None:

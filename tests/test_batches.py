@@ -208,8 +208,7 @@ def test_a_second_run_does_nothing_and_any_order_gives_the_same(tmp_path: Path) 
     one, other = Scenes(tmp_path / "a", 6), Scenes(tmp_path / "b", 6)
     assert one.run(jobs=3) == {"done": 6} and one.run() == {}
     other.entries.reverse()
-    assert other.run() == {"done": 6}
-    assert one.digests() == other.digests() and set(one.runs().values()) == {1}
+    assert other.run() == {"done": 6} and one.digests() == other.digests() and set(one.runs().values()) == {1}
     assert not list((tmp_path / "a/out/_batch/work").iterdir())
     (record,) = (one for one in one.batch.records("done") if one.scene == "s3")
     assert (tmp_path / "a/out" / record.place / "x.txt").read_text() == "result of s3\n"
@@ -241,8 +240,7 @@ def test_exit_codes_decide_how_often_a_step_is_tried(
     assert made.batch.log(record.key).load() == b"error: it broke\n"
     made.does("s0", "")
     assert made.run() == {}, "what has failed stays so"
-    assert batching.retry(str(made.batch.out), str(code))["forgotten"] == 1
-    assert made.run() == {"done": 1}
+    assert batching.retry(str(made.batch.out), str(code))["forgotten"] == 1 and made.run() == {"done": 1}
     (path,) = (tmp_path / "out/s0/command").iterdir()
     assert [file.name for file in path.iterdir()] == ["x.txt"], "nothing is left of the failure"
 
@@ -295,8 +293,7 @@ def test_a_killed_step_is_tried_again_alone_and_with_less(tmp_path: Path, monkey
     assert "".join(order.read_text().split()) == "baa", "the second try waited for the other step"
     made.entries.append(Entry("s2", "/logs/2"))
     made.does("s2", "kill -9 $$")
-    assert made.run(threads=4) == {"failed": 1}
-    assert "also alone" in next(made.batch.records("failed")).words
+    assert made.run(threads=4) == {"failed": 1} and "also alone" in next(made.batch.records("failed")).words
 
 
 def test_too_few_programs_and_processes(tmp_path: Path) -> None:
@@ -304,8 +301,7 @@ def test_too_few_programs_and_processes(tmp_path: Path) -> None:
         run_step(["/no/such/program", "mudg"], tmp_path, 1, Stop())
     made = Scenes(tmp_path, 1)
     made.does("s0", "exit 0")
-    assert made.run() == {"failed": 1}
-    assert next(made.batch.records("failed")).words == "it ended well but wrote nothing"
+    assert made.run() == {"failed": 1} and next(made.batch.records("failed")).words == "it ended well but wrote nothing"
 
 
 # ---- drivers -------------------------------------------------------------------------------------
@@ -574,13 +570,11 @@ def test_the_command_line_says_what_is_missing(tmp_path: Path, capsys: pytest.Ca
     assert app.main(["batch", "run", "--out", str(tmp_path / "o")]) == 2
     (tmp_path / "list.txt").write_text("city\n")
     words = ["batch", "run", "--list", str(tmp_path / "list.txt"), "--out", str(tmp_path / "o")]
-    assert app.main([*words, "--shard", "3"]) == 2
-    assert app.main([*words, "--shard", "0/3", "--engine", "ray"]) == 2
+    assert app.main([*words, "--shard", "3"]) == 2 and app.main([*words, "--shard", "0/3", "--engine", "ray"]) == 2
     assert app.main([*words, "--set", "fit.iterationz=3"]) == 2
     assert "did you mean fit.iterations" in capsys.readouterr().err
     assert app.main([*words, "--stages", "ingest", "fuse", "--dry-run"]) == 0
-    assert "1 scenes: ingest -> fuse" in capsys.readouterr().out
-    assert not (tmp_path / "o").exists()
+    assert "1 scenes: ingest -> fuse" in capsys.readouterr().out and not (tmp_path / "o").exists()
 
 
 def test_failures_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

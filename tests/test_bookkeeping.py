@@ -50,8 +50,7 @@ def test_no_altered_bookkeeping_is_taken(name: str, nth: int, finished: Path) ->
         with pytest.raises(MudgError) if name != "run.json" else _either():
             assert not run(finished).complete
         file.write_bytes(whole)
-    assert store.digest(finished) == before
-    assert run(finished).complete
+    assert store.digest(finished) == before and run(finished).complete
 
 
 class _either:
@@ -150,8 +149,7 @@ def test_an_output_that_cannot_be_is_refused_in_words(tmp_path: Path, overwrite:
     for out, words in cases.items():
         with pytest.raises(UsageError, match=words):
             refuse_and_open(out, overwrite)
-    assert sorted(os.listdir(tmp_path)) == before
-    assert (tmp_path / "file").read_text() == "mine"
+    assert sorted(os.listdir(tmp_path)) == before and (tmp_path / "file").read_text() == "mine"
 
 
 def test_names_as_long_as_can_be_work(tmp_path: Path) -> None:

@@ -64,11 +64,8 @@ def test_an_affine_map_of_the_truth_comes_back_as_the_truth(
     given = DepthInput(given.rgb, measured, given.filled, given.sky)
     prediction = Prediction((scale * goal + shift).astype(np.float32), space)
     found = align_to_lidar(prediction, given, RULES)
-    assert found.fit.used
-    assert found.dense is not None
-    assert np.abs(found.dense.depth / truth - 1).max() < 1e-3
-    assert (found.dense.depth[given.sky] == RULES.sky_m).all()
-    assert found.fit.residual < 1e-3
+    assert found.fit.used and found.dense is not None and np.abs(found.dense.depth / truth - 1).max() < 1e-3
+    assert (found.dense.depth[given.sky] == RULES.sky_m).all() and found.fit.residual < 1e-3
 
 
 def test_wrong_returns_from_behind_do_not_pull() -> None:
@@ -81,8 +78,7 @@ def test_wrong_returns_from_behind_do_not_pull() -> None:
     found = align_to_lidar(
         Prediction(truth / 80 - 0.1, "depth"), DepthInput(given.rgb, measured, given.filled, given.sky), RULES
     )
-    assert found.dense is not None
-    assert np.abs(found.dense.depth / truth - 1).max() < 1e-3
+    assert found.dense is not None and np.abs(found.dense.depth / truth - 1).max() < 1e-3
 
 
 def test_depth_that_does_not_fit_the_returns_is_not_used() -> None:
@@ -106,16 +102,14 @@ def test_confidence_is_low_where_the_depth_is_off() -> None:
     off[:, :24] *= 1.3
     confidence = residual_confidence(off, given.measured, given.sky, RULES.sky_m)
     right, wrong = np.median(confidence[30:, 40:]), np.median(confidence[30:, :16])
-    assert right > 0.5 > 0.1 > wrong
-    assert confidence.dtype == np.float32
+    assert right > 0.5 > 0.1 > wrong and confidence.dtype == np.float32
     assert ((confidence >= 0) & (confidence <= 1)).all()
 
 
 def test_the_map_for_the_network_has_no_holes_and_no_sky() -> None:
     given, truth = street()
     cue = lidar_cue(given, 36)
-    assert tuple(cue.shape) == (1, 1, 24, 36)
-    assert bool(torch.isfinite(cue).all())
+    assert tuple(cue.shape) == (1, 1, 24, 36) and bool(torch.isfinite(cue).all())
     assert float(cue.max()) <= float(truth[~given.sky].max())
     flat = DepthInput(given.rgb, given.measured, np.full_like(truth, 5.0), given.sky)
     assert float(lidar_cue(flat).max() - lidar_cue(flat).min()) > 0
@@ -212,8 +206,7 @@ def test_marigold_without_guidance_answers_as_the_package_does(prediction_type: 
         Image.fromarray(given.rgb), latents=noise, match_input_resolution=False, output_type="pt"
     ).prediction
     found = model.predict(image, size, noise)
-    assert found.shape == expected.shape
-    assert float(expected.max() - expected.min()) > 1e-2
+    assert found.shape == expected.shape and float(expected.max() - expected.min()) > 1e-2
     np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=2e-5)
     assert np.array_equal(model(given).values, model(given).values)  # no chance
 
@@ -246,8 +239,7 @@ def test_bfloat16_gives_nearly_the_same(tmp_path: Path) -> None:
     for folder, options in (("a", DepthOptions()), ("b", DepthOptions(guided=True, steps=2))):
         exact = load_depth_network(tmp_path / folder, Place("cpu"), options)(given).values
         rounded = load_depth_network(tmp_path / folder, Place("cpu", bf16=True), options)(given).values
-        assert rounded.dtype == np.float32
-        assert 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
+        assert rounded.dtype == np.float32 and 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
 
 
 def test_a_missing_device_is_named(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -126,8 +126,7 @@ def test_files_of_other_ages_give_the_same(published: tuple[Path, dict[str, Any]
     conversion.convert_folder(folder, tmp_path / "out", torch.float16, 1 << 20)
     parts = depthlab.read_parts(tmp_path / "out", json.loads((tmp_path / "out" / "model.json").read_text()))
     rounded = {name: value.half().float() for name, value in made["vae"].state_dict().items()}
-    assert renamed.keys() != rounded.keys()
-    assert same(parts.vae.state_dict(), rounded)
+    assert renamed.keys() != rounded.keys() and same(parts.vae.state_dict(), rounded)
     found = parts.image_encoder.visual_projection.weight
     assert torch.equal(found, clip["visual_projection.weight"].half().float())
 
@@ -275,12 +274,9 @@ def test_known_depth_at_another_size_is_the_nearest_return_there() -> None:
     measured[0, 0], measured[1, 1], measured[3, 5] = 9, 4, 7
     assert np.array_equal(known_depth(measured, (4, 6)), measured, equal_nan=True)
     small = known_depth(measured, (2, 3))
-    assert small[0, 0] == 4
-    assert small[1, 2] == 7
-    assert np.isfinite(small).sum() == 2
+    assert small[0, 0] == 4 and small[1, 2] == 7 and np.isfinite(small).sum() == 2
     large = known_depth(measured, (8, 12))
-    assert (large[6:, 10:] == 7).all()
-    assert np.isfinite(large).sum() == 12
+    assert (large[6:, 10:] == 7).all() and np.isfinite(large).sum() == 12
 
 
 def test_linear_interpolation_is_exact_on_planes_and_zero_outside() -> None:
@@ -291,27 +287,23 @@ def test_linear_interpolation_is_exact_on_planes_and_zero_outside() -> None:
         known[row, column] = plane[row, column]
     inside = (v >= 2) & (v <= 9) & (u >= 2) & (u <= 12)
     filled = linear_fill(known)
-    assert np.abs(filled - plane)[inside].max() < 1e-5
-    assert (filled[~inside] == 0).all()
+    assert np.abs(filled - plane)[inside].max() < 1e-5 and (filled[~inside] == 0).all()
     line = np.full_like(plane, np.nan)
     line[3] = plane[3]
-    assert np.array_equal(linear_fill(line)[3], plane[3])
-    assert not linear_fill(line)[[2, 4]].any()
+    assert np.array_equal(linear_fill(line)[3], plane[3]) and not linear_fill(line)[[2, 4]].any()
 
 
 def test_what_is_prepared_spans_the_known_depth() -> None:
     given, _ = street(30, 50)
     made = prepare(given, replace(SAMPLING, normalize_scale=0.5), 4, 28)
-    assert made.size == (28, 48)
-    assert made.image.shape == (1, 3, 28, 48)
+    assert made.size == (28, 48) and made.image.shape == (1, 3, 28, 48)
     seen = np.isfinite(given.measured) & ~given.sky
     assert (made.low_m, made.high_m) == (given.measured[seen].min(), given.measured[seen].max())
     known = made.missing == 0
     for plane in (made.nearest, made.linear):
         assert float(plane[known].min()) == pytest.approx(-0.5, abs=1e-5)
         assert float(plane[known].max()) == pytest.approx(0.5, abs=1e-5)
-    assert torch.equal(made.nearest[known], made.linear[known])
-    assert set(made.missing.unique().tolist()) == {0.0, 1.0}
+    assert torch.equal(made.nearest[known], made.linear[known]) and set(made.missing.unique().tolist()) == {0.0, 1.0}
     same_size = prepare(given, replace(SAMPLING, processing_px=50), 8, 28)
     assert same_size.image.shape == (1, 3, 32, 56)
     assert torch.equal(same_size.image[..., :30, 50:], same_size.image[..., :30, 49:50].expand(-1, -1, -1, 6))
@@ -423,8 +415,7 @@ def test_denoising_is_that_of_a_twin_written_out(converted: Path, tmp_path: Path
     found = model.predict(inputs, noise)
     with torch.no_grad():
         expected = twin(made, inputs, noise, SAMPLING)
-    assert found.shape == expected.shape == (1, 1, 28, 48)
-    assert float(expected.std()) > 1e-2
+    assert found.shape == expected.shape == (1, 1, 28, 48) and float(expected.std()) > 1e-2
     np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=2e-5)
 
 
@@ -470,19 +461,15 @@ def test_all_steps_start_from_noise(converted: Path, tmp_path: Path) -> None:
     inputs = prepare(street(24, 32)[0], replace(SAMPLING, processing_px=32), 2, 28)
     noise = torch.randn(1, 4, 12, 16, generator=torch.Generator().manual_seed(1))
     model.predict(inputs, noise)
-    assert len(seen) == 3
-    assert torch.equal(seen[0], noise)
+    assert len(seen) == 3 and torch.equal(seen[0], noise)
 
 
 def test_answers_are_of_the_images_size_and_always_the_same(converted: Path) -> None:
     given, _ = street(30, 50)
     model = load_depth_network(converted)
     first, second = model(given), model(given)
-    assert first.space == "depth"
-    assert first.values.shape == (30, 50)
-    assert first.values.dtype == np.float32
-    assert float(first.values.min()) >= 0
-    assert np.array_equal(first.values, second.values)
+    assert first.space == "depth" and first.values.shape == (30, 50) and first.values.dtype == np.float32
+    assert float(first.values.min()) >= 0 and np.array_equal(first.values, second.values)
     assert np.array_equal(first.values, load_depth_network(converted)(given).values)
     other = DepthInput(given.rgb, given.measured * 2, given.filled, given.sky)
     np.testing.assert_allclose(model(other).values, 2 * first.values, rtol=1e-3, atol=1e-3)  # metres in, metres out
@@ -519,7 +506,6 @@ def test_annotate_reads_a_converted_folder(converted: Path, tmp_path: Path) -> N
     scene = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run())
     for frame in scene.frames:
         depth = read_label(scene, frame, "depth")
-        assert depth.shape == (48, 96)
-        assert np.isfinite(depth).all()
+        assert depth.shape == (48, 96) and np.isfinite(depth).all()
     (note,) = [note for note in scene.source.notes if note.startswith("depth of 2 frames")]
     assert "network 'depthlab' in folder 'depthlab' (sha256 " in note

@@ -17,8 +17,7 @@ def said(monkeypatch):
 
 def test_auto_is_the_cpu_where_there_is_no_cuda(monkeypatch, said):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    assert devices.choose_device("auto", "fit") == torch.device("cpu")
-    assert said == ["fit: on the CPU"]
+    assert devices.choose_device("auto", "fit") == torch.device("cpu") and said == ["fit: on the CPU"]
 
 
 def test_auto_is_the_first_cuda_device_and_says_its_name_and_memory(monkeypatch, said):
@@ -76,5 +75,4 @@ def test_the_pretend_device_refuses_what_a_gpu_refuses():
         ):
             with pytest.raises((RuntimeError, TypeError)):
                 slip()
-        assert (a + 1).cpu().tolist() == [2.0, 2.0, 2.0]
-        assert (a * a).sum().item() == 3.0
+        assert (a + 1).cpu().tolist() == [2.0, 2.0, 2.0] and (a * a).sum().item() == 3.0

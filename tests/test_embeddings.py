@@ -202,8 +202,7 @@ def test_consistency_by_hand() -> None:
     # Neighbours at right angles: 0. With the first: 0 and max(0, -1).
     assert subject_consistency(rows) == 0
     tilted = np.array([[1.0, 0.0], [1.0, 1.0]])
-    assert subject_consistency(tilted) == pytest.approx(0.5**0.5)
-    assert subject_consistency(rows[:1]) is None
+    assert subject_consistency(tilted) == pytest.approx(0.5**0.5) and subject_consistency(rows[:1]) is None
 
 
 # ---- in the scorer -------------------------------------------------------------------------------
@@ -237,8 +236,7 @@ def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> 
     document = store.read_json(out / "metrics.json")
     values = {r["method"]: r["values"] for r in document["results"]}
     assert values["a"]["fd_dinov2"] == pytest.approx(0, abs=1e-4)  # the toy's views are its recorded images
-    assert values["a"]["cmmd"] == pytest.approx(0, abs=1e-9)
-    assert values["a"]["clip_v"] == pytest.approx(1.0, abs=1e-6)
+    assert values["a"]["cmmd"] == pytest.approx(0, abs=1e-9) and values["a"]["clip_v"] == pytest.approx(1.0, abs=1e-6)
     assert values["b"]["fd_dinov2"] > 0.1 and values["b"]["cmmd"] > 0 and values["b"]["clip_v"] < 0.9999
     assert 0 < values["a"]["subject_consistency"] <= 1 and 0 < values["a"]["clip_f"] <= 1
 

@@ -50,8 +50,7 @@ def test_slerp_moves_at_constant_rate_between_both_ends(a: np.ndarray, b: np.nda
 
     whole = angle(q0, q1)
     if whole < np.pi - 1e-3:
-        assert abs(angle(q0, q) - u * whole) < 1e-5
-        assert abs(angle(q, q1) - (1 - u) * whole) < 1e-5
+        assert abs(angle(q0, q) - u * whole) < 1e-5 and abs(angle(q, q1) - (1 - u) * whole) < 1e-5
     np.testing.assert_allclose(geometry.matrix_from_quaternion(geometry.slerp(q0, q1, 1.0)), b[:3, :3], atol=1e-7)
 
 
@@ -92,8 +91,7 @@ def test_pose_at_is_exact_at_keys_interpolates_both_neighbours_and_never_extrapo
     keys = np.stack(
         [geometry.yaw_matrix(0.0, (0, 0, 0)), geometry.yaw_matrix(0.4, (2, 0, 0)), geometry.yaw_matrix(1.0, (2, 4, 0))]
     )
-    assert geometry.pose_at(times, keys, -0.01) is None
-    assert geometry.pose_at(times, keys, 2.01) is None
+    assert geometry.pose_at(times, keys, -0.01) is None and geometry.pose_at(times, keys, 2.01) is None
     np.testing.assert_array_equal(geometry.pose_at(times, keys, 1.0), keys[1])
     middle = geometry.pose_at(times, keys, 1.5)
     assert middle is not None
@@ -114,8 +112,7 @@ def test_pose_at_is_exact_at_keys_interpolates_both_neighbours_and_never_extrapo
 def test_rigid_problem_names_the_fault(matrix: np.ndarray, word: str) -> None:
     assert word in str(geometry.rigid_problem(matrix))
     if matrix.shape == (4, 4):
-        assert geometry.all_rigid(np.stack([np.eye(4)] * 3))
-        assert not geometry.all_rigid(np.stack([np.eye(4), matrix]))
+        assert geometry.all_rigid(np.stack([np.eye(4)] * 3)) and not geometry.all_rigid(np.stack([np.eye(4), matrix]))
 
 
 def test_zero_quaternion_is_refused() -> None:

@@ -34,8 +34,7 @@ def test_ground_plane_is_found_among_walls_and_noise(slope: tuple[float, float, 
     ground = np.c_[flat, flat @ slope[:2] + slope[2] + rng.normal(0, 0.02, 6000)]
     wall = np.c_[np.full(3000, 12.0), rng.uniform(-20, 20, 3000), rng.uniform(0, 8, 3000) + 12 * slope[0] + slope[2]]
     plane = fit_ground(np.concatenate([ground, wall]).astype(np.float32), np.zeros((3, 3)))
-    assert plane is not None
-    assert np.abs(plane - slope).max() < 0.02
+    assert plane is not None and np.abs(plane - slope).max() < 0.02
 
 
 def test_no_ground_is_no_plane() -> None:
@@ -50,8 +49,7 @@ def test_ground_is_found_at_the_end_of_a_long_drive() -> None:
     behind = path[:1] - np.c_[np.arange(500.0, 0, -5), np.zeros((100, 2))]
     here = path[0]
     near, long = ground_near(xyz, path, here), ground_near(xyz, np.concatenate([behind, path]), here)
-    assert near is not None
-    assert long == pytest.approx(near)
+    assert near is not None and long == pytest.approx(near)
 
 
 def test_distance_to_path_goes_on_beyond_its_ends() -> None:
@@ -66,8 +64,7 @@ def test_a_vehicle_that_stood_has_the_direction_of_its_heading() -> None:
     path = driven_path(np.stack([pose, pose]))
     assert distance_to_path(np.array([[3.0, 59, 0], [8, 5, 0]]), path) == pytest.approx([0, 5], abs=0.3)
     moved = np.stack([pose, yaw_matrix(0, (9.0, 4.0, 1.0))])
-    assert (driven_path(moved) == moved[:, :3, 3]).all()
-    assert len(driven_path(np.zeros((0, 4, 4)))) == 0
+    assert (driven_path(moved) == moved[:, :3, 3]).all() and len(driven_path(np.zeros((0, 4, 4)))) == 0
 
 
 @pytest.mark.parametrize("slope", [(0.0, 0.0), (0.06, -0.02)])
@@ -79,8 +76,7 @@ def test_the_road_is_joined_to_the_path_and_the_sidewalk_is_not(slope: tuple[flo
     places = np.c_[places, places @ slope + np.where(np.abs(places[:, 1]) > KERB_AT_M, 0.12, 0)]
     reachable, _, raised = ground.under(places)
     from_kerb = np.abs(places[:, 1]) - KERB_AT_M
-    assert reachable[from_kerb < -2 * CELL_M].mean() > 0.98
-    assert reachable[from_kerb > 2 * CELL_M].mean() < 0.02
+    assert reachable[from_kerb < -2 * CELL_M].mean() > 0.98 and reachable[from_kerb > 2 * CELL_M].mean() < 0.02
     beyond = (from_kerb > 2 * CELL_M) & (from_kerb < 2)
     assert np.median(raised[beyond]) == pytest.approx(0.12, abs=0.05 + 3 * abs(slope[1]))
     assert np.median(raised[from_kerb < -3]) < 0.06
@@ -89,11 +85,9 @@ def test_the_road_is_joined_to_the_path_and_the_sidewalk_is_not(slope: tuple[flo
 def test_without_a_kerb_all_is_joined_and_walls_are_no_ground() -> None:
     xyz, path = street(np.random.default_rng(7), kerb_m=0.0)
     ground = map_ground(xyz, path, path[0])
-    assert ground is not None
-    assert ground.under(np.array([[5.0, 7, 0], [-20, -7, 0]]))[0].all()
+    assert ground is not None and ground.under(np.array([[5.0, 7, 0], [-20, -7, 0]]))[0].all()
     reachable, _, raised = ground.under(np.array([[5.0, 7, 3], [500, 0, 0], [np.nan, 0, 0]]))
-    assert not reachable.any()
-    assert (raised == 0).all()
+    assert not reachable.any() and (raised == 0).all()
 
 
 def test_a_vehicle_that_stood_and_sees_no_ground_around_it_is_joined_to_what_it_sees() -> None:
@@ -114,8 +108,7 @@ def test_a_lowered_kerb_joins_a_sidewalk_but_not_directly() -> None:
     assert ground is not None
     far, at_it, other_side, road = np.array([[-12, 6, 0.12], [10, 4.6, 0.04], [-12, -6, 0.12], [-12, 3, 0]], float)
     reachable, direct, _ = ground.under(np.stack([far, at_it, other_side, road]))
-    assert reachable.tolist() == [True, True, False, True]
-    assert direct.tolist() == [False, True, False, True]
+    assert reachable.tolist() == [True, True, False, True] and direct.tolist() == [False, True, False, True]
 
 
 def test_the_order_of_returns_changes_nothing() -> None:
@@ -123,13 +116,10 @@ def test_the_order_of_returns_changes_nothing() -> None:
     one, other = (
         map_ground(points, path, path[0]) for points in (xyz, xyz[np.random.default_rng(1).permutation(len(xyz))])
     )
-    assert one is not None
-    assert other is not None
-    assert (one.reachable == other.reachable).mean() > 0.999
+    assert one is not None and other is not None and (one.reachable == other.reachable).mean() > 0.999
     assert above_plane(one.plane, path) == pytest.approx(above_plane(other.plane, path), abs=1e-3)
 
 
 def test_no_path_or_no_returns_is_no_map() -> None:
     xyz, path = street(np.random.default_rng(9))
-    assert map_ground(xyz[:0], path, path[0]) is None
-    assert map_ground(xyz, path[:0], path[0]) is None
+    assert map_ground(xyz[:0], path, path[0]) is None and map_ground(xyz, path[:0], path[0]) is None

@@ -70,9 +70,7 @@ def test_both_layouts_give_equal_features_and_the_epsilon_matters(state) -> None
         one = i3d.I3DFeatures(state)(clip)
         other = i3d.I3DFeatures({renamed(name): value for name, value in state.items()})(clip)
         fine = i3d.I3DFeatures(state, epsilon=1e-5)(clip)
-    assert one.shape == (1, 400)
-    assert torch.equal(one, other)
-    assert not torch.equal(one, fine)
+    assert one.shape == (1, 400) and torch.equal(one, other) and not torch.equal(one, fine)
 
 
 def test_short_clips_and_other_sizes_are_refused(state) -> None:
@@ -142,8 +140,7 @@ def test_clips_floor_and_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     backwards = distributions.ImageSet(40, lambda n: toy_views.colors(39 - n))
     sets = distributions.TrajectorySets("front_shift+2.0", "front", 48, 32, {"a": same, "b": backwards}, None)
     values = found.of(sets)
-    assert values["a"] == {"fvd": pytest.approx(0.0, abs=1e-5), "n": 4, "n_reference": 4}
-    assert values["b"]["fvd"] > 1e-3
+    assert values["a"] == {"fvd": pytest.approx(0.0, abs=1e-5), "n": 4, "n_reference": 4} and values["b"]["fvd"] > 1e-3
     (floor,) = found.record()["floors"]
     assert (floor["n"], floor["n_reference"]) == (2, 2)
     short = distributions.TrajectorySets(
@@ -163,8 +160,7 @@ def test_the_scorer_writes_fvd_with_its_sizes_and_floor(tmp_path: Path, monkeypa
     out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=config).run()
     document = store.read_json(out / "metrics.json")
     for row in document["results"]:  # all views count, on the recorded path as well
-        assert row["values"]["fvd"] == pytest.approx(0.0, abs=1e-5)
-        assert row["video"] == {"n": 4, "n_reference": 4}
+        assert row["values"]["fvd"] == pytest.approx(0.0, abs=1e-5) and row["video"] == {"n": 4, "n_reference": 4}
         assert row["values"]["fid"] == "not computed"
     assert document["videos"]["weights_sha256"] == store.sha256_file(weights)
     assert [floor["trajectory"] for floor in document["videos"]["floors"]] == ["front_recorded", "front_shift+2.0"]

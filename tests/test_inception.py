@@ -36,8 +36,7 @@ def picture(height: int = 64, width: int = 96, seed: int = 0) -> np.ndarray:
 
 def test_the_published_file_has_these_tensors() -> None:
     shapes = inception.tensor_shapes()
-    assert len(shapes) == 472
-    assert sum(math.prod(shape) for shape in shapes.values()) == 23_885_392
+    assert len(shapes) == 472 and sum(math.prod(shape) for shape in shapes.values()) == 23_885_392
     assert sum(name.endswith("conv.weight") for name in shapes) == 94
     assert shapes["Conv2d_4a_3x3.conv.weight"] == (192, 80, 3, 3)
     assert shapes["Mixed_5b.branch5x5_2.conv.weight"] == (64, 48, 5, 5)
@@ -45,8 +44,7 @@ def test_the_published_file_has_these_tensors() -> None:
     assert shapes["Mixed_6c.branch7x7_2.conv.weight"] == (160, 160, 1, 7)
     assert shapes["Mixed_7a.branch7x7x3_4.conv.weight"] == (192, 192, 3, 3)
     assert shapes["Mixed_7c.branch3x3dbl_3b.conv.weight"] == (384, 384, 3, 1)
-    assert shapes["Mixed_7c.branch_pool.bn.running_var"] == (192,)
-    assert shapes["fc.weight"] == (1008, 2048)
+    assert shapes["Mixed_7c.branch_pool.bn.running_var"] == (192,) and shapes["fc.weight"] == (1008, 2048)
 
 
 SIZES = {
@@ -80,8 +78,7 @@ def test_taps_have_their_widths_and_do_not_depend_on_the_batch(network: inceptio
         "logits_unbiased": (2, 1008),
     }
     alone = network(images[1:])
-    assert list(alone) == ["2048"]
-    assert torch.allclose(alone["2048"], found["2048"][1:], atol=1e-5)
+    assert list(alone) == ["2048"] and torch.allclose(alone["2048"], found["2048"][1:], atol=1e-5)
     assert float((found["2048"][0] - found["2048"][1]).abs().max()) > 1e-3
     weight = network.get_buffer("fc/weight")
     assert torch.allclose(found["logits_unbiased"], found["2048"] @ weight.T, atol=1e-4)
@@ -233,8 +230,7 @@ def test_other_weights_are_refused_and_named(state) -> None:
 def test_plain_images_keep_their_value_under_every_rule(rule: inception.ResizeRule) -> None:
     for value in (0, 128, 255):
         found = inception.prepared(np.full((40, 70, 3), value, np.uint8), rule)
-        assert found.shape == (3, 299, 299)
-        assert found.dtype == torch.float32
+        assert found.shape == (3, 299, 299) and found.dtype == torch.float32
         expected = 2 * value / 255 - 1 if rule == "pytorch-fid" else (value - 128) / 128
         assert torch.allclose(found, torch.full_like(found, expected), atol=1e-4)
 

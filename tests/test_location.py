@@ -101,8 +101,7 @@ def content(folder: Path) -> dict[str, bytes]:
     ],
 )
 def test_an_address_has_one_spelling(given: str | Path, text: str) -> None:
-    assert str(Location.of(given)) == text
-    assert Location.of(Location.of(given)) == Location.of(given)
+    assert str(Location.of(given)) == text and Location.of(Location.of(given)) == Location.of(given)
 
 
 @pytest.mark.parametrize(
@@ -120,8 +119,7 @@ def test_an_address_has_one_spelling(given: str | Path, text: str) -> None:
 def test_an_address_with_a_secret_is_refused_and_not_shown(given: str | Path) -> None:
     with pytest.raises(UsageError) as caught:
         Location.of(given)
-    assert "hunter2" not in str(caught.value)
-    assert "leave" in caught.value.remedy
+    assert "hunter2" not in str(caught.value) and "leave" in caught.value.remedy
 
 
 @pytest.mark.parametrize(
@@ -155,10 +153,8 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
 
 
 def test_files_are_saved_read_listed_and_removed(root: Location) -> None:
-    assert not root.exists() and root.names() == []
-    assert (root / "b/one").save(b"1") and (root / "a").save(b"12")
-    assert (root / "b/one").save(b"123")
-    assert root.names() == ["a", "b"] and (root / "b").names() == ["one"]
+    assert not root.exists() and root.names() == [] and (root / "b/one").save(b"1") and (root / "a").save(b"12")
+    assert (root / "b/one").save(b"123") and root.names() == ["a", "b"] and (root / "b").names() == ["one"]
     assert (root / "b" / "one").load() == b"123" and root.tree() == {"a": 2, "b/one": 3}
     assert root.load_below(["a", "gone"]) == {"a": b"12"}
     assert root.exists() and (root / "b").exists() and (root / "a").exists()
@@ -172,8 +168,7 @@ def test_files_are_saved_read_listed_and_removed(root: Location) -> None:
 
 def test_only_one_makes_a_file(root: Location) -> None:
     claim = root / "claims" / "x.json"
-    assert claim.save(b"first", only_if_absent=True)
-    assert not claim.save(b"second", only_if_absent=True)
+    assert claim.save(b"first", only_if_absent=True) and not claim.save(b"second", only_if_absent=True)
     assert claim.load() == b"first" and (root / "claims").names() == ["x.json"]
     claim.remove()
     assert claim.save(b"third", only_if_absent=True)

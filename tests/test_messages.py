@@ -64,9 +64,7 @@ def test_values_in_errors_are_short_and_plain(source: str) -> None:
     assert not OBEYED.search(str(SOURCES[source](FORGED)))
     for value in ("x" * 1_000_000, "\x1b" * 1_000_000, "a b; c, " * 100_000):
         said = str(SOURCES[source](value))
-        assert len(said) < 3000
-        assert not re.search("x{201}", said)
-        assert not OBEYED.search(said)
+        assert len(said) < 3000 and not re.search("x{201}", said) and not OBEYED.search(said)
 
 
 def test_lines_of_a_remedy_and_short_values_stay_as_they_are() -> None:

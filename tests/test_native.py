@@ -49,8 +49,7 @@ def isa(request: pytest.FixtureRequest) -> Any:
 @needs_native
 def test_status_names_what_is_in_use() -> None:
     words = native.status()
-    assert native.isa() in words
-    assert f"{native.threads()} threads" in words
+    assert native.isa() in words and f"{native.threads()} threads" in words
 
 
 def _forget(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -63,9 +62,7 @@ def test_a_missing_library_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(native, "LIBRARY_PATH", tmp_path / "nothing.so")
     monkeypatch.setattr(native, "FOLDER", tmp_path)
     (tmp_path / "build_info.json").write_text('{"native": false, "reason": "no C++ compiler was found"}')
-    assert native.library() is None
-    assert "no C++ compiler was found" in native.status()
-    assert "ziglang" in native.status()
+    assert native.library() is None and "no C++ compiler was found" in native.status() and "ziglang" in native.status()
     assert native.threads() == 1
     with pytest.raises(ResourceError, match="drawing a picture needs the native library"):
         native.require("drawing a picture")
@@ -75,23 +72,20 @@ def test_a_file_that_is_no_library_is_named(monkeypatch: pytest.MonkeyPatch, tmp
     _forget(monkeypatch)
     monkeypatch.setattr(native, "LIBRARY_PATH", tmp_path / "broken.so")
     (tmp_path / "broken.so").write_bytes(b"not a library")
-    assert native.library() is None
-    assert "does not load" in native.status()
+    assert native.library() is None and "does not load" in native.status()
 
 
 @needs_native
 def test_a_library_of_another_version_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     _forget(monkeypatch)
     monkeypatch.setattr(native, "ABI_VERSION", 999)
-    assert native.library() is None
-    assert "build it again" in native.status()
+    assert native.library() is None and "build it again" in native.status()
 
 
 def test_the_environment_can_switch_it_off(monkeypatch: pytest.MonkeyPatch) -> None:
     _forget(monkeypatch)
     monkeypatch.setenv("MUDG_NATIVE", "off")
-    assert native.library() is None
-    assert "MUDG_NATIVE=off" in native.status()
+    assert native.library() is None and "MUDG_NATIVE=off" in native.status()
 
 
 @pytest.mark.parametrize("text", ["0", "-1", "many", "1.5"])
@@ -191,8 +185,7 @@ def test_photometric_equals_its_float64_twin(isa: str, shape: tuple[int, int, in
     assert got.item() == pytest.approx(want.item(), rel=1e-6, abs=1e-7)
     (3 * got).backward()
     (3 * want).backward()
-    assert mine.grad is not None
-    assert exact.grad is not None
+    assert mine.grad is not None and exact.grad is not None
     assert (mine.grad.double() - exact.grad).norm() <= 2e-6 * exact.grad.norm()
 
 
@@ -207,8 +200,7 @@ def test_weighted_photometric_equals_its_float64_twin(isa: str, shape: tuple[int
     assert got.item() == pytest.approx(want.item(), rel=1e-6, abs=1e-7)
     got.backward()
     want.backward()
-    assert mine.grad is not None
-    assert exact.grad is not None
+    assert mine.grad is not None and exact.grad is not None
     assert (mine.grad.double() - exact.grad).norm() <= 2e-6 * exact.grad.norm() + 1e-12
     whole = native_ops.photometric(prediction, target, 0.4, torch.ones(shape[1:]))
     assert whole.item() == pytest.approx(native_ops.photometric(prediction, target, 0.4).item(), rel=1e-6)
@@ -220,9 +212,7 @@ def test_photometric_of_equal_images_is_zero_and_flat() -> None:
     image = target.clone().requires_grad_()
     value = native_ops.photometric(image, target)
     value.backward()
-    assert abs(value.item()) < 1e-6
-    assert image.grad is not None
-    assert image.grad.abs().max() < 1e-6
+    assert abs(value.item()) < 1e-6 and image.grad is not None and image.grad.abs().max() < 1e-6
 
 
 @needs_native
@@ -235,8 +225,7 @@ def test_photometric_does_not_depend_on_the_number_of_threads(pool: Any) -> None
         value = native_ops.photometric(image, target)
         value.backward()
         results.append((value.item(), image.grad))
-    assert results[0][0] == results[1][0]
-    assert torch.equal(results[0][1], results[1][1])
+    assert results[0][0] == results[1][0] and torch.equal(results[0][1], results[1][1])
 
 
 def test_photometric_refuses_what_does_not_fit() -> None:
@@ -258,13 +247,10 @@ def test_box_mean_equals_its_float64_twin(isa: str, shape: tuple[int, ...], size
     values, upstream = (torch.randn(shape, generator=generator) for _ in range(2))
     mine, exact = values.clone().requires_grad_(), values.double().requires_grad_()
     got, want = native_ops.box_mean(mine, size), native_ops.torch_box_mean(exact, size)
-    assert got.shape == values.shape
-    assert (got.double() - want).abs().max() < 1e-6
+    assert got.shape == values.shape and (got.double() - want).abs().max() < 1e-6
     got.backward(upstream)
     want.backward(upstream.double())
-    assert mine.grad is not None
-    assert exact.grad is not None
-    assert (mine.grad.double() - exact.grad).abs().max() < 2e-6
+    assert mine.grad is not None and exact.grad is not None and (mine.grad.double() - exact.grad).abs().max() < 2e-6
 
 
 def test_box_mean_keeps_constants_and_wants_odd_sizes() -> None:
@@ -339,8 +325,7 @@ def test_class_loss_equals_its_float64_twin(isa: str, shape: tuple[int, int, int
     want = losses.class_loss(exact, target, weight.double(), 7.0, (channel, lift.double()) if lifted else None)
     assert got.item() == pytest.approx(want.item(), rel=2e-6, abs=1e-6)
     (found,), (true,) = _gradients(3 * got, mine), _gradients(3 * want, exact)
-    assert (found - true).norm() <= 3e-6 * true.norm() + 1e-9
-    assert found[:, target == 255].abs().sum() == 0
+    assert (found - true).norm() <= 3e-6 * true.norm() + 1e-9 and found[:, target == 255].abs().sum() == 0
 
 
 @needs_native
@@ -427,8 +412,7 @@ def test_adam_equals_its_float64_twin(isa: str, shape: tuple[int, ...], sparse: 
     for got, want in zip(mine, exact):
         torch.testing.assert_close(got.double(), want, rtol=2e-6, atol=2e-6)
     if visible is not None:
-        assert torch.equal(mine[0][~visible], parameter[~visible])
-        assert mine[1][~visible].abs().sum() == 0
+        assert torch.equal(mine[0][~visible], parameter[~visible]) and mine[1][~visible].abs().sum() == 0
 
 
 def test_sparse_adam_leaves_invisible_rows_and_their_moments_alone(isa: str) -> None:
@@ -475,8 +459,7 @@ def test_adam_on_all_columns_in_one_pass_is_adam_on_each(isa: str, share: float)
         adam(values[0], values[1], values[2], values[3], 0.1 * i, 3)
     for values, expected, old in zip(together, alone, before):
         for k in (0, 2, 3):
-            assert torch.equal(values[k][visible], expected[k])
-            assert torch.equal(values[k][~visible], old[k][~visible])
+            assert torch.equal(values[k][visible], expected[k]) and torch.equal(values[k][~visible], old[k][~visible])
 
 
 @needs_native
@@ -492,9 +475,7 @@ def test_adam_tells_autograd_that_values_have_changed() -> None:
 def test_adam_drops_moments_too_small_to_matter() -> None:
     parameter, first, second = torch.ones(40), torch.full((40,), 1e-37), torch.full((40,), 1e-37)
     adam(parameter, torch.zeros(40), first, second, 0.1, 500)
-    assert first.abs().max() == 0
-    assert second.max() == 0
-    assert torch.isfinite(parameter).all()
+    assert first.abs().max() == 0 and second.max() == 0 and torch.isfinite(parameter).all()
 
 
 def test_adam_refuses_what_does_not_fit() -> None:

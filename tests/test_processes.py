@@ -75,8 +75,7 @@ def test_calls_end_in_any_order_and_all_are_told(tmp_path: Path) -> None:
     assert sorted(run_in_processes(begin_and_fail, [(place, False) for place in places], 3)) == [
         (n, None) for n in range(5)
     ]
-    assert all((place / "begun").exists() for place in places)
-    assert list(run_in_processes(begin_and_fail, [], 2)) == []
+    assert all((place / "begun").exists() for place in places) and list(run_in_processes(begin_and_fail, [], 2)) == []
 
 
 def test_workers_of_a_parent_that_is_killed_end(tmp_path: Path) -> None:
@@ -187,10 +186,8 @@ def stopped_command(
 def test_a_command_that_is_stopped_stops_its_workers(tmp_path: Path, number: int, group: bool, code: int) -> None:
     got, said, workers = stopped_command(tmp_path, number, group=group)
     assert got == code, said
-    assert "Repeat the same command to resume" in said
-    assert "Traceback" not in said
-    assert (tmp_path / "0steps" / "checkpoint").exists()
-    assert (tmp_path / "1cleanup" / "tidy").exists()
+    assert "Repeat the same command to resume" in said and "Traceback" not in said
+    assert (tmp_path / "0steps" / "checkpoint").exists() and (tmp_path / "1cleanup" / "tidy").exists()
     assert not list(tmp_path.glob("*never/started")), "a call began after the command was stopped"
     assert not any(process_alive(worker) for worker in workers)
 
@@ -200,16 +197,14 @@ def test_a_command_that_is_stopped_after_an_error_stops_its_workers(tmp_path: Pa
     """While it waits for the calls that still run."""
     got, said, workers = stopped_command(tmp_path, signal.SIGTERM, group=False, first="fails", after_s=2.0)
     assert got == 143, said
-    assert (tmp_path / "1cleanup" / "tidy").exists()
-    assert not any(process_alive(worker) for worker in workers)
+    assert (tmp_path / "1cleanup" / "tidy").exists() and not any(process_alive(worker) for worker in workers)
 
 
 @pytest.mark.skipif(os.name == "nt", reason="signals of POSIX systems")
 def test_a_command_that_is_stopped_stops_the_calls_beside_it(tmp_path: Path) -> None:
     got, said, workers = stopped_command(tmp_path, signal.SIGTERM, group=False, calling=BESIDE)
     assert got == 143, said
-    assert (tmp_path / "0steps" / "checkpoint").exists()
-    assert (tmp_path / "1cleanup" / "tidy").exists()
+    assert (tmp_path / "0steps" / "checkpoint").exists() and (tmp_path / "1cleanup" / "tidy").exists()
     assert not list(tmp_path.glob("*never/started")), "a call began after the command was stopped"
     assert not any(process_alive(worker) for worker in workers)
 

@@ -61,9 +61,7 @@ def test_the_first_problem_is_named(value: object, what: str, where: str, detail
     with pytest.raises(InputError) as caught:
         parse_record(Cart, value, "cart.json: ")
     error = caught.value
-    assert what in error.what
-    assert error.where == where
-    assert detail in str(error)
+    assert what in error.what and error.where == where and detail in str(error)
 
 
 def test_further_problems_are_counted() -> None:
@@ -80,8 +78,7 @@ def test_long_values_are_shortened() -> None:
 
 def test_places_are_joined() -> None:
     assert place("a.json: ", "frames", 3, "image") == "a.json: frames[3].image"
-    assert place("a.json: frames[3]", "pose", 2) == "a.json: frames[3].pose[2]"
-    assert place("a.json: ") == "a.json"
+    assert place("a.json: frames[3]", "pose", 2) == "a.json: frames[3].pose[2]" and place("a.json: ") == "a.json"
 
 
 def test_an_owner_is_replaced_by_the_record_it_was_read_from() -> None:

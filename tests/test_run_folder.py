@@ -46,13 +46,11 @@ def test_run_folder_is_reused_only_when_it_verifies(tmp_path: Path) -> None:
     made.log(step=1, loss=0.5)
     made.finish({"psnr": 30.0})
     again = run(tmp_path / "r")
-    assert again.complete
-    assert store.read_json(again.path / "run.json")["summary"] == {"psnr": 30.0}
+    assert again.complete and store.read_json(again.path / "run.json")["summary"] == {"psnr": 30.0}
     (made.path / "out.txt").write_text("altered")
     with pytest.raises(IntegrityError, match="--overwrite"):
         run(tmp_path / "r")
-    assert not run(tmp_path / "r", overwrite=True).complete
-    assert (made.path / "out.txt").read_text() == "altered"
+    assert not run(tmp_path / "r", overwrite=True).complete and (made.path / "out.txt").read_text() == "altered"
 
 
 def test_run_folder_refuses_another_configuration_and_names_the_difference(tmp_path: Path) -> None:
@@ -78,8 +76,7 @@ def test_interrupted_run_continues_and_a_crash_before_the_state_is_not_complete(
     made.pause()
     assert json.loads((tmp_path / "r" / "run.json").read_text())["state"] == "interrupted"
     again = run(tmp_path / "r", overwrite=True)  # the same command continues, whatever else it says
-    assert not again.complete
-    assert (again.path / "out.txt").read_text() == "half"
+    assert not again.complete and (again.path / "out.txt").read_text() == "half"
     store.write_manifest(again.path)  # a crash between manifest and state
     assert not run(tmp_path / "r").complete
 
@@ -171,19 +168,16 @@ def test_only_files_of_the_old_result_are_removed_and_others_named_and_kept(
         "run.yaml",
         *kept[1:],
     }
-    assert (folder / "link" / "b.jpg").read_text() == "far away"
-    assert new.path == new.out == folder
+    assert (folder / "link" / "b.jpg").read_text() == "far away" and new.path == new.out == folder
     store.verify_manifest(folder)
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["elsewhere", "r"]
-    assert run(folder, 2).complete
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["elsewhere", "r"] and run(folder, 2).complete
 
 
 def test_a_file_of_somebody_else_with_the_name_of_a_new_one_gets_another(tmp_path: Path) -> None:
     folder = finished(tmp_path / "r").path
     (folder / "rows" / "2.txt").write_text("mine")
     finished(folder, 2, overwrite=True)
-    assert (folder / "rows" / "2.txt").read_text() == "row"
-    assert (folder / "rows" / "2.txt.kept1").read_text() == "mine"
+    assert (folder / "rows" / "2.txt").read_text() == "row" and (folder / "rows" / "2.txt.kept1").read_text() == "mine"
 
 
 def test_a_manifest_names_nothing_outside_its_folder(tmp_path: Path) -> None:
@@ -237,8 +231,7 @@ def test_the_old_result_stands_until_the_new_one_is_finished(tmp_path: Path) -> 
     folder = finished(tmp_path / "r").path
     before = contents(folder)
     new = run(folder, 2, overwrite=True)
-    assert new.path != folder
-    assert new.path.parent == folder.parent
+    assert new.path != folder and new.path.parent == folder.parent
     store.write_text(new.path / "out.txt", "half")
     new.log(step=1)
     assert contents(folder) == before
@@ -248,11 +241,9 @@ def test_the_old_result_stands_until_the_new_one_is_finished(tmp_path: Path) -> 
     again = run(folder, 2, overwrite=True)
     assert (again.path / "out.txt").read_text() == "half"
     other = run(folder, 3, overwrite=True)
-    assert not (other.path / "out.txt").exists()
-    assert contents(folder) == before
+    assert not (other.path / "out.txt").exists() and contents(folder) == before
     finished(folder, 3, overwrite=True)
-    assert contents(folder)["out.txt"] == "result 3"
-    assert [p.name for p in tmp_path.iterdir()] == ["r"]
+    assert contents(folder)["out.txt"] == "result 3" and [p.name for p in tmp_path.iterdir()] == ["r"]
     assert ".part" not in "".join(contents(folder).values())
 
 
@@ -260,8 +251,7 @@ def test_a_finished_result_of_the_same_settings_is_reused_with_overwrite_too(tmp
     folder = finished(tmp_path / "r").path
     assert run(folder, overwrite=True).complete
     (folder / "out.txt").write_text("altered")
-    assert finished(folder, overwrite=True).path == folder
-    assert (folder / "out.txt").read_text() == "result 1"
+    assert finished(folder, overwrite=True).path == folder and (folder / "out.txt").read_text() == "result 1"
 
 
 def test_a_replacement_goes_on_when_the_old_result_was_taken_away(tmp_path: Path) -> None:
@@ -278,8 +268,7 @@ def test_a_link_to_a_folder_stays_a_link(tmp_path: Path) -> None:
     finished(tmp_path / "real")
     (tmp_path / "r").symlink_to("real")
     finished(tmp_path / "r", 2, overwrite=True)
-    assert (tmp_path / "r").is_symlink()
-    assert (tmp_path / "real" / "out.txt").read_text() == "result 2"
+    assert (tmp_path / "r").is_symlink() and (tmp_path / "real" / "out.txt").read_text() == "result 2"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["r", "real"]
 
 
@@ -383,8 +372,7 @@ def test_the_old_result_comes_back_where_the_new_one_does_not_verify(
     folder = finished(tmp_path / "r").path
     crashed(folder, monkeypatch, ("rename", 2))
     (store.staging_path(folder) / "out.txt").write_text("damaged")
-    assert run(folder).complete
-    assert contents(folder)["out.txt"] == "result 1"
+    assert run(folder).complete and contents(folder)["out.txt"] == "result 1"
 
 
 def test_a_folder_made_by_hand_between_the_renames_is_not_mistaken(
@@ -416,8 +404,7 @@ def test_a_failed_second_rename_is_undone(tmp_path: Path, monkeypatch: pytest.Mo
     with pytest.raises(ResourceError, match="it is finished and lies in"):
         new.finish()
     monkeypatch.undo()
-    assert run(folder).complete
-    assert run(folder, 2, overwrite=True).complete
+    assert run(folder).complete and run(folder, 2, overwrite=True).complete
     assert contents(folder)["out.txt"] == "result 2"
 
 
@@ -425,8 +412,7 @@ def test_a_reader_of_a_folder_of_results_does_not_see_staging_folders(tmp_path: 
     finished(tmp_path / "root" / "a")
     before = store.digest(tmp_path / "root")
     run(tmp_path / "root" / "a", 2, overwrite=True).log(step=1)
-    assert store.digest(tmp_path / "root") == before
-    assert run_state(tmp_path / "nothing there") == {}
+    assert store.digest(tmp_path / "root") == before and run_state(tmp_path / "nothing there") == {}
     assert Replacement.at(tmp_path / "root" / "a").staging.is_dir()
 
 
@@ -470,8 +456,7 @@ def test_overlaps_are_found_through_links_and_dots(places: Path, out: str, given
     for base in (Path(), places):
         with pytest.raises(UsageError, match=relation) as refused:
             refuse_overlap(base / out, {"nothing": None, "none": "", "scene": base / given})
-        assert str(base / out) in str(refused.value)
-        assert str(base / given) in str(refused.value)
+        assert str(base / out) in str(refused.value) and str(base / given) in str(refused.value)
         assert refused.value.remedy
 
 

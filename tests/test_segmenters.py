@@ -97,11 +97,8 @@ def test_classes_come_out_by_name_whole_and_in_tiles(
     assert package == [(kind, str(folder), asked)]
     for stripe, name in enumerate(("road", "traffic light", "sky")):
         inner = np.s_[:, 32 * stripe + 6 : 32 * stripe + 26]
-        assert (ids[inner] == ID[name]).all()
-        assert (confidence[inner] > 0.9).all()
-    assert ids.dtype == np.uint8
-    assert confidence.dtype == np.float32
-    assert ((confidence >= 0) & (confidence <= 1)).all()
+        assert (ids[inner] == ID[name]).all() and (confidence[inner] > 0.9).all()
+    assert ids.dtype == np.uint8 and confidence.dtype == np.float32 and ((confidence >= 0) & (confidence <= 1)).all()
     assert confidence[:, 31].max() < confidence[:, 10].min()  # less sure at the edge of a stripe
 
 
@@ -132,8 +129,7 @@ def test_real_networks_answer_as_the_package_says(
     best, which = expected[:3].max(0)  # the fourth is no class of ours
     ours = np.array([ID[TINY_NAMES[n].lower()] for n in range(3)])[which.numpy()]
     clear = (expected[:3].sort(0).values.diff(dim=0)[-1] > 1e-4).numpy()
-    assert clear.mean() > 0.9
-    assert (ids == ours)[clear].all()
+    assert clear.mean() > 0.9 and (ids == ours)[clear].all()
     np.testing.assert_allclose(confidence, best.numpy(), atol=1e-5)
 
 
@@ -147,10 +143,8 @@ def test_real_networks_read_images_of_any_size_in_tiles(
     segmenter = Segmenter.load(tmp_path)
     for size in ((50, 77), (100, 150)):
         ids, confidence = segmenter.classes(np.random.default_rng(5).integers(0, 255, (*size, 3), np.uint8))
-        assert ids.shape == confidence.shape == size
-        assert np.isfinite(confidence).all()
-        assert set(np.unique(ids)) <= {ID[TINY_NAMES[n].lower()] for n in range(3)}
-        assert int(ids.max()) < len(CLASSES)
+        assert ids.shape == confidence.shape == size and np.isfinite(confidence).all()
+        assert set(np.unique(ids)) <= {ID[TINY_NAMES[n].lower()] for n in range(3)} and int(ids.max()) < len(CLASSES)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -168,8 +162,7 @@ def test_squares_are_scaled_to_the_network(package: list, tmp_path: Path) -> Non
     segmenter = Segmenter.load(folder_of(tmp_path, "eomt"))
     large = flag().repeat(3, 0).repeat(3, 1)
     ids, _ = segmenter.classes(large)
-    assert ids.shape == (192, 288)
-    assert set(segmenter._network.seen) == {(2, 3, SQUARE_PX, SQUARE_PX)}
+    assert ids.shape == (192, 288) and set(segmenter._network.seen) == {(2, 3, SQUARE_PX, SQUARE_PX)}
     for stripe, name in enumerate(("road", "traffic light", "sky")):
         assert (ids[:, 96 * stripe + 20 : 96 * stripe + 76] == ID[name]).all()
 
@@ -180,8 +173,7 @@ def test_tiles_cover_everything_and_overlap() -> None:
         covered = np.zeros(length, bool)
         for start in starts:
             covered[start : start + tile] = True
-        assert covered.all()
-        assert starts[-1] == max(0, length - tile)
+        assert covered.all() and starts[-1] == max(0, length - tile)
         assert all(b - a <= 0.75 * tile + 1 for a, b in zip(starts[:-1], starts[1:]))
 
 
@@ -211,8 +203,7 @@ def test_a_network_is_found_in_the_cache_by_its_name(tmp_path: Path, monkeypatch
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_CACHE", str(tmp_path / "hub"))
     for name in ("a-town/streets.b0", f"a-town/streets.b0@{revision}"):
         found = folders.find(name)
-        assert found == home / "snapshots" / revision
-        assert folders.title(found) == "a-town/streets.b0@0123456789ab"
+        assert found == home / "snapshots" / revision and folders.title(found) == "a-town/streets.b0@0123456789ab"
     assert isinstance(Segmenter.load("a-town/streets.b0"), Segmenter)
     for name in ("a-town/streets.b1", "a-town/streets.b0@other"):
         with pytest.raises(ResourceError, match="no copy of such a repository") as caught:

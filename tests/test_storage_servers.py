@@ -326,8 +326,7 @@ def test_a_batch_whose_list_logs_and_results_lie_in_a_store(
         record["reasons"][0]["reason"].endswith("the log holds no text") and b"s03" in (made.out / "status.html").load()
     )
     made.put_log("s03", "text of s03\n")
-    assert app.main(["batch", "retry", str(made.out), "--reason", "3"]) == 0
-    assert made.start("three").wait(120) == 0
+    assert app.main(["batch", "retry", str(made.out), "--reason", "3"]) == 0 and made.start("three").wait(120) == 0
     assert made.results() == {name: f"text of {name}\n" for name in made.names}
     once = {name for name, count in made.runs().items() if count == 1}
     assert set(made.names) - once <= {"s03", *begun} and sum(made.runs().values()) <= made.scenes + 2
@@ -409,8 +408,7 @@ def test_two_shards_and_a_store_that_fails_now_and_then(root: Location, server: 
         assert [one.wait(300) for one in both] == [0, 0]
         print(f"{server}: {handler.count} requests, {handler.count // 7} refused, {handler.count // 11} answers lost")
         assert handler.count > 100
-    assert made.results() == {name: f"text of {name}\n" for name in made.names}
-    assert sum(made.runs().values()) == 8
+    assert made.results() == {name: f"text of {name}\n" for name in made.names} and sum(made.runs().values()) == 8
 
 
 def test_of_six_drivers_one_works_on_a_batch(root: Location, server: str) -> None:

@@ -26,8 +26,7 @@ def test_atomic_path_leaves_the_old_file_when_the_writer_fails(tmp_path: Path) -
 
     with pytest.raises(RuntimeError):
         fail()
-    assert target.read_text() == "old"
-    assert [p.name for p in tmp_path.iterdir()] == ["a.txt"]
+    assert target.read_text() == "old" and [p.name for p in tmp_path.iterdir()] == ["a.txt"]
 
 
 def test_written_files_follow_the_umask(tmp_path: Path) -> None:
@@ -90,16 +89,14 @@ def test_checkpoints_keep_two_and_fall_back_past_a_damaged_one(tmp_path: Path) -
         checkpoint.save(tmp_path, step, {"model": {"w": torch.full((4,), float(step))}}, {"loss": 1 / step})
     assert sorted(p.name for p in tmp_path.iterdir()) == ["step_00000020", "step_00000030"]
     newest = checkpoint.latest(tmp_path)
-    assert newest is not None
-    assert newest.step == 30
+    assert newest is not None and newest.step == 30
     assert torch.equal(newest.tensors("model")["w"], torch.full((4,), 30.0))
     damaged = tmp_path / "step_00000030" / "model.safetensors"
     content = bytearray(damaged.read_bytes())
     content[-1] ^= 1
     damaged.write_bytes(bytes(content))
     older = checkpoint.latest(tmp_path)
-    assert older is not None
-    assert older.step == 20
+    assert older is not None and older.step == 20
     (tmp_path / "step_00000020" / store.MANIFEST).unlink()
     with pytest.raises(IntegrityError, match="no checkpoint verifies"):
         checkpoint.latest(tmp_path)
@@ -183,8 +180,7 @@ def test_errors_carry_all_fields_and_cross_process_boundaries() -> None:
     text = str(error)
     assert all(part in text for part in ("bad", "a.json: x", "expected: 1", "got: 2", "fix it"))
     again = pickle.loads(pickle.dumps(error))
-    assert isinstance(again, InputError)
-    assert str(again) == text
+    assert isinstance(again, InputError) and str(again) == text
     codes = [errors.UsageError, errors.InputError, errors.IntegrityError, errors.ResourceError, errors.NumericsError]
     assert [c.exit_code for c in codes] == [2, 3, 4, 5, 6]
 

@@ -62,12 +62,10 @@ def test_evidence_of_a_street_is_what_was_built() -> None:
     _, _, depth = STREET.image(given.view)
     near = found.away_deg < 0.3
     road = (truth == ID["road"]) & near & (depth < 25)
-    assert np.abs(found.height_m[road]).max() < 0.4
-    assert np.median(np.abs(found.height_m[road])) < 0.03
+    assert np.abs(found.height_m[road]).max() < 0.4 and np.median(np.abs(found.height_m[road])) < 0.03
     assert np.median(found.upwards[road]) > 0.97
     wall = (truth == ID["building"]) & near
-    assert np.median(found.upwards[wall]) < 0.1
-    assert np.median(found.height_m[wall]) > 0.5
+    assert np.median(found.upwards[wall]) < 0.1 and np.median(found.height_m[wall]) > 0.5
     assert (found.elevation_rad == ray_elevation(given.view)).all()
     measured = np.isfinite(
         visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
@@ -75,8 +73,7 @@ def test_evidence_of_a_street_is_what_was_built() -> None:
     assert ((found.away_deg == 0) == measured).all()
     car = truth == ID["car"]
     inside = (found.box == 1) & found.in_box
-    assert found.box_labels.tolist() == [ID["car"]]
-    assert (inside & car).sum() / (inside | car).sum() > 0.75
+    assert found.box_labels.tolist() == [ID["car"]] and (inside & car).sum() / (inside | car).sum() > 0.75
 
 
 def test_evidence_tells_ground_beyond_a_kerb() -> None:
@@ -84,26 +81,20 @@ def test_evidence_tells_ground_beyond_a_kerb() -> None:
     found = gather(given)
     near = (found.away_deg < 0.3) & (found.depth_m < 20)
     road, wall = (truth == ID["road"]) & near, (truth == ID["building"]) & near & (found.height_m > 1)
-    assert found.reachable[road].mean() > 0.95
-    assert not found.reachable[wall].any()
-    assert (found.raised_m[wall] == 0).all()
+    assert found.reachable[road].mean() > 0.95 and not found.reachable[wall].any() and (found.raised_m[wall] == 0).all()
 
 
 def test_without_returns_evidence_says_so_and_keeps_outlines() -> None:
     found = gather(given_at(STREET, lidar=False)[0])
-    assert np.isnan(found.depth_m).all()
-    assert (found.away_deg == 90).all()
-    assert not found.in_box.any()
+    assert np.isnan(found.depth_m).all() and (found.away_deg == 90).all() and not found.in_box.any()
     assert (found.box == 1).any()
     planes = dict(zip(PLANES, encode(found), strict=False))
-    assert not planes["measured at all"].any()
-    assert (planes["distance to a return"] == 1).all()
+    assert not planes["measured at all"].any() and (planes["distance to a return"] == 1).all()
 
 
 def test_a_nearer_surface_hides_a_box() -> None:
     given, truth = given_at(replace(STREET, car_start=(40.0, 0.0)))
-    assert not (truth == ID["car"]).any()
-    assert not (gather(given).box > 0).any()
+    assert not (truth == ID["car"]).any() and not (gather(given).box > 0).any()
 
 
 def test_the_outline_of_a_nearer_box_does_not_take_what_lies_in_a_farther_one() -> None:
@@ -128,24 +119,20 @@ def test_the_outline_of_a_nearer_box_does_not_take_what_lies_in_a_farther_one() 
     found = gather(replace(given, tracks=[car, nearer], xyz_world=xyz))
     assert found.box_labels.tolist() == [ID["car"], ID["truck"]]
     surely = gather(given).in_box & found.in_box & (found.depth_m > (given.view.cam_from_world @ pose)[2, 3] + 1)
-    assert surely.sum() > 200
-    assert (found.box[surely] == 1).all()
+    assert surely.sum() > 200 and (found.box[surely] == 1).all()
 
 
 def test_encoding_is_finite_and_of_unit_size() -> None:
     for lidar in (True, False):
         planes = encode(gather(given_at(STREET, lidar=lidar)[0]))
-        assert planes.shape[0] == PLANE_COUNT
-        assert planes.dtype == np.float32
-        assert np.abs(planes).max() < 3
+        assert planes.shape[0] == PLANE_COUNT and planes.dtype == np.float32 and np.abs(planes).max() < 3
     box = np.zeros((4, 6), np.uint8)
     box[1, :3], box[2] = 1, 2
     sure = box == 2
     labels = np.array([ID["bus"], ID["person"]])
     groups = encode(made_up(box=box, in_box=sure, box_labels=labels))[len(PLANES) :]
     bus, person = (next(n for n, g in enumerate(BOX_GROUPS) if name in g) for name in ("bus", "person"))
-    assert (groups[bus] == np.float32(0.4) * (box == 1)).all()
-    assert (groups[person] == (box == 2)).all()
+    assert (groups[bus] == np.float32(0.4) * (box == 1)).all() and (groups[person] == (box == 2)).all()
     assert groups.sum() == pytest.approx(0.4 * 3 + 6)
     assert {TRAIN_ID_OF[label] for label in TRAIN_ID_OF} <= {ID[name] for group in BOX_GROUPS for name in group}
 
@@ -165,8 +152,7 @@ def test_sky_is_neither_at_returns_nor_below_the_horizon() -> None:
     found = settled(even(), made_up(elevation_rad=elevation, away_deg=away, height_m=away * 0, direct=away > 99))
     free = np.zeros((4, 6), bool)
     free[:2, 2:] = True
-    assert (found[ID["sky"], ~free] < 1e-3).all()
-    assert found[:, free] == pytest.approx(1 / len(CLASSES))
+    assert (found[ID["sky"], ~free] < 1e-3).all() and found[:, free] == pytest.approx(1 / len(CLASSES))
     assert found.sum(0) == pytest.approx(1)
 
 
@@ -178,8 +164,7 @@ def test_roads_are_low_and_boxes_hold_their_own_classes() -> None:
     inside = box.astype(bool)
     inside[3] = False
     found = settled(even(), made_up(height_m=height, box=box, in_box=inside, box_labels=np.array([ID["rider"]])))
-    assert (found[ID["road"], 0] < 1e-3).all()
-    assert (found[ID["road"], 1] > 0.04).all()
+    assert (found[ID["road"], 0] < 1e-3).all() and (found[ID["road"], 1] > 0.04).all()
     classes = [ID[name] for name in ("rider", "motorcycle", "bicycle")]
     assert found[classes][:, 2, 3:].sum(0) == pytest.approx(1)
     assert (found[classes][:, 3, 3:].sum(0) < 0.01).all()  # in the outline, but not in the box
@@ -192,8 +177,7 @@ def test_no_people_beside_or_behind_what_fills_their_box() -> None:
     box = np.zeros((4, 6), np.uint8)
     box[2:] = 1
     found = settled(even(), made_up(box=box, box_labels=np.array([ID["person"]])))
-    assert (found[ID["person"], 2:] < 1e-3).all()
-    assert (found[ID["person"], :2] > 0.04).all()
+    assert (found[ID["person"], 2:] < 1e-3).all() and (found[ID["person"], :2] > 0.04).all()
     far = settled(
         even(), made_up(box=box, box_labels=np.array([ID["person"]]), away_deg=np.full((4, 6), 9, np.float32))
     )
@@ -205,8 +189,7 @@ def test_joined_ground_is_hardly_sidewalk() -> None:
     joined = np.zeros((4, 6), bool)
     joined[:, 3:] = True
     found = settled(even(), made_up(beside_m=beside, direct=joined))[ID["sidewalk"]]
-    assert (found[:, 3:] < 0.002).all()
-    assert (found[:, :3] > 0.05).all()
+    assert (found[:, 3:] < 0.002).all() and (found[:, :3] > 0.05).all()
 
 
 def test_outside_boxes_there_is_hardly_anything_that_boxes_are_drawn_around() -> None:
@@ -225,8 +208,7 @@ def test_a_dark_place_is_hardly_sky_unless_all_is_dark() -> None:
     evidence = gather(given)
     evenly = np.full((len(CLASSES), *truth.shape), 1 / len(CLASSES), np.float32)
     found = settled_by_color(evenly, given.rgb, evidence)[ID["sky"]]
-    assert (found[truth == ID["building"]] < 0.01).mean() > 0.9
-    assert (found[truth == ID["sky"]] > 0.05).mean() > 0.9
+    assert (found[truth == ID["building"]] < 0.01).mean() > 0.9 and (found[truth == ID["sky"]] > 0.05).mean() > 0.9
     road = (truth == ID["road"]) & evidence.direct
     grey = settled_by_color(evenly, given.rgb, evidence)
     assert (grey[ID["terrain"], road] < 0.2 * grey[ID["road"], road]).mean() > 0.9
@@ -240,11 +222,9 @@ def test_a_picture_is_looked_at_with_the_focal_length_of_training() -> None:
     small = reduced(given, camera.fx / 2)
     assert small.rgb.shape[:2] == (small.view.camera.height, small.view.camera.width)
     assert small.rgb.shape[1] == round(camera.width / 2)
-    assert small.view.camera.fx == pytest.approx(camera.fx / 2, rel=0.01)
-    assert reduced(given, camera.fx + 1) is given
+    assert small.view.camera.fx == pytest.approx(camera.fx / 2, rel=0.01) and reduced(given, camera.fx + 1) is given
     ids, confidence = at_size(np.eye(len(CLASSES), dtype=np.float32)[:, [[3, 3], [7, 7]]], 40, 20)
-    assert ids.shape == confidence.shape == (40, 20)
-    assert (ids[:10] == 3).all() and (ids[30:] == 7).all()
+    assert ids.shape == confidence.shape == (40, 20) and (ids[:10] == 3).all() and (ids[30:] == 7).all()
 
 
 # --- the network ----------------------------------------------------------------------------------
@@ -256,8 +236,7 @@ def test_every_pixel_gets_scores_at_any_size() -> None:
     for height, width in ((20, 33), (64, 32)):
         rgb = rng.integers(0, 256, (height, width, 3), np.uint8)
         found = net.probabilities(rgb, rng.normal(0, 1, (PLANE_COUNT, height, width)).astype(np.float32))
-        assert found.shape == (len(CLASSES), height, width)
-        assert found.sum(0) == pytest.approx(1, abs=1e-5)
+        assert found.shape == (len(CLASSES), height, width) and found.sum(0) == pytest.approx(1, abs=1e-5)
 
 
 def test_temperature_flattens_and_keeps_the_order() -> None:
@@ -273,38 +252,31 @@ def test_temperature_flattens_and_keeps_the_order() -> None:
     sharp = net.probabilities(rgb, planes)
     net.config = replace(TINY, temperature=2.0)
     flat = net.probabilities(rgb, planes)
-    assert (sharp.argmax(0) == flat.argmax(0)).all()
-    assert (flat.max(0) <= sharp.max(0) + 1e-6).all()
+    assert (sharp.argmax(0) == flat.argmax(0)).all() and (flat.max(0) <= sharp.max(0) + 1e-6).all()
     assert np.log(flat[0] / flat[1]) == pytest.approx(np.log(sharp[0] / sharp[1]) / 2, abs=1e-3)
 
 
 def test_the_shipped_network_knows_a_street_it_never_saw() -> None:
     given, truth = given_at(STREET)
     labels = labeller("embedded")(given)
-    assert overlap(labels.semantics, truth, "road") > 0.9
-    assert overlap(labels.semantics, truth, "car") > 0.75
-    assert overlap(labels.semantics, truth, "sky") > 0.8
-    assert labels.confidence.dtype == np.float32
-    assert ((labels.confidence > 0) & (labels.confidence <= 1)).all()
-    assert (labels.depth[labels.sky] == 100).all()
+    assert overlap(labels.semantics, truth, "road") > 0.9 and overlap(labels.semantics, truth, "car") > 0.75
+    assert overlap(labels.semantics, truth, "sky") > 0.8 and labels.confidence.dtype == np.float32
+    assert ((labels.confidence > 0) & (labels.confidence <= 1)).all() and (labels.depth[labels.sky] == 100).all()
     again = labeller("embedded")(given)
-    assert (again.semantics == labels.semantics).all()
-    assert (again.confidence == labels.confidence).all()
+    assert (again.semantics == labels.semantics).all() and (again.confidence == labels.confidence).all()
 
 
 def test_the_shipped_network_works_without_lidar_and_boxes() -> None:
     given, truth = given_at(STREET, lidar=False, boxes=False)
     labels = labeller("embedded")(given)
-    assert overlap(labels.semantics, truth, "sky") > 0.9
-    assert np.isnan(labels.depth[~labels.sky]).all()
+    assert overlap(labels.semantics, truth, "sky") > 0.9 and np.isnan(labels.depth[~labels.sky]).all()
 
 
 def test_the_shipped_files_are_small_and_explained() -> None:
     folder = street_net.EMBEDDED
     assert sum(path.stat().st_size for path in folder.iterdir()) < 8 * 2**20
     card = (folder / "MODEL_CARD.md").read_text()
-    assert "Apache-2.0" in card
-    assert "generated cities" in card
+    assert "Apache-2.0" in card and "generated cities" in card
 
 
 # --- files ----------------------------------------------------------------------------------------
@@ -398,12 +370,10 @@ def test_training_that_was_stopped_ends_as_one_that_was_not(tmp_path: Path, monk
             train_segmenter.train(options_of(tmp_path, "parts"))
     train_segmenter.train(options_of(tmp_path, "parts"))
     one, two = (checkpoint.latest(tmp_path / run) for run in ("whole", "parts"))
-    assert one is not None and two is not None
-    assert one.step == two.step == 2
+    assert one is not None and two is not None and one.step == two.step == 2
     for group in ("net", "average", "moments"):
         a, b = one.tensors(group), two.tensors(group)
-        assert all(torch.equal(a[name], b[name]) for name in a)
-        assert set(a) == set(b)
+        assert all(torch.equal(a[name], b[name]) for name in a) and set(a) == set(b)
     assert not torch.equal(one.tensors("net")["head.bias"], one.tensors("average")["head.bias"])
 
 
@@ -417,15 +387,11 @@ def test_variations_are_drawn_anew_and_keep_classes_on_their_pixels() -> None:
     rules = segmenter_vary.Rules(no_returns=0.0, no_ground=0.0, no_boxes=0.0)
     for seed in range(4):
         rgb, planes, classes = segmenter_vary.varied(sample, np.random.default_rng(seed), rules)
-        assert rgb.shape == (3, *segmenter_vary.CROP)
-        assert rgb.dtype == planes.dtype == np.float32
-        assert np.isfinite(rgb).all()
-        assert np.isfinite(planes).all()
+        assert rgb.shape == (3, *segmenter_vary.CROP) and rgb.dtype == planes.dtype == np.float32
+        assert np.isfinite(rgb).all() and np.isfinite(planes).all()
         elevation = planes[PLANES.index("elevation")]
-        assert (elevation[classes == ID["sky"]] > 0).all()
-        assert (elevation[classes == ID["road"]] < 0).all()
+        assert (elevation[classes == ID["sky"]] > 0).all() and (elevation[classes == ID["road"]] < 0).all()
         again = segmenter_vary.varied(sample, np.random.default_rng(seed), rules)
         assert all((a == b).all() for a, b in zip((rgb, planes, classes), again, strict=True))
     bare = segmenter_vary.disturbed(sample.evidence, np.random.default_rng(0), segmenter_vary.Rules(no_returns=1.0))
-    assert np.isnan(bare.depth_m).all()
-    assert not encode(bare)[PLANES.index("measured at all")].any()
+    assert np.isnan(bare.depth_m).all() and not encode(bare)[PLANES.index("measured at all")].any()

@@ -82,8 +82,7 @@ def test_a_page_escapes_cells_and_marks_lines():
 
 @pytest.mark.parametrize(("better", "best"), [("higher", ["b"]), ("lower", ["a"]), ("one", ["c"])])
 def test_the_best_of_a_column(better, best):
-    assert best_of(better, {"a": 0.4, "b": 1.3, "c": 0.9}) == best
-    assert best_of(better, {"a": 1.0}) == []
+    assert best_of(better, {"a": 0.4, "b": 1.3, "c": 0.9}) == best and best_of(better, {"a": 1.0}) == []
 
 
 def test_equal_numbers_are_all_best():

@@ -35,8 +35,7 @@ def test_processor_time_counts_work_and_not_waiting() -> None:
     time.sleep(0.3)
     wait_until(time.process_time() + 0.2)
     found = meter.stop()
-    assert found.seconds >= 0.5
-    assert 0.15 < found.processor_s < found.seconds - 0.2
+    assert found.seconds >= 0.5 and 0.15 < found.processor_s < found.seconds - 0.2
     assert meter.usage() == found  # stopped
 
 
@@ -133,8 +132,7 @@ print(alone, together, sum(size.all_bytes for size in sizes.values()))
 def test_memory_that_a_forked_process_has_not_changed_counts_once() -> None:
     said = subprocess.run([sys.executable, "-c", FORKING], check=True, capture_output=True, text=True).stdout
     alone, together, resident = map(int, said.split())
-    assert resident > alone + (200 << 20)
-    assert alone < together < alone + (20 << 20)
+    assert resident > alone + (200 << 20) and alone < together < alone + (20 << 20)
 
 
 @needs_proc
@@ -155,8 +153,7 @@ def test_shares_are_asked_for_only_where_a_new_peak_is_possible(monkeypatch: pyt
     meter.seen(1 << 50)
     monkeypatch.setattr(usage, "held_bytes", lambda *given: asked.append(1) or held_bytes(*given))
     time.sleep(3 * usage.PERIOD_S)
-    assert meter.stop().peak_bytes == 1 << 50
-    assert not asked
+    assert meter.stop().peak_bytes == 1 << 50 and not asked
 
 
 FREEING = """
@@ -194,8 +191,7 @@ def test_the_thread_ends_with_the_last_meter() -> None:
 def test_sizes_are_those_of_a_folder_or_of_one_file(tmp_path: Path) -> None:
     for name, size in (("a/b.txt", 300), ("a/c/d.txt", 40)):
         store.write_text(tmp_path / name, "x" * size)
-    assert usage.folder_bytes(tmp_path) == 340
-    assert usage.folder_bytes(tmp_path / "a" / "b.txt") == 300
+    assert usage.folder_bytes(tmp_path) == 340 and usage.folder_bytes(tmp_path / "a" / "b.txt") == 300
     assert usage.folder_bytes(tmp_path / "missing") == 0
 
 
@@ -217,10 +213,8 @@ def test_a_run_folder_notes_what_it_took_over_all_its_runs(tmp_path: Path) -> No
     wait_until(time.process_time() + 0.1)
     second.finish()
     done = store.read_json(tmp_path / "out" / "run.json")
-    assert paused["processor_s"] >= 0.09
-    assert done["processor_s"] >= paused["processor_s"] + 0.09
-    assert done["seconds"] > paused["seconds"]
-    assert done["written_bytes"] >= 5000
+    assert paused["processor_s"] >= 0.09 and done["processor_s"] >= paused["processor_s"] + 0.09
+    assert done["seconds"] > paused["seconds"] and done["written_bytes"] >= 5000
     files = sum(p.stat().st_size for p in (tmp_path / "out").iterdir() if p.name not in ("run.json", "lock"))
     assert done["written_bytes"] == files
     assert open_it().complete  # none of it decides on reuse

@@ -71,10 +71,8 @@ def test_colour_latent_is_blind_to_nothing_constant():
 def test_shares_count_labelled_pixels_only():
     ids = torch.tensor([[0, 0, 10, 255], [0, 13, 255, 255]])
     shares = semantic_shares(ids)
-    assert shares.shape == (19, 1, 2)
-    assert float(shares[0, 0, 0]) == pytest.approx(0.75)
-    assert float(shares[13, 0, 0]) == pytest.approx(0.25)
-    assert float(shares[10, 0, 1]) == 1.0
+    assert shares.shape == (19, 1, 2) and float(shares[0, 0, 0]) == pytest.approx(0.75)
+    assert float(shares[13, 0, 0]) == pytest.approx(0.25) and float(shares[10, 0, 1]) == 1.0
     assert float(semantic_shares(torch.full((2, 2), 255)).sum()) == 0.0
 
 
@@ -108,9 +106,7 @@ def test_leading_axes_are_kept():
     }
     with torch.no_grad():
         made = codec.decode(latents)
-    assert made.rgb.shape == rgb.shape
-    assert made.depth.shape == depth.shape
-    assert made.semantics.shape == ids.shape
+    assert made.rgb.shape == rgb.shape and made.depth.shape == depth.shape and made.semantics.shape == ids.shape
 
 
 def test_an_empty_depth_range_is_refused():

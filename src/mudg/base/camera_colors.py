@@ -50,9 +50,8 @@ class ColorMap:
     def of_bytes(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         """Colours u8[..., 3] mapped, rounded and clamped."""
         levels = np.arange(256) / 255.0
-        tables = [
-            np.clip(np.rint((g * levels + o) * 255), 0, 255).astype(np.uint8) for g, o in zip(self.gain, self.offset)
-        ]
+        values = [np.rint((g * levels + o) * 255) for g, o in zip(self.gain, self.offset)]
+        tables = np.clip(values, 0, 255).astype(np.uint8)
         return np.stack([table[rgb[..., channel]] for channel, table in enumerate(tables)], -1)
 
 
@@ -86,19 +85,14 @@ class CameraColors:
 
     def record(self) -> dict[str, Any]:
         """As JSON values; inverse of ``of_record``."""
-        maps = {
-            name: {"gain": list(m.gain), "offset": list(m.offset), "pairs": m.pairs}
-            for name, m in self.to_common.items()
-        }
-        return {"reference": self.reference, "to_common": maps}
+        values = lambda m: {"gain": list(m.gain), "offset": list(m.offset), "pairs": m.pairs}  # noqa: E731
+        return {"reference": self.reference, "to_common": {name: values(m) for name, m in self.to_common.items()}}
 
     @classmethod
     def of_record(cls, values: Mapping[str, Any]) -> CameraColors:
         """From JSON values. KeyError, TypeError or ValueError if they are malformed."""
-        maps = {
-            str(name): ColorMap(_triple(m["gain"]), _triple(m["offset"]), int(m["pairs"]))
-            for name, m in values["to_common"].items()
-        }
+        map_of = lambda m: ColorMap(_triple(m["gain"]), _triple(m["offset"]), int(m["pairs"]))  # noqa: E731
+        maps = {str(name): map_of(m) for name, m in values["to_common"].items()}
         if any(min(m.gain) <= 0 for m in maps.values()):
             raise ValueError("a gain is not positive")
         return cls(str(values["reference"]), maps)

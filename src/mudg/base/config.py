@@ -128,11 +128,8 @@ def result_settings(config: Any) -> dict[str, Any]:
 
 def without_devices(values: Mapping[str, Any]) -> dict[str, Any]:
     """Settings as JSON values without every ``device``, at any depth."""
-    return {
-        name: without_devices(value) if isinstance(value, Mapping) else value
-        for name, value in values.items()
-        if name != "device"
-    }
+    rest = {name: value for name, value in values.items() if name != "device"}
+    return {name: without_devices(value) if isinstance(value, Mapping) else value for name, value in rest.items()}
 
 
 def dump_yaml(config: Any) -> str:
@@ -175,9 +172,7 @@ def load(
         problem = first_problem(error, f"{yaml_path or 'configuration'}: ", UsageError)
         if _holds(overrides or {}, path):
             flag = "--" + ".".join(path).replace("_", "-")
-            problem = UsageError(
-                problem.what, where=flag, expected=problem.expected, got=problem.got, remedy=problem.remedy
-            )
+            problem = problem.located(flag)
         raise problem from error
 
 
@@ -231,14 +226,9 @@ def _read_yaml(path: Path) -> dict[str, Any]:
 
 
 def _merge(
-    base: dict[str, Any],
-    new: Mapping[str, Any],
-    where: str,
-    config_type: Any,
-    path: str = "",
-    fixed: Sequence[str] = (),
+    base: dict[str, Any], new: Mapping[str, Any], where: str, kind: Any, path: str = "", fixed: Sequence[str] = ()
 ) -> dict[str, Any]:
-    known = {name: kind for name, kind in _types_of_fields(config_type).items() if name not in fixed}
+    known = {name: type_ for name, type_ in _types_of_fields(kind).items() if name not in fixed}
     merged = dict(base)
     for name, value in new.items():
         group = known.get(name)
@@ -248,15 +238,11 @@ def _merge(
             what, expected = f"unknown configuration key {path}{name}", "one of " + ", ".join(known)
             remedy = f"did you mean {path}{near}?" if near else "remove it"
             if str(name).split(".")[0] in known and "." in str(name):
-                remedy = (
-                    "write each part before a dot as a group: "
-                    + str(name).replace(".", ": {")
-                    + ": ..."
-                    + "}" * str(name).count(".")
-                )
+                group_text = str(name).replace(".", ": {") + ": ..." + "}" * str(name).count(".")
+                remedy = f"write each part before a dot as a group: {group_text}"
             raise UsageError(what, where=where, expected=expected, remedy=remedy)
         if is_group and is_mapping and isinstance(base.get(name), Mapping):
-            merged[name] = _merge(base[name], value, where, group, f"{path}{name}.", fixed_of(config_type, name))
+            merged[name] = _merge(base[name], value, where, group, f"{path}{name}.", fixed_of(kind, name))
         else:
             merged[name] = value
     return merged

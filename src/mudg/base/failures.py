@@ -15,25 +15,18 @@ SMALLER: Final = (
     "take smaller images, fewer frames or fewer processes, close other programs, or use a machine with more memory"
 )
 _NO_MEMORY: Final = (
-    "DefaultCPUAllocator",
-    "not enough memory",
-    "Cannot allocate memory",
-    "out of memory",
-    "failed to map segment",
-    "can't allocate memory",
-    "can't start new thread",
-    "bad_alloc",
-    "error return without exception set",
-)
+    "DefaultCPUAllocator,not enough memory,Cannot allocate memory,out of memory,failed to map segment,"
+    "can't allocate memory,can't start new thread,bad_alloc,error return without exception set"
+).split(",")
 """What libraries say when memory is short; the last is an import that ran out of it."""
+_FREE: Final = "free disk space, then repeat the command to resume"
 _DISK: Final = {
-    errno.ENOSPC: ("the disk is full", "free disk space, then repeat the command to resume"),
-    errno.EDQUOT: ("the disk quota is used up", "free disk space, then repeat the command to resume"),
+    errno.ENOSPC: ("the disk is full", _FREE),
+    errno.EDQUOT: ("the disk quota is used up", _FREE),
     errno.EFBIG: ("a file is larger than it may become", "raise the limit (ulimit -f), or choose another --out"),
     errno.EIO: ("the disk could not be read or written", "check the disk, then repeat the command to resume"),
     errno.EROFS: ("the file system is read-only", "choose another --out"),
-    errno.EACCES: ("access to a file was refused", "check who may read and write it"),
-    errno.EPERM: ("access to a file was refused", "check who may read and write it"),
+    **dict.fromkeys((errno.EACCES, errno.EPERM), ("access to a file was refused", "check who may read and write it")),
     errno.EMFILE: ("too many files are open", "raise the limit (ulimit -n)"),
     errno.ENFILE: ("too many files are open on this machine", "close other programs"),
     errno.ENAMETOOLONG: ("a path is too long", "choose a shorter path"),
@@ -57,12 +50,8 @@ def in_words(error: BaseException, smaller: str = "") -> MudgError | None:
         return error
     if _is_memory(error):
         free = memory.free_bytes()
-        return ResourceError(
-            "there is not enough memory",
-            expected=_asked(error),
-            got=f"{memory.in_words(free)} free" if free else "",
-            remedy=f"{smaller}; {SMALLER}" if smaller else SMALLER,
-        )
+        got, remedy = f"{memory.in_words(free)} free" if free else "", f"{smaller}; {SMALLER}" if smaller else SMALLER
+        return ResourceError("there is not enough memory", expected=_asked(error), got=got, remedy=remedy)
     if isinstance(error, BrokenProcessPool):
         return ended_process(str(error))
     if isinstance(error, OSError):
@@ -81,9 +70,8 @@ def ended_process(got: str = "") -> ResourceError:
 def _is_memory(error: BaseException) -> bool:
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
-    return isinstance(error, RuntimeError | ImportError | SystemError) and any(
-        sign in str(error) for sign in _NO_MEMORY
-    )
+    kind = isinstance(error, RuntimeError | ImportError | SystemError)
+    return kind and any(sign in str(error) for sign in _NO_MEMORY)
 
 
 def _asked(error: BaseException) -> str:

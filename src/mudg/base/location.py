@@ -26,16 +26,12 @@ from typing import Any, Final
 
 from mudg.base import log, memory, store
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
-from mudg.base.run_folder import is_temporary
+from mudg.base.run_folder import all_names, is_temporary
 
 PACKAGES: Final[Mapping[str, tuple[str, str]]] = {
-    "s3": ("s3fs", "s3"),
-    "s3a": ("s3fs", "s3"),
-    "gs": ("gcsfs", "gs"),
-    "gcs": ("gcsfs", "gs"),
-    "abfs": ("adlfs", "abfs"),
-    "abfss": ("adlfs", "abfs"),
-    "az": ("adlfs", "abfs"),
+    **dict.fromkeys(("s3", "s3a"), ("s3fs", "s3")),
+    **dict.fromkeys(("gs", "gcs"), ("gcsfs", "gs")),
+    **dict.fromkeys(("abfs", "abfss", "az"), ("adlfs", "abfs")),
     "memory": ("fsspec", "s3"),
 }
 """Scheme of an address -> the package that reads it, and the extra of this program that installs it."""
@@ -63,9 +59,8 @@ def checked_address(text: str) -> str:
     rest = text[len(scheme) + 3 :]
     if scheme not in PACKAGES:
         known = ", ".join(f"{one}://" for one in PACKAGES)
-        raise UsageError(
-            "no storage of this kind is known", where=f"{scheme}://", expected=f"a path, or one of {known}"
-        )
+        where, expected = f"{scheme}://", f"a path, or one of {known}"
+        raise UsageError("no storage of this kind is known", where=where, expected=expected)
     head, _, tail = rest.partition("/")
     # Azure: container@account; a password may hold a slash
     if ("@" in head and PACKAGES[scheme][0] != "adlfs") or ":" in head:
@@ -76,9 +71,8 @@ def checked_address(text: str) -> str:
         raise UsageError(what, where=where, expected=f"{scheme}://bucket/folder", remedy="leave the part from ? on out")
     parts = [part for part in tail.split("/") if part]
     if ".." in parts or "." in parts or "\0" in rest or "::" in head:
-        raise UsageError(
-            "an address is not plain", where=text[:200].replace("\0", "?"), expected=f"{scheme}://bucket/folder"
-        )
+        where, expected = text[:200].replace("\0", "?"), f"{scheme}://bucket/folder"
+        raise UsageError("an address is not plain", where=where, expected=expected)
     if not head and scheme != "memory":
         raise UsageError("an address names no bucket", where=text[:200], expected=f"{scheme}://bucket/folder")
     return f"{scheme}://" + "/".join(part for part in (head, *parts) if part)
@@ -106,25 +100,17 @@ def _file_system(scheme: str, process: int) -> Any:
 
 # failures in words --------------------------------------------------------------------------------
 
+_AGAIN: Final = "then repeat the command to resume"
 _WORDS: Final[Mapping[str, tuple[str, str]]] = {
-    "connection": (
-        "a storage server cannot be reached",
-        "check the network and the server's address (S3: AWS_ENDPOINT_URL), then repeat the command to resume",
-    ),
-    "busy": ("a storage server does not answer as it should", "repeat the command later to resume"),
-    "refused": (
-        "a storage server refused access",
-        "check which account the environment names and what it may do there",
-    ),
+    "connection": ("cannot be reached", f"check the network and the server's address (S3: AWS_ENDPOINT_URL), {_AGAIN}"),
+    "busy": ("does not answer as it should", "repeat the command later to resume"),
+    "refused": ("refused access", "check which account the environment names and what it may do there"),
+    "request": ("cannot do what was asked", "check the address: the bucket's name, its region, the server's kind"),
     "credentials": (
         "no credentials for a storage server",
         "set them in the environment (S3: AWS_ACCESS_KEY_ID and AWS_SECRET_ACCESS_KEY, or AWS_PROFILE)",
     ),
     "certificate": ("a storage server's certificate is not trusted", "check the address, or set AWS_CA_BUNDLE"),
-    "request": (
-        "a storage server cannot do what was asked",
-        "check the address: the bucket's name, its region, the server's kind",
-    ),
 }
 _CREDENTIALS: Final = re.compile(r"Credential|TokenRetrieval|UnauthorizedSSO|ProfileNotFound|ClientAuthentication")
 _CONNECTION: Final = re.compile(r"Connect|Timeout|ClientPayload|ClientOSError|HTTPClientError|IncompleteRead|ServiceRe")
@@ -177,6 +163,7 @@ def _in_words(doing: str, where: str, missing: str = "") -> Iterator[None]:
         if not kind:
             raise
         what, remedy = _WORDS[kind]
+        what = what if "storage server" in what else f"a storage server {what}"
         text = without_secrets(" ".join(str(error).split()))[:300] or type(error).__name__
         raise ResourceError(what, where=where, got=f"{doing}: {text}", remedy=remedy) from error
 
@@ -205,35 +192,22 @@ class Upload:
     def content(self) -> bytes:
         """The record as it is stored."""
         files = {name: {"bytes": one.size, "sha256": one.sha256} for name, one in sorted(self.files.items())}
-        return store.json_text(
-            {"schema": 1, "state": "complete" if self.complete else "uploading", "files": files}, indent=None
-        ).encode()
+        record = {"schema": 1, "state": "complete" if self.complete else "uploading", "files": files}
+        return store.json_text(record, indent=None).encode()
 
 
 def _plain(name: str, where: str) -> str:
     """A name that stays below its folder, or IntegrityError: what lies in a store may be anybody's."""
-    parts = PurePosixPath(name).parts
-    if (
-        not parts
-        or name.startswith("/")
-        or ".." in parts
-        or "\\" in name
-        or "\0" in name
-        or (os.name == "nt" and ":" in name)
-    ):
+    parts, foreign = PurePosixPath(name).parts, ("\\", "\0", *(":" if os.name == "nt" else ""))
+    if not parts or name.startswith("/") or ".." in parts or any(one in name for one in foreign):
         raise IntegrityError("a name leads out of its folder", where=where, got=repr(name)[:200])
     return name
 
 
 def _files_below(folder: Path) -> list[str]:
     """Relative POSIX names of all regular files, sorted, without temporary ones and locks."""
-    names = []
-    for top, _, files in os.walk(folder):
-        for name in files:
-            relative = (Path(top).relative_to(folder) / name).as_posix()
-            if name not in ("lock", CONTENTS) and ".part" not in relative and (folder / relative).is_file():
-                names.append(relative)
-    return sorted(names)
+    names = (name for name in all_names(folder) if PurePosixPath(name).name not in ("lock", CONTENTS))
+    return [name for name in names if ".part" not in name and (folder / name).is_file()]
 
 
 # locations ----------------------------------------------------------------------------------------
@@ -319,9 +293,8 @@ class Location:
         missing = "nothing is at this address; check it, and whether its upload was finished"
         try:
             with _in_words("reading", self.text, missing):
-                return (
-                    store.read_bytes(self.local) if self.local is not None else bytes(self._files.cat_file(self._path))
-                )
+                found = self._files.cat_file(self._path) if self.local is None else store.read_bytes(self.local)
+                return bytes(found)
         except IsADirectoryError as error:
             raise InputError("a folder is where a file should be", where=self.text) from error
 
@@ -383,11 +356,8 @@ class Location:
         else:
             below = []
             with contextlib.suppress(FileNotFoundError), _in_words("listing", self.text):
-                below = [
-                    str(path).strip("/").rpartition("/")[2]
-                    for path in self._files.ls(self._path, detail=False)
-                    if str(path).strip("/") != self._path
-                ]
+                paths = (str(path).strip("/") for path in self._files.ls(self._path, detail=False))
+                below = [path.rpartition("/")[2] for path in paths if path != self._path]
         return sorted(name for name in below if name and not is_temporary(name))
 
     def tree(self) -> dict[str, int]:
@@ -397,10 +367,8 @@ class Location:
         with contextlib.suppress(FileNotFoundError), _in_words("listing", self.text):
             found = {str(path).strip("/"): facts for path, facts in self._files.find(self._path, detail=True).items()}
             head = f"{self._path}/"
-            sizes = {
-                path[len(head) :]: int(facts.get("size") or 0) for path, facts in found.items() if path.startswith(head)
-            }
-            return {name: size for name, size in sorted(sizes.items()) if name and name != CONTENTS}
+            below = {path[len(head) :]: facts for path, facts in sorted(found.items()) if path.startswith(head)}
+            return {name: int(one.get("size") or 0) for name, one in below.items() if name not in ("", CONTENTS)}
         return {}
 
     # folders --------------------------------------------------------------------------------------
@@ -412,10 +380,8 @@ class Location:
             return None
         try:
             values = store.parse_json(record.load(), str(record))
-            files = {
-                str(name): Expected(int(entry["bytes"]), str(entry["sha256"]))
-                for name, entry in values["files"].items()
-            }
+            entries = values["files"].items()
+            files = {str(name): Expected(int(one["bytes"]), str(one["sha256"])) for name, one in entries}
             complete = values["state"] == "complete"
         except (InputError, KeyError, TypeError, AttributeError, ValueError) as error:
             what, remedy = "the record of an upload is damaged", "upload the folder again, to another address"
@@ -434,9 +400,8 @@ class Location:
         """
         to, kind = Path(to), self._kind()
         if not kind:
-            raise InputError(
-                "nothing is at this address", where=self.text, remedy="check it, and whether its upload was finished"
-            )
+            remedy = "check it, and whether its upload was finished"
+            raise InputError("nothing is at this address", where=self.text, remedy=remedy)
         wanted = self._wanted() if kind == "directory" else {"": Expected(self._size())}
         missing = [name for name, one in wanted.items() if not _is_here(to / name if name else to, one)]
         missing.sort(key=lambda name: (PurePosixPath(name).name in (store.MANIFEST, store.RUN_STATE), name))
@@ -451,24 +416,22 @@ class Location:
                     store.take_place(part, to / name if name else to)
                     bar.advance()
         if mirror and kind == "directory":
-            for path in [
-                path for path in to.rglob("*") if not path.is_dir() and path.relative_to(to).as_posix() not in wanted
-            ]:
-                store.remove(path)
+            for path in [path for path in to.rglob("*") if not path.is_dir()]:
+                if path.relative_to(to).as_posix() not in wanted:
+                    store.remove(path)
 
     def _size(self) -> int:
+        if self.local is not None:
+            return self.local.stat().st_size
         with _in_words("looking it up", self.text):
-            return (
-                self.local.stat().st_size if self.local is not None else int(self._files.info(self._path)["size"] or 0)
-            )
+            return int(self._files.info(self._path)["size"] or 0)
 
     def _wanted(self) -> dict[str, Expected]:
         record, sizes = self.uploaded(), self.tree()
         if record is not None:
             if not record.complete or (store.MANIFEST in record.files and store.MANIFEST not in sizes):
-                raise InputError(
-                    "an upload was not finished", where=self.text, remedy="repeat the command that makes it: it resumes"
-                )
+                remedy = "repeat the command that makes it: it resumes"
+                raise InputError("an upload was not finished", where=self.text, remedy=remedy)
             absent = sorted(set(record.files) - set(sizes))
             if absent:
                 raise IntegrityError("a file is missing", where=f"{self}/{absent[0]}")
@@ -519,9 +482,8 @@ class Location:
         frm = Path(frm)
         if not frm.is_dir():
             raise InputError("no folder to upload", where=str(frm))
-        files = {
-            name: Expected((frm / name).stat().st_size, store.sha256_file(frm / name)) for name in _files_below(frm)
-        }
+        paths = {name: frm / name for name in _files_below(frm)}
+        files = {name: Expected(path.stat().st_size, store.sha256_file(path)) for name, path in paths.items()}
         sizes, earlier = self.tree(), self.uploaded()
         before = earlier.files if earlier is not None else {}
         there = {name for name, one in files.items() if before.get(name) == one and sizes.get(name) == one.size}
@@ -564,12 +526,8 @@ class Location:
         if PACKAGES[scheme_of(self.text)][0] == "s3fs":
             options = {"chunksize": max(_CHUNK, *((frm / name).stat().st_size // 9000 for name in names))}
         with _in_words("uploading", self.text, _NO_BUCKET):
-            self._files.put(
-                [str(frm / name) for name in names],
-                [f"{self._path}/{name}" for name in names],
-                batch_size=_FILES_AT_ONCE,
-                **options,
-            )
+            sources, targets = [str(frm / name) for name in names], [f"{self._path}/{name}" for name in names]
+            self._files.put(sources, targets, batch_size=_FILES_AT_ONCE, **options)
 
     def put_file(self, file: Path) -> None:
         """Upload one file to this place."""
@@ -589,12 +547,8 @@ def _part(path: Path) -> Path:
 
 
 def _is_here(path: Path, wanted: Expected) -> bool:
-    return (
-        bool(wanted.sha256)
-        and path.is_file()
-        and path.stat().st_size == wanted.size
-        and store.sha256_file(path) == wanted.sha256
-    )
+    known = bool(wanted.sha256) and path.is_file() and path.stat().st_size == wanted.size
+    return known and store.sha256_file(path) == wanted.sha256
 
 
 def _verify(part: Path, wanted: Expected, where: str) -> None:

@@ -70,11 +70,8 @@ def in_words(count: float) -> str:
 
 
 def _group_bytes() -> int | None:
-    for limit, used in (
-        ("memory.max", "memory.current"),
-        ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
-    ):
-        texts = [system_text(f"/sys/fs/cgroup/{name}").strip() for name in (limit, used)]
+    for names in ("memory.max memory.current", "memory/memory.limit_in_bytes memory/memory.usage_in_bytes"):
+        texts = [system_text(f"/sys/fs/cgroup/{name}").strip() for name in names.split()]
         if all(text.isdigit() for text in texts) and int(texts[0]) < 1 << 60:
             return max(0, int(texts[0]) - int(texts[1]))
     return None
@@ -142,21 +139,15 @@ class Usage:
 
     def record(self) -> dict[str, Any]:
         """As JSON values."""
-        return {
-            "seconds": round(self.seconds, 3),
-            "processor_s": round(self.processor_s, 3),
-            "peak_bytes": self.peak_bytes,
-        }
+        spent = {"seconds": round(self.seconds, 3), "processor_s": round(self.processor_s, 3)}
+        return {**spent, "peak_bytes": self.peak_bytes}
 
     @classmethod
     def of_record(cls, values: Mapping[str, Any]) -> Usage:
         """Of what `record` wrote; what is not noted is 0 or unknown."""
+        seconds, processor_s = (float(values.get(name, 0.0)) for name in ("seconds", "processor_s"))
         peak = values.get("peak_bytes")
-        return cls(
-            float(values.get("seconds", 0.0)),
-            float(values.get("processor_s", 0.0)),
-            None if peak is None else int(peak),
-        )
+        return cls(seconds, processor_s, None if peak is None else int(peak))
 
 
 class Meter:
@@ -293,5 +284,4 @@ def folder_bytes(folder: Path) -> int:
 
 
 def _processor_seconds() -> float:
-    now = os.times()
-    return now.user + now.system + now.children_user + now.children_system
+    return sum(os.times()[:4])  # of this process and of children that have ended

@@ -30,16 +30,7 @@ _DTYPE: Final = re.compile(r"b1|[iu][1248]|f[248]|O8?|[US]\d{1,4}")
 _MARK: Final = object()
 PERSISTENT: Final = "persistent"
 """Maker that allows a pickle to point to what lies beside it: the pointers become objects of this name."""
-_MALFORMED: Final = (
-    ValueError,
-    IndexError,
-    KeyError,
-    TypeError,
-    AttributeError,
-    OverflowError,
-    RecursionError,
-    struct.error,
-)
+_MALFORMED: Final = (*(ValueError, LookupError, TypeError, AttributeError, OverflowError, RecursionError), struct.error)
 """What a malformed pickle makes the disassembler or an opcode raise."""
 
 
@@ -125,8 +116,7 @@ def _from_buffer(content: Any, dtype: Any, shape: Any, order: Any) -> Array:
 
 
 def _scalar(dtype: Any, content: Any) -> Any:
-    value = _filled((), dtype, "C", content)
-    return value[()].item()
+    return _filled((), dtype, "C", content).item()
 
 
 Maker = Callable[..., Any]
@@ -154,9 +144,8 @@ def read_pickle(content: bytes, where: str, makers: Mapping[str, Maker | None]) 
         InputError: cut off, malformed, too large, or it names something that is not in ``makers``.
     """
     if len(content) > MAX_BYTES:
-        raise InputError(
-            "pickle is too large", where=where, expected=f"<= {MAX_BYTES} bytes", got=f"{len(content)} bytes"
-        )
+        got = f"{len(content)} bytes"
+        raise InputError("pickle is too large", where=where, expected=f"<= {MAX_BYTES} bytes", got=got)
     machine = _Machine(where, makers)
     try:
         for count, (opcode, argument, _place) in enumerate(pickletools.genops(content)):
@@ -271,10 +260,9 @@ class _Machine:
             if len(items) != size:
                 raise IndexError("stack is too short")
             stack.append(items)
-        elif opcode == "TUPLE":
-            stack.append(tuple(self._since_mark()))
-        elif opcode == "LIST":
-            stack.append(self._since_mark())
+        elif opcode in ("TUPLE", "LIST"):
+            items = self._since_mark()
+            stack.append(tuple(items) if opcode == "TUPLE" else items)
         elif opcode in ("APPEND", "APPENDS"):
             items = [stack.pop()] if opcode == "APPEND" else self._since_mark()
             target = stack[-1].items if isinstance(stack[-1], PickledObject) else stack[-1]
@@ -309,21 +297,16 @@ class _Machine:
         arguments, kind = stack.pop(), stack.pop()
         if not isinstance(arguments, tuple):
             raise TypeError("arguments are no tuple")
-        if isinstance(
-            kind, PickledObject
-        ):  # a call of an object: kept as it stands, whoever knows its class may read it
+        if isinstance(kind, PickledObject):  # a call of an object is kept: whoever knows its class may read it
             stack.append(PickledObject(kind.name, (kind, *arguments)))
         elif not isinstance(kind, Name):
             raise TypeError(f"a call of a {type(kind).__name__}")
         else:
-            maker = self._makers[kind.text]
-            if maker is None or opcode != "REDUCE":
-                stack.append(PickledObject(kind.text, arguments))
-            else:
-                stack.append(maker(*arguments))
+            maker = self._makers[kind.text] if opcode == "REDUCE" else None
+            stack.append(PickledObject(kind.text, arguments) if maker is None else maker(*arguments))
 
 
-_MEMO: Final = frozenset(("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT", "GET", "BINGET", "LONG_BINGET"))
+_MEMO: Final = frozenset("MEMOIZE PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET".split())
 _CONTAINERS: Final = frozenset(
     "EMPTY_LIST EMPTY_DICT EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3 TUPLE LIST APPEND APPENDS DICT SETITEM SETITEMS".split()
 )

@@ -27,11 +27,9 @@ MOST_DIGITS: Final = 100
 """Characters of one number."""
 
 _WORDS: Final = {
-    "": None,
-    "~": None,
-    **dict.fromkeys(("null", "Null", "NULL")),
-    **dict.fromkeys(("yes", "Yes", "YES", "true", "True", "TRUE", "on", "On", "ON"), True),
-    **dict.fromkeys(("no", "No", "NO", "false", "False", "FALSE", "off", "Off", "OFF"), False),
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys("yes Yes YES true True TRUE on On ON".split(), True),
+    **dict.fromkeys("no No NO false False FALSE off Off OFF".split(), False),
 }
 _INTEGER: Final = re.compile(r"[-+]?(0|[1-9][0-9_]*)")
 _FLOAT: Final = re.compile(
@@ -75,26 +73,17 @@ def _parse(text: str | bytes, where: str, largest: int, lines: Lines | None) -> 
         text.encode()  # refuses halves of surrogate pairs
         directive = _DIRECTIVE.search(text)
         if directive is not None:
-            raise InputError(
-                "directives of YAML are not read here",
-                where=_at(where, text.count("\n", 0, directive.start())),
-                got="%",
-                remedy="leave the line out",
-            )
+            at = _at(where, text.count("\n", 0, directive.start()))
+            raise InputError("directives of YAML are not read here", where=at, got="%", remedy="leave the line out")
         # the same events, the first ten times faster
         for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
             builder.take(event)
         return builder.root
-    except (
-        yaml.YAMLError,
-        ValueError,
-        OverflowError,
-    ) as error:  # ValueError: bytes that are no text, letters that do not exist
+    except (yaml.YAMLError, ValueError, OverflowError) as error:  # ValueError: bytes that are no text, no such letters
         mark, got = getattr(error, "problem_mark", None), str(getattr(error, "problem", None) or error)
         last = str(text).rstrip().count("\n")
-        line = (
-            mark.line if mark is not None else str(text).count("\n", 0, getattr(error, "position", 0)) or builder.line
-        )
+        line = str(text).count("\n", 0, getattr(error, "position", 0)) or builder.line
+        line = line if mark is None else mark.line
         what = "YAML is nested too deeply" if "nesting depth" in got else "not valid YAML"
         raise InputError(what, where=_at(where, min(line, last)), got=got.replace("\n", " ")) from error
 
@@ -132,9 +121,8 @@ class _Builder:
         if isinstance(event, yaml.DocumentStartEvent):
             self._documents += 1
             if self._documents > 1:
-                raise InputError(
-                    "a file holds one YAML document", where=_at(self._where, line), remedy="leave out what follows ---"
-                )
+                where, remedy = _at(self._where, line), "leave out what follows ---"
+                raise InputError("a file holds one YAML document", where=where, remedy=remedy)
         elif isinstance(event, yaml.CollectionEndEvent):
             closed = self._open.pop()
             if closed.merged:
@@ -154,9 +142,8 @@ class _Builder:
             raise InputError(what, where=at, got=f"{event.tag}", expected="a plain value", remedy=remedy)
         is_alias, is_scalar = isinstance(event, yaml.AliasEvent), isinstance(event, yaml.ScalarEvent)
         if not is_alias and event.anchor is not None and len(self._anchored) + len(self._open) > MOST_ANCHORS:
-            raise InputError(
-                "YAML has too many anchors", where=at, expected=f"at most {MOST_ANCHORS}", remedy="write the values out"
-            )
+            expected = f"at most {MOST_ANCHORS}"
+            raise InputError("YAML has too many anchors", where=at, expected=expected, remedy="write the values out")
         holder = self._open[-1] if self._open else None
         if holder is not None and isinstance(holder.value, dict) and holder.key is None:
             self._key(event, holder, line)
@@ -169,9 +156,8 @@ class _Builder:
         count = 1
         if is_alias:
             if any(one.anchor == event.anchor for one in self._open):
-                raise InputError(
-                    "a value contains itself", where=at, got=f"*{event.anchor}", remedy="write the value out"
-                )
+                got = f"*{event.anchor}"
+                raise InputError("a value contains itself", where=at, got=got, remedy="write the value out")
             if event.anchor not in self._anchored:
                 raise InputError("not valid YAML", where=at, got=f"*{event.anchor} without an anchor of this name")
             value, count = self._anchored[event.anchor]
@@ -194,13 +180,8 @@ class _Builder:
         plain = isinstance(event, yaml.ScalarEvent)
         key = _scalar(event, at) if plain else None
         if not isinstance(key, str):
-            got = (
-                event.value
-                if plain
-                else "a list or mapping"
-                if isinstance(event, yaml.CollectionStartEvent)
-                else f"*{event.anchor}"
-            )
+            collection = isinstance(event, yaml.CollectionStartEvent)
+            got = event.value if plain else "a list or mapping" if collection else f"*{event.anchor}"
             what, remedy = "a key is no text", "put quotes around it, if it is a name"
             raise InputError(what, where=at, expected="the name of a setting", got=got or "nothing", remedy=remedy)
         if key in holder.value and not (key == _MERGE and event.implicit[0]):
@@ -255,10 +236,4 @@ def _scalar(event: yaml.ScalarEvent, at: str) -> Any:
     if len(text) > MOST_DIGITS:
         what = "a number is too long"
         raise InputError(what, where=at, expected=f"at most {MOST_DIGITS} digits", got=f"{len(text)}: {text[:40]}...")
-    return number(
-        text.replace("_", "")
-        .replace(".inf", "inf")
-        .replace(".nan", "nan")
-        .replace(".Inf", "inf")
-        .replace(".INF", "inf")
-    )
+    return number(text.lower().replace("_", "").replace(".inf", "inf").replace(".nan", "nan"))

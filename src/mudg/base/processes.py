@@ -19,6 +19,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import contextlib
+import functools
 import itertools
 import multiprocessing
 import multiprocessing.process
@@ -41,9 +42,7 @@ from mudg.base.failures import ended_process
 
 Result = TypeVar("Result")
 
-_ERRORS: dict[str, type[MudgError]] = {
-    cls.__name__: cls for cls in (UsageError, InputError, IntegrityError, ResourceError, NumericsError)
-}
+_ERRORS = {cls.__name__: cls for cls in (UsageError, InputError, IntegrityError, ResourceError, NumericsError)}
 _POLL_S = 0.5
 _NOTICED_AFTER = 20
 """Polls without a result in which a worker is dead, until the pool is given up."""
@@ -78,16 +77,14 @@ def child_environment(threads: int, torch_threads: int = 1) -> Iterator[None]:
         threads: threads of the native library in each child. torch_threads: threads of torch and OpenMP in each child.
     """
     wanted = {"OMP_NUM_THREADS": str(torch_threads), "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": str(threads)}
-    before = {name: os.environ.get(name) for name in wanted}
+    before = {name: os.environ[name] for name in wanted if name in os.environ}
     os.environ.update(wanted)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                os.environ.pop(name, None)
-            else:
-                os.environ[name] = value
+        for name in wanted:
+            os.environ.pop(name, None)
+        os.environ.update(before)
 
 
 # ---- other processes -----------------------------------------------------------------------------
@@ -377,16 +374,19 @@ def _prepare_child() -> None:
 
 
 def end_with_parent() -> None:
-    """End this spawned process when its parent is gone."""
-    threading.Thread(target=_exit_with_parent, daemon=True).start()
-
-
-def _exit_with_parent() -> None:
-    """End this process when its parent is gone: a worker whose parent was killed would wait for work for ever."""
+    """End this spawned process when its parent is gone: a worker would wait for work for ever."""
     parent = multiprocessing.parent_process()
     if parent is not None:
-        wait([parent.sentinel])
-        os._exit(1)
+        _end_after(functools.partial(wait, [parent.sentinel]), "parent")
+
+
+def _end_after(event: Callable[[], object], name: str) -> None:
+    def end() -> None:
+        with contextlib.suppress(OSError):
+            event()
+            os._exit(1)
+
+    threading.Thread(target=end, name=name, daemon=True).start()
 
 
 LIFE_LINE = "MUDG_LIFE_LINE"
@@ -408,14 +408,7 @@ def hold_life_line() -> None:
     """End this process when the one that started it, and gave it a life line, is gone."""
     number = os.environ.pop(LIFE_LINE, "")
     if number.isdecimal():
-        threading.Thread(target=_exit_at_end_of, args=(int(number),), name="life line", daemon=True).start()
-
-
-def _exit_at_end_of(number: int) -> None:
-    with contextlib.suppress(OSError):
-        while os.read(number, 64):
-            pass
-        os._exit(1)
+        _end_after(lambda: os.fdopen(int(number), "rb").read(), "life line")
 
 
 def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -> Generator[Result, None, None]:

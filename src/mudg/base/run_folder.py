@@ -71,9 +71,8 @@ class Replacement:
             ResourceError: the folder is a mount point, or its parent cannot be written.
         """
         if os.path.ismount(self.folder):
-            raise ResourceError(
-                "a mount point cannot be replaced", where=str(self.folder), remedy="choose an --out inside it"
-            )
+            remedy = "choose an --out inside it"
+            raise ResourceError("a mount point cannot be replaced", where=str(self.folder), remedy=remedy)
         with store.disk_errors("the new result cannot be made beside the old one", self.folder.parent):
             self.staging.mkdir(exist_ok=True)
         return self.staging
@@ -151,9 +150,9 @@ class Replacement:
 def all_names(folder: Path) -> list[str]:
     """Relative POSIX names of all files and links below a folder, sorted; links are not followed."""
     names = []
-    for place, folders, files in os.walk(folder):
-        links = [name for name in folders if (Path(place) / name).is_symlink()]
-        names += [(Path(place) / name).relative_to(folder).as_posix() for name in (*files, *links)]
+    for top, folders, files in os.walk(folder):
+        links = [name for name in folders if (Path(top) / name).is_symlink()]
+        names += [(Path(top) / name).relative_to(folder).as_posix() for name in (*files, *links)]
     return sorted(names)
 
 
@@ -184,9 +183,6 @@ _TEMPORARY = re.compile(r"\..+\.([a-z0-9_]{8}\.part(\..*)?|\d+-\d+\.part)")
 """Names under which files and scenes are written before they get their own; a killed run leaves some."""
 _LONGEST_NAME, _LONGEST_PATH = 230, 3800
 """Bytes: what file systems take (255 and 4096), less what temporary names and files inside the folder add."""
-
-
-# inputs and outputs apart -------------------------------------------------------------------------
 
 
 def refuse_overlap(out: Path | str, inputs: Mapping[str, Path | str | None]) -> None:
@@ -261,9 +257,6 @@ def _identity(path: Path) -> object:
     return (found.st_dev, found.st_ino) if found.st_ino else os.path.normcase(path)
 
 
-# what is in a folder ------------------------------------------------------------------------------
-
-
 class _State(ForeignRecord):
     """What is read of ``run.json``."""
 
@@ -295,12 +288,13 @@ class VerbOutput:
 
 def _matches(name: str, patterns: Sequence[str]) -> bool:
     parts = name.split("/")
-    for pattern in patterns:
+
+    def fits(pattern: str) -> bool:
         wanted = pattern.rstrip("/").split("/")
-        fits = len(parts) > len(wanted) if pattern.endswith("/") else len(parts) == len(wanted)
-        if fits and all(map(fnmatchcase, parts, wanted)):
-            return True
-    return False
+        length = len(parts) > len(wanted) if pattern.endswith("/") else len(parts) == len(wanted)
+        return length and all(map(fnmatchcase, parts, wanted))
+
+    return any(map(fits, patterns))
 
 
 def is_temporary(name: str) -> bool:
@@ -314,17 +308,20 @@ def run_state(folder: Path) -> dict[str, Any]:
     Raises:
         UsageError: the folder holds something else than a run.
     """
-    refused = UsageError(
-        "the output folder holds files of something else", where=str(folder), remedy="choose an empty --out"
-    )
+    what, empty = "the output folder holds files of something else", "choose an empty --out"
+    refused = UsageError(what, where=str(folder), remedy=empty)
     if not folder.is_dir():
         if os.path.lexists(folder):
             remedy = "choose the name of a folder that does not exist yet"
-            raise UsageError("the output is no folder", where=str(folder), got=_what_is(folder), remedy=remedy)
+            got = "a file" if folder.is_file() else "a device, pipe or socket"
+            if folder.is_symlink() and not folder.exists():
+                got = f"a link that leads nowhere: {os.readlink(folder)}"
+            raise UsageError("the output is no folder", where=str(folder), got=got, remedy=remedy)
         return {}
     if not (folder / _STATE).is_file():
-        if any(not is_temporary(entry.name) and not _is_lock(entry) for entry in folder.iterdir()):
-            raise refused
+        for entry in folder.iterdir():  # but for the lock of a run that was killed before it wrote anything else
+            if not is_temporary(entry.name) and not (entry.name == _LOCK and _owner(entry) is not None):
+                raise refused
         return {}
     try:
         state = store.read_json(folder / _STATE)
@@ -347,17 +344,6 @@ def known_input(folder: Path, name: str) -> Path | None:
     except (InputError, KeyError, TypeError, IndexError):
         pass
     return None
-
-
-def _what_is(path: Path) -> str:
-    if path.is_symlink() and not path.exists():
-        return f"a link that leads nowhere: {os.readlink(path)}"
-    return "a file" if path.is_file() else "a device, pipe or socket"
-
-
-def _is_lock(path: Path) -> bool:
-    """Whether this is the lock of a run that was killed before it wrote anything else."""
-    return path.name == _LOCK and _owner(path) is not None
 
 
 def _owner(lock: Path) -> tuple[int, str] | None:
@@ -397,14 +383,12 @@ def own_names(output: VerbOutput, folder: Path) -> list[str]:
 
 
 def _is_finished(folder: Path) -> bool:
-    try:
-        if run_state(folder).get("state") != "complete":
-            return False
-        store.verify_manifest(folder)
-        store.verify_record(folder)
-    except (UsageError, InputError, IntegrityError):
-        return False
-    return True
+    with contextlib.suppress(UsageError, InputError, IntegrityError):
+        if run_state(folder).get("state") == "complete":
+            store.verify_manifest(folder)
+            store.verify_record(folder)
+            return True
+    return False
 
 
 # a verb's output folder ---------------------------------------------------------------------------
@@ -487,11 +471,8 @@ class RunDir:
                 remove_files(work, own(work))
             replacement.begin()
         run = cls(out, work, output, key, inputs)
-        run._paths = {
-            name: [os.path.relpath(path, out), str(Path(path).absolute())]
-            for name, path in (paths or {}).items()
-            if path
-        }
+        known = {name: path for name, path in (paths or {}).items() if path}
+        run._paths = {name: [os.path.relpath(path, out), str(path.absolute())] for name, path in known.items()}
         run._seen = state if work == out else run_state(work)
         if work != out and staged.get("key") == key and _is_finished(work):
             _drop_lock_of_the_dead(work / _LOCK)
@@ -510,9 +491,8 @@ class RunDir:
         take_lock(self.path / _LOCK)
         if run_state(self.path) != self._seen:
             (self.path / _LOCK).unlink(missing_ok=True)
-            raise ResourceError(
-                "another process has worked in this folder meanwhile", where=str(self.path), remedy="repeat the command"
-            )
+            what = "another process has worked in this folder meanwhile"
+            raise ResourceError(what, where=str(self.path), remedy="repeat the command")
         self._write_state("running", {})
         values = {"verb": self.verb, **json.loads(store.json_text(dict(config)))}
         store.write_text(self.path / _SETTINGS, yaml.safe_dump(values, sort_keys=False))
@@ -523,19 +503,10 @@ class RunDir:
         if state != "running":
             self._meter.stop()
         spent = self.spent_before().then(self._meter.usage()).record()
-        values = {
-            "schema": store.RUN_SCHEMA,
-            "verb": self.verb,
-            "key": self.key,
-            "inputs": self.inputs,
-            "state": state,
-            **spent,
-            "written_bytes": self._written_bytes(),
-            "files": list(self._output.files),
-            "environment": environment(),
-            "summary": dict(summary),
-            **({"paths": self._paths} if self._paths else {}),
-        }
+        values = {"schema": store.RUN_SCHEMA, "verb": self.verb, "key": self.key, "inputs": self.inputs, "state": state}
+        values |= {**spent, "written_bytes": self._written_bytes(), "files": list(self._output.files)}
+        values |= {"environment": environment(), "summary": dict(summary)}
+        values |= {"paths": self._paths} if self._paths else {}
         store.write_json(self.path / _STATE, store.sealed(values, self.path) if state == "complete" else values)
 
     def _written_bytes(self) -> int:
@@ -572,14 +543,11 @@ class RunDir:
     def finish(self, summary: Mapping[str, Any] | None = None) -> None:
         """Mark the folder complete: hash every file of the verb, write the manifest, release the lock, and take the
         place of the result that is to be replaced."""
-        # of runs that were killed
-        remove_files(self.path, [name for name in all_names(self.path) if is_temporary(name)])
+        remove_files(self.path, list(filter(is_temporary, all_names(self.path))))  # of runs that were killed
         names = [name for name in store.list_files(self.path) if name not in (_LOG, _STATE)]
         own = [name for name in names if name == _SETTINGS or _matches(name, self._output.files)]
-        if len(own) < len(names):
-            log.warn(
-                f"{self.path} holds files that {self.verb} did not make: {', '.join(sorted(set(names) - set(own))[:8])}"
-            )
+        if others := sorted(set(names) - set(own)):
+            log.warn(f"{self.path} holds files that {self.verb} did not make: {', '.join(others[:8])}")
         store.write_manifest(self.path, own)
         self._ended = True
         self._write_state("complete", summary or {})
@@ -770,14 +738,8 @@ class ResultFile:
         """
         form = form or self.out
         old = [one for one in self._forms if os.path.lexists(one)]
-        values = {
-            "schema": 1,
-            "verb": self.verb,
-            "key": self.key,
-            "file": form.name,
-            "sha256": store.digest(self.staged(form)),
-            **about,
-        }
+        values = {"schema": 1, "verb": self.verb, "key": self.key, "file": form.name}
+        values |= {"sha256": store.digest(self.staged(form)), **about}
         if self._unknown and (old != [form] or store.digest(form) != values["sha256"]):
             raise UsageError("the file exists", where=str(old[0]), remedy="choose another --out, or add --overwrite")
         with store.disk_errors("the result cannot get its name", form):
@@ -794,7 +756,7 @@ class ResultFile:
 
     def reused(self) -> Path:
         """Say that an earlier result is used again, and return where it lies."""
-        form = next(one for one in self._forms if os.path.lexists(one))
+        form = next(filter(os.path.lexists, self._forms))
         log.info(f"{self.verb}: reused {form} (verified)")
         return form
 
@@ -807,17 +769,14 @@ class ResultFile:
             found = store.read_json(description_path(self.out))
         except InputError:
             return {}
-        known = isinstance(found, dict) and all(
-            isinstance(found.get(name), str) for name in ("verb", "key", "file", "sha256")
-        )
-        return found if known else {}
+        texts = map(found.get, ("verb", "key", "file", "sha256")) if isinstance(found, dict) else (None,)
+        return found if all(isinstance(text, str) for text in texts) else {}
 
     def _examine(self, overwrite: bool) -> None:
         about, file = self.description(), description_path(self.out)
         if os.path.lexists(self.out) and not self.out.is_file():
-            raise ResourceError(
-                "cannot write here", where=str(self.out), got="not a regular file", remedy="choose another --out"
-            )
+            got, remedy = "not a regular file", "choose another --out"
+            raise ResourceError("cannot write here", where=str(self.out), got=got, remedy=remedy)
         there = [one for one in self._forms if os.path.lexists(one)]
         if about.get("key") == self.key and [one.name for one in there] == [about["file"]]:
             self.complete = store.digest(there[0]) == about["sha256"]
@@ -848,15 +807,11 @@ class ResultFile:
 
     def _tidy(self) -> None:
         """Remove what this and earlier, killed commands left: no other is at work here."""
-        ends = [
-            (one, r"[a-z0-9_]{8}\.part") for one in (*self._forms, description_path(self.out), _lock_path(self.out))
-        ]
-        names = [re.escape(f".{one.stem}.") + end + re.escape(one.suffix) for one, end in ends]
+        targets = (*self._forms, description_path(self.out), _lock_path(self.out))
+        names = [re.escape(f".{one.stem}.") + r"[a-z0-9_]{8}\.part" + re.escape(one.suffix) for one in targets]
         for one in self._forms:
-            names += [
-                re.escape(self._retired(one).name),
-                rf"\.?{re.escape(self.staged(one).name.removesuffix(one.suffix))}.*",
-            ]
+            staged = re.escape(self.staged(one).name.removesuffix(one.suffix))
+            names += [re.escape(self._retired(one).name), rf"\.?{staged}.*"]
         left = re.compile("|".join(names))
         with contextlib.suppress(OSError):  # an error may have brought us here, and that one is to be told
             for one in [one for one in self.out.parent.iterdir() if left.fullmatch(one.name)]:

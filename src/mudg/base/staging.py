@@ -88,24 +88,14 @@ class _Staging:
 
     @classmethod
     def of(cls, verb: str, args: Any, scratch: Path | None) -> _Staging:
-        found = sorted(
-            {
-                str(one)
-                for item in fields(args)
-                if item.name != "settings"
-                for one in _addresses(getattr(args, item.name))
-            }
-        )
+        flags = {item.name: getattr(args, item.name) for item in fields(args) if item.name != "settings"}
+        found = sorted({str(one) for value in flags.values() for one in _addresses(value)})
         key = hashlib.sha256("\n".join([verb, *found]).encode()).hexdigest()[:12]
         if scratch is not None and _address(scratch) is not None:
             raise UsageError("the scratch folder lies on this machine", where="--scratch", got=str(scratch))
         root = Path(tempfile.gettempdir()) if scratch is None else scratch
         plan = cls(args, root.absolute() / f"mudg-{verb.replace(' ', '-')}-{key}")
-        changes = {
-            item.name: plan._placed(item.name, getattr(args, item.name))
-            for item in fields(args)
-            if item.name != "settings"
-        }
+        changes = {name: plan._placed(name, value) for name, value in flags.items()}
         if plan.inputs or plan.outputs:
             plan.args = replace(args, **changes)
             plan._check()
@@ -153,10 +143,8 @@ class _Staging:
             yield
         except BaseException:
             store.remove(lock)
-            log.info(
-                f"{self.folder} keeps what was fetched and made: the same command goes on with it. Delete the folder to"
-                " give it up"
-            )
+            again = "the same command goes on with it. Delete the folder to give it up"
+            log.info(f"{self.folder} keeps what was fetched and made: {again}")
             raise
 
     def shown(self, value: Any) -> Any:
@@ -221,9 +209,8 @@ def _make_private(folder: Path) -> None:
             folder.mkdir(mode=0o700)
         found = folder.lstat()
         if folder.is_symlink() or not folder.is_dir() or (hasattr(os, "getuid") and found.st_uid != os.getuid()):
-            raise ResourceError(
-                "the scratch folder belongs to somebody else", where=str(folder), remedy="choose another --scratch"
-            )
+            what, remedy = "the scratch folder belongs to somebody else", "choose another --scratch"
+            raise ResourceError(what, where=str(folder), remedy=remedy)
 
 
 # there and back -----------------------------------------------------------------------------------

@@ -85,9 +85,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     make_folder(path.parent)
     with disk_errors("cannot write here", path):
         if path.exists() and not path.is_file():  # a device would be replaced by a file
-            raise ResourceError(
-                "cannot write here", where=str(path), got="not a regular file", remedy="choose another --out"
-            )
+            got, remedy = "not a regular file", "choose another --out"
+            raise ResourceError("cannot write here", where=str(path), got=got, remedy=remedy)
         fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
     os.close(fd)
     temporary = Path(name)
@@ -152,11 +151,11 @@ def sync_tree(folder: Path) -> None:
         return
     with _writing(folder):
         for path in sorted(Path(folder).rglob("*")):
-            if path.is_dir():
-                fsync_directory(path)
-            elif path.is_file():
+            if path.is_file():
                 with path.open("rb+") as handle:
                     os.fsync(handle.fileno())
+            else:
+                fsync_directory(path)
     fsync_directory(folder)
 
 
@@ -279,9 +278,8 @@ def parse_json(text: str | bytes, where: str) -> Any:
     """Parse strict JSON (no NaN, no numbers beyond floats, no duplicate keys, no halves of letters, bounded size and
     nesting); InputError names ``where``."""
     if len(text) > _MAX_JSON_BYTES:
-        raise InputError(
-            "JSON file is too large", where=where, expected=f"<= {_MAX_JSON_BYTES} bytes", got=f"{len(text)}"
-        )
+        expected = f"<= {_MAX_JSON_BYTES} bytes"
+        raise InputError("JSON file is too large", where=where, expected=expected, got=f"{len(text)}")
     try:
         if isinstance(text, bytes):
             text = text.decode(json.detect_encoding(text))
@@ -300,13 +298,8 @@ def read_json(path: Path) -> Any:
     return parse_json(read_bytes(path), str(path))
 
 
-_KINDS = (
-    (stat.S_ISDIR, "a folder"),
-    (stat.S_ISFIFO, "a named pipe"),
-    (stat.S_ISSOCK, "a socket"),
-    (stat.S_ISCHR, "a device"),
-    (stat.S_ISBLK, "a device"),
-)
+_KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a named pipe"), (stat.S_ISSOCK, "a socket"))
+_KINDS += ((stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"))
 
 
 def regular(path: Path) -> Path:
@@ -478,14 +471,12 @@ def atomic_directory(path: Path) -> Iterator[Path]:
     except BaseException:
         shutil.rmtree(partial, ignore_errors=True)
         raise
+    old = path.with_name(path.name + ".old.part")
     if path.exists():
-        old = path.with_name(path.name + ".old.part")
         shutil.rmtree(old, ignore_errors=True)
         path.rename(old)
-        partial.rename(path)
-        shutil.rmtree(old, ignore_errors=True)
-    else:
-        partial.rename(path)
+    partial.rename(path)
+    shutil.rmtree(old, ignore_errors=True)
     fsync_directory(path.parent)
 
 
@@ -537,10 +528,13 @@ def verify_manifest(folder: Path) -> str:
         if not file.is_file():
             raise IntegrityError("a file is missing", where=str(file))
         if file.stat().st_size != size or sha256_file(file) != expected:
-            raise IntegrityError(
-                "a file was altered after it was written", where=str(file), expected=f"sha256 {expected[:16]}..."
-            )
+            raise _altered(file, expected)
     return sha256_file(path)
+
+
+def _altered(file: Path, sha256: str) -> IntegrityError:
+    expected = f"sha256 {sha256[:16]}..."
+    return IntegrityError("a file was altered after it was written", where=str(file), expected=expected)
 
 
 def sealed(values: Mapping[str, Any], folder: Path) -> dict[str, Any]:
@@ -596,9 +590,7 @@ def verify_record(folder: Path) -> None:
         if expected is not None and not file.is_file():
             raise IntegrityError("a file of a finished result is missing", where=str(file))
         if expected and sha256_file(file) != expected:
-            raise IntegrityError(
-                "a file was altered after it was written", where=str(file), expected=f"sha256 {expected[:16]}..."
-            )
+            raise _altered(file, expected)
 
 
 def require(path: Path) -> None:

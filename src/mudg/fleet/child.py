@@ -79,25 +79,13 @@ def run_step(words: Sequence[str], folder: Path | None, threads: int, stop: Stop
     Raises:
         UsageError: there is no such program. ResourceError: no process can be started.
     """
-    environment = {
-        "OMP_NUM_THREADS": str(threads),
-        "OMP_WAIT_POLICY": "PASSIVE",
-        "MUDG_THREADS": str(threads),
-        _HELD: "1",
-    }
+    own = {"OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": str(threads), _HELD: "1"}
     with _turn(alone, stop), tempfile.TemporaryFile() as said, processes.life_line() as line:
         began_s = time.monotonic()
         try:
-            process = subprocess.Popen(
-                _guarded(words),
-                cwd=folder,
-                stdin=subprocess.DEVNULL,
-                stdout=said,
-                stderr=said,
-                start_new_session=True,
-                env={**os.environ, **environment, processes.LIFE_LINE: str(line)},
-                pass_fds=(line,),
-            )
+            environment = {**os.environ, **own, processes.LIFE_LINE: str(line)}
+            streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": said, "stderr": said, "pass_fds": (line,)}
+            process = subprocess.Popen(_guarded(words), cwd=folder, env=environment, start_new_session=True, **streams)
         except FileNotFoundError as error:
             raise UsageError("there is no such program", where="--command", got=words[0]) from error
         except OSError as error:

@@ -101,10 +101,8 @@ class LocalRun:
             first = next(self.job.plan.units(following))
             reads = "://" in following.source and "{source}" in " ".join(first.stage.words) and not first.stage.direct
             if reads and following.name not in self._ahead and not self.job.folder.record("done", first.key).exists():
-                version = following.settings.get(REVISION, "")
-                self._ahead[following.name] = self.job.inputs.fetch_ahead(
-                    Location.of(following.source), version, self.stop
-                )
+                source, version = Location.of(following.source), following.settings.get(REVISION, "")
+                self._ahead[following.name] = self.job.inputs.fetch_ahead(source, version, self.stop)
 
 
 # Ray ----------------------------------------------------------------------------------------------
@@ -120,17 +118,15 @@ def run_on_ray(job: Job, entries: Sequence[Entry], batch: BatchConfig, tell: Tel
     try:
         import ray
     except ImportError as error:
-        raise ResourceError(
-            "the package ray is not installed", where="--engine ray", remedy="pip install 'mudg[ray]'"
-        ) from error
+        what, remedy = "the package ray is not installed", "pip install 'mudg[ray]'"
+        raise ResourceError(what, where="--engine ray", remedy=remedy) from error
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if not ray.is_initialized():
         try:
             ray.init(address=batch.ray_address or None, log_to_driver=False, logging_level="warning")
         except (ConnectionError, ValueError, RuntimeError) as error:
-            raise ResourceError(
-                "no Ray cluster answers", where="--ray-address", got=str(error).split("\n")[0][:300]
-            ) from error
+            got = str(error).split("\n")[0][:300]
+            raise ResourceError("no Ray cluster answers", where="--ray-address", got=got) from error
     memory = {"memory": int(batch.memory_gb * _GB)} if batch.memory_gb else {}
     options: dict[str, Any] = {"num_cpus": batch.cpus, "num_gpus": batch.gpus, "max_retries": _LOST_NODES, **memory}
     task, common = ray.remote(scheduling_strategy="SPREAD", **options)(_ray_task), ray.put(job)
@@ -200,14 +196,12 @@ def submit_to_slurm(job: Job, entries: Sequence[Entry], batch: BatchConfig) -> t
     try:
         import submitit
     except ImportError as error:
-        raise ResourceError(
-            "the package submitit is not installed", where="--engine slurm", remedy="pip install 'mudg[slurm]'"
-        ) from error
+        what, remedy = "the package submitit is not installed", "pip install 'mudg[slurm]'"
+        raise ResourceError(what, where="--engine slurm", remedy=remedy) from error
     local, given = job.folder.own.local, dict(_option(text) for text in batch.slurm_options)
     if "time" not in given:
-        raise UsageError(
-            "Slurm needs to know how long a task may run", where="--slurm-options", expected="time=4:00:00 among them"
-        )
+        what, expected = "Slurm needs to know how long a task may run", "time=4:00:00 among them"
+        raise UsageError(what, where="--slurm-options", expected=expected)
     folder = local / "slurm" if local is not None else Path.cwd() / "mudg-batch-slurm"
     store.make_folder(folder)
     folder.chmod(0o700)  # tasks are pickles that nobody else may write

@@ -85,13 +85,8 @@ def run_listed(
     outcomes = [_outcome(entry, told[entry.name], out / entry.name, before[entry.name]) for entry in entries]
     counts = {state: sum(one["state"] == state for one in outcomes) for state in ("done", "reused", "failed")}
     store.write_json(status, {"schema": 1, "verb": words[0], "counts": counts, "scenes": outcomes})
-    return {
-        "scenes": outcomes,
-        **counts,
-        "status": status,
-        "text": table(words[0], outcomes),
-        "exit_code": exit_code(counts["failed"]),
-    }
+    shown = {"status": status, "text": table(words[0], outcomes), "exit_code": exit_code(counts["failed"])}
+    return {"scenes": outcomes, **counts, **shown}
 
 
 def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: Path | None) -> None:
@@ -116,20 +111,11 @@ def _outcome(entry: Entry, report: Ended, folder: Path, before: str) -> dict[str
     state, words, error = "failed", report.words, f"code {report.code}"
     if report.state == DONE:
         state = "reused" if before and before == _finished(folder) else "done"
-        summary = _state(folder).get("summary")
-        summary = summary if isinstance(summary, Mapping) else {}
-        words, error = (
-            ", ".join(f"{value} {name}" for name, value in summary.items() if isinstance(value, int | str)),
-            "",
-        )
-    return {
-        "name": entry.name,
-        "source": entry.source,
-        "state": state,
-        "seconds": round(report.seconds, 2),
-        "words": words,
-        "error": error,
-    }
+        summary, error = _state(folder).get("summary"), ""
+        facts = summary.items() if isinstance(summary, Mapping) else ()
+        words = ", ".join(f"{value} {name}" for name, value in facts if isinstance(value, int | str))
+    outcome = {"name": entry.name, "source": entry.source, "state": state, "seconds": round(report.seconds, 2)}
+    return {**outcome, "words": words, "error": error}
 
 
 def _state(folder: Path) -> Mapping[str, Any]:
@@ -161,7 +147,5 @@ def table(verb: str, outcomes: Sequence[Mapping[str, Any]]) -> str:
     out = io.StringIO()
     Console(file=out, width=int(os.environ.get("COLUMNS") or 120), markup=False, highlight=False).print(grid)
     failed = sum(outcome["state"] == "failed" for outcome in outcomes)
-    out.write(
-        f"{len(outcomes) - failed} of {len(outcomes)} scenes are there" + (f", {failed} failed" if failed else "")
-    )
-    return out.getvalue()
+    there = f"{len(outcomes) - failed} of {len(outcomes)} scenes are there"
+    return out.getvalue() + there + (f", {failed} failed" if failed else "")

@@ -227,17 +227,8 @@ _version = functools.cache(version)
 
 def _key(stage: BatchStage, entry: Entry, needs: Mapping[str, str]) -> str:
     """Content key: of the log's identity, settings, version and the keys of what is read."""
-    values = [
-        RULES_VERSION,
-        _version(),
-        stage.name,
-        list(stage.words),
-        without_devices(stage.settings),
-        entry.name,
-        entry.source,
-        dict(entry.settings),
-        dict(needs),
-    ]
+    values = [RULES_VERSION, _version(), stage.name, list(stage.words), without_devices(stage.settings)]
+    values += [entry.name, entry.source, dict(entry.settings), dict(needs)]
     return hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()[:32]
 
 
@@ -299,17 +290,8 @@ def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> 
         return words
     groups = {"ingest": "", "run": "ingest."}
     own = list(line_words(unit.entry.settings, groups[unit.stage.name])) if unit.stage.name in groups else []
-    return [
-        sys.executable,
-        "-m",
-        "mudg",
-        *words,
-        "--out",
-        out,
-        "--quiet",
-        *(["--config", config] if config else []),
-        *own,
-    ]
+    given = ["--out", out, "--quiet", *(["--config", config] if config else [])]
+    return [sys.executable, "-m", "mudg", *words, *given, *own]
 
 
 def line_words(settings: Mapping[str, str], group: str = "") -> Iterator[str]:

@@ -103,17 +103,16 @@ class Owner(_Record):
 
     def __str__(self) -> str:
         what = f"job {self.job}" if self.job else f"process {self.process}"
-        return (
-            f"{what} on {self.host.split(' ')[0]} since {time.strftime('%Y-%m-%d %H:%M UTC', time.gmtime(self.since))}"
-        )
+        since = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime(self.since))
+        return f"{what} on {self.host.split(' ')[0]} since {since}"
 
 
-class _StageRecord(_Record):
+class _Named(_Record):
     name: Name
 
 
 class _PlanRecord(_Record):
-    stages: Annotated[list[_StageRecord], Field(min_length=1)]
+    stages: Annotated[list[_Named], Field(min_length=1)]
 
 
 def _checked(kind: type[Kind], content: bytes, where: str, remedy: str) -> Kind:
@@ -192,9 +191,8 @@ class BatchFolder:
         file, record = self.own / "plan.json", json.loads(store.json_text(plan.record()))
         names = [name for name in self.out.names() if not name.startswith(".")] if self.out.local is not None else []
         if names and BOOKKEEPING not in names:  # another shard may begin at the same moment
-            raise UsageError(
-                "the output holds files of something else", where=str(self.out), remedy="choose an empty --out"
-            )
+            what, remedy = "the output holds files of something else", "choose an empty --out"
+            raise UsageError(what, where=str(self.out), remedy=remedy)
         if not file.save((store.json_text(record) + "\n").encode(), only_if_absent=True):
             before = store.parse_json(file.load(), str(file))
             if before != record:
@@ -212,10 +210,8 @@ class BatchFolder:
         file = self.own / "plan.json"
         if not file.exists():
             raise InputError("no batch is here", where=str(self.out), expected="the --out of a mudg batch run")
-        return [
-            one.name
-            for one in _checked(_PlanRecord, file.load(), str(file), "begin the batch again in another folder").stages
-        ]
+        plan = _checked(_PlanRecord, file.load(), str(file), "begin the batch again in another folder")
+        return [stage.name for stage in plan.stages]
 
     def scenes(self) -> list[str]:
         """Names of the scenes of all lists that were ever given. InputError: a list is damaged."""
@@ -224,9 +220,8 @@ class BatchFolder:
             if name.startswith("list."):
                 where = str(self.own / name)
                 try:
-                    scenes.update(
-                        row[0] for row in _LISTED.validate_python(store.parse_json((self.own / name).load(), where))
-                    )
+                    rows = _LISTED.validate_python(store.parse_json((self.own / name).load(), where))
+                    scenes.update(row[0] for row in rows)
                 except ValidationError as error:
                     raise first_problem(error, f"{where}: ") from error
         return sorted(scenes)
@@ -237,10 +232,8 @@ class BatchFolder:
         """Drivers on record, by the names of their files. InputError: a record is damaged."""
         names = [name for name in self.own.names() if _OWNER.fullmatch(name)]
         remedy = "remove it, if no driver of this batch runs"
-        return {
-            name: _checked(Owner, content, f"{self.own}/{name}", remedy)
-            for name, content in self.own.load_below(names).items()
-        }
+        contents = self.own.load_below(names).items()
+        return {name: _checked(Owner, content, f"{self.own}/{name}", remedy) for name, content in contents}
 
     @contextlib.contextmanager
     def owned(
@@ -276,9 +269,8 @@ class BatchFolder:
                 remedy = "wait for it, or stop it" if alive else "if it is gone, add --take-over"
                 raise UsageError(what, where=str(self.own / other_name), got=str(other), remedy=remedy)
             if not mine.save(content, only_if_absent=True) and mine.load() != content:
-                raise UsageError(
-                    "another driver works on this batch", where=str(mine), remedy="wait for it, or stop it"
-                )
+                what, remedy = "another driver works on this batch", "wait for it, or stop it"
+                raise UsageError(what, where=str(mine), remedy=remedy)
         try:
             yield mine
         finally:

@@ -106,19 +106,14 @@ class BatchStatus:
         for name, one in self.stages.items():
             hours = (one.processor_s + one.lost_s) / 3600
             rest = hours / one.done * self.left(name) if one.done else 0.0
-            rows[name] = {
-                "core_hours": hours,
-                "lost_hours": one.lost_s / 3600,
-                "core_hours_left": rest,
-                "money": hours * self.price,
-                "money_left": rest * self.price,
-            }
+            rows[name] = {"core_hours": hours, "lost_hours": one.lost_s / 3600, "core_hours_left": rest}
+            rows[name] |= {"money": hours * self.price, "money_left": rest * self.price}
         rows["total"] = {key: sum(row[key] for row in rows.values()) for key in next(iter(rows.values()))}
         return {name: {key: round(value, 4) for key, value in row.items()} for name, row in rows.items()}
 
     def corpus(self) -> dict[str, Any]:
         """Sums over the logs."""
-        objects: Counter[str] = Counter()
+        cameras, objects = sorted(Counter(log.cameras for log in self.logs).items()), Counter[str]()
         for log in self.logs:
             objects.update(log.objects)
         return {
@@ -126,38 +121,27 @@ class BatchStatus:
             "images": sum(log.images for log in self.logs),
             "hours": round(sum(log.seconds for log in self.logs) / 3600, 4),
             "kilometres": round(sum(log.metres for log in self.logs) / 1000, 4),
-            "cameras": {
-                str(count): scenes for count, scenes in sorted(Counter(log.cameras for log in self.logs).items())
-            },
+            "cameras": {str(count): scenes for count, scenes in cameras},
             "datasets": dict(Counter(log.dataset for log in self.logs).most_common()),
             "objects": dict(objects.most_common()),
         }
 
     def record(self) -> dict[str, Any]:
         """As JSON values."""
-        stages = {
-            name: {
-                "done": one.done,
-                "failed": one.failed,
-                "left": self.left(name),
-                "seconds": round(one.seconds, 1),
-                "processor_s": round(one.processor_s, 1),
-                "lost_s": round(one.lost_s, 1),
-                "written_bytes": one.written_bytes,
-                "peak_bytes": one.peak_bytes,
-                "slowest": one.slowest[1],
-            }
-            for name, one in self.stages.items()
-        }
+        stages = {}
+        for name, one in self.stages.items():
+            stages[name] = {"done": one.done, "failed": one.failed, "left": self.left(name)}
+            stages[name] |= {key: round(getattr(one, key), 1) for key in ("seconds", "processor_s", "lost_s")}
+            stages[name] |= {"written_bytes": one.written_bytes, "peak_bytes": one.peak_bytes}
+            stages[name] |= {"slowest": one.slowest[1]}
+        reasons = [{"reason": words, "steps": count, "example": example} for words, count, example in self.reasons()]
         return {
             "out": self.out,
             "scenes": self.scenes,
             "finished": self.finished,
             "left": self.steps_left(),
             "stages": stages,
-            "reasons": [
-                {"reason": words, "steps": count, "example": example} for words, count, example in self.reasons()
-            ],
+            "reasons": reasons,
             "steps_per_hour": round(self.rate() * 3600, 2),
             "forecast_s": self.forecast_s(),
             "costs": self.costs(),
@@ -203,40 +187,18 @@ def duration_text(seconds: float | None) -> str:
     return f"{seconds:.0f} s"
 
 
-HEADS: Final = (
-    "step",
-    "done",
-    "failed",
-    "left",
-    "seconds each",
-    "most memory",
-    "written",
-    "core-hours",
-    "lost",
-    "still needed",
-)
+HEADS: Final = tuple("step,done,failed,left,seconds each,most memory,written,core-hours,lost,still needed".split(","))
 
 
 def stage_rows(state: BatchStatus) -> list[tuple[str, ...]]:
     """One row per step, and a total of the costs where a price is known."""
-    rows, costs, money = [], state.costs(), bool(state.price)
+    rows, costs = [], state.costs()
     for name, one in state.stages.items():
-        cost = costs[name]
-        rows.append(
-            (
-                name,
-                str(one.done),
-                str(one.failed),
-                str(state.left(name)),
-                f"{one.seconds / one.done:.1f}" if one.done else "",
-                in_words(one.peak_bytes) if one.peak_bytes else "",
-                in_words(one.written_bytes) if one.written_bytes else "",
-                f"{cost['core_hours']:.3f}",
-                f"{cost['lost_hours']:.3f}",
-                f"{cost['core_hours_left']:.3f}",
-            )
-        )
-    if money:
+        each = f"{one.seconds / one.done:.1f}" if one.done else ""
+        sizes = (in_words(size) if size else "" for size in (one.peak_bytes, one.written_bytes))
+        hours = (f"{costs[name][key]:.3f}" for key in ("core_hours", "lost_hours", "core_hours_left"))
+        rows.append((name, str(one.done), str(one.failed), str(state.left(name)), each, *sizes, *hours))
+    if state.price:
         total = costs["total"]
         rows.append((f"cost at {state.price:g}", *[""] * 6, f"{total['money']:.2f}", "", f"{total['money_left']:.2f}"))
     return rows

@@ -159,11 +159,9 @@ class _Step:
                 return self._fail(ending)
             if ending.code == IntegrityError.exit_code:
                 self._remove()  # what was made is thrown away first
-                if "://" in self._unit.entry.source:
+                if "://" in (source := self._unit.entry.source):
                     self._held.close()
-                    self._job.inputs.doubt(
-                        Location.of(self._unit.entry.source), self._unit.entry.settings.get(REVISION, "")
-                    )
+                    self._job.inputs.doubt(Location.of(source), self._unit.entry.settings.get(REVISION, ""))
             log.warn(f"{self._unit.title} is tried again: {ending.words}")
             self._stop.sleep(waits[tries[ending.code]])
             tries[ending.code] += 1
@@ -177,10 +175,8 @@ class _Step:
             if adopted is None and not self._unpublished:
                 self._prepare()
                 if alone:
-                    log.warn(
-                        f"{self._unit.title} was killed, most likely for want of memory: now alone on this machine,"
-                        " with one thread"
-                    )
+                    how = "alone on this machine, with one thread"
+                    log.warn(f"{self._unit.title} was killed, most likely for want of memory: now {how}")
                 ending = self._run_command(alone)
                 if ending.code:
                     return ending, None
@@ -207,29 +203,24 @@ class _Step:
         if ending.code == UsageError.exit_code and self._is_unfinished() and "--overwrite" not in words:
             ending = run_step([*words, "--overwrite"], folder, threads, self._stop, alone=alone)
         if alone and ending.code == KILLED:
-            return replace(
-                ending,
-                words="its process was killed by signal 9, also alone on its machine with one thread: out of memory?",
-            )
+            words = "its process was killed by signal 9, also alone on its machine with one thread: out of memory?"
+            return replace(ending, words=words)
         if ending.code == 0 and not self._result.exists():
             return replace(ending, code=1, words="it ended well but wrote nothing")
         return ending
 
     def _is_unfinished(self) -> bool:
         try:
-            return not self._unit.stage.is_own and store.read_json(self._result / store.RUN_STATE)["state"] in (
-                "running",
-                "interrupted",
-            )
+            begun = ("running", "interrupted")
+            return not self._unit.stage.is_own and store.read_json(self._result / store.RUN_STATE)["state"] in begun
         except (InputError, KeyError, TypeError):
             return False
 
     def _command(self) -> list[str]:
         source, settings = self._unit.entry.source, _SETTINGS if self._unit.stage.settings else ""
         if self._direct is not None:
-            return command_of(
-                self._unit, {"source": source}, str(self._result), str(self._path / settings) if settings else ""
-            )
+            config = str(self._path / settings) if settings else ""
+            return command_of(self._unit, {"source": source}, str(self._result), config)
         if "://" in source:
             source = f"source/{Location.of(source).name}"
         places = {"source": source, **{name: f"inputs/{name}" for name in self._unit.needs}}
@@ -349,9 +340,8 @@ class _Step:
             self._result.rename(place.local)
         except OSError as error:
             if not place.local.exists():
-                raise ResourceError(
-                    "the result cannot be moved to its place", where=str(place), got=str(error)
-                ) from error
+                what = "the result cannot be moved to its place"
+                raise ResourceError(what, where=str(place), got=str(error)) from error
         store.fsync_directory(place.local.parent)
 
     def _leave(self) -> None:
@@ -385,8 +375,7 @@ class _Step:
             code=ending.code,
             words=ending.words[:2000],
             ended=round(time.time(), 3),
-            seconds=round(ending.seconds, 3),
-            processor_s=round(ending.processor_s, 3),
+            **{name: round(getattr(ending, name), 3) for name in ("seconds", "processor_s")},
             lost_s=round(self._lost_s, 3),
             **more,
         )
@@ -394,14 +383,8 @@ class _Step:
     def _record(self, result: Path, ending: Ending) -> Ended:
         if self._direct is not None:
             return self._ended(DONE, ending)
-        return self._ended(
-            DONE,
-            ending,
-            digest=digest_of(result),
-            written_bytes=folder_bytes(result),
-            peak_bytes=peak_of(result),
-            facts=facts_of(result),
-        )
+        facts: dict[str, Any] = {"digest": digest_of(result), "written_bytes": folder_bytes(result)}
+        return self._ended(DONE, ending, **facts, peak_bytes=peak_of(result), facts=facts_of(result))
 
     def _fail(self, ending: Ending) -> Ended:
         record = self._ended(FAILED, replace(ending, processor_s=0.0))

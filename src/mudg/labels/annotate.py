@@ -12,7 +12,6 @@ stopped.
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -109,19 +108,6 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
     return found
 
 
-def load(config: AnnotateConfig) -> DepthNetwork | None:
-    """The depth network of a configuration, None if it names none.
-
-    Raises:
-        ResourceError, InputError: see ``load_depth_network``.
-    """
-    if not config.depth_network:
-        return None
-    return load_depth_network(
-        config.depth_network, place(config), DepthOptions(config.depth_guided, config.depth_steps)
-    )
-
-
 def with_network(network: DepthNetwork, given: LabelInput, labels: Labels, frame_id: str, staging: Path) -> Labels:
     """Labels with the network's depth, aligned to the frame's LiDAR, or as they are if it cannot be."""
     measured = visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
@@ -131,12 +117,10 @@ def with_network(network: DepthNetwork, given: LabelInput, labels: Labels, frame
         found = align_to_lidar(network(asked), asked, RULES)
         if found.dense is not None:
             return replace(labels, depth=found.dense.depth, depth_confidence=found.dense.confidence)
-        reason = (
-            "the network's depth does not fit the LiDAR (half of the returns off by more than"
-            f" {found.fit.residual:.0%})"
-        )
-        if not np.isfinite(found.fit.residual):
-            reason = "the network's depth does not increase with the LiDAR's"
+        reason = "the network's depth does not increase with the LiDAR's"
+        if np.isfinite(found.fit.residual):
+            off = f"half of the returns off by more than {found.fit.residual:.0%}"
+            reason = f"the network's depth does not fit the LiDAR ({off})"
     log.warn(f"frame {frame_id}: {reason}; its depth is filled from LiDAR instead")
     store.write_json(_mark(staging, frame_id), {"reason": reason})
     return labels
@@ -148,10 +132,8 @@ def depth_origin(config: AnnotateConfig, networks: Mapping[str, str], made: Sequ
     if "depth_network" not in networks:
         return filled
     without = sum(_mark(staging, frame_id).is_file() for frame_id in made)
-    words = (
-        f"network '{kind_of(config.depth_network)}'{describe_folder(config.depth_network, networks['depth_network'])},"
-        f" aligned to points of {config.sweeps} sweeps, sky at a fixed distance"
-    )
+    network = f"'{kind_of(config.depth_network)}'{describe_folder(config.depth_network, networks['depth_network'])}"
+    words = f"network {network}, aligned to points of {config.sweeps} sweeps, sky at a fixed distance"
     return words + (f"; {without} of them, where it did not fit: {filled}" if without else "")
 
 
@@ -182,9 +164,8 @@ def find_ego(scene: Scene, camera: str) -> NDArray[np.bool_]:
     steps = np.diff(scene.ego.world_from_ego[:, :3, 3], axis=0)
     travel_m = float(np.linalg.norm(steps, axis=1).sum())
     if len(frames) < 4 or travel_m < MIN_TRAVEL_M:
-        log.warn(
-            f"camera {camera}: the log is too short to find the own vehicle ({len(frames)} images, {travel_m:.0f} m)"
-        )
+        length = f"{len(frames)} images, {travel_m:.0f} m"
+        log.warn(f"camera {camera}: the log is too short to find the own vehicle ({length})")
         return np.zeros(size, bool)
     at = np.unique(np.linspace(0, len(frames) - 1, FRAMES).astype(int))
     return steady_bottom(np.stack([read_image(scene, frames[index]).mean(2) for index in at]))
@@ -281,9 +262,8 @@ class NearbyReturns:
             shots = SweepShots(sweep.time_s, sweep.world_from_lidar, points, ())
             owner, owned = separate(shots, self._dynamic_tracks, self._rules)
             world = geometry.transform_points(sweep.world_from_lidar, points.xyz).astype(np.float32)
-            self._kept[sweep.id] = _Separated(
-                world[owner == STATIC], owned, largest_beam_gap(points.xyz), _highest(sweep, world)
-            )
+            gap_deg = largest_beam_gap(points.xyz)
+            self._kept[sweep.id] = _Separated(world[owner == STATIC], owned, gap_deg, _highest(sweep, world))
         return self._kept[sweep.id]
 
 
@@ -326,19 +306,10 @@ def write_page(scene: Scene, made: set[str], out: Path) -> Path:
             name = f"pictures/{frame.id.replace('/', '_')}.jpg"
             store.write_image(out / name, picture(scene, frame), quality=88)
             pictures.append({"file": name, "caption": _caption(scene, frame)})
-    text = html.render(
-        "labels.html.j2",
-        title=f"Labels of {scene.id}",
-        kicker="mudg annotate",
-        notes=scene.source.notes,
-        pictures=pictures,
-        lead=(
-            "Image; depth (near warm, far cold, darker where unsure); classes, with dynamic objects outlined in red; "
-            "confidence of the classes."
-        ),
-        class_legend=html.class_legend(),
-    )
-    store.write_text(out / NAME, text)
+    lead = "Image; depth (near warm, far cold, darker where unsure); classes, with dynamic objects outlined in red; "
+    known = {"title": f"Labels of {scene.id}", "kicker": "mudg annotate", "notes": scene.source.notes}
+    known |= {"lead": f"{lead}confidence of the classes.", "class_legend": html.class_legend(), "pictures": pictures}
+    store.write_text(out / NAME, html.render("labels.html.j2", **known))
     return out / NAME
 
 
@@ -348,9 +319,8 @@ def _caption(scene: Scene, frame: Frame) -> str:
         depth = read_label(scene, frame, "depth")
         parts.append(f"depth known {100 * np.isfinite(depth).mean():.0f} %")
     if "semantics" in frame.labels:
-        parts.append(
-            f"classes known {100 * (read_label(scene, frame, 'semantics') != palette.UNLABELLED).mean():.0f} %"
-        )
+        known = read_label(scene, frame, "semantics") != palette.UNLABELLED
+        parts.append(f"classes known {100 * known.mean():.0f} %")
     return ", ".join(parts)
 
 
@@ -400,9 +370,8 @@ def write_labelled(config: AnnotateConfig, scene: Path, work: RunDir) -> dict[st
     if not (out / "scene.json").is_file():
         staging = out / _STAGING
         _label_frames(config, scene, loaded, missing, staging)
-        source = dataclasses.replace(
-            loaded.source, notes=(*loaded.source.notes, *_notes(config, missing, work.inputs, staging))
-        )
+        notes = (*loaded.source.notes, *_notes(config, missing, work.inputs, staging))
+        source = replace(loaded.source, notes=notes)
         with SceneWriter(out, loaded.id, source) as writer:
             writer.copy_all_but_frames(loaded)
             _add_frames(config, loaded, missing, staging, writer)
@@ -414,12 +383,8 @@ def write_labelled(config: AnnotateConfig, scene: Path, work: RunDir) -> dict[st
 
 def wanted_labels(config: AnnotateConfig) -> set[str]:
     """Names of the labels that every frame shall have; a confidence comes only with a label that was made."""
-    return (
-        {"semantics", "sky"}
-        | ({"depth"} if config.depth else set())
-        | ({"dynamic"} if config.dynamic else set())
-        | ({"ego"} if config.ego else set())
-    )
+    optional = {"depth": config.depth, "dynamic": config.dynamic, "ego": config.ego}
+    return {"semantics", "sky", *(name for name, wanted in optional.items() if wanted)}
 
 
 def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str, str], staging: Path) -> Iterator[str]:
@@ -456,11 +421,8 @@ def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Seq
             for _ in label_into_staging(config, scene, todo, staging):
                 bar.advance()
             return
-        work = [
-            (config, path, list(part), staging)
-            for part in np.array_split(np.array(todo, dtype=object), 4 * processes)
-            if len(part)
-        ]
+        parts = np.array_split(np.array(todo, dtype=object), 4 * processes)
+        work = [(config, path, list(part), staging) for part in parts if len(part)]
         for _, labelled in run_in_processes(_label_in_process, work, processes):
             bar.advance(labelled)
 
@@ -483,23 +445,16 @@ def label_into_staging(config: AnnotateConfig, scene: Scene, ids: Sequence[str],
     if not ids:
         return
     label = labeller(config.labeller, config.weights, place(config) if config.labeller != "geometry" else CPU)
-    network = load(config)
+    options = DepthOptions(config.depth_guided, config.depth_steps)
+    network = load_depth_network(config.depth_network, place(config), options) if config.depth_network else None
     returns = NearbyReturns(scene, config.sweeps)
     path = driven_path(scene.ego.world_from_ego)
     frames = {frame.id: frame for frame in scene.frames}
     for frame_id in ids:
         frame = frames[frame_id]
         near = returns.of(frame)
-        given = LabelInput(
-            frame.view,
-            read_image(scene, frame),
-            near.xyz_world,
-            scene.tracks,
-            path,
-            near.beam_gap_deg,
-            near.highest_rad,
-            returns.moving,
-        )
+        seen = (near.xyz_world, scene.tracks, path, near.beam_gap_deg, near.highest_rad, returns.moving)
+        given = LabelInput(frame.view, read_image(scene, frame), *seen)
         with one_torch_thread():
             labels = label(given)
             if network is not None and "depth" not in frame.labels:
@@ -515,11 +470,7 @@ def staged_labels(staging: Path, frame_id: str) -> Path:
 
 def label_arrays(config: AnnotateConfig, labels: Labels) -> dict[str, NDArray[Any]]:
     """Labels under the names that a scene has for them; what was not asked for is left out."""
-    arrays: dict[str, NDArray[Any]] = {
-        "semantics": labels.semantics,
-        "sky": labels.sky,
-        "semantics_confidence": labels.confidence,
-    }
+    arrays = {"semantics": labels.semantics, "sky": labels.sky, "semantics_confidence": labels.confidence}
     if config.depth:
         arrays |= {"depth": labels.depth, "depth_confidence": labels.depth_confidence}
     if config.dynamic:

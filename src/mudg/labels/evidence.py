@@ -23,32 +23,25 @@ from mudg.base.palette import ID
 from mudg.core.depth import beyond_reach, complete_depth, ray_elevation
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
-from mudg.labels.ground import GroundMap, above_plane, beside_path, map_ground
+from mudg.labels.ground import above_plane, beside_path, map_ground
 from mudg.labels.inputs import LabelInput, far_to_near, surface_points
 
-BOX_GROUPS: Final[tuple[tuple[str, ...], ...]] = (
-    ("car",),
-    ("truck",),
-    ("bus", "train"),
-    ("person",),
-    ("rider", "motorcycle", "bicycle"),
-)
+BOX_GROUPS: Final = (("car",), ("truck",), ("bus", "train"), ("person",), ("rider", "motorcycle", "bicycle"))
 """Classes of boxes that share a plane."""
 GROUP_OF: Final[Mapping[int, int]] = {ID[name]: n for n, names in enumerate(BOX_GROUPS) for name in names}
 """Number of the group of each class that boxes have."""
 PLANES: Final = (
-    "height, fine",
-    "height",
-    "log depth",
-    "distance to a return",
-    "upwards",
-    "beside the path",
-    "elevation",
-    "silent",
-    "roughness",
-    "measured at all",
-    "reachable from the path",
-    "raised",
+    *(
+        "height, fine",
+        "height",
+        "log depth",
+        "distance to a return",
+        "upwards",
+        "beside the path",
+        "elevation",
+        "silent",
+    ),
+    *("roughness", "measured at all", "reachable from the path", "raised"),
 )
 """Planes that ``encode`` makes, before one for each of ``BOX_GROUPS``."""
 PLANE_COUNT: Final = len(PLANES) + len(BOX_GROUPS)
@@ -102,49 +95,22 @@ def gather(given: LabelInput) -> Evidence:
     known = np.isfinite(measured)
     shape = measured.shape
     elevation = ray_elevation(view)
-    zero = np.zeros(shape, np.float32)
+    zero, none = np.zeros(shape, np.float32), np.zeros(shape, bool)
     if not known.any():
-        box, in_box, labels = _boxes(given, None, np.full(shape, np.nan, np.float32), known)
-        return Evidence(
-            zero,
-            np.full(shape, np.nan, np.float32),
-            np.full(shape, 90, np.float32),
-            zero,
-            zero,
-            zero > 1,
-            zero > 1,
-            zero,
-            elevation,
-            zero > 1,
-            zero,
-            box,
-            in_box,
-            labels,
-        )
+        unknown, boxes = np.full(shape, np.nan, np.float32), _boxes(given, None, measured, known)
+        return Evidence(zero, unknown, zero + 90, zero, zero, none, none, zero, elevation, none, zero, *boxes)
     away_px = np.asarray(ndimage.distance_transform_edt(~known), np.float32)
     beyond = beyond_reach(view, measured, given.highest_rad, gap_deg=gap_deg)
     depth = complete_depth(given.rgb, measured, None, beyond).depth
     xyz = surface_points(view, depth)
-    box, in_box, labels = _boxes(given, xyz, depth, known)
     ground = map_ground(given.xyz_world, given.path_world, view.center_world)
-    reachable, direct, raised = (zero > 1, zero > 1, zero) if ground is None else ground.under(xyz)
+    height = zero if ground is None else np.clip(above_plane(ground.plane, xyz), -60, 60).astype(np.float32)
+    under = (none, none, zero) if ground is None else ground.under(xyz)
     beside = beside_path(xyz, given.path_world, 2) if len(given.path_world) else np.full(shape, NO_PATH_M, np.float32)
-    return Evidence(
-        _height(ground, xyz),
-        depth,
-        np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32),
-        _upwards(xyz),
-        beside,
-        reachable,
-        direct,
-        raised,
-        elevation,
-        beyond,
-        _roughness(measured, gap_deg, view.camera.fy),
-        box,
-        in_box,
-        labels,
-    )
+    away_deg = np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32)
+    rough = _roughness(measured, gap_deg, view.camera.fy)
+    seen = (height, depth, away_deg, _upwards(xyz), beside, *under, elevation, beyond, rough)
+    return Evidence(*seen, *_boxes(given, xyz, depth, known))
 
 
 def encode(evidence: Evidence) -> NDArray[np.float32]:
@@ -174,13 +140,6 @@ def encode(evidence: Evidence) -> NDArray[np.float32]:
 
 
 # --- the facts ------------------------------------------------------------------------------------
-
-
-def _height(ground: GroundMap | None, xyz: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Height above the ground plane, metres; 0 without one."""
-    if ground is None:
-        return np.zeros(xyz.shape[:2], np.float32)
-    return np.clip(above_plane(ground.plane, xyz), -60, 60).astype(np.float32)
 
 
 def _upwards(xyz: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -172,9 +172,8 @@ def map_ground(
     passable = (known & (step < KERB_M)) | ((away_m > 2 * CELL_M) & (behind < _BLIND_M) & (step < KERB_M))
     way_m = _way(passable, beside)
     # a step takes a cell from the road, too: neighbours of cells that are reached count as reached
-    reachable, direct = (
-        cells | (_dilated(cells) & known) for cells in (np.isfinite(way_m), way_m <= _DETOUR[0] * beside + _DETOUR[1])
-    )
+    ways = np.isfinite(way_m), way_m <= _DETOUR[0] * beside + _DETOUR[1]
+    reachable, direct = (cells | (_dilated(cells) & known) for cells in ways)
     floor = ndimage.minimum_filter(ndimage.uniform_filter(height, 3), 2 * round(_FLOOR_WINDOW_M / CELL_M) + 1)
     raised = np.where(known, np.maximum(height - floor, 0), 0).astype(np.float32)
     return GroundMap(corner, plane, reachable, direct, raised)

@@ -15,22 +15,11 @@ from mudg.base.types import Track, View
 from mudg.core.fusion import points_in_box
 
 TRAIN_ID_OF: Final[Mapping[str, int]] = {
-    "car": ID["car"],
-    "van": ID["car"],
-    "vehicle": ID["car"],
-    "misc": ID["car"],
-    "truck": ID["truck"],
-    "bus": ID["bus"],
+    **{name: ID[name] for name in ("car", "truck", "bus", "train", "person", "rider", "motorcycle", "bicycle")},
+    **dict.fromkeys(("van", "vehicle", "misc"), ID["car"]),
+    **dict.fromkeys(("pedestrian", "person_sitting"), ID["person"]),
+    **dict.fromkeys(("cyclist", "motorcyclist"), ID["rider"]),
     "tram": ID["train"],
-    "train": ID["train"],
-    "person": ID["person"],
-    "pedestrian": ID["person"],
-    "person_sitting": ID["person"],
-    "cyclist": ID["rider"],
-    "rider": ID["rider"],
-    "motorcycle": ID["motorcycle"],
-    "motorcyclist": ID["rider"],
-    "bicycle": ID["bicycle"],
 }
 """Class of a tracked box by its label; labels not listed here are not painted."""
 GAP_DEG: Final = 0.6

@@ -92,15 +92,11 @@ class Segmenter:
         """
         path = folders.find(folder)
         if not folder or not (path / "config.json").is_file():
-            raise ResourceError(
-                "the labeller's weights are missing",
-                where=str(folder) or "weights",
-                expected="a folder with config.json and model.safetensors",
-                remedy=(
-                    "give the folder of a segmentation network with Cityscapes classes as --weights, or its name in the"
-                    " Hugging Face cache, or use --labeller geometry"
-                ),
-            )
+            expected = "a folder with config.json and model.safetensors"
+            given = "give the folder of a segmentation network with Cityscapes classes as --weights"
+            remedy = f"{given}, or its name in the Hugging Face cache, or use --labeller geometry"
+            what, where = "the labeller's weights are missing", str(folder) or "weights"
+            raise ResourceError(what, where=where, expected=expected, remedy=remedy)
         settings = folders.read_settings(path / "config.json")
         kind = str(settings.get("model_type"))
         if kind not in KINDS:

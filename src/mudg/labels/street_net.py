@@ -131,20 +131,12 @@ class StreetNet(nn.Module):
 
 def save(net: StreetNet, folder: Path, card: str, facts: Mapping[str, Any]) -> None:
     """Write a network as fp16 safetensors, ``model.json`` (shape, SHA-256 of the weights, facts) and MODEL_CARD.md."""
-    store.write_safetensors(
-        folder / WEIGHTS_FILE, {name: value.half().contiguous() for name, value in net.state_dict().items()}
-    )
+    weights = {name: value.half().contiguous() for name, value in net.state_dict().items()}
+    store.write_safetensors(folder / WEIGHTS_FILE, weights)
     store.write_text(folder / "MODEL_CARD.md", card)
-    store.write_json(
-        folder / MODEL_FILE,
-        {
-            "schema": 1,
-            "kind": "street_net",
-            "config": asdict(net.config),
-            "files": {WEIGHTS_FILE: store.sha256_file(folder / WEIGHTS_FILE)},
-            "facts": dict(facts),
-        },
-    )
+    files = {WEIGHTS_FILE: store.sha256_file(folder / WEIGHTS_FILE)}
+    model = {"schema": 1, "kind": "street_net", "config": asdict(net.config), "files": files, "facts": dict(facts)}
+    store.write_json(folder / MODEL_FILE, model)
 
 
 def load(folder: Path | str = EMBEDDED) -> StreetNet:

@@ -22,12 +22,11 @@ from mudg.networks.folders import checked_state
 
 HEAD_WIDTH: Final = 64
 EPSILON: Final = 1e-5
-_BLOCK: Final = (
-    ("ln_1", "layer_norm1"),
-    ("ln_2", "layer_norm2"),
-    ("attn.out_proj", "self_attn.out_proj"),
-    ("mlp.c_fc", "mlp.fc1"),
-    ("mlp.c_proj", "mlp.fc2"),
+_BLOCK: Final = tuple(
+    zip(
+        "ln_1 ln_2 attn.out_proj mlp.c_fc mlp.c_proj".split(),
+        "layer_norm1 layer_norm2 self_attn.out_proj mlp.fc1 mlp.fc2".split(),
+    )
 )
 _FIXED: Final = (
     ("visual.class_embedding", "vision_model.embeddings.class_embedding"),
@@ -75,11 +74,8 @@ def tensor_shapes(width: int, blocks: int, patch: int, places: int, out: int) ->
     for number in range(blocks):
         block = f"visual.transformer.resblocks.{number}"
         shapes |= {f"{block}.attn.in_proj_weight": (3 * width, width), f"{block}.attn.in_proj_bias": (3 * width,)}
-        for name, rows, columns in (
-            ("attn.out_proj", width, width),
-            ("mlp.c_fc", 4 * width, width),
-            ("mlp.c_proj", width, 4 * width),
-        ):
+        for name, rows, columns in (("attn.out_proj", 1, 1), ("mlp.c_fc", 4, 1), ("mlp.c_proj", 1, 4)):
+            rows, columns = rows * width, columns * width
             shapes |= {f"{block}.{name}.weight": (rows, columns), f"{block}.{name}.bias": (rows,)}
     return shapes
 

@@ -199,9 +199,8 @@ class PatchCodec(nn.Module):
         d_rgb, d_depth, d_scores = self.leave(functional.silu(x)).float().split([12, 4, 4 * CLASSES], 1)
         with torch.autocast(x.device.type, enabled=False):  # half precision would cost a percent of depth
             rgb = torch.einsum("nkhw,ck->nchw", latents["rgb"].float() * self.rgb_scale.view(4, 1, 1), self.rgb_basis)
-            depth = torch.einsum(
-                "nkhw,ck->nchw", latents["depth"].float() * self.depth_scale.view(4, 1, 1), self.depth_basis
-            )
+            scaled = latents["depth"].float() * self.depth_scale.view(4, 1, 1)
+            depth = torch.einsum("nkhw,ck->nchw", scaled, self.depth_basis)
         rgb = functional.pixel_shuffle(rgb + self.rgb_mean.view(12, 1, 1) + 0.2 * d_rgb, 2)
         depth = functional.pixel_shuffle(depth + 0.05 * d_depth, 2)
         scores = functional.pixel_shuffle(d_scores, 2)
@@ -234,7 +233,5 @@ def shipped_codec() -> PatchCodec:
     content, prefix = store.read_json(SHIPPED / "model.json"), "codec."
     codec = PatchCodec(records.parse_dataclass(CodecConfig, content["config"]["codec"], "codec: "))
     state = checkpoint.read_shards(SHIPPED, content["files"])
-    codec.load_state_dict(
-        {name.removeprefix(prefix): value for name, value in state.items() if name.startswith(prefix)}
-    )
+    codec.load_state_dict({n.removeprefix(prefix): value for n, value in state.items() if n.startswith(prefix)})
     return codec.eval()

@@ -44,12 +44,8 @@ def tensor_shapes(width: int, blocks: int, places: int = 37 * 37, feed: int = 0)
         block = f"blocks.{number}"
         for name in ("norm1", "norm2"):
             shapes |= {f"{block}.{name}.weight": (width,), f"{block}.{name}.bias": (width,)}
-        for name, out, into in (
-            ("attn.qkv", 3 * width, width),
-            ("attn.proj", width, width),
-            ("mlp.fc1", feed, width),
-            ("mlp.fc2", width, feed),
-        ):
+        sides = {"attn.qkv": (3 * width, width), "attn.proj": (width, width), "mlp.fc1": (feed, width)}
+        for name, (out, into) in {**sides, "mlp.fc2": (width, feed)}.items():
             shapes |= {f"{block}.{name}.weight": (out, into), f"{block}.{name}.bias": (out,)}
         shapes |= {f"{block}.{name}.gamma": (width,) for name in ("ls1", "ls2")}
     return {**shapes, "norm.weight": (width,), "norm.bias": (width,)}
@@ -74,9 +70,8 @@ class DinoFeatures(nn.Module):
             remedy = "use dinov2_vits14_pretrain.pth or dinov2_vitl14_pretrain.pth, not those with registers, nor ViT-g"
             raise InputError(what, where=where, expected=expected, got=", ".join(list(state)[:5]), remedy=remedy)
         self.width = int(places.shape[2])
-        self.blocks = 1 + max(
-            int(name.split(".")[1]) for name in state if name.startswith("blocks.") and name.split(".")[1].isdigit()
-        )
+        numbers = [name.split(".")[1] for name in state if name.startswith("blocks.")]
+        self.blocks = 1 + max(int(number) for number in numbers if number.isdigit())
         wanted = tensor_shapes(self.width, self.blocks, int(places.shape[1]) - 1, int(first.shape[0]))
         for name, value in checked_state(state, wanted, where, "DINOv2", lambda name: name == "mask_token").items():
             self.register_buffer(name.replace(".", "/"), value)
@@ -115,9 +110,8 @@ class DinoFeatures(nn.Module):
         return torch.cat([known[:, :1], grid.permute(0, 2, 3, 1).flatten(1, 2)], 1)
 
     def _attended(self, block: str, x: Tensor) -> Tensor:
-        query, key, value = (
-            self._linear(f"{block}/attn/qkv", x).unflatten(-1, (3, -1, HEAD_WIDTH)).permute(2, 0, 3, 1, 4)
-        )
+        joined = self._linear(f"{block}/attn/qkv", x)
+        query, key, value = joined.unflatten(-1, (3, -1, HEAD_WIDTH)).permute(2, 0, 3, 1, 4)
         mixed = F.scaled_dot_product_attention(query, key, value).transpose(1, 2).flatten(2)
         return self._linear(f"{block}/attn/proj", mixed)
 

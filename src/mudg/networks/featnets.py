@@ -34,6 +34,7 @@ from mudg.core.losses import distance_places, lpips_distance, unit_features
 from mudg.core.metrics import Pair
 from mudg.core.native_ops import box_mean
 from mudg.networks.codec import PatchCodec
+from mudg.networks.folders import checked_state
 
 OPPONENT: Final = ((0.299, 0.587, 0.114), (0.5, -0.5, 0.0), (0.25, 0.25, -0.5))
 
@@ -242,10 +243,8 @@ def lpips_shapes(trunk: LpipsTrunk) -> dict[str, tuple[int, ...]]:
     for number, stage in enumerate(TRUNKS[trunk]):
         for layer in _layers(stage):
             named = f"net.slice{number + 1}.{layer.place}"
-            shapes |= {
-                f"{named}.weight": (layer.out, layer.into, layer.size, layer.size),
-                f"{named}.bias": (layer.out,),
-            }
+            shapes[f"{named}.weight"] = (layer.out, layer.into, layer.size, layer.size)
+            shapes[f"{named}.bias"] = (layer.out,)
         shapes[f"lin{number}.model.1.weight"] = (1, WIDTHS[trunk][number], 1, 1)
     return shapes
 
@@ -289,8 +288,8 @@ class LpipsFeatures(nn.Module):
         self.given: LpipsInput = given
         self.register_buffer("shift", torch.tensor(self.SHIFT).view(1, 3, 1, 1))
         self.register_buffer("scale", torch.tensor(self.SCALE).view(1, 3, 1, 1))
-        for name, shape in lpips_shapes(trunk).items():
-            self.register_buffer(name.replace(".", "/"), _tensor(state, name, shape, where))
+        for name, value in checked_state(state, lpips_shapes(trunk), where, "LPIPS", lambda _: True).items():
+            self.register_buffer(name.replace(".", "/"), value)
 
     @property
     def channel_weights(self) -> list[Tensor]:
@@ -322,16 +321,6 @@ class LpipsFeatures(nn.Module):
         path = f"net/slice{stage + 1}/{layer.place.replace('.', '/')}"
         kernel, bias = self.get_buffer(f"{path}/weight"), self.get_buffer(f"{path}/bias")
         return F.relu(F.conv2d(x, kernel, bias, layer.stride, layer.padding))
-
-
-def _tensor(state: Mapping[str, Tensor], name: str, shape: tuple[int, ...], where: str) -> Tensor:
-    found = state.get(name)
-    if found is None or tuple(found.shape) != shape:
-        got = "missing" if found is None else str(tuple(found.shape))
-        raise InputError(
-            "LPIPS weights are incomplete or of another network", where=f"{where}: {name}", expected=str(shape), got=got
-        )
-    return found.float()
 
 
 @dataclass(frozen=True)
@@ -406,10 +395,8 @@ class PerceptualDistance:
             if getattr(self._known, "image", None) is not pair.truth_rgb:
                 self._known.features = unit_features(self._features(pair.truth_rgb.to(self._device)))
                 self._known.image = pair.truth_rgb
-            made, mask = (
-                self._features(pair.rgb.to(self._device)),
-                (None if pair.mask is None else pair.mask.to(self._device)),
-            )
+            made, mask = self._features(pair.rgb.to(self._device)), pair.mask
+            mask = None if mask is None else mask.to(self._device)
             distance = lpips_distance(made, self._known.features, mask, self._weights, over_weight=True)
             return float(distance)
 
@@ -432,9 +419,8 @@ class PerceptualDistance:
                 "only distances in the features of the codec are made band by band", where="PerceptualDistance.of_all"
             )
         images = [reduced(pair.rgb) for pair in pairs if pair.rgb is not None]
-        given = _Compared(
-            network, self._device, images, reduced(truth), None if mask is None else reduced(mask.float())
-        )
+        mask = None if mask is None else reduced(mask.float())
+        given = _Compared(network, self._device, images, reduced(truth), mask)
         height, width = given.truth.shape[-2:]
         with ThreadPoolExecutor(threads) as pool:
             parts = list(pool.map(given.sums_of, _bands(height, width, network)))
@@ -465,13 +451,12 @@ class _Compared:
         shares = [self._share(band, features) for features in true]
         return [
             [
-                (float((places * share).double().sum()), float(share.expand_as(places).double().sum()))
-                for features, target, share in zip(
-                    band.features(self.network, image.to(self.device)), true, shares, strict=True
+                (float((apart * share).double().sum()), float(share.expand_as(apart).double().sum()))
+                for apart, share in zip(
+                    map(distance_places, band.features(self.network, at), true), shares, strict=True
                 )
-                for places in [distance_places(features, target)]
             ]
-            for image in self.images
+            for at in (image.to(self.device) for image in self.images)
         ]
 
     def _share(self, band: _Band, features: Tensor) -> Tensor:

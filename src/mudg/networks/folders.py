@@ -33,29 +33,39 @@ def checked_state(
     wanted: Mapping[str, tuple[int, ...]],
     where: str,
     network: str,
-    ignored: Callable[[str], bool],
+    ignored: Callable[[str], bool] = lambda name: name.endswith(".bn.num_batches_tracked"),
+    *,
+    owner: str = "the network",
+    remedies: tuple[str, str] = ("", ""),
+    names: Mapping[str, str] | None = None,
 ) -> dict[str, Tensor]:
     """The wanted tensors of a file as float32.
 
     Args:
         wanted: name -> shape of all that the network needs. where: file name for errors. network: its name. ignored:
-            names that may be there and are not read; all other names are refused.
+            names that may be there and are not read; all other names are refused. owner: the network in words.
+            remedies: for tensors that are missing or misshaped, and for unknown ones. names: those in the file.
 
     Raises:
-        InputError: a tensor is missing, has another shape, holds values that are not finite, or is unknown.
+        InputError: a tensor is missing, has another shape, holds impossible values, or is unknown.
     """
+    normed = any(name.endswith("running_var") for name in wanted)
     for name, shape in wanted.items():
-        found = state.get(name)
+        found, at = state.get(name), f"{where}: {(names or {}).get(name, name)}"
         if found is None or tuple(found.shape) != shape or not found.is_floating_point():
             got = "missing" if found is None else f"{found.dtype} {tuple(found.shape)}"
             what = f"{network} weights are incomplete or of another network"
-            raise InputError(what, where=f"{where}: {name}", expected=str(shape), got=got)
-        if not bool(torch.isfinite(found).all()):
-            raise InputError(f"{network} weights hold values that are not finite", where=f"{where}: {name}")
+            raise InputError(what, where=at, expected=str(shape), got=got, remedy=remedies[0])
+        if not bool(torch.isfinite(found).all()) or (name.endswith("running_var") and bool((found < 0).any())):
+            what = f"{network} weights hold {'impossible values' if normed else 'values that are not finite'}"
+            raise InputError(what, where=at, expected="finite numbers, variances of at least 0" if normed else "")
     for name in state:
         if name not in wanted and not ignored(name):
-            what = f"{network} weights hold a tensor that the network has not"
-            raise InputError(what, where=f"{where}: {name}", expected=f"{len(wanted)} tensors")
+            what, at = (
+                f"{network} weights hold a tensor that {owner} has not",
+                f"{where}: {(names or {}).get(name, name)}",
+            )
+            raise InputError(what, where=at, expected=f"{len(wanted)} tensors", remedy=remedies[1])
     return {name: state[name].detach().float() for name in wanted}
 
 
@@ -136,24 +146,17 @@ def title(folder: str | Path) -> str:
 def package(name: Literal["transformers", "diffusers", "huggingface_hub"]) -> ModuleType:
     """A package that reads folders, with its progress bars off; ResourceError names the extra if it is missing."""
     try:
-        match name:
-            case "transformers":
-                found = importlib.import_module("transformers")
-            case "diffusers":
-                found = importlib.import_module("diffusers")
-            case "huggingface_hub":
-                found = importlib.import_module("huggingface_hub")
+        found = {  # literal names: no text becomes an import
+            "transformers": lambda: importlib.import_module("transformers"),
+            "diffusers": lambda: importlib.import_module("diffusers"),
+            "huggingface_hub": lambda: importlib.import_module("huggingface_hub"),
+        }[name]()
     except ImportError as error:
         raise ResourceError(
             f"the {name} package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
         ) from error
-    return _quiet(found)
-
-
-def _quiet(found: ModuleType) -> ModuleType:
-    """Progress bars of the package would run through ours."""
     switch = getattr(getattr(getattr(found, "utils", None), "logging", None), "disable_progress_bar", None)
-    if switch is not None:
+    if switch is not None:  # its bars would run through ours
         switch()
     return found
 

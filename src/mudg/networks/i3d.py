@@ -19,6 +19,7 @@ from torch import Tensor, nn
 
 from mudg.base.errors import InputError
 from mudg.core.pictures import bilinear_from_corner
+from mudg.networks.folders import checked_state
 
 SIDE_PX: Final = 224
 WIDTH: Final = 400
@@ -64,15 +65,9 @@ class _Mixed(NamedTuple):
     def units(self) -> dict[str, _Cube]:
         """The convolutions by branch name."""
         b0, b1a, b1b, b2a, b2b, b3b = self.widths
-        rows = {
-            "b0": (self.into, b0, 1),
-            "b1a": (self.into, b1a, 1),
-            "b1b": (b1a, b1b, 3),
-            "b2a": (self.into, b2a, 1),
-            "b2b": (b2a, b2b, 3),
-            "b3b": (self.into, b3b, 1),
-        }
-        return {branch: _Cube(f"{self.name}.{branch}", *row) for branch, row in rows.items()}
+        rows = (("b0", self.into, b0, 1), ("b1a", self.into, b1a, 1), ("b1b", b1a, b1b, 3))
+        rows += (("b2a", self.into, b2a, 1), ("b2b", b2a, b2b, 3), ("b3b", self.into, b3b, 1))
+        return {branch: _Cube(f"{self.name}.{branch}", *row) for branch, *row in rows}
 
 
 _STEPS: Final[tuple[_Cube | _Pool | _Mixed, ...]] = (
@@ -93,19 +88,12 @@ _STEPS: Final[tuple[_Cube | _Pool | _Mixed, ...]] = (
     _Mixed("Mixed_5b", 832, (256, 160, 320, 32, 128, 128)),
     _Mixed("Mixed_5c", 832, (384, 192, 384, 48, 128, 128)),
 )
-_OTHER_NAMES: Final = (
-    ("batch3d.", "bn."),
-    ("conv3d_0c_1x1.", "logits."),
-    ("conv3d_1a", "Conv3d_1a"),
-    ("conv3d_2b", "Conv3d_2b"),
-    ("conv3d_2c", "Conv3d_2c"),
-    ("mixed_", "Mixed_"),
-    ("branch_0.", "b0."),
-    ("branch_1.0.", "b1a."),
-    ("branch_1.1.", "b1b."),
-    ("branch_2.0.", "b2a."),
-    ("branch_2.1.", "b2b."),
-    ("branch_3.1.", "b3b."),
+_OTHER_NAMES: Final = tuple(
+    row.split()
+    for row in (
+        "batch3d. bn.,conv3d_0c_1x1. logits.,conv3d_1a Conv3d_1a,conv3d_2b Conv3d_2b,conv3d_2c Conv3d_2c,mixed_ Mixed_,"
+        "branch_0. b0.,branch_1.0. b1a.,branch_1.1. b1b.,branch_2.0. b2a.,branch_2.1. b2b.,branch_3.1. b3b."
+    ).split(",")
 )
 """Parts of names in the first layout -> in the second."""
 
@@ -156,8 +144,8 @@ class I3DFeatures(nn.Module):
         """
         if (
             clips.dim() != 5
-            or clips.shape[1] != 3
-            or clips.shape[3:] != (SIDE_PX, SIDE_PX)
+            or clips.shape[1::2] != (3, SIDE_PX)
+            or clips.shape[4] != SIDE_PX
             or clips.shape[2] < SHORTEST
         ):
             expected = f"[n, 3, T >= {SHORTEST}, {SIDE_PX}, {SIDE_PX}]"
@@ -170,10 +158,8 @@ class I3DFeatures(nn.Module):
                 x = _maxima(x, step)
             else:
                 x = self._mixed(step, x)
-        x = F.avg_pool3d(x, (2, 7, 7), 1)
-        return F.conv3d(x, self.get_buffer("logits/conv3d/weight"), self.get_buffer("logits/conv3d/bias")).mean(
-            (2, 3, 4)
-        )
+        weight, bias = self.get_buffer("logits/conv3d/weight"), self.get_buffer("logits/conv3d/bias")
+        return F.conv3d(F.avg_pool3d(x, (2, 7, 7), 1), weight, bias).mean((2, 3, 4))
 
     def _mixed(self, block: _Mixed, x: Tensor) -> Tensor:
         of = {branch: lambda y, unit=unit: self._convolved(unit, y) for branch, unit in block.units().items()}
@@ -182,12 +168,8 @@ class I3DFeatures(nn.Module):
 
     def _convolved(self, unit: _Cube, x: Tensor) -> Tensor:
         path = unit.name.replace(".", "/")
-        x = F.conv3d(
-            same_padded(x, (unit.size,) * 3, (unit.stride,) * 3),
-            self.get_buffer(f"{path}/conv3d/weight"),
-            None,
-            unit.stride,
-        )
+        x = same_padded(x, (unit.size,) * 3, (unit.stride,) * 3)
+        x = F.conv3d(x, self.get_buffer(f"{path}/conv3d/weight"), None, unit.stride)
         weight, bias, mean, variance = (self.get_buffer(f"{path}/bn/{leaf}") for leaf in _NORM)
         return F.relu(F.batch_norm(x, mean, variance, weight, bias, training=False, eps=self.epsilon))
 
@@ -226,24 +208,8 @@ def _renamed(name: str) -> str:
 
 
 def _checked(state: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
-    wanted, found, given = tensor_shapes(), {}, {}
-    for name, value in state.items():
-        clean = _renamed(name)
-        found[clean], given[clean] = value, name
-    for name, shape in wanted.items():
-        value = found.get(name)
-        if value is None or tuple(value.shape) != shape or not value.is_floating_point():
-            got = "missing" if value is None else f"{value.dtype} {tuple(value.shape)}"
-            what = "I3D weights are incomplete or of another network"
-            raise InputError(what, where=f"{where}: {given.get(name, name)}", expected=str(shape), got=got)
-        if not bool(torch.isfinite(value).all()) or (name.endswith("running_var") and bool((value < 0).any())):
-            what = "I3D weights hold impossible values"
-            raise InputError(what, where=f"{where}: {given[name]}", expected="finite numbers, variances of at least 0")
-    for name in found:
-        if name not in wanted and not name.endswith(".bn.num_batches_tracked"):
-            what = "I3D weights hold a tensor that FVD's network has not"
-            raise InputError(what, where=f"{where}: {given[name]}", expected=f"{len(wanted)} tensors")
-    return {name: found[name].detach().float() for name in wanted}
+    found, names = {_renamed(name): value for name, value in state.items()}, {_renamed(name): name for name in state}
+    return checked_state(found, tensor_shapes(), where, "I3D", owner="FVD's network", names=names)
 
 
 def prepared_frame(rgb: NDArray[np.uint8], rule: VideoRule) -> Tensor:

@@ -20,6 +20,7 @@ from torch import Tensor, nn
 
 from mudg.base.errors import InputError
 from mudg.core.pictures import bilinear_from_corner, resize_bicubic
+from mudg.networks.folders import checked_state
 
 SIDE_PX: Final = 299
 NORM_EPSILON: Final = 1e-3
@@ -65,62 +66,46 @@ def _unit(name: str, out: int, size: int | tuple[int, int] = 1, stride: int = 1)
     return _Unit(name, out, (size, size) if isinstance(size, int) else size, stride, stride == 1)
 
 
+def _chain(name: str, *layers: tuple[int, int | tuple[int, int]]) -> tuple[_Unit, ...]:
+    """Units NAME_1, NAME_2, ...: channels out and kernel of each."""
+    return tuple(_unit(f"{name}_{number}", out, size) for number, (out, size) in enumerate(layers, 1))
+
+
 def _block_a(pool: int) -> tuple[_Branch, ...]:
     return (
         (_unit("branch1x1", 64),),
-        (_unit("branch5x5_1", 48), _unit("branch5x5_2", 64, 5)),
-        (_unit("branch3x3dbl_1", 64), _unit("branch3x3dbl_2", 96, 3), _unit("branch3x3dbl_3", 96, 3)),
+        _chain("branch5x5", (48, 1), (64, 5)),
+        _chain("branch3x3dbl", (64, 1), (96, 3), (96, 3)),
         (_AVERAGE, _unit("branch_pool", pool)),
     )
 
 
 def _block_b() -> tuple[_Branch, ...]:
-    return (
-        (_unit("branch3x3", 384, 3, 2),),
-        (_unit("branch3x3dbl_1", 64), _unit("branch3x3dbl_2", 96, 3), _unit("branch3x3dbl_3", 96, 3, 2)),
-        (_MAXIMUM_HALF,),
-    )
+    double = (*_chain("branch3x3dbl", (64, 1), (96, 3)), _unit("branch3x3dbl_3", 96, 3, 2))
+    return (_unit("branch3x3", 384, 3, 2),), double, (_MAXIMUM_HALF,)
 
 
 def _block_c(width: int) -> tuple[_Branch, ...]:
     flat, tall = (1, 7), (7, 1)
     return (
         (_unit("branch1x1", 192),),
-        (_unit("branch7x7_1", width), _unit("branch7x7_2", width, flat), _unit("branch7x7_3", 192, tall)),
-        (
-            _unit("branch7x7dbl_1", width),
-            _unit("branch7x7dbl_2", width, tall),
-            _unit("branch7x7dbl_3", width, flat),
-            _unit("branch7x7dbl_4", width, tall),
-            _unit("branch7x7dbl_5", 192, flat),
-        ),
+        _chain("branch7x7", (width, 1), (width, flat), (192, tall)),
+        _chain("branch7x7dbl", (width, 1), (width, tall), (width, flat), (width, tall), (192, flat)),
         (_AVERAGE, _unit("branch_pool", 192)),
     )
 
 
 def _block_d() -> tuple[_Branch, ...]:
-    return (
-        (_unit("branch3x3_1", 192), _unit("branch3x3_2", 320, 3, 2)),
-        (
-            _unit("branch7x7x3_1", 192),
-            _unit("branch7x7x3_2", 192, (1, 7)),
-            _unit("branch7x7x3_3", 192, (7, 1)),
-            _unit("branch7x7x3_4", 192, 3, 2),
-        ),
-        (_MAXIMUM_HALF,),
-    )
+    long = (*_chain("branch7x7x3", (192, 1), (192, (1, 7)), (192, (7, 1))), _unit("branch7x7x3_4", 192, 3, 2))
+    return (_unit("branch3x3_1", 192), _unit("branch3x3_2", 320, 3, 2)), long, (_MAXIMUM_HALF,)
 
 
 def _block_e(pool: str) -> tuple[_Branch, ...]:
-    flat, tall = (1, 3), (3, 1)
+    ends = (("a", (1, 3)), ("b", (3, 1)))
     return (
         (_unit("branch1x1", 320),),
-        (_unit("branch3x3_1", 384), (_unit("branch3x3_2a", 384, flat), _unit("branch3x3_2b", 384, tall))),
-        (
-            _unit("branch3x3dbl_1", 448),
-            _unit("branch3x3dbl_2", 384, 3),
-            (_unit("branch3x3dbl_3a", 384, flat), _unit("branch3x3dbl_3b", 384, tall)),
-        ),
+        (_unit("branch3x3_1", 384), tuple(_unit(f"branch3x3_2{k}", 384, s) for k, s in ends)),
+        (*_chain("branch3x3dbl", (448, 1), (384, 3)), tuple(_unit(f"branch3x3dbl_3{k}", 384, s) for k, s in ends)),
         (pool, _unit("branch_pool", 192)),
     )
 
@@ -138,12 +123,10 @@ _STEM: Final[tuple[_Unit | str, ...]] = (
 
 _BLOCKS: Final[dict[str, tuple[_Branch, ...]]] = {
     "Mixed_5b": _block_a(32),
-    "Mixed_5c": _block_a(64),
-    "Mixed_5d": _block_a(64),
+    **dict.fromkeys(("Mixed_5c", "Mixed_5d"), _block_a(64)),
     "Mixed_6a": _block_b(),
     "Mixed_6b": _block_c(128),
-    "Mixed_6c": _block_c(160),
-    "Mixed_6d": _block_c(160),
+    **dict.fromkeys(("Mixed_6c", "Mixed_6d"), _block_c(160)),
     "Mixed_6e": _block_c(192),
     "Mixed_7a": _block_d(),
     "Mixed_7b": _block_e(_AVERAGE),
@@ -272,23 +255,9 @@ def _pooled(kind: str, x: Tensor) -> Tensor:
 
 
 def _checked(state: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
-    wanted = tensor_shapes()
-    for name, shape in wanted.items():
-        found = state.get(name)
-        if found is None or tuple(found.shape) != shape or not found.is_floating_point():
-            got = "missing" if found is None else f"{found.dtype} {tuple(found.shape)}"
-            what = "Inception weights are incomplete or of another network"
-            remedy = "use pt_inception-2015-12-05-6726825d.pth or a copy of it as safetensors"
-            raise InputError(what, where=f"{where}: {name}", expected=str(shape), got=got, remedy=remedy)
-        if not bool(torch.isfinite(found).all()) or (name.endswith("running_var") and bool((found < 0).any())):
-            expected = "finite numbers, variances of at least 0"
-            raise InputError("Inception weights hold impossible values", where=f"{where}: {name}", expected=expected)
-    for name in state:
-        if name not in wanted and not name.endswith(".bn.num_batches_tracked"):
-            what = "Inception weights hold a tensor that FID's network has not"
-            remedy = "torchvision's Inception-v3 is another network"
-            raise InputError(what, where=f"{where}: {name}", expected=f"{len(wanted)} tensors", remedy=remedy)
-    return {name: state[name].detach().float() for name in wanted}
+    complete = "use pt_inception-2015-12-05-6726825d.pth or a copy of it as safetensors"
+    remedies = complete, "torchvision's Inception-v3 is another network"
+    return checked_state(state, tensor_shapes(), where, "Inception", owner="FID's network", remedies=remedies)
 
 
 # ---- images in ----

@@ -52,17 +52,9 @@ LATENT_SCALE: Final = 0.18215
 UNETS: Final = ("denoising_unet", "reference_unet")
 PARTS: Final = (*UNETS, "mapping_layer", "vae", "image_encoder")
 _VISION: Final = (
-    "hidden_size",
-    "intermediate_size",
-    "projection_dim",
-    "num_hidden_layers",
-    "num_attention_heads",
-    "num_channels",
-    "image_size",
-    "patch_size",
-    "hidden_act",
-    "layer_norm_eps",
-)
+    "hidden_size intermediate_size projection_dim num_hidden_layers num_attention_heads num_channels image_size "
+    "patch_size hidden_act layer_norm_eps"
+).split()
 
 
 @checked_dataclass(frozen=True, config=STRICT)
@@ -247,10 +239,8 @@ def share_features(reference_unet: Any, denoising_unet: Any) -> None:
     Raises:
         InputError: the two differ in their blocks, or have none.
     """
-    writers, readers = (
-        {name: module for name, module in unet.named_modules() if name.rpartition(".")[2] == "attn1"}
-        for unet in (reference_unet, denoising_unet)
-    )
+    unets = [dict(unet.named_modules()) for unet in (reference_unet, denoising_unet)]
+    writers, readers = ({name: m for name, m in unet.items() if name.rpartition(".")[2] == "attn1"} for unet in unets)
     if set(writers) != set(readers) or not writers:
         got = ", ".join(sorted(set(writers) ^ set(readers))[:4]) or "none at all"
         raise InputError("the two U-Nets differ in their self-attentions", where="DepthLab", got=got)
@@ -486,41 +476,26 @@ def find(folder: Path) -> Sources:
         InputError: something is missing, or there twice.
     """
     places = [folder, *sorted(place for place in folder.iterdir() if place.is_dir())]
-    pickles = _only(
-        folder,
-        [place for place in places if any((place / name).is_file() for name in PICKLES.values())],
-        f"the published files {', '.join(PICKLES.values())}",
-    )
+    published = [place for place in places if any((place / name).is_file() for name in PICKLES.values())]
+    pickles = _only(folder, published, f"the published files {', '.join(PICKLES.values())}")
     for name in PICKLES.values():
         if not (pickles / name).is_file():
             raise InputError("a published file is missing", where=str(pickles), expected=name)
-    marigolds = ("MarigoldPipeline", "MarigoldDepthPipeline")
-    base = _only(
-        folder,
-        [place for place in places if _json_value(place / "model_index.json", "_class_name") in marigolds],
-        "marigold-depth-v1-0, a folder of diffusers",
-    )
-    encoder = _only(
-        folder,
-        [
-            place
-            for place in places
-            if _json_value(place / "config.json", "model_type") in ("clip", "clip_vision_model")
-        ],
-        "CLIP-ViT-H-14-laion2B-s32B-b79K, a folder of transformers",
-    )
+    kinds = {place: _json_value(place / "model_index.json", "_class_name") for place in places}
+    marigolds = [place for place, kind in kinds.items() if kind in ("MarigoldPipeline", "MarigoldDepthPipeline")]
+    base = _only(folder, marigolds, "marigold-depth-v1-0, a folder of diffusers")
+    kinds = {place: _json_value(place / "config.json", "model_type") for place in places}
+    clips = [place for place, kind in kinds.items() if kind in ("clip", "clip_vision_model")]
+    encoder = _only(folder, clips, "CLIP-ViT-H-14-laion2B-s32B-b79K, a folder of transformers")
     return Sources(pickles, base, encoder)
 
 
-def _only(folder: Path, found: list[Path], what: str) -> Path:
+def _only(folder: Path, found: list[Path], what_it_holds: str) -> Path:
     if len(found) != 1:
-        raise InputError(
-            "a part of DepthLab is missing" if not found else "a part of DepthLab was found more than once",
-            where=str(folder),
-            expected=f"one folder with {what}",
-            got=", ".join(place.name for place in found) or "none",
-            remedy="put the three folders into one, as DepthLab's page says, and give that folder",
-        )
+        what = "a part of DepthLab is missing" if not found else "a part of DepthLab was found more than once"
+        expected, got = f"one folder with {what_it_holds}", ", ".join(place.name for place in found) or "none"
+        remedy = "put the three folders into one, as DepthLab's page says, and give that folder"
+        raise InputError(what, where=str(folder), expected=expected, got=got, remedy=remedy)
     return found[0]
 
 
@@ -573,11 +548,8 @@ def read(sources: Sources, configs: Mapping[str, Mapping[str, Any]]) -> dict[str
     found["image_encoder"] = {
         name: value for name, value in encoder.items() if name.startswith(_ENCODER) and name != _PLACES
     }
-    files = {
-        **{part: sources.pickles / name for part, name in PICKLES.items()},
-        "vae": sources.base / "vae",
-        "image_encoder": sources.encoder_file(),
-    }
+    files = {part: sources.pickles / name for part, name in PICKLES.items()}
+    files |= {"vae": sources.base / "vae", "image_encoder": sources.encoder_file()}
     for part, network in blank_parts(configs).items():
         weights.match_exactly(found[part], shapes_of(network), str(files[part]), f"DepthLab's {part}")
         weights.refuse_bad_values(found[part], str(files[part]))
@@ -597,36 +569,21 @@ def convert_folder(folder: Path, to: Path, dtype: torch.dtype | None, shard_byte
     sources = find(folder)
     configs, schedule = described(sources)
     found = read(sources, configs)
-    facts = {
-        "sources": [
-            {
-                "file": path.relative_to(folder).as_posix(),
-                "bytes": path.stat().st_size,
-                "sha256": store.sha256_file(path),
-            }
-            for path in sources.files()
-        ],
-        "licence": LICENCE,
-    }
+    facts = {"sources": [_facts_of(path, folder) for path in sources.files()], "licence": LICENCE}
     with store.atomic_directory(to) as partial:
-        parts = {
-            part: {
-                "config": configs[part],
-                "files": checkpoint.write_shards(partial / part, found[part], shard_bytes, dtype),
-            }
-            for part in PARTS
-        }
+        parts: dict[str, Any] = {part: {"config": configs[part]} for part in PARTS}
+        for part, described_part in parts.items():
+            described_part["files"] = checkpoint.write_shards(partial / part, found[part], shard_bytes, dtype)
         store.write_text(partial / "MODEL_CARD.md", _card(facts))
-        description = {
-            "schema": SCHEMA,
-            "kind": KIND,
-            "parts": parts,
-            "scheduler": schedule,
-            "sampling": asdict(PUBLISHED_SAMPLING),
-            "facts": facts,
-        }
+        description = {"schema": SCHEMA, "kind": KIND, "parts": parts, "scheduler": schedule}
+        description |= {"sampling": asdict(PUBLISHED_SAMPLING), "facts": facts}
         store.write_json(partial / DESCRIPTION, description)
         store.sync_tree(partial)
+
+
+def _facts_of(file: Path, folder: Path) -> dict[str, Any]:
+    name, size = file.relative_to(folder).as_posix(), file.stat().st_size
+    return {"file": name, "bytes": size, "sha256": store.sha256_file(file)}
 
 
 def _card(facts: Mapping[str, Any]) -> str:

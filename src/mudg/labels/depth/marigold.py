@@ -99,32 +99,22 @@ class Marigold:
         with torch.no_grad():
             empty_text = text(_empty_tokens(path).to(place.device))[0].float()
         schedule = path / SCHEDULE_FILE
-        parts = MarigoldParts(
-            folders.load_network(folders.member(diffusers, "UNet2DConditionModel"), path, place, "unet"),
-            folders.load_network(folders.member(diffusers, "AutoencoderKL"), path, place, "vae"),
-            ddim_scheduler(folders.read_settings(schedule), str(schedule)),
-            empty_text,
-        )
+        unet = folders.load_network(folders.member(diffusers, "UNet2DConditionModel"), path, place, "unet")
+        vae = folders.load_network(folders.member(diffusers, "AutoencoderKL"), path, place, "vae")
+        parts = MarigoldParts(unet, vae, ddim_scheduler(folders.read_settings(schedule), str(schedule)), empty_text)
         space: Space = "disparity" if index.get("prediction_type") == "disparity" else "depth"
         usual = GUIDED_STEPS if options.guided else int(index.get("default_denoising_steps") or PLAIN_STEPS)
         longest_px = int(index.get("default_processing_resolution") or PROCESSING_PX)
-        return cls(
-            parts, space=space, steps=options.steps or usual, guided=options.guided, longest_px=longest_px, place=place
-        )
+        steps, guided = options.steps or usual, options.guided
+        return cls(parts, space=space, steps=steps, guided=guided, longest_px=longest_px, place=place)
 
     def __call__(self, given: DepthInput) -> Prediction:
         """Depth of one image at the image's size, up to scale and shift (to what is near the LiDAR's with guidance)."""
         image, size = self._prepared(given.rgb)
-        noise = torch.randn(
-            1,
-            self._parts.vae.config.latent_channels,
-            image.shape[2] // self._cell,
-            image.shape[3] // self._cell,
-            generator=seeds.torch_generator(0, 0, "marigold"),
-        )
-        found = self.predict(
-            image, size, noise, _returns(given, self._space, self._place.device) if self._guided else None
-        )
+        shape = (1, self._parts.vae.config.latent_channels, *(side // self._cell for side in image.shape[2:]))
+        noise = torch.randn(shape, generator=seeds.torch_generator(0, 0, "marigold"))
+        returns = _returns(given, self._space, self._place.device) if self._guided else None
+        found = self.predict(image, size, noise, returns)
         return Prediction.resized(found, given, self._space)
 
     def _prepared(self, rgb: NDArray[np.uint8]) -> tuple[Tensor, tuple[int, int]]:
@@ -188,9 +178,8 @@ class Marigold:
         depth = self._decoded(clean, size)
         at = functional.grid_sample(depth, returns.grid, mode="bilinear", padding_mode="border", align_corners=False)
         values = at[0, 0, 0]
-        scale, shift, spread = _towards(
-            fit_affine(values.detach().cpu(), returns.depth_m.cpu(), self._space), returns.goal
-        )
+        fit = fit_affine(values.detach().cpu(), returns.depth_m.cpu(), self._space)
+        scale, shift, spread = _towards(fit, returns.goal)
         error = (scale * values + shift) / returns.goal - 1
         loss = functional.huber_loss(error, torch.zeros_like(error), delta=max(3 * spread, 1e-3))
         return torch.autograd.grad(loss, latent)[0]
@@ -230,9 +219,8 @@ def _returns(given: DepthInput, space: Space, device: str) -> _Returns | None:
     height, width = given.measured.shape
     grid = np.stack([2 * (column + 0.5) / width - 1, 2 * (row + 0.5) / height - 1], 1).astype(np.float32)
     depth_m = torch.from_numpy(given.measured[row, column]).to(device)
-    return _Returns(
-        torch.from_numpy(grid)[None, None].to(device), depth_m, depth_m if space == "depth" else 1 / depth_m
-    )
+    goal = depth_m if space == "depth" else 1 / depth_m
+    return _Returns(torch.from_numpy(grid)[None, None].to(device), depth_m, goal)
 
 
 def working_size(rgb: NDArray[np.uint8], longest_px: int) -> tuple[int, int]:

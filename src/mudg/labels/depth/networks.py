@@ -64,23 +64,19 @@ class Preparation:
         size = settings.get("size") or {}
         if not isinstance(size, dict):
             size = {"height": size, "width": size}
-        return cls(
-            int(size.get("height", side_px)),
-            int(size.get("width", side_px)),
-            int(settings.get("ensure_multiple_of") or multiple),
-            bool(settings.get("keep_aspect_ratio", True)),
-            tuple(settings.get("image_mean") or folders.MEAN),
-            tuple(settings.get("image_std") or folders.DEVIATION),
-        )
+        height, width = (int(size.get(side, side_px)) for side in ("height", "width"))
+        multiple = int(settings.get("ensure_multiple_of") or multiple)
+        mean, deviation = settings.get("image_mean") or folders.MEAN, settings.get("image_std") or folders.DEVIATION
+        keep_aspect = bool(settings.get("keep_aspect_ratio", True))
+        return cls(height, width, multiple, keep_aspect, tuple(mean), tuple(deviation))
 
     def size_for(self, height: int, width: int) -> tuple[int, int]:
         """Height and width the network reads: with the aspect kept, the side that changes less gets its size."""
         by = [self.height / height, self.width / width]
         if self.keep_aspect:
             by = [min(by, key=lambda factor: abs(1 - factor))] * 2
-        high, wide = (
-            max(1, round(factor * side / self.multiple)) * self.multiple for factor, side in zip(by, (height, width))
-        )
+        step = self.multiple
+        high, wide = (max(1, round(f * side / step)) * step for f, side in zip(by, (height, width)))
         return high, wide
 
     def pixels(self, rgb: NDArray[np.uint8]) -> Tensor:
@@ -126,9 +122,8 @@ def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
     height, width = dense.shape
     scale = min(1.0, longest_px / max(height, width))
     size = (max(1, round(height * scale)), max(1, round(width * scale)))
-    small = functional.interpolate(
-        torch.from_numpy(dense.astype(np.float32))[None, None], size=size, mode="nearest-exact"
-    )
+    whole = torch.from_numpy(dense.astype(np.float32))[None, None]
+    small = functional.interpolate(whole, size=size, mode="nearest-exact")
     if float(small.max() - small.min()) <= 0:
         small[..., 0, 0] *= 1.01  # the network divides by the range
     return small
@@ -139,10 +134,8 @@ def _load_transformers(folder: Path, place: Place, *, with_lidar: bool) -> Trans
     network_class = folders.member(folders.package("transformers"), class_name)
     network: Any = folders.load_network(network_class, folder, place)
     preparation = Preparation.read(folder, 756 if with_lidar else 518, int(network.config.patch_size))
-    metric = with_lidar or network.config.depth_estimation_type == "metric"
-    return TransformersDepth(
-        network, preparation, "depth" if metric else "disparity", with_lidar=with_lidar, place=place
-    )
+    space = "depth" if with_lidar or network.config.depth_estimation_type == "metric" else "disparity"
+    return TransformersDepth(network, preparation, space, with_lidar=with_lidar, place=place)
 
 
 # --- folders --------------------------------------------------------------------------------------
@@ -151,8 +144,7 @@ def _load_transformers(folder: Path, place: Place, *, with_lidar: bool) -> Trans
 KINDS: Final[Mapping[str, Callable[[Path, Place, DepthOptions], DepthNetwork]]] = {
     "prompt_depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=True),
     "depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=False),
-    "MarigoldDepthPipeline": Marigold.load,
-    "MarigoldPipeline": Marigold.load,
+    **dict.fromkeys(("MarigoldDepthPipeline", "MarigoldPipeline"), Marigold.load),
     "depthlab": DepthLab.load,
 }
 """``model_type`` of a folder's ``config.json``, ``_class_name`` of its ``model_index.json``, or ``kind`` of the
