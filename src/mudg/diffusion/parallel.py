@@ -359,12 +359,6 @@ def _shard_axis(value: Tensor) -> int:
     return placements.index(Shard(0))
 
 
-def clip_gradients(part: nn.Module, limit: float) -> float:
-    """Norm of all gradients over all processes; they are scaled down to `limit` if that is not 0."""
-    norm = torch.nn.utils.clip_grad_norm_(part.parameters(), limit or float("inf"))
-    return float(gathered(norm))
-
-
 # a step's end -------------------------------------------------------------------------------------
 
 
