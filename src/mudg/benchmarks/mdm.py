@@ -37,12 +37,8 @@ def measure(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     cities = city_clips.LISTS[config.cities][: config.count]
     rules = CityClipRules(window=model.config.window, fitted=model.config.renders)
     city_clips.write_missing(rules, cities, out / "clips", fit_city if rules.fitted else None)
-    result: dict[str, Any] = {
-        "cities": list(cities),
-        "model": model_files.digest(config.model),
-        "bf16": bf16,
-        "rows": [],
-    }
+    result: dict[str, Any] = {"cities": list(cities), "model": model_files.digest(config.model), "bf16": bf16}
+    result["rows"] = []
     lines = [f"# Diffusion model on {len(cities)} held-out cities ({config.cities} list), exact truth", ""]
     with log.task("scoring", 2 * len(config.steps)) as bar:
         for given in (True, False):

@@ -1,4 +1,4 @@
-"""Conditions and training clips for the diffusion model.
+"""Conditions of the diffusion model.
 
 `build_conditions` makes the model's input for a path of views from a fused cloud and recorded images:
 
@@ -15,7 +15,7 @@
 Steps 2 to 7 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead:
 points only, zero where nothing is known, the reference image in frame 0 being put in by the model.
 
-Training clips are made of these in `from_city.py` and `from_log.py`.
+Training clips are made of these in `city_clips.py` and `log_clips.py`.
 """
 
 from __future__ import annotations
@@ -461,7 +461,7 @@ def build_conditions(
         InputError: no views.
     """
     if not views:
-        raise InputError("a condition needs at least one view", where="clips.build_conditions")
+        raise InputError("a condition needs at least one view", where="build_conditions")
     small = [view.resized(rules.width, rules.height) for view in views]
     among = [range(len(recorded))] * len(views) if among is None else among
     reference = _reference(small[0], [recorded[n] for n in among[0]], rules, recolor)

@@ -1,8 +1,8 @@
 """The multi-modal diffusion model: from a sparse, projected point cloud to dense colour, depth and semantic video.
 
 Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to
-do, `encode_condition`, `loss` and `sample`. The networks are in `network.py`, reading and
-writing in `model_files.py`.
+do, `encode_condition`, `loss` and `sample`. The networks are in `network.py`, reading and writing in
+`model_files.py`.
 
 The network's input is, per latent cell, [noisy latents of all modalities | colour condition | depth condition |
 backdrop | masks of what was seen | classes of the condition]. It states the clean latents of all modalities at once,

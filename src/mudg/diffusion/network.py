@@ -635,8 +635,13 @@ class PixelSource(Protocol):
     """The condition of a clip at the size that is wanted (N, H, W), of which one rectangle at a time is asked."""
 
     @property
-    def grid(self) -> tuple[int, int, int]: ...
-    def crop(self, rows: slice, columns: slice) -> ConditionPixels: ...
+    def grid(self) -> tuple[int, int, int]:
+        """N, H, W."""
+        ...
+
+    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
+        """A rectangle of pixels."""
+        ...
 
 
 def finish_in_tiles(

@@ -1,6 +1,6 @@
 """The published multi-modal diffusion model, full size: the same thing as `MDM`, of other parts.
 
-    conditions -> latents          autoencoder (`kl_vae`); frame 0 of the colour condition is the dense reference
+    conditions -> latents          autoencoder; frame 0 of the colour condition is the dense reference
     reference  -> image tokens     image tower (`clip`) and resampler, 16 tokens for each of 16 frames
     one pass per modality          v-prediction with classifier-free guidance, told apart by the modality label
     latents    -> pixels           autoencoder
