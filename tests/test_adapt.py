@@ -38,28 +38,24 @@ from mudg.steps.fit import Fit
 from mudg.steps.ingest import Fuse, Ingest
 from mudg.steps.synthesize import Adapt, fit_scene
 
-SIZE = (96, 64)
+
+def drive(root, city, test_every, **fitting):
+    """A small drive, its cloud, a fit to it, and a tiny model that uses renders."""
+    ingesting = IngestConfig(city=city, test_every=test_every, contact_sheet=False)
+    Ingest(log=ingest.CITY, out=root / "scene", settings=ingesting).run()
+    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
+    few = fit_config(method="street_gaussians", **fitting)
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit", settings=few).run()
+    before, area = model_files.load("embedded-tiny"), city.width * city.height
+    grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1), area_px=area)
+    model_files.save(extended(before, grown), root / "tiny", "", {})
+    return root
 
 
 @pytest.fixture(scope="module")
 def log(tmp_path_factory):
-    """A small drive, its cloud, a fit to it, and a tiny model that uses renders."""
-    root = tmp_path_factory.mktemp("adapt")
-    city = CityConfig(
-        seed=5, n_frames=13, width=SIZE[0], height=SIZE[1], cameras=("front",), lidar_azimuth_step_deg=0.6
-    )
-    Ingest(log=ingest.CITY, out=root / "scene", settings=IngestConfig(city=city, test_every=6)).run()
-    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
-    Fit(
-        scene=root / "scene",
-        fused=root / "fuse",
-        out=root / "fit",
-        settings=fit_config(method="street_gaussians", iterations=30, start__gaussians=8000),
-    ).run()
-    before = model_files.load("embedded-tiny")
-    grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1), area_px=SIZE[0] * SIZE[1])
-    model_files.save(extended(before, grown), root / "tiny", "", {})
-    return root
+    city = CityConfig(seed=5, n_frames=13, width=96, height=64, cameras=("front",), lidar_azimuth_step_deg=0.6)
+    return drive(tmp_path_factory.mktemp("adapt"), city, 6, iterations=30, start__gaussians=8000)
 
 
 def settings(log, **changes):
@@ -231,16 +227,8 @@ def test_an_interrupted_adaptation_continues_to_the_same_model(log, result, tmp_
 @pytest.fixture(scope="module")
 def short_log(tmp_path_factory):
     """The least that a model can be adapted to: six small frames."""
-    root, size = tmp_path_factory.mktemp("short"), (64, 48)
-    city = CityConfig(seed=5, n_frames=6, width=size[0], height=size[1], cameras=("front",), lidar_azimuth_step_deg=1.2)
-    Ingest(log="city", out=root / "scene", settings=IngestConfig(city=city, test_every=0, contact_sheet=False)).run()
-    Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
-    few = fit_config(method="street_gaussians", iterations=4, start__gaussians=1000)
-    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit", settings=few).run()
-    before = model_files.load("embedded-tiny")
-    grown = replace(before.config, renders=True, finish_widths=(8, 16), finish_blocks=(1, 1), area_px=size[0] * size[1])
-    model_files.save(extended(before, grown), root / "tiny", "", {})
-    return root
+    city = CityConfig(seed=5, n_frames=6, width=64, height=48, cameras=("front",), lidar_azimuth_step_deg=1.2)
+    return drive(tmp_path_factory.mktemp("short"), city, 0, iterations=4, start__gaussians=1000)
 
 
 COMMANDS = """
@@ -262,41 +250,11 @@ def commands(log):
     """Runs ``mudg adapt`` with one thread into a folder, and sends it a signal after some seconds of work; gives the
     exit status."""
     environment = {**os.environ, "MUDG_THREADS": "1", "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parent)}
-    words = [
-        "adapt",
-        log / "scene",
-        "--fused",
-        log / "fuse",
-        "--fitted",
-        log / "fit",
-        "--model",
-        log / "tiny",
-        "--shifts-m",
-        "1",
-        "-1",
-        "--no-gaps",
-        "--block",
-        "1",
-        "--held-out-every",
-        "3",
-        "--fit-iterations",
-        "4",
-        "--steps",
-        "4",
-        "--batch-frames",
-        "2",
-        "--precision",
-        "float32",
-        "--out",
-    ]
-    with subprocess.Popen(
-        [sys.executable, "-c", COMMANDS],
-        env=environment,
-        stdin=subprocess.PIPE,
-        stdout=subprocess.PIPE,
-        text=True,
-        bufsize=1,
-    ) as server:
+    words = ["adapt", log / "scene", "--fused", log / "fuse", "--fitted", log / "fit", "--model", log / "tiny"]
+    words += "--shifts-m 1 -1 --no-gaps --block 1 --held-out-every 3 --fit-iterations 4".split()
+    words += "--steps 4 --batch-frames 2 --precision float32 --out".split()
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
+    with subprocess.Popen([sys.executable, "-c", COMMANDS], env=environment, **pipes) as server:
         orders, answers = server.stdin, server.stdout
         assert orders is not None and answers is not None
 
@@ -341,13 +299,7 @@ def test_an_adaptation_stopped_at_random_moments_is_repeated_to_the_same_files(s
 
 def test_what_cannot_be_adapted_is_refused(log, tmp_path):
     with pytest.raises(UsageError, match="renders"):
-        Adapt(
-            scene=log / "scene",
-            fused=log / "fuse",
-            fitted=log / "fit",
-            out=tmp_path / "a",
-            settings=settings(log, model="embedded-tiny"),
-        ).run()
+        adapted(log, tmp_path / "a", model="embedded-tiny")
     with pytest.raises(InputError, match="too short|cannot be adapted"):
         adapted(log, tmp_path / "b", block=20)
     assert not (tmp_path / "b").exists()

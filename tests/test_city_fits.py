@@ -105,7 +105,7 @@ def test_a_city_is_fitted_and_learnt_from(tmp_path):
     """From the generator over a short fit to a trained model with finisher; the renders resemble what they show."""
     rules = replace(RULES, fit_steps=(60, 100))
     for city in (0, city_clips.HELD_OUT):
-        assert city_clips.write_fitted_city(rules, city, tmp_path / "clips") == (
+        assert city_clips.write_city(rules, city, tmp_path / "clips", city_clips.fit_city) == (
             2 if city == 0 else len(city_clips.shifts_of(RULES, city))
         )
     shifted = clips.read_clip(tmp_path / "clips", 0, 0, [0, 1])

@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 import torch
 
+from mudg import native
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Clip, Condition, FusedCloud, Photo, PointCloud, SweepPoints, Track, View
 from mudg.core import project as visible
 from mudg.core.fusion import SweepShots
 from mudg.diffusion import city_clips, clips, inputs
 from mudg.diffusion import condition as conditions
+from mudg.diffusion.city_clips import HELD_OUT, CityClipRules, shifts_of
 from mudg.diffusion.condition import ConditionRules, WarpSource, build_conditions
 from mudg.diffusion.inputs import ConditionSources, conditions_of
 
@@ -273,10 +275,6 @@ def test_variation_treats_truth_and_condition_alike(tmp_path):
 
 
 def test_city_clips_are_a_function_of_seed_and_number():
-    from mudg import native
-    from mudg.diffusion import city_clips
-    from mudg.diffusion.city_clips import CityClipRules
-
     if native.library() is None:
         pytest.skip("the native library is not built")
     rules = CityClipRules(width=48, height=32, window=1, clips=1)
@@ -293,8 +291,6 @@ def test_city_clips_are_a_function_of_seed_and_number():
 
 
 def test_held_out_cities_have_the_stated_shifts():
-    from mudg.diffusion.city_clips import HELD_OUT, CityClipRules, shifts_of
-
     rules = CityClipRules()
     assert shifts_of(rules, HELD_OUT) == (2.0, -3.0, 4.0, 0.0)
     assert shifts_of(rules, HELD_OUT + 1) == (-2.0, 3.0, -4.0, 0.0)

@@ -23,12 +23,12 @@ from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Condition
 from mudg.core.depth import fit_depth
 from mudg.diffusion import convert, memory_plan, model_files, parallel, published
-from mudg.diffusion import views as loading
 from mudg.diffusion.model import MDM
 from mudg.diffusion.models import model_config
 from mudg.diffusion.published import WorkSplit
 from mudg.diffusion.requests import GeneratedClip, SampleRequest, generated, generated_and_finished
 from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
+from mudg.diffusion.views import check_config, load_any
 from mudg.labels import street_net
 from mudg.labels.depth.inputs import DepthInput
 from mudg.labels.depth.networks import Preparation, TransformersDepth
@@ -222,31 +222,27 @@ def street(tmp_path_factory):
     return root
 
 
+def synthesized(street, out, config):
+    return Synthesize(scene=street / "scene", fused=street / "fuse", out=out, settings=config).run()
+
+
+def labelled(street, out, config):
+    return read_scene(Annotate(scene=street / "scene", out=out, settings=config).run())
+
+
 @pytest.mark.slow
 def test_synthesize_on_a_device_writes_the_same_views(small, street, tmp_path):
     model_files.save(small, tmp_path / "model", "", {})
     config = SynthesizeConfig(
         shifts_m=(1.0, -1.0), model=str(tmp_path / "model"), steps=2, device="cpu", precision="float32", processes=1
     )
-    here = Synthesize(scene=street / "scene", fused=street / "fuse", out=tmp_path / "here", settings=config).run()
+    here = synthesized(street, tmp_path / "here", config)
     with pretend_device():
         elsewhere = replace(config, device="pretend", processes=0)
-        there = Synthesize(
-            scene=street / "scene", fused=street / "fuse", out=tmp_path / "there", settings=elsewhere
-        ).run()
+        there = synthesized(street, tmp_path / "there", elsewhere)
         with pytest.raises(UsageError, match="one process makes all trajectories"):
-            Synthesize(
-                scene=street / "scene",
-                fused=street / "fuse",
-                out=tmp_path / "more",
-                settings=replace(elsewhere, processes=2),
-            ).run()
-        again = Synthesize(
-            scene=street / "scene",
-            fused=street / "fuse",
-            out=tmp_path / "here",
-            settings=replace(elsewhere, processes=1),
-        ).run()
+            synthesized(street, tmp_path / "more", replace(elsewhere, processes=2))
+        again = synthesized(street, tmp_path / "here", replace(elsewhere, processes=1))
     assert again == here  # where a result was computed is no part of what it is
     for name in ("front_shift+1.0", "front_shift-1.0"):
         a, b = read_observations(here / name), read_observations(there / name)
@@ -263,30 +259,23 @@ def in_float16(folder):
 
 
 def test_float16_is_refused_on_the_cpu_and_for_other_models(street, tmp_path):
-    config, given, out = in_float16(tmp_path), (street / "scene", street / "fuse"), tmp_path / "out"
+    config, out = in_float16(tmp_path), tmp_path / "out"
     with pytest.raises(
         UsageError, match=r"float16 is for published-type models on CUDA devices(.|\n)*a published-type model on cpu"
     ):
-        Synthesize(scene=given[0], fused=given[1], out=out, settings=config).run()
+        synthesized(street, out, config)
     with pretend_device(), pytest.raises(UsageError, match="another model on pretend"):
-        Synthesize(
-            scene=given[0],
-            fused=given[1],
-            out=out,
-            settings=replace(config, model="embedded-tiny", guidance=None, device="pretend"),
-        ).run()
+        synthesized(street, out, replace(config, model="embedded-tiny", guidance=None, device="pretend"))
     assert not out.exists()
 
 
 @pytest.mark.slow
 def test_weights_and_views_of_published_type_models_are_in_float16_on_cards(street, tmp_path):
-    config, given, out = in_float16(tmp_path), (street / "scene", street / "fuse"), tmp_path / "out"
-    here = Synthesize(
-        scene=given[0], fused=given[1], out=tmp_path / "here", settings=replace(config, precision="float32")
-    ).run()
+    config, out = in_float16(tmp_path), tmp_path / "out"
+    here = synthesized(street, tmp_path / "here", replace(config, precision="float32"))
     with pretend_device():
-        assert loading.load_any(replace(config, device="pretend")).dtype == torch.float16
-        there = Synthesize(scene=given[0], fused=given[1], out=out, settings=replace(config, device="pretend")).run()
+        assert load_any(replace(config, device="pretend")).dtype == torch.float16
+        there = synthesized(street, out, replace(config, device="pretend"))
     a, b = read_observations(here / "front_shift+1.0"), read_observations(there / "front_shift+1.0")
     apart = [float((a[i].rgb - b[i].rgb).abs().mean()) for i in range(5)]
     assert 0 < max(apart) < 0.02  # measured: see the message of a failure
@@ -295,15 +284,9 @@ def test_weights_and_views_of_published_type_models_are_in_float16_on_cards(stre
 @pytest.mark.slow
 def test_the_shipped_labeller_on_a_device_writes_the_same_labels(street, tmp_path):
     config = AnnotateConfig(device="cpu", processes=1, depth=False)
-    scenes = [read_scene(Annotate(scene=street / "scene", out=tmp_path / "here", settings=config).run())]
+    scenes = [labelled(street, tmp_path / "here", config)]
     with pretend_device(), copies() as crossed:
-        scenes.append(
-            read_scene(
-                Annotate(
-                    scene=street / "scene", out=tmp_path / "there", settings=replace(config, device="pretend")
-                ).run()
-            )
-        )
+        scenes.append(labelled(street, tmp_path / "there", replace(config, device="pretend")))
     for one, other in zip(*(scene.frames for scene in scenes), strict=True):
         here, there = (read_label(scene, f, "semantics") for scene, f in zip(scenes, (one, other)))
         assert np.mean(here != there) < 1e-2
@@ -360,15 +343,9 @@ def test_annotate_on_a_device_writes_the_same_labels(street, tmp_path):
         device="cpu",
         processes=1,
     )
-    scenes = [read_scene(Annotate(scene=street / "scene", out=tmp_path / "here", settings=config).run())]
+    scenes = [labelled(street, tmp_path / "here", config)]
     with pretend_device():
-        scenes.append(
-            read_scene(
-                Annotate(
-                    scene=street / "scene", out=tmp_path / "there", settings=replace(config, device="pretend")
-                ).run()
-            )
-        )
+        scenes.append(labelled(street, tmp_path / "there", replace(config, device="pretend")))
     for one, other in zip(*(scene.frames for scene in scenes), strict=True):
         assert set(one.labels) == set(other.labels)
         classes, depth = (
@@ -384,7 +361,7 @@ def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch)
     for device, error in (("cuda", ResourceError), ("mps:1", ResourceError), ("tpu", UsageError)):
         config = SynthesizeConfig(model=str(tmp_path / "model"), device=device)
         with pytest.raises(error, match="--device"):
-            Synthesize(scene=street / "scene", fused=street / "fuse", out=tmp_path / "out", settings=config).run()
+            synthesized(street, tmp_path / "out", config)
         with pytest.raises(error, match="--device"), parallel.join_processes(device):
             pass
         with pytest.raises(error, match="--device"):
@@ -392,7 +369,7 @@ def test_what_a_device_does_not_do_is_said(street, small, tmp_path, monkeypatch)
     assert not (tmp_path / "out").exists()
     for name in ("offload", "compiled"):
         with pytest.raises(UsageError, match="published-type models only"):
-            loading.check_config(SynthesizeConfig(model=str(tmp_path / "model"), **{name: True}), False)
+            check_config(SynthesizeConfig(model=str(tmp_path / "model"), **{name: True}), False)
 
 
 def test_several_processes_take_a_device_each(monkeypatch):

@@ -19,7 +19,7 @@ from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.steps.settings import PRESETS
 
 TOY = (
-    "import sys; from toy_published import TINY; from mudg.diffusion.published import convert; convert.PublishedConfig"
+    "import sys; from toy_published import TINY; from mudg.diffusion import convert; convert.PublishedConfig"
     " = lambda: TINY\n"
 )
 """Before `convert` alone: checkpoints hold the toy network. Everything else is told by the model's folder."""
@@ -81,12 +81,9 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
     )
     one, two = (published.load(tmp_path / name / "model") for name in ("one", "two"))
     assert ((one.config.width, one.config.height), (two.config.width, two.config.height)) == ((32, 32), (36, 32))
-    kept, before, after = (
-        two.temporal_parameters("transformers"),
-        one.trained_part().state_dict(),
-        two.trained_part().state_dict(),
-    )
-    assert {name for name in before if torch.equal(before[name], after[name])} == kept
+    before, after = (model.trained_part().state_dict() for model in (one, two))
+    unchanged = {name for name in before if torch.equal(before[name], after[name])}
+    assert unchanged == two.temporal_parameters("transformers")
 
     code, words = mudg("adapt log/scene --fused log/fuse --fitted log/fuse --model two/model --out adapted")
     assert code in (2, 3) and "renders" in words and not (tmp_path / "adapted").exists()

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy_clips import HEIGHT, WIDTH, WINDOW, write_clips
+from toy_clips import training_words, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import UsageError
@@ -46,54 +46,22 @@ def start(processes, clips, out, fault="", restarts=0, **changes):
 
 def torchrun(nodes, processes, clips, out, fault="", **changes):
     """Command and environment of a training with `processes` on this node."""
-    flags = {
-        "out": out,
+    usual = {
         "steps": STEPS,
-        "data.clips": clips,
-        "data.cities": 3,
-        "data.first-cities": 2,
-        "data.held-out": 1,
-        "data.width": WIDTH,
-        "data.height": HEIGHT,
-        "data.window": WINDOW,
         "data.clips-per-city": 2,
-        "network.widths": "16 32",
-        "network.blocks": "1 1",
-        "network.spatial-attention": "False True",
-        "network.temporal-attention": "False True",
-        "network.refine-widths": "8 16",
-        "network.refine-blocks": "1 1",
         "network.finish-widths": "8 16",
         "network.finish-blocks": "1 1",
-        "codec.steps": 2,
-        "codec.batch": 2,
-        "codec.fit-batches": 1,
         "optimizer.batch-frames": 16,
         "optimizer.warmup-steps": 1,
-        "score.steps": 1,
         "score.every": 100,
         "precision": "float32",
-        "compute.workers": 0,
-        "compute.log-every": 1,
         "compute.checkpoint-every": 2,
         "compute.checkpoints-kept": 3,
-        **changes,
     }
-    words = [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]
+    words = training_words(clips, out, **usual | changes)
     here = Path(__file__).parent
-    command = [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--rdzv-backend",
-        "c10d",
-        *nodes,
-        "--nproc-per-node",
-        str(processes),
-        str(here / "learn_on_nodes.py"),
-        "learn",
-        *words,
-    ]
+    command = [sys.executable, *"-m torch.distributed.run --rdzv-backend c10d".split(), *nodes]
+    command += ["--nproc-per-node", str(processes), str(here / "learn_on_nodes.py"), "learn", *words]
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(here), *sys.path]),
         "GLOO_SOCKET_IFNAME": "lo",
@@ -146,22 +114,12 @@ def test_a_node_that_vanishes_leaves_the_training_to_the_other(clips, tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    nodes = (
-        "--nnodes",
-        "1:2",
-        "--rdzv-id",
-        "training",
-        "--rdzv-endpoint",
-        f"127.0.0.1:{port}",
-        "--max-restarts",
-        "3",
-        "--rdzv-conf",
-        "last_call_timeout=5,keep_alive_interval=1,keep_alive_max_attempt=3",
-    )
+    nodes = f"--nnodes 1:2 --rdzv-id training --rdzv-endpoint 127.0.0.1:{port} --max-restarts 3 --rdzv-conf".split()
+    patience = "last_call_timeout=5,keep_alive_interval=1,keep_alive_max_attempt=3"
     said = [(tmp_path / f"node{number}").open("w+") for number in range(2)]
     running = []
     for number, end in enumerate(("is_host=true", "is_host=false")):
-        command, environment = torchrun((*nodes[:-1], f"{nodes[-1]},{end}"), 1, clips, out, steps=steps)
+        command, environment = torchrun((*nodes, f"{patience},{end}"), 1, clips, out, steps=steps)
         running.append(subprocess.Popen(command, env=environment, stdout=said[number], stderr=subprocess.STDOUT))
     try:
         began = time.monotonic()
@@ -209,18 +167,8 @@ def test_checkpoints_are_cut_anew_bit_equal(tmp_path):
     before = ""
     for processes, layout in ((1, "fsdp"), (2, "fsdp"), (4, "fsdp"), (4, "hsdp"), (2, "fsdp"), (1, "fsdp")):
         into = tmp_path / f"{len(sums)}"
-        command = [
-            sys.executable,
-            "-m",
-            "torch.distributed.run",
-            "--standalone",
-            "--nproc-per-node",
-            str(processes),
-            str(here / "reshard_together.py"),
-            layout,
-            before,
-            str(into),
-        ]
+        words = f"-m torch.distributed.run --standalone --nproc-per-node {processes}".split()
+        command = [sys.executable, *words, str(here / "reshard_together.py"), layout, before, str(into)]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300)
         assert done.returncode == 0, done.stderr
         sums[into] = done.stdout.split()[-1]

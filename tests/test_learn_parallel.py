@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 from torch import nn
-from toy_clips import HEIGHT, WIDTH, WINDOW, tiny, write_clips
+from toy_clips import tiny, training_words, write_clips
 
 from mudg.base import checkpoint, store
 from mudg.base.errors import IntegrityError, NumericsError, UsageError
@@ -92,45 +92,9 @@ def test_a_run_may_go_on_under_another_layout(clips, tmp_path):
 
 def torchrun(clips, out, **changes):
     """The command that trains on two processes started by torch's launcher."""
-    flags = {
-        "out": out,
-        "steps": 2,
-        "data.clips": clips,
-        "data.cities": 3,
-        "data.first-cities": 2,
-        "data.held-out": 1,
-        "data.width": WIDTH,
-        "data.height": HEIGHT,
-        "data.window": WINDOW,
-        "network.widths": "16 32",
-        "network.blocks": "1 1",
-        "network.spatial-attention": "False True",
-        "network.temporal-attention": "False True",
-        "network.refine-widths": "8 16",
-        "network.refine-blocks": "1 1",
-        "codec.steps": 2,
-        "codec.batch": 2,
-        "codec.fit-batches": 1,
-        "optimizer.batch-frames": 8,
-        "score.steps": 1,
-        "compute.workers": 0,
-        "compute.log-every": 1,
-        "compute.parallel": "fsdp",
-        **changes,
-    }
-    words = [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]
-    return [
-        sys.executable,
-        "-m",
-        "torch.distributed.run",
-        "--standalone",
-        "--nproc-per-node",
-        "2",
-        "-m",
-        "mudg",
-        "learn",
-        *words,
-    ]
+    usual = {"steps": 2, "optimizer.batch-frames": 8, "compute.parallel": "fsdp"}
+    launcher = "-m torch.distributed.run --standalone --nproc-per-node 2 -m mudg learn".split()
+    return [sys.executable, *launcher, *training_words(clips, out, **usual | changes)]
 
 
 @pytest.mark.slow

@@ -106,10 +106,7 @@ def test_the_loss_of_a_batch_is_the_mean_of_its_parts(converted, clips):
 
     @torch.no_grad()
     def losses(step, part):
-        drawn = [
-            corner(clip)
-            for clip in learn.clips_of_cities(settings, clips, points_alone=True).draw(step, 2, 4, "batch", part)
-        ]
+        drawn = corners(settings, clips, step, 2, 4, "batch", part)
         return model(drawn, BatchPart(settings.seed, step, part.start, 2), LossSettings(None, 1.0, 0.2))
 
     for step in range(2):
@@ -202,9 +199,7 @@ def test_what_goes_without_the_reference(converted, clips, share, frame, matters
     still shows it."""
     settings = published_settings(converted, clips)
     model, _ = models.starting_model(settings)
-    (clip,) = (
-        corner(clip) for clip in learn.clips_of_cities(settings, clips, points_alone=True).draw(0, 1, 4, "batch")
-    )
+    (clip,) = corners(settings, clips, 0, 1, 4, "batch")
     other = replace(clip, condition=replace(clip.condition, reference=1 - clip.condition.reference))
     rules = LossSettings(None, 1.0, share, frame_dropout=frame)
     with torch.no_grad():
@@ -216,9 +211,7 @@ def test_what_goes_without_the_reference(converted, clips, share, frame, matters
 def test_the_scope_of_dropout_changes_no_clip_that_keeps_its_reference(converted, clips):
     settings = published_settings(converted, clips)
     model, _ = models.starting_model(settings)
-    (clip,) = (
-        corner(clip) for clip in learn.clips_of_cities(settings, clips, points_alone=True).draw(0, 1, 4, "batch")
-    )
+    (clip,) = corners(settings, clips, 0, 1, 4, "batch")
     with torch.no_grad():
         losses = {
             (share, frame): float(

@@ -131,6 +131,11 @@ def test_a_view_never_sees_its_own_image(log, tmp_path):
     assert bool(clip.condition.warped[1].any())
 
 
+def depth_term(truth):
+    code = truth.depth_code
+    return float(losses.depth_code_error(torch.zeros_like(code), code, truth.depth_known, 1.0))
+
+
 def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
     opened = log_clips.OpenLog(measured[1], replace(RULES, width=64, height=32))
     window = log_clips.log_windows(opened.scene, RULES)[0]
@@ -141,10 +146,7 @@ def test_unknown_depth_has_no_part_in_the_loss(measured, tmp_path):
 
     def term(depth, known):
         filled = replace(clip, depth=torch.where(known, clip.depth, depth))
-        truth = model.encode_truth([filled]).pixels
-        return float(
-            losses.depth_code_error(torch.zeros_like(truth.depth_code), truth.depth_code, truth.depth_known, 1.0)
-        )
+        return depth_term(model.encode_truth([filled]).pixels)
 
     assert term(torch.tensor(3.0), clip.depth_valid) == term(torch.tensor(90.0), clip.depth_valid)
     assert term(torch.tensor(3.0), ~clip.depth_valid) != term(torch.tensor(90.0), ~clip.depth_valid)
@@ -161,19 +163,8 @@ def test_a_model_goes_on_learning_on_a_log(log, tmp_path):
     run.mkdir()
     for name, folder in (("scene", log[1].scene), ("fuse", log[1].fused)):
         (run / name).symlink_to(folder)
-    config = tiny(
-        "",
-        start=str(first),
-        scenes=(str(run),),
-        steps=2,
-        score_every=1,
-        log_every=1,
-        stride=2,
-        held_out_every=4,
-        window=4,
-        width=64,
-        height=32,
-    )
+    cut = {"stride": 2, "held_out_every": 4, "window": 4, "width": 64, "height": 32}
+    config = tiny("", start=str(first), scenes=(str(run),), steps=2, score_every=1, log_every=1, **cut)
     made = Learn(out=tmp_path / "tuned", settings=config).run()
     index = json.loads((tmp_path / "tuned" / "clips" / "log_clips.json").read_text())
     assert index["rules"]["width"] == 64 and index["rules"]["height"] == 32  # the camera's aspect of 2
@@ -258,10 +249,8 @@ def test_the_weight_of_depth_scales_its_loss(annotated):
     model = MDM(models.model_config(tiny(Path(), width=64, height=32, window=3)))
 
     def term(confidence):
-        truth = model.pixel_truth([replace(clip, depth_confidence=torch.full_like(clip.depth, confidence))])
-        return float(
-            losses.depth_code_error(torch.zeros_like(truth.depth_code), truth.depth_code, truth.depth_known, 1.0)
-        )
+        weighted = replace(clip, depth_confidence=torch.full_like(clip.depth, confidence))
+        return depth_term(model.pixel_truth([weighted]))
 
     assert term(0.25) == pytest.approx(term(1.0) / 4, rel=1e-4) and term(1.0) > 0
     cells = model.encode_truth([replace(clip, depth_confidence=torch.full_like(clip.depth, 0.5))]).depth_known

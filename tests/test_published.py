@@ -18,6 +18,7 @@ from mudg.base.store import read_safetensors
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
 from mudg.diffusion import convert, memory_plan, published
+from mudg.diffusion.condition import ConditionRules, build_conditions
 from mudg.diffusion.published import PublishedConfig, WorkSplit
 from mudg.diffusion.published_network import (
     LATENT_SCALE,
@@ -34,7 +35,9 @@ from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
 from mudg.diffusion.views import recorded_at_pose, recorded_images
 from mudg.networks import clip
 from mudg.networks.clip import ImageTower, TextTower, TowerConfig
+from mudg.scene.clouds import read_fused
 from mudg.scene.observations import read_observations
+from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.ingest import Fuse
 from mudg.steps.synthesize import Synthesize
@@ -218,12 +221,6 @@ def test_posterior_is_sampled_or_not_as_asked():
     assert float(standard.std()) == pytest.approx(1.0, abs=0.03)
 
 
-def test_slices_of_frames_change_nothing(model):
-    z = torch.randn(5, 4, 8, 12, generator=torch.Generator().manual_seed(0))
-    with torch.no_grad():
-        assert torch.allclose(model.codec.decode_image(z, 2), model.codec.decode_image(z, 5), atol=1e-5)
-
-
 def test_missing_is_zero_and_the_reference_is_frame_zero():
     config = replace(TINY, codec=replace(TINY.codec, posterior="mean"))
     model = tiny_model()
@@ -263,9 +260,8 @@ def test_cuts_of_the_work_do_not_change_the_sample(model):
         assert torch.allclose(z, second.latents[name], rtol=1e-3, atol=1e-3), name
     assert torch.allclose(first.rgb, second.rgb, atol=1e-3)
     assert torch.allclose(first.depth, second.depth, atol=0.1)
-    assert first.rgb.shape == (4, 3, 8, 12)
-    assert first.depth.shape == (4, 1, 8, 12)
-    assert first.semantics.shape == (4, 8, 12)
+    shapes = [tuple(x.shape) for x in (first.rgb, first.depth, first.semantics)]
+    assert shapes == [(4, 3, 8, 12), (4, 1, 8, 12), (4, 8, 12)]
     assert 0 <= float(first.confidence.min()) <= float(first.confidence.max()) <= 1
     again = model.sample(condition, SampleRequest(3, seed=5, index=1))
     assert torch.equal(again.rgb, first.rgb)
@@ -507,10 +503,6 @@ def test_synthesize_with_a_converted_model(street, tmp_path, monkeypatch):
 
 def test_the_released_resizing(street):
     """Colours by the nearest pixel, depth bilinearly with its zeros mixed in; nothing is filled."""
-    from mudg.diffusion.condition import ConditionRules, build_conditions
-    from mudg.scene.clouds import read_fused
-    from mudg.scene.read import read_scene
-
     scene, cloud = read_scene(street / "scene"), read_fused(street / "fused")
     view = scene.frames_of("front")[0].view
     native = ConditionRules(48, 32, published=True)
@@ -526,8 +518,6 @@ def test_the_released_resizing(street):
 
 
 def test_the_reference_fits_only_where_it_was_taken(street):
-    from mudg.scene.read import read_scene
-
     scene = read_scene(street / "scene")
     recorded = recorded_images(scene, SynthesizeConfig(given_classes=False))
     view = recorded[0].view
@@ -547,13 +537,6 @@ def test_short_trajectories_are_refused_in_words(street, tmp_path):
     )
     with pytest.raises(UsageError, match="fixed number of frames"):
         Synthesize(scene=root / "scene", fused=root / "fused", out=root / "out", settings=config).run()
-
-
-def test_models_come_back_as_they_were(street, model):
-    loaded = published.load(street / "model")
-    condition = some_condition()
-    loaded.text.copy_(model.text)
-    assert torch.equal(loaded.sample(condition, SampleRequest(2)).rgb, model.sample(condition, SampleRequest(2)).rgb)
 
 
 @pytest.mark.slow

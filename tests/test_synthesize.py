@@ -14,7 +14,6 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera, View
 from mudg.core import trajectory
 from mudg.diffusion import condition, model_files, synthesize
-from mudg.diffusion import condition as stacked
 from mudg.diffusion.condition import PreparedImages
 from mudg.diffusion.model import MDM, MDMConfig
 from mudg.diffusion.models import extended
@@ -167,11 +166,13 @@ def test_prepared_images_are_kept_exactly():
 
 def test_conditions_in_files_change_nothing(world, large, tmp_path, monkeypatch):
     mapped, map_array = [], scratch.mapped_array
-    monkeypatch.setattr(stacked, "LARGE_PIXELS", 0)
+    monkeypatch.setattr(condition, "LARGE_PIXELS", 0)
     monkeypatch.setattr(
         scratch, "mapped_array", lambda folder, *asked: mapped.append(folder) or map_array(folder, *asked)
     )
     filed = made(world, tmp_path / "filed", full_size=True)
+    first = read_observations(large / "front_shift+1.0")[2]
+    assert first.rgb.shape[1:] == first.semantics.shape == (64, 96) and first.view.camera.width == 96
     assert set(mapped) == {filed}
     assert sorted(p.relative_to(filed) for p in filed.rglob("*")) == sorted(
         p.relative_to(large) for p in large.rglob("*")
@@ -180,13 +181,6 @@ def test_conditions_in_files_change_nothing(world, large, tmp_path, monkeypatch)
         assert torch.equal(a.rgb, b.rgb)
         assert torch.equal(a.depth.nan_to_num(), b.depth.nan_to_num())
         assert torch.equal(a.semantics, b.semantics)
-
-
-def test_full_size_views_have_the_cameras_size(large):
-    first = read_observations(large / "front_shift+1.0")[2]
-    assert first.rgb.shape == (3, 64, 96)
-    assert first.semantics.shape == (64, 96)
-    assert first.view.camera.width == 96
 
 
 @pytest.mark.parametrize("frames", [1, 3, 8, 9, 13, 24, 199])
@@ -202,12 +196,7 @@ def test_windows_cover_every_frame(frames, overlap):
         assert len(after) == 8
 
 
-def test_overlap_must_leave_something_new():
-    with pytest.raises(UsageError):
-        windows(20, 8, 8)
-
-
-def test_detail_is_given_back_where_the_sample_agrees(world):
+def test_detail_is_given_back_where_the_sample_agrees():
     generator = torch.Generator().manual_seed(0)
     fine = torch.rand(2, 3, 32, 48, generator=generator)
     coarse = torch.nn.functional.interpolate(fine, size=(16, 24), mode="area")
@@ -229,6 +218,8 @@ def test_detail_is_given_back_where_the_sample_agrees(world):
 
 
 def test_bad_requests(world, tmp_path):
+    with pytest.raises(UsageError, match="overlap"):
+        windows(20, 8, 8)
     with pytest.raises(InputError, match="no diffusion model"):
         made(world, tmp_path / "a", model=str(tmp_path / "nowhere"))
     with pytest.raises((InputError, UsageError)):

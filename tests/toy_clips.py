@@ -153,3 +153,31 @@ def before_each_batch(act: Callable[[int], None]) -> Iterator[None]:
 def interrupted_at(step: int) -> contextlib.AbstractContextManager[None]:
     """Within, the user interrupts a training during this step."""
     return before_each_batch(lambda now: signal.raise_signal(signal.SIGINT) if now == step else None)
+
+
+def training_words(clips: Path, out: Path, **changes: Any) -> list[str]:
+    """Words after `mudg learn` for a training like `tiny`; changes by the names of the flags."""
+    flags = {
+        "out": out,
+        "data.clips": clips,
+        "data.cities": 3,
+        "data.first-cities": 2,
+        "data.held-out": 1,
+        "data.width": WIDTH,
+        "data.height": HEIGHT,
+        "data.window": WINDOW,
+        "network.widths": "16 32",
+        "network.blocks": "1 1",
+        "network.spatial-attention": "False True",
+        "network.temporal-attention": "False True",
+        "network.refine-widths": "8 16",
+        "network.refine-blocks": "1 1",
+        "codec.steps": 2,
+        "codec.batch": 2,
+        "codec.fit-batches": 1,
+        "score.steps": 1,
+        "compute.workers": 0,
+        "compute.log-every": 1,
+        **changes,
+    }
+    return [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]

@@ -1,8 +1,8 @@
 """adapt: the diffusion model, trained for a few steps on the log that it is going to work on.
 
-Read from `PlannedAdaptation`: short fits to what the lessons of the log show, clips of them, some steps of
-the `learn` verb, and the comparison on blocks of frames that were kept for it. Frames that the scene holds
-out are never read.
+Read from `PlannedAdaptation`: short fits to what the lessons of the log show, clips of them, some steps of the
+`learn` verb, and the comparison on blocks of frames that were kept for it. Frames that the scene holds out are never
+read.
 
     OUT/model/            the model to use: adapted, or the one started from if that is as good (same layout as
                           `learn`'s)

@@ -94,14 +94,9 @@ MARGIN_M: Final = 4.2
 the camera; their clips are shifted by as much less."""
 
 
-def aspect_of(city: int) -> float:
-    """Width over height of a city's images."""
-    return ASPECTS[city % len(ASPECTS)]
-
-
 def sized(width: int, height: int, city: int, multiple: int = 16) -> tuple[int, int]:
     """Size of a city's images: the area of width x height at the city's aspect, in multiples of a number of pixels."""
-    aspect = aspect_of(city)
+    aspect = ASPECTS[city % len(ASPECTS)]
     rows = max(1, round(math.sqrt(width * height / aspect) / multiple))
     columns = max(1, round(rows * aspect))
     return columns * multiple, rows * multiple
@@ -169,7 +164,11 @@ def draw_sensors(seed: int, city: int, config: CityConfig) -> SensorFaults:
     if rng.random() < 0.2:
         place = (float(rng.uniform(0.5, 2.0)), float(rng.uniform(-0.9, 0.9)), float(rng.uniform(0.8, 2.0)))
         second = LidarMount(place, int(rng.choice([16, 32])), -20.0, float(rng.choice([2.0, 15.0])))
-    return SensorFaults(looks, cameras, _lidar_faults(rng), _pose_faults(rng), _box_faults(rng), second)
+    lidar, upto = _lidar_faults(rng), lambda most: float(rng.uniform(0, most))
+    has = [float(rng.random() < 0.6) for _ in range(2)]
+    poses = PoseFaults(has[0] * upto(0.03), has[0] * upto(0.08), has[1] * upto(0.05), has[1] * upto(0.15))
+    boxes = BoxFaults() if rng.random() < 0.25 else BoxFaults(upto(0.15), upto(2.0), upto(0.07))
+    return SensorFaults(looks, cameras, lidar, poses, boxes, second)
 
 
 def _camera_faults(rng: np.random.Generator, scale: float) -> CameraFaults:
@@ -201,22 +200,6 @@ def _lidar_faults(rng: np.random.Generator) -> LidarFaults:
         hole_share=float((rng.random() < 0.15) * rng.uniform(0.02, 0.15)),
         dropout=float((rng.random() < 0.3) * rng.uniform(0.05, 0.5)),
     )
-
-
-def _pose_faults(rng: np.random.Generator) -> PoseFaults:
-    has = [float(rng.random() < 0.6) for _ in range(2)]
-    return PoseFaults(
-        float(has[0] * rng.uniform(0, 0.03)),
-        float(has[0] * rng.uniform(0, 0.08)),
-        float(has[1] * rng.uniform(0, 0.05)),
-        float(has[1] * rng.uniform(0, 0.15)),
-    )
-
-
-def _box_faults(rng: np.random.Generator) -> BoxFaults:
-    if rng.random() < 0.25:
-        return BoxFaults()
-    return BoxFaults(float(rng.uniform(0, 0.15)), float(rng.uniform(0, 2.0)), float(rng.uniform(0, 0.07)))
 
 
 # city log -----------------------------------------------------------------------------------------
@@ -625,12 +608,6 @@ def write_city(rules: CityClipRules, city: int, folder: Path, fit: FitCity | Non
 # fits to cities ----------------------------------------------------------------------------------------
 #
 # Short fits to generated cities, whose renders become part of the conditions that the diffusion model is trained on.
-
-
-def write_fitted_city(rules: CityClipRules, city: int, folder: Path) -> int:
-    """Make one city's clips with renders of a fit and write its shard; returns the number of clips. For a process of
-    its own."""
-    return write_city(rules, city, folder, fit_city)
 
 
 def fit_city(rules: CityClipRules, city: int, log: CityLog) -> RenderAt:

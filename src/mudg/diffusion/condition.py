@@ -1,4 +1,4 @@
-"""Conditions and training clips for the diffusion model.
+"""Conditions of the diffusion model.
 
 `build_conditions` makes the model's input for a path of views from a fused cloud and recorded images:
 
@@ -15,7 +15,7 @@
 Steps 2 to 7 are what the published system does not do; `ConditionRules(published=True)` gives its condition instead:
 points only, zero where nothing is known, the reference image in frame 0 being put in by the model.
 
-Training clips are made of these in `from_city.py` and `from_log.py`.
+Training clips are made of these in `city_clips.py` and `log_clips.py`.
 """
 
 from __future__ import annotations
@@ -117,14 +117,6 @@ def _pulled(color: Tensor, weight: Tensor) -> Tensor:
     coarse = _pulled(coarse * (share > 0), (share > 0).float())
     larger = functional.interpolate(coarse, size=color.shape[-2:], mode="bilinear", align_corners=False)
     return color + (1 - weight) * larger
-
-
-def uncertain_there(render: RenderPlanes, vacated: Vacated, hole: Tensor, color: Tensor) -> RenderPlanes:
-    """A render that claims to know nothing where something stood, but for what other photographs determined, and shows
-    in the hole what the condition does."""
-    unknown = vacated.mask & ~vacated.known(render)
-    certainty = torch.where(unknown, torch.zeros_like(render.certainty), render.certainty)
-    return replace(render, color=torch.where(hole, color, render.color), certainty=certainty)
 
 
 # condition ----------------------------------------------------------------------------------------
@@ -256,7 +248,11 @@ class DrawnCloud:
         near &= _among_measured(sparse, depth, rules) | ~other
         surface_seen = (far_ids != palette.ID["sky"]) & (far_ids != palette.UNLABELLED)
         hidden = ~solid & (below_horizon(view, rules.ground_slope) | surface_seen) & bool(valid.any())
-        depth = torch.where(valid, depth, _levelled(view, depth, ids, nearest).clamp(max=rules.far_m))
+        # ground goes on at the height, not at the depth, of the nearest measured pixel
+        falls = -ray_directions(view)[2]
+        level = torch.isin(ids, GROUND_IDS) & (falls > LEAST_FALL) & (falls[nearest] > LEAST_FALL)
+        levelled = torch.where(level, depth * falls[nearest] / falls.clamp(min=LEAST_FALL), depth)
+        depth = torch.where(valid, depth, levelled.clamp(max=rules.far_m))
         render = replace(
             render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics)
         )
@@ -316,7 +312,11 @@ class Surfaces:
         # what stood there, or its shadow, may have coloured points: of ground, only their place counts
         hole = self.vacated.mask & ~found
         color, ids = continued(color, ids, self.vacated, hole)
-        render = None if self.render is None else uncertain_there(self.render, self.vacated, hole, color)
+        render = self.render
+        if render is not None:  # it knows nothing where something stood, but for what other photographs determined
+            unknown = self.vacated.mask & ~self.vacated.known(render)
+            certainty = torch.where(unknown, torch.zeros_like(render.certainty), render.certainty)
+            render = replace(render, color=torch.where(hole, color, render.color), certainty=certainty)
         return replace(self, measured=self.measured & ~(hole & ~ground), render=render), color, ids, found
 
 
@@ -461,7 +461,7 @@ def build_conditions(
         InputError: no views.
     """
     if not views:
-        raise InputError("a condition needs at least one view", where="clips.build_conditions")
+        raise InputError("a condition needs at least one view", where="build_conditions")
     small = [view.resized(rules.width, rules.height) for view in views]
     among = [range(len(recorded))] * len(views) if among is None else among
     reference = _reference(small[0], [recorded[n] for n in among[0]], rules, recolor)
@@ -597,15 +597,6 @@ def _among_measured(sparse: ProjectedPoints, depth: Tensor, rules: ConditionRule
     for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
         between |= on_side(down, right) & on_side(-down, -right)
     return between
-
-
-def _levelled(view: View, depth: Tensor, ids: Tensor, nearest: tuple[Tensor, Tensor]) -> Tensor:
-    """Filled depth f32[H,W] in which ground goes on at the height, not at the depth, of the nearest measured pixel;
-    `ids` u8[H,W] are that pixel's classes."""
-    falls = -ray_directions(view)[2]
-    there = falls[nearest]
-    level = torch.isin(ids, GROUND_IDS) & (falls > LEAST_FALL) & (there > LEAST_FALL)
-    return torch.where(level, depth * there / falls.clamp(min=LEAST_FALL), depth)
 
 
 def _published_condition(

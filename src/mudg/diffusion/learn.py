@@ -294,8 +294,8 @@ def making_clips(source: TrainingClips, rules: CityClipRules) -> contextlib.Abst
             "training clips cannot be written here", where=str(folder), remedy="choose another --data.clips"
         )
     log.info(f"learn: {len(missing)} cities to generate into {folder}, {workers} processes")
-    make = city_clips.write_fitted_city if rules.fitted else city_clips.write_city
-    return calls_beside(make, [(rules, n, folder) for n in missing], workers)
+    fit = city_clips.fit_city if rules.fitted else None
+    return calls_beside(city_clips.write_city, [(rules, n, folder, fit) for n in missing], workers)
 
 
 def log_rules(config: LearnConfig, multiple: int, points_alone: bool = False) -> LogClipRules:
@@ -445,14 +445,8 @@ def _begin(model: Model, config: LearnConfig, out: Path, ranks: Ranks) -> tuple[
         for part in trained.values():
             parallel.recompute(part)
     spread = Spread(model, trained, ranks, config.compute.parallel, config.compute.processes_per_replica)
-    rules = config.optimizer
-    optimizer = torch.optim.AdamW(
-        [p for p in trained.parameters() if p.requires_grad],
-        lr=rules.lr,
-        betas=rules.betas,
-        weight_decay=WEIGHT_DECAY,
-        fused=True,
-    )
+    rules, moving = config.optimizer, [p for p in trained.parameters() if p.requires_grad]
+    optimizer = torch.optim.AdamW(moving, lr=rules.lr, betas=rules.betas, weight_decay=WEIGHT_DECAY, fused=True)
     average = None
     if rules.average_decay:
         average = {name: value.detach().clone() for name, value in trained.state_dict().items()}
@@ -527,7 +521,8 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
                 for name, value in {**loss.terms, "total": float(loss.total.detach())}.items():
                     terms[name] = terms.get(name, 0.0) + value
             terms, stop = agreed_terms(ranks, terms, len(parts), step, "network", stop=interruption.requested)
-            norm = parallel.clip_gradients(state.trained, config.optimizer.clip_norm)
+            limit = config.optimizer.clip_norm or float("inf")
+            norm = float(parallel.gathered(torch.nn.utils.clip_grad_norm_(state.trained.parameters(), limit)))
             agreed_terms(ranks, {"gradient norm": norm}, 1, step, "network")
             state.optimizer.step()
             state.step = done = step + 1
@@ -539,7 +534,11 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
             last = done == config.steps
             if done % config.compute.log_every == 0 or last:
                 if ranks.leads:
-                    _record(run_dir, board, done, {"frames": frames, "rate": round(rate, 3), **mean_of(recent)})
+                    values = {"frames": frames, "rate": round(rate, 3), **mean_of(recent)}
+                    run_dir.log(step=done, **values)
+                    score.plot_losses(run_dir.path / "log.jsonl", run_dir.path / "loss.png")
+                    for name, value in values.items() if board is not None else ():
+                        board.add_scalar(f"learn/{name}", value, done)
                 recent = []
             if done % config.compute.checkpoint_every == 0 or last or stop:
                 took_s = state.save(out, ranks, facts, config.compute.checkpoints_kept)
@@ -558,15 +557,6 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
 
 def _picture(run_dir: RunDir, step: int) -> Path:
     return run_dir.path / "samples" / f"{step:07d}.png"
-
-
-def _record(run_dir: RunDir, board: Any, step: int, values: dict[str, float]) -> None:
-    """A line of the log, the loss curve, and the same for TensorBoard if it is wanted."""
-    run_dir.log(step=step, **values)
-    score.plot_losses(run_dir.path / "log.jsonl", run_dir.path / "loss.png")
-    if board is not None:
-        for name, value in values.items():
-            board.add_scalar(f"learn/{name}", value, step)
 
 
 def loss_settings(config: LearnConfig, weights: Tensor) -> LossSettings:

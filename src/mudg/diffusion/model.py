@@ -1,8 +1,8 @@
 """The multi-modal diffusion model: from a sparse, projected point cloud to dense colour, depth and semantic video.
 
 Read from the bottom up: `MDM` holds the codec, the noise schedule and the denoising network, and has three things to
-do, `encode_condition`, `loss` and `sample`. The networks are in `network.py`, reading and
-writing in `model_files.py`.
+do, `encode_condition`, `loss` and `sample`. The networks are in `network.py`, reading and writing in
+`model_files.py`.
 
 The network's input is, per latent cell, [noisy latents of all modalities | colour condition | depth condition |
 backdrop | masks of what was seen | classes of the condition]. It states the clean latents of all modalities at once,
@@ -47,7 +47,6 @@ from mudg.diffusion.network import (
 from mudg.diffusion.requests import (
     GeneratedClip,
     SampleRequest,
-    StartClip,
     check_image_size,
     confidence_of,
     denoised,
@@ -284,7 +283,11 @@ class MDM(nn.Module):
         steps = noise.stratified_steps(part.count, len(self.schedule), generator)
         t = steps[part.first : part.first + len(clips)].to(truth.shares.device)
         weight = noise.loss_weight(self.schedule, t).view(-1, 1, 1, 1, 1)
-        eps = {m: self._clip_noise(truth.latents[m], generator.initial_seed(), part.first, m) for m in MODALITIES}
+        eps = {}
+        for m, z in truth.latents.items():  # clip by clip: that of a clip depends on its number alone
+            draws = (seeds.torch_generator(generator.initial_seed(), part.first + i, m) for i in range(len(z)))
+            own = [noise.video_noise((1, *z.shape[1:]), draw, self.config.shared_noise) for draw in draws]
+            eps[m] = torch.cat(own).to(z.device)
         x = {m: self.schedule.add_noise(truth.latents[m], eps[m], t) for m in MODALITIES}
         stated, log_shares = self.predict(x, encoded, t)
         errors = {
@@ -325,16 +328,6 @@ class MDM(nn.Module):
             torch.cat([getattr(clip, name) for clip in clips]) for name in ("rgb", "depth", "depth_weight", "semantics")
         )
         return PixelTruth(rgb * 2 - 1, self.codec.linear_depth_code(depth), ids, weight)
-
-    def _clip_noise(self, like: Tensor, seed: int, first: int, name: str) -> Tensor:
-        """Noise shaped `like` [B,T,C,h,w], clip by clip from seeds of their own: that of clip `first + i` depends on
-        nothing else."""
-        shape = (1, *like.shape[1:])
-        draws = [
-            noise.video_noise(shape, seeds.torch_generator(seed, first + i, name), self.config.shared_noise)
-            for i in range(len(like))
-        ]
-        return torch.cat(draws).to(like.device)
 
     def _refiner_terms(
         self,
@@ -530,7 +523,13 @@ class MDM(nn.Module):
         device, shared = encoded.planes.device, self.config.shared_noise
         draw = lambda: noise.video_noise((*lead, sum(sizes), *cell), generator, shared).to(device)  # noqa: E731
         known = None if request.known is None else torch.cat([request.known[m] for m in MODALITIES], 1)[None].to(device)
-        begun = None if request.start is None else self._encode_start(request.start, device)
+        begun = None
+        if request.start is not None:  # the latents that the sample begins from, and the freedom of their cells
+            begin = request.start
+            rgb, depth, ids = (x[None].to(device) for x in (begin.rgb, begin.depth, begin.semantics))
+            shares = self.codec.shares_to_latent(cell_shares(ids))
+            start = torch.cat([self.codec.encode_rgb(rgb), self.codec.encode_depth(depth), shares], 2)
+            begun = start, functional.max_pool2d(begin.freedom.to(device), self.codec.factor)[None]
 
         def denoise(x: Tensor, t: int) -> Tensor:
             at = torch.full((lead[0],), t, device=device)
@@ -545,14 +544,6 @@ class MDM(nn.Module):
             x, estimates = denoised(denoise, draw, self.schedule, request, "x0")
         color = lambda z: z[:, :, : sizes[0]]  # noqa: E731
         return dict(zip(MODALITIES, x.split(sizes, 2))), mean_change([color(e) for e in estimates], color(x))
-
-    def _encode_start(self, start: StartClip, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Latents [1,T,C,h,w] of the clip that a sample begins from, and the freedom f32[1,T,1,h,w] of their cells."""
-        rgb, depth, ids = (x[None].to(device) for x in (start.rgb, start.depth, start.semantics))
-        shares = self.codec.shares_to_latent(cell_shares(ids))
-        latents = torch.cat([self.codec.encode_rgb(rgb), self.codec.encode_depth(depth), shares], 2)
-        freedom = functional.max_pool2d(start.freedom.to(device), self.codec.factor)[None]
-        return latents, freedom
 
 
 @dataclass(frozen=True)

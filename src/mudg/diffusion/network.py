@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Protocol
+from typing import Protocol, Self
 
 import torch
 from torch import Tensor, nn
@@ -289,7 +289,21 @@ class UNet(nn.Module):
 
 
 @dataclass(frozen=True)
-class ConditionPixels:
+class PixelPlanes:
+    """Tensors of the same pixels."""
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The same with ``change`` applied to every tensor."""
+        planes = (getattr(self, f.name) for f in fields(self))
+        return type(self)(*(None if x is None else change(x) for x in planes))
+
+    def crop(self, rows: slice, columns: slice) -> Self:
+        """A rectangle of pixels."""
+        return self.map(lambda x: x[..., rows, columns])
+
+
+@dataclass(frozen=True)
+class ConditionPixels(PixelPlanes):
     """The condition at pixel resolution: color, backdrop f32[N,3,H,W] in [-1,1]; depth_code f32[N,1,H,W]; valid, warped
     f32[N,1,H,W]; ids, backdrop_ids u8[N,1,H,W], 255 = unknown. N = clips times frames. For models that use renders also
     render f32[N,3,H,W] in [-1,1], render_code f32[N,1,H,W] (depth), alpha, certainty f32[N,1,H,W] (alpha -1: no
@@ -312,15 +326,6 @@ class ConditionPixels:
     def grid(self) -> tuple[int, int, int]:
         """N, H, W."""
         return len(self.color), int(self.color.shape[-2]), int(self.color.shape[-1])
-
-    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
-        """A rectangle of pixels."""
-        return self.map(lambda x: x[..., rows, columns])
-
-    def map(self, change: Callable[[Tensor], Tensor]) -> ConditionPixels:
-        """The same with ``change`` applied to every tensor."""
-        parts = (getattr(self, f.name) for f in fields(self))
-        return ConditionPixels(*(None if x is None else change(x) for x in parts))
 
 
 @dataclass(frozen=True)
@@ -459,7 +464,7 @@ class Refiner(CellNet):
 
 
 @dataclass(frozen=True)
-class PixelTruth:
+class PixelTruth(PixelPlanes):
     """What the refiner should give: rgb f32[N,3,H,W] in [-1,1], depth code f32[N,1,H,W], ids i64[N,H,W] (255 =
     unlabelled); depth_known f32[N,1,H,W]: 1 where the depth is true, 0 where it only fills a gap."""
 
@@ -467,10 +472,6 @@ class PixelTruth:
     depth_code: Tensor
     ids: Tensor
     depth_known: Tensor
-
-    def crop(self, rows: slice, columns: slice) -> PixelTruth:
-        """A rectangle of pixels."""
-        return PixelTruth(*(x[..., rows, columns] for x in (self.rgb, self.depth_code, self.ids, self.depth_known)))
 
 
 # finisher -----------------------------------------------------------------------------------------
@@ -487,7 +488,7 @@ LEAST_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
-class Made:
+class Made(PixelPlanes):
     """A generated clip, or a finished one: rgb f32[N,3,H,W] in [-1,1], depth_code f32[N,1,H,W], ids u8[N,1,H,W],
     log_error f32[N,1,H,W]: logarithm of the expected absolute error of rgb."""
 
@@ -495,10 +496,6 @@ class Made:
     depth_code: Tensor
     ids: Tensor
     log_error: Tensor
-
-    def crop(self, rows: slice, columns: slice) -> Made:
-        """A rectangle of pixels."""
-        return Made(*(getattr(self, f.name)[..., rows, columns] for f in fields(self)))
 
     def enlarged(self, size: tuple[int, int], rows: tuple[int, int], columns: tuple[int, int]) -> Made:
         """The clip enlarged to `size` (height, width), of that only the rectangle rows x columns, which may reach
@@ -638,8 +635,13 @@ class PixelSource(Protocol):
     """The condition of a clip at the size that is wanted (N, H, W), of which one rectangle at a time is asked."""
 
     @property
-    def grid(self) -> tuple[int, int, int]: ...
-    def crop(self, rows: slice, columns: slice) -> ConditionPixels: ...
+    def grid(self) -> tuple[int, int, int]:
+        """N, H, W."""
+        ...
+
+    def crop(self, rows: slice, columns: slice) -> ConditionPixels:
+        """A rectangle of pixels."""
+        ...
 
 
 def finish_in_tiles(

@@ -359,12 +359,6 @@ def _shard_axis(value: Tensor) -> int:
     return placements.index(Shard(0))
 
 
-def clip_gradients(part: nn.Module, limit: float) -> float:
-    """Norm of all gradients over all processes; they are scaled down to `limit` if that is not 0."""
-    norm = torch.nn.utils.clip_grad_norm_(part.parameters(), limit or float("inf"))
-    return float(gathered(norm))
-
-
 # a step's end -------------------------------------------------------------------------------------
 
 
@@ -443,12 +437,12 @@ class TrainingState:
 
         All processes must call this together.
         """
-        found = {}
+        whole = {}
         for name, value in (self.average or self.trained.state_dict()).items():
             tensor = gathered(value)
             if ranks.leads:
-                found[name] = tensor
-        return found
+                whole[name] = tensor
+        return whole
 
     def _moments(self) -> dict[str, dict[str, Tensor]]:
         names = {id(p): name for name, p in self.trained.named_parameters()}
@@ -472,12 +466,8 @@ class TrainingState:
                 for name, tensors in groups.items():
                     write_rows(partial, name, ranks.rank, tensors)
 
-        if not ranks.leads:
-            ranks.wait()
-            ranks.all_do(write_own)
-            ranks.wait()
-            return time.monotonic() - began
-        with checkpoint.writing(folder, self.step, {**facts, "processes": ranks.size, "sharded": sharded}, keep):
+        record = {**facts, "processes": ranks.size, "sharded": sharded}
+        with checkpoint.writing(folder, self.step, record, keep) if ranks.leads else contextlib.nullcontext():
             ranks.wait()
             ranks.all_do(write_own)
         ranks.wait()

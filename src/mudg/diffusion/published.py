@@ -1,6 +1,6 @@
 """The published multi-modal diffusion model, full size: the same thing as `MDM`, of other parts.
 
-    conditions -> latents          autoencoder (`kl_vae`); frame 0 of the colour condition is the dense reference
+    conditions -> latents          autoencoder; frame 0 of the colour condition is the dense reference
     reference  -> image tokens     image tower (`clip`) and resampler, 16 tokens for each of 16 frames
     one pass per modality          v-prediction with classifier-free guidance, told apart by the modality label
     latents    -> pixels           autoencoder
@@ -439,7 +439,9 @@ class PublishedMDM(nn.Module):
         eps = torch.cat(draws).to(self.device)
         text = torch.where(no_text[:, None, None], self.text[1], self.text[0])
         features = torch.where(no_reference[:, None, None], encoded.grey, encoded.features)
-        self._seed_dropout(seed, range(first, first + count))
+        dropouts = [m for m in self.modules() if isinstance(m, SeededDropout) and m.training]
+        for number, layer in enumerate(dropouts):
+            layer.seeds = tuple(seeds.key(seed, clip, f"dropout {number}") for clip in range(first, first + count))
         stated = self.predict(
             self.schedule.add_noise(x0, eps, t), encoded.planes, t, names, text, self.image_tokens(features)
         )
@@ -458,15 +460,13 @@ class PublishedMDM(nn.Module):
     ) -> tuple[Tensor, list[Modality], Tensor, Tensor]:
         """Of the clips of a batch: noise steps i64[N], modalities, and bool[N] each: without the caption, without the
         reference."""
-        steps, names = noise.stratified_steps(count, len(self.schedule), generator), _draw_modalities(count, generator)
+        steps = noise.stratified_steps(count, len(self.schedule), generator)
+        u = torch.rand(count, generator=generator, dtype=torch.float64)
+        limits = torch.tensor(list(MODALITY_SHARES.values()), dtype=torch.float64).cumsum(0)[:-1]
+        names = [list(MODALITY_SHARES)[int(n)] for n in torch.bucketize(u, limits, right=True)]
         u = torch.rand(count, generator=generator)
         no_reference = (u >= dropout.text) & (u < dropout.text + dropout.both + dropout.reference)
         return steps, names, u < dropout.text + dropout.both, no_reference
-
-    def _seed_dropout(self, seed: int, clips: range) -> None:
-        layers = [m for m in self.modules() if isinstance(m, SeededDropout) and m.training]
-        for number, layer in enumerate(layers):
-            layer.seeds = tuple(seeds.key(seed, clip, f"dropout {number}") for clip in clips)
 
     def trained_part(self) -> nn.ModuleDict:
         """What training changes, by attribute name: the denoising network and the resampler of the image tokens."""
@@ -584,13 +584,6 @@ class PublishedMDM(nn.Module):
             return found[0] if guidance == 1 else noise.guide(found[0], found[1], guidance, rescale)
 
         return velocity
-
-
-def _draw_modalities(count: int, generator: torch.Generator) -> list[Modality]:
-    u = torch.rand(count, generator=generator, dtype=torch.float64)
-    limits = torch.tensor(list(MODALITY_SHARES.values()), dtype=torch.float64).cumsum(0)[:-1]
-    names = list(MODALITY_SHARES)
-    return [names[int(place)] for place in torch.bucketize(u, limits, right=True)]
 
 
 # files --------------------------------------------------------------------------------------------

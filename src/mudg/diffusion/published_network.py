@@ -99,7 +99,6 @@ class CoderMiddle(nn.Module):
         self.block1, self.attention, self.block2 = Block(width, width), CellAttention(width), Block(width, width)
 
     def forward(self, x: Tensor) -> Tensor:
-        """[N,C,h,w] -> the same."""
         return self.block2(self.attention(self.block1(x)))
 
 

@@ -111,14 +111,21 @@ class Sampling(Protocol):
     """What `generated` asks of a model."""
 
     @property
-    def device(self) -> torch.device: ...
-    def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip: ...
+    def device(self) -> torch.device:
+        """Where the weights lie."""
+        ...
+
+    def sample(self, condition: Condition, request: SampleRequest) -> GeneratedClip:
+        """Generate one clip."""
+        ...
 
 
 class Finishing(Sampling, Protocol):
     """What `generated_and_finished` asks of a model."""
 
-    def finish(self, clip: GeneratedClip, fine: Condition, *, bf16: bool = False) -> GeneratedClip: ...
+    def finish(self, clip: GeneratedClip, fine: Condition, *, bf16: bool = False) -> GeneratedClip:
+        """A generated clip at the size of `fine`."""
+        ...
 
 
 CPU = torch.device("cpu")

@@ -226,13 +226,11 @@ class ListedScene(StrictRecord):
     """Whether it is for scoring only."""
 
 
-def _as_record(value: object) -> object:
-    return {"path": value} if isinstance(value, str) else value
-
-
 class _Listed(StrictRecord):
     data_sets: dict[str, Annotated[float, Field(ge=0, allow_inf_nan=False)]] = {}
-    scenes: list[Annotated[ListedScene, BeforeValidator(_as_record)]] = Field(min_length=1)
+    scenes: list[
+        Annotated[ListedScene, BeforeValidator(lambda value: {"path": value} if isinstance(value, str) else value)]
+    ] = Field(min_length=1)
 
 
 class SceneList:

@@ -250,11 +250,6 @@ def _view_maker(
 
 def _sheet_row(condition: Condition, sample: GeneratedClip, i: int) -> np.ndarray:
     """Condition, colour, depth, classes and confidence of one frame side by side, u8[H,5W,3]."""
-    cells = [
-        to_bytes(condition.color[i]),
-        to_bytes(sample.rgb[i]),
-        depth_colors(sample.depth[i, 0].numpy()),
-        class_colors(sample.semantics[i].numpy()),
-        gray(sample.confidence[i, 0].numpy()),
-    ]
+    depth, ids = depth_colors(sample.depth[i, 0].numpy()), class_colors(sample.semantics[i].numpy())
+    cells = [to_bytes(condition.color[i]), to_bytes(sample.rgb[i]), depth, ids, gray(sample.confidence[i, 0].numpy())]
     return np.concatenate(cells, 1)
