@@ -159,7 +159,9 @@ def tracklet_xml(drive: Drive, twisted: bool) -> str:
     item = f"<objectType>Car</objectType>{size}<first_frame>{drive.frames[0]}</first_frame>"
     item += f"<poses><count>{len(poses)}</count>{''.join(poses)}</poses>"
     head = '<?xml version="1.0" encoding="UTF-8" standalone="yes" ?>\n<!DOCTYPE boost_serialization>\n'
-    return f"{head}<boost_serialization><tracklets><count>1</count><item>{item}</item></tracklets></boost_serialization>\n"
+    return (
+        f"{head}<boost_serialization><tracklets><count>1</count><item>{item}</item></tracklets></boost_serialization>\n"
+    )
 
 
 def label_line(time_s: float, prefix: str, track: Matrix | None = None) -> str:

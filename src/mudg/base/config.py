@@ -1,9 +1,7 @@
 """Frozen configuration: presets < YAML file < flags, unknown keys refused with the nearest name.
 
-Settings that were taken out are listed in their class: the class variable ``RETIRED`` maps each name to the setting
-before which it stood ("" = last) and to the only value that results may have been made with. That value still stands in
-``to_dict``, so a result's key stays what it was, and files may hold it. Any other value is refused. The class variable
-``FIXED`` maps a group to those of its fields that are no settings: they have their defaults, as if they were taken out.
+The class variable ``FIXED`` maps a group to those of its fields that are no settings of this class: they have their
+defaults.
 """
 
 from __future__ import annotations
@@ -84,12 +82,8 @@ def changed(config: Config, values: Mapping[str, Any]) -> Config:
 
 
 def to_dict(config: Any) -> dict[str, Any]:
-    """A configuration as plain JSON values, in the order of its settings, those of ``RETIRED`` included."""
-    retired, whole = getattr(config, "RETIRED", {}), dict[str, Any]()
-    for field in dataclasses.fields(config):
-        whole |= {old: former for old, (follower, former) in retired.items() if follower == field.name}
-        whole[field.name] = _plain(getattr(config, field.name))
-    return whole | {old: former for old, (follower, former) in retired.items() if not follower}
+    """A configuration as plain JSON values, in the order of its settings."""
+    return {field.name: _plain(getattr(config, field.name)) for field in dataclasses.fields(config)}
 
 
 def _plain(value: Any) -> Any:
@@ -98,20 +92,19 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
-def _without_retired(
+def _without_fixed(
     config_type: Any, values: Mapping[str, Any], where: str, path: str = "", fixed: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Settings without those of ``RETIRED`` and ``fixed``; UsageError for one with another value than theirs."""
+    """Settings without those of ``fixed``; UsageError for one with another value than its default."""
     known, rest = _types_of_fields(config_type), dict[str, Any]()
-    retired = getattr(config_type, "RETIRED", {}) | {name: ("", getattr(config_type(), name)) for name in fixed}
     for name, value in values.items():
-        if name not in retired:
+        if name not in fixed:
             group = dataclasses.is_dataclass(known.get(name)) and isinstance(value, Mapping)
             inside = fixed_of(config_type, name)
-            rest[name] = _without_retired(known[name], value, where, f"{path}{name}.", inside) if group else value
-        elif (former := retired[name][1]) != (list(value) if isinstance(value, tuple) else value):
-            what, got = f"the setting {path}{name} was removed", repr(value)
-            raise UsageError(what, where=where, expected=f"nothing, or {former!r}", got=got, remedy="leave it out")
+            rest[name] = _without_fixed(known[name], value, where, f"{path}{name}.", inside) if group else value
+        elif (usual := getattr(config_type(), name)) != value:
+            what, got = f"{path}{name} is no setting here", repr(value)
+            raise UsageError(what, where=where, expected=f"nothing, or {usual!r}", got=got, remedy="leave it out")
     return rest
 
 
@@ -154,13 +147,13 @@ def load(
     usual = config_type() if preset is None else preset
     if yaml_path is None and not overrides:
         return usual
-    values = _without_retired(config_type, to_dict(usual), "preset")
+    values = _without_fixed(config_type, to_dict(usual), "preset")
     if yaml_path is not None:
         content = _read_yaml(yaml_path)
         content.pop("verb", None)
-        values = _merge(values, _without_retired(config_type, content, str(yaml_path)), str(yaml_path), config_type)
+        values = _merge(values, _without_fixed(config_type, content, str(yaml_path)), str(yaml_path), config_type)
     if overrides:
-        values = _merge(values, _without_retired(config_type, overrides, "flags"), "flags", config_type)
+        values = _merge(values, _without_fixed(config_type, overrides, "flags"), "flags", config_type)
     from pydantic import ValidationError
 
     from mudg.base.records import first_problem
@@ -208,7 +201,7 @@ def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> C
     from mudg.base.records import first_problem
 
     try:
-        return _adapter(config_type).validate_python(_without_retired(config_type, values, where))
+        return _adapter(config_type).validate_python(_without_fixed(config_type, values, where))
     except ValidationError as error:
         raise first_problem(error, f"{where}: ", UsageError) from error
 

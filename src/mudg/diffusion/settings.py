@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 from mudg.base.config import Limits, setting, settings
 from mudg.base.devices import DeviceName
@@ -16,12 +15,6 @@ from mudg.base.devices import DeviceName
 @settings
 class SynthesizeConfig:
     """Generate dense RGB, depth and semantics on laterally shifted trajectories with the diffusion model."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "samples": ("condition", 1),
-        "label_confidence": ("align_depth", 0.5),
-        "held_out_images": ("precision", False),
-    }
 
     cameras: tuple[str, ...] = ("front",)
     """Cameras for which shifted views are made (empty = the first camera). A name that the scene lacks is an error."""
@@ -95,14 +88,6 @@ class SynthesizeConfig:
 class HarmonizeConfig:
     """Where and how far a diffusion model changes the views of an edited scene."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "weather_any_model": ("seed", False),
-        "changed_above": ("seed", 4 / 255),
-        "feather_px": ("seed", 3),
-        "images_per_view": ("seed", 24),
-        "keep_classes": ("seed", True),
-    }
-
     on: bool = False
     """Let the diffusion model repair what an edit script changed. Needs the fused clouds."""
     model: str = "embedded"
@@ -134,12 +119,6 @@ class HarmonizeConfig:
 class AdaptConfig:
     """Adapt the diffusion model to a recorded log: train it for a few steps on the log's own photographs, seen from
     where other photographs of the log were taken or might have been taken."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "cameras_left_out": ("block", []),
-        "augment": ("precision", True),
-        "label_confidence": ("precision", 0.5),
-    }
 
     model: str = "embedded"
     """Diffusion model to start from: "embedded", shipped with the package, or a model folder written by learn. It must
@@ -189,8 +168,6 @@ class AdaptConfig:
 class ConvertConfig:
     """Convert a published checkpoint to a model folder."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"shard_mb": ("memory_gb", 1024)}
-
     network: Literal["diffusion", "inception", "i3d", "dinov2", "clip", "lpips", "lpips-vgg", "lpips-squeeze"] = (
         "diffusion"
     )
@@ -221,13 +198,6 @@ class LearnData:
 
     STREAMED: ClassVar[tuple[str, ...]] = ("clips",)
     """Settings that may be addresses of an object store."""
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "weathers": ("textures", 0),
-        "effect_dropout": ("textures", 0.1),
-        "frame_step": ("held_out_every", 1),
-        "label_confidence": ("depth", 0.5),
-    }
-
     width: int = setting(default=192, ge=32)
     """Width of the training images in pixels."""
     height: int = setting(default=128, ge=32)
@@ -306,8 +276,6 @@ class LearnData:
 class LearnNetwork:
     """Shape of the denoising network and of the refiner behind it."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"patch": ("refine_widths", 2), "effects": ("", 0)}
-
     widths: tuple[int, ...] = (64, 128, 224)
     """Channels of the network at each resolution level."""
     blocks: tuple[int, ...] = (1, 1, 2)
@@ -344,8 +312,6 @@ class LearnCodec:
 @settings
 class LearnOptimizer:
     """AdamW, its learning-rate schedule, and the batch size."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"weight_decay": ("clip_norm", 0.01)}
 
     batch_frames: int = setting(default=16, ge=1)
     """Frames per step over all processes. Steps use clips of half the window first, and whole windows at the end."""

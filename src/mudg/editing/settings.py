@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
 from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
@@ -13,11 +12,6 @@ from mudg.diffusion.settings import HarmonizeConfig
 @settings
 class EditConfig:
     """Change a drive as an edit script says."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "changed_above": ("harmonize", 4 / 255),
-        "grow_px": ("harmonize", 2),
-    }
 
     harmonize: HarmonizeConfig = setting(default_factory=HarmonizeConfig)
     """Of a whole run: let the diffusion model repair what the edits touch in its images."""
@@ -30,13 +24,6 @@ class EditConfig:
 @settings
 class RenderConfig:
     """Render a fitted scene on recorded and shifted trajectories."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "height_m": ("width_px", 0.0),
-        "yaw_deg": ("width_px", 0.0),
-        "sky_below_alpha": ("video", 0.5),
-        "fps": ("harmonize", 10.0),
-    }
 
     cameras: tuple[str, ...] = ("front",)
     """Cameras to render (empty = the first camera). A name that the scene lacks is an error."""

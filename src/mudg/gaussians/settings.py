@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar, Literal
+from typing import Literal
 
 from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
@@ -18,24 +17,6 @@ GridSizes = tuple[int, int, int, int, int]
 class RadianceConfig:
     """Method emernerf: sizes and samples. A grid is five numbers: levels, features per level, cells along an axis of
     the coarsest and of the finest level, and log2 of the largest number of entries per level."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "error_share": ("proposal_samples", 0.25),
-        "near_m": ("static_grid", 0.1),
-        "far_m": ("static_grid", 1000.0),
-        "appearance": ("", 16),
-        "rate": ("", 0.01),
-        "weight_decay": ("", 1e-5),
-        "proposals_every": ("", 5),
-        "sky_weight": ("", 0.001),
-        "lidar_weight": ("", 1.0),
-        "sight_weight": ("", 0.1),
-        "sight_start": ("", 0.08),
-        "sight_least_m": ("", 0.6),
-        "dynamic_weight": ("", 0.002),
-        "shadow_weight": ("", 0.01),
-        "cycle_weight": ("", 0.01),
-    }
 
     rays: int = setting(default=512, ge=1)
     """Pixels per step."""
@@ -69,8 +50,6 @@ class RadianceConfig:
 class StartConfig:
     """Initial Gaussians."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"far_m": ("", 150.0)}
-
     gaussians: int = setting(default=70_000, ge=50)
     """Largest number of static Gaussians taken from the fused cloud; the same limit holds for all objects together."""
     voxel_m: float = setting(default=0.15, gt=0)
@@ -96,8 +75,6 @@ class DensifyConfig:
 class ObjectConfig:
     """Dynamic objects."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"network_layers": ("", 4), "network_width": ("", 64)}
-
     deformable: bool = True
     """Let pedestrians and cyclists change shape inside their boxes."""
     mirror_start: bool = True
@@ -119,8 +96,6 @@ class PoseConfig:
 @settings
 class AppearanceConfig:
     """Correction of camera poses and exposure while fitting; renders do not use it."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"exposure_weight": ("cameras", 0.01)}
 
     exposure: Literal["none", "camera", "image"] = "none"
     """Learn an affine colour map per camera or per recorded image. Use it if exposure or white balance changes during
@@ -176,8 +151,6 @@ class RecordedLossConfig:
 class VirtualConfig:
     """mudg_s: learning from virtual views. Loss weights of 0 turn a term off."""
 
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"densify": ("confidence_power", False)}
-
     probability: float = setting(default=0.4, ge=0, le=1)
     """Probability that a step uses a virtual view, 0 to 1 (published: 0.2)."""
     continued_probability: float = setting(default=1.0, ge=0, le=1)
@@ -225,10 +198,6 @@ class VirtualConfig:
 @settings
 class FitConfig:
     """Fit a dynamic Gaussian scene to recorded and, optionally, virtual views."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "hexplane": ("poses", {"features": 8, "levels": 2, "space": 64, "time": 25, "width": 64})
-    }
 
     method: Literal[
         "gs3d", "street_gaussians", "pvg", "omnire", "s3gaussian", "bezier", "emernerf", "difix", "mudg_s"

@@ -2,20 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
-
 from mudg.base.config import setting, settings
 
 
 @settings
 class FuseConfig:
     """Fuse sweeps and images into a static coloured point cloud and one cloud per dynamic object."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "max_image_gap_s": ("match_colors", 0.06),
-        "color_from_held_out": ("box_growth_m", False),
-    }
 
     voxel_m: float = setting(default=0.0, ge=0)
     """Keep one point per voxel of this size, in metres (0 = keep all)."""

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar
-
 from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
 
@@ -12,8 +9,6 @@ from mudg.base.devices import DeviceName
 @settings
 class PageConfig:
     """What a viewer page holds."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {"image_width_px": ("images", 320), "lidar_points": ("", 20_000)}
 
     method: str = ""
     """Fit of a run to show (empty = the best one: mudg_s, else street_gaussians)."""
@@ -30,11 +25,6 @@ class PageConfig:
 @settings
 class ViewConfig(PageConfig):
     """What ``mudg view`` shows, and where."""
-
-    RETIRED: ClassVar[Mapping[str, tuple[str, Any]]] = {
-        "image_width_px": ("images", 640),
-        "lidar_points": ("port", 20_000),
-    }
 
     budget: int = setting(default=0, ge=0)
     """Most Gaussians on the page (0 = all)."""
