@@ -12,15 +12,14 @@ from fit_settings import SMALL_RADIANCE, fit_config
 from pretend_device import pretend_device
 from toy_world import fused_cloud, view_at, write_scene
 
-from mudg.base import config as configuration
 from mudg.base import seeds, store
 from mudg.base.errors import InputError, NumericsError, UsageError
-from mudg.baselines.emernerf import field as fields
-from mudg.baselines.emernerf import field as marching
-from mudg.baselines.emernerf import field as sampling
-from mudg.baselines.emernerf import fit as loop
-from mudg.baselines.emernerf.field import Budget, Extent, FieldSizes, RadianceField, RayDraws, Rays, aggregated
-from mudg.baselines.emernerf.fit import extent_of, flow_colors, lidar_rays, load_field, view_rays
+from mudg.baselines import emernerf as loop
+from mudg.baselines import emernerf_field as fields
+from mudg.baselines import emernerf_field as marching
+from mudg.baselines import emernerf_field as sampling
+from mudg.baselines.emernerf import extent_of, flow_colors, lidar_rays, load_field, view_rays
+from mudg.baselines.emernerf_field import SIZES, Budget, Extent, RadianceField, RayDraws, Rays, aggregated
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig
 from mudg.gaussians.settings import FitConfig
@@ -33,12 +32,7 @@ from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
 
 TINY = {"method": "emernerf", "iterations": 8, "preview_every": 100, "checkpoint_every": 4, **SMALL_RADIANCE}
-FEW_RAYS = {
-    "radiance__rays": 8,
-    "radiance__lidar_rays": 8,
-    "radiance__proposal_samples": (6, 4),
-    "radiance__samples": 4,
-}
+FEW_RAYS = {"radiance__rays": 8, "radiance__lidar_rays": 8}
 
 
 def drawn(*shape: int, name: str = "values", dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -46,7 +40,7 @@ def drawn(*shape: int, name: str = "values", dtype: torch.dtype = torch.float64)
 
 
 def tiny_field() -> RadianceField:
-    sizes = loop.sizes_of(fit_config(**TINY).radiance)
+    sizes = SIZES["tiny"]
     return RadianceField(
         sizes, Extent((1.0, 2.0, 3.0), (10.0, 20.0, 5.0), 0.0, 2.0, 0.2), ("front",), {"method": "emernerf"}
     )
@@ -278,7 +272,7 @@ def started(world: Path, device: torch.device | str = "cpu", **changes: object) 
 
 
 def test_a_short_fit_lowers_its_losses(world):
-    state, config = started(world, iterations=80, radiance__rays=128, radiance__lidar_rays=128, radiance__samples=16)
+    state, config = started(world, iterations=80, radiance__rays=128, radiance__lidar_rays=128)
     lines = [
         {name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()}
         for step in range(1, 81)
@@ -333,7 +327,7 @@ def test_renders_as_observations_without_classes(world, tmp_path):
 
 def test_saved_field_is_the_fitted_one(world):
     field, budget = load_field(world / "fit")
-    assert budget == loop.budget_of(fit_config(**TINY).radiance)
+    assert budget == loop.BUDGETS["tiny"]
     assert field.facts == {"method": "emernerf", "scene": "toy"}
     values = store.read_json(world / "fit" / "model.json")
     tensors = store.read_tensors(world / "fit" / "field.safetensors")
@@ -366,14 +360,10 @@ def load_field_of_gaussians(folder: Path) -> None:
     load_field(folder)
 
 
-def test_published_sizes_are_settings_of_the_same_code(tmp_path):
-    page = (Path(__file__).parents[1] / "docs" / "baselines.md").read_text(encoding="utf-8")
-    (tmp_path / "emernerf.yaml").write_text(
-        page.partition("--config emernerf.yaml")[2].split("```yaml\n")[1].split("```")[0]
-    )
-    config = configuration.load(FitConfig, None, tmp_path / "emernerf.yaml")
-    assert config.iterations == 25_000 and config.radiance.static_grid == (10, 4, 16, 8192, 20)
-    assert isinstance(loop.sizes_of(config.radiance), FieldSizes)
+def test_published_sizes_are_a_row_of_the_same_table():
+    config = fit_config(method="emernerf", radiance__size="published")
+    assert SIZES[config.radiance.size].static == (10, 4, 16, 8192, 20)
+    assert loop.BUDGETS[config.radiance.size].proposals == (128, 64)
 
 
 # ---- rays ----------------------------------------------------------------------------------------

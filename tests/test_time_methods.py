@@ -20,10 +20,10 @@ from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Track
+from mudg.baselines import emernerf as radiance_loop
+from mudg.baselines import emernerf as rays
 from mudg.baselines import pvg
 from mudg.baselines.bezier import BezierNode, bernstein, distance_change, fit_path
-from mudg.baselines.emernerf import fit as radiance_loop
-from mudg.baselines.emernerf import fit as rays
 from mudg.baselines.flat_network import FlatNetwork, waves
 from mudg.baselines.omnire import DeformationField, DeformedNode
 from mudg.baselines.pvg import VibrationNode, average_velocity, moving_rows, starting_columns

@@ -23,7 +23,7 @@ from mudg.base.palette import CLASSES
 from mudg.base.processes import computed_ahead
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Observation, Scene, Trajectory, View
-from mudg.baselines.emernerf.fit import load_field, observe
+from mudg.baselines.emernerf import load_field, observe
 from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.place import drawing_device

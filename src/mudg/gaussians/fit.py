@@ -9,7 +9,7 @@ parameters.
     OUT/appearance.json, appearance.safetensors                 corrections of cameras and colours, where learnt
     OUT/log.jsonl, preview/*.png                                how it went
     OUT/field.safetensors                                       instead of the Gaussians, for method emernerf
-                                                                (``baselines/emernerf``)
+                                                                (``baselines/emernerf.py``)
     OUT/steps/                                                  checkpoints, while it runs
 
 With ``start`` it goes on with a finished fit (``gaussians/storage.py``).

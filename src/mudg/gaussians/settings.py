@@ -7,43 +7,17 @@ from typing import Literal
 from mudg.base.config import setting, settings
 from mudg.base.devices import DeviceName
 
-# settings of ``mudg fit --method emernerf`` -------------------------------------------------------
-
-
-GridSizes = tuple[int, int, int, int, int]
-
 
 @settings
 class RadianceConfig:
-    """Method emernerf: sizes and samples. A grid is five numbers: levels, features per level, cells along an axis of
-    the coarsest and of the finest level, and log2 of the largest number of entries per level."""
+    """Method emernerf."""
 
+    size: Literal["small", "published", "tiny"] = "small"
+    """Sizes of the networks and samples of a ray (docs/baselines.md)."""
     rays: int = setting(default=512, ge=1)
     """Pixels per step."""
     lidar_rays: int = setting(default=256, ge=1)
     """LiDAR rays per step."""
-    proposal_samples: tuple[int, int] = (64, 32)
-    """Samples per ray of the two proposal rounds."""
-    samples: int = setting(default=32, ge=2)
-    """Samples per ray of the fields."""
-    static_grid: GridSizes = (8, 2, 16, 1024, 17)
-    """Grid of the static field, in space."""
-    dynamic_grid: GridSizes = (8, 2, 8, 256, 17)
-    """Grid of the dynamic field, in space and time. Levels with more places than entries share them: 32 cells along
-    each of four axes are a million places."""
-    flow_grid: GridSizes = (8, 2, 8, 128, 15)
-    """Grid of the flow field, in space and time."""
-    first_proposal_grid: GridSizes = (5, 1, 16, 128, 16)
-    """Grid of the first proposal network, in space."""
-    second_proposal_grid: GridSizes = (5, 1, 16, 512, 16)
-    """Grid of the second proposal network, in space."""
-    width: int = setting(default=32, ge=1)
-    """Width of the networks and of their features."""
-    proposal_width: int = setting(default=16, ge=1)
-    """Width of the proposal networks."""
-
-
-# fit ----------------------------------------------------------------------------------------------
 
 
 @settings

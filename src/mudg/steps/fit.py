@@ -93,7 +93,7 @@ class Fit(Output):
     def prepare(self, inputs: dict[str, str]) -> Make:
         if self.reads_scene_alone:
             from mudg.base.devices import choose_device
-            from mudg.baselines.emernerf.fit import fit_radiance
+            from mudg.baselines.emernerf import fit_radiance
 
             return partial(fit_radiance, self.settings, self.scene, choose_device(self.settings.device, "fit"))
         from mudg.gaussians import fit

@@ -14,7 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 import torch
@@ -28,10 +28,10 @@ from mudg.base.processes import Interruption, one_torch_thread
 from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, Observation, Scene, View
-from mudg.baselines.emernerf.field import (
+from mudg.baselines.emernerf_field import (
+    SIZES,
     Budget,
     Extent,
-    FieldSizes,
     Marched,
     RadianceField,
     RayDraws,
@@ -45,7 +45,7 @@ from mudg.baselines.emernerf.field import (
 )
 from mudg.core.pictures import depth_colors, gray, side_by_side, to_bytes
 from mudg.gaussians.rendering import COVERED
-from mudg.gaussians.settings import FitConfig, RadianceConfig
+from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.storage import RADIANCE, description_of, kind_of
 from mudg.gaussians.views import StoredView, load_recorded, training_frames
 from mudg.scene.read import read_points, read_scene
@@ -375,8 +375,13 @@ PROPOSALS_EVERY = 5
 ERROR_SHARE = 0.25
 """Share of the pixels that are drawn where the colour error was large."""
 NEAR_M, FAR_M = 0.1, 1000.0
+BUDGETS: Final[Mapping[str, Budget]] = {
+    "small": Budget((64, 32), 32, NEAR_M, FAR_M),
+    "published": Budget((128, 64), 64, NEAR_M, FAR_M),
+    "tiny": Budget((16, 12), 8, NEAR_M, FAR_M),
+}
+"""Samples of a ray, by setting."""
 """Distances of the nearest and of the farthest sample."""
-APPEARANCE = 16
 """Numbers that describe the appearance of a camera."""
 WEIGHTS = Weights(sky=0.001, lidar=1.0, sight=0.1, dynamic=0.002, shadow=0.01, cycle=0.01)
 """Published, but for the dynamic density: 0.01, at once."""
@@ -415,7 +420,7 @@ def fit_radiance(config: FitConfig, scene: Path, device: torch.device, folder: R
     with one_torch_thread(), memory_of(device, "fit"):
         state = prepare(config, read_scene(scene), folder, device)
         optimise(state, config, folder)
-    budget = budget_of(config.radiance)
+    budget = BUDGETS[config.radiance.size]
     write_preview(state.field, state.shown, budget, folder.path / "preview" / "final.png", whole=True)
     save_field(state.field, budget, folder.path)
     shutil.rmtree(folder.path / "steps", ignore_errors=True)
@@ -432,32 +437,13 @@ def prepare(config: FitConfig, scene: Scene, folder: RunDir, device: torch.devic
     if not pixels.sky_known:
         log.info("the sky of this scene is not labelled: fitted without the sky term")
     facts = {"method": config.method, "scene": scene.id}
-    field = RadianceField(sizes_of(config.radiance), extent, cameras, facts, config.seed).to(device)
+    field = RadianceField(SIZES[config.radiance.size], extent, cameras, facts, config.seed).to(device)
     state = RadianceState(field, _optimisers(field), pixels, lidar, shown)
     found = checkpoint.latest(folder.path / "steps")
     if found is not None:
         log.info(f"resuming at step {found.step} of {config.iterations}")
         _restore(state, found)
     return state
-
-
-def sizes_of(settings: RadianceConfig) -> FieldSizes:
-    """The sizes of the networks."""
-    proposals = (settings.first_proposal_grid, settings.second_proposal_grid)
-    return FieldSizes(
-        settings.static_grid,
-        settings.dynamic_grid,
-        settings.flow_grid,
-        proposals,
-        settings.width,
-        settings.proposal_width,
-        APPEARANCE,
-    )
-
-
-def budget_of(settings: RadianceConfig) -> Budget:
-    """The samples of a ray."""
-    return Budget(settings.proposal_samples, settings.samples, NEAR_M, FAR_M)
 
 
 # ---- the loop ------------------------------------------------------------------------------------
@@ -477,7 +463,7 @@ def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
                 bar.update(f"psnr {state.last['psnr']:.1f}")
             if step % config.preview_every == 0 and step < config.iterations:
                 write_preview(
-                    state.field, state.shown, budget_of(config.radiance), folder.path / "preview" / f"{step:06d}.png"
+                    state.field, state.shown, BUDGETS[config.radiance.size], folder.path / "preview" / f"{step:06d}.png"
                 )
             if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
                 with pace.saving():
@@ -491,7 +477,7 @@ def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
 def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, Tensor]:
     """A gradient step from pixels and one from LiDAR rays; the weighted loss terms of both."""
     settings, field = config.radiance, state.field
-    device, budget = field.device, budget_of(settings)
+    device, budget = field.device, BUDGETS[settings.size]
     weights = replace(WEIGHTS, dynamic=WEIGHTS.dynamic * dynamic_share(step, config.iterations))
     learns = step <= WARM_UP * config.iterations or step % PROPOSALS_EVERY == 0
     for optimiser in state.optimisers:

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Final
 
 import torch
 from torch import Tensor, nn
@@ -153,7 +153,36 @@ class FieldSizes:
     proposals: tuple[tuple[int, int, int, int, int], ...]
     width: int
     proposal_width: int
-    appearance: int
+    appearance: int = 16
+
+
+SIZES: Final[Mapping[str, FieldSizes]] = {
+    "small": FieldSizes(
+        static=(8, 2, 16, 1024, 17),
+        dynamic=(8, 2, 8, 256, 17),
+        flow=(8, 2, 8, 128, 15),
+        proposals=((5, 1, 16, 128, 16), (5, 1, 16, 512, 16)),
+        width=32,
+        proposal_width=16,
+    ),
+    "published": FieldSizes(
+        static=(10, 4, 16, 8192, 20),
+        dynamic=(10, 4, 32, 8192, 18),
+        flow=(10, 4, 16, 4096, 18),
+        proposals=((8, 1, 16, 512, 20), (8, 1, 16, 2048, 20)),
+        width=64,
+        proposal_width=64,
+    ),
+    "tiny": FieldSizes(
+        static=(3, 2, 4, 16, 10),
+        dynamic=(3, 2, 4, 16, 10),
+        flow=(2, 2, 4, 8, 9),
+        proposals=((2, 1, 4, 8, 9), (2, 1, 4, 16, 9)),
+        width=8,
+        proposal_width=8,
+    ),
+}
+"""By setting; tiny tries out the code. Grids of space and time with more places than entries share them."""
 
 
 @dataclass(frozen=True)

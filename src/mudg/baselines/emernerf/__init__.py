@@ -1,1 +1,0 @@
-"""EmerNeRF, a radiance field of a street that is marched along rays."""
