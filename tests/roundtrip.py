@@ -32,16 +32,8 @@ from mudg.city.config import CityConfig
 from mudg.city.logs import write_city
 from mudg.scene.read import read_image, read_points
 
-SMALL = CityConfig(
-    seed=3,
-    n_frames=5,
-    width=96,
-    height=64,
-    cameras=("front", "front_left"),
-    lidar_beams=16,
-    lidar_azimuth_step_deg=1.5,
-    supersample=1,
-)
+_LIDAR = {"lidar_beams": 16, "lidar_azimuth_step_deg": 1.5}
+SMALL = CityConfig(seed=3, n_frames=5, width=96, height=64, cameras=("front", "front_left"), supersample=1, **_LIDAR)
 
 BOX_REACH_M = 30.0
 

@@ -95,23 +95,10 @@ def test_the_package_is_a_usd_package_with_files_by_name(package: Package) -> No
         name, extra = (int.from_bytes(package.content[info.header_offset + at :][:2], "little") for at in (26, 28))
         assert (info.header_offset + 30 + name + extra) % 64 == 0
     facts = package.metadata
-    assert set(facts) == {
-        "scene_id",
-        "version_string",
-        "training_date",
-        "dataset_hash",
-        "uuid",
-        "is_resumable",
-        "sensors",
-        "logger",
-        "time_range",
-        "training_step_outputs",
-    }
-    assert facts["sensors"] == {"camera_ids": ["front", "left"], "lidar_ids": []} and set(facts["logger"]) == {
-        "name",
-        "run_id",
-        "run_url",
-    }
+    names = "scene_id version_string training_date dataset_hash uuid is_resumable sensors logger time_range"
+    assert set(facts) == {*names.split(), "training_step_outputs"}
+    assert facts["sensors"] == {"camera_ids": ["front", "left"], "lidar_ids": []}
+    assert set(facts["logger"]) == {"name", "run_id", "run_url"}
     times = package.trajectory["T_rig_world_timestamps_us"]
     assert facts["time_range"] == {"start": times[0], "end": times[-1]} and all(
         isinstance(at, int) and at >= 0 for at in times

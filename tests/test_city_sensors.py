@@ -178,16 +178,8 @@ def test_boxes_err_as_stated_each_by_itself() -> None:
 
 @pytest.fixture(scope="module")
 def small() -> CityConfig:
-    return CityConfig(
-        seed=11,
-        n_frames=4,
-        width=64,
-        height=48,
-        cameras=("front",),
-        lidar_beams=16,
-        lidar_azimuth_step_deg=1.0,
-        supersample=1,
-    )
+    lidar = {"lidar_beams": 16, "lidar_azimuth_step_deg": 1.0}
+    return CityConfig(seed=11, n_frames=4, width=64, height=48, cameras=("front",), supersample=1, **lidar)
 
 
 @needs_native

@@ -3,7 +3,6 @@ the way."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import fields, replace
 from types import SimpleNamespace
@@ -14,7 +13,7 @@ import tiny_networks
 import torch
 from pretend_device import copies, pretend_device
 from test_published import some_condition
-from toy_clips import HEIGHT, WIDTH, interrupted_at, made_up_clip, tiny, with_settings, write_clips
+from toy_clips import HEIGHT, WIDTH, interrupted_at, losses_of, made_up_clip, tiny, with_settings, write_clips
 from toy_published import TINY, published_settings, tiny_checkpoint, tiny_model, write_tiny
 from toy_scene import ToyStreet
 
@@ -173,11 +172,6 @@ def clips(tmp_path_factory):
     return write_clips(tmp_path_factory.mktemp("clips"))
 
 
-def losses_in(out):
-    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return [row["total"] for row in rows if "total" in row]
-
-
 @pytest.mark.slow
 def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path):
     """Codec, network, refiner, finisher and scores; stopped after two steps and continued."""
@@ -188,7 +182,7 @@ def test_learn_on_a_device_is_learn_and_resumes(clips, tmp_path):
         with interrupted_at(1), pytest.raises(KeyboardInterrupt):
             Learn(out=tmp_path / "there", settings=there).run()
         made = Learn(out=tmp_path / "there", settings=there).run()
-    assert losses_in(tmp_path / "there") == pytest.approx(losses_in(tmp_path / "here"), rel=1e-5)
+    assert losses_of(tmp_path / "there") == pytest.approx(losses_of(tmp_path / "here"), rel=1e-5)
     a, b = (model_files.load(folder).state_dict() for folder in (here, made))
     assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 2e-3  # kept in 16 bits
     assert store.read_json(tmp_path / "there" / "metrics.json")["average"]["psnr"] == pytest.approx(
@@ -206,7 +200,7 @@ def test_a_published_type_model_learns_on_a_device(tmp_path):
     here = Learn(out=tmp_path / "here", settings=config).run()
     with pretend_device():
         there = Learn(out=tmp_path / "there", settings=with_settings(config, device="pretend")).run()
-    assert losses_in(tmp_path / "there") == pytest.approx(losses_in(tmp_path / "here"), rel=1e-5)
+    assert losses_of(tmp_path / "there") == pytest.approx(losses_of(tmp_path / "here"), rel=1e-5)
     a, b = (published.load(folder).state_dict() for folder in (here, there))
     assert max(far_apart(a[name], b[name]) for name in a if a[name].any()) < 1e-3
 

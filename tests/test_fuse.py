@@ -439,13 +439,8 @@ class KittiCheck:
             return View(self.camera, pose(n) @ self.lidar_from_cam, self.scene.frames[n].view.time_s)
 
         sweeps = (
-            SweepShots(
-                self.scene.sweeps[n].time_s,
-                pose(n),
-                read_points(self.scene, self.scene.sweeps[n]),
-                [Photo(view(n), self.images[n])],
-            )
-            for n in range(16)
+            SweepShots(sweep.time_s, pose(n), read_points(self.scene, sweep), [Photo(view(n), self.images[n])])
+            for n, sweep in enumerate(self.scene.sweeps)
             if n != 8
         )
         cloud, _ = fuse_sweeps(sweeps, self.scene.tracks if mode.endswith("boxes") else (), rules)

@@ -3,7 +3,6 @@ run."""
 
 import contextlib
 import hashlib
-import json
 import os
 import re
 import signal
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from toy_clips import training_words, write_clips
+from toy_clips import losses_of, training_words, write_clips
 
 from mudg.base import checkpoint
 from mudg.base.errors import UsageError
@@ -30,12 +29,6 @@ STEPS = 8
 @pytest.fixture(scope="module")
 def clips(tmp_path_factory):
     return write_clips(tmp_path_factory.mktemp("clips"))
-
-
-def losses_of(out):
-    """Of each step; of one that was repeated after a restart, the last."""
-    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return {row["step"]: row["total"] for row in rows if "total" in row}
 
 
 def start(processes, clips, out, fault="", restarts=0, **changes):

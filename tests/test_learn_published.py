@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from test_learn_parallel import SAME, environment, losses_of
-from toy_clips import with_settings, write_clips
+from test_learn_parallel import SAME, environment
+from toy_clips import losses_of, with_settings, write_clips
 from toy_published import published_settings, write_tiny
 from toy_scene import ToyStreet
 
@@ -278,11 +278,8 @@ def test_clips_of_logs_show_points_alone(street, tmp_path):
     assert torch.allclose(given.measured.depth[points.valid], points.depth[points.valid], rtol=1e-3)
     cut = crop.cropped(given, slice(3, 9), slice(1, 8)).measured
     assert torch.equal(cut.depth, given.measured.depth[..., 3:9, 1:8])
-    seen = next(
-        v
-        for n in range(20)
-        if not torch.equal((v := clip_shards.vary(read, np.random.default_rng(n))).depth, read.depth)
-    )
+    varied = (clip_shards.vary(read, np.random.default_rng(n)) for n in range(20))
+    seen = next(one for one in varied if not torch.equal(one.depth, read.depth))
     assert torch.equal(seen.condition.measured.depth, given.measured.depth.flip(-1))
     thinner = log_clips.make_clip(log, window, 0)
     assert not torch.equal(thinner.condition.depth, clip.condition.depth)  # to train on: a share of the points

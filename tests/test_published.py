@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from toy_published import TINY, choose_trainable, fill, tiny_checkpoint, tiny_model
+from toy_published import TINY, choose_trainable, fill, tiny_model, write_tiny
 from toy_scene import ToyStreet
 
 from mudg.base import palette
@@ -17,7 +17,7 @@ from mudg.base.records import parse_dataclass
 from mudg.base.store import read_safetensors
 from mudg.base.types import Camera, Condition, View
 from mudg.core import noise
-from mudg.diffusion import convert, memory_plan, published
+from mudg.diffusion import memory_plan, published
 from mudg.diffusion.condition import ConditionRules, build_conditions
 from mudg.diffusion.published import PublishedConfig, WorkSplit
 from mudg.diffusion.published_network import (
@@ -31,7 +31,7 @@ from mudg.diffusion.published_network import (
     nearest_class,
 )
 from mudg.diffusion.requests import SampleRequest
-from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.views import recorded_at_pose, recorded_images
 from mudg.networks import clip
 from mudg.networks.clip import ImageTower, TextTower, TowerConfig
@@ -464,8 +464,7 @@ def street(tmp_path_factory):
     root = tmp_path_factory.mktemp("street")
     ToyStreet(times=[0.1 * n for n in range(6)]).write(root / "scene", width=48, height=32)
     Fuse(scene=root / "scene", out=root / "fused", settings=FuseConfig()).run()
-    torch.save({"state_dict": tiny_checkpoint()}, root / "512.ckpt")
-    convert.convert_file(ConvertConfig(), root / "512.ckpt", root / "model", TINY)
+    write_tiny(root)
     return root
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from toy_clips import interrupted_at, tiny, write_clips
+from toy_clips import interrupted_at, losses_of, tiny, write_clips
 
 from mudg import app
 from mudg.base import config as configuration
@@ -41,11 +41,6 @@ def address(clips, tmp_path_factory):
     place = Location.of(f"memory://{tmp_path_factory.mktemp('bucket').name}/clips")
     place.push(clips)
     return place
-
-
-def losses_of(out):
-    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
-    return {row["step"]: row["total"] for row in rows if "total" in row}
 
 
 def rng(step):

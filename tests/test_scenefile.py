@@ -39,11 +39,8 @@ def random_image(seed: int) -> np.ndarray:
 
 def some_points(count: int = 7) -> SweepPoints:
     rng = np.random.default_rng(count)
-    return SweepPoints(
-        rng.normal(size=(count, 3)).astype(np.float32) * 10,
-        rng.random(count).astype(np.float32),
-        rng.uniform(-0.05, 0.05, count).astype(np.float32),
-    )
+    xyz, intensity, dt_s = rng.normal(size=(count, 3)), rng.random(count), rng.uniform(-0.05, 0.05, count)
+    return SweepPoints(xyz.astype(np.float32) * 10, intensity.astype(np.float32), dt_s.astype(np.float32))
 
 
 def fill(writer: SceneWriter, frames: int = 3) -> None:
@@ -254,13 +251,8 @@ def test_what_a_killed_writer_left_is_cleared_and_a_live_one_is_not(tmp_path: Pa
     inside = tmp_path / "there" / ".scene.999999999-1.part"
     inside.mkdir(parents=True)
     small_scene(tmp_path / "there")
-    assert sorted(p.name for p in (tmp_path / "there").iterdir()) == [
-        "images",
-        "lidar",
-        "manifest.json",
-        "scene.json",
-        "tracks.json",
-    ]
+    names = "images lidar manifest.json scene.json tracks.json".split()
+    assert sorted(p.name for p in (tmp_path / "there").iterdir()) == names
 
 
 def test_the_current_folder_can_be_the_destination(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -301,18 +293,13 @@ def test_every_byte_is_covered_by_the_manifest(tmp_path: Path) -> None:
 
 
 def bad_frames() -> dict[str, tuple[str, Callable[[SceneWriter], None]]]:
-    nan_pose = np.eye(4)
+    nan_pose, big_pose = np.eye(4), np.diag([2.0, 2, 2, 1])
     nan_pose[0, 3] = np.nan
-    image = random_image(0)
+    image, side, changed = random_image(0), replace(CAMERA, name="side"), replace(CAMERA, fx=50.0)
+    doubled = np.full((20, 32), 2.0)
     return {
-        "unknown camera": (
-            "not added",
-            lambda w: w.add_frame("side/000000", view_at(0, replace(CAMERA, name="side")), image),
-        ),
-        "changed camera": (
-            "not added",
-            lambda w: w.add_frame("front/000009", view_at(0, replace(CAMERA, fx=50.0)), image),
-        ),
+        "unknown camera": ("not added", lambda w: w.add_frame("side/000000", view_at(0, side), image)),
+        "changed camera": ("not added", lambda w: w.add_frame("front/000009", view_at(0, changed), image)),
         "id of another camera": ("does not fit", lambda w: w.add_frame("side/000001", view_at(0), image)),
         "id that climbs": ("does not fit", lambda w: w.add_frame("front/../../x", view_at(0), image)),
         "twice": ("added twice", lambda w: w.add_frame("front/000000", view_at(9), image)),
@@ -323,15 +310,9 @@ def bad_frames() -> dict[str, tuple[str, Callable[[SceneWriter], None]]]:
         "label name": ("no such label", lambda w: w.add_label("front/000000", "skies", np.zeros((20, 32)))),
         "label of no frame": ("not added", lambda w: w.add_label("front/000077", "sky", np.zeros((20, 32)))),
         "class 19": ("no train id", lambda w: w.add_label("front/000000", "semantics", np.full((20, 32), 19))),
-        "confidence 2": (
-            "outside 0..1",
-            lambda w: w.add_label("front/000000", "depth_confidence", np.full((20, 32), 2.0)),
-        ),
+        "confidence 2": ("outside 0..1", lambda w: w.add_label("front/000000", "depth_confidence", doubled)),
         "NaN sweep pose": ("rigid", lambda w: w.add_sweep("top/000009", "top", 9.0, nan_pose, some_points())),
-        "scaled sweep pose": (
-            "rigid",
-            lambda w: w.add_sweep("top/000009", "top", 9.0, np.diag([2.0, 2, 2, 1]), some_points()),
-        ),
+        "scaled sweep pose": ("rigid", lambda w: w.add_sweep("top/000009", "top", 9.0, big_pose, some_points())),
         "NaN point": ("not finite", lambda w: w.add_sweep("top/000009", "top", 9.0, np.eye(4), nan_points())),
         "camera name": ("folder name", lambda w: w.add_camera(replace(CAMERA, name="../x"))),
         "focal length": ("focal length", lambda w: w.add_camera(replace(CAMERA, name="b", fx=1e-4))),
@@ -390,27 +371,17 @@ def edited(root: Path, change: Callable[[dict[str, Any]], object], name: str = "
 
 
 IDENTITY = [1.0, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0]
+MIRRORED, SCALED = [-1.0, *IDENTITY[1:]], [1.1, *IDENTITY[1:]]
+NOWHERE = "images/front/777.png"
 EDITS: dict[str, tuple[str, str, Callable[[dict[str, Any]], object]]] = {
     "version": ("schema version", "schema_version", lambda d: d.update(schema_version=99)),
     "format": ("not a mudg-scene", "scene.json", lambda d: d.update(format="other")),
     "typo": ("unknown field", "frames[1]", lambda d: d["frames"][1].update(world_from_camera=IDENTITY)),
     "missing field": ("missing", "frames[0]", lambda d: d["frames"][0].pop("image")),
-    "mirrored pose": (
-        "rigid",
-        "frames[0].world_from_cam",
-        lambda d: d["frames"][0].update(world_from_cam=[-1.0, *IDENTITY[1:]]),
-    ),
-    "scaled pose": (
-        "rigid",
-        "sweeps[2].world_from_lidar",
-        lambda d: d["sweeps"][2].update(world_from_lidar=[1.1, *IDENTITY[1:]]),
-    ),
+    "mirrored pose": ("rigid", "frames[0].world_from_cam", lambda d: d["frames"][0].update(world_from_cam=MIRRORED)),
+    "scaled pose": ("rigid", "sweeps[2].world_from_lidar", lambda d: d["sweeps"][2].update(world_from_lidar=SCALED)),
     "short pose": ("3x4", "frames[2].world_from_cam", lambda d: d["frames"][2].update(world_from_cam=IDENTITY[:11])),
-    "text in pose": (
-        "not a number",
-        "world_from_cam[3]",
-        lambda d: d["frames"][2]["world_from_cam"].__setitem__(3, "x"),
-    ),
+    "text in pose": ("not a number", "from_cam[3]", lambda d: d["frames"][2]["world_from_cam"].__setitem__(3, "x")),
     "huge number": ("beyond what a number can be", "", lambda d: d["frames"][2].update(time_s=10**400)),
     "true as number": ("not a number", "time_s", lambda d: d["frames"][2].update(time_s=True)),
     "zero focal length": ("focal length", "cameras.front.fx", lambda d: d["cameras"]["front"].update(fx=0)),
@@ -424,11 +395,7 @@ EDITS: dict[str, tuple[str, str, Callable[[dict[str, Any]], object]]] = {
     "unsorted": ("do not increase", "frames of camera front", lambda d: d["frames"].reverse()),
     "split": ("does not have", "split", lambda d: d["split"].update({"front/000099": "test"})),
     "split word": ("'train' or 'test'", "split.front/000000", lambda d: d["split"].update({"front/000000": "val"})),
-    "missing file": (
-        "missing",
-        "frame front/000001 image",
-        lambda d: d["frames"][1].update(image="images/front/777.png"),
-    ),
+    "missing file": ("missing", "frame front/000001 image", lambda d: d["frames"][1].update(image=NOWHERE)),
     "shared file": ("same file", "front/000001", lambda d: d["frames"][1].update(image="images/front/000000.png")),
     "climbing ref": ("'..'", "frames[1].image", lambda d: d["frames"][1].update(image="../../etc/passwd")),
     "absolute ref": ("absolute", "frames[1].image", lambda d: d["frames"][1].update(image="/etc/passwd")),

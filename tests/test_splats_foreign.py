@@ -72,14 +72,12 @@ def command(tmp_path: Path, content: bytes, suffix: str, *flags: str) -> int:
 
 # -- drawing ---------------------------------------------------------------------------------------
 
+MIP = "comment SplatRenderMode: mip"
+DRAWING = {"extras": {"drawing": {"antialias": True}}}
 MARKED: dict[str, tuple[bytes, str, bool]] = {
-    "ply Brush": (ply(head=["comment Exported from Brush", "comment SplatRenderMode: mip"]), ".ply", True),
+    "ply Brush": (ply(head=["comment Exported from Brush", MIP]), ".ply", True),
     "ply gsplat, default": (ply(head=["comment SplatRenderMode: default"]), ".ply", False),
-    "ply, the last one counts": (
-        ply(head=["comment SplatRenderMode: mip", "comment splatrendermode: DEFAULT"]),
-        ".ply",
-        False,
-    ),
+    "ply, the last one counts": (ply(head=[MIP, "comment splatrendermode: DEFAULT"]), ".ply", False),
     "ply, small letters": (ply(head=["comment splatrendermode: Mip"]), ".ply", True),
     "ply Postshot 1": (ply(head=["comment antialiased 1"]), ".ply", True),
     "ply Postshot 0": (ply(head=["comment antialiased 0"]), ".ply", False),
@@ -90,7 +88,7 @@ MARKED: dict[str, tuple[bytes, str, bool]] = {
     "ply disabled": (ply(head=["comment antialiasing: disabled"]), ".ply", False),
     "sog number": (sog(antialias=1), ".sog", True),
     "ply silent": (ply(head=["comment made elsewhere"]), ".ply", False),
-    "compressed ply": (compressed_ply(-1, 1, head=["comment SplatRenderMode: mip"]), ".ply", True),
+    "compressed ply": (compressed_ply(-1, 1, head=[MIP]), ".ply", True),
     "compressed ply silent": (compressed_ply(-1, 1), ".ply", False),
     **{f"spz {v} {flags}": (spz(v, flags), ".spz", bool(flags)) for v in (1, 2, 3) for flags in (0, 1)},
     "sog antialias": (sog(antialias=True), ".sog", True),
@@ -98,11 +96,7 @@ MARKED: dict[str, tuple[bytes, str, bool]] = {
     "sog model": (sog(model="antialiased"), ".sog", True),
     "sog model default": (sog(model="default", antialias=True), ".sog", False),
     "sog 2dgs": (sog(model="2dgs"), ".sog", False),
-    "glb facts": (
-        glb(document={"asset": {"version": "2.0", "extras": {"drawing": {"antialias": True}}}}),
-        ".glb",
-        True,
-    ),
+    "glb facts": (glb(document={"asset": {"version": "2.0", **DRAWING}}), ".glb", True),
     "glb silent": (glb(), ".glb", False),
 }
 
@@ -719,12 +713,8 @@ def test_bounds_of_chunks_in_double_keep_their_places() -> None:
 
 def test_a_far_object_keeps_its_shape(tmp_path: Path) -> None:
     (tmp_path / "a.ply").write_bytes(far_ply(UTM))
-    assert (
-        app.main(
-            ["asset", "import", str(tmp_path / "a.ply"), "--axes", "world", "--out", str(tmp_path / "a.safetensors")]
-        )
-        == 0
-    )
+    flags = ["--axes", "world", "--out", str(tmp_path / "a.safetensors")]
+    assert app.main(["asset", "import", str(tmp_path / "a.ply"), *flags]) == 0
     means = read_asset(tmp_path / "a.safetensors").columns["means"].numpy()
     assert np.abs((means - means[0]) - NEAR).max() < 1e-6
 

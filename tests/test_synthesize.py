@@ -68,9 +68,10 @@ def world(tmp_path_factory):
     return root, config
 
 
-def made(world, out, **changes):
-    root, config = world
-    return Synthesize(scene=root / "scene", fused=root / "fused", out=out, settings=replace(config, **changes)).run()
+def made(world, out, fitted=None, **changes):
+    (root, config), inputs = world, {"fitted": fitted} if fitted else {}
+    settings = replace(config, **changes)
+    return Synthesize(scene=root / "scene", fused=root / "fused", out=out, settings=settings, **inputs).run()
 
 
 def frames_of(path):
@@ -305,7 +306,6 @@ def test_renders_of_a_fitted_scene_as_planes(world, fitted):
 
 def test_a_fitted_scene_is_part_of_the_condition(world, fitted, tmp_path, monkeypatch):
     """Its renders reach the model, and full-size views come from the finisher."""
-    root, config = world
     scene, model = fitted
     given, finished = [], []
     sample, finish = MDM.sample, MDM.finish
@@ -315,36 +315,22 @@ def test_a_fitted_scene_is_part_of_the_condition(world, fitted, tmp_path, monkey
     monkeypatch.setattr(
         MDM, "finish", lambda self, clip, fine, **more: (finished.append(fine), finish(self, clip, fine, **more))[1]
     )
-    settings = replace(config, model=str(model), full_size=True, steps=1)
-    out = Synthesize(
-        scene=root / "scene", fused=root / "fused", fitted=scene, out=tmp_path / "out", settings=settings
-    ).run()
-    made = frames_of(out / "front_shift+1.0")
-    assert len(made) == FRAMES and made[0].rgb.shape == (3, 64, 96)
+    changes = {"model": str(model), "full_size": True, "steps": 1}
+    seen = frames_of(made(world, tmp_path / "out", scene, **changes) / "front_shift+1.0")
+    assert len(seen) == FRAMES and seen[0].rgb.shape == (3, 64, 96)
     assert all(c.renders is not None and c.renders.color.shape[-2:] == (32, 48) for c in given)
     assert all(c.renders is not None and c.renders.color.shape[-2:] == (64, 96) for c in finished)
     assert len(finished) == len(given) > 1
-    sky = made[0].semantics == palette.ID["sky"]
-    assert bool((torch.isnan(made[0].depth[0]) | ~sky | finished[0].valid[0, 0]).all())
-    plain = Synthesize(
-        scene=root / "scene", fused=root / "fused", out=tmp_path / "plain", settings=settings
-    ).run()  # works without a fit, too
-    assert not torch.equal(made[2].rgb, frames_of(plain / "front_shift+1.0")[2].rgb)
+    sky = seen[0].semantics == palette.ID["sky"]
+    assert bool((torch.isnan(seen[0].depth[0]) | ~sky | finished[0].valid[0, 0]).all())
+    plain = made(world, tmp_path / "plain", **changes)  # works without a fit, too
+    assert not torch.equal(seen[2].rgb, frames_of(plain / "front_shift+1.0")[2].rgb)
 
 
-def test_a_model_without_renders_takes_no_fitted_scene(world, fitted, tmp_path):
-    root, config = world
-    with pytest.raises(UsageError, match="not trained with renders"):
-        Synthesize(
-            scene=root / "scene", fused=root / "fused", fitted=fitted[0], out=tmp_path / "out", settings=config
-        ).run()
+@pytest.mark.parametrize(("condition", "words"), [("full", "not trained with renders"), ("points", "switched off")])
+def test_what_takes_no_fitted_scene(world, fitted, tmp_path, condition, words):
+    """A model without renders, and a condition with parts switched off."""
+    changes = {} if condition == "full" else {"model": str(fitted[1]), "condition": condition}
+    with pytest.raises(UsageError, match=words):
+        made(world, tmp_path / "out", fitted[0], **changes)
     assert not (tmp_path / "out").exists()
-
-
-def test_a_condition_with_parts_switched_off_has_no_renders(world, fitted, tmp_path):
-    root, config = world
-    settings = replace(config, model=str(fitted[1]), condition="points")
-    with pytest.raises(UsageError, match="switched off"):
-        Synthesize(
-            scene=root / "scene", fused=root / "fused", fitted=fitted[0], out=tmp_path / "out", settings=settings
-        ).run()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import signal
 from collections.abc import Callable, Iterator
 from dataclasses import fields, replace
@@ -181,3 +182,9 @@ def training_words(clips: Path, out: Path, **changes: Any) -> list[str]:
         **changes,
     }
     return [word for name, value in flags.items() for word in (f"--{name}", *str(value).split())]
+
+
+def losses_of(out: Path) -> dict[int, float]:
+    """The loss of each step of a training; of one that was repeated after a restart, the last."""
+    rows = [json.loads(line) for line in (out / "log.jsonl").read_text().splitlines()]
+    return {row["step"]: row["total"] for row in rows if "total" in row}

@@ -309,17 +309,14 @@ class MDM(nn.Module):
 
     def encode_truth(self, clips: Sequence[Clip]) -> EncodedTruth:
         """What `loss` compares with."""
-        rgb, depth, valid, ids = (
-            torch.stack([getattr(clip, name) for clip in clips])
-            for name in ("rgb", "depth", "depth_valid", "semantics")
-        )
+        rgb, depth, ids = (torch.stack([getattr(c, name) for c in clips]) for name in ("rgb", "depth", "semantics"))
         pixels = self.pixel_truth(clips)
         latents: dict[Modality, Tensor] = {
             "rgb": self.codec.encode_rgb(rgb),
             "depth": self.codec.encode_depth(depth),
             "semantics": self.codec.encode_semantics(ids),
         }
-        cells = functional.avg_pool2d(pixels.depth_known, self.codec.factor).unflatten(0, valid.shape[:2])
+        cells = functional.avg_pool2d(pixels.depth_known, self.codec.factor).unflatten(0, rgb.shape[:2])
         return EncodedTruth(latents, semantic_shares(ids), cells, pixels)
 
     def pixel_truth(self, clips: Sequence[Clip]) -> PixelTruth:
@@ -340,9 +337,8 @@ class MDM(nn.Module):
         """Weighted terms of the refiner in a rectangle of the image, at the denoiser's resolution."""
         frames, (h, w) = encoded.planes.shape[1], encoded.planes.shape[-2:]
         cells = self._refined_window(part, settings.refined_share, h, w)
-        latents: dict[Modality, Tensor] = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
-        factor = self.codec.factor
-        tall, wide = (slice(s.start * factor, s.stop * factor) for s in cells)
+        latents = {m: z[..., cells[0], cells[1]].flatten(0, 1) for m, z in stated.items()}
+        tall, wide = (slice(s.start * self.codec.factor, s.stop * self.codec.factor) for s in cells)
         made = self.refine(latents, encoded.pixels.crop(tall, wide), frames)
         return self._pixel_terms(made, truth.crop(tall, wide), settings, "pixel")
 
@@ -376,9 +372,7 @@ class MDM(nn.Module):
         starts, sides = (patch.row, patch.column), (side // patch.scale for side in patch.clip.rgb.shape[-2:])
         around = [_around(start, side, factor, count) for start, side, count in zip(starts, sides, cells, strict=True)]
         tall, wide = (slice(cut.start * factor, cut.stop * factor) for cut in around)
-        latents: dict[Modality, Tensor] = {
-            m: z[own, ..., around[0], around[1]].flatten(0, 1) for m, z in stated.items()
-        }
+        latents = {m: z[own, ..., around[0], around[1]].flatten(0, 1) for m, z in stated.items()}
         pixels = encoded.pixels.map(lambda x: x[number * frames : (number + 1) * frames]).crop(tall, wide)
         small = self._made(self.refine(latents, pixels, frames))
         size = (tall.stop - tall.start) * patch.scale, (wide.stop - wide.start) * patch.scale

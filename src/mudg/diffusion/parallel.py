@@ -513,68 +513,57 @@ def write_rows(folder: Path, group: str, rank: int, tensors: Mapping[str, Tensor
 
 
 def read_rows(folder: Path, group: str, tensors: Mapping[str, Tensor]) -> None:
-    """Fill this process's rows of named tensors in place; the inverse of `write_rows` under any layout."""
-    files = RowFiles(folder, group)
-    with torch.no_grad():
-        for name, value in tensors.items():
-            local(value).copy_(files.read(name, value))
+    """Fill this process's rows of named tensors in place; the inverse of `write_rows` under any layout.
 
+    Raises:
+        IntegrityError: a file is damaged, there is no such tensor, it has another shape, or rows are missing.
+    """
+    where, index, shapes = f"{folder}: {group}", dict[str, list[tuple[int, Path]]](), dict[str, tuple[int, ...]]()
+    try:
+        for path in sorted(folder.glob(f"{group}.[0-9][0-9][0-9][0-9].json")):
+            for name, entry in store.read_json(path).items():
+                shapes[name] = tuple(int(n) for n in entry["shape"])
+                index.setdefault(name, []).append((int(entry["start"]), path.with_suffix(".safetensors")))
+    except (InputError, KeyError, TypeError, AttributeError, ValueError) as error:
+        raise IntegrityError("the index of a checkpoint is damaged", where=where, got=str(error)) from error
 
-class RowFiles:
-    """The files of one group of tensors in a checkpoint, read row by row."""
-
-    def __init__(self, folder: Path, group: str) -> None:
-        self._where = f"{folder}: {group}"
-        self._files: dict[Path, Any] = {}
-        self._index: dict[str, list[tuple[int, Path]]] = {}
-        self._shapes: dict[str, tuple[int, ...]] = {}
+    @functools.cache
+    def opened(path: Path) -> Any:
         try:
-            for path in sorted(folder.glob(f"{group}.[0-9][0-9][0-9][0-9].json")):
-                for name, entry in store.read_json(path).items():
-                    self._shapes[name] = tuple(int(n) for n in entry["shape"])
-                    self._index.setdefault(name, []).append((int(entry["start"]), path.with_suffix(".safetensors")))
-        except (InputError, KeyError, TypeError, AttributeError, ValueError) as error:
-            raise IntegrityError("the index of a checkpoint is damaged", where=self._where, got=str(error)) from error
+            return safe_open(str(store.regular(path)), "pt")
+        except (SafetensorError, InputError, OSError) as error:
+            raise IntegrityError("a file of a checkpoint is damaged", where=str(path), got=str(error)) from error
 
-    def read(self, name: str, value: Tensor) -> Tensor:
-        """The rows of tensor `name` that this process holds of `value`.
-
-        Raises:
-            IntegrityError: there is no such tensor, it has another shape, or rows are missing.
-        """
+    def rows_of(name: str, value: Tensor) -> Tensor:
+        """The rows of tensor `name` that this process holds of `value`."""
         piece, shape, start = local(value), tuple(value.shape), first_row(value)
-        if self._shapes.get(name) != shape:
+        if shapes.get(name) != shape:
             raise IntegrityError(
                 "a checkpoint does not fit the model",
-                where=f"{self._where}.{name}",
+                where=f"{where}.{name}",
                 expected=str(shape),
-                got=str(self._shapes.get(name, "no such tensor")),
+                got=str(shapes.get(name, "no such tensor")),
             )
         if not shape:
-            return self._open(self._index[name][0][1]).get_tensor(name)
-        stop = start + len(piece)
-        rows = []
-        for first, path in sorted(self._index[name]):
-            part = self._open(path).get_slice(name)
+            return opened(index[name][0][1]).get_tensor(name)
+        stop, rows = start + len(piece), []
+        for first, path in sorted(index[name]):
+            part = opened(path).get_slice(name)
             a, b = max(start, first), min(stop, first + part.get_shape()[0])
             if a < b:
                 rows.append((a, part[a - first : b - first]))
         if sum(len(r) for _, r in rows) != len(piece):
             raise IntegrityError(
                 "rows of a tensor are missing from a checkpoint",
-                where=f"{self._where}.{name}",
+                where=f"{where}.{name}",
                 expected=f"{start} to {stop}",
                 got=str([(a, len(r)) for a, r in rows]),
             )
         return torch.cat([r for _, r in rows]) if rows else torch.empty_like(piece)
 
-    def _open(self, path: Path) -> Any:
-        if path not in self._files:
-            try:
-                self._files[path] = safe_open(str(store.regular(path)), "pt")
-            except (SafetensorError, InputError, OSError) as error:
-                raise IntegrityError("a file of a checkpoint is damaged", where=str(path), got=str(error)) from error
-        return self._files[path]
+    with torch.no_grad():
+        for name, value in tensors.items():
+            local(value).copy_(rows_of(name, value))
 
 
 def newest_checkpoint(folder: Path, ranks: Ranks) -> checkpoint.Checkpoint | None:
