@@ -45,8 +45,8 @@ def import_log(source: Path, out: Path, options: ImportOptions) -> Scene:
             else:
                 sweeps.append(SweepRecord(name, time_s, world_from_sensor, path, partial(points, path)))
     about = Source("my_log", "own recording", None, ())
-    boxes, reference = tracks(source / "boxes.csv"), next(iter(cameras))
-    drive = DriveLog("my-log", cameras, reference, images, sweeps, boxes, ego, about, str(source), optics, "own")
+    boxes = tracks(source / "boxes.csv")
+    drive = DriveLog("my-log", cameras, images, sweeps, boxes, ego, about, str(source), optics, "own")
     return write_log(drive, out, options)  # "own": boxes are where objects are at the box's time, not at a sweep's
 
 
