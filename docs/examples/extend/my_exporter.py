@@ -17,5 +17,5 @@ def to_bytes(request: WriteRequest) -> bytes:
     return text.getvalue().encode()
 
 
-# Suffix, axes (here x forward, y left, z up), and how to write. `carries` is empty: `mudg export` says what is lost.
-FORMAT = SplatFormat((".xyz",), "FLU", to_bytes, carries=frozenset())
+# Suffix, axes (x forward, y left, z up), how to write, no way to read; nothing is carried: `mudg export` says what is lost.
+FORMAT = SplatFormat((".xyz",), "FLU", to_bytes, None, frozenset())
