@@ -31,8 +31,7 @@ from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import ScoreConfig
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
-from mudg.gaussians.methods import METHODS
-from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.ingest import Fuse, Ingest

@@ -21,7 +21,7 @@ from mudg.city.logs import LogRules
 from mudg.city.world import CityWorld
 from mudg.diffusion import city_clips, model_files
 from mudg.diffusion.model import MDM
-from mudg.gaussians.methods import METHODS, PUBLISHED
+from mudg.gaussians.settings import METHODS, PUBLISHED
 from mudg.scene.observations import list_observation_sets, read_observations
 from mudg.scoring import truth as score_truth
 

@@ -18,9 +18,8 @@ from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.core.table import Table
 from mudg.gaussians import fit
 from mudg.gaussians.model import SceneModel, compose
-from mudg.gaussians.nodes import RigidNode, StaticNode
+from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode
 from mudg.gaussians.rendering import render_condition
-from mudg.gaussians.sky import SkyNode
 from mudg.gaussians.trust import COLOR_ERROR, DEPTH_ERROR, PhotoEvidence, certainty_of, difference_images, weight_sums
 from mudg.gaussians.views import LidarPixels, StoredView
 from mudg.scene.clouds import write_fused

@@ -13,7 +13,7 @@ import toy_views
 from mudg import native
 from mudg.base import store
 from mudg.base.memory import in_words
-from mudg.core.raster import probe
+from mudg.core.raster import rasterize as probe
 from mudg.gaussians import views as kept
 from mudg.steps import cost
 from mudg.steps import doctor as diagnosis

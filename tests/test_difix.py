@@ -20,9 +20,8 @@ from mudg.diffusion import views
 from mudg.diffusion.condition import ConditionRules
 from mudg.diffusion.inputs import ConditionSources, conditions_of
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.gaussians.methods import METHODS
 from mudg.gaussians.recipes import recipe_of
-from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.steps.fit import Fit
 from mudg.steps.synthesize import Synthesize
 

@@ -34,9 +34,8 @@ from mudg.editing.apply import carry_out, edited_cloud, edited_model, surface_li
 from mudg.editing.plan import Actor, Background, EditPlan, EditSources, EditWorld, collisions, plan_edits
 from mudg.editing.script import parse_edits, read_edits
 from mudg.gaussians.model import CERTAINTY, SceneModel, compose
-from mudg.gaussians.nodes import DeformableNode, RigidNode, StaticNode
+from mudg.gaussians.nodes import DeformableNode, RigidNode, SkyNode, StaticNode
 from mudg.gaussians.rendering import render_view
-from mudg.gaussians.sky import SkyNode
 from mudg.gaussians.start import SH_C0
 from mudg.steps.settings import DEMO_CITY
 

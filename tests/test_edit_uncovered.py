@@ -20,8 +20,7 @@ from mudg.editing.plan import Actor, EditSources, EditWorld, plan_edits
 from mudg.editing.script import parse_edits
 from mudg.editing.street import SHOWN, Hidden, continued, noted, shaded_cells, shown_by, without_traces
 from mudg.gaussians.model import CERTAINTY, SceneModel
-from mudg.gaussians.nodes import RigidNode, StaticNode
-from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode
 from mudg.gaussians.start import SH_C0
 
 SIZE = (4.0, 2.0, 1.5)

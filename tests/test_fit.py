@@ -576,7 +576,7 @@ def test_learning_rates_follow_the_length_of_the_run():
 def test_the_methods_that_can_be_fitted_are_those_of_the_configuration():
     from typing import get_args, get_type_hints
 
-    from mudg.gaussians.methods import METHODS
+    from mudg.gaussians.settings import METHODS
 
     fitted = {name: row for name, row in METHODS.items() if row.made_by == "render"}
     assert set(fitted) == set(get_args(get_type_hints(FitConfig)["method"]))

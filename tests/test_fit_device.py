@@ -29,7 +29,7 @@ from mudg.benchmarks import chain, rows
 from mudg.benchmarks import cities as bench_poses
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import native_ops
-from mudg.core.raster import place
+from mudg.core.raster import rasterize as place
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.editing.settings import RenderConfig, ScoreConfig
@@ -45,12 +45,11 @@ from mudg.gaussians.densify import (
     relocate_and_grow,
 )
 from mudg.gaussians.model import SceneModel, compose
-from mudg.gaussians.nodes import StaticNode
+from mudg.gaussians.nodes import SkyNode, StaticNode
 from mudg.gaussians.perception import perception_of
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import FiniteCheck
 from mudg.gaussians.settings import FitConfig, VirtualConfig
-from mudg.gaussians.sky import SkyNode
 from mudg.scene.observations import read_observations
 from mudg.scoring import score
 from mudg.steps.fit import Fit

@@ -27,7 +27,7 @@ from mudg.core import trajectory
 from mudg.gaussians import fit, trust
 from mudg.gaussians import views as fit_views
 from mudg.gaussians import views as kept
-from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.nodes import SkyNode
 from mudg.gaussians.start import StartPoints
 from mudg.gaussians.views import LidarPixels, StoredView, TrainView, ViewSet
 from mudg.scene.clouds import write_fused

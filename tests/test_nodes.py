@@ -28,8 +28,7 @@ from mudg.gaussians import nodes
 from mudg.gaussians import nodes as motion
 from mudg.gaussians import start as initial
 from mudg.gaussians.model import SceneModel, compose
-from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
-from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.nodes import NodeRows, RigidNode, SkyNode, StaticNode
 
 
 def pose(x: float, y: float, z: float, yaw: float, pitch: float = 0.0) -> np.ndarray:

@@ -24,21 +24,21 @@ from mudg.baselines import emernerf as radiance_loop
 from mudg.baselines import emernerf as rays
 from mudg.baselines import pvg
 from mudg.baselines.bezier import BezierNode, bernstein, distance_change, fit_path
-from mudg.baselines.flat_network import FlatNetwork, waves
 from mudg.baselines.omnire import DeformationField, DeformedNode
 from mudg.baselines.pvg import VibrationNode, average_velocity, moving_rows, starting_columns
 from mudg.baselines.s3gaussian import SHORT_GAIN, HexPlaneNode, plane_smoothness
 from mudg.baselines.s3gaussian import moving_rows as hexplane_moving
+from mudg.baselines.timed import FlatNetwork, waves
 from mudg.core import losses, metrics
 from mudg.core.grids import PlaneSizes
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.core.table import Table
 from mudg.gaussians import densify, fit, nodes
 from mudg.gaussians import views as fit_views
-from mudg.gaussians.methods import METHODS, PUBLISHED
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
 from mudg.gaussians.recipes import RECIPES, recipe_of
+from mudg.gaussians.settings import METHODS, PUBLISHED
 from mudg.gaussians.start import columns_from_points
 from mudg.scene import fuse
 from mudg.scene.clouds import read_fused, write_fused

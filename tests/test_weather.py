@@ -22,7 +22,8 @@ from mudg.base.weather_settings import (
 )
 from mudg.core import weather
 from mudg.core.weather import air as fog
-from mudg.core.weather import ground, noise
+from mudg.core.weather import air as noise
+from mudg.core.weather import ground
 from mudg.core.weather import light as relight
 from mudg.core.weather import light as tone
 from mudg.core.weather.gbuffer import (

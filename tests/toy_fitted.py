@@ -13,8 +13,7 @@ from mudg.base.palette import ID
 from mudg.base.types import Scene
 from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
-from mudg.gaussians.nodes import DEFORM_CELLS, DeformableNode, RigidNode, StaticNode
-from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.nodes import DEFORM_CELLS, DeformableNode, RigidNode, SkyNode, StaticNode
 from mudg.gaussians.storage import save_model
 
 CLASSES = (ID["road"], ID["building"], ID["vegetation"], ID["sky"], ID["person"], ID["car"])

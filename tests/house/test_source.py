@@ -51,7 +51,6 @@ TORCH_FREE = (
     "*/settings.py",
     "*/settings/*.py",
     "*/*_settings.py",
-    "gaussians/methods.py",
     "benchmarks/step.py",
     "base/*.py",
 )

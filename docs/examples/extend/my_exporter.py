@@ -17,5 +17,5 @@ def to_bytes(request: WriteRequest) -> bytes:
     return text.getvalue().encode()
 
 
-# Suffix, axes (x forward, y left, z up), how to write, no way to read; nothing is carried: `mudg export` says what is lost.
+# Suffix, axes (x forward, y left, z up), writer, no reader; nothing is carried: `mudg export` says what is lost.
 FORMAT = SplatFormat((".xyz",), "FLU", to_bytes, None, frozenset())

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from mudg.base import seeds
 from mudg.base.types import FusedCloud, Scene
-from mudg.baselines.flat_network import FlatNetwork, waves
+from mudg.baselines.timed import FlatNetwork, waves
 from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import DeformableNode, NodeRows, RigidNode, StaticNode

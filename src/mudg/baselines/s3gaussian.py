@@ -20,8 +20,7 @@ from torch import Tensor
 
 from mudg.base import log, seeds
 from mudg.base.types import FusedCloud, Scene, View
-from mudg.baselines.flat_network import FlatNetwork
-from mudg.baselines.timed import timed_points
+from mudg.baselines.timed import FlatNetwork, timed_points
 from mudg.core import losses
 from mudg.core.grids import TIME, PlaneSizes, look_up
 from mudg.core.table import Table

@@ -29,7 +29,7 @@ from mudg.base.types import Trajectory
 from mudg.benchmarks.rows import EXACT, FILL, LONGER, REPAIRED, Row, usual_fit
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core.pictures import resize_area
-from mudg.core.raster.place import drawing_device
+from mudg.core.raster.rasterize import drawing_device
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig
 from mudg.formats.exporters.video import Encoding, jpeg_bytes, mp4_within, video_encoders

@@ -75,8 +75,7 @@ from mudg.core import metrics
 from mudg.core.edit import Motion
 from mudg.core.fusion import fuse_sweeps
 from mudg.core.losses import lpips_distance, unit_features
-from mudg.core.raster.place import drawing_device
-from mudg.core.raster.rasterize import rasterize
+from mudg.core.raster.rasterize import drawing_device, rasterize
 from mudg.core.view_metrics import SAME
 from mudg.diffusion import city_clips as from_city
 from mudg.diffusion import model_files as mdm_files

@@ -50,7 +50,7 @@ from mudg.core import metrics as flicker
 from mudg.core.edit import Motion
 from mudg.core.fusion import STATIC
 from mudg.core.lidar import DEPTH_LIMIT_M, OwnedPoints
-from mudg.core.raster.place import drawing_device
+from mudg.core.raster.rasterize import drawing_device
 from mudg.editing.apply import (
     Drawer,
     EditedDrive,

@@ -60,7 +60,7 @@ from mudg.benchmarks.shift import standard_error, virtual_fits_of
 from mudg.core.metrics import METRICS
 from mudg.diffusion import model_files as mdm_files
 from mudg.editing.settings import ScoreConfig
-from mudg.gaussians.methods import METHODS
+from mudg.gaussians.settings import METHODS
 from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, compared, distances
 from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
 from mudg.steps.settings import PresetName

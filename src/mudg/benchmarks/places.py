@@ -33,7 +33,7 @@ from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.formats import ingest
 from mudg.formats.importers.common import holdout_split, parse_frame_range, parse_resolution
 from mudg.formats.settings import IngestConfig
-from mudg.gaussians.methods import METHODS
+from mudg.gaussians.settings import METHODS
 from mudg.labels import annotate
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.read import read_scene

@@ -20,9 +20,8 @@ from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files, views
 from mudg.diffusion.published import is_published
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.gaussians.methods import METHODS, PUBLISHED
 from mudg.gaussians.recipes import recipe_of
-from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.settings import METHODS, PUBLISHED, FitConfig
 from mudg.networks.inception import ResizeRule
 from mudg.scoring import score
 from mudg.scoring.tables import title_of

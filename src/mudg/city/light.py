@@ -18,10 +18,10 @@ from mudg.base import seeds, store
 from mudg.base.errors import InputError
 from mudg.city import layout as rec
 from mudg.city.config import CityConfig
+from mudg.core.weather.air import patch_threshold
 from mudg.core.weather.gbuffer import Surroundings
 from mudg.core.weather.ground import noise_seed
 from mudg.core.weather.light import LAMP_POWER, FilmicResponse
-from mudg.core.weather.noise import patch_threshold
 
 Numbers = NDArray[np.float64]
 

@@ -61,9 +61,8 @@ from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import AssetSource, EditScript, conditions_of
 from mudg.editing.street import MOST_VIEWS, Hidden, noted, with_closed_sides, without_traces
 from mudg.gaussians.model import SceneModel
-from mudg.gaussians.nodes import RigidNode
+from mudg.gaussians.nodes import RigidNode, SkyNode
 from mudg.gaussians.rendering import raster_of, render_view
-from mudg.gaussians.sky import SkyNode
 from mudg.gaussians.start import SH_C0
 from mudg.gaussians.storage import load_model
 from mudg.scene.clouds import read_fused

@@ -18,7 +18,7 @@ from mudg.base.errors import UsageError
 from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
 from mudg.base.types import FusedCloud, Scene
-from mudg.core.raster.place import drawing_device
+from mudg.core.raster.rasterize import drawing_device
 from mudg.diffusion.published import is_published
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.diffusion.synthesize import Drive, JobInputs

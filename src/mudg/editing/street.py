@@ -37,8 +37,7 @@ from mudg.core.table import Table
 from mudg.core.weather.light import LUMINANCE
 from mudg.editing.model import GROUND_CLASSES, SOLID_OPACITY, classes_of_rows, display_of, linear_of
 from mudg.gaussians.model import CERTAINTY, SceneModel, compose
-from mudg.gaussians.nodes import SYMMETRIC_LABELS, RigidNode
-from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.nodes import SYMMETRIC_LABELS, RigidNode, SkyNode
 from mudg.gaussians.start import SH_C0
 
 Array = NDArray[np.float64]

@@ -54,9 +54,8 @@ from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene, logit, 
 from mudg.formats.splats.cloud import known as known_axes
 from mudg.formats.splats.formats import COARSE_M, FORMATS, WriteRequest, file_from_world, losses, read_cloud
 from mudg.gaussians.model import COLUMNS, SceneModel
-from mudg.gaussians.nodes import DeformableNode, NodeRows, RigidNode, StaticNode
+from mudg.gaussians.nodes import DeformableNode, NodeRows, RigidNode, SkyNode, StaticNode
 from mudg.gaussians.rendering import DRAWING
-from mudg.gaussians.sky import SkyNode
 from mudg.gaussians.storage import load_model, model_of_scene, save_model
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import open_files, read_points, read_scene

@@ -38,8 +38,7 @@ from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.base.types import FusedCloud, Gaussians, Render, Scene
 from mudg.core import losses, metrics, native_ops
 from mudg.core.pictures import panels_of
-from mudg.core.raster.place import drawing_device
-from mudg.core.raster.rasterize import RasterConfig, rasterize
+from mudg.core.raster.rasterize import RasterConfig, drawing_device, rasterize
 from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.densify import (
     DensifySettings,
@@ -51,7 +50,6 @@ from mudg.gaussians.densify import (
     reset_opacity,
     shorten_needles,
 )
-from mudg.gaussians.methods import METHODS
 from mudg.gaussians.model import CERTAINTY, SceneModel, compose, composite_sky, sky_lift
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.perception import Perception, perception_of
@@ -61,7 +59,7 @@ from mudg.gaussians.rendering import NEAR_M as NEAR_M
 from mudg.gaussians.rendering import boxes_in_view, check_drawing, drawing_facts, objects_only, raster_of
 from mudg.gaussians.rendering import render_view as render_view
 from mudg.gaussians.schedule import FiniteCheck, appearance_rates, densify_schedule, learning_rates, pose_round_due
-from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.gaussians.storage import (
     StartFit,
     all_classes,

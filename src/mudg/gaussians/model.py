@@ -38,14 +38,13 @@ from mudg.base.palette import CLASSES, ID
 from mudg.base.types import Gaussians, View
 from mudg.core import native_ops
 from mudg.core.table import Table
-from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
-from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.nodes import NodeRows, RigidNode, SkyNode, StaticNode
 
 NODES: Final[Mapping[str, str]] = {
     "static": "mudg.gaussians.nodes:StaticNode",
     "rigid": "mudg.gaussians.nodes:RigidNode",
     "deformable": "mudg.gaussians.nodes:DeformableNode",
-    "sky": "mudg.gaussians.sky:SkyNode",
+    "sky": "mudg.gaussians.nodes:SkyNode",
     "vibration": "mudg.baselines.pvg:VibrationNode",
     "deformed": "mudg.baselines.omnire:DeformedNode",
     "deformation": "mudg.baselines.omnire:DeformationField",

@@ -26,11 +26,9 @@ from mudg.base.errors import InputError
 from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.types import FusedCloud, PointCloud, Scene
 from mudg.core.table import Table
-from mudg.gaussians.methods import METHODS
 from mudg.gaussians.model import SceneModel
-from mudg.gaussians.nodes import RigidNode, StaticNode, object_node
-from mudg.gaussians.settings import FitConfig
-from mudg.gaussians.sky import SkyNode
+from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode, object_node
+from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.gaussians.views import StoredView, heads_of
 
 # starting values of Gaussians: points, thinned and coloured, become rows of the table -------------

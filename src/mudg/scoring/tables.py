@@ -8,7 +8,7 @@ from typing import Any, Final
 from mudg.base import html
 from mudg.base.errors import plain_lines
 from mudg.base.types import Scene
-from mudg.gaussians.methods import METHODS
+from mudg.gaussians.settings import METHODS
 
 NO_TRUTH: Final = "no truth"
 NOT_REQUESTED: Final = "not requested"

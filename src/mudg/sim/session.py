@@ -21,8 +21,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import Camera, Scene, View
 from mudg.core.pictures import to_bytes
-from mudg.core.raster.place import drawing_device
-from mudg.core.raster.rasterize import MAX_EXTRA_CHANNELS, Shutter, rasterize
+from mudg.core.raster.rasterize import MAX_EXTRA_CHANNELS, Shutter, drawing_device, rasterize
 from mudg.editing.apply import carry_out
 from mudg.editing.runs import find_run, scene_at
 from mudg.editing.script import EditScript, read_edits

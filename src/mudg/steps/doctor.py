@@ -135,7 +135,7 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
     import torch
 
     from mudg import native
-    from mudg.core.raster import probe
+    from mudg.core.raster import rasterize as probe
     from mudg.scene.read import read_scene
     from mudg.steps import cost
     from mudg.steps.settings import PRESETS

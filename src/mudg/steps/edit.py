@@ -68,7 +68,7 @@ class Edit(Output):
         return {} if parts.whole else {"scene": parts.scene, "fused": parts.fused}
 
     def prepare(self, inputs: dict[str, str]) -> Make:
-        from mudg.core.raster.place import drawing_device
+        from mudg.core.raster.rasterize import drawing_device
         from mudg.editing.edit import PlannedEdit
         from mudg.editing.script import read_edits
 

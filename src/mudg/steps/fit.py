@@ -53,14 +53,14 @@ class Fit(Output):
     @property
     def reads_scene_alone(self) -> bool:
         """Whether the method has no Gaussians: it starts from no clouds."""
-        from mudg.gaussians.methods import METHODS
+        from mudg.gaussians.settings import METHODS
 
         return METHODS[self.settings.method].scene == "radiance"
 
     def output(self) -> VerbOutput:
         """Methods without boxes fuse the clouds again; results of those that took the ones of `mudg fuse` are made
         again."""
-        from mudg.gaussians.methods import METHODS
+        from mudg.gaussians.settings import METHODS
 
         own = super().output()
         if self.reads_scene_alone or METHODS[self.settings.method].boxes:

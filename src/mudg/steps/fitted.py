@@ -63,7 +63,7 @@ class FittedScene:
             InputError: not such a folder, or of another version. IntegrityError: a file was altered. ResourceError: no
                 such device.
         """
-        from mudg.core.raster.place import drawing_device
+        from mudg.core.raster.rasterize import drawing_device
         from mudg.editing.runs import fit_at
         from mudg.gaussians.fit import load_model
 

@@ -192,7 +192,7 @@ def _forecast(config: RunConfig, scene: Path) -> str:
     """A line on what the steps from here on will take."""
     from mudg import native
     from mudg.base import devices
-    from mudg.core.raster import probe
+    from mudg.core.raster import rasterize as probe
     from mudg.scene.read import read_scene
     from mudg.steps import cost
     from mudg.steps.doctor import scene_size

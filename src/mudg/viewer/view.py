@@ -19,7 +19,7 @@ from mudg.base.records import parse_record
 from mudg.base.run_folder import ResultFile, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import HeightMap
-from mudg.core.raster.place import drawing_device
+from mudg.core.raster.rasterize import drawing_device
 from mudg.editing.apply import SEED, ground_of
 from mudg.editing.runs import RunParts, find_run
 from mudg.gaussians.model import SceneModel

@@ -15,8 +15,8 @@ from scipy.spatial import KDTree
 from mudg.base import seeds
 from mudg.base.palette import ID
 from mudg.base.types import View
+from mudg.core.weather.air import patch_threshold, patches, smoothstep
 from mudg.core.weather.gbuffer import GBuffer, Surroundings, places_within_pixels, sky_share, world_points, world_rays
-from mudg.core.weather.noise import patch_threshold, patches, smoothstep
 
 Array = NDArray[np.float64]
 Plane = NDArray[np.float32]

@@ -19,9 +19,9 @@ from scipy import ndimage
 from mudg.base.palette import ID
 from mudg.base.types import View
 from mudg.base.weather_settings import LightSettings, ResponseSettings, SeasonSettings
+from mudg.core.weather.air import patches, smoothstep
 from mudg.core.weather.gbuffer import GBuffer, Surroundings, sky_share, world_points, world_rays
 from mudg.core.weather.ground import noise_seed, sky_light
-from mudg.core.weather.noise import patches, smoothstep
 
 # camera response: linear light to display values and back, as an explicit object that every caller chooses ------------
 
