@@ -22,7 +22,8 @@ from mudg.base.plugins import GROUP, load_plugin, plugins
 from mudg.base.types import Scene
 from mudg.core.metrics import METRICS
 from mudg.formats.splats.formats import FORMATS
-from mudg.gaussians.storage import save_model
+from mudg.gaussians.recipes import RECIPES
+from mudg.gaussians.storage import load_model, save_model
 from mudg.scene.read import read_scene
 
 
@@ -48,7 +49,7 @@ def truth(tmp_path_factory: pytest.TempPathFactory) -> Scene:
 
 
 def test_nothing_is_offered_where_no_package_offers_it() -> None:
-    assert plugins("importer") == {} == plugins("method")
+    assert plugins("importer") == {}
 
 
 def test_an_importer_of_another_package_reads_a_recording(installed: Path, truth: Scene, tmp_path: Path) -> None:
@@ -104,3 +105,18 @@ def test_an_exporter_writes_files_and_says_what_they_lose(
     rows = np.loadtxt(tmp_path / "scene.xyz")
     assert rows.shape[1] == 7 and (rows[:, 3:] >= 0).all() and (rows[:, 3:] <= 1).all()
     assert len(rows) == 690 and "motion" in str(store.read_json(tmp_path / "scene.xyz.json")["not_in_the_file"])
+
+
+def test_a_method_adds_its_loss_to_the_common_fit(
+    installed: Path, truth: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fused = mudg.fuse(truth.root, out=tmp_path / "fused")
+
+    def smallest_axes_m(name: str) -> float:
+        settings = {"iterations": 40, "width_px": 48, "start": {"gaussians": 600}, "densify": {"kind": "none"}}
+        folder = mudg.fit(truth.root, fused, out=tmp_path / name, method="street_gaussians", **settings)
+        return float(load_model(folder).table["log_scales"].detach().exp().min(1).values.mean())
+
+    plain = smallest_axes_m("plain")
+    monkeypatch.setitem(RECIPES, "street_gaussians", "my_method:FlatRecipe")
+    assert smallest_axes_m("flat") < 0.9 * plain

@@ -1,5 +1,7 @@
-"""Importers and methods of other packages: entry points of the group ``mudg.plugins``, named ``importer.NAME`` or
-``method.NAME``. Names are read from package metadata; a package's code is imported only when you ask for its name."""
+"""Importers of other packages: entry points of the group ``mudg.plugins``, named ``importer.NAME``.
+
+Names are read from package metadata; a package's code is imported only when you ask for its name.
+"""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ if TYPE_CHECKING:
 GROUP: Final = "mudg.plugins"
 
 
-def plugins(kind: Literal["importer", "method"]) -> dict[str, EntryPoint]:
+def plugins(kind: Literal["importer"]) -> dict[str, EntryPoint]:
     """Names of a kind that installed packages offer, in order, and where their code is."""
     from importlib.metadata import entry_points  # 14 ms
 
@@ -27,7 +29,7 @@ def origin(point: EntryPoint) -> str:
     return f"{point.value}{package}"
 
 
-def load_plugin(kind: Literal["importer", "method"], name: str) -> Any:
+def load_plugin(kind: Literal["importer"], name: str) -> Any:
     """The object behind a name of ``plugins``.
 
     Raises:

@@ -2,9 +2,9 @@
 points.
 
 Unit costs are processor seconds on the machine where they were measured (2 virtual cores with AVX-512 and AMX).
-`core/raster/rasterize.py` says how fast another machine is beside it, by one short step of a fit. On a CUDA card nothing
-was measured: there the memory is counted and the time is unknown. So is the time of a published-type model, on any
-device.
+`core/raster/rasterize.py` says how fast another machine is beside it, by one short step of a fit. On a CUDA card
+nothing was measured: there the memory is counted and the time is unknown. So is the time of a published-type model, on
+any device.
 """
 
 from __future__ import annotations

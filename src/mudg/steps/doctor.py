@@ -68,9 +68,7 @@ def report_machine() -> dict[str, Any]:
         "native library": _native(problems),
         "packages": _packages(problems),
         "optional packages": _optional(),
-        "plugins": {
-            f"{kind} {name}": origin(point) for kind in ("importer", "method") for name, point in plugins(kind).items()
-        },
+        "plugins": {f"importer {name}": origin(point) for name, point in plugins("importer").items()},
         "video": _video(problems),
         "weights": _weights(problems),
     }
