@@ -65,13 +65,8 @@ def before(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., None]], N
 def folder_of(tmp_path: Path, name: str = "made", **more: bytes) -> Path:
     """A small result: files at two depths, an empty one, a manifest and a record."""
     folder = tmp_path / name
-    files = {
-        "a/b/deep.bin": bytes(range(256)) * 3,
-        "plain.txt": b"plain",
-        "empty": b"",
-        "run.json": b'{"state": 1}',
-        **more,
-    }
+    files = {"a/b/deep.bin": bytes(range(256)) * 3, "plain.txt": b"plain", "empty": b""}
+    files |= {"run.json": b'{"state": 1}', **more}
     for relative, content in files.items():
         (folder / relative).parent.mkdir(parents=True, exist_ok=True)
         (folder / relative).write_bytes(content)

@@ -19,17 +19,7 @@ from mudg.steps.score import Score
 
 fsspec = pytest.importorskip("fsspec", reason="the store in memory is fsspec's")
 
-CITY = (
-    "--city.n-frames",
-    "2",
-    "--city.width",
-    "48",
-    "--city.height",
-    "32",
-    "--city.cameras",
-    "front",
-    "--no-contact-sheet",
-)
+CITY = "--city.n-frames 2 --city.width 48 --city.height 32 --city.cameras front --no-contact-sheet".split()
 
 
 @pytest.fixture(scope="module")
@@ -134,10 +124,8 @@ def test_a_file_goes_to_an_address_too(command: Callable[..., Any], scene: Path)
     args = Report(runs=(scene,), out=Path("memory://bucket/pages/page.html"))
     said = staging.run_staged("report", args, write)
     assert said == {"page": "memory://bucket/pages/page.html", "text": "see memory://bucket/pages/page.html"}
-    assert (
-        at("memory://bucket/pages/page.html").load() == b"page"
-        and at("memory://bucket/pages/page_more/x.bin").load() == b"x"
-    )
+    assert at("memory://bucket/pages/page.html").load() == b"page"
+    assert at("memory://bucket/pages/page_more/x.bin").load() == b"x"
 
 
 def test_every_kind_of_flag_is_staged(scratch: Path) -> None:
@@ -146,9 +134,8 @@ def test_every_kind_of_flag_is_staged(scratch: Path) -> None:
     seen = {}
 
     def look(args: Any) -> dict[str, Any]:
-        seen.update(
-            scene=args.scene.read_bytes(), views=[path.read_bytes() for path in args.views.values()], out=args.out
-        )
+        views = [path.read_bytes() for path in args.views.values()]
+        seen.update(scene=args.scene.read_bytes(), views=views, out=args.out)
         return {}
 
     views = {"mine": Path("memory://bucket/a/views"), "theirs": scratch / "x"}

@@ -18,7 +18,6 @@ from mudg.base import palette
 # Tables of text as Markdown, LaTeX and CSV; the macro ``table`` of ``assets/templates/macros.html.j2`` is their HTML.
 # No torch.
 
-
 PUBLISHED: Final = "published"
 """Kind of the lines that LaTeX sets apart from the others by a rule."""
 ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
@@ -130,7 +129,6 @@ def best_of(better: str, numbers: Mapping[str, float]) -> list[str]:
 
 
 # html ---------------------------------------------------------------------------------------------
-
 
 TONES: Final = ("truth", "nearest_fill", "street_gaussians", "mudg_r", "mudg_s")
 """Methods that have a colour of their own in ``page.css``."""

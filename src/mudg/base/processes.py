@@ -52,7 +52,6 @@ _SAME_SIGNAL_S = 10.0
 """A worker takes signals that come together for one: Ctrl-C reaches it from the terminal and again from its parent."""
 GIB = 1 << 30
 
-
 # ---- threads and environment ---------------------------------------------------------------------
 
 
@@ -98,7 +97,6 @@ def process_alive(pid: int) -> bool:
 
 
 # ---- interrupts ----------------------------------------------------------------------------------
-
 
 _NOTICES = (signal.SIGUSR1,) if hasattr(signal, "SIGUSR1") else ()
 """Signals that announce the end of a job."""

@@ -56,7 +56,6 @@ from mudg.scene.write import SceneWriter
 # A frame whose LiDAR returns are too few, or do not fit the network's depth, keeps the depth that was filled from them;
 # it is marked by a small file beside its labels, warned of, and counted in the notes.
 
-
 _FILLED: Final = ".filled.json"
 
 
@@ -150,7 +149,6 @@ def _mark(staging: Path, frame_id: str) -> Path:
 
 # the own vehicle in an image: what stays the same at the bottom of the image while everything else goes by ------------
 
-
 FRAMES: Final = 16
 MIN_TRAVEL_M: Final = 10.0
 MIN_SHARE: Final = 0.002
@@ -196,7 +194,6 @@ def steady_bottom(grey: NDArray[np.floating]) -> NDArray[np.bool_]:
 #
 # LiDAR returns for an image: points of the sweeps around it, dynamic objects standing where they are at the image's
 # time.
-
 
 MAX_GAP_S = 2.0
 """Sweeps farther in time than this from an image do not help: what moves without a track has gone elsewhere."""
@@ -290,7 +287,6 @@ def _highest(sweep: Sweep, world: NDArray[np.float32]) -> float:
 # red; confidence of the classes. What to look for: edges of the depth lie on edges of the image, the road has no steps,
 # sky ends at the roofs.
 
-
 NAME: Final = "labels.html"
 _FRAMES: Final = 6
 _WIDTH_PX: Final = 480
@@ -351,7 +347,6 @@ def _depth_picture(scene: Scene, frame: Frame) -> NDArray[np.uint8]:
 
 
 # annotate -----------------------------------------------------------------------------------------
-
 
 _STAGING = "labelled"
 _SHARING = 4

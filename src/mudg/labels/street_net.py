@@ -39,7 +39,6 @@ from mudg.networks.folders import CPU, Place
 # together as cells of 2x2 pixels, and the scores of a cell's four pixels leave together: nothing is computed at full
 # size, and nothing of it is lost.
 
-
 MODEL_FILE: Final = "model.json"
 WEIGHTS_FILE: Final = "weights.safetensors"
 EMBEDDED: Final = Path(__file__).resolve().parents[1] / "assets" / "segmenter_small"
@@ -180,7 +179,6 @@ def _described(folder: Path | str) -> Path:
 
 
 # street labels ------------------------------------------------------------------------------------
-
 
 RETURN_DEG: Final = 0.12
 """A pixel nearer than this to a return shows a surface, not the sky."""

@@ -81,7 +81,6 @@ class DepthLabSampling:
 
 PUBLISHED_SAMPLING: Final = DepthLabSampling()
 
-
 # --- the networks ---------------------------------------------------------------------------------
 
 
@@ -431,7 +430,6 @@ class DepthLab:
 # The three are recognised by what lies in them, not by their names. Tensors are compared with the networks that the
 # descriptions stand for, by name and shape, all of them before the first is written. The published code takes what the
 # pickle of the denoising U-Net or of the linear layer lacks from Marigold or leaves it random; here that is an error.
-
 
 PICKLES = {part: f"{part}.pth" for part in (*UNETS, "mapping_layer")}
 """Part -> the published file that holds it."""
