@@ -576,10 +576,8 @@ def _verified(path: Path, overwrite: bool) -> bool:
     except IntegrityError as error:
         if overwrite:
             return False
-        remedy = "add --overwrite to make it again, or choose another --out"
-        raise IntegrityError(
-            error.what, where=error.where, expected=error.expected, got=error.got, remedy=remedy
-        ) from error
+        fields = {**error.fields, "remedy": "add --overwrite to make it again, or choose another --out"}
+        raise IntegrityError(error.what, **fields) from error
     return True
 
 
