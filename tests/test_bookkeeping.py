@@ -62,6 +62,10 @@ class _either:
         return kind is not None and issubclass(kind, MudgError)
 
 
+def note(folder: Path, **values: str) -> None:
+    store.write_json(folder / "run.json", {**store.read_json(folder / "run.json"), **values})
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
@@ -69,19 +73,9 @@ class _either:
         (lambda folder: (folder / "log.jsonl").unlink(), IntegrityError, "missing"),
         (lambda folder: (folder / "out.txt").write_text("other"), IntegrityError, "altered"),
         (lambda folder: store.write_manifest(folder, ["out.txt"]), IntegrityError, "altered"),
-        (
-            lambda folder: store.write_json(folder / "run.json", {**store.read_json(folder / "run.json"), "key": "x"}),
-            IntegrityError,
-            "altered",
-        ),
+        (lambda folder: note(folder, key="x"), IntegrityError, "altered"),
         (lambda folder: store.write_json(folder / "run.json", []), IntegrityError, "damaged"),
-        (
-            lambda folder: store.write_json(
-                folder / "run.json", {**store.read_json(folder / "run.json"), "state": "running"}
-            ),
-            InputError,
-            "unfinished",
-        ),
+        (lambda folder: note(folder, state="running"), InputError, "unfinished"),
     ],
 )
 def test_a_folder_whose_bookkeeping_does_not_fit_is_no_input(

@@ -82,15 +82,8 @@ def test_short_clips_and_other_sizes_are_refused(state) -> None:
 
 @pytest.mark.parametrize(
     ("length", "kernel", "stride", "front", "back"),
-    [
-        (16, 7, 2, 2, 3),
-        (9, 7, 2, 3, 3),
-        (8, 3, 2, 0, 1),
-        (5, 3, 2, 1, 1),
-        (5, 2, 2, 0, 1),
-        (4, 2, 2, 0, 0),
-        (6, 3, 1, 1, 1),
-    ],
+    [(16, 7, 2, 2, 3), (9, 7, 2, 3, 3), (8, 3, 2, 0, 1), (5, 3, 2, 1, 1)]
+    + [(5, 2, 2, 0, 1), (4, 2, 2, 0, 0), (6, 3, 1, 1, 1)],
 )
 def test_padding_of_the_rule_same(length: int, kernel: int, stride: int, front: int, back: int) -> None:
     row = torch.arange(1.0, length + 1).view(1, 1, length, 1, 1)
