@@ -84,16 +84,9 @@ class Pretend(torch.Tensor):
 
     @staticmethod
     def __new__(cls, inner: torch.Tensor) -> Pretend:
-        return torch.Tensor._make_wrapper_subclass(
-            cls,
-            inner.size(),
-            strides=inner.stride(),
-            storage_offset=inner.storage_offset(),
-            dtype=inner.dtype,
-            layout=inner.layout,
-            device=DEVICE,
-            requires_grad=False,
-        )
+        options = {"dtype": inner.dtype, "layout": inner.layout, "device": DEVICE, "requires_grad": False}
+        options |= {"strides": inner.stride(), "storage_offset": inner.storage_offset()}
+        return torch.Tensor._make_wrapper_subclass(cls, inner.size(), **options)
 
     def __init__(self, inner: torch.Tensor) -> None:
         self.inner = inner

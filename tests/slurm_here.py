@@ -75,21 +75,15 @@ def slurm_here(folder: Path) -> Iterator[dict[str, str]]:
     (folder / "munge.key").write_bytes(os.urandom(128))
     (folder / "munge.key").chmod(0o600)
     host = socket.gethostname().split(".")[0]
-    text = CONF.format(
-        host=host, folder=folder, user="root", port=_free_port(), node_port=_free_port(), cores=os.cpu_count()
-    )
+    ports = {"port": _free_port(), "node_port": _free_port()}
+    text = CONF.format(host=host, folder=folder, user="root", cores=os.cpu_count(), **ports)
     (folder / "slurm.conf").write_text(text)
     environment = {**os.environ, "SLURM_CONF": str(folder / "slurm.conf")}
     commands = (
         [
-            "munged",
-            "--foreground",
-            "--force",
-            f"--key-file={folder}/munge.key",
+            *("munged", "--foreground", "--force", f"--key-file={folder}/munge.key"),
+            *(f"--{kind}-file={folder}/munge.{kind}" for kind in ("pid", "seed", "log")),
             f"--socket={folder}/munge.socket",
-            f"--pid-file={folder}/munge.pid",
-            f"--seed-file={folder}/munge.seed",
-            f"--log-file={folder}/munge.log",
         ],
         ["slurmctld", "-D", "-f", str(folder / "slurm.conf")],
         ["slurmd", "-D", "-f", str(folder / "slurm.conf"), "-N", host],
@@ -98,11 +92,8 @@ def slurm_here(folder: Path) -> Iterator[dict[str, str]]:
     try:
         for words in commands:
             with (folder / f"{words[0]}.out").open("wb") as log:
-                running.append(
-                    subprocess.Popen(
-                        [_program(words[0]) or words[0], *words[1:]], env=environment, stdout=log, stderr=log
-                    )
-                )
+                program = [_program(words[0]) or words[0], *words[1:]]
+                running.append(subprocess.Popen(program, env=environment, stdout=log, stderr=log))
             time.sleep(1.0)
         end = time.monotonic() + 60
         while (
@@ -116,12 +107,8 @@ def slurm_here(folder: Path) -> Iterator[dict[str, str]]:
         yield environment
     finally:
         with contextlib.suppress(OSError, subprocess.TimeoutExpired):  # no job may outlive its daemons
-            subprocess.run(
-                ["scancel", "--full", "--signal=KILL", "--user", "root"],
-                env=environment,
-                capture_output=True,
-                timeout=10,
-            )
+            words = ["scancel", "--full", "--signal=KILL", "--user", "root"]
+            subprocess.run(words, env=environment, capture_output=True, timeout=10)
             time.sleep(2.0)
         for one in reversed(running):
             one.terminate()

@@ -62,9 +62,8 @@ def test_labels_of_a_street_agree_with_the_truth() -> None:
     assert overlap(labels.semantics, truth, "sky") > 0.95
     assert overlap(labels.semantics, truth, "building", "vegetation", "wall") > 0.8
     assert (labels.semantics != UNLABELLED).mean() > 0.95
-    assert set(np.unique(labels.semantics)) <= {
-        ID[n] for n in ("road", "sidewalk", "terrain", "building", "vegetation", "sky", "car")
-    } | {UNLABELLED}
+    known = ("road", "sidewalk", "terrain", "building", "vegetation", "sky", "car")
+    assert set(np.unique(labels.semantics)) <= {*(ID[name] for name in known), UNLABELLED}
 
 
 def test_confidence_tells_right_from_wrong() -> None:
@@ -148,14 +147,9 @@ def test_elevation_of_rays() -> None:
     elevation = ray_elevation(view)
     middle = view.camera.height // 2
     assert elevation[middle - 1].min() > 0 > elevation[middle].max()
-    pitched = View(
-        view.camera,
-        view.world_from_cam
-        @ geometry.from_rotation_translation(
-            [[1, 0, 0], [0, np.cos(0.1), -np.sin(0.1)], [0, np.sin(0.1), np.cos(0.1)]], [0, 0, 0]
-        ),
-        0.0,
-    )
+    pitch = [[1, 0, 0], [0, np.cos(0.1), -np.sin(0.1)], [0, np.sin(0.1), np.cos(0.1)]]
+    pose = view.world_from_cam @ geometry.from_rotation_translation(pitch, [0, 0, 0])
+    pitched = View(view.camera, pose, 0.0)
     column = view.camera.width // 2
     assert ray_elevation(pitched)[middle, column] == pytest.approx(elevation[middle, column] + 0.1, abs=1e-3)
 
@@ -163,9 +157,8 @@ def test_elevation_of_rays() -> None:
 def test_sky_is_not_found_where_returns_are_or_below_the_horizon() -> None:
     rgb = np.full((60, 80, 3), 220, np.uint8)
     elevation = np.repeat(np.linspace(0.5, -0.5, 60)[:, None], 80, 1).astype(np.float32)
-    away_px = np.repeat(np.maximum(50.0 - np.arange(80), 0)[None], 60, 0).astype(
-        np.float32
-    )  # returns from column 50 on
+    # returns from column 50 on
+    away_px = np.repeat(np.maximum(50.0 - np.arange(80), 0)[None], 60, 0).astype(np.float32)
     sky = find_sky(rgb, elevation, away_px, 6.0)
     assert sky[:28, :48].all()  # grown up to the returns, not into them
     assert not sky[:, 49:].any() and not sky[31:].any()
@@ -197,9 +190,8 @@ def test_stage_makes_a_labelled_scene_and_leaves_the_given_one_alone(tmp_path: P
 
 def test_a_scene_with_labels_passes_through_unchanged(tmp_path: Path) -> None:
     given = STREET.write(tmp_path / "given")
-    scene = read_scene(
-        Annotate(scene=tmp_path / "given", out=tmp_path / "out", settings=AnnotateConfig(dynamic=False)).run()
-    )
+    settings = AnnotateConfig(dynamic=False)
+    scene = read_scene(Annotate(scene=tmp_path / "given", out=tmp_path / "out", settings=settings).run())
     for frame, before in zip(scene.frames, given.frames, strict=True):
         assert set(frame.labels) == set(before.labels)
         assert (read_label(scene, frame, "semantics") == read_label(given, before, "semantics")).all()
@@ -288,9 +280,8 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
     monkeypatch.setattr(annotate_depth, "load_depth_network", lambda *_: network)
     config = AnnotateConfig(depth_network=str(tmp_path / "weights"), processes=1)
     scene = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run())
-    by_points = read_scene(
-        Annotate(scene=tmp_path / "plain", out=tmp_path / "filled", settings=AnnotateConfig(processes=1)).run()
-    )
+    plain_config = AnnotateConfig(processes=1)
+    by_points = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "filled", settings=plain_config).run())
     first, second = (read_label(scene, frame, "depth") for frame in scene.frames)
     seen = ~read_label(scene, scene.frames[0], "sky").astype(bool) & np.isfinite(street.image(plain.frames[0].view)[2])
     assert np.median(np.abs(first / truth[plain.frames[0].id] - 1)[seen]) < 1e-2
@@ -307,9 +298,8 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
 def test_a_frame_without_lidar_keeps_its_depth(tmp_path: Path) -> None:
     given = replace(given_at(STREET)[0], xyz_world=np.zeros((0, 3), np.float32))
     labels = label_by_geometry(given)
-    assert (
-        annotate_depth.with_network(lambda _: pytest.fail("asked"), given, labels, "front/000000", tmp_path) is labels
-    )
+    network = lambda _: pytest.fail("asked")  # noqa: E731
+    assert annotate_depth.with_network(network, given, labels, "front/000000", tmp_path) is labels
     assert (tmp_path / "front" / "000000.filled.json").is_file()
 
 

@@ -107,18 +107,9 @@ def test_many_logs_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureF
     content = broken.read_bytes()
     broken.write_bytes(content[:-5])
     (tmp_path / "list.txt").write_text(f"{drives[0]} name=first frames=0:3\n{drives[1]} name=second\n")
-    words = [
-        "ingest",
-        "kitti",
-        "--list",
-        str(tmp_path / "list.txt"),
-        "--out",
-        str(tmp_path / "scenes"),
-        "--jobs",
-        "2",
-        "--no-contact-sheet",
-        "--quiet",
-    ]
+    words = (
+        f"ingest kitti --list {tmp_path}/list.txt --out {tmp_path}/scenes --jobs 2 --no-contact-sheet --quiet".split()
+    )
     assert app.main(words) == 11
     said = capsys.readouterr().out
     assert "1 of 2 scenes are there, 1 failed" in said and "cut off" in said

@@ -23,9 +23,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scenes = Scenes(tmp_path_factory.mktemp("batch"))
     scenes.does("s0", "echo 'error: it is cut off' >&2; exit 3")
     assert scenes.run() == {"failed": 1, "done": 2}
-    (scenes.folder / "out/_batch/owner-1-of-3.json").write_text(
-        json.dumps({"host": "elsewhere", "process": 1, "since": 1.0, "shard": [1, 3], "job": ""})
-    )
+    owner = {"host": "elsewhere", "process": 1, "since": 1.0, "shard": [1, 3], "job": ""}
+    (scenes.folder / "out/_batch/owner-1-of-3.json").write_text(json.dumps(owner))
     return scenes.folder / "out"
 
 
@@ -43,14 +42,10 @@ def damaged(content: bytes) -> Iterator[bytes]:
     for number, record in enumerate(records):
         for name in record if isinstance(record, dict) and number in (0, len(records) - 1) else ():
             for value in [..., *VALUES]:
-                changed = {
-                    key: value if key == name else kept
-                    for key, kept in record.items()
-                    if key != name or value is not ...
-                }
-                yield "".join(
-                    f"{json.dumps(one)}\n" for one in [*records[:number], changed, *records[number + 1 :]]
-                ).encode()
+                changed = {key: kept for key, kept in record.items() if key != name or value is not ...}
+                changed |= {name: value} if name in changed else {}
+                rows = [*records[:number], changed, *records[number + 1 :]]
+                yield "".join(f"{json.dumps(one)}\n" for one in rows).encode()
 
 
 def ends_in_words(call: Callable[[], object]) -> None:

@@ -49,27 +49,13 @@ class ListOfScenes:
         (folder / "list.txt").write_text("".join(f"city name=s{number:03d}\n" for number in range(scenes)))
 
     def words(self, out: Path, *more: str) -> list[str]:
-        return [
-            "batch",
-            "run",
-            "--list",
-            str(self.folder / "list.txt"),
-            "--out",
-            str(out),
-            "--quiet",
-            *more,
-            "--command",
-            "sh",
-            str(self.folder / "step.sh"),
-            "{name}",
-            "{out}",
-            str(self.tally),
-        ]
+        step = ["sh", str(self.folder / "step.sh"), "{name}", "{out}", str(self.tally)]
+        first = f"batch run --list {self.folder}/list.txt --out {out} --quiet".split()
+        return [*first, *more, "--command", *step]
 
     def start(self, out: Path, *more: str, **environment: str) -> subprocess.Popen[bytes]:
-        return subprocess.Popen(
-            [sys.executable, "-m", "mudg", *self.words(out, *more)], env={**os.environ, **environment}
-        )
+        command = [sys.executable, "-m", "mudg", *self.words(out, *more)]
+        return subprocess.Popen(command, env={**os.environ, **environment})
 
     def tallies(self) -> list[Path]:
         """A file for each scene that was begun."""
@@ -140,9 +126,8 @@ def test_slurm(tmp_path: Path, undisturbed: dict[str, str], slurm: dict[str, str
     made, out, began = ListOfScenes(tmp_path), tmp_path / "out", time.monotonic()
     running = made.start(out, *SLURM, "--jobs", "4", "--wait", **slurm)
     wait_until(lambda: len(made.tallies()) > 10, 120)
-    refused = subprocess.run(
-        [sys.executable, "-m", "mudg", *made.words(out)], env=slurm, capture_output=True, text=True
-    )
+    command = [sys.executable, "-m", "mudg", *made.words(out)]
+    refused = subprocess.run(command, env=slurm, capture_output=True, text=True)
     assert refused.returncode == 2 and "another driver works on this batch" in refused.stderr
     assert running.wait(500) == 12, messages(out)
     print(f"{SCENES} scenes through Slurm: {time.monotonic() - began:.1f} s")
@@ -158,9 +143,8 @@ def test_a_preempted_slurm_job_goes_on(how: str, tmp_path: Path, slurm: dict[str
     made, out = ListOfScenes(tmp_path, 30), tmp_path / "out"
     words = made.words(out, *SLURM, "--json")
     environment = {**slurm, "STEP_S": "1"}
-    submitted = subprocess.run(
-        [sys.executable, "-m", "mudg", *words], env=environment, cwd=tmp_path, capture_output=True, text=True
-    )
+    command = [sys.executable, "-m", "mudg", *words]
+    submitted = subprocess.run(command, env=environment, cwd=tmp_path, capture_output=True, text=True)
     assert submitted.returncode == 0, submitted.stderr
     number = json.loads(submitted.stdout)["job"]
     wait_until(lambda: made.runs() >= 3, 120)
@@ -230,15 +214,9 @@ def test_chaos(tmp_path: Path, undisturbed: dict[str, str]) -> None:
 
 CITIES = int(os.environ.get("MUDG_TEST_CITIES", "200"))
 TINY = (
-    "ingest.city.n_frames=6",
-    "ingest.city.width=96",
-    "ingest.city.height=64",
-    "ingest.city.cameras=[front]",
-    "ingest.city.lidar_beams=16",
-    "ingest.contact_sheet=false",
-    "fit.iterations=20",
-    "fit.start.gaussians=2000",
-)
+    "ingest.city.n_frames=6 ingest.city.width=96 ingest.city.height=64 ingest.city.cameras=[front] "
+    "ingest.city.lidar_beams=16 ingest.contact_sheet=false fit.iterations=20 fit.start.gaussians=2000"
+).split()
 
 
 class Cities:
@@ -250,22 +228,9 @@ class Cities:
         self.listed.write_text("".join(f"city name=c{number:03d} seed={number}\n" for number in range(CITIES)))
 
     def start(self, out: Path, *more: str, **environment: str) -> subprocess.Popen[bytes]:
-        words = [
-            "batch",
-            "run",
-            "--list",
-            str(self.listed),
-            "--out",
-            str(out),
-            "--quiet",
-            "--stages",
-            "ingest",
-            "fuse",
-            "fit",
-        ]
-        return subprocess.Popen(
-            [sys.executable, "-m", "mudg", *words, *more, "--set", *TINY], env={**os.environ, **environment}
-        )
+        words = f"batch run --list {self.listed} --out {out} --quiet --stages ingest fuse fit".split()
+        command = [sys.executable, "-m", "mudg", *words, *more, "--set", *TINY]
+        return subprocess.Popen(command, env={**os.environ, **environment})
 
 
 def digests(out: Path) -> dict[str, str]:
@@ -331,9 +296,8 @@ def test_status_of_a_hundred_thousand_scenes(tmp_path: Path) -> None:
         (tmp_path / "_batch" / kind).mkdir()
     for number, unit in enumerate(unit for entry in entries for unit in plan.units(entry)):
         kind = "failed" if number % 100 == 77 else "done"
-        ended = Ended(
-            scene=unit.entry.name, stage="command", key=unit.key, code=3 * (kind == "failed"), ended=1e9 + number
-        )
+        facts = {"scene": unit.entry.name, "stage": "command", "key": unit.key, "code": 3 * (kind == "failed")}
+        ended = Ended(**facts, ended=1e9 + number)
         (tmp_path / "_batch" / kind / f"{unit.key}.json").write_text(ended.model_dump_json())
     began = time.monotonic()
     state = status.read_status(folder)

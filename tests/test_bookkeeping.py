@@ -62,6 +62,10 @@ class _either:
         return kind is not None and issubclass(kind, MudgError)
 
 
+def note(folder: Path, **values: str) -> None:
+    store.write_json(folder / "run.json", {**store.read_json(folder / "run.json"), **values})
+
+
 @pytest.mark.parametrize(
     ("change", "error", "words"),
     [
@@ -69,19 +73,9 @@ class _either:
         (lambda folder: (folder / "log.jsonl").unlink(), IntegrityError, "missing"),
         (lambda folder: (folder / "out.txt").write_text("other"), IntegrityError, "altered"),
         (lambda folder: store.write_manifest(folder, ["out.txt"]), IntegrityError, "altered"),
-        (
-            lambda folder: store.write_json(folder / "run.json", {**store.read_json(folder / "run.json"), "key": "x"}),
-            IntegrityError,
-            "altered",
-        ),
+        (lambda folder: note(folder, key="x"), IntegrityError, "altered"),
         (lambda folder: store.write_json(folder / "run.json", []), IntegrityError, "damaged"),
-        (
-            lambda folder: store.write_json(
-                folder / "run.json", {**store.read_json(folder / "run.json"), "state": "running"}
-            ),
-            InputError,
-            "unfinished",
-        ),
+        (lambda folder: note(folder, state="running"), InputError, "unfinished"),
     ],
 )
 def test_a_folder_whose_bookkeeping_does_not_fit_is_no_input(
@@ -114,9 +108,8 @@ def test_a_copied_folder_is_an_input_with_and_without_its_record(finished: Path,
 @pytest.mark.parametrize("lost", [("check",), ("check", "sealed")])
 def test_a_record_without_its_seal_is_damaged_whatever_schema_it_names(finished: Path, lost: tuple[str, ...]) -> None:
     state = store.read_json(finished / "run.json")
-    store.write_json(
-        finished / "run.json", {name: value for name, value in state.items() if name not in lost} | {"schema": 1}
-    )
+    older = {name: value for name, value in state.items() if name not in lost} | {"schema": 1}
+    store.write_json(finished / "run.json", older)
     with pytest.raises(IntegrityError, match="record of a run is damaged"):
         store.digest(finished)
 

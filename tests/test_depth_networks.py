@@ -75,9 +75,8 @@ def test_wrong_returns_from_behind_do_not_pull() -> None:
     measured = given.measured.copy()
     bad = np.isfinite(measured) & (np.random.default_rng(2).uniform(size=truth.shape) < 0.4)
     measured[bad] *= 1.4
-    found = align_to_lidar(
-        Prediction(truth / 80 - 0.1, "depth"), DepthInput(given.rgb, measured, given.filled, given.sky), RULES
-    )
+    asked = DepthInput(given.rgb, measured, given.filled, given.sky)
+    found = align_to_lidar(Prediction(truth / 80 - 0.1, "depth"), asked, RULES)
     assert found.dense is not None and np.abs(found.dense.depth / truth - 1).max() < 1e-3
 
 
@@ -88,10 +87,8 @@ def test_depth_that_does_not_fit_the_returns_is_not_used() -> None:
     for values in (noise, -truth, np.full_like(truth, 3.0)):
         assert align_to_lidar(Prediction(values, "depth"), given, RULES).dense is None
     few = np.where(np.cumsum(np.isfinite(given.measured)).reshape(truth.shape) <= 20, given.measured, np.nan)
-    assert (
-        align_to_lidar(Prediction(truth, "depth"), DepthInput(given.rgb, few, given.filled, given.sky), RULES).dense
-        is None
-    )
+    asked = DepthInput(given.rgb, few, given.filled, given.sky)
+    assert align_to_lidar(Prediction(truth, "depth"), asked, RULES).dense is None
     with pytest.raises(InputError, match="size"):
         align_to_lidar(Prediction(truth[1:], "depth"), given, RULES)
 
@@ -145,13 +142,8 @@ def test_what_is_missing_or_wrong_is_named(tmp_path: Path, monkeypatch: pytest.M
     (tmp_path / "d" / "model.json").write_text(json.dumps({"kind": "published"}))
     with pytest.raises(InputError, match="another kind"):
         kind_of(tmp_path / "d")
-    assert set(KINDS) == {
-        "prompt_depth_anything",
-        "depth_anything",
-        "MarigoldDepthPipeline",
-        "MarigoldPipeline",
-        "depthlab",
-    }
+    known = "prompt_depth_anything depth_anything MarigoldDepthPipeline MarigoldPipeline depthlab"
+    assert set(KINDS) == set(known.split())
 
 
 @real_packages
@@ -202,9 +194,8 @@ def test_marigold_without_guidance_answers_as_the_package_does(prediction_type: 
     image, size = model._prepared(given.rgb)
     noise = torch.randn(1, 4, image.shape[2] // 2, image.shape[3] // 2, generator=torch.Generator().manual_seed(1))
     pipeline.set_progress_bar_config(disable=True)
-    expected = pipeline(
-        Image.fromarray(given.rgb), latents=noise, match_input_resolution=False, output_type="pt"
-    ).prediction
+    options = {"latents": noise, "match_input_resolution": False, "output_type": "pt"}
+    expected = pipeline(Image.fromarray(given.rgb), **options).prediction
     found = model.predict(image, size, noise)
     assert found.shape == expected.shape and float(expected.max() - expected.min()) > 1e-2
     np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=2e-5)

@@ -53,12 +53,8 @@ def converted(published: tuple[Path, dict[str, Any]], tmp_path_factory: pytest.T
     """The converted folder, with a sampling for small images."""
     to = tmp_path_factory.mktemp("weights") / "depthlab"
     conversion.convert_folder(published[0], to, None, 20_000)
-    assert json.loads((to / "model.json").read_text())["sampling"] == {
-        "processing_px": 768,
-        "steps": 50,
-        "strength": 0.8,
-        "normalize_scale": 1.0,
-    }
+    sampling = {"processing_px": 768, "steps": 50, "strength": 0.8, "normalize_scale": 1.0}
+    assert json.loads((to / "model.json").read_text())["sampling"] == sampling
     return describe(to, sampling={"processing_px": 48, "steps": 5, "strength": 0.8, "normalize_scale": 1.0})
 
 
@@ -105,9 +101,8 @@ def test_files_of_other_ages_give_the_same(published: tuple[Path, dict[str, Any]
     shutil.copytree(published[0], folder)
     clip = made["clip"].state_dict()
     (folder / "CLIP" / "model.safetensors").unlink()
-    torch.save(
-        {**clip, "vision_model.embeddings.position_ids": torch.arange(5)[None]}, folder / "CLIP" / "pytorch_model.bin"
-    )
+    older = {**clip, "vision_model.embeddings.position_ids": torch.arange(5)[None]}
+    torch.save(older, folder / "CLIP" / "pytorch_model.bin")
     told = json.loads((folder / "CLIP" / "config.json").read_text())
     inner = {**told["vision_config"], "projection_dim": 512, "num_beams": 1, "torch_dtype": None}
     (folder / "CLIP" / "config.json").write_text(json.dumps({**told, "vision_config": inner}))
@@ -253,13 +248,9 @@ def test_a_converted_folder_that_changed_is_refused(converted: Path, tmp_path: P
 
 
 def test_packages_that_are_missing_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    told = {
-        "kind": "depthlab",
-        "schema": 1,
-        "scheduler": {},
-        "parts": {n: {"config": {}, "files": {}} for n in depthlab.PARTS},
-        "sampling": {"processing_px": 48, "steps": 5, "strength": 0.8, "normalize_scale": 1},
-    }
+    told = {"kind": "depthlab", "schema": 1, "scheduler": {}}
+    told["parts"] = {name: {"config": {}, "files": {}} for name in depthlab.PARTS}
+    told["sampling"] = {"processing_px": 48, "steps": 5, "strength": 0.8, "normalize_scale": 1}
     (tmp_path / "model.json").write_text(json.dumps(told))
     tiny_networks.hide(monkeypatch, "diffusers")
     with pytest.raises(ResourceError, match=r"mudg\[models\]"):
@@ -332,10 +323,8 @@ def test_the_image_encoders_image_is_the_packages(height: int, width: int) -> No
 
 def attend(attn: Any, x: Tensor, context: Tensor) -> Tensor:
     """Attention of one layer of diffusers, written out."""
-    q, k, v = (
-        y.unflatten(-1, (attn.heads, -1)).transpose(1, 2)
-        for y in (attn.to_q(x), attn.to_k(context), attn.to_v(context))
-    )
+    parts = (attn.to_q(x), attn.to_k(context), attn.to_v(context))
+    q, k, v = (y.unflatten(-1, (attn.heads, -1)).transpose(1, 2) for y in parts)
     share = torch.softmax(q @ k.transpose(-1, -2) / q.shape[-1] ** 0.5, -1)
     return attn.to_out[0]((share @ v).transpose(1, 2).flatten(2))
 
@@ -386,9 +375,8 @@ def twin(made: dict[str, Any], inputs: depthlab.Prepared, noise: Tensor, samplin
     missing = inputs.missing[..., ::cell, ::cell].double()
     kept = torch.cumprod(1 - torch.linspace(0.00085**0.5, 0.012**0.5, 1000, dtype=torch.float64) ** 2, 0)
     stride = 1000 // sampling.steps
-    times = [1000 - n * stride - 1 for n in range(sampling.steps)][
-        sampling.steps - int(sampling.steps * sampling.strength) :
-    ]
+    first = sampling.steps - int(sampling.steps * sampling.strength)
+    times = [1000 - n * stride - 1 for n in range(sampling.steps)][first:]
     noise = noise.double()
     noisy = lambda t: kept[t].sqrt() * depth + (1 - kept[t]).sqrt() * noise  # noqa: E731
     x = noisy(times[0])

@@ -30,9 +30,7 @@ def images(count: int, side: int, seed: int = 0) -> torch.Tensor:
 def attended(x: torch.Tensor, weight: torch.Tensor, bias: torch.Tensor, heads: int) -> torch.Tensor:
     """Attention head by head and token by token, float64."""
     width = x.shape[1]
-    query, key, value = (
-        x @ weight[i * width : (i + 1) * width].T + bias[i * width : (i + 1) * width] for i in range(3)
-    )
+    query, key, value = (x @ w.T + b for w, b in zip(weight.split(width), bias.split(width)))
     out = torch.zeros_like(x)
     for head in range(heads):
         own = slice(head * width // heads, (head + 1) * width // heads)
@@ -63,21 +61,12 @@ def test_dinov2_against_a_twin_in_float64() -> None:
     x = torch.cat([state["cls_token"][0], x]) + state["pos_embed"][0]
     for number in range(2):
         block = f"blocks.{number}"
-        y = attended(
-            normed(x, state, f"{block}.norm1", 1e-6),
-            state[f"{block}.attn.qkv.weight"],
-            state[f"{block}.attn.qkv.bias"],
-            2,
-        )
-        x = (
-            x
-            + (y @ state[f"{block}.attn.proj.weight"].T + state[f"{block}.attn.proj.bias"])
-            * state[f"{block}.ls1.gamma"]
-        )
-        y = (
-            normed(x, state, f"{block}.norm2", 1e-6) @ state[f"{block}.mlp.fc1.weight"].T
-            + state[f"{block}.mlp.fc1.bias"]
-        )
+        joined = (state[f"{block}.attn.qkv.weight"], state[f"{block}.attn.qkv.bias"])
+        y = attended(normed(x, state, f"{block}.norm1", 1e-6), *joined, 2)
+        y = y @ state[f"{block}.attn.proj.weight"].T + state[f"{block}.attn.proj.bias"]
+        x = x + y * state[f"{block}.ls1.gamma"]
+        y = normed(x, state, f"{block}.norm2", 1e-6)
+        y = y @ state[f"{block}.mlp.fc1.weight"].T + state[f"{block}.mlp.fc1.bias"]
         y = y * 0.5 * (1 + torch.erf(y / 2**0.5))
         x = x + (y @ state[f"{block}.mlp.fc2.weight"].T + state[f"{block}.mlp.fc2.bias"]) * state[f"{block}.ls2.gamma"]
     expected = normed(x, state, "norm", 1e-6)[0]
@@ -113,29 +102,18 @@ def test_sizes_name_the_network() -> None:
 def test_clip_against_a_twin_in_float64_under_both_names() -> None:
     state = {name.removeprefix("visual."): value.double() for name, value in toy_vit.clip_state().items()}
     image = images(1, 42)[0].double()
-    x = (
-        torch.cat([state["class_embedding"][None], patches(image, state["conv1.weight"], 14)])
-        + state["positional_embedding"]
-    )
+    x = torch.cat([state["class_embedding"][None], patches(image, state["conv1.weight"], 14)])
+    x = x + state["positional_embedding"]
     x = normed(x, state, "ln_pre", 1e-5)
     for number in range(2):
         block = f"transformer.resblocks.{number}"
-        y = attended(
-            normed(x, state, f"{block}.ln_1", 1e-5),
-            state[f"{block}.attn.in_proj_weight"],
-            state[f"{block}.attn.in_proj_bias"],
-            2,
-        )
+        joined = (state[f"{block}.attn.in_proj_weight"], state[f"{block}.attn.in_proj_bias"])
+        y = attended(normed(x, state, f"{block}.ln_1", 1e-5), *joined, 2)
         x = x + y @ state[f"{block}.attn.out_proj.weight"].T + state[f"{block}.attn.out_proj.bias"]
-        y = (
-            normed(x, state, f"{block}.ln_2", 1e-5) @ state[f"{block}.mlp.c_fc.weight"].T
-            + state[f"{block}.mlp.c_fc.bias"]
-        )
-        x = (
-            x
-            + (y / (1 + torch.exp(-1.702 * y))) @ state[f"{block}.mlp.c_proj.weight"].T
-            + state[f"{block}.mlp.c_proj.bias"]
-        )
+        y = normed(x, state, f"{block}.ln_2", 1e-5)
+        y = y @ state[f"{block}.mlp.c_fc.weight"].T + state[f"{block}.mlp.c_fc.bias"]
+        y = y / (1 + torch.exp(-1.702 * y))
+        x = x + y @ state[f"{block}.mlp.c_proj.weight"].T + state[f"{block}.mlp.c_proj.bias"]
     expected = normed(x[0], state, "ln_post", 1e-5) @ state["proj"]
     for names in (toy_vit.clip_state(), toy_vit.transformers_names(toy_vit.clip_state())):
         network = clip_image.ClipImageFeatures(names)
@@ -165,18 +143,15 @@ def test_other_weights_are_refused_and_named() -> None:
 
 def test_prepared_images_have_the_statistics_of_the_networks() -> None:
     white = np.full((50, 80, 3), 255, np.uint8)
-    assert dinov2.prepared(white)[:, 100, 100].tolist() == pytest.approx(
-        [(1 - m) / d for m, d in zip(dinov2.MEAN, dinov2.DEVIATION)]
-    )
+    expected = [(1 - m) / d for m, d in zip(dinov2.MEAN, dinov2.DEVIATION)]
+    assert dinov2.prepared(white)[:, 100, 100].tolist() == pytest.approx(expected)
     assert clip_image.prepared(white)[0, 100, 100].item() == pytest.approx((1 - 0.48145466) / 0.26862954)
     assert clip_image.prepared(white).shape == (3, 336, 336)
     picture = toy_views.colors(0)
-    expected = functional.interpolate(
-        torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255, (336, 336), mode="bicubic"
-    )
-    found = clip_image.prepared(picture) * torch.tensor(clip_image.DEVIATION).view(3, 1, 1) + torch.tensor(
-        clip_image.MEAN
-    ).view(3, 1, 1)
+    planes = torch.from_numpy(picture).permute(2, 0, 1)[None].float() / 255
+    expected = functional.interpolate(planes, (336, 336), mode="bicubic")
+    mean, deviation = (torch.tensor(of).view(3, 1, 1) for of in (clip_image.MEAN, clip_image.DEVIATION))
+    found = clip_image.prepared(picture) * deviation + mean
     assert (found - expected[0]).abs().max() < 1e-6
 
 
@@ -214,10 +189,8 @@ def darker(_index: int, seen: Observation) -> Observation:
 
 def test_the_scorer_computes_what_weights_and_features_allow(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
-    methods = {
-        "a": toy_views.write_views(scene, tmp_path / "a", "a", (2.0,)),
-        "b": toy_views.write_views(scene, tmp_path / "b", "b", (2.0,), darker),
-    }
+    methods = {"a": toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))}
+    methods["b"] = toy_views.write_views(scene, tmp_path / "b", "b", (2.0,), darker)
     store.write_safetensors(tmp_path / "dino.safetensors", toy_vit.dino_state())
     store.write_safetensors(tmp_path / "clip.safetensors", toy_vit.clip_state())
     rng = np.random.default_rng(0)
@@ -264,21 +237,16 @@ def test_programs_are_not_read_as_video_features(tmp_path: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
     program = tmp_path / "extractor.pt"
     program.write_bytes(b"PK")
+    settings = ScoreConfig(video_features=str(program), perceptual_views=0)
     with pytest.raises(InputError, match="no such folder of features"):
-        Score(
-            scene=scene,
-            views={"a": views},
-            out=tmp_path / "score",
-            settings=ScoreConfig(video_features=str(program), perceptual_views=0),
-        ).run()
+        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=settings).run()
 
 
 def test_malformed_video_features_are_refused(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
     views = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
-    store.write_safetensors(
-        tmp_path / "video" / "recorded" / "front.safetensors", {"features": np.zeros((3, 2, 2), np.float32)}
-    )
+    file = tmp_path / "video" / "recorded" / "front.safetensors"
+    store.write_safetensors(file, {"features": np.zeros((3, 2, 2), np.float32)})
     config = ScoreConfig(video_features=str(tmp_path / "video"), perceptual_views=0)
     with pytest.raises(InputError, match=r"front.safetensors"):
         Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=config).run()

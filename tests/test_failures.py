@@ -200,7 +200,6 @@ def test_workers_without_memory_to_start_end_the_work(tmp_path: Path) -> None:
     )
     (tmp_path / "parent.py").write_text(script)
     places = [str(Path(__file__).parent), *(path for path in sys.path if path)]
-    done = subprocess.run(
-        [sys.executable, str(tmp_path / "parent.py"), *places], capture_output=True, text=True, timeout=120, check=False
-    )
+    command = [sys.executable, str(tmp_path / "parent.py"), *places]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 55, done.stderr[-2000:]

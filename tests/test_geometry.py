@@ -88,9 +88,8 @@ def test_resized_camera_keeps_the_rays() -> None:
 
 def test_pose_at_is_exact_at_keys_interpolates_both_neighbours_and_never_extrapolates() -> None:
     times = np.array([0.0, 1.0, 2.0])
-    keys = np.stack(
-        [geometry.yaw_matrix(0.0, (0, 0, 0)), geometry.yaw_matrix(0.4, (2, 0, 0)), geometry.yaw_matrix(1.0, (2, 4, 0))]
-    )
+    at = ((0.0, (0, 0, 0)), (0.4, (2, 0, 0)), (1.0, (2, 4, 0)))
+    keys = np.stack([geometry.yaw_matrix(*one) for one in at])
     assert geometry.pose_at(times, keys, -0.01) is None and geometry.pose_at(times, keys, 2.01) is None
     np.testing.assert_array_equal(geometry.pose_at(times, keys, 1.0), keys[1])
     middle = geometry.pose_at(times, keys, 1.5)

@@ -113,9 +113,8 @@ def test_a_lowered_kerb_joins_a_sidewalk_but_not_directly() -> None:
 
 def test_the_order_of_returns_changes_nothing() -> None:
     xyz, path = street(np.random.default_rng(9))
-    one, other = (
-        map_ground(points, path, path[0]) for points in (xyz, xyz[np.random.default_rng(1).permutation(len(xyz))])
-    )
+    shuffled = xyz[np.random.default_rng(1).permutation(len(xyz))]
+    one, other = (map_ground(points, path, path[0]) for points in (xyz, shuffled))
     assert one is not None and other is not None and (one.reachable == other.reachable).mean() > 0.999
     assert above_plane(one.plane, path) == pytest.approx(above_plane(other.plane, path), abs=1e-3)
 

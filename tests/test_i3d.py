@@ -48,12 +48,8 @@ def renamed(name: str) -> str:
         ("b0", "branch_0"),
     ):
         name = name.replace(f".{theirs}.", f".{ours}.")
-    return (
-        name.replace(".bn.", ".batch3d.")
-        .replace("Mixed", "mixed")
-        .replace("Conv3d_", "conv3d_")
-        .replace("logits", "conv3d_0c_1x1")
-    )
+    name = name.replace(".bn.", ".batch3d.").replace("Mixed", "mixed")
+    return name.replace("Conv3d_", "conv3d_").replace("logits", "conv3d_0c_1x1")
 
 
 def test_tensors_and_values_are_those_of_the_published_files() -> None:
@@ -86,15 +82,8 @@ def test_short_clips_and_other_sizes_are_refused(state) -> None:
 
 @pytest.mark.parametrize(
     ("length", "kernel", "stride", "front", "back"),
-    [
-        (16, 7, 2, 2, 3),
-        (9, 7, 2, 3, 3),
-        (8, 3, 2, 0, 1),
-        (5, 3, 2, 1, 1),
-        (5, 2, 2, 0, 1),
-        (4, 2, 2, 0, 0),
-        (6, 3, 1, 1, 1),
-    ],
+    [(16, 7, 2, 2, 3), (9, 7, 2, 3, 3), (8, 3, 2, 0, 1), (5, 3, 2, 1, 1)]
+    + [(5, 2, 2, 0, 1), (4, 2, 2, 0, 0), (6, 3, 1, 1, 1)],
 )
 def test_padding_of_the_rule_same(length: int, kernel: int, stride: int, front: int, back: int) -> None:
     row = torch.arange(1.0, length + 1).view(1, 1, length, 1, 1)
@@ -111,9 +100,8 @@ def test_rules_of_frames() -> None:
     assert set(cut[0, 100].round(decimals=1).unique().tolist()) >= {-1.0, 1.0}
     assert float(cut[0, 100, 0]) == -1.0  # what lies beside the middle is cut off
     assert float(squashed[0, 100, 0]) == pytest.approx(2 * 128 / 255 - 1, abs=1e-5)
-    assert float(i3d.prepared_frame(np.full((37, 50, 3), 255, np.uint8), "google").min()) == pytest.approx(
-        1.0, abs=1e-5
-    )
+    white = i3d.prepared_frame(np.full((37, 50, 3), 255, np.uint8), "google")
+    assert float(white.min()) == pytest.approx(1.0, abs=1e-5)
 
 
 class Means(torch.nn.Module):
@@ -133,9 +121,8 @@ def test_clips_floor_and_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     weights = tmp_path / "weights.safetensors"
     store.write_safetensors(weights, {"any": np.zeros(1, np.float32)})
     scene = read_scene(toy_views.write_scene(tmp_path / "scene"))
-    found = videos.VideoDistances(
-        scene, videos.ClipFiles(weights, "videogpt", tmp_path / "features", torch.device("cpu"))
-    )
+    files = videos.ClipFiles(weights, "videogpt", tmp_path / "features", torch.device("cpu"))
+    found = videos.VideoDistances(scene, files)
     same = distributions.ImageSet(40, toy_views.colors)
     backwards = distributions.ImageSet(40, lambda n: toy_views.colors(39 - n))
     sets = distributions.TrajectorySets("front_shift+2.0", "front", 48, 32, {"a": same, "b": backwards}, None)
@@ -143,9 +130,8 @@ def test_clips_floor_and_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert values["a"] == {"fvd": pytest.approx(0.0, abs=1e-5), "n": 4, "n_reference": 4} and values["b"]["fvd"] > 1e-3
     (floor,) = found.record()["floors"]
     assert (floor["n"], floor["n_reference"]) == (2, 2)
-    short = distributions.TrajectorySets(
-        "x", "front", 48, 32, {"a": distributions.ImageSet(20, toy_views.colors)}, None
-    )
+    sets = {"a": distributions.ImageSet(20, toy_views.colors)}
+    short = distributions.TrajectorySets("x", "front", 48, 32, sets, None)
     assert found.of(short) == {"a": score_tables.TOO_FEW}
 
 

@@ -70,13 +70,8 @@ def test_taps_have_their_widths_and_do_not_depend_on_the_batch(network: inceptio
     images = torch.stack([inception.prepared(picture(seed=n), "tf1") for n in range(2)])
     taps = ("64", "192", "768", "2048", "logits_unbiased")
     found = network(images, taps)
-    assert {tap: tuple(x.shape) for tap, x in found.items()} == {
-        "64": (2, 64),
-        "192": (2, 192),
-        "768": (2, 768),
-        "2048": (2, 2048),
-        "logits_unbiased": (2, 1008),
-    }
+    widths = {"64": 64, "192": 192, "768": 768, "2048": 2048, "logits_unbiased": 1008}
+    assert {tap: tuple(x.shape) for tap, x in found.items()} == {tap: (2, width) for tap, width in widths.items()}
     alone = network(images[1:])
     assert list(alone) == ["2048"] and torch.allclose(alone["2048"], found["2048"][1:], atol=1e-5)
     assert float((found["2048"][0] - found["2048"][1]).abs().max()) > 1e-3
@@ -102,10 +97,8 @@ def convolved(x: np.ndarray, state: dict[str, torch.Tensor], name: str) -> np.nd
     for i in range(tall):
         for j in range(wide):
             total += np.einsum("oc,chw->ohw", kernel[:, :, i, j], padded[:, i : i + height, j : j + width])
-    norm = {
-        leaf: state[f"{name}.bn.{leaf}"].double().numpy()[:, None, None]
-        for leaf in ("weight", "bias", "running_mean", "running_var")
-    }
+    leaves = ("weight", "bias", "running_mean", "running_var")
+    norm = {leaf: state[f"{name}.bn.{leaf}"].double().numpy()[:, None, None] for leaf in leaves}
     scaled = (total - norm["running_mean"]) / np.sqrt(norm["running_var"] + 0.001) * norm["weight"] + norm["bias"]
     return np.maximum(scaled, 0)
 
@@ -125,16 +118,8 @@ def test_the_last_blocks_against_a_twin_in_numpy(network, state, name: str, pool
     one = x[0].double().numpy()
     middle = of(one, "branch3x3_1")
     double = of(of(one, "branch3x3dbl_1"), "branch3x3dbl_2")
-    expected = np.concatenate(
-        [
-            of(one, "branch1x1"),
-            of(middle, "branch3x3_2a"),
-            of(middle, "branch3x3_2b"),
-            of(double, "branch3x3dbl_3a"),
-            of(double, "branch3x3dbl_3b"),
-            of(neighbours(one, pool), "branch_pool"),
-        ]
-    )
+    ends = [of(middle, f"branch3x3_2{k}") for k in "ab"] + [of(double, f"branch3x3dbl_3{k}") for k in "ab"]
+    expected = np.concatenate([of(one, "branch1x1"), *ends, of(neighbours(one, pool), "branch_pool")])
     assert np.abs(network.block(name, x)[0].numpy() - expected).max() < 1e-4 * np.abs(expected).max()
 
 
@@ -160,9 +145,8 @@ def test_the_order_of_branches_and_the_pools_of_earlier_blocks(network, state, n
             tuple(f"branch7x7_{n}" for n in (1, 2, 3)),
             tuple(f"branch7x7dbl_{n}" for n in (1, 2, 3, 4, 5)),
         ]
-    expected = np.concatenate(
-        [*(chain(one, *branch) for branch in branches), chain(neighbours(one, pool), "branch_pool")]
-    )
+    chains = [chain(one, *branch) for branch in branches]
+    expected = np.concatenate([*chains, chain(neighbours(one, pool), "branch_pool")])
     found = network.block(name, torch.from_numpy(one).float()[None])[0].numpy()
     assert np.abs(found - expected).max() < 1e-4 * np.abs(expected).max()
 
@@ -262,9 +246,8 @@ def test_tf1_against_loops(height: int, width: int) -> None:
 def test_antialiasing_rules_are_pillows_on_floats(rule: inception.ResizeRule, height: int, width: int) -> None:
     image = picture(height, width)
     method = Image.Resampling.BICUBIC if rule == "clean" else Image.Resampling.BILINEAR
-    planes = [
-        np.asarray(Image.fromarray(image[..., c].astype(np.float32)).resize((299, 299), method)) for c in range(3)
-    ]
+    images = [Image.fromarray(image[..., c].astype(np.float32)) for c in range(3)]
+    planes = [np.asarray(one.resize((299, 299), method)) for one in images]
     found = inception.prepared(image, rule).numpy() * 128 + 128
     assert np.abs(found - np.clip(np.stack(planes), 0, 255)).max() < 0.01
 

@@ -53,9 +53,8 @@ def test_several_images_are_compared_with_features_of_the_truth_that_are_made_on
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     first, distance = pair_of(136, 40, masked=True), small_distance()
-    pairs = [
-        replace(first, rgb=image) for image in torch.rand(3, 3, 136, 40, generator=torch.Generator().manual_seed(5))
-    ]
+    images = torch.rand(3, 3, 136, 40, generator=torch.Generator().manual_seed(5))
+    pairs = [replace(first, rgb=image) for image in images]
     monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
     monkeypatch.setattr(featnets, "BAND_PIXELS", 24 * 40)
     alone = [distance(pair) for pair in pairs]
@@ -88,11 +87,8 @@ def test_a_view_that_cannot_fit_is_refused_before_the_work(monkeypatch: pytest.M
     monkeypatch.setattr(render.memory, "free_bytes", lambda: 64 << 30)
     with pytest.raises(ResourceError, match="1000000 x 562500 pixels needs more memory") as refused:
         render._require_memory([path])
-    assert (
-        "TiB" in refused.value.expected
-        and refused.value.got == "64.0 GiB free"
-        and "--width-px" in refused.value.remedy
-    )
+    assert "TiB" in refused.value.expected and refused.value.got == "64.0 GiB free"
+    assert "--width-px" in refused.value.remedy
 
 
 def test_motion_found_in_bands_is_that_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -127,11 +123,8 @@ def test_trajectories_are_made_one_after_another_where_memory_lasts_for_one(
     for free_gib, expected in ((64, 2), (8, 1), (1, 1), (0, 2)):
         monkeypatch.setattr(synthesize.memory, "free_bytes", lambda f=free_gib: f << 30)
         assert synthesize.usual_processes(SynthesizeConfig(device="cpu"), paths) == expected
-    assert (
-        len(said) == 2
-        and "1 of 2 processes: at 3840x2160 each takes about" in said[0]
-        and "8.0 GiB are free" in said[0]
-    )
+    assert len(said) == 2 and "8.0 GiB are free" in said[0]
+    assert "1 of 2 processes: at 3840x2160 each takes about" in said[0]
     monkeypatch.setattr(synthesize.memory, "free_bytes", lambda: 8 << 30)
     assert synthesize.usual_processes(SynthesizeConfig(device="cpu", full_size=False), paths) == 2
 
@@ -141,13 +134,11 @@ def test_tiles_of_a_condition_are_those_of_the_whole() -> None:
     camera = Camera("front", 44, 36, 40.0, 40.0, 22.0, 18.0)
     views = tuple(View(camera, torch.eye(4, dtype=torch.float64).numpy(), 0.1 * t) for t in range(2))
     one = lambda *shape: torch.rand(*shape, generator=noise)  # noqa: E731
-    whole = Condition(
-        views, one(2, 3, 36, 44), one(2, 1, 36, 44), one(2, 1, 36, 44) > 0.5, one(3, 36, 44), backdrop=one(2, 3, 36, 44)
-    )
+    planes = (one(2, 3, 36, 44), one(2, 1, 36, 44), one(2, 1, 36, 44) > 0.5, one(3, 36, 44))
+    whole = Condition(views, *planes, backdrop=one(2, 3, 36, 44))
     part = cropped(whole, slice(4, 20), slice(8, 40))
-    assert torch.equal(part.color, whole.color[..., 4:20, 8:40]) and torch.equal(
-        part.backdrop, whole.backdrop[..., 4:20, 8:40]
-    )
+    for name in ("color", "backdrop"):
+        assert torch.equal(getattr(part, name), getattr(whole, name)[..., 4:20, 8:40])
     assert part.warped is None and {(v.camera.width, v.camera.height) for v in part.views} == {(32, 16)}
 
 

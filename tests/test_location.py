@@ -65,13 +65,8 @@ def before(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[..., None]], N
 def folder_of(tmp_path: Path, name: str = "made", **more: bytes) -> Path:
     """A small result: files at two depths, an empty one, a manifest and a record."""
     folder = tmp_path / name
-    files = {
-        "a/b/deep.bin": bytes(range(256)) * 3,
-        "plain.txt": b"plain",
-        "empty": b"",
-        "run.json": b'{"state": 1}',
-        **more,
-    }
+    files = {"a/b/deep.bin": bytes(range(256)) * 3, "plain.txt": b"plain", "empty": b""}
+    files |= {"run.json": b'{"state": 1}', **more}
     for relative, content in files.items():
         (folder / relative).parent.mkdir(parents=True, exist_ok=True)
         (folder / relative).write_bytes(content)
@@ -107,12 +102,8 @@ def test_an_address_has_one_spelling(given: str | Path, text: str) -> None:
 @pytest.mark.parametrize(
     "given",
     [
-        "s3://key:hunter2@bucket/x",
-        "s3://key:hun/hunter2@bucket/x",
-        "s3://hunter2@bucket/x",
-        "s3://bucket/x?X-Amz-Signature=hunter2",
-        "abfs://box:hunter2@account/x",
-        "gs://:hunter2@bucket",
+        *"s3://key:hunter2@bucket/x s3://key:hun/hunter2@bucket/x s3://hunter2@bucket/x gs://:hunter2@bucket".split(),
+        *"s3://bucket/x?X-Amz-Signature=hunter2 abfs://box:hunter2@account/x".split(),
         Path("s3://key:hunter2@bucket/x"),
     ],
 )

@@ -81,9 +81,8 @@ def test_lines_of_a_remedy_and_short_values_stay_as_they_are() -> None:
 @pytest.mark.parametrize("terminal", [False, True])
 def test_messages_and_progress_cannot_be_forged(terminal: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     written = io.StringIO()
-    plain_console = Console(
-        file=written, force_terminal=terminal, width=200, color_system=None, highlight=False, soft_wrap=True
-    )
+    options = {"force_terminal": terminal, "width": 200, "color_system": None, "highlight": False}
+    plain_console = Console(file=written, soft_wrap=True, **options)
     monkeypatch.setattr(log, "_console", lambda: plain_console)
     monkeypatch.setattr(log, "_quiet", False)
     log.info(f"a {FORGED}", "second line")
@@ -100,9 +99,8 @@ def test_messages_and_progress_cannot_be_forged(terminal: bool, monkeypatch: pyt
 
 def test_no_verb_prints_what_a_track_is_called_as_it_is(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Ids of tracks may hold anything; the same id twice is an error that names it."""
-    ToyStreet(car_start=(12.0, 0.0), times=[0.0, 0.1]).write(
-        scene := tmp_path / "scene", width=24, height=16, labels=False
-    )
+    scene, street = tmp_path / "scene", ToyStreet(car_start=(12.0, 0.0), times=[0.0, 0.1])
+    street.write(scene, width=24, height=16, labels=False)
     tracks = store.read_json(scene / "tracks.json")
     for track in tracks["tracks"]:
         track["id"] += FORGED
@@ -136,10 +134,6 @@ def test_json_that_no_file_or_float_can_hold_is_refused(text: str | bytes) -> No
 
 
 def test_json_at_the_limits_is_read() -> None:
-    assert store.parse_json('{"a": "\\ud83d\\ude00", "b": 1e308, "c": "1e999", "d": 123}', "here") == {
-        "a": "\U0001f600",
-        "b": 1e308,
-        "c": "1e999",
-        "d": 123,
-    }
+    values = {"a": "\U0001f600", "b": 1e308, "c": "1e999", "d": 123}
+    assert store.parse_json('{"a": "\\ud83d\\ude00", "b": 1e308, "c": "1e999", "d": 123}', "here") == values
     assert store.parse_json('"ü"'.encode("utf-16"), "here") == "ü"

@@ -259,30 +259,14 @@ def test_box_mean_keeps_constants_and_wants_odd_sizes() -> None:
         native_ops.box_mean(torch.zeros(1, 4, 4), 4)
 
 
-def adam(
-    parameter: Tensor,
-    gradient: Tensor,
-    moment1: Tensor,
-    moment2: Tensor,
-    rate: float,
-    step: int,
-    chosen: Tensor | None = None,
-) -> None:
-    """A step on one column."""
-    native_ops.adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step, chosen)
+def adam(*tensors: Any) -> None:
+    """A step on one column: parameter, gradient, both moments, rate; then step and chosen rows."""
+    native_ops.adam_columns([AdamColumn(*tensors[:5])], *tensors[5:])
 
 
-def twin(
-    parameter: Tensor,
-    gradient: Tensor,
-    moment1: Tensor,
-    moment2: Tensor,
-    rate: float,
-    step: int,
-    chosen: Tensor | None = None,
-) -> None:
+def twin(*tensors: Any) -> None:
     """The same in plain torch."""
-    torch_adam_columns([AdamColumn(parameter, gradient, moment1, moment2, rate)], step, chosen)
+    torch_adam_columns([AdamColumn(*tensors[:5])], *tensors[5:])
 
 
 def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -296,9 +280,8 @@ def test_without_the_library_the_plain_twins_do_the_same(monkeypatch: pytest.Mon
     torch.testing.assert_close(parameter, torch.full((4, 3), 0.9))
     torch.testing.assert_close(native_ops.box_mean(prediction, 3), native_ops.torch_box_mean(prediction, 3))
     cover, labels = torch.rand(1, 20, 20), torch.ones(20, 20, dtype=torch.int64)
-    torch.testing.assert_close(
-        native_ops.over(prediction, cover, target), native_ops.torch_over(prediction, cover, target)
-    )
+    planes = (prediction, cover, target)
+    torch.testing.assert_close(native_ops.over(*planes), native_ops.torch_over(*planes))
     got = native_ops.class_loss(prediction, labels, cover[0], 2.0)
     torch.testing.assert_close(got, losses.class_loss(prediction, labels, cover[0], 2.0))
 
@@ -333,31 +316,22 @@ def test_class_loss_equals_its_float64_twin(isa: str, shape: tuple[int, int, int
 def test_class_loss_shows_a_logit_that_is_not_finite(isa: str, bad: float) -> None:
     logits = torch.zeros(6, 20, 20)
     logits[4, 7, 3] = bad
-    assert not math.isfinite(
-        native_ops.class_loss(logits, torch.zeros(20, 20, dtype=torch.int64), torch.ones(20, 20), 400.0).item()
-    )
+    target, weight = torch.zeros(20, 20, dtype=torch.int64), torch.ones(20, 20)
+    assert not math.isfinite(native_ops.class_loss(logits, target, weight, 400.0).item())
 
 
 @pytest.mark.parametrize(
     "sizes",
-    [
-        ((3, 1, 1), (1, 1)),
-        ((3, 7, 9), (3, 2)),
-        ((1, 32, 64), (8, 16)),
-        ((3, 33, 50), (5, 13)),
-        ((2, 9, 12), (9, 12)),
-        ((3, 6, 5), (9, 11)),
-    ],
+    [((3, 1, 1), (1, 1)), ((3, 7, 9), (3, 2)), ((1, 32, 64), (8, 16))]
+    + [((3, 33, 50), (5, 13)), ((2, 9, 12), (9, 12)), ((3, 6, 5), (9, 11))],
 )
 def test_picture_over_the_sky_equals_its_float64_twin(
     isa: str, sizes: tuple[tuple[int, int, int], tuple[int, int]]
 ) -> None:
     generator = torch.Generator().manual_seed(2)
     (channels, height, width), small = sizes
-    inputs = [
-        torch.rand(shape, generator=generator)
-        for shape in ((channels, height, width), (1, height, width), (channels, *small))
-    ]
+    shapes = ((channels, height, width), (1, height, width), (channels, *small))
+    inputs = [torch.rand(shape, generator=generator) for shape in shapes]
     upstream = torch.randn(channels, height, width, generator=generator)
     mine, exact = [t.clone().requires_grad_() for t in inputs], [t.double().requires_grad_() for t in inputs]
     got, want = native_ops.over(*mine), native_ops.torch_over(*exact)

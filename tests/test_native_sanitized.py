@@ -23,9 +23,8 @@ sys.exit(pytest.main(["-q", "-x", "-s", "-p", "no:cacheprovider", "-m", "not slo
 
 
 def _runtime(command: tuple[str, ...], name: str) -> str:
-    found = subprocess.run(
-        [*command, f"-print-file-name={name}"], capture_output=True, text=True, check=False
-    ).stdout.strip()
+    words = [*command, f"-print-file-name={name}"]
+    found = subprocess.run(words, capture_output=True, text=True, check=False).stdout.strip()
     return found if os.path.isabs(found) and Path(found).exists() else ""
 
 
@@ -61,13 +60,6 @@ def test_kernels_are_clean_under_the_sanitizers(tmp_path: Path, monkeypatch: pyt
     # Loading other libraries on purpose, and forking, is what these tests do; the sanitizers have nothing to say to
     # that.
     skipped = "not library and not five_million and not forked and not environment and not version"
-    done = subprocess.run(
-        [sys.executable, "-c", RUN, str(library), *tests, "-k", skipped],
-        cwd=ROOT,
-        env=environment,
-        capture_output=True,
-        text=True,
-        timeout=1800,
-        check=False,
-    )
+    command = [sys.executable, "-c", RUN, str(library), *tests, "-k", skipped]
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=1800, check=False)
     assert done.returncode == 0, (done.stdout + done.stderr)[-20000:]

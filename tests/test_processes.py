@@ -72,9 +72,8 @@ def test_after_an_error_no_call_begins_any_more(tmp_path: Path) -> None:
 
 def test_calls_end_in_any_order_and_all_are_told(tmp_path: Path) -> None:
     places = folders(tmp_path, *"abcde")
-    assert sorted(run_in_processes(begin_and_fail, [(place, False) for place in places], 3)) == [
-        (n, None) for n in range(5)
-    ]
+    found = run_in_processes(begin_and_fail, [(place, False) for place in places], 3)
+    assert sorted(found) == [(n, None) for n in range(5)]
     assert all((place / "begun").exists() for place in places) and list(run_in_processes(begin_and_fail, [], 2)) == []
 
 

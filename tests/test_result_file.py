@@ -64,9 +64,8 @@ def pair(out: Path) -> dict[str, bytes]:
     if not out.exists():
         return {}
     content = out.read_bytes()
-    assert json.loads(about.read_text())["sha256"] == hashlib.sha256(content).hexdigest(), (
-        "the description is of another file"
-    )
+    sha256 = json.loads(about.read_text())["sha256"]
+    assert sha256 == hashlib.sha256(content).hexdigest(), "the description is of another file"
     return {out.name: content, about.name: about.read_bytes()}
 
 
@@ -217,10 +216,8 @@ def crowd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene, _, _, small = write_toy_run(root, degree=0)
     rng = np.random.default_rng(0)
     rows = torch.from_numpy(rng.integers(0, 720, 95_003))
-    columns = {
-        name: values[rows] + 0.01 * torch.from_numpy(rng.standard_normal(values[rows].shape, np.float32))
-        for name, values in small.table.columns.items()
-    }
+    noise = lambda values: 0.01 * torch.from_numpy(rng.standard_normal(values.shape, np.float32))  # noqa: E731
+    columns = {name: values[rows] + noise(values[rows]) for name, values in small.table.columns.items()}
     some = torch.randn(4096, generator=torch.Generator().manual_seed(0)) * 2
     whole, alone = torch.sigmoid(some), torch.stack([torch.sigmoid(one) for one in some])  # in vectors, and one by one
     odd = some[whole != alone] if (whole != alone).any() else some

@@ -161,13 +161,8 @@ def test_only_files_of_the_old_result_are_removed_and_others_named_and_kept(
     said = capsys.readouterr().err.replace("\n", " ")
     kept = ["link", "photos/2024/a.jpg", "rows/mine.md", *(["out.txt.kept1", "rows/9.txt"] if done else [])]
     assert all(name in said for name in kept)
-    assert {name for name in contents(folder) if "link" not in name} == {
-        "manifest.json",
-        "out.txt",
-        "rows/2.txt",
-        "run.yaml",
-        *kept[1:],
-    }
+    made = {"manifest.json", "out.txt", "rows/2.txt", "run.yaml"}
+    assert {name for name in contents(folder) if "link" not in name} == made | set(kept[1:])
     assert (folder / "link" / "b.jpg").read_text() == "far away" and new.path == new.out == folder
     store.verify_manifest(folder)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["elsewhere", "r"] and run(folder, 2).complete
@@ -184,10 +179,7 @@ def test_a_manifest_names_nothing_outside_its_folder(tmp_path: Path) -> None:
     folder = finished(tmp_path / "r").path
     (tmp_path / "precious").write_text("x")
     manifest = store.read_json(folder / "manifest.json")
-    manifest["files"] |= {
-        "../precious": {"bytes": 1, "sha256": "0"},
-        str(tmp_path / "precious"): {"bytes": 1, "sha256": "0"},
-    }
+    manifest["files"] |= dict.fromkeys(("../precious", str(tmp_path / "precious")), {"bytes": 1, "sha256": "0"})
     store.write_json(folder / "manifest.json", manifest)
     finished(folder, 2, overwrite=True)
     assert (tmp_path / "precious").read_text() == "x"
@@ -204,19 +196,16 @@ def test_an_older_unfinished_run_that_did_not_note_its_files_is_known_by_its_ver
     assert set(contents(folder)) == {"manifest.json", "mine.md", "out.txt", "rows/2.txt", "run.yaml"}
 
 
-@pytest.mark.parametrize(
-    ("name", "temporary"),
-    [
-        (".run.abcd_f12.part.json", True),
-        (".scene.123-456.part/images/a.png", True),
-        (".r.new.part", False),
-        ("a.part", False),
-        (".bashrc", False),
-        ("film.part.mp4", False),
-    ],
-)
-def test_names_of_temporary_files(name: str, temporary: bool) -> None:
-    assert is_temporary(name) is temporary
+def test_names_of_temporary_files() -> None:
+    names = [
+        ".run.abcd_f12.part.json",
+        ".scene.123-456.part/images/a.png",
+        ".r.new.part",
+        "a.part",
+        ".bashrc",
+        "film.part.mp4",
+    ]
+    assert [is_temporary(name) for name in names] == [True, True, False, False, False, False]
 
 
 def test_names_that_writers_give_are_known_as_temporary(tmp_path: Path) -> None:
@@ -432,27 +421,20 @@ def places(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-OVERLAPS = [
-    ("data/scene", "data/scene", "is also"),
-    ("data/scene/", "link", "is also"),
-    ("link", "data/scene", "is also"),
-    ("data/../data/scene", "data/scene", "is also"),
-    ("other/up/scene", "data/scene", "is also"),
-    ("data", "data/scene", "holds"),
-    (".", "link", "holds"),
-    ("data/scene/new", "data/scene", "lies in"),
-    ("link/a/b/c", "data/scene", "lies in"),
-    ("other/../link/new", "data/scene", "lies in"),
-    ("other/up/scene/new", "link", "lies in"),
-    ("data/scene", "data/scene/weights", "holds"),
-    ("data/scene/weights", "data/scene/weights", "is also"),
-    ("data/scene", "weights_link", "holds"),
-    ("link/images", "data", "lies in"),
-]
+OVERLAPS = {
+    "is also": "data/scene=data/scene data/scene/=link link=data/scene data/../data/scene=data/scene "
+    "other/up/scene=data/scene data/scene/weights=data/scene/weights",
+    "holds": "data=data/scene .=link data/scene=data/scene/weights data/scene=weights_link",
+    "lies in": "data/scene/new=data/scene link/a/b/c=data/scene other/../link/new=data/scene other/up/scene/new=link "
+    "link/images=data",
+}
+"""Relation -> outputs and inputs between which it is."""
+NEAR = ("other", "data/scene2", "data/sc")
 
 
-@pytest.mark.parametrize(("out", "given", "relation"), OVERLAPS)
-def test_overlaps_are_found_through_links_and_dots(places: Path, out: str, given: str, relation: str) -> None:
+@pytest.mark.parametrize(("relation", "pair"), [(name, one) for name, all_ in OVERLAPS.items() for one in all_.split()])
+def test_overlaps_are_found_through_links_and_dots(places: Path, relation: str, pair: str) -> None:
+    out, given = pair.split("=")
     for base in (Path(), places):
         with pytest.raises(UsageError, match=relation) as refused:
             refuse_overlap(base / out, {"nothing": None, "none": "", "scene": base / given})
@@ -460,19 +442,10 @@ def test_overlaps_are_found_through_links_and_dots(places: Path, out: str, given
         assert refused.value.remedy
 
 
-@pytest.mark.parametrize(
-    ("out", "given"),
-    [
-        ("other", "data/scene"),
-        ("data/scene2", "data/scene"),
-        ("data/new/deep", "link"),
-        ("data/scene/images", "data/scene/weights"),
-        ("data/sc", "data/scene"),
-        ("nowhere", "nothing there"),
-    ],
-)
-def test_neighbours_do_not_overlap(places: Path, out: str, given: str) -> None:
-    refuse_overlap(out, {"scene": given})
+def test_neighbours_do_not_overlap(places: Path) -> None:
+    refuse_overlap("data/scene/images", {"scene": "data/scene/weights"})
+    for out, given in (("data/new/deep", "link"), ("nowhere", "nothing there"), *((n, "data/scene") for n in NEAR)):
+        refuse_overlap(out, {"scene": given})
 
 
 def test_upper_and_lower_case_are_one_where_the_file_system_says_so(

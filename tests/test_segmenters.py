@@ -55,9 +55,8 @@ class Network(torch.nn.Module):
 
 
 def folder_of(tmp_path: Path, kind: str, names: dict[str, str] | None = None) -> Path:
-    (tmp_path / "config.json").write_text(
-        json.dumps({"model_type": kind, "id2label": NAMES if names is None else names})
-    )
+    config = {"model_type": kind, "id2label": NAMES if names is None else names}
+    (tmp_path / "config.json").write_text(json.dumps(config))
     (tmp_path / "preprocessor_config.json").write_text(json.dumps({"image_mean": MEAN, "image_std": DEVIATION}))
     return tmp_path
 

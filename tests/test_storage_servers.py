@@ -32,17 +32,7 @@ from mudg.fleet.records import BatchFolder
 pytestmark = [pytest.mark.cluster, pytest.mark.filterwarnings("ignore")]  # warnings of the servers' own packages
 
 SERVERS = dict(one.split("=", 1) for one in os.environ.get("MUDG_TEST_S3", "").split(",") if one)
-CITY = (
-    "--city.n-frames",
-    "2",
-    "--city.width",
-    "48",
-    "--city.height",
-    "32",
-    "--city.cameras",
-    "front",
-    "--no-contact-sheet",
-)
+CITY = "--city.n-frames 2 --city.width 48 --city.height 32 --city.cameras front --no-contact-sheet".split()
 CONDITIONAL = {"moto": True, "rclone": False}
 
 
@@ -77,9 +67,8 @@ def folder_of(tmp_path: Path, *sizes: int) -> Path:
 
 
 def content(folder: Path) -> dict[str, str]:
-    return {
-        path.relative_to(folder).as_posix(): store.sha256_file(path) for path in folder.rglob("*") if path.is_file()
-    }
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    return {path.relative_to(folder).as_posix(): store.sha256_file(path) for path in files}
 
 
 def test_single_objects(root: Location, server: str) -> None:
@@ -256,21 +245,8 @@ class BatchInAStore:
 
     def words(self, machine: str, *more: str) -> list[str]:
         step = ["--command", "sh", str(self.folder / "step.sh"), "{source}", "{out}", "{name}", str(self.tally)]
-        return [
-            "batch",
-            "run",
-            "--list",
-            str(self.root / "list.txt"),
-            "--out",
-            str(self.out),
-            "--quiet",
-            "--jobs",
-            "1",
-            "--scratch",
-            str(self.folder / machine),
-            *more,
-            *step,
-        ]
+        first = f"batch run --list {self.root}/list.txt --out {self.out} --quiet --jobs 1".split()
+        return [*first, "--scratch", str(self.folder / machine), *more, *step]
 
     def start(
         self, machine: str, *more: str, before: tuple[str, ...] = (), **environment: str
@@ -322,9 +298,8 @@ def test_a_batch_whose_list_logs_and_results_lie_in_a_store(
     assert app.main(["batch", "status", str(made.out), "--html", "--json"]) == 0
     record = json.loads(capfd.readouterr().out)
     assert (record["finished"], record["left"], record["stages"]["command"]["failed"]) == (5, 0, 1)
-    assert (
-        record["reasons"][0]["reason"].endswith("the log holds no text") and b"s03" in (made.out / "status.html").load()
-    )
+    assert record["reasons"][0]["reason"].endswith("the log holds no text")
+    assert b"s03" in (made.out / "status.html").load()
     made.put_log("s03", "text of s03\n")
     assert app.main(["batch", "retry", str(made.out), "--reason", "3"]) == 0 and made.start("three").wait(120) == 0
     assert made.results() == {name: f"text of {name}\n" for name in made.names}
@@ -364,11 +339,8 @@ class _Unreliable(http.server.BaseHTTPRequestHandler):
         if number % 11 == 0:
             self.close_connection = True
             return
-        kept = {
-            name: value
-            for name, value in found.getheaders()
-            if name.lower() not in ("connection", "transfer-encoding", "keep-alive")
-        }
+        own = ("connection", "transfer-encoding", "keep-alive")
+        kept = {name: value for name, value in found.getheaders() if name.lower() not in own}
         self._answer(found.status, kept, data)
 
     do_GET = do_PUT = do_HEAD = do_POST = do_DELETE = _pass_on
@@ -440,22 +412,10 @@ def test_steps_of_a_batch_from_store_to_store(root: Location, tmp_path: Path) ->
     for place, machine in ((Location.of(tmp_path / "here"), "one"), (root, "two")):
         scratch = ("--quiet", "--scratch", str(tmp_path / machine))
         for seed in ("1", "2"):
-            assert (
-                app.main(["ingest", "city", str(place / f"scenes/c{seed}"), *CITY, "--city.seed", seed, *scratch]) == 0
-            )
+            words = ["ingest", "city", str(place / f"scenes/c{seed}"), *CITY, "--city.seed", seed, *scratch]
+            assert app.main(words) == 0
         (place / "list.txt").save(b"scenes/c1\nscenes/c2\n")
-        words = [
-            "batch",
-            "run",
-            "--list",
-            str(place / "list.txt"),
-            "--out",
-            str(place / "runs"),
-            "--stages",
-            "fuse",
-            "--jobs",
-            "1",
-        ]
+        words = f"batch run --list {place}/list.txt --out {place}/runs --stages fuse --jobs 1".split()
         assert app.main([*words, *scratch]) == 0
         digests.append({record.scene: record.digest for record in BatchFolder(place / "runs").records("done")})
     assert digests[0] == digests[1] and len(digests[0]) == 2

@@ -34,22 +34,9 @@ TINY = StreetNetConfig(widths=(8, 8, 8, 8, 8), blocks=(1, 1, 1, 1, 1))
 def made_up(height: int = 4, width: int = 6, **given: np.ndarray) -> Evidence:
     """Evidence of a road 10 m away, seen by every ray, without boxes."""
     zero = np.zeros((height, width), np.float32)
-    plain = Evidence(
-        zero,
-        zero + 10,
-        zero,
-        zero + 1,
-        zero,
-        zero == 0,
-        zero == 0,
-        zero,
-        zero - 0.2,
-        zero > 1,
-        zero,
-        zero.astype(np.uint8),
-        zero > 1,
-        np.zeros(0, np.int64),
-    )
+    no, nothing = zero > 1, np.zeros(0, np.int64)
+    depth = (zero, zero + 10, zero, zero + 1, zero, zero == 0, zero == 0, zero, zero - 0.2, no, zero)
+    plain = Evidence(*depth, zero.astype(np.uint8), no, nothing)
     return replace(plain, **given)
 
 
@@ -67,9 +54,8 @@ def test_evidence_of_a_street_is_what_was_built() -> None:
     wall = (truth == ID["building"]) & near
     assert np.median(found.upwards[wall]) < 0.1 and np.median(found.height_m[wall]) > 0.5
     assert (found.elevation_rad == ray_elevation(given.view)).all()
-    measured = np.isfinite(
-        visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
-    )
+    returns = visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
+    measured = np.isfinite(returns)
     assert ((found.away_deg == 0) == measured).all()
     car = truth == ID["car"]
     inside = (found.box == 1) & found.in_box
@@ -102,13 +88,8 @@ def test_the_outline_of_a_nearer_box_does_not_take_what_lies_in_a_farther_one() 
     (car,) = given.tracks
     toward = np.eye(4)
     toward[:3, 3] = -0.4 * (car.world_from_object[0, :3, 3] - given.view.center_world) * [1, 1, 0]
-    nearer = replace(
-        car,
-        id="nearer",
-        label="truck",
-        size_m=car.size_m * [0.1, 1, 1],
-        world_from_object=toward @ car.world_from_object,
-    )
+    nearer = replace(car, id="nearer", label="truck", world_from_object=toward @ car.world_from_object)
+    nearer = replace(nearer, size_m=car.size_m * [0.1, 1, 1])
     pose = nearer.pose_at(given.view.time_s)
     assert pose is not None
     rng = np.random.default_rng(0)
@@ -168,9 +149,8 @@ def test_roads_are_low_and_boxes_hold_their_own_classes() -> None:
     classes = [ID[name] for name in ("rider", "motorcycle", "bicycle")]
     assert found[classes][:, 2, 3:].sum(0) == pytest.approx(1)
     assert (found[classes][:, 3, 3:].sum(0) < 0.01).all()  # in the outline, but not in the box
-    assert found[classes][:, 3, :3].sum(0) == pytest.approx(
-        3 / 16, abs=1e-3
-    )  # no sky; driven ground: no sidewalk, no terrain
+    # no sky; driven ground: no sidewalk, no terrain
+    assert found[classes][:, 3, :3].sum(0) == pytest.approx(3 / 16, abs=1e-3)
 
 
 def test_no_people_beside_or_behind_what_fills_their_box() -> None:
@@ -178,9 +158,8 @@ def test_no_people_beside_or_behind_what_fills_their_box() -> None:
     box[2:] = 1
     found = settled(even(), made_up(box=box, box_labels=np.array([ID["person"]])))
     assert (found[ID["person"], 2:] < 1e-3).all() and (found[ID["person"], :2] > 0.04).all()
-    far = settled(
-        even(), made_up(box=box, box_labels=np.array([ID["person"]]), away_deg=np.full((4, 6), 9, np.float32))
-    )
+    away_deg = np.full((4, 6), 9, np.float32)
+    far = settled(even(), made_up(box=box, box_labels=np.array([ID["person"]]), away_deg=away_deg))
     assert (far[ID["person"]] > 0.04).all()
 
 
@@ -245,10 +224,8 @@ def test_temperature_flattens_and_keeps_the_order() -> None:
     with torch.no_grad():
         for parameter in net.parameters():
             parameter.copy_(torch.from_numpy(rng.normal(0, 0.05, parameter.shape).astype(np.float32)))
-    rgb, planes = (
-        rng.integers(0, 256, (64, 64, 3), np.uint8),
-        rng.normal(0, 1, (PLANE_COUNT, 64, 64)).astype(np.float32),
-    )
+    rgb = rng.integers(0, 256, (64, 64, 3), np.uint8)
+    planes = rng.normal(0, 1, (PLANE_COUNT, 64, 64)).astype(np.float32)
     sharp = net.probabilities(rgb, planes)
     net.config = replace(TINY, temperature=2.0)
     flat = net.probabilities(rgb, planes)
@@ -329,20 +306,8 @@ def tools(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def options_of(work: Path, run: str, **given: object) -> Namespace:
-    plain = {
-        "seed": 3,
-        "cities": 1,
-        "first_cities": 1,
-        "all_cities_at": 1,
-        "run": run,
-        "start": "",
-        "steps": 2,
-        "batch": 1,
-        "lr": 1e-3,
-        "balance": 0.25,
-        "checkpoint_every": 1,
-        "workers": 0,
-    }
+    plain = {"seed": 3, "cities": 1, "first_cities": 1, "all_cities_at": 1, "run": run, "start": "", "steps": 2}
+    plain |= {"batch": 1, "lr": 1e-3, "balance": 0.25, "checkpoint_every": 1, "workers": 0}
     return Namespace(work=work, **plain | given)
 
 

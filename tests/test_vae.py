@@ -94,16 +94,10 @@ def test_a_single_frame_without_leading_axes_is_fine():
 
 def test_leading_axes_are_kept():
     codec = PatchCodec(CodecConfig()).eval()
-    rgb, depth, ids = (
-        torch.rand(2, 3, 3, 8, 8),
-        torch.full((2, 3, 1, 8, 8), 9.0),
-        torch.zeros(2, 3, 8, 8, dtype=torch.long),
-    )
-    latents = {
-        "rgb": codec.encode_rgb(rgb),
-        "depth": codec.encode_depth(depth),
-        "semantics": codec.encode_semantics(ids),
-    }
+    rgb, depth = torch.rand(2, 3, 3, 8, 8), torch.full((2, 3, 1, 8, 8), 9.0)
+    ids = torch.zeros(2, 3, 8, 8, dtype=torch.long)
+    latents = {"rgb": codec.encode_rgb(rgb), "depth": codec.encode_depth(depth)}
+    latents["semantics"] = codec.encode_semantics(ids)
     with torch.no_grad():
         made = codec.decode(latents)
     assert made.rgb.shape == rgb.shape and made.depth.shape == depth.shape and made.semantics.shape == ids.shape

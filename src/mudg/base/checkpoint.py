@@ -111,7 +111,6 @@ def check_fit(tensors: Mapping[str, Tensor], wanted: Mapping[str, Tensor], where
 
 # checkpoint ---------------------------------------------------------------------------------------
 
-
 _PREFIX = "step_"
 
 

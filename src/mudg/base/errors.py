@@ -95,14 +95,18 @@ class MudgError(Exception):
         lines.extend(f"  {name}: {value}" for name, value in fields if value)
         return "\n".join(lines)
 
+    @property
+    def fields(self) -> dict[str, str]:
+        """All but what is wrong, as this class takes them."""
+        return {"where": self.where, "expected": self.expected, "got": self.got, "remedy": self.remedy}
+
     def located(self, where: str) -> Self:
         """The same error with another place."""
-        return type(self)(self.what, where=where, expected=self.expected, got=self.got, remedy=self.remedy)
+        return type(self)(self.what, **{**self.fields, "where": where})
 
     def __reduce__(self) -> tuple[object, ...]:
         """Keep the fields when the error crosses a process boundary."""
-        fields = {"where": self.where, "expected": self.expected, "got": self.got, "remedy": self.remedy}
-        return (_rebuild, (type(self), self.what, fields))
+        return (_rebuild, (type(self), self.what, self.fields))
 
 
 def _rebuild(cls: type[MudgError], what: str, fields: dict[str, str]) -> MudgError:

@@ -18,7 +18,6 @@ from mudg.base import palette
 # Tables of text as Markdown, LaTeX and CSV; the macro ``table`` of ``assets/templates/macros.html.j2`` is their HTML.
 # No torch.
 
-
 PUBLISHED: Final = "published"
 """Kind of the lines that LaTeX sets apart from the others by a rule."""
 ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
@@ -89,12 +88,8 @@ def latex(table: TextTable) -> list[str]:
         f"{h}: {c.reason}" for line in table.lines for h, c in zip(heads, line.cells, strict=True) if c.reason
     )
     lines = [*([f"% {table.title}"] if table.title else []), *(f"% -- {reason}" for reason in reasons)]
-    lines += [
-        r"\begin{tabular}{l" + "r" * len(heads) + "}",
-        r"\hline",
-        " & ".join(map(escaped, table.heads)) + r" \\",
-        r"\hline",
-    ]
+    first = " & ".join(map(escaped, table.heads)) + r" \\"
+    lines += [r"\begin{tabular}{l" + "r" * len(heads) + "}", r"\hline", first, r"\hline"]
     kind = ""
     for line in table.lines:
         if kind and PUBLISHED in (kind, line.kind) and kind != line.kind:
@@ -131,7 +126,6 @@ def best_of(better: str, numbers: Mapping[str, float]) -> list[str]:
 
 # html ---------------------------------------------------------------------------------------------
 
-
 TONES: Final = ("truth", "nearest_fill", "street_gaussians", "mudg_r", "mudg_s")
 """Methods that have a colour of their own in ``page.css``."""
 
@@ -152,22 +146,16 @@ def render_text(template: str, **values: Any) -> str:
 
 def class_legend() -> list[tuple[str, str]]:
     """Name and CSS colour of every class."""
-    return [
-        (name, f"rgb({r},{g},{b})")
-        for name, (r, g, b) in zip(palette.CLASSES, palette.DISPLAY_COLORS.tolist(), strict=False)
-    ]
+    colors = palette.DISPLAY_COLORS.tolist()
+    return [(name, f"rgb({r},{g},{b})") for name, (r, g, b) in zip(palette.CLASSES, colors)]
 
 
 @functools.cache
 def _environment() -> Environment:
-    environment = Environment(
-        loader=PackageLoader("mudg", "assets/templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        auto_reload=False,  # what is loaded needs no file any more
-    )
+    loader = PackageLoader("mudg", "assets/templates")
+    # what is loaded needs no file any more
+    environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, auto_reload=False)
+    environment.trim_blocks = environment.lstrip_blocks = True
     environment.globals |= {"arrows": ARROWS, "senses": SENSES}
     environment.globals["tone"] = lambda method: method if method in TONES else "soft"
     return environment

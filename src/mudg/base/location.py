@@ -170,7 +170,6 @@ def _in_words(doing: str, where: str, missing: str = "") -> Iterator[None]:
 
 _NO_BUCKET: Final = "there is no such bucket, or it is not reachable for this account"
 
-
 # records of uploads -------------------------------------------------------------------------------
 
 

@@ -74,15 +74,9 @@ class ProgressTask:
         if console.is_terminal:
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-            self._progress = Progress(
-                TextColumn("{task.description}", markup=False),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TimeRemainingColumn(),
-                TextColumn("{task.fields[text]}", markup=False),
-                console=console,
-                transient=False,
-            )
+            before, after = (TextColumn(f"{{task.{of}}}", markup=False) for of in ("description", "fields[text]"))
+            columns = (before, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), after)
+            self._progress = Progress(*columns, console=console, transient=False)
             self._progress.start()
             self._id = self._progress.add_task(self._description, total=total, completed=start, text="")
 

@@ -111,7 +111,6 @@ def system_text(path: str) -> str:
 # once (Linux: proportional set sizes). Asking for these costs about 15 ms per GB, so it is done only when the resident
 # sizes allow a new peak, and never for more than `MOST_OF_TIME` of the time.
 
-
 PERIOD_S: Final = 0.25
 MOST_OF_TIME: Final = 0.05
 _PROPORTIONAL: Final = re.compile(r"^(Pss|Pss_Anon):\s+(\d+) kB", re.MULTILINE)

@@ -41,6 +41,8 @@ from mudg.base.errors import InputError, IntegrityError, MudgError, NumericsErro
 from mudg.base.failures import ended_process
 
 Result = TypeVar("Result")
+Pool = concurrent.futures.ProcessPoolExecutor
+Future = concurrent.futures.Future
 
 _ERRORS = {cls.__name__: cls for cls in (UsageError, InputError, IntegrityError, ResourceError, NumericsError)}
 _POLL_S = 0.5
@@ -51,7 +53,6 @@ _PATIENCE_S = 60.0
 _SAME_SIGNAL_S = 10.0
 """A worker takes signals that come together for one: Ctrl-C reaches it from the terminal and again from its parent."""
 GIB = 1 << 30
-
 
 # ---- threads and environment ---------------------------------------------------------------------
 
@@ -98,7 +99,6 @@ def process_alive(pid: int) -> bool:
 
 
 # ---- interrupts ----------------------------------------------------------------------------------
-
 
 _NOTICES = (signal.SIGUSR1,) if hasattr(signal, "SIGUSR1") else ()
 """Signals that announce the end of a job."""
@@ -162,8 +162,7 @@ class Interruption:
 
 def error_record(error: MudgError) -> dict[str, Any]:
     """An error as JSON values; ``error_from_record`` makes it again."""
-    fields = {"where": error.where, "expected": error.expected, "got": error.got, "remedy": error.remedy}
-    return {"error": type(error).__name__, "what": error.what, "fields": fields}
+    return {"error": type(error).__name__, "what": error.what, "fields": error.fields}
 
 
 def error_from_record(record: Mapping[str, Any]) -> MudgError:
@@ -232,7 +231,7 @@ def calls_beside(
         pool = process_pool(processes)
         futures = [pool.submit(_stoppable, function, items) for items in arguments]
 
-    def drop_rest(done: concurrent.futures.Future[Any]) -> None:
+    def drop_rest(done: Future[Any]) -> None:
         if not done.cancelled() and done.exception() is not None:
             for future in futures:
                 future.cancel()
@@ -260,17 +259,14 @@ def calls_beside(
 
 
 def _in_turn(
-    pool: concurrent.futures.ProcessPoolExecutor,
-    function: Callable[..., Result],
-    arguments: Sequence[tuple[Any, ...]],
-    processes: int,
+    pool: Pool, function: Callable[..., Result], arguments: Sequence[tuple[Any, ...]], processes: int
 ) -> Iterator[tuple[int, Result]]:
     """Results as they come. No more calls are handed out than there are processes: the pool cannot take back one that
     waits in its queue, and after an error it would still be begun."""
-    futures: dict[concurrent.futures.Future[Result], int] = {}
+    futures: dict[Future[Result], int] = {}
     rest = iter(enumerate(arguments))
 
-    def hand_out(count: int) -> list[concurrent.futures.Future[Result]]:
+    def hand_out(count: int) -> list[Future[Result]]:
         given = [(pool.submit(_stoppable, function, items), index) for index, items in itertools.islice(rest, count)]
         futures.update(given)
         return [future for future, _ in given]
@@ -280,9 +276,7 @@ def _in_turn(
 
 
 def _as_completed(
-    pool: concurrent.futures.ProcessPoolExecutor,
-    futures: Mapping[concurrent.futures.Future[Result], int],
-    next_of: Callable[[], Sequence[concurrent.futures.Future[Result]]] = tuple,
+    pool: Pool, futures: Mapping[Future[Result], int], next_of: Callable[[], Sequence[Future[Result]]] = tuple
 ) -> Iterator[tuple[int, Result]]:
     """Results as they come; ``next_of`` hands out what takes the place of a call that has ended well. The pool itself
     does not notice every death: its own threads can be short of memory, too."""
@@ -301,18 +295,18 @@ def _as_completed(
             raise BrokenProcessPool("a worker is gone")
 
 
-def _members(pool: concurrent.futures.ProcessPoolExecutor) -> list[multiprocessing.process.BaseProcess]:
+def _members(pool: Pool) -> list[multiprocessing.process.BaseProcess]:
     return list((getattr(pool, "_processes", None) or {}).values())
 
 
-def _kill(pool: concurrent.futures.ProcessPoolExecutor) -> None:
+def _kill(pool: Pool) -> None:
     """End what is left of a broken pool: nobody waits for a worker that may never answer."""
     for process in _members(pool):
         with contextlib.suppress(OSError, ValueError):
             process.kill()
 
 
-def _stop(pool: concurrent.futures.ProcessPoolExecutor) -> None:
+def _stop(pool: Pool) -> None:
     """End the calls of a pool: a fit writes its checkpoint. Who does not end in time, or at an interrupt, is killed."""
     members = _members(pool)
     pool.shutdown(wait=False, cancel_futures=True)
@@ -359,10 +353,10 @@ def _note_stop(_number: int, _frame: types.FrameType | None) -> None:
     _stop_asked.set()
 
 
-def process_pool(processes: int) -> concurrent.futures.ProcessPoolExecutor:
+def process_pool(processes: int) -> Pool:
     """A pool of quiet processes of one torch thread each."""
     context = multiprocessing.get_context("spawn")
-    return concurrent.futures.ProcessPoolExecutor(processes, mp_context=context, initializer=_prepare_child)
+    return Pool(processes, mp_context=context, initializer=_prepare_child)
 
 
 def _prepare_child() -> None:
@@ -414,7 +408,7 @@ def hold_life_line() -> None:
 def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -> Generator[Result, None, None]:
     """``compute(0)``, ``compute(1)``, ... in order, a few ahead in other threads, each with one torch thread."""
     with one_torch_thread(), concurrent.futures.ThreadPoolExecutor(threads) as pool:
-        waiting: deque[concurrent.futures.Future[Result]] = deque()
+        waiting: deque[Future[Result]] = deque()
         try:
             for number in range(count):
                 waiting.append(pool.submit(compute, number))

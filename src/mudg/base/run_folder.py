@@ -37,7 +37,6 @@ from mudg.base.records import ForeignRecord, Number, parse_record
 #
 # Of the old content only the files of the old result are removed. Files of somebody else move to the new folder.
 
-
 OwnNames = Callable[[Path], Sequence[str]]
 """Folder -> relative names of the files in it that belong to the result, in the order in which they may be removed:
 those last that the function itself reads. All other files belong to somebody else."""
@@ -167,7 +166,6 @@ def remove_files(folder: Path, names: Sequence[str]) -> None:
 
 
 # run folder ---------------------------------------------------------------------------------------
-
 
 fcntl: Any
 try:
@@ -578,10 +576,8 @@ def _verified(path: Path, overwrite: bool) -> bool:
     except IntegrityError as error:
         if overwrite:
             return False
-        remedy = "add --overwrite to make it again, or choose another --out"
-        raise IntegrityError(
-            error.what, where=error.where, expected=error.expected, got=error.got, remedy=remedy
-        ) from error
+        fields = {**error.fields, "remedy": "add --overwrite to make it again, or choose another --out"}
+        raise IntegrityError(error.what, **fields) from error
     return True
 
 

@@ -34,7 +34,6 @@ RUN_STATE, RUN_LOG, RUN_SCHEMA = "run.json", "log.jsonl", 2
 _MAX_JSON_BYTES = 512 * 1024 * 1024
 _CHUNK = 1 << 20
 
-
 # single files -------------------------------------------------------------------------------------
 
 

@@ -179,7 +179,6 @@ class RenderPlanes(_Brief):
 
 # types --------------------------------------------------------------------------------------------
 
-
 Matrix = NDArray[np.float64]
 TrajectoryOrigin = Literal["recorded", "shifted"]
 ObservationKind = Literal["recorded", "virtual"]

@@ -8,33 +8,24 @@ import platform
 from typing import Any
 
 
-def version() -> str:
-    """Version of this package, or ``0+unknown`` when it runs uninstalled."""
+def _of(package: str, missing: str) -> str:
     from importlib import metadata  # late: it takes a sixth of what --help takes
 
     try:
-        return metadata.version("mudg")
+        return metadata.version(package)
     except metadata.PackageNotFoundError:
-        return "0+unknown"
+        return missing
+
+
+def version() -> str:
+    """Version of this package, or ``0+unknown`` when it runs uninstalled."""
+    return _of("mudg", "0+unknown")
 
 
 @functools.cache
 def environment() -> dict[str, Any]:
     """Versions and machine facts that results may depend on. Holds no host name, user name or path. Looked up once:
     metadata is parsed anew at every question."""
-    from importlib import metadata
-
-    packages = {}
-    for name in ("torch", "numpy", "scipy", "pillow", "safetensors", "av"):
-        try:
-            packages[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            packages[name] = "missing"
-    return {
-        "mudg": version(),
-        "python": platform.python_version(),
-        "system": platform.system(),
-        "machine": platform.machine(),
-        "cpu_count": os.cpu_count(),
-        "packages": packages,
-    }
+    machine = {"system": platform.system(), "machine": platform.machine(), "cpu_count": os.cpu_count()}
+    packages = {name: _of(name, "missing") for name in ("torch", "numpy", "scipy", "pillow", "safetensors", "av")}
+    return {"mudg": version(), "python": platform.python_version(), **machine, "packages": packages}

@@ -34,7 +34,6 @@ _AT_ONCE: Final = 2000
 """Scenes that wait in Ray's queue at a time."""
 _GB: Final = 1_000_000_000
 
-
 # this machine -------------------------------------------------------------------------------------
 
 

@@ -157,7 +157,6 @@ OF_A_LINE: Final = ("format", "frames", "cameras", "sequence", "poses", "boxes",
 REVISION: Final = "revision"
 """Setting of a line that only changes the key: another content at the same address."""
 
-
 _PLACEHOLDER: Final = re.compile(r"\{(\w+)\}")
 COMMAND: Final = "command"
 """Name of the step that is a program of the user's own."""

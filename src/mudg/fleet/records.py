@@ -121,8 +121,8 @@ def _checked(kind: type[Kind], content: bytes, where: str, remedy: str) -> Kind:
         return kind.model_validate_json(store.json_text(store.parse_json(content, where), indent=None))
     except ValidationError as error:
         problem = first_problem(error, f"{where}: ")
-        what, got = f"a record of the batch is damaged: {problem.what}", problem.got
-        raise InputError(what, where=problem.where, expected=problem.expected, got=got, remedy=remedy) from error
+        fields = {**problem.fields, "remedy": remedy}
+        raise InputError(f"a record of the batch is damaged: {problem.what}", **fields) from error
 
 
 def this_host() -> str:

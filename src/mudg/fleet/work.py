@@ -50,13 +50,7 @@ REASONS: Final[Mapping[int, str]] = {
     KILLED: "killed, most likely for want of memory",
     ASKED_TO_STOP: "asked to stop",
 }
-WAITS_S: Final[dict[int, tuple[float, ...]]] = {
-    4: (0.0,),
-    5: (10.0, 60.0),
-    130: (2.0, 2.0),
-    KILLED: (5.0,),
-    ASKED_TO_STOP: (2.0, 2.0),
-}
+WAITS_S: Final = {4: (0.0,), 5: (10.0, 60.0), 130: (2.0, 2.0), KILLED: (5.0,), ASKED_TO_STOP: (2.0, 2.0)}
 """Exit code -> pauses before further tries; another signal: one more try. Other codes would come again."""
 _RESULT: Final = "result"
 _SETTINGS: Final = "settings.yaml"

@@ -50,14 +50,8 @@ from mudg.scene.write import SceneWriter
 
 # depth --------------------------------------------------------------------------------------------
 #
-# Networks of ``mudg annotate``: where they compute, what tells them apart in a scene's notes, and their depth in place
-# of the filled.
-#
 # A frame whose LiDAR returns are too few, or do not fit the network's depth, keeps the depth that was filled from them;
 # it is marked by a small file beside its labels, warned of, and counted in the notes.
-
-
-_FILLED: Final = ".filled.json"
 
 
 def place(config: AnnotateConfig) -> Place:
@@ -100,9 +94,8 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
         found["weights"] = street_net.digest(config.weights or street_net.EMBEDDED)
     if config.depth_network:
         if not config.depth:
-            raise UsageError(
-                "--depth-network contradicts --no-depth", where="--depth-network", remedy="leave out one of them"
-            )
+            what, remedy = "--depth-network contradicts --no-depth", "leave out one of them"
+            raise UsageError(what, where="--depth-network", remedy=remedy)
         kind_of(config.depth_network)
         found["depth_network"] = store.digest(find(config.depth_network))
     return found
@@ -145,11 +138,10 @@ def describe_folder(folder: str, digest: str) -> str:
 
 def _mark(staging: Path, frame_id: str) -> Path:
     """File that says that a frame kept its filled depth."""
-    return staging / f"{frame_id}{_FILLED}"
+    return staging / f"{frame_id}.filled.json"
 
 
 # the own vehicle in an image: what stays the same at the bottom of the image while everything else goes by ------------
-
 
 FRAMES: Final = 16
 MIN_TRAVEL_M: Final = 10.0
@@ -193,10 +185,6 @@ def steady_bottom(grey: NDArray[np.floating]) -> NDArray[np.bool_]:
 
 
 # points -------------------------------------------------------------------------------------------
-#
-# LiDAR returns for an image: points of the sweeps around it, dynamic objects standing where they are at the image's
-# time.
-
 
 MAX_GAP_S = 2.0
 """Sweeps farther in time than this from an image do not help: what moves without a track has gone elsewhere."""
@@ -242,11 +230,9 @@ class NearbyReturns:
         chosen = [s for sweeps in self._sensors.values() for s in nearest_sweeps(sweeps, time_s, self._count)]
         ids = {sweep.id for sweep in chosen}
         self._kept = {key: value for key, value in self._kept.items() if key in ids}
-        parts = [np.zeros((0, 3), np.float32)]
-        known = [self._separated(sweep) for sweep in chosen]
+        parts, known = [np.zeros((0, 3), np.float32)], [self._separated(sweep) for sweep in chosen]
         for sweep in known:
-            parts.append(sweep.static)
-            parts += list(self._dynamic_points_at(time_s, sweep.owned))
+            parts += [sweep.static, *self._dynamic_points_at(time_s, sweep.owned)]
         gap = min((sweep.gap_deg for sweep in known), default=0.6)
         return Returns(np.concatenate(parts), gap, max((sweep.highest_rad for sweep in known), default=0.0))
 
@@ -284,12 +270,7 @@ def _highest(sweep: Sweep, world: NDArray[np.float32]) -> float:
 
 # annotate page ------------------------------------------------------------------------------------
 #
-# ``labels.html`` of an annotated scene: pictures of some frames beside what was made of them.
-#
-# Columns: image; depth (near warm, far cold, darker where unsure); classes over the image, dynamic objects outlined in
-# red; confidence of the classes. What to look for: edges of the depth lie on edges of the image, the road has no steps,
-# sky ends at the roofs.
-
+# What to look for: edges of the depth lie on edges of the image, the road has no steps, sky ends at the roofs.
 
 NAME: Final = "labels.html"
 _FRAMES: Final = 6
@@ -352,7 +333,6 @@ def _depth_picture(scene: Scene, frame: Frame) -> NDArray[np.uint8]:
 
 # annotate -----------------------------------------------------------------------------------------
 
-
 _STAGING = "labelled"
 _SHARING = 4
 """Processes that share a device with the shipped network: each holds a context of some hundred megabytes there."""
@@ -406,17 +386,13 @@ def _notes(config: AnnotateConfig, missing: Sequence[Frame], inputs: Mapping[str
             yield f"{name} of {count} frames: {origin}, not truth"
 
 
-# --- one frame after the other --------------------------------------------------------------------
-
-
 def _label_frames(config: AnnotateConfig, path: Path, scene: Scene, missing: Sequence[Frame], staging: Path) -> None:
     """Put the labels of every frame that has none yet into ``staging``."""
     todo = [frame.id for frame in missing if not staged_labels(staging, frame.id).is_file()]
-    if len(todo) < len(missing):
-        log.info(f"annotate: {len(missing) - len(todo)} frames are labelled already")
-    most = config.processes or _usual_processes(config)
-    processes = min(most, len(todo) // _FRAMES_PER_PROCESS)
-    with log.task("labelling frames", len(missing), len(missing) - len(todo)) as bar:
+    if done := len(missing) - len(todo):
+        log.info(f"annotate: {done} frames are labelled already")
+    processes = min(config.processes or _usual_processes(config), len(todo) // _FRAMES_PER_PROCESS)
+    with log.task("labelling frames", len(missing), done) as bar:
         if processes <= 1:
             for _ in label_into_staging(config, scene, todo, staging):
                 bar.advance()

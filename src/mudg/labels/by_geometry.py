@@ -30,6 +30,10 @@ from mudg.core.project import visible_depth
 from mudg.labels.ground import above_plane, beside_path, map_ground
 from mudg.labels.inputs import LabelInput, Labels, PlacedBox, far_to_near, surface_points
 
+Bytes = NDArray[np.uint8]
+Floats = NDArray[np.float32]
+Mask = NDArray[np.bool_]
+
 GROUND_M: Final = 0.2
 """Height above the ground plane up to which a pixel is ground (and a little more far away)."""
 LANE_M: Final = 2.5
@@ -46,8 +50,8 @@ _THIN: Final = (ID["person"], ID["rider"], ID["bicycle"], ID["motorcycle"])
 class _Measured:
     """Visible returns: ``depth_m`` f32[H, W], NaN = none, and ``away_px`` f32[H, W], distance to the nearest."""
 
-    depth_m: NDArray[np.float32]
-    away_px: NDArray[np.float32]
+    depth_m: Floats
+    away_px: Floats
     gap_px: float
 
     @property
@@ -59,9 +63,9 @@ class _Measured:
 class _Surface:
     """Dense depth: ``xyz_world`` f32[H, W, 3] (NaN = unknown), ``depth`` f32[H, W] metres, ``confidence`` f32[H, W]."""
 
-    xyz_world: NDArray[np.float32]
-    depth: NDArray[np.float32]
-    confidence: NDArray[np.float32]
+    xyz_world: Floats
+    depth: Floats
+    confidence: Floats
 
 
 def label_by_geometry(given: LabelInput) -> Labels:
@@ -85,20 +89,14 @@ def label_by_geometry(given: LabelInput) -> Labels:
     return _with_surface(given, semantics, confidence, sky, surface)
 
 
-def label_by_network(given: LabelInput, semantics: NDArray[np.uint8], confidence: NDArray[np.float32]) -> Labels:
+def label_by_network(given: LabelInput, semantics: Bytes, confidence: Floats) -> Labels:
     """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, the rest by rules."""
     measured = _measure(given)
     sky = (semantics == ID["sky"]) & ~np.isfinite(measured.depth_m)
     return _with_surface(given, semantics, confidence, sky, _complete(given, measured, sky))
 
 
-def _with_surface(
-    given: LabelInput,
-    semantics: NDArray[np.uint8],
-    confidence: NDArray[np.float32],
-    sky: NDArray[np.bool_],
-    surface: _Surface,
-) -> Labels:
+def _with_surface(given: LabelInput, semantics: Bytes, confidence: Floats, sky: Mask, surface: _Surface) -> Labels:
     depth, depth_confidence = surface.depth.copy(), surface.confidence.copy()
     depth[sky] = RULES.sky_m
     painted_over = ~sky & (depth == RULES.sky_m)  # a box before the sky that nothing measured
@@ -114,7 +112,7 @@ def _measure(given: LabelInput) -> _Measured:
     return _Measured(depth, np.asarray(away, np.float32), gap_px)
 
 
-def _complete(given: LabelInput, measured: _Measured, sky: NDArray[np.bool_]) -> _Surface:
+def _complete(given: LabelInput, measured: _Measured, sky: Mask) -> _Surface:
     """Dense depth of what is not sky, and its points."""
     beyond = beyond_reach(given.view, measured.depth_m, given.highest_rad, gap_deg=given.beam_gap_deg)
     for box in far_to_near(given):  # the windows of vehicles return nothing, although they are near
@@ -126,11 +124,7 @@ def _complete(given: LabelInput, measured: _Measured, sky: NDArray[np.bool_]) ->
 
 
 def _paint_surface(
-    semantics: NDArray[np.uint8],
-    confidence: NDArray[np.float32],
-    given: LabelInput,
-    surface: _Surface,
-    greenness: NDArray[np.float32],
+    semantics: Bytes, confidence: Floats, given: LabelInput, surface: _Surface, greenness: Floats
 ) -> None:
     """Each pixel of known depth by its height above the ground, its place beside the path, and its colour."""
     known = np.isfinite(surface.depth)
@@ -153,16 +147,8 @@ def _paint_surface(
     confidence[standing] = 0.3 + 0.2 * surface.confidence[standing]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _BoxPixels:
+def _box_pixels(box: PlacedBox, view: View, surface: _Surface) -> tuple[tuple[slice, slice], Mask, Mask] | None:
     """Of a box: the part of the image around it; there its outline, and where the surface lies in it, bool[h, w]."""
-
-    window: tuple[slice, slice]
-    outline: NDArray[np.bool_]
-    inside: NDArray[np.bool_]
-
-
-def _box_pixels(box: PlacedBox, view: View, surface: _Surface) -> _BoxPixels | None:
     outline = box.outline(view)
     if outline is None:
         return None
@@ -171,59 +157,54 @@ def _box_pixels(box: PlacedBox, view: View, surface: _Surface) -> _BoxPixels | N
     known = outline & np.isfinite(surface.depth[window])
     inside = np.zeros(outline.shape, bool)
     inside[known] = box.contains(surface.xyz_world[window][known])
-    return _BoxPixels(window, outline, inside)
+    return window, outline, inside
 
 
 def _paint_box(
-    semantics: NDArray[np.uint8],
-    confidence: NDArray[np.float32],
-    box: PlacedBox,
-    view: View,
-    measured: _Measured,
-    surface: _Surface,
+    semantics: Bytes, confidence: Floats, box: PlacedBox, view: View, measured: _Measured, surface: _Surface
 ) -> None:
     """Paint a tracked box: surely where the surface lies in it, less surely in its outline; not behind what is near."""
     pixels = _box_pixels(box, view, surface)
     if pixels is None:
         return
-    semantics, confidence, depth = (m[pixels.window] for m in (semantics, confidence, surface.depth))
-    certain, inside = surface.confidence[pixels.window], pixels.inside
-    if measured.any and not (inside & np.isfinite(measured.depth_m[pixels.window])).any():
+    window, outline, inside = pixels
+    semantics, confidence, depth = (m[window] for m in (semantics, confidence, surface.depth))
+    certain = surface.confidence[window]
+    if measured.any and not (inside & np.isfinite(measured.depth_m[window])).any():
         return  # the LiDAR sees around there and nothing is in the box: it is hidden, or empty
     if not (measured.any and box.train_id in _THIN):  # people and bicycles fill little of their boxes
         far_side_m = box.depth_m(view) + float(np.linalg.norm(box.track.size_m)) / 2
-        guessed = pixels.outline & ~inside & ~(depth < far_side_m) & (certain < 0.15)
+        guessed = outline & ~inside & ~(depth < far_side_m) & (certain < 0.15)
         semantics[guessed], confidence[guessed] = box.train_id, 0.4
     semantics[inside], confidence[inside] = box.train_id, (0.5 + 0.4 * certain)[inside]
 
 
-def find_dynamic(given: LabelInput, semantics: NDArray[np.uint8], surface: _Surface) -> NDArray[np.bool_]:
+def find_dynamic(given: LabelInput, semantics: Bytes, surface: _Surface) -> Mask:
     """Pixels of dynamic objects, bool[H, W]: the surface lies in their box, or is uncertain and has their class."""
     dynamic = np.zeros(semantics.shape, bool)
     for box in far_to_near(given):
         pixels = _box_pixels(box, given.view, surface) if box.number in given.moving else None
         if pixels is not None:
-            uncertain = pixels.outline & ~(surface.confidence[pixels.window] > 0.3)
-            dynamic[pixels.window] |= pixels.inside | (uncertain & (semantics[pixels.window] == box.train_id))
+            window, outline, inside = pixels
+            uncertain = outline & ~(surface.confidence[window] > 0.3)
+            dynamic[window] |= inside | (uncertain & (semantics[window] == box.train_id))
     return dynamic
 
 
-def _span(present: NDArray[np.bool_], margin: int) -> slice:
+def _span(present: Mask, margin: int) -> slice:
     """From the first to the last true entry, and ``margin`` more on either side."""
     at = np.flatnonzero(present)
     return slice(max(0, int(at[0]) - margin), int(at[-1]) + margin + 1)
 
 
-def greenness_of(rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+def greenness_of(rgb: Bytes) -> Floats:
     """Positive where a smoothed pixel is rather green, or the dark mottled colour of leaves; f32[H, W]."""
     smooth = ndimage.uniform_filter(rgb.astype(np.float32), (5, 5, 1))
     red, green, blue = smooth[..., 0], smooth[..., 1], smooth[..., 2]
     return green - np.maximum(red * 0.97, blue * 1.04) - 1.5
 
 
-def find_sky(
-    rgb: NDArray[np.uint8], elevation: NDArray[np.float32], away_px: NDArray[np.float32], gap_px: float
-) -> NDArray[np.bool_]:
+def find_sky(rgb: Bytes, elevation: Floats, away_px: Floats, gap_px: float) -> Mask:
     """Sky mask bool[H, W]: above the horizon, without returns, bright or blue, smooth, connected to the top of the
     image.
 
@@ -257,12 +238,12 @@ def find_sky(
     return ndimage.binary_dilation(sky, iterations=int(np.ceil(gap_px)) + 1, mask=free & (sky_like | sky))
 
 
-def _morphology(operation: Callable[..., NDArray[np.bool_]], mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _morphology(operation: Callable[..., Mask], mask: Mask) -> Mask:
     """Opening or closing by 3x3 pixels; beyond its edges the mask continues with its last row and column."""
     return operation(np.pad(mask, 2, mode="edge"), np.ones((3, 3), bool))[2:-2, 2:-2]
 
 
-def _two_group_threshold(values: NDArray[np.float32]) -> float:
+def _two_group_threshold(values: Floats) -> float:
     """The level that splits values into two groups of least inner variance; at least a modest brightness of 90."""
     counts, edges = np.histogram(values, 128)
     centers = (edges[:-1] + edges[1:]) / 2

@@ -14,6 +14,10 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+Points = NDArray[np.floating]
+Places = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
 NEAR_PATH_M: Final = 30.0
 """The ground plane belongs to the part of the path within this distance of the camera."""
 CELL_M: Final = 0.3
@@ -36,7 +40,7 @@ _STOOD_M: Final = 0.5
 """A path that goes no farther than this shows no direction."""
 
 
-def fit_ground(xyz_world: NDArray[np.floating], path_world: NDArray[np.float64]) -> NDArray[np.float64] | None:
+def fit_ground(xyz_world: Points, path_world: Places) -> Places | None:
     """Ground plane z = a x + b y + c within 40 m of the path's middle, f64[3], or None with too few points to tell.
 
     Starts from the lowest returns of 2 m cells (their lower half by height), then least squares on what lies within
@@ -65,9 +69,7 @@ def fit_ground(xyz_world: NDArray[np.floating], path_world: NDArray[np.float64])
     return plane if np.hypot(plane[0], plane[1]) < 0.2 else None
 
 
-def ground_near(
-    xyz_world: NDArray[np.floating], path_world: NDArray[np.float64], centre_world: NDArray[np.float64]
-) -> NDArray[np.float64] | None:
+def ground_near(xyz_world: Points, path_world: Places, centre_world: Places) -> Places | None:
     """``fit_ground`` for the part of the path near a place: a log is longer than a plane is flat."""
     if len(path_world) == 0:
         return None
@@ -75,12 +77,12 @@ def ground_near(
     return fit_ground(xyz_world, path_world[away <= max(NEAR_PATH_M, float(away.min()))])
 
 
-def above_plane(plane: NDArray[np.float64], xyz_world: NDArray[np.floating]) -> NDArray[np.float64]:
+def above_plane(plane: Places, xyz_world: Points) -> Places:
     """Height of points ``[..., 3]`` above a plane of ``fit_ground``, metres."""
     return xyz_world[..., 2] - (xyz_world[..., 0] * plane[0] + xyz_world[..., 1] * plane[1] + plane[2])
 
 
-def driven_path(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
+def driven_path(world_from_ego: Places) -> Places:
     """Places f64[M, 3] of a vehicle with poses f64[T, 4, 4]; of one that stood, 1 m behind and ahead of it, too."""
     places = world_from_ego[:, :3, 3]
     if len(places) == 0 or np.linalg.norm(places[:, :2] - places[0, :2], axis=1).max() > _STOOD_M:
@@ -88,7 +90,7 @@ def driven_path(world_from_ego: NDArray[np.float64]) -> NDArray[np.float64]:
     return places[0] + np.array([[-1.0], [0.0], [1.0]]) * world_from_ego[0, :3, 0]
 
 
-def distance_to_path(xyz_world: NDArray[np.floating], path_world: NDArray[np.float64]) -> NDArray[np.float64]:
+def distance_to_path(xyz_world: Points, path_world: Places) -> Places:
     """Horizontal distance of points ``[N, 2 or 3]`` to the driven path, gone on straight for 80 m at both ends; metres
     f64[N].
 
@@ -110,7 +112,7 @@ def distance_to_path(xyz_world: NDArray[np.floating], path_world: NDArray[np.flo
     return cKDTree(line).query(xyz_world[:, :2])[0]
 
 
-def beside_path(xyz_world: NDArray[np.float32], path_world: NDArray[np.float64], step: int) -> NDArray[np.float32]:
+def beside_path(xyz_world: NDArray[np.float32], path_world: Places, step: int) -> NDArray[np.float32]:
     """``distance_to_path`` of the points f32[H, W, 3] of an image, worked out at every ``step``-th pixel; metres f32[H,
     W], infinite where a point is not finite."""
     coarse = xyz_world[::step, ::step]
@@ -133,15 +135,13 @@ class GroundMap:
         raised_m: f32[N, N], height above the lowest ground within 3 m, 0 where unknown.
     """
 
-    corner_m: NDArray[np.float64]
-    plane: NDArray[np.float64]
-    reachable: NDArray[np.bool_]
-    direct: NDArray[np.bool_]
+    corner_m: Places
+    plane: Places
+    reachable: Mask
+    direct: Mask
     raised_m: NDArray[np.float32]
 
-    def under(
-        self, xyz_world: NDArray[np.floating]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
+    def under(self, xyz_world: Points) -> tuple[Mask, Mask, NDArray[np.float32]]:
         """``reachable``, ``direct`` and ``raised_m`` under points ``[..., 3]``; False and 0 where is no ground."""
         place = np.floor(np.nan_to_num((xyz_world[..., :2] - self.corner_m) / CELL_M, nan=-1.0)).astype(np.int64)
         last = len(self.reachable) - 1
@@ -150,9 +150,7 @@ class GroundMap:
         return self.reachable[i, j] & low, self.direct[i, j] & low, np.where(low, self.raised_m[i, j], np.float32(0))
 
 
-def map_ground(
-    xyz_world: NDArray[np.floating], path_world: NDArray[np.float64], centre_world: NDArray[np.float64]
-) -> GroundMap | None:
+def map_ground(xyz_world: Points, path_world: Places, centre_world: Places) -> GroundMap | None:
     """Map of the ground within ``REACH_M`` of a place; None without a ground plane.
 
     Args:
@@ -179,7 +177,7 @@ def map_ground(
     return GroundMap(corner, plane, reachable, direct, raised)
 
 
-def _way(passable: NDArray[np.bool_], beside_m: NDArray[np.float64]) -> NDArray[np.float64]:
+def _way(passable: Mask, beside_m: Places) -> Places:
     """Length of the way from the driven path to each cell over passable ones, metres, infinite where there is none.
 
     Cells are reached in turns of four and of eight neighbours, which measures lengths to 8 percent.
@@ -196,14 +194,12 @@ def _way(passable: NDArray[np.bool_], beside_m: NDArray[np.float64]) -> NDArray[
     return way
 
 
-def _dilated(mask: NDArray[np.bool_], diagonally: bool = False) -> NDArray[np.bool_]:
+def _dilated(mask: Mask, diagonally: bool = False) -> Mask:
     """A mask and the four, or eight, neighbours of its cells."""
     return np.asarray(ndimage.binary_dilation(mask, ndimage.generate_binary_structure(2, 1 + diagonally)), np.bool_)
 
 
-def _cell_heights(
-    xyz_world: NDArray[np.floating], plane: NDArray[np.float64], corner_m: NDArray[np.float64], side: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _cell_heights(xyz_world: Points, plane: Places, corner_m: Places, side: int) -> tuple[Places, Places]:
     """Height above the plane of each cell, f64[side, side]: the lower quartile of its low points, else that of the
     nearest cell with any; and how far away that is, metres."""
     place = np.floor((xyz_world[:, :2] - corner_m) / CELL_M).astype(np.int64)

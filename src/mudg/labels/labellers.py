@@ -1,9 +1,8 @@
 """The labellers of ``mudg annotate``.
 
-* ``geometry``: rules on LiDAR, tracked boxes and colour (``models.labels.by_geometry``). No parameters.
-* ``embedded``: classes from the small network that comes with the package (``models.labels.street_labels``), which
-  reads the same evidence and the image.
-* ``network``: classes from a segmentation network in a folder (``models.labels.segmenters``).
+* ``geometry``: rules on LiDAR, tracked boxes and colour (``by_geometry.py``). No parameters.
+* ``embedded``: classes from the small shipped network, which reads image and ``evidence.py`` (``street_net.py``).
+* ``network``: classes from a segmentation network in a folder (``segmenters.py``).
 
 Depth and dynamic objects are found in the same way for all three.
 """

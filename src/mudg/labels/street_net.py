@@ -1,7 +1,7 @@
 """Labels by the network that comes with the package: ``mudg annotate --labeller embedded``.
 
 Images of a longer focal length than in training are made smaller, so that objects have the size they had there; the
-measured evidence of ``models.labels.evidence`` has the same size. Rules then correct what evidence and colour decide
+measured evidence of ``evidence.py`` has the same size. Rules then correct what evidence and colour decide
 (``settled``, ``settled_by_color``), and the probabilities are resampled to the image's size.
 """
 
@@ -33,12 +33,9 @@ from mudg.networks.folders import CPU, Place
 
 # street net ---------------------------------------------------------------------------------------
 #
-# A small segmentation network: Cityscapes classes of a street from colour and measured evidence.
-#
-# An encoder and decoder with skips at strides 2 to 32. Colour and the planes of ``models.labels.evidence`` enter
+# An encoder and decoder with skips at strides 2 to 32. Colour and the planes of ``evidence.py`` enter
 # together as cells of 2x2 pixels, and the scores of a cell's four pixels leave together: nothing is computed at full
 # size, and nothing of it is lost.
-
 
 MODEL_FILE: Final = "model.json"
 WEIGHTS_FILE: Final = "weights.safetensors"
@@ -181,7 +178,6 @@ def _described(folder: Path | str) -> Path:
 
 # street labels ------------------------------------------------------------------------------------
 
-
 RETURN_DEG: Final = 0.12
 """A pixel nearer than this to a return shows a surface, not the sky."""
 BELOW_RAD: Final = -0.02
@@ -247,14 +243,13 @@ def settled(probabilities: NDArray[np.float32], evidence: Evidence, boxes_known:
     (``boxes_known``), there is hardly anything outside them that boxes are drawn around.
     """
     found = probabilities.copy()
-    measured = evidence.away_deg < RETURN_DEG
-    found[ID["sky"], measured | (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
+    found[ID["sky"], (evidence.away_deg < RETURN_DEG) | (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
     near = evidence.away_deg < 1
     for index in _FLAT:
         found[index, near & (evidence.height_m > ROAD_M)] *= _SMALL
     driven = near & (evidence.beside_m < CORRIDOR_M) & (np.abs(evidence.height_m) < GROUND_M) & (evidence.box == 0)
-    found[ID["sidewalk"], driven & (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
-    found[ID["terrain"], driven & (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
+    for name in ("sidewalk", "terrain"):
+        found[ID[name], driven & (evidence.elevation_rad < BELOW_RAD)] *= _SMALL
     _hand_over(found, evidence.direct, "sidewalk", "road", _RARER)
     if boxes_known:
         for index in GROUP_OF:

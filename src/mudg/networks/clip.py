@@ -30,15 +30,12 @@ MAX_ATTENTION_BATCH = 32768
 """Attention over more sequences than this is done in parts: GPU kernels have a limit of 65535."""
 
 
-def attend(query: Tensor, key: Tensor, value: Tensor, heads: int) -> Tensor:
+def attend(query: Tensor, key: Tensor, value: Tensor, heads: int, causal: bool = False) -> Tensor:
     """Softmax attention of `query` [N,L,C] over `key`, `value` [N,M,C] with C split into `heads` -> [N,L,C]."""
     q, k, v = (x.unflatten(-1, (heads, -1)).transpose(1, 2) for x in (query, key, value))
-    if len(q) > MAX_ATTENTION_BATCH:
-        parts = zip(*(x.split(MAX_ATTENTION_BATCH) for x in (q, k, v)))
-        mixed = torch.cat([functional.scaled_dot_product_attention(*part) for part in parts])
-    else:
-        mixed = functional.scaled_dot_product_attention(q, k, v)
-    return mixed.transpose(1, 2).flatten(2)
+    parts = list(zip(*(x.split(MAX_ATTENTION_BATCH) for x in (q, k, v))))
+    mixed = [functional.scaled_dot_product_attention(*part, is_causal=causal) for part in parts]
+    return (mixed[0] if len(mixed) == 1 else torch.cat(mixed)).transpose(1, 2).flatten(2)
 
 
 @dataclass(frozen=True)
@@ -76,12 +73,7 @@ class TowerBlock(nn.Module):
     def forward(self, x: Tensor, causal: bool) -> Tensor:
         """[N,L,C] -> the same; `causal`: a token sees itself and what stands before it."""
         query, key, value = self.query_key_value(self.norm1(x)).chunk(3, -1)
-        if causal:
-            q, k, v = (y.unflatten(-1, (self.heads, -1)).transpose(1, 2) for y in (query, key, value))
-            mixed = functional.scaled_dot_product_attention(q, k, v, is_causal=True).transpose(1, 2).flatten(2)
-        else:
-            mixed = attend(query, key, value, self.heads)
-        x = x + self.out(mixed)
+        x = x + self.out(attend(query, key, value, self.heads, causal))
         return x + self.feed_out(functional.gelu(self.feed_in(self.norm2(x))))
 
 

@@ -95,9 +95,8 @@ class ClipImageFeatures(nn.Module):
     def __init__(self, state: Mapping[str, Tensor], where: str = "CLIP weights") -> None:
         super().__init__()
         found = with_openai_names(state)
-        places, kernel, projection = (
-            found.get(f"visual.{name}") for name in ("positional_embedding", "conv1.weight", "proj")
-        )
+        needed = ("positional_embedding", "conv1.weight", "proj")
+        places, kernel, projection = (found.get(f"visual.{name}") for name in needed)
         if places is None or kernel is None or projection is None or kernel.shape[0] % HEAD_WIDTH:
             got = ", ".join(list(state)[:5])
             expected = "visual.* as OpenAI names them, or vision_model.* and visual_projection.weight"
@@ -138,9 +137,8 @@ class ClipImageFeatures(nn.Module):
         return F.linear(x, self.get_buffer(f"visual/{name}/weight"), self.get_buffer(f"visual/{name}/bias"))
 
     def _norm(self, name: str, x: Tensor) -> Tensor:
-        return F.layer_norm(
-            x, (self.width,), self.get_buffer(f"visual/{name}/weight"), self.get_buffer(f"visual/{name}/bias"), EPSILON
-        )
+        weight, bias = (self.get_buffer(f"visual/{name}/{leaf}") for leaf in ("weight", "bias"))
+        return F.layer_norm(x, (self.width,), weight, bias, EPSILON)
 
 
 def prepared(rgb: NDArray[np.uint8], side: int = 336) -> Tensor:

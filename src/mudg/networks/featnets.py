@@ -230,22 +230,20 @@ TRUNKS: Final[dict[LpipsTrunk, tuple[_Stage, ...]]] = {
     ),
 }
 """Stages of each network; features are read after each. Places are those of torchvision's networks."""
-WIDTHS: Final[dict[LpipsTrunk, tuple[int, ...]]] = {
-    "alex": (64, 192, 384, 256, 256),
-    "vgg": (64, 128, 256, 512, 512),
-    "squeeze": (64, 128, 256, 384, 384, 512, 512),
-}
 
 
 def lpips_shapes(trunk: LpipsTrunk) -> dict[str, tuple[int, ...]]:
     """Name -> shape of the tensors of a network of LPIPS, as the lpips package names them."""
     shapes: dict[str, tuple[int, ...]] = {}
     for number, stage in enumerate(TRUNKS[trunk]):
+        width = 0
+        for step in stage:
+            width = step.out if isinstance(step, _Layer) else 2 * step.each if isinstance(step, _Fire) else width
         for layer in _layers(stage):
             named = f"net.slice{number + 1}.{layer.place}"
             shapes[f"{named}.weight"] = (layer.out, layer.into, layer.size, layer.size)
             shapes[f"{named}.bias"] = (layer.out,)
-        shapes[f"lin{number}.model.1.weight"] = (1, WIDTHS[trunk][number], 1, 1)
+        shapes[f"lin{number}.model.1.weight"] = (1, width, 1, 1)
     return shapes
 
 
@@ -272,8 +270,7 @@ class LpipsFeatures(nn.Module):
         InputError: a tensor is missing or has another shape.
     """
 
-    SHIFT: Final = (-0.030, -0.088, -0.188)
-    SCALE: Final = (0.458, 0.448, 0.450)
+    SHIFT, SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
     SMALLEST_PX: Final = 31
 
     def __init__(
@@ -284,10 +281,9 @@ class LpipsFeatures(nn.Module):
         given: LpipsInput = "correct",
     ) -> None:
         super().__init__()
-        self.trunk: LpipsTrunk = trunk
-        self.given: LpipsInput = given
-        self.register_buffer("shift", torch.tensor(self.SHIFT).view(1, 3, 1, 1))
-        self.register_buffer("scale", torch.tensor(self.SCALE).view(1, 3, 1, 1))
+        self.trunk, self.given = trunk, given
+        for name, values in (("shift", self.SHIFT), ("scale", self.SCALE)):
+            self.register_buffer(name, torch.tensor(values).view(1, 3, 1, 1))
         for name, value in checked_state(state, lpips_shapes(trunk), where, "LPIPS", lambda _: True).items():
             self.register_buffer(name.replace(".", "/"), value)
 

@@ -71,7 +71,6 @@ def checked_state(
 
 # folders ------------------------------------------------------------------------------------------
 
-
 _REMEDY: Final = "pip install 'mudg[models]'"
 
 

@@ -18,7 +18,7 @@ the image: only that one is computed here. The noise is the same for every image
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -81,7 +81,6 @@ class DepthLabSampling:
 
 PUBLISHED_SAMPLING: Final = DepthLabSampling()
 
-
 # --- the networks ---------------------------------------------------------------------------------
 
 
@@ -122,19 +121,20 @@ def blank_parts(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, nn.Module
     diffusers, transformers = folders.package("diffusers"), folders.package("transformers")
     unet = folders.member(diffusers, "UNet2DConditionModel")
     vision = folders.member(transformers, "CLIPVisionConfig")
+    vae = folders.member(diffusers, "AutoencoderKL")
+    encoder = folders.member(transformers, "CLIPVisionModelWithProjection")
+    makers: dict[str, Callable[[dict[str, Any]], nn.Module]] = {
+        **dict.fromkeys(UNETS, unet.from_config),
+        "mapping_layer": lambda config: nn.Linear(**config),
+        "vae": vae.from_config,
+        "image_encoder": lambda config: encoder(vision(**config)),
+    }
     made: dict[str, nn.Module] = {}
     name = ""
     try:
         with torch.device("meta"):
-            for name in UNETS:
-                made[name] = unet.from_config(dict(configs[name]))
-            name = "mapping_layer"
-            made[name] = nn.Linear(**configs[name])
-            name = "vae"
-            made[name] = folders.member(diffusers, "AutoencoderKL").from_config(dict(configs[name]))
-            name = "image_encoder"
-            network_class = folders.member(transformers, "CLIPVisionModelWithProjection")
-            made[name] = network_class(vision(**configs[name]))
+            for name, make in makers.items():
+                made[name] = make(dict(configs[name]))
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, NotImplementedError) as error:
         raise InputError(
             "a network cannot be made as it is described", where=f"DepthLab: {name}", got=str(error)[:300]
@@ -418,10 +418,7 @@ class DepthLab:
         return latent.float() * LATENT_SCALE
 
 
-# depthlab -----------------------------------------------------------------------------------------
-#
-# convert, of DepthLab: three published pickles, Marigold's folder and CLIP's -> one folder that ``annotate
-# --depth-network`` reads.
+# conversion ---------------------------------------------------------------------------------------
 #
 #     FOLDER/
 #       DepthLab/                denoising_unet.pth, reference_unet.pth, mapping_layer.pth
@@ -431,7 +428,6 @@ class DepthLab:
 # The three are recognised by what lies in them, not by their names. Tensors are compared with the networks that the
 # descriptions stand for, by name and shape, all of them before the first is written. The published code takes what the
 # pickle of the denoising U-Net or of the linear layer lacks from Marigold or leaves it random; here that is an error.
-
 
 PICKLES = {part: f"{part}.pth" for part in (*UNETS, "mapping_layer")}
 """Part -> the published file that holds it."""

@@ -41,7 +41,6 @@ CUE_PX: Final = 256
 _ERROR_SCALE: Final = 0.05
 _SKY_CONFIDENCE: Final = 0.8
 
-
 # --- networks of transformers ---------------------------------------------------------------------
 
 
@@ -139,7 +138,6 @@ def _load_transformers(folder: Path, place: Place, *, with_lidar: bool) -> Trans
 
 
 # --- folders --------------------------------------------------------------------------------------
-
 
 KINDS: Final[Mapping[str, Callable[[Path, Place, DepthOptions], DepthNetwork]]] = {
     "prompt_depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=True),
