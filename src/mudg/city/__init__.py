@@ -21,12 +21,8 @@ __all__ = ["CityConfig", "CitySweep", "CityTruth", "CityWorld", "write_city"]
 
 
 def __getattr__(name: str) -> Any:
-    if name in ("CitySweep", "CityTruth", "CityWorld"):
-        from mudg.city import world
+    if name not in __all__:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from mudg.city import logs, world
 
-        return getattr(world, name)
-    if name == "write_city":
-        from mudg.city.logs import write_city
-
-        return write_city
-    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(logs if name == "write_city" else world, name)

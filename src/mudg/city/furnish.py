@@ -6,19 +6,7 @@ import math
 
 from mudg.city import layout as rec
 from mudg.city.config import CityConfig
-from mudg.city.layout import (
-    AHEAD_M,
-    BRICK_COLORS,
-    KERB_M,
-    LEAF_COLORS,
-    RENDER_COLORS,
-    Color,
-    Furnisher,
-    Size,
-    StreetPlan,
-    colors,
-    plant_tree,
-)
+from mudg.city.layout import LEAF_COLORS, RENDER_COLORS, Color, Furnisher, Size, colors
 
 # overhead ------------------------------------------------------------------------------------------
 #
@@ -43,7 +31,7 @@ class Overhead:
 
     def __init__(self, furnisher: Furnisher, amount: float) -> None:
         self.f, self.amount = furnisher, amount
-        self.end = furnisher.plan.drive_length + AHEAD_M - 60
+        self.end = furnisher.plan.drive_length + rec.AHEAD_M - 60
 
     def kerb(self, side: int) -> float:
         """|u| of the kerb."""
@@ -322,7 +310,7 @@ class Sidewalk:
         self.f, self.side, self.front = f, side, front
         self.kerb = abs(plan.kerb(side))
         self.width = plan.sidewalk(side)
-        self.end = plan.drive_length + AHEAD_M - 40
+        self.end = plan.drive_length + rec.AHEAD_M - 40
         self.corner = (plan.crossing.corner + 2.0) if plan.crossing else 0.0
         self.facing_street = -side * math.pi / 2  # local +x towards the road
         self.facing_back = 0.0 if side < 0 else math.pi
@@ -378,7 +366,7 @@ def _street_trees(walk: Sidewalk) -> None:
         if f.chance(0.85) and not f.near_crossing(s, walk.corner + 2):
             u = f.free_u(s, side * (walk.kerb + 0.9), 0.5, 0.35, side, side * (walk.front - 0.4))
             if u is not None:
-                plant_tree(f, s, u)
+                rec.plant_tree(f, s, u)
         s += spacing * f.uniform(0.9, 1.1)
 
 
@@ -453,7 +441,7 @@ def _sign(walk: Sidewalk, s: float) -> None:
 # furnish ------------------------------------------------------------------------------------------
 
 
-def furnish(config: CityConfig, plan: StreetPlan) -> list[list[float]]:
+def furnish(config: CityConfig, plan: rec.StreetPlan) -> list[list[float]]:
     """Records of everything static."""
     f = Furnisher(config, plan)
     for side in (-1, 1):
@@ -497,7 +485,7 @@ def _building(f: Furnisher, x0: float, y0: float, x1: float, y1: float, side: in
     height = facade[2] + floors * facade[1] + (0.2 if gable else 0.7)
     if not urban and f.chance(0.4):
         height = facade[2] + 0.25
-    wall = f.pick(BRICK_COLORS if brick else RENDER_COLORS)
+    wall = f.pick(rec.BRICK_COLORS if brick else RENDER_COLORS)
     trim = f.pick(((0.62, 0.60, 0.56), (0.45, 0.43, 0.40), (0.30, 0.29, 0.28), (0.70, 0.69, 0.67)))
     balconies = float(urban and f.chance(0.35))
     yaw_out = yaw if side > 0 else yaw + math.pi  # local -y faces the street
@@ -508,7 +496,7 @@ def _building(f: Furnisher, x0: float, y0: float, x1: float, y1: float, side: in
 def _building_row(f: Furnisher, side: int, front: float) -> None:
     plan, line = f.plan, f.plan.line
     s = -60.0 + f.uniform(0, 8)
-    end = plan.drive_length + AHEAD_M - 25
+    end = plan.drive_length + rec.AHEAD_M - 25
     while s < end:
         length = f.uniform(9, 26) if plan.urban else f.uniform(8, 14)
         if f.near_crossing(s + length / 2, length / 2 + (plan.crossing.sidewalk if plan.crossing else 0) + 1.0):
@@ -545,7 +533,7 @@ def _front_garden(f: Furnisher, side: int, front: float, s: float, length: float
         f.place(rec.HEDGE, (middle, u + side * 0.2), 0, size, rgb, parameters=(0, 0, 0, 0.17))
     elif draw < 0.55:
         brick = f.chance(0.5)
-        color, size = f.pick(BRICK_COLORS if brick else RENDER_COLORS), (extent, 0.24, f.uniform(0.6, 1.5))
+        color, size = f.pick(rec.BRICK_COLORS if brick else RENDER_COLORS), (extent, 0.24, f.uniform(0.6, 1.5))
         f.place(rec.WALL, (middle, u), 0, size, color, (0.5, 0.49, 0.46), (float(brick),))
     elif draw < 0.9:
         _fence(f, middle, u, 0, extent)
@@ -557,7 +545,7 @@ def _front_garden(f: Furnisher, side: int, front: float, s: float, length: float
             sizes, rgb = (size, size, size * f.uniform(0.7, 1.1)), f.pick(LEAF_COLORS)
             f.place(rec.BUSH, place, turn, sizes, rgb, parameters=(0, 0, 0, 0.15), z=0.08)
         if f.chance(0.5) and setback > 4:
-            plant_tree(f, s + f.uniform(1, length - 1), side * (front + setback * 0.5), garden=True)
+            rec.plant_tree(f, s + f.uniform(1, length - 1), side * (front + setback * 0.5), garden=True)
 
 
 def _fence(f: Furnisher, s: float, u: float, turn: float, length: float) -> None:
@@ -578,10 +566,10 @@ def _green_lot(f: Furnisher, side: int, front: float, s: float, length: float) -
             _fence(f, middle, u, 0, length)
         else:
             brick = f.chance(0.5)
-            size, rgb = (length, 0.26, f.uniform(1.0, 2.3)), f.pick(BRICK_COLORS if brick else RENDER_COLORS)
+            size, rgb = (length, 0.26, f.uniform(1.0, 2.3)), f.pick(rec.BRICK_COLORS if brick else RENDER_COLORS)
             f.place(rec.WALL, (middle, u), 0, size, rgb, (0.5, 0.49, 0.46), (float(brick),))
     for _ in range(int(length / 5)):
-        plant_tree(f, s + f.uniform(0, length), side * (front + f.uniform(2.5, 12)), garden=True)
+        rec.plant_tree(f, s + f.uniform(0, length), side * (front + f.uniform(2.5, 12)), garden=True)
 
 
 def _crossing_surroundings(f: Furnisher) -> None:
@@ -606,7 +594,7 @@ def _crossing_surroundings(f: Furnisher) -> None:
                     x, y = crossing.to_world(arm * (a + 2), side * (crossing.half_width + 0.9))
                     size, seed, rgb = (1, 1, f.uniform(6, 9)), f.seed(), f.pick(LEAF_COLORS)
                     crown = (f.uniform(1.8, 2.5), 0.6, 0.0, 0.27, 0.15)
-                    f.add(rec.TREE, (x, y, KERB_M), 0.0, size, seed, rgb, (0.13, 0.10, 0.075), crown)
+                    f.add(rec.TREE, (x, y, rec.KERB_M), 0.0, size, seed, rgb, (0.13, 0.10, 0.075), crown)
                 a += length + (0.05 if plan.urban else f.uniform(3, 8))
         x, y = crossing.to_world(arm * 125.0, 0.0)  # something closes the view
         _block(f, (x, y), crossing.yaw + arm * -math.pi / 2, (40, 12, f.uniform(9, 16)))
@@ -659,13 +647,13 @@ def _signals(f: Furnisher) -> None:
             continue
         facing = crossing.yaw + (0.0 if arm_side > 0 else math.pi)
         rgb = (tone, tone, tone)
-        f.add(rec.SIGNAL, (x, y, KERB_M), facing, (0.3, 0.3, 3.5), f.seed(), rgb, parameters=(0.0, 2.0 - lit))
+        f.add(rec.SIGNAL, (x, y, rec.KERB_M), facing, (0.3, 0.3, 3.5), f.seed(), rgb, parameters=(0.0, 2.0 - lit))
 
 
 def _background(f: Furnisher) -> None:
     """Taller blocks behind the first row, a wood or a block at the end of the street, hills at the horizon."""
     plan = f.plan
-    end = plan.drive_length + AHEAD_M - 22
+    end = plan.drive_length + rec.AHEAD_M - 22
     x, y, heading = plan.line.point(end, 0)
     if plan.urban:
         place = (x + 8 * math.cos(heading), y + 8 * math.sin(heading))

@@ -269,12 +269,8 @@ _STEP_M: Final = 0.5
 
 
 def painted(plan: StreetPlan, street: Array, xy: Array) -> NDArray[np.bool_]:
-    """Whether points of the road carry paint, bool[N].
-
-    Args:
-        street: s, u and distance to the kerb f64[N, 3] of the points (``CityHandle.street``). xy: the points f64[N, 2]
-            in the world.
-    """
+    """Whether points of the road carry paint, bool[N]. ``street``: s, u and distance to the kerb f64[N, 3] of the
+    points (``CityHandle.street``). ``xy``: the points f64[N, 2] in the world."""
     s, u = street[:, 0], street[:, 1]
     crossing = plan.crossing
     a, b = (np.zeros(len(xy)), np.zeros(len(xy))) if crossing is None else _cross_coordinates(crossing, xy)

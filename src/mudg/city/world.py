@@ -304,12 +304,9 @@ class CityWorld:
             raise InputError(what, where=error.where, expected=error.expected, got=error.got, remedy=remedy) from error
 
     def rearranged(self, keys: Mapping[str, NDArray[np.float64] | None]) -> CityWorld:
-        """The same world, light and shadows included, with some vehicles or people elsewhere or gone.
-
-        Args:
-            keys: track id -> x, y, z of the point on the ground below the box's centre, yaw f64[K, 4] at
-                ``key_times_s``; None: not there.
-        """
+        """The same world, light and shadows included, with some vehicles or people elsewhere or gone. ``keys``: track
+        id -> x, y, z of the point on the ground below the box's centre, yaw f64[K, 4] at ``key_times_s``; None: not
+        there."""
         moved = self._keys.copy()
         for track_id, values in keys.items():
             index = self._index_of(track_id)
@@ -415,14 +412,11 @@ class CityWorld:
         views = []
         for index in range(self.config.n_frames):
             time_s = self.frame_time(index)
-            views.append(View(self._cameras[camera], self._world_from_ego(time_s) @ self._mounts[camera], time_s))
+            views.append(View(self._cameras[camera], self.frame_pose(time_s) @ self._mounts[camera], time_s))
         return tuple(views)
 
     def frame_pose(self, time_s: float) -> NDArray[np.float64]:
         """world_from_ego f64[4, 4] of the recording vehicle; UsageError outside the log."""
-        return self._world_from_ego(time_s)
-
-    def _world_from_ego(self, time_s: float) -> NDArray[np.float64]:
         pose = self._ego_path.pose_at(time_s)
         if pose is None:
             what = "time lies outside the log"
@@ -448,11 +442,7 @@ class CityWorld:
 
     def markings(self, view: View, truth: CityTruth) -> NDArray[np.bool_]:
         """Pixels bool[H, W] whose centre shows paint on the road, exactly: without the blur of a pixel and without
-        wear.
-
-        Args:
-            truth: what ``render`` gave for this view.
-        """
+        wear. ``truth``: what ``render`` gave for this view."""
         rows, columns = np.nonzero((truth.semantics == ID["road"]) & ~truth.sky)
         xyz = geometry.unproject(view, np.stack([columns, rows], 1) + 0.5, truth.depth[rows, columns])
         mask = np.zeros(truth.semantics.shape, bool)
@@ -516,14 +506,14 @@ class CityWorld:
         Rows are taken in strips of one time each. Times beyond the log's span keep the pose of its end.
         """
         camera, parts = view.camera, []
-        mount = geometry.invert(self._world_from_ego(view.time_s)) @ view.world_from_cam
+        mount = geometry.invert(self.frame_pose(view.time_s)) @ view.world_from_cam
         edges = np.linspace(0, camera.height, min(strips, camera.height) + 1).round().astype(int)
         first, last = max(self.span_s[0], float(self._ego_times[0])), min(self.span_s[1], float(self._ego_times[-1]))
         for top, bottom in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
             at = view.time_s + readout_s * ((top + bottom) / 2 / camera.height - 0.5)
             at = min(max(at, first), last)
             intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy - top)
-            strip = (intrinsics, camera.width, bottom - top, self._world_from_ego(at) @ mount)
+            strip = (intrinsics, camera.width, bottom - top, self.frame_pose(at) @ mount)
             objects = (self._object_keys_at(np.array([at]))[0], self._phases(at))
             parts.append(self._handle.render(*objects, *strip, self.config.supersample, 0))
         rgb, depth, semantics, instance = zip(*parts, strict=True)
@@ -545,7 +535,7 @@ class CityWorld:
         mount = scan.ego_from_lidar
         time_s += scan.delay_s
         knots = np.clip(knots + scan.delay_s, *self.span_s)
-        world_from_lidar = self._world_from_ego(time_s) @ mount
+        world_from_lidar = self.frame_pose(time_s) @ mount
         columns = _interpolated_poses(self._ego_times, self._ego_poses, time_s + offsets) @ mount
         settings = (config.lidar_range_m, config.lidar_noise_m, config.lidar_dropout, 0.55)
         objects, beams = (self._object_keys_at(knots), self._phases(time_s)), (scan.elevations_rad, azimuths)
@@ -561,12 +551,8 @@ class CityWorld:
         points = SweepPoints(local.astype(np.float32), intensity[hit], dt_s.astype(np.float32))
         if scan.delay_s:
             time_s -= scan.delay_s
-            world_from_lidar = self._world_from_ego(time_s) @ mount
+            world_from_lidar = self.frame_pose(time_s) @ mount
         return CitySweep(time_s, world_from_lidar, points, semantics[hit], instance[hit])
-
-    def kerb_distance(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Signed distance [N] of world points [N, 2] to the kerb line in metres, negative on the road."""
-        return self._handle.street(xy)[:, 2]
 
 
 def _interpolated_poses(

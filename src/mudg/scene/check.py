@@ -182,11 +182,7 @@ Findings = Iterator[Finding]
 
 def folded(findings: Sequence[Finding], rest: str) -> list[str]:
     """A line per finding; many that say the same of different things become one line with their number and three
-    examples.
-
-    Args:
-        rest: the command that lists them all.
-    """
+    examples. ``rest``: the command that lists them all."""
     groups: dict[tuple[str, str], list[Finding]] = {}
     for finding in findings:
         kind = finding.where.split(" ")[0], re.sub(r"[\d.]*\d", "#", finding.message)

@@ -210,11 +210,7 @@ class SceneWriter:
 
     def copy_all_but_frames(self, scene: Scene, point_classes: bool = True) -> None:
         """Add everything of another scene but its frames: cameras, sweeps (as in ``copy_frame``), tracks, ego path,
-        split.
-
-        Args:
-            point_classes: whether the classes of LiDAR points are kept.
-        """
+        split. ``point_classes``: whether the classes of LiDAR points are kept."""
         files = open_files(scene.root)
         for camera in scene.cameras.values():
             self.add_camera(camera)

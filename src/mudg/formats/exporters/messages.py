@@ -417,11 +417,8 @@ ONCE: Final = frozenset({"/tf_static", "/ego/path", "/points"})
 
 
 def bag_metadata(topics: Mapping[str, tuple[str, int]], span: tuple[int, int]) -> bytes:
-    """``metadata.yaml`` of a bag, version 5 (Humble; read by all later ones).
-
-    Args:
-        topics: type and number of messages of every topic. span: nanoseconds of the first and the last message.
-    """
+    """``metadata.yaml`` of a bag, version 5 (Humble; read by all later ones). ``topics``: type and number of messages
+    of every topic. ``span``: nanoseconds of the first and the last message."""
     start, length = {"nanoseconds_since_epoch": span[0]}, {"nanoseconds": span[1] - span[0]}
     total = sum(count for _, count in topics.values())
     listed = []

@@ -39,11 +39,8 @@ _MOST_PACKAGE: Final = (1 << 32) - 1
 
 
 def to_text(scene: SplatScene, time_s: float | None = None, sky: bool = False, log: Scene | None = None) -> bytes:
-    """A scene as USD text: as it is at a time, or (None) with all its motion.
-
-    Args:
-        sky: refer to the picture `SKY_FILE` beside it. log: whose cameras are put in, with their recorded poses.
-    """
+    """A scene as USD text: as it is at a time, or (None) with all its motion. ``sky``: refer to the picture `SKY_FILE`
+    beside it. ``log``: whose cameras are put in, with their recorded poses."""
     static = time_s is not None
     nodes = (SplatNode("scene", scene.at(time_s)),) if time_s is not None else scene.nodes
     first, last = scene.span_s
