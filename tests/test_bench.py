@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from tiny_networks import small_mdm
 
 from mudg.base.errors import MudgError, UsageError
 from mudg.benchmarks import run as bench
@@ -14,23 +15,9 @@ from mudg.benchmarks.settings import BenchConfig
 from mudg.core import metrics
 from mudg.diffusion import files
 from mudg.diffusion.clips import from_city
-from mudg.diffusion.model import MDM, MDMConfig
-from mudg.networks.codec import CodecConfig
+from mudg.diffusion.model import MDM
 
-SMALL = MDMConfig(
-    widths=(16, 24),
-    blocks=(1, 1),
-    spatial_attention=(False, True),
-    temporal_attention=(False, True),
-    head_width=8,
-    embed_width=16,
-    patch=2,
-    codec=CodecConfig(decoder_width=8, decoder_blocks=1),
-    refine_widths=(8, 16),
-    refine_blocks=(1, 1),
-    window=8,
-    area_px=24576,
-)
+SMALL = small_mdm(widths=(16, 24), head_width=8, window=8)
 
 
 def still_wall(frames=3, height=12, width=16):

@@ -21,6 +21,7 @@ from mudg.benchmarks.chain import Chain, FillViews
 from mudg.benchmarks.places import PROTOCOLS, SPLITS
 from mudg.benchmarks.rows import real_rows
 from mudg.benchmarks.settings import BenchConfig
+from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
 from mudg.core import calibration, lidar
 from mudg.core.fusion import STATIC
@@ -48,8 +49,6 @@ BY_NAME = {protocol.name: protocol for protocol in PROTOCOLS}
 
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
-    from mudg.city.config import CityConfig
-
     config = CityConfig(**CITY, cameras=("front", "front_left"))
     settings = IngestConfig(test_every=0, contact_sheet=False, city=config)
     return Ingest(log=ingest.CITY, out=tmp_path_factory.mktemp("log") / "city", settings=settings).run()
@@ -67,12 +66,8 @@ def job_of(out, source, split, config, model="", rows=()):
 @pytest.mark.parametrize(
     ("moments", "length", "blocks"),
     [
-        (24, 1, [4, 8, 12, 16, 20]),
-        (24, 3, [(4, 6), (10, 12), (17, 19)]),
-        (24, 5, [(5, 9), (14, 18)]),
-        (16, 5, [(6, 10)]),
-        (3, 1, [1]),
-        (4, 3, []),
+        *((24, 1, [4, 8, 12, 16, 20]), (24, 3, [(4, 6), (10, 12), (17, 19)]), (24, 5, [(5, 9), (14, 18)])),
+        *((16, 5, [(6, 10)]), (3, 1, [1]), (4, 3, [])),
     ],
 )
 def test_blocks_are_spread_and_leave_both_ends(moments, length, blocks):
@@ -163,13 +158,8 @@ ADAPT = AdaptConfig(block=1, held_out_every=2, fit_iterations=2, steps=1, shifts
 
 def made_from(source, out, split, model):
     """Everything that methods make of a log under a split, by name, as bytes."""
-    config = BenchConfig(
-        model=model,
-        iterations=6,
-        fit=FitConfig(densify={"kind": "none"}),
-        synthesize=SynthesizeConfig(steps=1, shifts_m=(2.0,)),
-        methods=("nearest_fill", "mudg_s"),
-    )
+    settings = {"fit": FitConfig(densify={"kind": "none"}), "synthesize": SynthesizeConfig(steps=1, shifts_m=(2.0,))}
+    config = BenchConfig(model=model, iterations=6, methods=("nearest_fill", "mudg_s"), **settings)
     job = job_of(out, source, split, config, model, real_rows(config))
     whole = read_scene(source)
     held = places.held_out(whole, split, ())
@@ -439,14 +429,9 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     watched = [split / "fit" / "street_gaussians" / "run.json", out / "city" / "truth" / "lidar" / "run.json"]
     before = [path.stat().st_mtime_ns for path in watched]
     added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_s-no-renders", "mudg_r-no-adapt")
-    more = dataclasses.replace(
-        config,
-        methods=added,
-        protocols=("gap-1",),
-        model=model,
-        variant=("rough=densify.kind:none,method:gs3d",),
-        synthesize=SynthesizeConfig(shifts_m=(2.0,)),
-    )
+    variant, settings = ("rough=densify.kind:none,method:gs3d",), SynthesizeConfig(shifts_m=(2.0,))
+    changes = {"methods": added, "protocols": ("gap-1",), "model": model, "variant": variant, "synthesize": settings}
+    more = dataclasses.replace(config, **changes)
     real.run(more, [city], out)
     assert [path.stat().st_mtime_ns for path in watched] == before
     document = store.read_json(out / "bench.json")
@@ -504,16 +489,12 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
 
 
 def test_rows_say_what_they_leave_out():
-    rows = {
-        row.name: row for row in real_rows(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))
-    }
-    assert list(rows) == [
-        *("street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_r-no-adapt", "mudg_r-no-renders", "mudg_s"),
-        *("mudg_s-no-adapt", "mudg_s-no-renders", "a"),
-    ]
-    assert [rows[name].sees for name in ("mudg_s", "mudg_s-no-adapt", "mudg_s-no-renders", "a")] == [
-        *("adapted", "renders", "points", "adapted")
-    ]
+    config = BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",))
+    rows = {row.name: row for row in real_rows(config)}
+    base, ends = "street_gaussians street_gaussians-longer", ("", "-no-adapt", "-no-renders")
+    assert list(rows) == [*base.split(), *(f"mudg_{one}{end}" for one in "rs" for end in ends), "a"]
+    sees = {name: rows[name].sees for name in (*(f"mudg_s{end}" for end in ends), "a")}
+    assert list(sees.values()) == ["adapted", "renders", "points", "adapted"]
     assert rows["mudg_s"].title != rows["mudg_s-no-adapt"].title
 
 
@@ -556,9 +537,7 @@ def test_classes_of_points_change_nothing_that_methods_make(city, tmp_path):
     scene, found = read_scene(city), []
     for name, train_id in (("a", "road"), ("b", "sky")):
         with_classes(scene, tmp_path / name, lambda count, i=ID[train_id]: np.full(count, i, np.uint8))
-        job = real.SplitJob(
-            tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], (), (), BenchConfig(), ADAPT, False
-        )
+        job = job_of(tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], BenchConfig())
         job.write_seen(read_scene(tmp_path / name), places.HeldOut())
         found.append((job.chain().fuse() / "static.safetensors").read_bytes())
     assert found[0] == found[1]
@@ -580,16 +559,15 @@ def test_a_dataset_log_is_imported_with_the_settings_of_the_command(city, tmp_pa
 
 
 def test_other_folders_methods_and_names_are_refused(city, tmp_path):
-    with pytest.raises(UsageError, match="unknown method"):
-        real.run(BenchConfig(methods=("nerf",)), [city], tmp_path / "out")
-    with pytest.raises(UsageError, match="unknown protocol"):
-        real.run(BenchConfig(protocols=("shift",)), [city], tmp_path / "out")
-    with pytest.raises(UsageError, match="no log"):
-        real.run(BenchConfig(), [], tmp_path / "out")
-    with pytest.raises(UsageError, match="same name"):
-        real.run(BenchConfig(), [city, city], tmp_path / "out")
-    with pytest.raises(UsageError, match="taken as it is"):
-        real.run(BenchConfig(frames="0:2"), [city], tmp_path / "out")
+    for config, logs, what in (
+        (BenchConfig(methods=("nerf",)), [city], "unknown method"),
+        (BenchConfig(protocols=("shift",)), [city], "unknown protocol"),
+        (BenchConfig(), [], "no log"),
+        (BenchConfig(), [city, city], "same name"),
+        (BenchConfig(frames="0:2"), [city], "taken as it is"),
+    ):
+        with pytest.raises(UsageError, match=what):
+            real.run(config, logs, tmp_path / "out")
     store.write_json(tmp_path / "other" / "bench.json", {"schema": 1, "methods": []})
     with pytest.raises(UsageError, match="do not belong"):
         real.run(BenchConfig(), [city], tmp_path / "other")
@@ -598,14 +576,11 @@ def test_other_folders_methods_and_names_are_refused(city, tmp_path):
 def test_pooled_values_leave_out_logs_without_a_number():
     protocol, logs = BY_NAME["gap-1"], []
     for name, a, b in (("one", 20.0, 21.0), ("two", 22.0, "none")):
-        values = {
-            m: {"mean": dict.fromkeys(protocol.columns, "none") | {"psnr": v}}
-            for m, v in (("street_gaussians", a), ("mudg_s", b))
-        }
+        nothing = dict.fromkeys(protocol.columns, "none")
+        values = {m: {"mean": {**nothing, "psnr": v}} for m, v in (("street_gaussians", a), ("mudg_s", b))}
         logs.append({"log": name, "protocols": {"gap-1": {"values": values, "facts": {}}}})
-    found = real.document(logs, [{"name": "street_gaussians"}, {"name": "mudg_s"}], [protocol], {})["protocols"][
-        "gap-1"
-    ]
+    rows = [{"name": "street_gaussians"}, {"name": "mudg_s"}]
+    found = real.document(logs, rows, [protocol], {})["protocols"]["gap-1"]
     assert found["pooled"]["street_gaussians"]["psnr"] == 21.0 and found["pooled"]["mudg_s"]["psnr"] == 21.0
     assert found["pooled"]["mudg_s"]["ssim"] == "none" and found["against"]["mudg_s"]["ssim"] is None
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -48,11 +51,8 @@ def test_flags_beat_the_file_and_the_file_beats_the_preset(tmp_path: Path) -> No
 
 def test_the_seed_goes_to_every_verb_that_draws() -> None:
     args = parse("demo", "--seed", "7")
-    seeds = [
-        part["seed"]
-        for part in configuration.to_dict(args.settings).values()
-        if isinstance(part, dict) and "seed" in part
-    ]
+    parts = [part for part in configuration.to_dict(args.settings).values() if isinstance(part, dict)]
+    seeds = [part["seed"] for part in parts if "seed" in part]
     assert len(seeds) >= 2
     assert set(seeds) == {7}
     assert args.settings.ingest.city.seed == 7
@@ -209,10 +209,6 @@ def test_version_and_overview(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_sigterm_stops_like_ctrl_c_with_its_own_code(monkeypatch: pytest.MonkeyPatch) -> None:
-    import os
-    import signal
-    import time
-
     def act(_args: object) -> dict[str, Any]:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(5)
@@ -227,10 +223,8 @@ def test_sigterm_stops_like_ctrl_c_with_its_own_code(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("verb", "flag", "field"),
     [
-        ("render", "--model", "model"),
-        ("fit", "--fused", "fused"),
-        ("synthesize", "--fused", "fused"),
-        ("score", "--views", "views"),
+        *(("render", "--model", "model"), ("fit", "--fused", "fused")),
+        *(("synthesize", "--fused", "fused"), ("score", "--views", "views")),
     ],
 )
 def test_the_second_input_may_stand_after_the_scene(verb: str, flag: str, field: str) -> None:

@@ -182,17 +182,15 @@ def test_without_weights_the_tables_name_the_flag(tmp_path: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
     out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=ScoreConfig(perceptual_views=0)).run()
     document = store.read_json(out / "metrics.json")
-    assert {values(document, "front_recorded", name)["a"] for name in ("fid", "kid", "fvd", "lpips")} == {
-        "not computed"
-    }
+    for name in ("fid", "kid", "fvd", "lpips"):
+        assert values(document, "front_recorded", name)["a"] == "not computed"
     assert "distributions" not in document
     assert not (out / "features").exists()
     assert "FVD (--fvd-weights)" in (out / "metrics.md").read_text()
     shown = page._score_values(document)
     assert "FID (Inception weights: mudg score --fid-weights FILE)" in shown["not_computed"]
-    assert "not computed (--fid-weights)" in {
-        cell["text"] for row in shown["score_groups"][-1]["rows"] for cell in row["cells"]
-    }
+    cells = [cell["text"] for row in shown["score_groups"][-1]["rows"] for cell in row["cells"]]
+    assert "not computed (--fid-weights)" in cells
 
 
 def test_the_page_and_the_terminal_show_the_floor_below_the_methods(tmp_path: Path, quick: Path) -> None:
@@ -207,22 +205,16 @@ def test_the_page_and_the_terminal_show_the_floor_below_the_methods(tmp_path: Pa
 
 def test_weights_are_checked_before_the_work(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
-    views = {"a": toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))}
-    with pytest.raises(InputError, match="nothing.pth"):
-        Score(
-            scene=scene,
-            views=views,
-            out=tmp_path / "score",
-            settings=ScoreConfig(fid_weights=str(tmp_path / "nothing.pth")),
-        ).run()
-    other = tmp_path / "other.safetensors"
-    store.write_safetensors(other, {"conv1.weight": np.zeros(3, np.float32)})
-    with pytest.raises(InputError, match="Conv2d_1a_3x3.conv.weight"):
-        Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig(fid_weights=str(other))).run()
-    assert not (tmp_path / "score" / "truth").exists()
-    inside = tmp_path / "score" / "weights.safetensors"
-    with pytest.raises(UsageError, match="fid-weights"):
-        Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig(fid_weights=str(inside))).run()
+    views, out = {"a": toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))}, tmp_path / "score"
+    store.write_safetensors(tmp_path / "other.safetensors", {"conv1.weight": np.zeros(3, np.float32)})
+    for weights, error, what in (
+        (tmp_path / "nothing.pth", InputError, "nothing.pth"),
+        (tmp_path / "other.safetensors", InputError, "Conv2d_1a_3x3.conv.weight"),
+        (out / "weights.safetensors", UsageError, "fid-weights"),
+    ):
+        with pytest.raises(error, match=what):
+            Score(scene=scene, views=views, out=out, settings=ScoreConfig(fid_weights=str(weights))).run()
+        assert not (out / "truth").exists()
 
 
 @pytest.mark.parametrize("suffix", [pytest.param(".pth", marks=pytest.mark.slow), ".safetensors"])

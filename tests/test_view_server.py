@@ -33,17 +33,10 @@ def _no_memory(_asked: object) -> tuple[bytes, str]:
 
 
 def site() -> Site:
-    answers = {
-        "echo": lambda asked: (json.dumps(asked).encode(), "application/json"),
-        "broken": _broken,
-        "no_memory": _no_memory,
-    }
-    return Site(
-        {"": PAGE, "small": b"small"},
-        answers,
-        TOKEN,
-        {"film": lambda asked, send: [send(b"x" * 100_000) for _ in range(100)]},
-    )
+    echo = lambda asked: (json.dumps(asked).encode(), "application/json")  # noqa: E731
+    film = lambda asked, send: [send(b"x" * 100_000) for _ in range(100)]  # noqa: E731
+    answers = {"echo": echo, "broken": _broken, "no_memory": _no_memory}
+    return Site({"": PAGE, "small": b"small"}, answers, TOKEN, {"film": film})
 
 
 @pytest.fixture
