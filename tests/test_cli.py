@@ -102,8 +102,7 @@ def test_unknown_flag_suggests_the_nearest(capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["fti", "--help"], "did you mean `mudg fit`?"),
-        (["synthesise"], "did you mean `mudg synthesize`?"),
+        *((["fti", "--help"], "did you mean `mudg fit`?"), (["synthesise"], "did you mean `mudg synthesize`?")),
         (["zzzz"], "see mudg --help"),
     ],
 )
@@ -115,17 +114,15 @@ def test_unknown_verb_suggests_the_nearest(words: list[str], expected: str, caps
 @pytest.mark.parametrize(
     "words",
     [
-        ["fit", "scene", "--fused", "f", "--out", "o", "--iterations", "0"],
-        ["fit", "scene", "--fused", "f", "--out", "o", "--iterations", "many"],
-        ["fit", "scene", "--fused", "f", "--out", "o", "--method", "nerf"],
-        ["score", "scene", "--out", "o", "--views", "no-equals-sign"],
-        ["demo", "--seed", "x"],
-        ["render", "scene"],
+        "fit scene --fused f --out o --iterations 0",
+        "fit scene --fused f --out o --iterations many",
+        "fit scene --fused f --out o --method nerf",
+        "score scene --out o --views no-equals-sign",
+        *("demo --seed x", "render scene"),
     ],
-    ids=" ".join,
 )
-def test_wrong_values_end_with_code_2_and_no_traceback(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert app.main(words) == 2
+def test_wrong_values_end_with_code_2_and_no_traceback(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert app.main(words.split()) == 2
     assert "Traceback" not in capsys.readouterr().err
 
 
@@ -160,12 +157,8 @@ def test_yaml_objects_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("error", "code"),
     [
-        (UsageError, 2),
-        (InputError, 3),
-        (IntegrityError, 4),
-        (ResourceError, 5),
-        (NumericsError, 6),
-        (KeyboardInterrupt, 130),
+        *((UsageError, 2), (InputError, 3), (IntegrityError, 4)),
+        *((ResourceError, 5), (NumericsError, 6), (KeyboardInterrupt, 130)),
     ],
 )
 def test_exit_codes(

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pretend_device import pretend_device
 
 from mudg import native
-from mudg.base import geometry
+from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
@@ -332,13 +332,8 @@ def test_an_asset_keeps_the_shape_of_the_middle_of_its_track() -> None:
 
 def test_objects_of_other_methods_are_edited_or_refused() -> None:
     curved = toy(BezierNode)
-    curved = replace(
-        curved,
-        table=Table(
-            {**{k: v.detach() for k, v in curved.table.columns.items()}, "curve": torch.zeros(690, 4, 3)},
-            curved.table.labels,
-        ),
-    )
+    columns = {name: value.detach() for name, value in curved.table.columns.items()}
+    curved = replace(curved, table=Table({**columns, "curve": torch.zeros(690, 4, 3)}, curved.table.labels))
     with pytest.raises(InputError, match="curves"):
         carried(curved, "- stop: {id: car-1, at_s: 0.5}")
     assert carried(curved, "- remove: {ids: [car-1]}").node_names() == ()
@@ -366,8 +361,6 @@ def test_an_asset_goes_through_its_file_and_renders_as_the_object_did(tmp_path: 
 
 
 def test_what_is_no_asset_is_refused(tmp_path: Path) -> None:
-    from mudg.base import store
-
     file = tmp_path / "x.safetensors"
     store.write_safetensors(file, {"means": np.zeros((3, 3), np.float32)})
     with pytest.raises(InputError, match="no asset"):
@@ -388,9 +381,8 @@ def test_an_asset_takes_the_light_of_the_scene() -> None:
     asset = edited.asset_of(toy(), "car-1", light_rgb=here)
     lit, gain = edited.matched_light(asset, there)
     assert gain == pytest.approx([2**-0.75, 1, 2**0.75])
-    before, after = (
-        edited.linear_of((0.5 + SH_C0 * a.columns["sh_dc"].double().numpy()).clip(0)) for a in (asset, lit)
-    )
+    colors = (0.5 + SH_C0 * one.columns["sh_dc"].double().numpy() for one in (asset, lit))
+    before, after = (edited.linear_of(rgb.clip(0)) for rgb in colors)
     assert after == pytest.approx(before * gain, rel=1e-4, abs=1e-6)
     assert edited.matched_light(asset, None)[1] == pytest.approx([1, 1, 1])
     assert edited.matched_light(edited.asset_of(toy(), "car-1"), there)[1] == pytest.approx([1, 1, 1])

@@ -80,17 +80,14 @@ def test_a_log_is_compared_with_its_recorded_frames_off_its_path_too(tmp_path: P
     assert shifted["b"] > 1.0
     assert values(document, "front_shift+2.0", "kid")["a"] < values(document, "front_shift+2.0", "kid")["b"]
     sizes = {r["trajectory"]: (r["distribution"]["n"], r["distribution"]["n_reference"]) for r in document["results"]}
-    assert sizes == {
-        "front_recorded": (2, 4),
-        "front_shift+2.0": (4, 4),
-    }  # held-out frames against the whole recorded video
+    # held-out frames against the whole recorded video
+    assert sizes == {"front_recorded": (2, 4), "front_shift+2.0": (4, 4)}
     made = document["distributions"]
     assert made["weights_sha256"] == store.sha256_file(quick)
     assert not made["published_weights"]
     assert made["resize"] == "pytorch-fid"
-    assert any(
-        "weights that are not the published file" in rule and "pytorch-fid" in rule for rule in document["rules"]
-    )
+    words = ("weights that are not the published file", "pytorch-fid")
+    assert any(all(word in rule for word in words) for rule in document["rules"])
     sets = {(one["trajectory"], one["method"]): one for one in made["sets"]}
     kept = lambda name: store.read_safetensors(out / "features" / name)["features"]  # noqa: E731
     of_b = sets["front_shift+2.0", "b"]
@@ -114,9 +111,8 @@ def test_the_numbers_are_those_of_the_pure_functions(tmp_path: Path, quick: Path
     assert values(document, "front_shift+2.0", "fid")["b"] == pytest.approx(expected, rel=2e-2)
     floor = document["distributions"]["floors"][0]
     assert floor["how"] == "every second recorded frame against the others"
-    assert floor["fid"] == pytest.approx(
-        feature_distances.frechet_distance(features(1.0)[::2], features(1.0)[1::2]), abs=1e-5
-    )
+    expected = feature_distances.frechet_distance(features(1.0)[::2], features(1.0)[1::2])
+    assert floor["fid"] == pytest.approx(expected, abs=1e-5)
 
 
 def test_features_are_kept_by_content_and_not_computed_twice(tmp_path: Path, quick: Path) -> None:
