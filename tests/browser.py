@@ -15,9 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-CHROMIUM = next(
-    (found for name in ("chromium", "chromium-browser", "google-chrome") if (found := shutil.which(name))), None
-)
+CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
 NO_BROWSER = "no Chromium is installed"
 FLAGS = (
     *("--headless=new", "--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
@@ -147,9 +145,8 @@ class Browser:
         size = found["height"], found["width"], 4
         made = {}
         for name, text in found["values"].items():
-            values = np.frombuffer(
-                base64.b64decode(text), np.uint8 if name in ("color", "class") else np.float32
-            ).reshape(size)
+            kind = np.uint8 if name in ("color", "class") else np.float32
+            values = np.frombuffer(base64.b64decode(text), kind).reshape(size)
             made[name] = values[..., 0] if name == "class" else values
         return made
 

@@ -19,14 +19,8 @@ for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MUD
 os.environ.setdefault("NO_COLOR", "1")
 os.environ.setdefault("COLUMNS", "120")
 
-settings.register_profile(
-    "mudg",
-    deadline=None,
-    derandomize=True,
-    max_examples=25,
-    database=None,
-    suppress_health_check=[HealthCheck.too_slow],
-)
+ALIKE = {"deadline": None, "derandomize": True, "max_examples": 25, "database": None}
+settings.register_profile("mudg", **ALIKE, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("mudg")
 
 REPOSITORY = Path(__file__).resolve().parents[1]

@@ -23,9 +23,8 @@ ALPHA_MIN, ALPHA_MAX, STOP = 1 / 255, 0.999, 1e-4
 
 def install(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The package gsplat, drawing with the stand-ins until the test ends."""
-    gsplat = pytest.importorskip(
-        "gsplat", reason="gsplat is not installed (pip install gsplat; it needs no CUDA for this test)"
-    )
+    reason = "gsplat is not installed (pip install gsplat; it needs no CUDA for this test)"
+    gsplat = pytest.importorskip("gsplat", reason=reason)
     backend = ModuleType("gsplat.cuda._backend")
     backend._C = Kernels()
     monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
@@ -85,10 +84,8 @@ class Kernels:
     PINHOLE = "pinhole"
 
     def __init__(self) -> None:
-        for name in (
-            *("GLOBAL", "ROLLING_TOP_TO_BOTTOM", "ROLLING_LEFT_TO_RIGHT", "ROLLING_BOTTOM_TO_TOP"),
-            *("ROLLING_RIGHT_TO_LEFT",),
-        ):
+        sides = ("TOP_TO_BOTTOM", "LEFT_TO_RIGHT", "BOTTOM_TO_TOP", "RIGHT_TO_LEFT")
+        for name in ("GLOBAL", *(f"ROLLING_{side}" for side in sides)):
             setattr(self, name, name)
         self.UnscentedTransformParameters = self.FThetaCameraDistortionParameters = SimpleNamespace
 
@@ -100,21 +97,13 @@ class Kernels:
         return _spherical_harmonics(degree, dirs, coeffs)
 
     def spherical_harmonics_bwd(
-        self,
-        bases: int,
-        degree: int,
-        dirs: Tensor,
-        coeffs: Tensor,
-        masks: Tensor | None,
-        v_colors: Tensor,
-        wants_dirs: bool,
+        self, bases: int, degree: int, dirs: Tensor, coeffs: Tensor, masks: Any, v_colors: Tensor, wants_dirs: bool
     ) -> tuple[Tensor, Tensor]:
         assert dirs.norm(dim=-1).min() > 0  # the kernel divides by it
         with torch.enable_grad():
             dirs, coeffs = _leaves(dirs, coeffs)
-            v_coeffs, v_dirs = _gradients(
-                [self.spherical_harmonics_fwd(degree, dirs, coeffs, masks)], [v_colors], [coeffs, dirs]
-            )
+            colors = self.spherical_harmonics_fwd(degree, dirs, coeffs, masks)
+            v_coeffs, v_dirs = _gradients([colors], [v_colors], [coeffs, dirs])
         return v_coeffs, v_dirs
 
     # ---- projection of ellipsoids ----
@@ -127,18 +116,8 @@ class Kernels:
         covars, _ = _quat_scale_to_covar_preci(quats, scales, True, False)
         return _fully_fused_projection(means, covars, viewmats, Ks, *rest)
 
-    def projection_ewa_3dgs_fused_fwd(
-        self,
-        means: Tensor,
-        covars: None,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        viewmats: Tensor,
-        Ks: Tensor,
-        *rest: Any,
-    ) -> Any:
-        width, height, eps2d, near, far, clip, compensate, model = rest
+    def projection_ewa_3dgs_fused_fwd(self, means: Tensor, covars: None, *rest: Any) -> Any:
+        quats, scales, opacities, viewmats, Ks, width, height, eps2d, near, far, clip, compensate, model = rest
         for tensor in (means, quats, scales, opacities, viewmats, Ks):
             assert tensor.dtype == torch.float32
             assert tensor.is_contiguous()
@@ -153,9 +132,8 @@ class Kernels:
         drawn = (depths >= near) & (depths <= far) & (seen >= ALPHA_MIN) & (size > clip).any(-1)
         drawn &= ((means2d + size > 0) & (means2d - size < limit)).all(-1)
         radii = torch.where(drawn[..., None], size, 0).int()
-        poisoned = [
-            torch.where(drawn.view(*drawn.shape, *[1] * (t.ndim - 2)), t, torch.nan) for t in (means2d, depths, conics)
-        ]
+        like = lambda tensor: drawn.view(*drawn.shape, *[1] * (tensor.ndim - 2))  # noqa: E731
+        poisoned = [torch.where(like(tensor), tensor, torch.nan) for tensor in (means2d, depths, conics)]
         return radii, *poisoned, torch.where(drawn, factor, 0) if compensate else None
 
     def _projection_gradients(
@@ -166,9 +144,8 @@ class Kernels:
         with torch.enable_grad():
             leaves = _leaves(means, quats, scales, viewmats)
             parts = [leaf[used] for leaf in leaves[:3]]
-            _, *outputs = self._project(
-                *parts, leaves[3], Ks, (width, height, eps2d, 0.0, 1e10, cotangents[3] is not None, model)
-            )
+            settings = (width, height, eps2d, 0.0, 1e10, cotangents[3] is not None, model)
+            _, *outputs = self._project(*parts, leaves[3], Ks, settings)
             pairs = [(out[where[0], row], v) for out, v in zip(outputs, cotangents, strict=True) if v is not None]
             return _gradients([out for out, _ in pairs], [v for _, v in pairs], leaves)
 
@@ -178,9 +155,8 @@ class Kernels:
         width, height, eps2d, model, radii, _, _, v_means2d, v_depths, v_conics, v_factor, _ = rest
         drawn = torch.nonzero((radii > 0).all(-1), as_tuple=True)
         cotangents = [None if v is None else v[drawn] for v in (v_means2d, v_depths, v_conics, v_factor)]
-        v = self._projection_gradients(
-            drawn, (means, quats, scales, viewmats, Ks, width, height, eps2d, model), cotangents
-        )
+        inputs = (means, quats, scales, viewmats, Ks, width, height, eps2d, model)
+        v = self._projection_gradients(drawn, inputs, cotangents)
         return v[0], None, v[1], v[2], v[3]
 
     def projection_ewa_3dgs_packed_fwd(
@@ -202,19 +178,10 @@ class Kernels:
 
     # ---- tiles ----
 
-    def intersect_tile(
-        self,
-        means2d: Tensor,
-        radii: Tensor,
-        depths: Tensor,
-        images: Tensor | None,
-        gaussians: Tensor | None,
-        count: int,
-        *rest: Any,
-    ) -> Any:
+    def intersect_tile(self, means2d: Tensor, radii: Tensor, depths: Tensor, *rest: Any) -> Any:
         from gsplat.cuda._torch_impl import _isect_tiles
 
-        tile, across, down, sort, _ = rest
+        images, gaussians, count, tile, across, down, sort, _ = rest
         if images is None or gaussians is None:
             return _isect_tiles(means2d.nan_to_num(), radii, depths.nan_to_num(), tile, across, down, sort)
         most, place = int(gaussians.max()) + 1 if len(gaussians) else 1, (images, gaussians)
@@ -231,13 +198,7 @@ class Kernels:
     # ---- pixels: linear projection ----
 
     def _pixels(
-        self,
-        colors: Tensor,
-        size: tuple[int, int, int],
-        offsets: Tensor,
-        ids: Tensor,
-        response: Any,
-        masked: tuple[Any, Any],
+        self, colors: Tensor, size: tuple[int, int, int], offsets: Tensor, ids: Tensor, response: Any, *masked: Any
     ) -> tuple[Tensor, Tensor]:
         assert masked == (None, None)  # backgrounds and masks
         width, height, tile = size
@@ -259,13 +220,9 @@ class Kernels:
     def _flat_response(self, means: Tensor, conics: Tensor, opacity: Tensor, width: int, spread: list[Any]) -> Any:
         def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
             x, y = _centers(pixels, width)
-            # A copy of the means per pixel, so that absolute gradients can be summed over pixels.
-            here = (
-                means[entries].detach().expand(len(pixels), -1, -1).clone().requires_grad_()
-                if spread
-                else means[entries][None]
-            )
-            if spread:
+            here = means[entries][None]
+            if spread:  # a copy of the means per pixel, so that absolute gradients can be summed over pixels
+                here = means[entries].detach().expand(len(pixels), -1, -1).clone().requires_grad_()
                 spread.append((here, entries))
             dx, dy = here[..., 0] - x[:, None], here[..., 1] - y[:, None]
             c = conics[entries]
@@ -278,12 +235,10 @@ class Kernels:
         self, means2d: Tensor, conics: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
     ) -> Any:
         background, mask, width, height, tile, offsets, ids = rest
-        means, conics, colors, opacity = (
-            t.reshape(-1, *shape)
-            for t, shape in ((means2d, (2,)), (conics, (3,)), (colors, colors.shape[-1:]), (opacities, ()))
-        )
+        means, conics, colors = (tensor.reshape(-1, tensor.shape[-1]) for tensor in (means2d, conics, colors))
+        opacity = opacities.reshape(-1)
         response = self._flat_response(means, conics, opacity, width, [])
-        image, alpha = self._pixels(colors, (width, height, tile), offsets, ids, response, (background, mask))
+        image, alpha = self._pixels(colors, (width, height, tile), offsets, ids, response, background, mask)
         return image, alpha, torch.zeros(0)
 
     def rasterize_to_pixels_3dgs_bwd(
@@ -291,13 +246,11 @@ class Kernels:
     ) -> Any:
         background, mask, width, height, tile, offsets, ids, _, _, v_image, v_alpha, absolute = rest
         with torch.enable_grad():
-            flat = [
-                t.reshape(-1, *shape) for t, shape in ((conics, (3,)), (colors, colors.shape[-1:]), (opacities, ()))
-            ]
-            leaves = _leaves(*flat)
+            flat = [tensor.reshape(-1, tensor.shape[-1]) for tensor in (conics, colors)]
+            leaves = _leaves(*flat, opacities.reshape(-1))
             spread: list[Any] = [None]
             response = self._flat_response(means2d.reshape(-1, 2), leaves[0], leaves[2], width, spread)
-            image, alpha = self._pixels(leaves[1], (width, height, tile), offsets, ids, response, (background, mask))
+            image, alpha = self._pixels(leaves[1], (width, height, tile), offsets, ids, response, background, mask)
             copies = spread[1:]
             v = _gradients([image, alpha], [v_image, v_alpha], [*leaves, *(here for here, _ in copies)])
         v_means = torch.zeros(means2d.reshape(-1, 2).shape)
@@ -305,43 +258,22 @@ class Kernels:
         for gradient, (_, entries) in zip(v[3:], copies, strict=True):
             v_means.index_add_(0, entries, gradient.sum(0))
             v_abs.index_add_(0, entries, gradient.abs().sum(0))
-        return (
-            v_abs.view_as(means2d) if absolute else None,
-            v_means.view_as(means2d),
-            v[0].view_as(conics),
-            v[1].view_as(colors),
-            v[2].view_as(opacities),
-        )
+        v_flat = [one.view_as(like) for one, like in zip(v[:3], (conics, colors, opacities), strict=True)]
+        return v_abs.view_as(means2d) if absolute else None, v_means.view_as(means2d), *v_flat
 
     # ---- responses in space ----
 
-    def projection_ut_3dgs_fused(
-        self,
-        means: Tensor,
-        quats: Tensor,
-        scales: Tensor,
-        opacities: Tensor,
-        viewmats: Tensor,
-        viewmats_rs: Tensor | None,
-        Ks: Tensor,
-        *rest: Any,
-    ) -> Any:
+    def projection_ut_3dgs_fused(self, means: Tensor, quats: Tensor, scales: Tensor, *rest: Any) -> Any:
         """Only what the pixels need of it: the order, and rectangles that certainly hold every response (the whole
         image)."""
-        width, height, _, near, far, *_ = rest
+        opacities, viewmats, viewmats_rs, Ks, width, height, _, near, far, *_ = rest
         middle = viewmats if viewmats_rs is None else (viewmats + viewmats_rs) / 2
         here = means @ middle[:, :3, :3].transpose(1, 2) + middle[:, None, :3, 3]
         means2d = (here @ Ks.transpose(1, 2))[..., :2] / here[..., 2:]
         drawn = (here[..., 2] >= near) & (here[..., 2] <= far) & (opacities >= ALPHA_MIN)
         radii = torch.where(drawn[..., None], width + height + means2d.abs(), 0).int()
-        conics = torch.full((*drawn.shape, 3), torch.nan)
-        return (
-            radii,
-            torch.where(drawn[..., None], means2d, torch.nan),
-            torch.where(drawn, here[..., 2], torch.nan),
-            conics,
-            None,
-        )
+        conics, depths = torch.full((*drawn.shape, 3), torch.nan), torch.where(drawn, here[..., 2], torch.nan)
+        return radii, torch.where(drawn[..., None], means2d, torch.nan), depths, conics, None
 
     def rasterize_to_pixels_from_world_3dgs_fwd(
         self, means: Tensor, quats: Tensor, scales: Tensor, colors: Tensor, opacities: Tensor, *rest: Any
@@ -365,10 +297,8 @@ class Kernels:
             end = first if last is None else last
             assert torch.equal(end[0, :3, :3], first[0, :3, :3])  # a turning camera would need spherical interpolation
             turn, shift = first[0, :3, :3], (1 - time) * first[0, :3, 3] + time * end[0, :3, 3]
-            ray = (
-                torch.stack([(x - Ks[0, 0, 2]) / Ks[0, 0, 0], (y - Ks[0, 1, 2]) / Ks[0, 1, 1], torch.ones_like(x)], 1)
-                @ turn
-            )
+            (fx, _, cx), (_, fy, cy), _ = Ks[0]
+            ray = torch.stack([(x - cx) / fx, (y - cy) / fy, torch.ones_like(x)], 1) @ turn
             origin = -shift @ turn
             whiten = rotation[entries].transpose(1, 2) / scales[entries][:, :, None]
             offset = torch.einsum("mij,pmj->pmi", whiten, origin[:, None] - means[entries])
@@ -377,7 +307,7 @@ class Kernels:
             return opacity[entries] * torch.exp(-power), power
 
         flat = colors.reshape(-1, colors.shape[-1])
-        image, alpha = self._pixels(flat, (width, height, tile), offsets, ids, response, (background, mask))
+        image, alpha = self._pixels(flat, (width, height, tile), offsets, ids, response, background, mask)
         return image, alpha, torch.zeros(0)
 
     def rasterize_to_pixels_from_world_3dgs_bwd(self, *arguments: Any) -> Any:
@@ -404,9 +334,8 @@ class Kernels:
         drawn = (radii > 0).all(-1)
         with torch.enable_grad():
             leaves = _leaves(means, quats, scales, viewmats)
-            _, means2d, depths, rays, normals = self.projection_2dgs_fused_fwd(
-                *leaves, Ks, width, height, 0.3, 0.01, 1e10, 0.0
-            )
+            settings = (width, height, 0.3, 0.01, 1e10, 0.0)
+            _, means2d, depths, rays, normals = self.projection_2dgs_fused_fwd(*leaves, Ks, *settings)
             pairs = ((means2d, v_means2d), (depths, v_depths), (rays, v_rays), (normals, v_normals))
             return _gradients([out[drawn] for out, _ in pairs], [v[drawn] for _, v in pairs], leaves)
 
@@ -414,9 +343,8 @@ class Kernels:
         def response(image: int, pixels: Tensor, entries: Tensor) -> tuple[Tensor, Tensor]:
             x, y = _centers(pixels, width)
             ray = rays[entries]
-            across = torch.linalg.cross(
-                -ray[:, 0] + ray[:, 2] * x[:, None, None], -ray[:, 1] + ray[:, 2] * y[:, None, None]
-            )
+            planes = (ray[:, 2] * along[:, None, None] - ray[:, axis] for axis, along in enumerate((x, y)))
+            across = torch.linalg.cross(*planes)
             in_space = (across[..., :2] / across[..., 2:]).square().sum(-1)
             in_image = 2 * (torch.stack([x, y], 1)[:, None] - means[entries]).square().sum(-1)
             sigma = 0.5 * torch.minimum(in_space, in_image)
@@ -431,21 +359,12 @@ class Kernels:
         assert torch.isfinite(colors).all()  # gsplat pads with uninitialised memory
         response = self._disc_response(means2d.reshape(-1, 2), rays.reshape(-1, 3, 3), opacities.reshape(-1), width)
         flat = torch.cat([colors, normals], -1).reshape(-1, colors.shape[-1] + 3)
-        image, alpha = self._pixels(flat, (width, height, tile), offsets, ids, response, (background, mask))
+        image, alpha = self._pixels(flat, (width, height, tile), offsets, ids, response, background, mask)
         nothing = torch.zeros_like(alpha)
         return image[..., :-3], alpha, image[..., -3:], nothing, nothing.clone(), torch.zeros(0), torch.zeros(0)
 
-    def rasterize_to_pixels_2dgs_bwd(
-        self,
-        means2d: Tensor,
-        rays: Tensor,
-        colors: Tensor,
-        opacities: Tensor,
-        normals: Tensor,
-        densify: Tensor,
-        *rest: Any,
-    ) -> Any:
-        *settings, _, _, _, _, v_image, v_alpha, v_normals, _, _, _ = rest
+    def rasterize_to_pixels_2dgs_bwd(self, means2d: Tensor, rays: Tensor, *rest: Any) -> Any:
+        colors, opacities, normals, _, *settings, _, _, _, _, v_image, v_alpha, v_normals, _, _, _ = rest
         with torch.enable_grad():
             leaves = _leaves(means2d, rays, colors, opacities, normals)
             image, alpha, seen, *_ = self.rasterize_to_pixels_2dgs_fwd(*leaves, *settings)

@@ -33,10 +33,8 @@ def test_scores_are_those_of_the_vehicle_alone() -> None:
     assert found["psnr"] == pytest.approx(-20 * math.log10(error), abs=1e-3)
     assert found["light"] == pytest.approx(2.0, rel=1e-4)
     assert found["psnr_recorded"] > 80
-    assert (
-        cities.vehicle_scores([seen(0.3, 0.3)], [seen(0.1, 0.4)])["perceptual"]
-        < cities.vehicle_scores([seen(0.1, 0.4)], [])["perceptual"]
-    )
+    right, wrong = (cities.vehicle_scores([seen(*tones)], [])["perceptual"] for tones in ((0.3, 0.3), (0.1, 0.4)))
+    assert right < wrong
     nothing = cities.vehicle_scores([], [seen(0.3, 0.3)])
     assert nothing["psnr"] is None and nothing["light"] is None and nothing["perceptual"] is None
 
@@ -55,9 +53,8 @@ def test_the_command_edits_cities_and_puts_vehicles_of_one_into_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fitted, case_of = [], cities.case_of
-    monkeypatch.setattr(
-        cities, "case_of", lambda config, city, out: (fitted.append(city), case_of(config, city, out))[1]
-    )
+    noted = lambda config, city, out: (fitted.append(city), case_of(config, city, out))[1]  # noqa: E731
+    monkeypatch.setattr(cities, "case_of", noted)
     out = bench.run("edit", BenchConfig(cities="development", count=2, pose_iterations=40), tmp_path / "out")
     content = json.loads((out / "bench.json").read_text())
     text = (out / "bench.md").read_text()

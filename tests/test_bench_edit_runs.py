@@ -52,11 +52,8 @@ def case(run: Path) -> RunCase:
 
 def test_an_edit_that_does_nothing_changes_nothing(case: RunCase) -> None:
     seen: list[bool] = []
-    row = measured(
-        case,
-        parse_edits("- move: {id: car, along_m: 0, ground: false}", "nothing"),
-        lambda _, old, new: seen.append(torch.equal(old.rgb, new.rgb)),
-    )
+    script = parse_edits("- move: {id: car, along_m: 0, ground: false}", "nothing")
+    row = measured(case, script, lambda _, old, new: seen.append(torch.equal(old.rgb, new.rgb)))
     assert seen == [True] * FRAMES and row["outside"] == 0.0
     assert row["warp"] == row["warp_before"] > 0 and row["lidar"] == row["lidar_before"] > 0
     assert row["overlap"] == row["overlap_before"] > 0.3
@@ -184,11 +181,8 @@ def test_what_cannot_be_measured_is_refused_in_words(
 @pytest.mark.slow
 def test_a_recorded_drive(shared_data: Callable[[str], Path], tmp_path: Path) -> None:
     root = tmp_path / "kitti"
-    Ingest(
-        log=shared_data("kitti_2011_09_26"),
-        out=tmp_path / "raw",
-        settings=IngestConfig(resolution="320", contact_sheet=False),
-    ).run()
+    settings = IngestConfig(resolution="320", contact_sheet=False)
+    Ingest(log=shared_data("kitti_2011_09_26"), out=tmp_path / "raw", settings=settings).run()
     Annotate(scene=tmp_path / "raw", out=root / "scene", settings=AnnotateConfig()).run()
     Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     config = fit_config(method="street_gaussians", iterations=100, start__gaussians=6000, densify__max_gaussians=8000)

@@ -24,20 +24,8 @@ def script(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[..., dic
     def run(name: str, *words: str) -> dict[str, Any]:
         out = tmp_path / "result.json"
         module = importlib.import_module(name)
-        module.main(
-            [
-                "--small",
-                "--device",
-                "cpu",
-                "--repeats",
-                "1",
-                "--out",
-                str(out),
-                "--work",
-                str(tmp_path / "work"),
-                *words,
-            ]
-        )
+        folders = ["--out", str(out), "--work", str(tmp_path / "work")]
+        module.main(["--small", "--device", "cpu", "--repeats", "1", *folders, *words])
         result = json.loads(out.read_text())
         assert result["device"] == "cpu" and result["card"] is None and result["small"] is True
         assert {"cuda", "packages", "python"} <= set(result["versions"])
@@ -95,9 +83,8 @@ def test_training_of_the_small_model(script: Callable[..., dict[str, Any]], tmp_
     result = script("train_mdm")
     shipped = FOLDER.parents[1] / "src" / "mudg" / "assets" / "mdm_small" / "model.json"
     (trained,) = (tmp_path / "work" / "learned").rglob("model.json")
-    assert result["digests"] == {
-        n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in (("shipped", shipped), ("trained", trained))
-    }
+    files = {"shipped": shipped, "trained": trained}
+    assert result["digests"] == {n: hashlib.sha256(p.read_bytes()).hexdigest() for n, p in files.items()}
     training, *scores = result["rows"]
     assert training["steps"] == json.loads(trained.read_text())["facts"]["recipe"]["steps"] == 2
     for row, path in zip(scores, (shipped, trained), strict=True):
@@ -109,7 +96,6 @@ def test_the_whole_chain(script: Callable[..., dict[str, Any]], tmp_path: Path) 
     result, run = script("city_run"), tmp_path / "work" / "run"
     assert result["digests"]["metrics"] == hashlib.sha256((run / "score" / "metrics.json").read_bytes()).hexdigest()
     steps = json.loads((run / "run.json").read_text())["steps"]
-    assert {row["what"]: row["seconds"] for row in result["rows"]} == pytest.approx(
-        {n: of["seconds"] for n, of in steps.items()}
-    )
+    seconds = {row["what"]: row["seconds"] for row in result["rows"]}
+    assert seconds == pytest.approx({name: of["seconds"] for name, of in steps.items()})
     assert {"ingest", "fit with diffusion", "score"} <= set(steps)

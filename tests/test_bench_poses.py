@@ -39,15 +39,12 @@ def test_disturbances_have_the_size_they_say(kind):
 def test_a_constant_motion_in_the_box_frame_is_no_error_and_the_rest_is():
     truth = tracks(1)[0].world_from_object
     shifted = truth @ geometry.yaw_matrix(0.3, (0.5, -0.2, 0.1))
-    assert pose_errors(truth, shifted).position_m == pytest.approx(0, abs=1e-9)
-    assert pose_errors(truth, shifted).yaw_rad == pytest.approx(0, abs=1e-9)
+    assert pose_errors(truth, shifted) == pytest.approx((0, 0), abs=1e-9)
     absolute = pose_errors(truth, shifted, free=False)
-    assert absolute.position_m == pytest.approx(math.sqrt(0.25 + 0.04 + 0.01), abs=1e-9)
-    assert absolute.yaw_rad == pytest.approx(0.3, abs=1e-9)
+    assert absolute == pytest.approx((math.sqrt(0.25 + 0.04 + 0.01), 0.3), abs=1e-9)
     sway = np.stack([geometry.yaw_matrix(0.02 * (-1) ** n, (0.1 * (-1) ** n, 0, 0)) for n in range(60)])
-    both = pose_errors(truth, truth @ geometry.yaw_matrix(0.3) @ sway)
-    assert both.position_m == pytest.approx(0.1, rel=1e-2)
-    assert both.yaw_rad == pytest.approx(0.02, rel=1e-3)
+    position_m, yaw_rad = pose_errors(truth, truth @ geometry.yaw_matrix(0.3) @ sway)
+    assert position_m == pytest.approx(0.1, rel=1e-2) and yaw_rad == pytest.approx(0.02, rel=1e-3)
 
 
 def test_the_summary_pools_keys_and_says_what_was_recovered():

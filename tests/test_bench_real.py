@@ -21,6 +21,7 @@ from mudg.benchmarks.chain import Chain, FillViews
 from mudg.benchmarks.places import PROTOCOLS, SPLITS
 from mudg.benchmarks.rows import real_rows
 from mudg.benchmarks.settings import BenchConfig
+from mudg.city.config import CityConfig
 from mudg.city.world import CityWorld
 from mudg.core import calibration, lidar
 from mudg.core.fusion import STATIC
@@ -40,25 +41,21 @@ from mudg.scene.settings import FuseConfig
 from mudg.scene.write import SceneWriter, write_part
 from mudg.steps.ingest import Fuse, Ingest
 
-CITY = {
-    "n_frames": 6,
-    "width": 96,
-    "height": 64,
-    "cameras": ("front", "front_left"),
-    "seed": 2100000,
-    "lidar_azimuth_step_deg": 0.6,
-}
+CITY = {"n_frames": 6, "width": 96, "height": 64, "seed": 2100000, "lidar_azimuth_step_deg": 0.6}
 BY_NAME = {protocol.name: protocol for protocol in PROTOCOLS}
 
 
 @pytest.fixture(scope="module")
 def city(tmp_path_factory):
-    from mudg.city.config import CityConfig
+    config = CityConfig(**CITY, cameras=("front", "front_left"))
+    settings = IngestConfig(test_every=0, contact_sheet=False, city=config)
+    return Ingest(log=ingest.CITY, out=tmp_path_factory.mktemp("log") / "city", settings=settings).run()
 
-    out = tmp_path_factory.mktemp("log") / "city"
-    return Ingest(
-        log=ingest.CITY, out=out, settings=IngestConfig(test_every=0, contact_sheet=False, city=CityConfig(**CITY))
-    ).run()
+
+def job_of(out, source, split, config, model="", rows=()):
+    """A log under a way of hiding."""
+    adapt = dataclasses.replace(ADAPT, model=model) if model else ADAPT
+    return real.SplitJob(out, source, split, (), rows, config, adapt, False)
 
 
 # ---- what is hidden ------------------------------------------------------------------------------
@@ -67,12 +64,8 @@ def city(tmp_path_factory):
 @pytest.mark.parametrize(
     ("moments", "length", "blocks"),
     [
-        (24, 1, [4, 8, 12, 16, 20]),
-        (24, 3, [(4, 6), (10, 12), (17, 19)]),
-        (24, 5, [(5, 9), (14, 18)]),
-        (16, 5, [(6, 10)]),
-        (3, 1, [1]),
-        (4, 3, []),
+        *((24, 1, [4, 8, 12, 16, 20]), (24, 3, [(4, 6), (10, 12), (17, 19)]), (24, 5, [(5, 9), (14, 18)])),
+        *((16, 5, [(6, 10)]), (3, 1, [1]), (4, 3, [])),
     ],
 )
 def test_blocks_are_spread_and_leave_both_ends(moments, length, blocks):
@@ -118,9 +111,8 @@ def test_a_part_holds_nothing_of_what_is_hidden(city, tmp_path):
         assert not read_image(part, frame).any() and not frame.labels
     frame = part.frames_in("train")[0]
     original = next(f for f in scene.frames if f.id == frame.id)
-    assert np.array_equal(read_image(part, frame), read_image(scene, original)) and set(frame.labels) == set(
-        original.labels
-    )
+    assert np.array_equal(read_image(part, frame), read_image(scene, original))
+    assert set(frame.labels) == set(original.labels)
 
 
 def corrupted(scene, out, frames, sweeps):
@@ -164,16 +156,9 @@ ADAPT = AdaptConfig(block=1, held_out_every=2, fit_iterations=2, steps=1, shifts
 
 def made_from(source, out, split, model):
     """Everything that methods make of a log under a split, by name, as bytes."""
-    config = BenchConfig(
-        model=model,
-        iterations=6,
-        fit=FitConfig(densify={"kind": "none"}),
-        synthesize=SynthesizeConfig(steps=1, shifts_m=(2.0,)),
-        methods=("nearest_fill", "mudg_s"),
-    )
-    job = real.SplitJob(
-        out, source, split, (), real_rows(config), config, dataclasses.replace(ADAPT, model=model), False
-    )
+    settings = {"fit": FitConfig(densify={"kind": "none"}), "synthesize": SynthesizeConfig(steps=1, shifts_m=(2.0,))}
+    config = BenchConfig(model=model, iterations=6, methods=("nearest_fill", "mudg_s"), **settings)
+    job = job_of(out, source, split, config, model, real_rows(config))
     whole = read_scene(source)
     held = places.held_out(whole, split, ())
     job.write_seen(whole, held)
@@ -240,9 +225,8 @@ def test_a_part_has_no_classes_of_points_and_else_the_same_points(city, tmp_path
     assert [s.id for s in part.sweeps] == [s.id for s in plain.sweeps] and len(part.sweeps) == len(scene.sweeps) - 1
     for one, other in zip(part.sweeps, plain.sweeps, strict=True):
         assert read_points(part, one).classes is None
-        assert (tmp_path / "part" / one.points.path).read_bytes() == (
-            tmp_path / "plain" / other.points.path
-        ).read_bytes()
+        a, b = ((tmp_path / folder / of.points.path).read_bytes() for folder, of in (("part", one), ("plain", other)))
+        assert a == b
 
 
 # ---- measures with known answers -----------------------------------------------------------------
@@ -294,9 +278,8 @@ def test_columns_by_hand():
     depth[3, 4], depth[6, 7], dynamic[6, 7] = 10.0, 20.0, 1
     color = np.full((30, 40, 3), 102, np.uint8)  # 0.4
     colored = (depth > 0).astype(np.uint8)
-    seen = sight(
-        {"depth": depth, "dynamic": dynamic, "color": color, "colored": colored}, depth=torch.full((1, 30, 40), 12.0)
-    )
+    maps = {"depth": depth, "dynamic": dynamic, "color": color, "colored": colored}
+    seen = sight(maps, depth=torch.full((1, 30, 40), 12.0))
     value = lambda name: columns.COLUMNS[name].close(columns.COLUMNS[name].of(seen))  # noqa: E731
     assert value("abs_rel") == pytest.approx((0.2 + 0.4) / 2)
     assert (value("abs_rel_static"), value("abs_rel_dynamic")) == (pytest.approx(0.2), pytest.approx(0.4))
@@ -327,14 +310,12 @@ def test_a_protocol_that_pools_weighs_cameras_by_what_was_seen_of_them():
         photo[:, 0, :seen_px] = 0.5 + off
         made = torch.full((1, 30, 40), 80.0)
         made[:, 0, :seen_px] = 10 * (1 + off)
-        view = dataclasses.replace(
-            sight({"seen": seen, "depth": depth}, depth=made, photo=photo), distance=lambda pair, d=off: d
-        )
+        view = sight({"seen": seen, "depth": depth}, depth=made, photo=photo)
+        view = dataclasses.replace(view, distance=lambda pair, d=off: d)
         sums[place] = {name: columns.COLUMNS[name].of(view) for name in BY_NAME["camera"].columns}
     found = columns.values_of(BY_NAME["camera"], sums)
-    assert [found["places"][place]["psnr_seen"] for place in sums] == pytest.approx(
-        [20.0, -20 * np.log10(0.2)], abs=1e-4
-    )
+    psnr = [found["places"][place]["psnr_seen"] for place in sums]
+    assert psnr == pytest.approx([20.0, -20 * np.log10(0.2)], abs=1e-4)
     mean = found["mean"]
     assert mean["psnr_seen"] == pytest.approx(-10 * np.log10((30 * 0.01 + 10 * 0.04) / 40), abs=1e-4)
     assert mean["abs_rel_seen"] == pytest.approx((30 * 0.1 + 10 * 0.2) / 40, abs=1e-5)
@@ -363,7 +344,7 @@ def exact(city, tmp_path_factory):
         scene, protocol = read_scene(city), BY_NAME[name]
         split = SPLITS[protocol.split]
         held = places.held_out(scene, split, ())
-        job = real.SplitJob(out, city, split, (), (), BenchConfig(), ADAPT, False)
+        job = job_of(out, city, split, BenchConfig())
         job.write_seen(scene, held)
         cameras, seen = job.cameras(scene, held), job.folder / "scene"
         world = CityWorld.from_source(scene.source)
@@ -371,12 +352,9 @@ def exact(city, tmp_path_factory):
             with ObservationWriter(out / "views" / path.name, path.name, "truth") as writer:
                 for view in path.views:
                     writer.add(world.observation(view, world.render(view)))
-        targets = columns.MakeTargets(
-            log=city, shown=seen, protocol=protocol, held=tuple(held.frames), cameras=cameras, out=out / "truth"
-        ).run()
-        scored = columns.ScoreTargets(
-            log=city, truth=targets, views=out / "views", protocol=protocol, out=out / "score"
-        ).run()
+        of, held = {"log": city, "protocol": protocol}, tuple(held.frames)
+        targets = columns.MakeTargets(**of, shown=seen, held=held, cameras=cameras, out=out / "truth").run()
+        scored = columns.ScoreTargets(**of, truth=targets, views=out / "views", out=out / "score").run()
         return store.read_json(scored / "metrics.json")["mean"], columns.read_targets(targets)
 
     return of
@@ -431,9 +409,8 @@ def test_the_command_compares_methods_under_every_protocol(made, city):
         assert against and "street_gaussians" not in document["protocols"][name]["against"]
     gap = document["protocols"]["gap-1"]
     mean = gap["logs"]["city"]["values"]["nearest_fill"]["mean"]["psnr"]
-    assert gap["against"]["nearest_fill"]["psnr"] == pytest.approx(
-        mean - gap["pooled"]["street_gaussians"]["psnr"], abs=1e-5
-    )
+    difference = mean - gap["pooled"]["street_gaussians"]["psnr"]
+    assert gap["against"]["nearest_fill"]["psnr"] == pytest.approx(difference, abs=1e-5)
     assert "too few" in document["protocols"]["gap-5"]["left_out"]["city"]
     assert "no classes of LiDAR points" in document["protocols"]["classes"]["left_out"]["city"]
     assert document["logs"][0]["digest"] == store.digest(city)
@@ -450,14 +427,9 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     watched = [split / "fit" / "street_gaussians" / "run.json", out / "city" / "truth" / "lidar" / "run.json"]
     before = [path.stat().st_mtime_ns for path in watched]
     added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_s-no-renders", "mudg_r-no-adapt")
-    more = dataclasses.replace(
-        config,
-        methods=added,
-        protocols=("gap-1",),
-        model=model,
-        variant=("rough=densify.kind:none,method:gs3d",),
-        synthesize=SynthesizeConfig(shifts_m=(2.0,)),
-    )
+    variant, settings = ("rough=densify.kind:none,method:gs3d",), SynthesizeConfig(shifts_m=(2.0,))
+    changes = {"methods": added, "protocols": ("gap-1",), "model": model, "variant": variant, "synthesize": settings}
+    more = dataclasses.replace(config, **changes)
     real.run(more, [city], out)
     assert [path.stat().st_mtime_ns for path in watched] == before
     document = store.read_json(out / "bench.json")
@@ -471,11 +443,8 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
         assert state["inputs"]["start"] == start and state["summary"]["steps"] == config.iterations // 2
     inputs = store.read_json(split / "fit" / "street_gaussians-longer" / "run.json")["inputs"]
     assert not [name for name in inputs if "virtual" in name or "observations" in name]
-    shown = {
-        name: store.read_json(split / "virtual" / name / "run.json")["inputs"].get("fitted")
-        for name in ("points", "renders")
-    }
-    assert shown == {"points": None, "renders": start}
+    inputs = {of: store.read_json(split / "virtual" / of / "run.json")["inputs"] for of in ("points", "renders")}
+    assert {of: inputs[of].get("fitted") for of in inputs} == {"points": None, "renders": start}
 
 
 @pytest.mark.slow
@@ -491,16 +460,7 @@ def test_a_log_too_short_to_adapt_to_is_compared_without_and_says_so(made, city)
 
 
 def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_said(city, model, tmp_path, monkeypatch):
-    job = real.SplitJob(
-        tmp_path / "out",
-        city,
-        SPLITS["all"],
-        (),
-        (),
-        BenchConfig(model=model, iterations=4),
-        dataclasses.replace(ADAPT, model=model),
-        False,
-    )
+    job = job_of(tmp_path / "out", city, SPLITS["all"], BenchConfig(model=model, iterations=4), model)
     scene = read_scene(city)
     job.write_seen(scene, places.held_out(scene, SPLITS["all"], ()))
     chain = job.chain()
@@ -527,16 +487,12 @@ def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_sai
 
 
 def test_rows_say_what_they_leave_out():
-    rows = {
-        row.name: row for row in real_rows(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))
-    }
-    assert list(rows) == [
-        *("street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_r-no-adapt", "mudg_r-no-renders", "mudg_s"),
-        *("mudg_s-no-adapt", "mudg_s-no-renders", "a"),
-    ]
-    assert [rows[name].sees for name in ("mudg_s", "mudg_s-no-adapt", "mudg_s-no-renders", "a")] == [
-        *("adapted", "renders", "points", "adapted")
-    ]
+    config = BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",))
+    rows = {row.name: row for row in real_rows(config)}
+    base, ends = "street_gaussians street_gaussians-longer", ("", "-no-adapt", "-no-renders")
+    assert list(rows) == [*base.split(), *(f"mudg_{one}{end}" for one in "rs" for end in ends), "a"]
+    sees = {name: rows[name].sees for name in (*(f"mudg_s{end}" for end in ends), "a")}
+    assert list(sees.values()) == ["adapted", "renders", "points", "adapted"]
     assert rows["mudg_s"].title != rows["mudg_s-no-adapt"].title
 
 
@@ -579,9 +535,7 @@ def test_classes_of_points_change_nothing_that_methods_make(city, tmp_path):
     scene, found = read_scene(city), []
     for name, train_id in (("a", "road"), ("b", "sky")):
         with_classes(scene, tmp_path / name, lambda count, i=ID[train_id]: np.full(count, i, np.uint8))
-        job = real.SplitJob(
-            tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], (), (), BenchConfig(), ADAPT, False
-        )
+        job = job_of(tmp_path / f"out_{name}", tmp_path / name, SPLITS["all"], BenchConfig())
         job.write_seen(read_scene(tmp_path / name), places.HeldOut())
         found.append((job.chain().fuse() / "static.safetensors").read_bytes())
     assert found[0] == found[1]
@@ -603,16 +557,15 @@ def test_a_dataset_log_is_imported_with_the_settings_of_the_command(city, tmp_pa
 
 
 def test_other_folders_methods_and_names_are_refused(city, tmp_path):
-    with pytest.raises(UsageError, match="unknown method"):
-        real.run(BenchConfig(methods=("nerf",)), [city], tmp_path / "out")
-    with pytest.raises(UsageError, match="unknown protocol"):
-        real.run(BenchConfig(protocols=("shift",)), [city], tmp_path / "out")
-    with pytest.raises(UsageError, match="no log"):
-        real.run(BenchConfig(), [], tmp_path / "out")
-    with pytest.raises(UsageError, match="same name"):
-        real.run(BenchConfig(), [city, city], tmp_path / "out")
-    with pytest.raises(UsageError, match="taken as it is"):
-        real.run(BenchConfig(frames="0:2"), [city], tmp_path / "out")
+    for config, logs, what in (
+        (BenchConfig(methods=("nerf",)), [city], "unknown method"),
+        (BenchConfig(protocols=("shift",)), [city], "unknown protocol"),
+        (BenchConfig(), [], "no log"),
+        (BenchConfig(), [city, city], "same name"),
+        (BenchConfig(frames="0:2"), [city], "taken as it is"),
+    ):
+        with pytest.raises(UsageError, match=what):
+            real.run(config, logs, tmp_path / "out")
     store.write_json(tmp_path / "other" / "bench.json", {"schema": 1, "methods": []})
     with pytest.raises(UsageError, match="do not belong"):
         real.run(BenchConfig(), [city], tmp_path / "other")
@@ -621,14 +574,11 @@ def test_other_folders_methods_and_names_are_refused(city, tmp_path):
 def test_pooled_values_leave_out_logs_without_a_number():
     protocol, logs = BY_NAME["gap-1"], []
     for name, a, b in (("one", 20.0, 21.0), ("two", 22.0, "none")):
-        values = {
-            m: {"mean": dict.fromkeys(protocol.columns, "none") | {"psnr": v}}
-            for m, v in (("street_gaussians", a), ("mudg_s", b))
-        }
+        nothing = dict.fromkeys(protocol.columns, "none")
+        values = {m: {"mean": {**nothing, "psnr": v}} for m, v in (("street_gaussians", a), ("mudg_s", b))}
         logs.append({"log": name, "protocols": {"gap-1": {"values": values, "facts": {}}}})
-    found = real.document(logs, [{"name": "street_gaussians"}, {"name": "mudg_s"}], [protocol], {})["protocols"][
-        "gap-1"
-    ]
+    rows = [{"name": "street_gaussians"}, {"name": "mudg_s"}]
+    found = real.document(logs, rows, [protocol], {})["protocols"]["gap-1"]
     assert found["pooled"]["street_gaussians"]["psnr"] == 21.0 and found["pooled"]["mudg_s"]["psnr"] == 21.0
     assert found["pooled"]["mudg_s"]["ssim"] == "none" and found["against"]["mudg_s"]["ssim"] is None
 

@@ -62,9 +62,8 @@ def test_the_reported_list_is_what_the_rule_gives():
 def test_moving_instances_are_those_of_the_generator():
     world = CityWorld(city_logs.log_config(city_logs.DEVELOPMENT[0], TINY))
     judged = set(city_logs.moving_instances(world))
-    still = {
-        number for number, posed in enumerate(world.objects, start=1) if np.ptp(posed.keys[:, :2], axis=0).max() == 0
-    }
+    ways = [np.ptp(posed.keys[:, :2], axis=0).max() for posed in world.objects]
+    still = {number for number, way in enumerate(ways, start=1) if way == 0}
     assert judged
     assert not judged & still
 
@@ -73,9 +72,8 @@ def test_moving_instances_are_those_of_the_generator():
 
 
 def test_variants_change_fields_of_the_fit():
-    rows = shift_rows(
-        BenchConfig(methods=("mudg_s",), variant=("a=virtual.probability:0.4,densify.kind:none", "b=sh_degree:1"))
-    )
+    variants = ("a=virtual.probability:0.4,densify.kind:none", "b=sh_degree:1")
+    rows = shift_rows(BenchConfig(methods=("mudg_s",), variant=variants))
     a, b = rows[-2].fit, rows[-1].fit
     assert (a.virtual.probability, a.densify.kind, a.iterations) == (0.4, "none", 1000)
     assert dataclasses.replace(b, sh_degree=0) == rows[0].fit
@@ -104,9 +102,8 @@ def test_ablation_brings_the_rows_it_is_compared_with():
 
 
 def test_published_methods_are_rows_where_they_are_asked_for():
-    rows = {
-        r.name: r.fit for r in shift_rows(BenchConfig(methods=("pvg", "street_gaussians", "emernerf"), iterations=30))
-    }
+    config = BenchConfig(methods=("pvg", "street_gaussians", "emernerf"), iterations=30)
+    rows = {row.name: row.fit for row in shift_rows(config)}
     assert list(rows) == ["street_gaussians", "pvg", "emernerf"]
     assert {name: (fit.method, fit.iterations) for name, fit in rows.items()} == {name: (name, 30) for name in rows}
     assert not set(PUBLISHED) & set(BenchConfig().methods)
@@ -131,21 +128,13 @@ def test_unknown_methods_and_repeated_names_are_refused():
 
 def made_up(psnr, abs_rel):
     """Logs whose methods have the given numbers at 2 m and these plus 1 at 4 m; nothing else."""
-    facts = {
-        "turn_deg": 1.0,
-        "length_m": 2.0,
-        "movers": 3,
-        "mover_share": 0.1,
-        "words": "x",
-        "films": [],
-        "seconds": {},
-    }
+    facts = {"turn_deg": 1.0, "length_m": 2.0, "movers": 3, "mover_share": 0.1, "words": "x", "films": []}
     places = (("0", 5), ("2", 0), ("4", 1))
     values = [
         {m: {p: {"psnr": psnr[m][log] + more, "abs_rel": abs_rel[m][log]} for p, more in places} for m in psnr}
         for log in range(len(psnr["a"]))
     ]
-    return [{"log": log, **facts, "values": of} for log, of in enumerate(values)]
+    return [{"log": log, **facts, "seconds": {}, "values": of} for log, of in enumerate(values)]
 
 
 def test_differences_and_ratios_with_their_standard_errors_by_hand():
@@ -167,17 +156,8 @@ def test_what_a_log_lacks_is_left_out_and_named():
     logs = made_up({"a": [20.0, 22.0], "b": [19.0, 20.0]}, {"a": [0.1, 0.2], "b": [0.2, 0.2]})
     logs[1]["values"]["a"]["2"]["psnr"] = "no truth"
     rows = [{"name": "a", "title": "a", "fit": None}, {"name": "b", "title": "b", "fit": None}]
-    settings = {
-        "list": "x",
-        "iterations": 1,
-        "seed": 0,
-        "frames": 4,
-        "size_px": [8, 8],
-        "cameras": ["front"],
-        "held_out_every": 4,
-        "renders": True,
-        "continued_share": 0.5,
-    }
+    settings = {"list": "x", "iterations": 1, "seed": 0, "frames": 4, "size_px": [8, 8], "cameras": ["front"]}
+    settings |= {"held_out_every": 4, "renders": True, "continued_share": 0.5}
     document = shift.document(logs, rows, [2.0, 4.0], settings)
     assert document["pooled"]["a"]["2"]["psnr"] == {"mean": 20.0, "standard_error": None, "logs": 1}
     assert document["logs"][1]["values"]["a"]["shifted"]["psnr"] == "no truth"
@@ -230,12 +210,8 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
     assert (out / log / "film" / "front_shift+3.0.jpg").is_file()
     assert f'src="{log}/film/front_shift%2B3.0.mp4"' in (out / "page.html").read_text()
     before = (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns
-    again = shift.run(
-        dataclasses.replace(config, methods=("street_gaussians",), videos=False, variant=("still=densify.kind:none",)),
-        out,
-        rules=TINY,
-        distances_m=(3.0,),
-    )
+    changes = {"methods": ("street_gaussians",), "videos": False, "variant": ("still=densify.kind:none",)}
+    again = shift.run(dataclasses.replace(config, **changes), out, rules=TINY, distances_m=(3.0,))
     assert (out / log / "fit" / "street_gaussians" / "run.json").stat().st_mtime_ns == before
     assert [m["name"] for m in store.read_json(again / "bench.json")["methods"]] == ["street_gaussians", "still"]
 
@@ -247,30 +223,17 @@ def test_fits_under_virtual_views_go_on_with_the_one_on_recorded_views(made, tmp
     model_files.save(MDM(dataclasses.replace(SMALL, renders=True)), tmp_path / "model", "a model of tests", {})
     log = out / str(city_logs.DEVELOPMENT[0])
     variants = ("louder=virtual.color_weight:2", "flat=sh_degree:1")
-    shift.run(
-        dataclasses.replace(
-            config, methods=("mudg_s", LONGER), videos=False, model=str(tmp_path / "model"), variant=variants
-        ),
-        out,
-        rules=TINY,
-        distances_m=(3.0,),
-        overwrite=True,
-    )
+    changes = {"methods": ("mudg_s", LONGER), "model": str(tmp_path / "model"), "variant": variants, "videos": False}
+    shift.run(dataclasses.replace(config, **changes), out, rules=TINY, distances_m=(3.0,), overwrite=True)
     states = {name: store.read_json(log / "fit" / name / "run.json") for name in ("mudg_s", LONGER, "louder", "flat")}
     first = store.digest(log / "fit" / "street_gaussians")
-    assert (
-        states["mudg_s"]["inputs"]["start"]
-        == states["louder"]["inputs"]["start"]
-        == states[LONGER]["inputs"]["start"]
-        == first
-    )
+    assert {states[name]["inputs"]["start"] for name in ("mudg_s", "louder", LONGER)} == {first}
     assert states["flat"]["inputs"]["start"] == store.digest(log / "start" / "flat") != first
     assert not (log / "start" / "louder").exists()
     for state in states.values():
         assert state["summary"]["steps"] == 15
-    assert store.digest(log / "fit" / "louder" / "gaussians.safetensors") != store.digest(
-        log / "fit" / "mudg_s" / "gaussians.safetensors"
-    )
+    digests = {store.digest(log / "fit" / name / "gaussians.safetensors") for name in ("louder", "mudg_s")}
+    assert len(digests) == 2
     assert store.read_json(log / "synthesize" / "run.json")["inputs"]["fitted"] == first
     assert "generated with renders of the fit on recorded views" in (out / "bench.md").read_text()
 

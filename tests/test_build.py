@@ -42,10 +42,8 @@ def test_system_compilers_are_tried_in_order(mc: ModuleType) -> None:
     found = {"c++": "/bin/c++", "clang++": "/bin/clang++"}
     commands = [c.command for c in mc.system_candidates({"CXX": "ccache my-c++ -m64"}, which=found.get)]
     assert commands == [("ccache", "my-c++", "-m64"), ("/bin/c++",), ("/bin/clang++",)]
-    assert [c.command for c in mc.system_candidates({"CXX": "/bin/c++"}, which=found.get)] == [
-        ("/bin/c++",),
-        ("/bin/clang++",),
-    ]
+    commands = [c.command for c in mc.system_candidates({"CXX": "/bin/c++"}, which=found.get)]
+    assert commands == [("/bin/c++",), ("/bin/clang++",)]
     assert mc.system_candidates({}, which=lambda name: None) == []
 
 
@@ -53,10 +51,8 @@ def test_the_first_compiler_that_works_is_taken_and_the_log_says_why(mc: ModuleT
     broken, good, spare = (mc.Compiler((name,), "system") for name in ("broken", "good", "spare"))
 
     def check(compiler: object) -> object:
-        works = compiler is not broken
-        return mc.ProbeResult(
-            works, "" if works else "cannot build a small C++17 library: no headers", "good 1.0", True
-        )
+        reason = "cannot build a small C++17 library: no headers" if compiler is broken else ""
+        return mc.ProbeResult(not reason, reason, "good 1.0", True)
 
     chosen, notes = mc.find_compiler([broken, good, spare], check)
     assert chosen.command == ("good",)
@@ -96,14 +92,9 @@ def _build(mc: ModuleType, tmp_path: Path, mode: str, failing: set[str], working
         library.write_bytes(b"library")
         return []
 
-    return mc.build(
-        tmp_path,
-        tmp_path / "objects",
-        {"MUDG_NATIVE": mode},
-        candidates=candidates,
-        check=lambda c: mc.ProbeResult(True, version="1"),
-        compile_with=compile_with,
-    )
+    check = lambda _: mc.ProbeResult(True, version="1")  # noqa: E731
+    how = {"candidates": candidates, "check": check, "compile_with": compile_with}
+    return mc.build(tmp_path, tmp_path / "objects", {"MUDG_NATIVE": mode}, **how)
 
 
 def test_a_failing_compile_hands_over_to_the_next_compiler(mc: ModuleType, tmp_path: Path) -> None:
@@ -166,9 +157,8 @@ def test_other_processors_compile_no_x86_variants(mc: ModuleType) -> None:
     names = {p.name for p in mc.sources_for(mc.Compiler(("c++",), "system", x86_64=False))}
     assert "kernels_portable.cpp" in names
     assert not [n for n in names if "avx" in n]
-    assert {"kernels_avx2.cpp", "kernels_avx512.cpp"} <= {
-        p.name for p in mc.sources_for(mc.Compiler(("c++",), "system", x86_64=True))
-    }
+    names = {p.name for p in mc.sources_for(mc.Compiler(("c++",), "system", x86_64=True))}
+    assert {"kernels_avx2.cpp", "kernels_avx512.cpp"} <= names
 
 
 def test_object_files_are_named_after_all_they_depend_on(mc: ModuleType, tmp_path: Path) -> None:
@@ -201,10 +191,9 @@ def test_the_backend_asks_for_ziglang_only_without_a_system_compiler(
     monkeypatch.setattr(backend.mudg_compile, "find_compiler", lambda candidates: (mc.Compiler(("c++",), "system"), []))
     assert backend.extra_requirements() == []
     monkeypatch.setattr(backend.mudg_compile, "find_compiler", lambda candidates: (None, ["c++ is broken"]))
-    monkeypatch.setattr(backend.mudg_compile, "zig_is_offered", lambda: True)
-    assert backend.extra_requirements() == ["ziglang"]
-    monkeypatch.setattr(backend.mudg_compile, "zig_is_offered", lambda: False)
-    assert backend.extra_requirements() == []
+    for offered, wanted in ((True, ["ziglang"]), (False, [])):
+        monkeypatch.setattr(backend.mudg_compile, "zig_is_offered", lambda offered=offered: offered)
+        assert backend.extra_requirements() == wanted
     monkeypatch.setenv("MUDG_NATIVE", "off")
     monkeypatch.setattr(backend.mudg_compile, "zig_is_offered", lambda: True)
     assert backend.extra_requirements() == []
@@ -218,12 +207,10 @@ def test_variants_share_no_function_with_the_rest(mc: ModuleType, tmp_path: Path
         pytest.skip("needs a system compiler for x86-64 and nm")
     for name in ("kernels_avx2", "kernels_avx512"):
         source, target = mc.NATIVE_SOURCES / f"{name}.cpp", tmp_path / f"{name}.o"
-        subprocess.run(
-            [*compiler.command, *mc.flags_for(compiler, source), "-c", str(source), "-o", str(target)], check=True
-        )
-        symbols = subprocess.run(
-            ["nm", "--defined-only", str(target)], capture_output=True, text=True, check=True
-        ).stdout
+        flags = mc.flags_for(compiler, source)
+        subprocess.run([*compiler.command, *flags, "-c", str(source), "-o", str(target)], check=True)
+        listing = ["nm", "--defined-only", str(target)]
+        symbols = subprocess.run(listing, capture_output=True, text=True, check=True).stdout
         kinds = {line.split()[-1]: line.split()[-2] for line in symbols.splitlines()}
         assert any(name in symbol for symbol in kinds)
         # those are addresses, alike in all

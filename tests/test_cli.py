@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import time
 from pathlib import Path
 from typing import Any
 
@@ -48,11 +51,8 @@ def test_flags_beat_the_file_and_the_file_beats_the_preset(tmp_path: Path) -> No
 
 def test_the_seed_goes_to_every_verb_that_draws() -> None:
     args = parse("demo", "--seed", "7")
-    seeds = [
-        part["seed"]
-        for part in configuration.to_dict(args.settings).values()
-        if isinstance(part, dict) and "seed" in part
-    ]
+    parts = [part for part in configuration.to_dict(args.settings).values() if isinstance(part, dict)]
+    seeds = [part["seed"] for part in parts if "seed" in part]
     assert len(seeds) >= 2
     assert set(seeds) == {7}
     assert args.settings.ingest.city.seed == 7
@@ -102,8 +102,7 @@ def test_unknown_flag_suggests_the_nearest(capsys: pytest.CaptureFixture[str]) -
 @pytest.mark.parametrize(
     ("words", "expected"),
     [
-        (["fti", "--help"], "did you mean `mudg fit`?"),
-        (["synthesise"], "did you mean `mudg synthesize`?"),
+        *((["fti", "--help"], "did you mean `mudg fit`?"), (["synthesise"], "did you mean `mudg synthesize`?")),
         (["zzzz"], "see mudg --help"),
     ],
 )
@@ -115,17 +114,15 @@ def test_unknown_verb_suggests_the_nearest(words: list[str], expected: str, caps
 @pytest.mark.parametrize(
     "words",
     [
-        ["fit", "scene", "--fused", "f", "--out", "o", "--iterations", "0"],
-        ["fit", "scene", "--fused", "f", "--out", "o", "--iterations", "many"],
-        ["fit", "scene", "--fused", "f", "--out", "o", "--method", "nerf"],
-        ["score", "scene", "--out", "o", "--views", "no-equals-sign"],
-        ["demo", "--seed", "x"],
-        ["render", "scene"],
+        "fit scene --fused f --out o --iterations 0",
+        "fit scene --fused f --out o --iterations many",
+        "fit scene --fused f --out o --method nerf",
+        "score scene --out o --views no-equals-sign",
+        *("demo --seed x", "render scene"),
     ],
-    ids=" ".join,
 )
-def test_wrong_values_end_with_code_2_and_no_traceback(words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert app.main(words) == 2
+def test_wrong_values_end_with_code_2_and_no_traceback(words: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert app.main(words.split()) == 2
     assert "Traceback" not in capsys.readouterr().err
 
 
@@ -160,12 +157,8 @@ def test_yaml_objects_are_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("error", "code"),
     [
-        (UsageError, 2),
-        (InputError, 3),
-        (IntegrityError, 4),
-        (ResourceError, 5),
-        (NumericsError, 6),
-        (KeyboardInterrupt, 130),
+        *((UsageError, 2), (InputError, 3), (IntegrityError, 4)),
+        *((ResourceError, 5), (NumericsError, 6), (KeyboardInterrupt, 130)),
     ],
 )
 def test_exit_codes(
@@ -209,10 +202,6 @@ def test_version_and_overview(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_sigterm_stops_like_ctrl_c_with_its_own_code(monkeypatch: pytest.MonkeyPatch) -> None:
-    import os
-    import signal
-    import time
-
     def act(_args: object) -> dict[str, Any]:
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(5)
@@ -227,10 +216,8 @@ def test_sigterm_stops_like_ctrl_c_with_its_own_code(monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("verb", "flag", "field"),
     [
-        ("render", "--model", "model"),
-        ("fit", "--fused", "fused"),
-        ("synthesize", "--fused", "fused"),
-        ("score", "--views", "views"),
+        *(("render", "--model", "model"), ("fit", "--fused", "fused")),
+        *(("synthesize", "--fused", "fused"), ("score", "--views", "views")),
     ],
 )
 def test_the_second_input_may_stand_after_the_scene(verb: str, flag: str, field: str) -> None:

@@ -80,12 +80,8 @@ def test_a_converted_file_keeps_its_origin(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr(inception, "KNOWN_SHA256", store.sha256_file(checkpoint))
     scene = toy_views.write_scene(tmp_path / "scene")
     views = toy_views.write_views(scene, tmp_path / "a", "a", (2.0,))
-    out = Score(
-        scene=scene,
-        views={"a": views},
-        out=tmp_path / "score",
-        settings=ScoreConfig(fid_weights=str(weights), perceptual_views=0),
-    ).run()
+    settings = ScoreConfig(fid_weights=str(weights), perceptual_views=0)
+    out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=settings).run()
     assert store.read_json(out / "metrics.json")["distributions"]["published_weights"] is True
     store.write_safetensors(weights, {name: value + 1 for name, value in store.read_tensors(weights).items()})
     assert converted.source_sha256(weights) == store.sha256_file(weights)  # altered since: no longer the published ones
@@ -102,15 +98,13 @@ def test_other_networks_are_refused_and_nothing_is_written(tmp_path: Path) -> No
 def test_the_verb_converts_replaces_and_refuses_foreign_settings(tmp_path: Path) -> None:
     checkpoint = saved(tmp_path, "dinov2")
     to = tmp_path / "weights" / "dino"
-    assert app.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]) == 0
+    words = ["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]
+    assert app.main(words) == 0
     assert (to / "weights.safetensors").is_file()
-    assert app.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2"]) != 0
-    assert app.main(["convert", str(checkpoint), "--to", str(to), "--network", "dinov2", "--overwrite"]) == 0
+    assert app.main(words) != 0
+    assert app.main([*words, "--overwrite"]) == 0
+    plain, half = ConvertConfig(network="dinov2"), ConvertConfig(network="dinov2", dtype="float16")
     with pytest.raises(UsageError, match="diffusion models only"):
-        Convert(
-            checkpoint=checkpoint, to=tmp_path / "other", settings=ConvertConfig(network="dinov2", dtype="float16")
-        ).run()
+        Convert(checkpoint=checkpoint, to=tmp_path / "other", settings=half).run()
     with pytest.raises(InputError, match="no such checkpoint"):
-        Convert(
-            checkpoint=tmp_path / "missing.pth", to=tmp_path / "other", settings=ConvertConfig(network="dinov2")
-        ).run()
+        Convert(checkpoint=tmp_path / "missing.pth", to=tmp_path / "other", settings=plain).run()

@@ -24,9 +24,8 @@ from mudg.steps.step import texts_of
 DEMO = cost.SceneSize(images=72, path_images=24, width=384, height=256, points=100_600)
 """What `mudg demo` makes."""
 FAST = cost.SceneSize(images=12, path_images=12, width=240, height=160, points=100_600)
-LOG = cost.SceneSize(
-    images=16, path_images=16, width=480, height=145, points=31_336, exact=False, labelled=False, adapts=True
-)
+UNLABELLED = {"points": 31_336, "exact": False, "labelled": False}
+LOG = cost.SceneSize(images=16, path_images=16, width=480, height=145, **UNLABELLED, adapts=True)
 SIX = (2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
 SLOWER = 0.46
 """Speed of two cores without AVX-512, as the probe found it between the runs."""
@@ -37,9 +36,8 @@ def settings(
 ) -> RunConfig:
     config = run_preset(preset)
     if iterations:  # of a run of its own
-        config = replace(
-            config, fit=replace(config.fit, iterations=iterations), synthesize=replace(config.synthesize, steps=steps)
-        )
+        fit, synthesize = replace(config.fit, iterations=iterations), replace(config.synthesize, steps=steps)
+        config = replace(config, fit=fit, synthesize=synthesize)
     if shifts_m:
         made, shown = replace(config.synthesize, shifts_m=shifts_m), replace(config.render, shifts_m=(0.0, *shifts_m))
         config = replace(config, synthesize=made, render=shown)
@@ -51,9 +49,10 @@ def city(images: int, path_images: int, width: int, height: int) -> cost.SceneSi
 
 
 def drive(frames: int, width: int, height: int, adapts: bool = False) -> cost.SceneSize:
-    return cost.SceneSize(frames, frames, width, height, 31_336, exact=False, labelled=False, adapts=adapts)
+    return cost.SceneSize(frames, frames, width, height, **UNLABELLED, adapts=adapts)
 
 
+WHOLE, SHORT = replace(LOG, width=1242, height=375), settings("default", 60, (2.0,))
 MEASURED = {
     # run: settings, scene, cores, speed; seconds by the clock, processor seconds, most memory in MB, results in MB,
     # from its run.json
@@ -61,36 +60,9 @@ MEASURED = {
     "demo on two cores, another day": (settings("default"), DEMO, 2, 1.0, 297.4, None, None, None),
     "demo --fast with six trajectories": (settings("fast", 250, SIX), FAST, 1, 1.0, None, 115.4, 1641, 203.3),
     "demo --fast, slower machine": (settings("fast"), FAST, 2, SLOWER, None, 153.0, 1859, 105.5),
-    "run --fast on 16 frames of a KITTI drive, slower machine": (
-        settings("fast"),
-        LOG,
-        2,
-        SLOWER,
-        None,
-        231.5,
-        1948,
-        187.6,
-    ),
-    "run on that drive at full size": (
-        settings("default"),
-        replace(LOG, width=1242, height=375),
-        2,
-        1.0,
-        653.0,
-        None,
-        3221,
-        None,
-    ),
-    "16 frames of it, adapted": (
-        settings("default", 60, (2.0,)),
-        drive(16, 320, 97, True),
-        1,
-        1.0,
-        None,
-        270.8,
-        2139,
-        105.4,
-    ),
+    "run --fast on a KITTI drive, slower machine": (settings("fast"), LOG, 2, SLOWER, None, 231.5, 1948, 187.6),
+    "run on that drive at full size": (settings("default"), WHOLE, 2, 1.0, 653.0, None, 3221, None),
+    "16 frames of it, adapted": (SHORT, drive(16, 320, 97, True), 1, 1.0, None, 270.8, 2139, 105.4),
     "10 frames of it": (settings("default", 100, (2.0, -2.0), 2), drive(10, 480, 145), 1, 1.0, None, 67.9, None, 120.0),
     "6 frames of it": (settings("default", 60, (2.0,)), drive(6, 320, 97), 1, 1.0, None, 17.5, None, 36.8),
     "two cameras": (settings("default", 100, (2.0, -2.0), 2), city(16, 8, 320, 208), 1, 1.0, None, 73.2, None, 103.5),
@@ -234,25 +206,13 @@ def test_doctor_says_what_every_preset_takes(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_real_run_is_forecast(tmp_path: Path) -> None:
     """Processor seconds, memory and bytes of the whole; the clock of a shared machine says little."""
-    command = [
-        sys.executable,
-        "-m",
-        "mudg",
-        "run",
-        "city",
-        "--preset",
-        "fast",
-        "--out",
-        str(tmp_path / "out"),
-        "--quiet",
-    ]
+    command = [sys.executable, "-m", "mudg", *"run city --preset fast --quiet --out".split(), str(tmp_path / "out")]
     # a process of its own: what earlier tests took would count
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     steps = store.read_json(tmp_path / "out" / "run.json")["steps"]
     found = cost.estimate(run_preset("fast"), FAST, native.default_threads(), probe.speed().idle)
     taken = [steps[name] for name in found.seconds]
-    assert (
-        0.5 < sum(value or 0.0 for value in found.processor_s.values()) / sum(step["processor_s"] for step in taken) < 2
-    )
+    processor_s = sum(value or 0.0 for value in found.processor_s.values())
+    assert 0.5 < processor_s / sum(step["processor_s"] for step in taken) < 2
     assert 0.5 < found.written_bytes / sum(step["written_bytes"] for step in taken) < 2
     assert 0.5 < found.memory_bytes / max(step["peak_bytes"] for step in taken) < 2

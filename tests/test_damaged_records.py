@@ -42,9 +42,8 @@ CASES = 24
 def begun(folder: Path) -> Path:
     """A run that was interrupted."""
     small_run(folder)
-    state = {
-        name: value for name, value in store.read_json(folder / "run.json").items() if name not in ("check", "sealed")
-    }
+    record = store.read_json(folder / "run.json").items()
+    state = {name: value for name, value in record if name not in ("check", "sealed")}
     store.write_json(folder / "run.json", {**state, "state": "interrupted"})
     (folder / "manifest.json").unlink()
     return folder / "run.json"
@@ -72,18 +71,14 @@ def observed(folder: Path) -> Path:
 
 def chain(folder: Path) -> Path:
     ledger = pipeline._Ledger(folder, {"verb": "run", "source": "city", **result_settings(RunConfig())}, {})
-    ledger._steps = {
-        "fit": {"state": "complete", "seconds": 1.5, "processor_s": 2.5, "peak_bytes": 3, "written_bytes": 4}
-    }
+    cost = {"seconds": 1.5, "processor_s": 2.5, "peak_bytes": 3, "written_bytes": 4}
+    ledger._steps = {"fit": {"state": "complete", **cost}}
     ledger._report = {"key": "k", "sha256": "s"}
     folder.mkdir()
     ledger.save("complete")
-    record = {
-        name: value
-        for name, value in store.read_json(folder / "run.json").items()
-        if name not in ("check", "environment")
-    }
-    store.write_json(folder / "run.json", record)
+    record = store.read_json(folder / "run.json").items()
+    kept = {name: value for name, value in record if name not in ("check", "environment")}
+    store.write_json(folder / "run.json", kept)
     return folder / "run.json"
 
 
@@ -128,10 +123,7 @@ READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "interrupted run, replaced": (begun, lambda folder: small_run(folder, 2, overwrite=True)),
     "fit to go on with": (fitted, lambda folder: StartFit.of_folder(folder, {"scene": "1", "fused": "2"})),
     "fused clouds": (fused, read_fused),
-    "fused clouds of an edit": (
-        fused,
-        lambda folder: edit._report_of(RunParts({}, None, folder, True), read_fused(folder)),
-    ),
+    "fused clouds of an edit": (fused, lambda f: edit._report_of(RunParts({}, None, f, True), read_fused(f))),
     "observations": (observed, lambda folder: read_observations(folder / "views" / "front_recorded")[0]),
     "whole run": (chain, read_chain),
     "whole run on a page": (lambda folder: run_of(folder) / "run.json", gallery.read_shown),
@@ -140,10 +132,7 @@ READERS: dict[str, tuple[Callable[[Path], Path], Callable[[Path], object]]] = {
     "scores in a report": (scored, lambda folder: report.write_page(folder, [])),
     "times in a report": (functools.partial(scored, name="run.json"), lambda folder: report.write_page(folder, [])),
     "checkpoint": (saved_checkpoint, checkpoint.latest),
-    "log of a training": (
-        written("log.jsonl", LOSSES),
-        lambda folder: plot_losses(folder / "log.jsonl", folder / "loss.png"),
-    ),
+    "log of a training": (written("log.jsonl", LOSSES), lambda f: plot_losses(f / "log.jsonl", f / "loss.png")),
     "model folder": (written("model.json", MODEL), convert.own_names),
     "boxes": (written("boxes.json", BOXES), lambda folder: read_detections(folder / "boxes.json")),
 }

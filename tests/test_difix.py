@@ -49,9 +49,8 @@ def test_a_repair_sees_the_render_and_one_photograph_and_nothing_measured(fine):
         assert not bool(condition.warped[..., : width // 2].any()) and bool(condition.warped[..., width // 2 :].all())
         if grid or not fine:  # the coarse grid averages the fine one
             assert torch.equal(condition.color[0], own.color) and torch.equal(condition.depth[0], own.depth)
-        assert torch.equal(condition.color, condition.renders.color) and torch.equal(
-            condition.depth, condition.renders.depth
-        )
+        assert torch.equal(condition.color, condition.renders.color)
+        assert torch.equal(condition.depth, condition.renders.depth)
         assert bool((condition.semantics == 2).all())
     small = conditions_of(replace(given, rules=ConditionRules(48, 32)), "repair", [view], {})[0]
     assert torch.allclose(small.backdrop[0], conditions.image_tensor(image), atol=1e-5)
@@ -90,14 +89,8 @@ def test_every_step_repairs_renders_of_the_fit_before_and_every_fit_goes_on_with
 
     def fitted(step):
         begun = None if step.start_from is None else "/".join(step.start_from.parts[-2:])
-        done.append(
-            (
-                step.settings.method,
-                step.settings.iterations,
-                ["/".join(path.parts[-2:]) for path in step.observations],
-                begun,
-            )
-        )
+        observed = ["/".join(path.parts[-2:]) for path in step.observations]
+        done.append((step.settings.method, step.settings.iterations, observed, begun))
         return step.out
 
     monkeypatch.setattr(Synthesize, "run", repaired)
@@ -115,22 +108,15 @@ def test_every_step_repairs_renders_of_the_fit_before_and_every_fit_goes_on_with
         ("difix", 50, ["1/front_shift+1.0", "2/front_shift+2.0", "3/front_shift+3.0"], first),
     ]
     replace(steps, out=tmp_path / "many", generator=SynthesizeConfig(shifts_m=(2.0, 3.0, 4.0))).fitted(row)
-    assert done[-1][2] == [  # steps two and three pass places of the step before: the newer views count, once
-        "1/front_shift+0.7",
-        "1/front_shift+1.0",
-        "2/front_shift+1.3",
-        "3/front_shift+2.0",
-        "2/front_shift+2.7",
-        "3/front_shift+3.0",
-        "3/front_shift+4.0",
-    ]
+    # steps two and three pass places of the step before: the newer views count, once
+    views = "1/+0.7 1/+1.0 2/+1.3 3/+2.0 2/+2.7 3/+3.0 3/+4.0"
+    assert done[-1][2] == views.replace("/", "/front_shift").split()
 
 
 def test_only_the_colour_of_a_repair_counts():
     used = recipe_of("difix").used(FitConfig(method="difix")).virtual
     assert (used.probability, used.continued_probability, used.color_weight, used.ssim_weight) == (0.3, 0.3, 0.3, 0.2)
-    assert (used.depth_weight, used.lidar_weight, used.semantic_weight, used.perceptual_weight, used.gaussians) == (
-        *(0, 0, 0, 0, 0),
-    )
+    unused = ("depth_weight", "lidar_weight", "semantic_weight", "perceptual_weight", "gaussians")
+    assert {getattr(used, name) for name in unused} == {0}
     assert "virtual" not in METHODS["difix"].supervision and "no last repair" in METHODS["difix"].title
     assert recipe_of("mudg_s").used(FitConfig()) == FitConfig()

@@ -31,38 +31,26 @@ FLAGS: dict[str, list[str]] = {
 }
 
 FOREIGN_FLAGS = {
-    "--nproc-per-node": "torchrun",
-    "--nnodes": "torchrun",
-    "--rdzv-conf": "torchrun",
-    "--standalone": "torchrun",
-    "--version": "mudg",
-    "--dist": "pytest",
-    "--help": "every verb",
-    "--help-all": "mudg run, mudg demo",
-    **dict.fromkeys(("--rm", "--network", "--gpus", "--build-arg", "--user"), "docker"),
-    **dict.fromkeys(
-        (
-            *("--rdzv-backend", "--rdzv-endpoint", "--rdzv-id", "--max-restarts", "--signals-to-handle"),
-            *("--shutdown-timeout",),
-        ),
-        "torchrun",
-    ),
-    **dict.fromkeys(("--nodes", "--ntasks-per-node", "--signal"), "sbatch"),
+    f"--{flag}": program
+    for program, flags in {
+        "torchrun": "nproc-per-node nnodes standalone rdzv-conf rdzv-backend rdzv-endpoint rdzv-id max-restarts"
+        " signals-to-handle shutdown-timeout",
+        "mudg": "version help help-all",
+        "pytest": "dist",
+        "docker": "rm network gpus build-arg user",
+        "sbatch": "nodes ntasks-per-node signal",
+    }.items()
+    for flag in flags.split()
 }
 FOLDERS = (
     "benchmarks fleet steps viewer scoring exporting editing diffusion baselines gaussians labels formats city scene"
     " networks core native base bench docs tests tools build_backend src"
 ).split()
 GROUPS = "virtual loss densify poses objects appearance start optimizer compute network codec city".split()
-
-
 FILE_ENDINGS = tuple(".py .json .jsonl .yaml .txt .md .png .jpg .mp4 .html .pt .ckpt .safetensors".split())
 FOREIGN_NAMES = (
-    *("PromptDepthAnything", "DepthLab", "DynamiCrafter", "DeepSpeed", "SegFormer", "MergedPointCloud"),
-    *("RayCluster", "RayJob"),
-)
-
-
+    "PromptDepthAnything DepthLab DynamiCrafter DeepSpeed SegFormer MergedPointCloud RayCluster RayJob"
+).split()
 SLOW = ("docs/bench_shift.md", "docs/paper_tables.md", "docs/results.md", "docs/training.md")
 """Pages whose examples take longer: a benchmark, the whole chain, a training. So do those of the formats."""
 
@@ -245,16 +233,9 @@ def unknown_names(text: str) -> list[str]:
 
 def unknown_paths(text: str) -> list[str]:
     """Files of the source tree that do not exist: Python and C++ paths, and folders that end in a slash."""
-    roots = (
-        REPOSITORY,
-        REPOSITORY / "src" / "mudg",
-        REPOSITORY / "src",
-        REPOSITORY / "docs",
-        REPOSITORY / "src" / "mudg" / "data",
-    )
-    names = {
-        p.name for folder in ("src", "tests", "docs", "bench", "tools") for p in (REPOSITORY / folder).rglob("*.py")
-    }
+    roots = [REPOSITORY / folder for folder in ("", "src/mudg", "src", "docs", "src/mudg/data")]
+    folders = ("src", "tests", "docs", "bench", "tools")
+    names = {path.name for folder in folders for path in (REPOSITORY / folder).rglob("*.py")}
     problems = []
     for code in re.findall(r"(?<!`)`([^`\s]+)`(?!`)", text):
         path = code.split(":")[0].split("#")[0]
@@ -326,9 +307,8 @@ def test_the_numbers_of_the_readme_are_those_of_the_results() -> None:
         for cell, heading in zip(cells, ("| recorded path, held-out", "| 2 m |", "| 3 m |", "| 4 m |"), strict=True):
             if cell:
                 table = rows_after(results, heading)
-                column = table[
-                    heading.strip("| ") if heading.endswith("|") else "recorded path, held-out frames"
-                ].index(columns[measure])
+                head = heading.strip("| ") if heading.endswith("|") else "recorded path, held-out frames"
+                column = table[head].index(columns[measure])
                 assert table[method][column] == cell, f"{measure} of {method} ({heading}): README {cell}"
                 checked += 1
     assert checked == 39
@@ -353,17 +333,11 @@ def test_what_does_not_exist_is_found(tmp_path: Path) -> None:
     assert not unknown_flags("`mudg fit --virtual.probability 0.4`, `--inplace`")
     assert unknown_settings("`virtual.probabilty`") == ["virtual.probabilty"]
     assert not unknown_settings("`virtual.probability`")
-    assert unknown_names("`losses.no_such` `NoSuch(a=1)` `SceneModel.no_such`") == [
-        "losses.no_such",
-        "NoSuch(a=1)",
-        "SceneModel.no_such",
-    ]
+    names = ["losses.no_such", "NoSuch(a=1)", "SceneModel.no_such"]
+    assert unknown_names(" ".join(f"`{name}`" for name in names)) == names
     assert not unknown_names("`losses.object_map` `SceneModel.without_nodes` `run.json`")
-    assert unknown_paths("`gaussians/no_such.py` `no_such.py` `diffusion/no_such/`") == [
-        "gaussians/no_such.py",
-        "no_such.py",
-        "diffusion/no_such/",
-    ]
+    paths = ["gaussians/no_such.py", "no_such.py", "diffusion/no_such/"]
+    assert unknown_paths(" ".join(f"`{path}`" for path in paths)) == paths
     assert not unknown_paths("`gaussians/fit.py` `src/mudg/app.py` `diffusion/`")
     page = tmp_path / "page.md"
     page.write_text("# One head\n[a](other.md) [b](#one-head) [c](#two)", encoding="utf-8")

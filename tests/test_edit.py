@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pretend_device import pretend_device
 
 from mudg import native
-from mudg.base import geometry
+from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera, FusedCloud, PointCloud, Track, View
@@ -261,10 +261,8 @@ def test_removing_an_object_leaves_the_picture_without_it() -> None:
     model = toy()
     made = carried(model, "- remove: {ids: [car-1]}")
     rows = model.table.labels["node"] == 0
-    bare = Table(
-        {k: v.detach()[rows] for k, v in model.table.columns.items()},
-        {k: v[rows] for k, v in model.table.labels.items()},
-    )
+    labels = {k: v[rows] for k, v in model.table.labels.items()}
+    bare = Table({k: v.detach()[rows] for k, v in model.table.columns.items()}, labels)
     alone = SceneModel(bare, (StaticNode(),), model.sky, model.classes, 0, {})
     assert torch.equal(picture(made), picture(alone))
     assert made.node_names() == ()
@@ -301,13 +299,7 @@ def test_a_parked_car_is_cut_out_of_the_background() -> None:
         plan = planned(f"- move: {{id: {name}, along_m: 1, ground: false}}", hidden)
         with pytest.raises(UsageError, match=name):
             edited_model(model, plan)
-    empty = Track(
-        "nobody",
-        "car",
-        np.array(SIZE),
-        parked().times_s,
-        parked().world_from_object @ geometry.yaw_matrix(0, (0, 0, 50)),
-    )
+    empty = replace(parked(), world_from_object=parked().world_from_object @ geometry.yaw_matrix(0, (0, 0, 50)))
     with pytest.raises(UsageError, match="nothing of the fitted background"):
         edited.cut_out(model, empty)
 
@@ -339,13 +331,8 @@ def test_an_asset_keeps_the_shape_of_the_middle_of_its_track() -> None:
 
 def test_objects_of_other_methods_are_edited_or_refused() -> None:
     curved = toy(BezierNode)
-    curved = replace(
-        curved,
-        table=Table(
-            {**{k: v.detach() for k, v in curved.table.columns.items()}, "curve": torch.zeros(690, 4, 3)},
-            curved.table.labels,
-        ),
-    )
+    columns = {name: value.detach() for name, value in curved.table.columns.items()}
+    curved = replace(curved, table=Table({**columns, "curve": torch.zeros(690, 4, 3)}, curved.table.labels))
     with pytest.raises(InputError, match="curves"):
         carried(curved, "- stop: {id: car-1, at_s: 0.5}")
     assert carried(curved, "- remove: {ids: [car-1]}").node_names() == ()
@@ -373,8 +360,6 @@ def test_an_asset_goes_through_its_file_and_renders_as_the_object_did(tmp_path: 
 
 
 def test_what_is_no_asset_is_refused(tmp_path: Path) -> None:
-    from mudg.base import store
-
     file = tmp_path / "x.safetensors"
     store.write_safetensors(file, {"means": np.zeros((3, 3), np.float32)})
     with pytest.raises(InputError, match="no asset"):
@@ -395,9 +380,8 @@ def test_an_asset_takes_the_light_of_the_scene() -> None:
     asset = edited.asset_of(toy(), "car-1", light_rgb=here)
     lit, gain = edited.matched_light(asset, there)
     assert gain == pytest.approx([2**-0.75, 1, 2**0.75])
-    before, after = (
-        edited.linear_of((0.5 + SH_C0 * a.columns["sh_dc"].double().numpy()).clip(0)) for a in (asset, lit)
-    )
+    colors = (0.5 + SH_C0 * one.columns["sh_dc"].double().numpy() for one in (asset, lit))
+    before, after = (edited.linear_of(rgb.clip(0)) for rgb in colors)
     assert after == pytest.approx(before * gain, rel=1e-4, abs=1e-6)
     assert edited.matched_light(asset, None)[1] == pytest.approx([1, 1, 1])
     assert edited.matched_light(edited.asset_of(toy(), "car-1"), there)[1] == pytest.approx([1, 1, 1])
@@ -447,9 +431,8 @@ def test_objects_take_the_light_of_another_street() -> None:
 
     def shown(scene: SceneModel, name: str) -> float:
         rows = scene.table.labels["node"] == scene.nodes.index(scene.dynamic_object(name))
-        return float(
-            edited.linear_of((0.5 + SH_C0 * scene.table["sh_dc"].detach()[rows].double().numpy()).clip(0)).mean()
-        )
+        colors = 0.5 + SH_C0 * scene.table["sh_dc"].detach()[rows].double().numpy()
+        return float(edited.linear_of(colors.clip(0)).mean())
 
     plain, cloud_plain = made(", match_light: false", ", match_light: false")
     full, cloud_full = made("", "")
@@ -572,9 +555,8 @@ def test_the_ready_scripts_fit_the_demo(repository: Path) -> None:
     scripts = sorted((repository / "docs" / "examples" / "edits").glob("*.yaml"))
     assert len(scripts) == 3
     city = CityWorld(CityConfig(seed=DEMO_CITY, n_frames=24))
-    actors = {
-        t.id: Actor(t.label, tuple(t.size_m), Motion.recorded(t.times_s, t.world_from_object)) for t in city.tracks()
-    }
+    motion = lambda track: Motion.recorded(track.times_s, track.world_from_object)  # noqa: E731
+    actors = {t.id: Actor(t.label, tuple(t.size_m), motion(t)) for t in city.tracks()}
     ego = city.ego_path()
     world = EditWorld(actors, Motion.recorded(ego.times_s, ego.world_from_ego))
     asset = edited.asset_of(toy(), "car-1")
@@ -603,9 +585,8 @@ def test_the_city_is_drawn_again_with_an_object_elsewhere() -> None:
 
 
 def test_the_city_is_drawn_again_with_another_look() -> None:
-    city, other = (
-        CityWorld(CityConfig(seed=seed, n_frames=4, width=64, height=40)) for seed in (DEMO_CITY, DEMO_CITY + 1)
-    )
+    size = {"n_frames": 4, "width": 64, "height": 40}
+    city, other = (CityWorld(CityConfig(seed=DEMO_CITY + more, **size)) for more in (0, 1))
     frame = city.frame_views("front")[1]
     truth = city.render(frame)
     number = int(np.bincount(truth.instance.ravel())[1:].argmax()) + 1
@@ -613,17 +594,17 @@ def test_the_city_is_drawn_again_with_another_look() -> None:
     assert np.array_equal(city.recast(name, city.objects[number - 1]).render(frame).rgb, truth.rgb)
     look = next(posed for posed in other.objects if posed.row[0] == rec.VAN)
     drawn = city.recast(name, look)
-    assert np.allclose(drawn.tracks()[number - 1].size_m, look.size)
-    assert np.allclose(
-        drawn.tracks()[number - 1].world_from_object[:, :2, 3], city.tracks()[number - 1].world_from_object[:, :2, 3]
-    )
+    mine, theirs = (world.tracks()[number - 1] for world in (drawn, city))
+    assert np.allclose(mine.size_m, look.size)
+    assert np.allclose(mine.world_from_object[:, :2, 3], theirs.world_from_object[:, :2, 3])
     seen = drawn.render(frame)
     assert (seen.instance == number).any() and (seen.rgb != truth.rgb).any()
     assert np.array_equal(city.render(frame).rgb, truth.rgb)  # the city itself stays
     with pytest.raises(UsageError, match="no such object"):
         city.recast("car-999", look)
-    gone = {drawn.tracks()[number - 1].id: None}
-    assert np.array_equal(drawn.rearranged(gone).render(frame).rgb, city.rearranged({name: None}).render(frame).rgb)
+    assert np.array_equal(
+        drawn.rearranged({mine.id: None}).render(frame).rgb, city.rearranged({name: None}).render(frame).rgb
+    )
 
 
 def test_another_street_lies_where_the_vehicle_drives() -> None:
@@ -643,9 +624,8 @@ def test_another_street_lies_where_the_vehicle_drives() -> None:
     assert made.node_names() == ("car-1",)
     assert (picture(made) - picture(model)).abs().max() < 0.02  # the sky was turned by whole texels
     assert torch.allclose(made.table["means"], model.table["means"], atol=1e-4)
-    alone = edited_model(
-        model, planned("- background: {run: other, keep: [ego]}", world, background=lambda name: street)
-    )
+    plan = planned("- background: {run: other, keep: [ego]}", world, background=lambda name: street)
+    alone = edited_model(model, plan)
     assert alone.node_names() == ()
     with pytest.raises(InputError, match="own path"):
         planned("- background: {run: other, keep: [objects]}", world)
@@ -662,11 +642,8 @@ def test_scripts_run_on_a_fitted_scene_alone(tmp_path: Path) -> None:
 
 
 def test_weather_without_classes_is_refused() -> None:
-    bare = toy()
-    bare = replace(
-        bare,
-        classes=(),
-        table=Table({k: v for k, v in bare.table.columns.items() if k != "semantics"}, bare.table.labels),
-    )
+    model = toy()
+    columns = {name: value for name, value in model.table.columns.items() if name != "semantics"}
+    bare = replace(model, classes=(), table=Table(columns, model.table.labels))
     with pytest.raises(InputError, match="classes"):
         carry_out(parse_edits("- weather: {wet: 0.5}", "e"), bare)

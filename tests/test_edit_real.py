@@ -28,11 +28,8 @@ LEAD = "0"
 @pytest.fixture(scope="module")
 def drive(shared_data: Callable[[str], Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
     root = tmp_path_factory.mktemp("kitti")
-    Ingest(
-        log=shared_data("kitti_2011_09_26"),
-        out=root / "raw",
-        settings=IngestConfig(resolution="320", contact_sheet=False),
-    ).run()
+    settings = IngestConfig(resolution="320", contact_sheet=False)
+    Ingest(log=shared_data("kitti_2011_09_26"), out=root / "raw", settings=settings).run()
     Annotate(scene=root / "raw", out=root / "scene", settings=AnnotateConfig()).run()  # classes tell what is ground
     Fuse(scene=root / "scene", out=root / "fuse", settings=FuseConfig()).run()
     config = fit_config(method="street_gaussians", iterations=100, start__gaussians=6000, densify__max_gaussians=8000)
@@ -53,9 +50,8 @@ def test_the_lead_car_of_a_recorded_drive(drive: Path, tmp_path: Path, text: str
         before, after = read_points(old, a), read_points(new, b)
         pose = lead.pose_at(a.time_s)
         assert pose is not None
-        here = np.linalg.norm(
-            geometry.transform_points(geometry.invert(pose) @ a.world_from_lidar, before.xyz)[:, :2], axis=1
-        )
+        local = geometry.transform_points(geometry.invert(pose) @ a.world_from_lidar, before.xyz)
+        here = np.linalg.norm(local[:, :2], axis=1)
         azimuth = np.arctan2(before.xyz[:, 1], before.xyz[:, 0])
         beside = (here > 12) & (np.abs(azimuth) > 0.5)
         kept = {tuple(p) for p in after.xyz}

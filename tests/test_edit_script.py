@@ -100,10 +100,8 @@ def test_a_script_without_settings_asks_for_the_settings_of_weather_and_light() 
     assert conditions_of(parse_edits("- weather: {}\n- light: {}", "e").canonical()) == Conditions()
     whole = conditions_of(parse_edits("- weather: {fog: {}, rain: {}, snow: {}}", "e").canonical())
     assert whole.weather == WeatherSettings(fog=FogSettings(), rain=RainSettings(), snow=SnowSettings())
-    assert (
-        conditions_of(parse_edits("- light: {time: dusk}\n- light: {time: night}", "e").canonical()).light.time
-        == "night"
-    )
+    last = conditions_of(parse_edits("- light: {time: dusk}\n- light: {time: night}", "e").canonical())
+    assert last.light.time == "night"
     with pytest.raises(InputError, match=r"weather.snow.wind_m_s"):
         parse_edits("- weather: {snow: {wind_m_s: [1, 2, 3]}}", "e")
     with pytest.raises(InputError, match=r"light.headlights"):

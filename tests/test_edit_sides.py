@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from mudg.base import geometry
@@ -27,9 +28,8 @@ CAMERA = Camera("front", 120, 80, 90.0, 90.0, 60.0, 40.0)
 FORWARD = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 RASTER = RasterConfig(near_m=0.2)
 TIMES = np.arange(4) / 3
-ACTOR = Actor(
-    "car", SIZE, Motion.recorded(TIMES, np.stack([geometry.yaw_matrix(0.0, (8 + t, 0, 0.75)) for t in TIMES]))
-)
+POSES = np.stack([geometry.yaw_matrix(0.0, (8 + t, 0, 0.75)) for t in TIMES])
+ACTOR = Actor("car", SIZE, Motion.recorded(TIMES, POSES))
 VIEWS = [View(CAMERA, geometry.from_rotation_translation(FORWARD, (t, 0, 1.2)), float(t)) for t in TIMES]
 
 
@@ -74,9 +74,8 @@ def test_flanks_continue_the_colours_of_the_rear() -> None:
     assert places[:, 0].min() < -1.6 and places[:, 0].max() > 1.8
     low, high = places[:, 2] < -0.2, places[:, 2] > 0.2
     assert low.any() and high.any()
-    assert np.allclose(colors[low], [0.8, 0.1, 0.1], atol=1e-3) and np.allclose(
-        colors[high], [0.1, 0.1, 0.8], atol=1e-3
-    )
+    for part, color in ((low, [0.8, 0.1, 0.1]), (high, [0.1, 0.1, 0.8])):
+        assert np.allclose(colors[part], color, atol=1e-3)
     assert np.abs(places[high, 0]).max() < places[low, 0].max()  # a car is shorter above
 
 
@@ -89,15 +88,9 @@ def test_only_gaps_of_vehicles_are_closed() -> None:
 
 
 def test_what_views_show_is_not_made_up() -> None:
-    beside = [
-        View(
-            CAMERA,
-            geometry.from_rotation_translation(np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), (8 + t, -5, 0.8)),
-            float(t),
-        )
-        for t in TIMES
-    ]
-    model = behind()
+    turn, model = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]]), behind()
+    poses = [geometry.from_rotation_translation(turn, (8 + t, -5, 0.8)) for t in TIMES]
+    beside = [View(CAMERA, pose, float(t)) for pose, t in zip(poses, TIMES, strict=True)]
 
     def right(views: Sequence[View]) -> int:
         return int((made(model, with_closed_sides(model, ["car"], views, RASTER))[0][:, 1] < 0).sum())
@@ -105,32 +98,27 @@ def test_what_views_show_is_not_made_up() -> None:
     assert right([*VIEWS, *beside]) < 0.2 * right(VIEWS)  # the right flank was seen to be empty; measured: 0
 
 
-def test_only_what_is_seen_from_another_side_is_closed() -> None:
-    sources = EditSources(lambda s: None, lambda n: None)
-
-    def sides(text: str) -> set[str]:
-        plan = plan_edits(parse_edits(text, "sides"), EditWorld({"car": ACTOR}), sources)
-        return plan.sides & shown_anew(plan, VIEWS, VIEWS)
-
-    assert sides("- move: {id: car, left_m: 2}") == {"car"} and sides("- move: {id: car, yaw_deg: 10}") == {"car"}
-    assert sides("- move: {id: car, along_m: 3}") == set()
-    assert sides("- move: {id: car, left_m: 2, close_sides: false}") == set()
+AWAY = [View(CAMERA, geometry.yaw_matrix(0.0, (0, 2.0, 0)) @ view.world_from_cam, view.time_s) for view in VIEWS]
 
 
-def test_sides_are_closed_where_the_vehicle_takes_another_path() -> None:
-    sources = EditSources(lambda s: None, lambda n: None)
+@pytest.mark.parametrize(
+    ("text", "views", "closed"),
+    [
+        *(("- move: {id: car, left_m: 2}", VIEWS, True), ("- move: {id: car, yaw_deg: 10}", VIEWS, True)),
+        ("- move: {id: car, along_m: 3}", VIEWS, False),
+        ("- move: {id: car, left_m: 2, close_sides: false}", VIEWS, False),
+        *(("- move: {id: ego, left_m: 2}", AWAY, True), ("- move: {id: ego, left_m: 2}", VIEWS, False)),
+        ("- move: {id: ego, left_m: 2, close_sides: false}", AWAY, False),
+        ("- move: {id: ego, left_m: 2}\n- remove: {ids: [car]}", AWAY, False),
+        ("- remove: {ids: [car]}", AWAY, False),
+    ],
+)
+def test_only_what_is_seen_from_another_side_is_closed(text: str, views: list[View], closed: bool) -> None:
+    """Of a vehicle that moves, and of one that another path shows."""
     ego = Motion.recorded(np.array(TIMES, float), np.stack([geometry.yaw_matrix(0.0)] * len(TIMES)))
-    away = [View(CAMERA, geometry.yaw_matrix(0.0, (0, 2.0, 0)) @ view.world_from_cam, view.time_s) for view in VIEWS]
-
-    def sides(text: str, views: list[View]) -> set[str]:
-        plan = plan_edits(parse_edits(text, "sides"), EditWorld({"car": ACTOR}, ego), sources)
-        return plan.sides & shown_anew(plan, VIEWS, views)
-
-    assert sides("- move: {id: ego, left_m: 2}", away) == {"car"}
-    assert sides("- move: {id: ego, left_m: 2}", VIEWS) == set()
-    assert sides("- move: {id: ego, left_m: 2, close_sides: false}", away) == set()
-    assert sides("- move: {id: ego, left_m: 2}\n- remove: {ids: [car]}", away) == set()
-    assert sides("- remove: {ids: [car]}", away) == set()
+    sources = EditSources(lambda s: None, lambda n: None)
+    plan = plan_edits(parse_edits(text, "sides"), EditWorld({"car": ACTOR}, ego), sources)
+    assert plan.sides & shown_anew(plan, VIEWS, views) == ({"car"} if closed else set())
 
 
 def test_an_asset_has_all_its_sides() -> None:

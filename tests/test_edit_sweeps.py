@@ -50,12 +50,8 @@ def recorded(boxes: dict[str, Actor]) -> SweepPoints:
     ranges, owner = exact(boxes)
     intensity = np.where(owner >= 0, 0.8, 0.2).astype(np.float32)
     classes = np.where(owner >= 0, ID["car"], ID["road"]).astype(np.uint8)
-    return SweepPoints(
-        (fan() * ranges[:, None]).astype(np.float32),
-        intensity,
-        np.arange(len(ranges), dtype=np.float32) * 1e-6,
-        classes,
-    )
+    xyz, dt_s = (fan() * ranges[:, None]).astype(np.float32), np.arange(len(ranges), dtype=np.float32) * 1e-6
+    return SweepPoints(xyz, intensity, dt_s, classes)
 
 
 def shell() -> PointCloud:
@@ -70,9 +66,8 @@ def shell() -> PointCloud:
 def changed(
     boxes: dict[str, Actor], text: str, surfaces: dict[str, PointCloud]
 ) -> tuple[SweepPoints, SweepPoints, dict[str, int], EditPlan]:
-    plan = plan_edits(
-        parse_edits(text, "e"), EditWorld(boxes, None, ground()), EditSources(lambda s: None, lambda n: None)
-    )
+    nothing = EditSources(lambda s: None, lambda n: None)
+    plan = plan_edits(parse_edits(text, "e"), EditWorld(boxes, None, ground()), nothing)
     points, sweep = recorded(boxes), Sweep("0", "lidar", 0.5, SENSOR, "")
     static = PointCloud(np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8), "world")
     made, counts = edited_points(points, sweep, plan, FusedCloud(static, surfaces))
@@ -91,9 +86,8 @@ def test_beams_meet_boxes_points_and_ground_where_geometry_says() -> None:
     assert both.sum() > 0.98 * np.isfinite(hit).sum() and np.median(np.abs(seen[both] - hit[both])) < 0.05
     assert (first[np.isfinite(seen)] >= 0).all()
     down = directions[directions[:, 2] < -0.1]
-    assert np.allclose(
-        lidar.met_ground(down, SENSOR, ground(), np.full(len(down), 1.0), 25.0), -2 / down[:, 2], atol=0.01
-    )
+    way = lidar.met_ground(down, SENSOR, ground(), np.full(len(down), 1.0), 25.0)
+    assert np.allclose(way, -2 / down[:, 2], atol=0.01)
     assert np.isinf(lidar.met_box(directions, geometry.yaw_matrix(0, (-10, 0, 0)), SIZE)).all()  # behind the sensor
 
 
@@ -108,9 +102,8 @@ def test_beams_that_met_a_removed_object_meet_the_ground_behind_it_or_do_not_com
     assert counts["on_ground"] + counts["unknown"] == counts["cleared"]
     order = np.round(new.dt_s / 1e-6).astype(int)
     ranges = np.linalg.norm(new.xyz, axis=1)
-    assert (
-        np.abs(ranges - free[order])[~gone[order] | (owner[order] < 0)].max() < 0.6
-    )  # what lies 0.1 m above the road counts as road
+    # what lies 0.1 m above the road counts as road
+    assert np.abs(ranges - free[order])[~gone[order] | (owner[order] < 0)].max() < 0.6
     assert not (gone[order] & (owner[order] == 0)).any()  # what b would have sent back is not known
     assert np.allclose(new.intensity[gone[order]], 0.2)
     assert len(new.xyz) == len(old.xyz) - counts["unknown"]
@@ -135,6 +128,5 @@ def test_what_no_edit_touches_stays_bit_for_bit() -> None:
     old, new, _, _ = changed(boxes, "- remove: {ids: [b]}", {})
     order = np.round(new.dt_s / 1e-6).astype(int)
     far = np.linalg.norm(old.xyz[order][:, :2] - [25, 6], axis=1) > 3
-    assert np.array_equal(new.xyz[far], old.xyz[order][far]) and np.array_equal(
-        new.intensity[far], old.intensity[order][far]
-    )
+    for one, other in ((new.xyz, old.xyz), (new.intensity, old.intensity)):
+        assert np.array_equal(one[far], other[order][far])

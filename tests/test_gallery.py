@@ -23,36 +23,26 @@ METRICS = [
 
 
 def scores_of(scene: str, psnr: float) -> dict[str, Any]:
-    rows = [
-        {
-            "method": "mudg_s",
-            "distance_m": d,
-            "trajectories": [],
-            "values": {"psnr": psnr - d, "abs_rel": "no truth" if d else 0.1},
-        }
-        for d in (0.0, 2.0)
-    ]
-    rows.append({"method": "mudg_r", "distance_m": 0.0, "trajectories": [], "values": {"psnr": "not produced"}})
+    def row(method: str, distance_m: float, **values: Any) -> dict[str, Any]:
+        return {"method": method, "distance_m": distance_m, "trajectories": [], "values": values}
+
+    rows = [row("mudg_s", d, psnr=psnr - d, abs_rel="no truth" if d else 0.1) for d in (0.0, 2.0)]
+    titles = {"mudg_s": "Gaussians with diffusion", "mudg_r": "Diffusion output"}
     return {
         "scene": {"id": scene, "dataset": "toy", "frames": 12, "cameras": {"front": [48, 32]}},
-        "by_distance": rows,
+        "by_distance": [*rows, row("mudg_r", 0.0, psnr="not produced")],
         "metrics": METRICS,
-        "methods": [
-            {"name": "mudg_s", "title": "Gaussians with diffusion"},
-            {"name": "mudg_r", "title": "Diffusion output"},
-        ],
+        "methods": [{"name": name, "title": title} for name, title in titles.items()],
     }
 
 
 def run_of(folder: Path, scene: str = "city-1", psnr: float = 25.0, state: str = "complete") -> Path:
-    store.write_json(
-        folder / "run.json", {"asked": {"verb": "run"}, "state": state, "steps": {"fit": {"seconds": 65.2}}}
-    )
+    steps = {"fit": {"seconds": 65.2}}
+    store.write_json(folder / "run.json", {"asked": {"verb": "run"}, "state": state, "steps": steps})
     store.write_json(folder / "score" / "metrics.json", scores_of(scene, psnr))
     store.write_text(folder / "report.html", "the report")
-    store.write_image(
-        folder / "render" / "mudg_s" / "front_recorded" / "rgb" / "000000.png", np.full((32, 48, 3), 90, np.uint8)
-    )
+    picture = folder / "render" / "mudg_s" / "front_recorded" / "rgb" / "000000.png"
+    store.write_image(picture, np.full((32, 48, 3), 90, np.uint8))
     return folder
 
 
@@ -130,14 +120,10 @@ def test_the_table_sorts_and_filters_in_a_browser(tmp_path: Path) -> None:
     gallery.run([tmp_path / name for name in "xyz"], tmp_path / "all.html")
     browser = Browser(tmp_path / "profile", size=(390, 844))
     try:
-        browser.open(
-            (tmp_path / "all.html").as_uri(),
-            "document.readyState === 'complete' && !!document.getElementById('scores')",
-        )
-        shown = (
-            "[...document.querySelectorAll('#scores tbody tr')].filter(r => !r.hidden).map(r =>"
-            " r.cells[0].innerText).join('')"
-        )
+        ready = "document.readyState === 'complete' && !!document.getElementById('scores')"
+        browser.open((tmp_path / "all.html").as_uri(), ready)
+        rows = "[...document.querySelectorAll('#scores tbody tr')].filter(r => !r.hidden)"
+        shown = f"{rows}.map(r => r.cells[0].innerText).join('')"
 
         def click(column: int) -> None:
             browser.run(f"document.querySelectorAll('#scores th button')[{column}].click()")
@@ -148,14 +134,12 @@ def test_the_table_sorts_and_filters_in_a_browser(tmp_path: Path) -> None:
         assert browser.run(shown) == "yzyxzx"
         click(5)
         assert browser.run(shown)[3:] == "yzx"  # rows without a number stay last
-        browser.run(
-            "const f = document.getElementById('filter'); f.value = 'CITY-Z'; f.dispatchEvent(new Event('input'))"
-        )
+        enter = "const e = document.getElementById('{}'); e.value = '{}'; e.dispatchEvent(new Event('{}'))"
+        enter = f"(() => {{{{ {enter} }}}})()"
+        browser.run(enter.format("filter", "CITY-Z", "input"))
         assert browser.run(shown) == "zz"
         assert browser.run("[...document.querySelectorAll('.cards li')].filter(c => !c.hidden).length") == 1
-        browser.run(
-            "const p = document.getElementById('place'); p.value = '2 m aside'; p.dispatchEvent(new Event('change'))"
-        )
+        browser.run(enter.format("place", "2 m aside", "change"))
         assert browser.run(shown) == "z"
         # a phone scrolls the table, not the page
         assert browser.run("document.documentElement.scrollWidth <= innerWidth")

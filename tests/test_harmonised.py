@@ -12,6 +12,7 @@ import pytest
 import torch
 from fit_settings import fit_config
 from test_clips import RULES, image_of_wall, stripes, view_at, wall
+from tiny_networks import small_mdm
 from toy_published import write_tiny
 from toy_world import fused_cloud, write_scene
 
@@ -27,10 +28,10 @@ from mudg.core.weather import DriveFacts
 from mudg.core.weather.gbuffer import Surroundings
 from mudg.core.weather.light import SRGB
 from mudg.diffusion import condition as clip_parts
-from mudg.diffusion import model_files
+from mudg.diffusion import model_files as files
 from mudg.diffusion.condition import ConditionRules, build_conditions, image_tensor
 from mudg.diffusion.inputs import ConditionSources, InWeather, conditions_of
-from mudg.diffusion.model import MDM, MDMConfig
+from mudg.diffusion.model import MDM
 from mudg.diffusion.published import PublishedMDM
 from mudg.diffusion.requests import SampleRequest, StartClip
 from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
@@ -42,7 +43,6 @@ from mudg.editing.recorded import boxes_mask, cleared_cloud, ground_mask, photos
 from mudg.editing.script import parse_edits
 from mudg.editing.settings import EditConfig, RenderConfig
 from mudg.gaussians import fit
-from mudg.networks.codec import CodecConfig
 from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.labels import read_label
 from mudg.scene.observations import read_observations
@@ -78,31 +78,31 @@ def observed(rgb: torch.Tensor, ids: torch.Tensor) -> Observation:
     )
 
 
+CLOUD = FusedCloud(wall(12.0, stripes), {})
+REMOVED = "- remove: {ids: [box]}"
+
+
 def test_the_condition_of_a_removed_object_is_that_of_a_log_that_never_had_it() -> None:
     """Two photographs with the box at different places, and two without any: the same condition, to the bit."""
-    plan = drive("- remove: {ids: [box]}")
-    cloud, target = FusedCloud(wall(12.0, stripes), {}), view_at(y=0.3, time_s=0.0)
+    plan, target = drive(REMOVED), view_at(y=0.3, time_s=0.0)
     with_box = photos_of_edited([photo_with_box(0.0, -2.0), photo_with_box(1.0, 2.0)], plan)
     assert all(p.usable is not None and bool(p.usable[p.rgb.max(-1) > 0].any()) for p in with_box)
     assert not any(bool(p.usable[(p.rgb == 0).all(-1)].any()) for p in with_box)
     empty = [Photo(p.view, image_of_wall(view_at(), 12.0)) for p in with_box]
-    given = build_conditions(cloud, [], [target], with_box, RULES, vacated_at=vacated_at(plan))[0]
-    never = build_conditions(cloud, [], [target], empty, RULES)[0]
+    given = build_conditions(CLOUD, [], [target], with_box, RULES, vacated_at=vacated_at(plan))[0]
+    never = build_conditions(CLOUD, [], [target], empty, RULES)[0]
     for name in ("color", "depth", "valid", "warped", "semantics"):
         assert torch.equal(getattr(given, name), getattr(never, name)), name
-    seen = build_conditions(cloud, [], [target], [replace(p, usable=None) for p in with_box], RULES)[0]
+    seen = build_conditions(CLOUD, [], [target], [replace(p, usable=None) for p in with_box], RULES)[0]
     assert not torch.equal(seen.color, never.color)  # the box would be in the picture
-    assert (
-        float((given.backdrop - never.backdrop).abs().max()) < 0.2 < float((seen.backdrop - never.backdrop).abs().max())
-    )
+    near, far = (float((one.backdrop - never.backdrop).abs().max()) for one in (given, seen))
+    assert near < 0.2 < far
 
 
 def test_what_nobody_saw_continues_its_surroundings_and_does_not_count_as_seen() -> None:
-    plan = drive("- remove: {ids: [box]}")
+    plan = drive(REMOVED)
     photos = photos_of_edited([photo_with_box(0.0, -2.0)], plan)
-    made = build_conditions(
-        FusedCloud(wall(12.0, stripes), {}), [], [view_at()], photos, RULES, vacated_at=vacated_at(plan)
-    )[0]
+    made = build_conditions(CLOUD, [], [view_at()], photos, RULES, vacated_at=vacated_at(plan))[0]
     hole = vacated_at(plan)(view_at()).mask
     assert 0 < float(hole.float().mean()) < 0.4
     assert not bool((made.warped[0, 0] | made.valid[0, 0])[hole].any())
@@ -115,7 +115,7 @@ def test_what_nobody_saw_continues_its_surroundings_and_does_not_count_as_seen()
 def test_what_photographs_determined_behind_a_removed_object_is_kept(usual: float) -> None:
     """A red render that is as certain in the left half of what stood there as anywhere in the view, however certain
     that is, and hardly in the right half."""
-    plan = drive("- remove: {ids: [box]}")
+    plan, full = drive(REMOVED), torch.tensor([1.0, 0, 0]).view(3, 1, 1)
     vacated = vacated_at(plan)(view_at())
     columns = torch.nonzero(vacated.stood.any(0))[:, 0]
     left = vacated.stood & (torch.arange(48) <= int(columns.float().mean()))
@@ -125,20 +125,13 @@ def test_what_photographs_determined_behind_a_removed_object_is_kept(usual: floa
     def render(view: View) -> RenderPlanes:
         one = torch.ones(1, view.camera.height, view.camera.width)
         certainty = torch.where(right, 0.1 * usual, usual)[None]
-        return RenderPlanes(
-            torch.tensor([1.0, 0, 0]).view(3, 1, 1) * one, 12 * one, one, certainty, (2 * one).to(torch.uint8)
-        )
+        return RenderPlanes(full * one, 12 * one, one, certainty, (2 * one).to(torch.uint8))
 
     photos = photos_of_edited([photo_with_box(0.0, -2.0)], plan)
-    cloud = FusedCloud(wall(12.0, stripes), {})
-    made = build_conditions(cloud, [], [view_at()], photos, RULES, render_at=render, vacated_at=vacated_at(plan))[0]
-    red = (made.color[0] == torch.tensor([1.0, 0, 0]).view(3, 1, 1)).all(0)
-    assert made.renders is not None
-    assert (
-        bool(red[left].all())
-        and bool(made.warped[0, 0][left].all())
-        and bool((made.renders.certainty[0, 0][left] == usual).all())
-    )
+    made = build_conditions(CLOUD, [], [view_at()], photos, RULES, render_at=render, vacated_at=vacated_at(plan))[0]
+    red = (made.color[0] == full).all(0)
+    assert made.renders is not None and bool(red[left].all()) and bool(made.warped[0, 0][left].all())
+    assert bool((made.renders.certainty[0, 0][left] == usual).all())
     unknown = vacated.mask & ~left
     assert not bool(red[unknown].any()) and not bool(made.warped[0, 0][unknown].any())
     assert bool((made.renders.certainty[0, 0][unknown] == 0).all())
@@ -148,7 +141,7 @@ def test_ground_that_a_removed_object_darkened_keeps_its_place_but_not_its_colou
     """Road points half a metre below the box; those in its shadow were coloured black."""
     x, y = np.meshgrid(np.arange(3, 14, 0.03), np.arange(-8, 8, 0.03))
     xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, -0.5)], 1).astype(np.float32)
-    plan = drive("- remove: {ids: [box]}")
+    plan = drive(REMOVED)
     dark = (np.abs(xyz[:, 0] - 6) < 0.8) & (np.abs(xyz[:, 1] + 2) < 1)
     rgb = np.where(dark[:, None], 0, 130).repeat(3, 1).astype(np.uint8)
     cloud = FusedCloud(PointCloud(xyz, rgb, "world", semantics=np.full(len(xyz), ID["road"], np.uint8)), {})
@@ -161,9 +154,8 @@ def test_ground_that_a_removed_object_darkened_keeps_its_place_but_not_its_colou
 
 
 def test_the_published_reference_is_masked_too() -> None:
-    photos = photos_of_edited([photo_with_box(0.0, -2.0)], drive("- remove: {ids: [box]}"))
-    rules = replace(RULES, published=True)
-    made = build_conditions(FusedCloud(wall(12.0, stripes), {}), [], [view_at()], photos, rules)[0]
+    photos = photos_of_edited([photo_with_box(0.0, -2.0)], drive(REMOVED))
+    made = build_conditions(CLOUD, [], [view_at()], photos, replace(RULES, published=True))[0]
     assert float(made.reference.amax(0).min()) > 0.2
     kept = torch.from_numpy(photos[0].usable)
     assert torch.equal(made.reference[:, kept], image_tensor(photos[0].rgb)[:, kept])
@@ -186,7 +178,7 @@ def test_a_box_beside_the_camera_does_not_cover_the_image() -> None:
 
 def test_points_that_a_box_left_behind_are_cleared() -> None:
     cloud = FusedCloud(wall(6.2, stripes, (-3, 3), (-0.4, 0.4)), {})
-    kept = cleared_cloud(cloud, drive("- remove: {ids: [box]}")).static.xyz
+    kept = cleared_cloud(cloud, drive(REMOVED)).static.xyz
     assert 0 < len(kept) < len(cloud.static.xyz)
     assert not ((np.abs(kept[:, 1] - 2.0) < 0.8) & (kept[:, 2] > -0.3)).any()
     assert len(cleared_cloud(cloud, drive("- move: {id: box, left_m: 1, ground: false}")).static) == len(kept)
@@ -217,13 +209,10 @@ def test_pasting_changes_nothing_outside_of_the_mask() -> None:
     assert bool((weight[14, 10:14].diff() > 0).all()) and float(weight[14, 10]) == pytest.approx(0.25)
     made = pasted(one, two, weight)
     for name in ("rgb", "depth", "semantics", "confidence", "mask"):
-        mine, theirs = getattr(one, name), getattr(made, name)
-        assert torch.equal(
-            mine[..., ~torch.from_numpy(mask)].nan_to_num(-1), theirs[..., ~torch.from_numpy(mask)].nan_to_num(-1)
-        ), name
-    assert torch.equal(made.rgb[:, 14, 20], two.rgb[:, 14, 20]) and torch.equal(
-        made.semantics[14, 20], two.semantics[14, 20]
-    )
+        mine, theirs = (getattr(view, name)[..., ~torch.from_numpy(mask)].nan_to_num(-1) for view in (one, made))
+        assert torch.equal(mine, theirs), name
+    for name in ("rgb", "semantics"):
+        assert torch.equal(getattr(made, name)[..., 14, 20], getattr(two, name)[..., 14, 20])
     nothing = pasted(one, two, torch.zeros(32, 48))
     assert torch.equal(nothing.rgb, one.rgb) and torch.equal(nothing.semantics, one.semantics)
 
@@ -246,20 +235,9 @@ def test_a_removed_car_does_not_come_back_and_an_inserted_one_does_not_vanish() 
 # -- through the commands --------------------------------------------------------------------------
 
 FRAMES = 4
-SMALL = MDMConfig(
-    widths=(16, 32),
-    blocks=(1, 1),
-    spatial_attention=(False, True),
-    temporal_attention=(False, True),
-    window=3,
-    embed_width=16,
-    codec=CodecConfig(decoder_width=8, decoder_blocks=1),
-    patch=2,
-    refine_widths=(16, 32),
-    refine_blocks=(1, 1),
-    area_px=48 * 32,
-    renders=True,
-)
+CAR_GONE = "- remove: {ids: [car]}"
+FITTED = "fit/street_gaussians"
+FIT = {"method": "street_gaussians", "start__gaussians": 900, "densify__max_gaussians": 1500}
 
 
 @pytest.fixture(scope="module")
@@ -268,10 +246,10 @@ def run(tmp_path_factory) -> Path:
     root = tmp_path_factory.mktemp("run")
     write_scene(root / "scene", frames=FRAMES, cameras=("front",), width=60, height=40)
     write_fused(root / "fuse", fused_cloud(FRAMES), {"tracks": {"car": {"moving": True}}})
-    config = fit_config(method="street_gaussians", iterations=40, start__gaussians=900, densify__max_gaussians=1500)
-    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
+    settings = fit_config(iterations=40, **FIT)
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / FITTED, settings=settings).run()
     torch.manual_seed(0)
-    model_files.save(MDM(SMALL), root / "model", "", {})
+    files.save(MDM(small_mdm(window=3, refine_widths=(16, 32), area_px=48 * 32, renders=True)), root / "model", "", {})
     return root
 
 
@@ -280,21 +258,31 @@ def script(folder: Path, text: str) -> Path:
     return folder / "edits.yaml"
 
 
+def rendered(run: Path, out: Path, *, shifts_m: tuple[float, ...] = (0.0,), **parts: Any) -> Path:
+    """Views of the fit. ``parts``: inputs of the verb, and ``harmonize``, settings with which they are repaired."""
+    harmonize = HarmonizeConfig(on=True, **how) if (how := parts.pop("harmonize", {})) else HarmonizeConfig()
+    settings = RenderConfig(shifts_m=shifts_m, video=False, harmonize=harmonize)
+    return RenderViews(**{"scene": run / "scene", "model": run / FITTED, **parts, "out": out}, settings=settings).run()
+
+
+def synthesized(run: Path, out: Path, settings: SynthesizeConfig, **parts: Any) -> Path:
+    return Synthesize(scene=run / "scene", fused=run / "fuse", **parts, out=out, settings=settings).run()
+
+
 def views_of(folder: Path, name: str = "front_recorded") -> list[Observation]:
     seen = read_observations(folder / name)
     return [seen[i] for i in range(len(seen))]
 
 
 def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
-    model = model_files.load(str(run / "model"))
+    model = files.load(str(run / "model"))
     views = [view_at(time_s=0.1 * n) for n in range(2)]
     photos = [Photo(view, image_of_wall(view, 12.0)) for view in views]
-    condition = build_conditions(FusedCloud(wall(12.0, stripes), {}), [], views, photos, RULES)[0]
+    condition = build_conditions(CLOUD, [], views, photos, RULES)[0]
     freedom = torch.zeros(2, 1, 32, 48)
     freedom[..., 8:24, 8:24] = 1.0
-    begun = StartClip(
-        condition.color.flip(-1), condition.depth, torch.full((2, 1, 32, 48), ID["road"], dtype=torch.uint8), freedom
-    )
+    road = torch.full((2, 1, 32, 48), ID["road"], dtype=torch.uint8)
+    begun = StartClip(condition.color.flip(-1), condition.depth, road, freedom)
     free = model.sample(condition, SampleRequest(2))
     same = model.sample(condition, SampleRequest(2, start=replace(begun, freedom=torch.ones_like(freedom))))
     held = model.sample(condition, SampleRequest(2, start=begun))
@@ -307,31 +295,16 @@ def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
 
 
 def test_synthesize_shows_the_edited_drive(run: Path, tmp_path: Path) -> None:
-    config = SynthesizeConfig(
-        shifts_m=(0.0,), model=str(run / "model"), steps=1, full_size=False, processes=1, precision="float32"
-    )
-    edits, parts = script(tmp_path, "- remove: {ids: [car]}"), (run / "scene", run / "fuse")
-    plain = Synthesize(scene=parts[0], fused=parts[1], out=tmp_path / "plain", settings=config).run()
-    made = Synthesize(scene=parts[0], fused=parts[1], edits=edits, out=tmp_path / "made", settings=config).run()
-    fitted = Synthesize(
-        scene=parts[0],
-        fused=parts[1],
-        edits=edits,
-        fitted=run / "fit" / "street_gaussians",
-        out=tmp_path / "fitted",
-        settings=config,
-    ).run()
+    settings = {"shifts_m": (0.0,), "steps": 1, "full_size": False, "processes": 1, "precision": "float32"}
+    config, edits = SynthesizeConfig(model=str(run / "model"), **settings), script(tmp_path, CAR_GONE)
+    plain = synthesized(run, tmp_path / "plain", config)
+    made = synthesized(run, tmp_path / "made", config, edits=edits)
+    fitted = synthesized(run, tmp_path / "fitted", config, edits=edits, fitted=run / FITTED)
     pictures = [[v.rgb for v in views_of(folder)] for folder in (plain, made, fitted)]
     assert not any(torch.equal(a, b) for a, b in zip(pictures[0], pictures[1], strict=True))
     assert not any(torch.equal(a, b) for a, b in zip(pictures[1], pictures[2], strict=True))
     with pytest.raises(InputError, match="no object of this id"):
-        Synthesize(
-            scene=parts[0],
-            fused=parts[1],
-            edits=script(tmp_path, "- remove: {ids: [cat]}"),
-            out=tmp_path / "bad",
-            settings=config,
-        ).run()
+        synthesized(run, tmp_path / "bad", config, edits=script(tmp_path, "- remove: {ids: [cat]}"))
     assert not (tmp_path / "bad").exists()
 
 
@@ -345,23 +318,16 @@ def test_renders_are_repaired_where_the_edit_touches_them(
     run: Path, tmp_path: Path, unguarded: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(harmonised, "FEATHER_PX", 0)
-    edits, fitted = script(tmp_path, "- remove: {ids: [car]}"), run / "fit" / "street_gaussians"
-    config = RenderConfig(shifts_m=(0.0,), video=False)
-    repaired = replace(config, harmonize=HarmonizeConfig(on=True, model=str(run / "model"), steps=2))
+    edits, model = script(tmp_path, CAR_GONE), {"model": str(run / "model"), "steps": 2}
     with pytest.raises(UsageError, match="--fused"):
-        RenderViews(scene=run / "scene", model=fitted, edits=edits, out=tmp_path / "none", settings=repaired).run()
+        rendered(run, tmp_path / "none", edits=edits, harmonize=model)
     before, physical, made = (
-        views_of(
-            RenderViews(
-                scene=run / "scene",
-                fused=run / "fuse",
-                model=fitted,
-                edits=file,
-                out=tmp_path / name,
-                settings=settings,
-            ).run()
+        views_of(rendered(run, tmp_path / name, fused=run / "fuse", **parts))
+        for name, parts in (
+            ("before", {}),
+            ("physical", {"edits": edits}),
+            ("made", {"edits": edits, "harmonize": model}),
         )
-        for name, settings, file in (("before", config, None), ("physical", config, edits), ("made", repaired, edits))
     )
     assert len(made) == FRAMES
     scene, changed = read_scene(run / "scene"), 0
@@ -377,17 +343,10 @@ def test_renders_are_repaired_where_the_edit_touches_them(
 
 def test_weather_is_that_of_the_formulas_with_another_model(run: Path, tmp_path: Path, capsys) -> None:
     log.set_quiet(False)  # a command before may have been asked to be
-    edits, fitted = script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), run / "fit" / "street_gaussians"
-    plain = RenderConfig(shifts_m=(0.0,), video=False)
-    asked = replace(plain, harmonize=HarmonizeConfig(on=True, model=str(run / "model"), steps=2, weather=1.0))
-    physical, kept = (
-        views_of(
-            RenderViews(
-                scene=run / "scene", fused=run / "fuse", model=fitted, edits=edits, out=tmp_path / name, settings=config
-            ).run()
-        )
-        for name, config in (("physical", plain), ("asked", asked))
-    )
+    parts = {"edits": script(tmp_path, "- weather: {fog: {visibility_m: 20}}"), "fused": run / "fuse"}
+    model = {"model": str(run / "model"), "steps": 2, "weather": 1.0}
+    physical = views_of(rendered(run, tmp_path / "physical", **parts))
+    kept = views_of(rendered(run, tmp_path / "asked", **parts, harmonize=model))
     assert "no published-type model" in capsys.readouterr().err
     assert all(torch.equal(one.rgb, before.rgb) for before, one in zip(physical, kept, strict=True))
 
@@ -398,17 +357,16 @@ def test_a_correction_keeps_the_detail_of_the_render() -> None:
     small = torch.nn.functional.interpolate(render_.rgb[None], size=(16, 24), mode="area")[0]
     assert torch.allclose(corrected(render_, small).rgb, render_.rgb, atol=1e-6)
     assert torch.allclose(corrected(render_, small + 0.1).rgb, render_.rgb + 0.1, atol=1e-6)
-    assert torch.allclose(corrected(render_, 1 - render_.rgb).rgb, 1 - render_.rgb, atol=1e-6), (
-        "at the model's own size: what it made"
-    )
+    own_size = 1 - render_.rgb  # what the model made
+    assert torch.allclose(corrected(render_, own_size).rgb, own_size, atol=1e-6)
 
 
 @pytest.mark.slow
 def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Path, unguarded: None) -> None:
     """Its images say which pixels were not recorded; warps leave these out; a fit goes on with the run's own fit."""
     harmonize = HarmonizeConfig(on=True, model=str(run / "model"), steps=1)
-    edits = script(tmp_path, "- remove: {ids: [car]}")
-    out = Edit(source=run, script=edits, out=tmp_path / "edited", settings=EditConfig(harmonize=harmonize)).run()
+    edits, repaired = script(tmp_path, CAR_GONE), EditConfig(harmonize=harmonize)
+    out = Edit(source=run, script=edits, out=tmp_path / "edited", settings=repaired).run()
     plain = Edit(source=run, script=edits, out=tmp_path / "plain", settings=EditConfig()).run()
     scene, other, old = read_scene(out / "scene"), read_scene(plain / "scene"), read_scene(run / "scene")
     differ = 0
@@ -419,35 +377,16 @@ def test_an_edited_run_with_repaired_images_is_fitted_on(run: Path, tmp_path: Pa
         differ += int((image != read_image(other, rendered)).any(-1).sum())
     assert differ > 0
     photos = recorded_images(scene, SynthesizeConfig())
-    assert all(
-        np.array_equal(~p.usable, read_label(scene, f, "rendered"))
-        for p, f in zip(photos, scene.frames_in("train"), strict=True)
-    )
-    config = fit_config(method="street_gaussians", iterations=4, start__gaussians=900, densify__max_gaussians=1500)
-    again = Fit(
-        scene=out / "scene",
-        fused=out / "fuse",
-        start_from=out / "fit" / "street_gaussians",
-        out=tmp_path / "again",
-        settings=config,
-    ).run()
+    for photo, frame in zip(photos, scene.frames_in("train"), strict=True):
+        assert np.array_equal(~photo.usable, read_label(scene, frame, "rendered"))
+    parts = {"start_from": out / FITTED, "settings": fit_config(iterations=4, **FIT)}
+    again = Fit(scene=out / "scene", fused=out / "fuse", out=tmp_path / "again", **parts).run()
     assert "car" not in fit.load_model(again).node_names()
     with pytest.raises(InputError, match="another scene"):
-        Fit(
-            scene=run / "scene",
-            fused=run / "fuse",
-            start_from=out / "fit" / "street_gaussians",
-            out=tmp_path / "wrong",
-            settings=config,
-        ).run()
+        Fit(scene=run / "scene", fused=run / "fuse", out=tmp_path / "wrong", **parts).run()
+    alone = {"source": run / FITTED, "scene": run / "scene", "out": tmp_path / "alone"}
     with pytest.raises(UsageError, match="no images"):
-        Edit(
-            source=run / "fit" / "street_gaussians",
-            script=edits,
-            scene=run / "scene",
-            out=tmp_path / "alone",
-            settings=EditConfig(harmonize=harmonize),
-        ).run()
+        Edit(**alone, script=edits, settings=repaired).run()
 
 
 @pytest.mark.slow
@@ -457,21 +396,14 @@ def test_the_benchmark_compares_ways_of_every_edit(tmp_path: Path) -> None:
     config = BenchConfig(cities="development", count=1, pose_iterations=60, harmonize=True, device="cpu")
     out = bench.run("edit", config, tmp_path / "out")
     rows = {(row["edit"], row["way"]): row for row in store.read_json(out / "bench.json")["diffusion"]["rows"]}
-    ways = ("fit", "+ diffusion", "+ refit")
-    assert rows.keys() == {
-        *((name, way) for name in ("remove", "move 3 m ahead", "insert") for way in ways),
-        ("remove", "never there"),
-    }
-    for name in ("remove", "move 3 m ahead", "insert"):
+    ways, names = ("fit", "+ diffusion", "+ refit"), ("remove", "move 3 m ahead", "insert")
+    assert rows.keys() == {*((name, way) for name in names for way in ways), ("remove", "never there")}
+    for name in names:
         plain, repaired = rows[name, "fit"], rows[name, "+ diffusion"]
         assert repaired["inside"] != plain["inside"]
         assert repaired["outside"] < plain["outside"] + 0.01
-    assert all(
-        np.isfinite(row[name])
-        for key, row in rows.items()
-        if key[0] == "remove"
-        for name in ("inside", "uncovered", "perceptual")
-    )
+    removed = [row for (edit, _), row in rows.items() if edit == "remove"]
+    assert all(np.isfinite(row[name]) for row in removed for name in ("inside", "uncovered", "perceptual"))
     assert rows["remove", "never there"]["uncovered"] not in {rows["remove", way]["uncovered"] for way in ways}
     assert "+ refit" in (out / "bench.md").read_text(encoding="utf-8")
 
@@ -537,25 +469,13 @@ def test_weather_is_generated_by_a_published_type_model(
     """Its points and its reference are in the fog; beside the recorded path the first frame, which is the reference,
     stays as rendered."""
     log.set_quiet(False)
-    edits, fitted = script(tmp_path, "- weather: {fog: {visibility_m: 8}}"), run / "fit" / "street_gaussians"
-
-    def rendered(name: str, **settings: Any) -> dict[str, list[Observation]]:
-        harmonize = (
-            HarmonizeConfig(on=bool(settings), model=published, steps=1, weather=1.0) if settings else HarmonizeConfig()
-        )
-        config = replace(RenderConfig(shifts_m=(0.0, 1.0), video=False), harmonize=harmonize)
-        out = RenderViews(
-            scene=run / "scene",
-            fused=run / "fuse" if settings else None,
-            model=fitted,
-            edits=edits,
-            out=tmp_path / name,
-            settings=config,
-        ).run()
-        return {path: views_of(out, path) for path in ("front_recorded", "front_shift+1.0")}
-
-    before, given = rendered("physical"), watched(monkeypatch)
-    made = rendered("made", on=True)
+    edits, shifts = script(tmp_path, "- weather: {fog: {visibility_m: 8}}"), (0.0, 1.0)
+    paths, model = ("front_recorded", "front_shift+1.0"), {"model": published, "steps": 1, "weather": 1.0}
+    folder = rendered(run, tmp_path / "physical", edits=edits, shifts_m=shifts)
+    before, given = {path: views_of(folder, path) for path in paths}, watched(monkeypatch)
+    parts = {"edits": edits, "fused": run / "fuse", "harmonize": model}
+    folder = rendered(run, tmp_path / "made", **parts, shifts_m=shifts)
+    made = {path: views_of(folder, path) for path in paths}
     assert "formulas alone" not in capsys.readouterr().err
     for path, frames in made.items():
         for number, (one, new) in enumerate(zip(before[path], frames, strict=True)):
@@ -574,43 +494,27 @@ def test_weather_is_generated_by_a_published_type_model(
 def test_views_are_generated_in_weather_by_a_published_type_model(
     run: Path, published: str, tmp_path: Path, monkeypatch
 ) -> None:
-    edits, folders, fitted = (
-        script(tmp_path, "- light: {time: night}"),
-        (run / "scene", run / "fuse"),
-        run / "fit" / "street_gaussians",
-    )
+    edits, fitted = script(tmp_path, "- light: {time: night}"), run / FITTED
     config = SynthesizeConfig(shifts_m=(1.0,), model=published, steps=1, precision="float32")
     given = watched(monkeypatch)
-    Synthesize(scene=folders[0], fused=folders[1], out=tmp_path / "day", settings=config).run()
-    Synthesize(
-        scene=folders[0], fused=folders[1], fitted=fitted, edits=edits, out=tmp_path / "night", settings=config
-    ).run()
+    synthesized(run, tmp_path / "day", config)
+    synthesized(run, tmp_path / "night", config, fitted=fitted, edits=edits)
     day, night = given
     assert float(night.reference.mean()) < 0.6 * float(day.reference.mean())
     assert float(night.color.mean()) < 0.6 * float(day.color.mean())
     assert torch.equal(day.depth, night.depth)
     with pytest.raises(UsageError, match="for weather and light of --edits only"):
-        Synthesize(scene=folders[0], fused=folders[1], fitted=fitted, out=tmp_path / "other", settings=config).run()
+        synthesized(run, tmp_path / "other", config, fitted=fitted)
 
 
 def test_a_removed_car_is_repaired_by_a_published_type_model(
     run: Path, published: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, unguarded: None
 ) -> None:
     """Only what the edit touched changes."""
-    edits, fitted = script(tmp_path, "- remove: {ids: [car]}"), run / "fit" / "street_gaussians"
-    given = watched(monkeypatch)
-
-    def rendered(name: str, harmonize: HarmonizeConfig) -> list[Observation]:
-        config = replace(RenderConfig(shifts_m=(0.0,), video=False), harmonize=harmonize)
-        fused = run / "fuse" if harmonize.on else None
-        return views_of(
-            RenderViews(
-                scene=run / "scene", fused=fused, model=fitted, edits=edits, out=tmp_path / name, settings=config
-            ).run()
-        )
-
-    before = rendered("plain", HarmonizeConfig())
-    made = rendered("made", HarmonizeConfig(on=True, model=published, steps=1))
+    edits, given = script(tmp_path, CAR_GONE), watched(monkeypatch)
+    before = views_of(rendered(run, tmp_path / "plain", edits=edits))
+    parts = {"fused": run / "fuse", "harmonize": {"model": published, "steps": 1}}
+    made = views_of(rendered(run, tmp_path / "made", edits=edits, **parts))
     assert len(given) == 1
     changed = [(a.rgb != b.rgb).any(0) for a, b in zip(before, made, strict=True)]
     assert any(bool(mask.any()) for mask in changed)
@@ -628,15 +532,11 @@ def test_a_removed_car_is_repaired_by_a_published_type_model(
 def test_what_published_type_models_cannot_harmonise_is_refused_first(
     run: Path, published: str, tmp_path: Path, settings, message
 ) -> None:
-    edits, fitted, scene = script(tmp_path, "- remove: {ids: [car]}"), run / "fit" / "street_gaussians", run / "scene"
+    edits, scene = script(tmp_path, CAR_GONE), run / "scene"
     if settings.pop("short", False):
         scene = tmp_path / "scene"
         write_scene(scene, frames=3, cameras=("front",), width=60, height=40)
-    config = RenderConfig(
-        shifts_m=(0.0,), video=False, harmonize=HarmonizeConfig(on=True, model=published, steps=1, **settings)
-    )
+    model = {"model": published, "steps": 1, **settings}
     with pytest.raises(UsageError, match=message):
-        RenderViews(
-            scene=scene, fused=run / "fuse", model=fitted, edits=edits, out=tmp_path / "out", settings=config
-        ).run()
+        rendered(run, tmp_path / "out", scene=scene, fused=run / "fuse", edits=edits, harmonize=model)
     assert not (tmp_path / "out").exists()

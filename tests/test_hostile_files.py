@@ -64,14 +64,8 @@ def test_only_regular_files_are_opened(tmp_path: Path) -> None:
     cases |= {"socket": "a socket"} if (tmp_path / "socket").exists() else {}
     with ends_within(5):
         for name, words in cases.items():
-            for read in (
-                store.read_bytes,
-                store.read_json,
-                store.sha256_file,
-                store.open_file,
-                store.regular,
-                store.read_safetensors,
-            ):
+            texts = (store.read_bytes, store.read_json, store.sha256_file)
+            for read in (*texts, store.open_file, store.regular, store.read_safetensors):
                 with pytest.raises(InputError, match=words) as refused:
                     read(tmp_path / name)
                 assert str(tmp_path / name) in refused.value.where
@@ -129,20 +123,13 @@ def test_no_import_waits_for_a_pipe(kind: str, tmp_path: Path) -> None:
     if kind == "kitti":
         log = kitti_folders.write_raw_drive(tmp_path / "in" / "day")
     else:
-        street = ToyStreet(times=[0.0, 0.1])
-        log = write_custom.write_log(
-            street.write(tmp_path / "street", width=24, height=16, labels=False), tmp_path / "in" / "day"
-        )
-    refused = []
+        street = ToyStreet(times=[0.0, 0.1]).write(tmp_path / "street", width=24, height=16, labels=False)
+        log = write_custom.write_log(street, tmp_path / "in" / "day")
+    refused, settings = [], IngestConfig(format=kind, workers=1, contact_sheet=False)
     for name in replaced_one_by_one(tmp_path / "in"):
         with ends_within(20):
             try:
-                Ingest(
-                    log=log,
-                    out=tmp_path / "out",
-                    overwrite=True,
-                    settings=IngestConfig(format=kind, workers=1, contact_sheet=False),
-                ).run()
+                Ingest(log=log, out=tmp_path / "out", overwrite=True, settings=settings).run()
             except MudgError:
                 refused.append(name)
         shutil.rmtree(tmp_path / "out", ignore_errors=True)
@@ -255,28 +242,10 @@ def test_the_slow_parser_refuses_the_same(name: str, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize(
     ("text", "value"),
     [
-        ("1:30", "1:30"),
-        ("2026-13-45", "2026-13-45"),
-        ("2026-01-02", "2026-01-02"),
-        ("0x10", "0x10"),
-        ("010", "010"),
-        ("0b1", "0b1"),
-        ("-3", -3),
-        ("1_000", 1000),
-        ("0", 0),
-        ("1.5", 1.5),
-        ("-.5", -0.5),
-        ("1.0e-05", 1e-05),
-        ("-.inf", -math.inf),
-        ("'1'", "1"),
-        ("~", None),
-        ("yes", True),
-        ("Off", False),
-        ("a b", "a b"),
-        ("'null'", "null"),
-        ("", None),
-        ("|\n a\n b\n", "a\nb\n"),
-        ("[a, {b: }]", ["a", {"b": None}]),
+        *((text, text) for text in "1:30 2026-13-45 2026-01-02 0x10 010 0b1".split()),
+        *(("-3", -3), ("1_000", 1000), ("0", 0), ("1.5", 1.5), ("-.5", -0.5), ("1.0e-05", 1e-05)),
+        *(("-.inf", -math.inf), ("'1'", "1"), ("~", None), ("yes", True), ("Off", False), ("a b", "a b")),
+        *(("'null'", "null"), ("", None), ("|\n a\n b\n", "a\nb\n"), ("[a, {b: }]", ["a", {"b": None}])),
     ],
 )
 def test_plain_values_are_read(text: str, value: object) -> None:
@@ -287,10 +256,7 @@ def test_plain_values_are_read(text: str, value: object) -> None:
 
 def test_plain_yaml_with_aliases_is_read() -> None:
     deep = "a: " + "[" * (DEEPEST - 1) + "]" * (DEEPEST - 1)
-    assert parse_yaml("a: &x {b: [1, 2]}\nc: *x\nd: {<<: *x, e: 3}", "here") == {
-        "a": {"b": [1, 2]},
-        "c": {"b": [1, 2]},
-        "d": {"b": [1, 2], "e": 3},
-    }
+    given, value = "a: &x {b: [1, 2]}\nc: *x\nd: {<<: *x, e: 3}", {"b": [1, 2]}
+    assert parse_yaml(given, "here") == {"a": value, "c": value, "d": {**value, "e": 3}}
     assert parse_yaml(deep, "here")
     assert parse_yaml("", "here") is None

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import itertools
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import kitti_folders
 import pytest
 import torch
 import toy_views
 from fit_settings import fit_config
+from tiny_networks import small_mdm
 from toy_clips import tiny, write_clips
 from toy_published import TINY, tiny_checkpoint
 from toy_scene import ToyStreet
@@ -30,7 +30,7 @@ from mudg.city.config import CityConfig
 from mudg.core import trajectory
 from mudg.diffusion import convert
 from mudg.diffusion import model_files as files
-from mudg.diffusion.model import MDM, MDMConfig
+from mudg.diffusion.model import MDM
 from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
 from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.fleet.listed import run_listed
@@ -38,7 +38,6 @@ from mudg.fleet.plan import Entry
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
 from mudg.labels.settings import AnnotateConfig
-from mudg.networks.codec import CodecConfig
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import write_zip
@@ -51,78 +50,43 @@ from mudg.steps.run import Run
 from mudg.steps.settings import RunConfig
 from mudg.steps.synthesize import Learn, Synthesize
 
-SMALL = MDMConfig(
-    widths=(16, 32),
-    blocks=(1, 1),
-    spatial_attention=(False, True),
-    temporal_attention=(False, True),
-    window=4,
-    embed_width=16,
-    codec=CodecConfig(decoder_width=8, decoder_blocks=1),
-    patch=2,
-    refine_widths=(8, 16),
-    refine_blocks=(1, 1),
-    area_px=24576,
-    renders=True,
-)
 CITY = CityConfig(seed=3, n_frames=3, width=48, height=32, cameras=("front",), lidar_beams=8, lidar_azimuth_step_deg=4)
 
 
-@dataclass(frozen=True)
-class Verb:
-    """One verb: ``call(given, out, variant, overwrite)``, with the inputs by name; variants 1 and 2 differ in the
-    settings."""
-
-    call: Callable[[dict[str, Path], Path, int, bool], Any]
-    inputs: tuple[str, ...]
+Given = dict[str, Path]
 
 
-def _ingest(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
+def _ingest(g: Given, v: int) -> Any:
     config = IngestConfig(test_every=v + 1, poses=str(g.get("poses", "")), workers=1, contact_sheet=False)
-    return Ingest(log=g["log"], out=out, overwrite=o, settings=config).run()
+    return partial(Ingest, log=g["log"], settings=config)
 
 
-def _annotate(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
+def _annotate(g: Given, v: int) -> Any:
     config = AnnotateConfig(labeller="geometry", sweeps=v, processes=1, weights=str(g.get("weights", "")))
-    return Annotate(scene=g["plain scene"], out=out, overwrite=o, settings=config).run()
+    return partial(Annotate, scene=g["plain scene"], settings=config)
 
 
-def _synthesize(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
-    config = SynthesizeConfig(
-        cameras=("front",),
-        shifts_m=(1.0, -1.0),
-        model=str(g["model"]),
-        steps=v,
-        width_px=48,
-        full_size=False,
-        precision="float32",
-        processes=1,
-    )
-    return Synthesize(
-        scene=g["scene"], fused=g["fused"], fitted=g["fitted"], out=out, overwrite=o, settings=config
-    ).run()
+def _synthesize(g: Given, v: int) -> Any:
+    size = {"width_px": 48, "full_size": False, "precision": "float32", "processes": 1}
+    config = SynthesizeConfig(cameras=("front",), shifts_m=(1.0, -1.0), model=str(g["model"]), steps=v, **size)
+    return partial(Synthesize, scene=g["scene"], fused=g["fused"], fitted=g["fitted"], settings=config)
 
 
-def _fit(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
+def _fit(g: Given, v: int) -> Any:
     config = fit_config(
         method="mudg_s", iterations=6, seed=v, start__gaussians=200, checkpoint_every=2, preview_every=3
     )
-    return Fit(
-        scene=g["scene"], fused=g["fused"], observations=(g["views"],), out=out, overwrite=o, settings=config
-    ).run()
+    return partial(Fit, scene=g["scene"], fused=g["fused"], observations=(g["views"],), settings=config)
 
 
-def _score(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
+def _score(g: Given, v: int) -> Any:
     config = ScoreConfig(width_px=24 * v, perceptual_views=0)
-    return Score(
-        scene=g["scene"], fused=g["fused"], views={"a": g["views"]}, truth=None, out=out, overwrite=o, settings=config
-    ).run()
+    return partial(Score, scene=g["scene"], fused=g["fused"], views={"a": g["views"]}, truth=None, settings=config)
 
 
-def _bench(g: dict[str, Path], out: Path, v: int, o: bool) -> Any:
-    return bench.run(
-        "mdm", BenchConfig(model=str(g["model"]), seed=v, precision="float32", threads=1), out, overwrite=o
-    )
+def _film(g: Given, v: int) -> Any:
+    views = {"truth": (g["views"],), **({"b": (g["views"],)} if v == 2 else {})}
+    return partial(chain.Film, views=views, paths=_paths(g["scene"], 1))
 
 
 def _paths(scene: Path, v: int) -> tuple[Any, ...]:
@@ -130,67 +94,53 @@ def _paths(scene: Path, v: int) -> tuple[Any, ...]:
     return trajectory.recorded(loaded, "front"), trajectory.shifted(loaded, "front", float(v))
 
 
-VERBS: dict[str, Verb] = {
-    "ingest a log": Verb(_ingest, ("log", "poses")),
-    "ingest a scene": Verb(lambda g, *rest: _ingest({"log": g["scene"]}, *rest), ("scene",)),
-    "ingest a zip": Verb(lambda g, *rest: _ingest({"log": g["zip"]}, *rest), ("zip",)),
-    "annotate": Verb(_annotate, ("plain scene", "weights")),
-    "fuse": Verb(
-        lambda g, out, v, o: Fuse(scene=g["scene"], out=out, overwrite=o, settings=FuseConfig(voxel_m=0.1 * v)).run(),
-        ("scene",),
-    ),
-    "learn": Verb(
-        lambda g, out, v, o: Learn(out=out, overwrite=o, settings=tiny(g["clips"], seed=v)).run(), ("clips",)
-    ),
-    "synthesize": Verb(_synthesize, ("scene", "fused", "model", "fitted")),
-    "fit": Verb(_fit, ("scene", "fused", "views")),
-    "render": Verb(
-        lambda g, out, v, o: RenderViews(
-            scene=g["scene"], model=g["fitted"], out=out, overwrite=o, settings=RenderConfig(shifts_m=(0.0, v))
-        ).run(),
+STEPS: dict[str, tuple[tuple[str, ...], Callable[[Given, int], Any]]] = {
+    "ingest a log": (("log", "poses"), _ingest),
+    "ingest a scene": (("scene",), lambda g, v: _ingest({"log": g["scene"]}, v)),
+    "ingest a zip": (("zip",), lambda g, v: _ingest({"log": g["zip"]}, v)),
+    "annotate": (("plain scene", "weights"), _annotate),
+    "fuse": (("scene",), lambda g, v: partial(Fuse, scene=g["scene"], settings=FuseConfig(voxel_m=0.1 * v))),
+    "learn": (("clips",), lambda g, v: partial(Learn, settings=tiny(g["clips"], seed=v))),
+    "synthesize": (("scene", "fused", "model", "fitted"), _synthesize),
+    "fit": (("scene", "fused", "views"), _fit),
+    "render": (
         ("scene", "fitted"),
+        lambda g, v: partial(
+            RenderViews, scene=g["scene"], model=g["fitted"], settings=RenderConfig(shifts_m=(0.0, v))
+        ),
     ),
-    "score": Verb(_score, ("scene", "views", "fused")),
-    "truth": Verb(
-        lambda g, out, v, o: DrawTruth(scene=g["city"], trajectories=_paths(g["city"], v), out=out, overwrite=o).run(),
-        ("city",),
-    ),
-    "film": Verb(
-        lambda g, out, v, o: chain.Film(
-            views={"truth": (g["views"],), **({"b": (g["views"],)} if v == 2 else {})},
-            paths=_paths(g["scene"], 1),
-            out=out,
-            overwrite=o,
-        ).run(),
-        ("views",),
-    ),
-    "fill": Verb(
-        lambda g, out, v, o: chain.FillViews(
-            scene=g["scene"], fused=g["fused"], paths=_paths(g["scene"], v), out=out, overwrite=o
-        ).run(),
+    "score": (("scene", "views", "fused"), _score),
+    "truth": (("city",), lambda g, v: partial(DrawTruth, scene=g["city"], trajectories=_paths(g["city"], v))),
+    "film": (("views",), _film),
+    "fill": (
         ("scene", "fused"),
+        lambda g, v: partial(chain.FillViews, scene=g["scene"], fused=g["fused"], paths=_paths(g["scene"], v)),
     ),
-    "exact": Verb(
-        lambda g, out, v, o: chain.ExactViews(
-            truth=g["views"], paths=_paths(g["scene"], 1)[: 3 - v], out=out, overwrite=o
-        ).run(),
+    "exact": (
         ("views",),
+        lambda g, v: partial(chain.ExactViews, truth=g["views"], paths=_paths(g["scene"], 1)[: 3 - v]),
     ),
-    "bench": Verb(_bench, ("model",)),
 }
+"""Verb -> its inputs by name, and the step from these in variants 1 and 2, which differ in the settings."""
+VERBS: Final = {**{name: inputs for name, (inputs, _) in STEPS.items()}, "bench": ("model",)}
+
+
+def call(name: str, given: Given, out: Path, variant: int, overwrite: bool) -> None:
+    if name == "bench":
+        config = BenchConfig(model=str(given["model"]), seed=variant, precision="float32", threads=1)
+        bench.run("mdm", config, out, overwrite=overwrite)
+    else:
+        STEPS[name][1](given, variant)(out=out, overwrite=overwrite).run()
 
 
 @pytest.fixture(scope="module")
-def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+def world(tmp_path_factory: pytest.TempPathFactory) -> Given:
     """One input of every kind, small."""
     root = tmp_path_factory.mktemp("world")
+    ToyStreet(times=[0.0, 0.1]).write(root / "plain", width=60, height=40, labels=False)
     given = {
         "scene": toy_views.write_scene(root / "scene", lidar=True),
         "zip": write_zip(root / "scene", root / "scene.zip"),
-    }
-    street = ToyStreet(times=[0.0, 0.1])
-    street.write(root / "plain", width=60, height=40, labels=False)
-    given |= {
         "plain scene": root / "plain",
         "log": kitti_folders.write_raw_drive(root / "day"),
         "clips": write_clips(root / "clips"),
@@ -200,11 +150,10 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     config = fit_config(method="street_gaussians", iterations=2, start__gaussians=200)
     given["fitted"] = Fit(scene=given["scene"], fused=given["fused"], out=root / "fitted", settings=config).run()
     torch.manual_seed(0)
-    files.save(MDM(SMALL), root / "model", "", {})
+    files.save(MDM(small_mdm(renders=True)), root / "model", "", {})
     given["model"] = root / "model"
-    given["city"] = Ingest(
-        log=ingest.CITY, out=root / "city", settings=IngestConfig(city=CITY, contact_sheet=False)
-    ).run()
+    settings = IngestConfig(city=CITY, contact_sheet=False)
+    given["city"] = Ingest(log=ingest.CITY, out=root / "city", settings=settings).run()
     return given
 
 
@@ -213,7 +162,7 @@ def tree(root: Path) -> dict[str, int]:
     return {p.relative_to(root).as_posix(): p.lstat().st_mtime_ns for p in sorted(root.rglob("*")) if p.is_file()}
 
 
-def copied(world: dict[str, Path], names: tuple[str, ...], root: Path) -> dict[str, Path]:
+def copied(world: Given, names: tuple[str, ...], root: Path) -> dict[str, Path]:
     """Copies of some inputs, each in a folder of its own; made-up files for those that the world lacks."""
     given = {}
     for name in names:
@@ -234,8 +183,8 @@ def copied(world: dict[str, Path], names: tuple[str, ...], root: Path) -> dict[s
 
 
 @pytest.mark.parametrize("name", VERBS)
-def test_an_output_that_touches_an_input_is_refused(name: str, world: dict[str, Path], tmp_path: Path) -> None:
-    touched = copied(world, VERBS[name].inputs, tmp_path / "in")
+def test_an_output_that_touches_an_input_is_refused(name: str, world: Given, tmp_path: Path) -> None:
+    touched = copied(world, VERBS[name], tmp_path / "in")
     given = {**world, **touched}
     (tmp_path / "link").symlink_to("in")
     before = tree(tmp_path)
@@ -245,13 +194,13 @@ def test_an_output_that_touches_an_input_is_refused(name: str, world: dict[str, 
         places += [path / "inside", through_link / "deep" / "inside"] if path.is_dir() else []
         for out, overwrite in zip((path, *places), itertools.cycle((False, True))):
             with pytest.raises(UsageError, match="an input") as refused:
-                VERBS[name].call(given, out, 1, overwrite)
+                call(name, given, out, 1, overwrite)
             assert str(out) in refused.value.where
             assert str(path) in refused.value.got or out == tmp_path / "in"
     assert tree(tmp_path) == before
 
 
-def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, Path], tmp_path: Path) -> None:
+def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: Given, tmp_path: Path) -> None:
     given = copied(world, ("scene", "plain scene"), tmp_path / "in")
     scenes = tmp_path / "scenes"
     for name, path in zip(("a", "b"), given.values(), strict=True):
@@ -278,7 +227,7 @@ def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: dict[str, 
     assert (tmp_path / "status.json").read_text() == "scenes/a\n"
 
 
-def test_files_of_a_log_that_lie_beside_it_count(world: dict[str, Path], tmp_path: Path) -> None:
+def test_files_of_a_log_that_lie_beside_it_count(world: Given, tmp_path: Path) -> None:
     shutil.copytree(world["log"].parent, tmp_path / "day")
     drive, calibration = tmp_path / "day" / world["log"].name, tmp_path / "day" / "calib_cam_to_cam.txt"
     assert calibration.is_file()
@@ -286,9 +235,7 @@ def test_files_of_a_log_that_lie_beside_it_count(world: dict[str, Path], tmp_pat
         Ingest(log=drive, out=calibration, overwrite=True, settings=IngestConfig()).run()
 
 
-def test_clips_of_a_training_lie_in_its_folder_only_where_they_do_by_default(
-    world: dict[str, Path], tmp_path: Path
-) -> None:
+def test_clips_of_a_training_lie_in_its_folder_only_where_they_do_by_default(world: Given, tmp_path: Path) -> None:
     out = tmp_path / "out"
     shutil.copytree(world["clips"], out / "clips")
     for clips in (out, out / "steps", tmp_path, out / "clips" / "deep"):
@@ -302,7 +249,7 @@ def test_clips_of_a_training_lie_in_its_folder_only_where_they_do_by_default(
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
-def test_the_chain_never_writes_into_its_log(world: dict[str, Path], tmp_path: Path, overwrite: bool) -> None:
+def test_the_chain_never_writes_into_its_log(world: Given, tmp_path: Path, overwrite: bool) -> None:
     given = copied(world, ("log", "scene", "zip"), tmp_path)
     before = tree(tmp_path)
     for path in given.values():
@@ -316,7 +263,7 @@ def test_the_chain_never_writes_into_its_log(world: dict[str, Path], tmp_path: P
 
 
 def test_the_chain_takes_the_scene_in_its_own_folder_and_leaves_it_alone(
-    world: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    world: Given, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
     shutil.copytree(world["scene"], out / "scene")
@@ -341,7 +288,7 @@ def test_the_chain_takes_the_scene_in_its_own_folder_and_leaves_it_alone(
         Run(source=out / "scene", out=out / "scene", overwrite=True, settings=RunConfig()).run()
 
 
-def test_the_chain_does_not_take_the_folder_of_a_verb_for_its_own(world: dict[str, Path], tmp_path: Path) -> None:
+def test_the_chain_does_not_take_the_folder_of_a_verb_for_its_own(world: Given, tmp_path: Path) -> None:
     folder = copied(world, ("fused",), tmp_path)["fused"]
     before = tree(tmp_path)
     for overwrite in (False, True):
@@ -413,31 +360,26 @@ def quick_bench(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.usefixtures("quick_bench")
 @pytest.mark.parametrize("name", VERBS)
 def test_an_interrupted_replacement_keeps_the_old_result_and_continues(
-    name: str,
-    world: dict[str, Path],
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+    name: str, world: Given, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = {key: path for key, path in world.items() if key not in ("poses", "weights")}
-    call, out = VERBS[name].call, tmp_path / "out"
+    made_by, out = partial(call, name, world), tmp_path / "out"
     with counted_writes(monkeypatch) as written:
-        call(given, tmp_path / "whole", 2, False)
+        made_by(tmp_path / "whole", 2, False)
     total = len(written)
-    call(given, out, 1, False)
+    made_by(out, 1, False)
     made = {n for n in tree(out) if n not in ("run.json", "log.jsonl", "manifest.json")}
     assert set(listed(out)) == made, "a file is missing among the names that the verb declares"
     (out / "mine.md").write_text("mine")
     before = tree(out)
     with pytest.raises(UsageError, match="another configuration"):
-        call(given, out, 2, False)
+        made_by(out, 2, False)
     with counted_writes(monkeypatch, stop_at=max(4, total // 2)), pytest.raises(KeyboardInterrupt):
-        call(given, out, 2, True)
+        made_by(out, 2, True)
     assert tree(out) == before
     store.verify_manifest(out)
-    call(given, out, 1, False)  # reused as ever
+    made_by(out, 1, False)  # reused as ever
     assert tree(out) == before
-    call(given, out, 2, True)
+    made_by(out, 2, True)
     assert "mine.md" in capsys.readouterr().err
     assert (out / "mine.md").read_text() == "mine"
     store.verify_manifest(out)
@@ -447,22 +389,21 @@ def test_an_interrupted_replacement_keeps_the_old_result_and_continues(
     assert not differing
     assert sorted(p.name for p in tmp_path.iterdir()) == ["out", "whole"]
     assert not [p for p in out.rglob("*") if p.is_file() and b".new.part" in p.read_bytes()]
-    call(given, out, 2, True)  # finished: reused
+    made_by(out, 2, True)  # finished: reused
 
 
-def test_a_failed_import_over_another_scene_leaves_that(world: dict[str, Path], tmp_path: Path) -> None:
+def test_a_failed_import_over_another_scene_leaves_that(world: Given, tmp_path: Path) -> None:
     out = Ingest(log=world["log"], out=tmp_path / "out", settings=IngestConfig(test_every=2, contact_sheet=False)).run()
     before = tree(out)
+    settings = IngestConfig(cameras=("frnt",), contact_sheet=False)
     with pytest.raises(UsageError, match="no such camera"):
-        Ingest(
-            log=world["log"], out=out, overwrite=True, settings=IngestConfig(cameras=("frnt",), contact_sheet=False)
-        ).run()
+        Ingest(log=world["log"], out=out, overwrite=True, settings=settings).run()
     assert tree(tmp_path / "out") == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
 
 
 def test_a_user_file_in_the_folder_of_a_failing_import_stays(
-    world: dict[str, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    world: Given, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
 
@@ -483,7 +424,7 @@ def test_a_model_is_replaced_by_a_whole_one_and_other_files_stay(
 
     def converted(dtype: str, *, overwrite: bool) -> Path:
         config = ConvertConfig(dtype=dtype, resolution="320x512")
-        work = functools.partial(convert.of_diffusion, config, tmp_path / "512.ckpt", network=TINY)
+        work = partial(convert.of_diffusion, config, tmp_path / "512.ckpt", network=TINY)
         return convert.run(config, tmp_path / "512.ckpt", tmp_path / "to", work, overwrite=overwrite)
 
     monkeypatch.setattr(convert.processes, "run_limited", lambda work, *_: work() or 0)

@@ -96,12 +96,9 @@ def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_
     other = replace(paper, fit=weights, synthesize=replace(paper.synthesize, model="embedded"))
     with pytest.raises(UsageError, match="published-type models only"):
         Run(source="city", out=out, settings=other).run()
+    without = replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path / "none")))
     with pytest.raises(InputError, match="no diffusion model here"):
-        Run(
-            source="city",
-            out=out,
-            settings=replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path / "none"))),
-        ).run()
+        Run(source="city", out=out, settings=without).run()
     with pytest.raises(UsageError, match="LPIPS needs a weight file"):
         mudg.run("city", out=out, preset="paper", synthesize={"model": "embedded"})
     assert not out.exists()

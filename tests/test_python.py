@@ -86,16 +86,13 @@ def test_verbs_check_settings_as_the_command_does(notebook: dict[str, Any], tmp_
 
 
 def test_what_a_notebook_gets_wrong_is_refused_in_words(notebook: dict[str, Any], tmp_path: Path) -> None:
-    scene, view = notebook["folder"] / "scene", notebook["view"]
+    scene, view, weight = notebook["folder"] / "scene", notebook["view"], {"loss.ssim_weight": 0.1}
     for said, wrong in (
         ("--views", lambda: mudg.score(scene, ["views"], out=tmp_path / "a")),
         ("--shifts-m", lambda: mudg.run("city", out=tmp_path / "a", shifts_m=2.0)),
         ("--cameras", lambda: mudg.run("city", out=tmp_path / "a", cameras="front")),
         ("--seed", lambda: mudg.run("city", out=tmp_path / "a", seed="x")),
-        (
-            r"loss: \{ssim_weight: \.\.\.\}",
-            lambda: mudg.fit(scene, scene, out=tmp_path / "a", **{"loss.ssim_weight": 0.1}),
-        ),
+        (r"loss: \{ssim_weight: \.\.\.\}", lambda: mudg.fit(scene, scene, out=tmp_path / "a", **weight)),
         (r"not a mudg\.Camera", lambda: notebook["fitted"].render("front", view.world_from_cam, view.time_s)),
     ):
         with pytest.raises(UsageError, match=said):

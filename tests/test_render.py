@@ -41,12 +41,8 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 @pytest.fixture(scope="module")
 def rendered(world, tmp_path_factory) -> Path:
-    return RenderViews(
-        scene=world["scene"],
-        model=world["model"],
-        out=tmp_path_factory.mktemp("r") / "out",
-        settings=RenderConfig(shifts_m=SHIFTS),
-    ).run()
+    settings = RenderConfig(shifts_m=SHIFTS)
+    return RenderViews(**world, out=tmp_path_factory.mktemp("r") / "out", settings=settings).run()
 
 
 def test_one_folder_and_video_per_trajectory(rendered):
@@ -73,10 +69,8 @@ def test_observations_hold_all_modalities(rendered):
 
 
 def test_views_lie_where_the_trajectory_says(rendered):
-    recorded, left = (
-        read_observations(rendered / "front_recorded").views,
-        read_observations(rendered / "front_shift+2.0").views,
-    )
+    names = ("front_recorded", "front_shift+2.0")
+    recorded, left = (read_observations(rendered / name).views for name in names)
     for a, b in zip(recorded, left):
         assert np.linalg.norm(b.center_world - a.center_world) == pytest.approx(2.0, abs=1e-9)
         assert b.time_s == a.time_s
@@ -84,7 +78,7 @@ def test_views_lie_where_the_trajectory_says(rendered):
 
 def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_path, monkeypatch):
     config = RenderConfig(shifts_m=(0.0, 2.0), video=False)
-    whole = RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "whole", settings=config).run()
+    whole = RenderViews(**world, out=tmp_path / "whole", settings=config).run()
     real, calls, numbers = render.render_view, [], itertools.count(1)
 
     def stop_at_third(*arguments):  # threads call
@@ -96,31 +90,26 @@ def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_
 
     monkeypatch.setattr(render, "render_view", stop_at_third)
     with pytest.raises(KeyboardInterrupt):
-        RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "parts", settings=config).run()
+        RenderViews(**world, out=tmp_path / "parts", settings=config).run()
     kept = len(list((tmp_path / "parts").rglob("*.safetensors")))
     assert kept == 2
     calls.clear()
-    parts = RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "parts", settings=config).run()
+    parts = RenderViews(**world, out=tmp_path / "parts", settings=config).run()
     assert len(calls) == 2 * FRAMES - kept
     for name in ("front_recorded", "front_shift+2.0"):
         first, second = read_observations(whole / name), read_observations(parts / name)
         for index in range(FRAMES):
             for field in ("rgb", "depth", "semantics", "confidence"):
-                assert torch.equal(*(torch.nan_to_num(getattr(o[index], field)) for o in (first, second))), (
-                    name,
-                    index,
-                    field,
-                )
+                one, other = (torch.nan_to_num(getattr(seen[index], field)) for seen in (first, second))
+                assert torch.equal(one, other), (name, index, field)
     calls.clear()
-    assert (
-        RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "parts", settings=config).run() == parts
-    )
+    assert RenderViews(**world, out=tmp_path / "parts", settings=config).run() == parts
     assert not calls
 
 
 def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
     config = RenderConfig(shifts_m=(0.0,), remove_tracks=("car",), video=False)
-    folder = RenderViews(scene=world["scene"], model=world["model"], out=tmp_path / "out", settings=config).run()
+    folder = RenderViews(**world, out=tmp_path / "out", settings=config).run()
     seen = read_observations(folder / "front_recorded")[1]
     with_car = fit.render_view(fit.load_model(world["model"]), seen.view, RasterConfig())
     uv, _ = geometry.project(seen.view, (car_pose(seen.view.time_s)[:3, 3] - [0, 0, CAR_SIZE[2] / 4])[None])
@@ -128,12 +117,7 @@ def test_removing_the_car_shows_what_is_behind_it(world, tmp_path):
     assert with_car.semantics[row, column] == ID["car"]
     assert seen.semantics[row, column] != ID["car"]
     with pytest.raises(UsageError, match="no dynamic object 'tram'"):
-        RenderViews(
-            scene=world["scene"],
-            model=world["model"],
-            out=tmp_path / "other",
-            settings=RenderConfig(remove_tracks=("tram",)),
-        ).run()
+        RenderViews(**world, out=tmp_path / "other", settings=RenderConfig(remove_tracks=("tram",))).run()
 
 
 def test_any_camera_any_width(world):

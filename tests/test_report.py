@@ -29,7 +29,6 @@ from mudg.editing.script import read_edits
 from mudg.editing.settings import ScoreConfig
 from mudg.steps.render import Score
 from mudg.viewer import report
-from mudg.viewer import report as report_page
 
 
 def dark(share: float) -> Any:
@@ -52,11 +51,8 @@ def finished_run(out: Path) -> Path:
     methods = {"street_gaussians": plain, "mudg_r": virtual, "mudg_s": guided}
     Score(scene=scene, views=methods, out=out / "score", settings=ScoreConfig(perceptual_views=1)).run()
     steps = {"ingest": {"state": "complete", "seconds": 1.5}, "score": {"state": "complete", "seconds": 3.0}}
-    ledger = {
-        "asked": {"source": "<toy> & co"},
-        "steps": steps,
-        "environment": {"mudg": "0", "packages": {"torch": "2"}},
-    }
+    environment = {"mudg": "0", "packages": {"torch": "2"}}
+    ledger = {"asked": {"source": "<toy> & co"}, "steps": steps, "environment": environment}
     store.write_json(out / "run.json", ledger)
     store.write_text(out / "run.yaml", "fit:\n  iterations: 3 # <script>alert(1)</script>\n")
     return out
@@ -178,10 +174,9 @@ def test_names_from_a_scene_cannot_become_tags(tmp_path: Path) -> None:
     spoilt = renamed(scores)
     spoilt["scene"] |= {"id": EVIL, "dataset": EVIL, "licence": EVIL, "notes": [EVIL]}
     spoilt["methods"][0]["title"] = spoilt["metrics"][0]["title"] = spoilt["metrics"][0]["unit"] = EVIL
-    video = report_page.TrajectoryVideo(
-        EVIL, EVIL, 2.0, 8, 8, 1, {EVIL: ("rgb",)}, "data:video/mp4;base64,AA==", "data:image/jpeg;base64,AA=="
-    )
-    page = report_page.page(spoilt, {"steps": {EVIL: {"seconds": 1.0}}}, EVIL, [video], [EVIL])
+    content = ("data:video/mp4;base64,AA==", "data:image/jpeg;base64,AA==")
+    video = report.TrajectoryVideo(EVIL, EVIL, 2.0, 8, 8, 1, {EVIL: ("rgb",)}, *content)
+    page = report.page(spoilt, {"steps": {EVIL: {"seconds": 1.0}}}, EVIL, [video], [EVIL])
     outline(page)
     assert "<script>alert" not in page and page.count("alert(1)") > 10
     data = re.search(r'<script type="application/json" id="player-data">(.*?)</script>', page, re.S)
@@ -247,30 +242,23 @@ def test_a_shifted_view_of_a_log_shows_the_recorded_path_beside_it(tmp_path: Pat
 
 
 def run_of(psnr: dict[tuple[str, float], float | str], truth: str = "exact") -> dict[str, Any]:
-    rows = [
-        {
-            "method": m,
-            "distance_m": d,
-            "sides": "both" if d else "recorded",
-            "values": {"psnr": v, "abs_rel": "no truth", "miou": "no truth"},
-        }
-        for (m, d), v in psnr.items()
-    ]
+    rows, missing = [], {"abs_rel": "no truth", "miou": "no truth"}
+    for (method, distance_m), value in psnr.items():
+        sides = "both" if distance_m else "recorded"
+        rows.append({"method": method, "distance_m": distance_m, "sides": sides, "values": {"psnr": value, **missing}})
     return {"by_distance": rows, "truth": truth, "scene": {"id": "toy", "held_out": 1}}
 
 
 def test_headline_says_what_the_numbers_say() -> None:
-    both = ("street_gaussians", "mudg_s")
-    gain = run_of({(both[0], 4.0): 15.0, (both[1], 4.0): 17.0, (both[0], 2.0): 16.0, (both[1], 2.0): 16.0})
-    assert report_page.headline(gain)[0] == "4 m off the recorded path, diffusion adds 2.0 dB"
-    loss = run_of({(both[0], 3.0): 15.0, (both[1], 3.0): 14.5})
-    assert report_page.headline(loss)[0] == "3 m off the recorded path, diffusion costs 0.5 dB"
-    same = run_of({(both[0], 3.0): 15.0, (both[1], 3.0): 15.01})
-    assert "no difference" in report_page.headline(same)[0]
-    recorded = run_of(
-        {(both[0], 0.0): 20.0, (both[1], 0.0): 21.0, (both[0], 2.0): "no truth", (both[1], 2.0): "no truth"}, "recorded"
-    )
-    title, words = report_page.headline(recorded)
+    def at(*pairs: tuple[float, float | str, float | str], truth: str = "exact") -> tuple[str, str]:
+        """Of distances with the numbers without and with diffusion."""
+        names = ("street_gaussians", "mudg_s")
+        return report.headline(run_of({(n, d): v for d, *two in pairs for n, v in zip(names, two)}, truth))
+
+    assert at((4.0, 15.0, 17.0), (2.0, 16.0, 16.0))[0] == "4 m off the recorded path, diffusion adds 2.0 dB"
+    assert at((3.0, 15.0, 14.5))[0] == "3 m off the recorded path, diffusion costs 0.5 dB"
+    assert "no difference" in at((3.0, 15.0, 15.01))[0]
+    title, words = at((0.0, 20.0, 21.0), (2.0, "no truth", "no truth"), truth="recorded")
     assert title == "toy: views off the recorded path"
     assert "21.0 dB with diffusion and 20.0 dB without" in words
 
@@ -279,7 +267,7 @@ def test_headline_says_what_the_numbers_say() -> None:
     ("low", "high"), [(9.5, 19.3), (0.03, 0.07), (1.0, 1.0), (0.0, 0.0), (12.1, 12.3), (-5.0, 3.0)]
 )
 def test_axis_ticks_enclose_the_values(low: float, high: float) -> None:
-    ticks = report_page.axis_ticks(low, high)
+    ticks = report.axis_ticks(low, high)
     assert ticks[0] <= low + 1e-9
     assert ticks[-1] >= high - 1e-9
     assert 3 <= len(ticks) <= 7
@@ -317,11 +305,8 @@ def test_a_chart_names_the_sides_that_it_shows(shifts_m: tuple[float, ...], left
         "trajectories": [{"name": str(s), "shift_m": s} for s in shifts_m],
         "results": [{"method": "a", "trajectory": str(s), "values": {"psnr": 20.0 + s}} for s in shifts_m],
     }
-    figure = report_page._chart(scores, {"name": "psnr", "title": "PSNR", "unit": "dB", "better": "higher"})
-    drawn = (
-        report_html._environment()
-        .from_string('{% from "macros.html.j2" import chart %}{{ chart(figure) }}')
-        .render(figure=figure)
-    )
+    figure = report._chart(scores, {"name": "psnr", "title": "PSNR", "unit": "dB", "better": "higher"})
+    template = report_html._environment().from_string('{% from "macros.html.j2" import chart %}{{ chart(figure) }}')
+    drawn = template.render(figure=figure)
     words = re.findall(r"<text [^>]*>(left|right, m|m)</text>", drawn)
     assert words == [word for word in (left, right) if word]

@@ -74,8 +74,15 @@ CHAIN = [
 ]
 
 
+USUAL = RunConfig()
+
+
+def chain(folder: Path, settings: RunConfig = USUAL, **more: Any) -> dict[str, Any]:
+    return Run(source="city", out=folder / "out", settings=settings, **more).run()
+
+
 def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    result = Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+    result = chain(tmp_path)
     assert verbs["calls"] == CHAIN
     assert result["report"] == tmp_path / "out" / "report.html"
     assert list(result["seconds"])[-1] == "report"
@@ -91,25 +98,20 @@ def test_the_whole_chain_in_order(tmp_path: Path, verbs: dict[str, Any]) -> None
     ledger = store.read_json(tmp_path / "out" / "run.json")
     assert ledger["state"] == "complete"
     assert all(step["state"] == "complete" for step in ledger["steps"].values())
-    files = [
-        path for path in (tmp_path / "out").rglob("*") if path.is_file() and path.name not in ("run.json", "run.yaml")
-    ]
-    assert (
-        sum(step["written_bytes"] for step in ledger["steps"].values())
-        == sum(path.stat().st_size for path in files)
-        > 0
-    )
+    sizes = {path: path.stat().st_size for path in (tmp_path / "out").rglob("*") if path.is_file()}
+    steps = sum(size for path, size in sizes.items() if path.name not in ("run.json", "run.yaml"))
+    assert sum(step["written_bytes"] for step in ledger["steps"].values()) == steps > 0
 
 
 def test_a_forecast_is_said_before_the_first_long_step(
     tmp_path: Path, verbs: dict[str, Any], capsys: pytest.CaptureFixture[str]
 ) -> None:
     log.set_quiet(False)
-    Run(source="city", out=tmp_path / "out", settings=run_preset("fast")).run()
+    chain(tmp_path, run_preset("fast"))
     said = capsys.readouterr().err
     assert said.index("== ingest") < said.index("forecast of scene") < said.index("== fuse")
     assert verbs["ingest"].settings.resolution == "", "a city has a size of its own"
-    Run(source="city", out=tmp_path / "out", settings=run_preset("fast")).run()
+    chain(tmp_path, run_preset("fast"))
     assert "forecast" not in capsys.readouterr().err
     (tmp_path / "log").mkdir()
     Run(source=tmp_path / "log", out=tmp_path / "other", settings=run_preset("fast")).run()
@@ -121,10 +123,8 @@ def test_two_runs_in_one_folder_at_a_time(
 ) -> None:
     out = tmp_path / "out"
     Run(source="city", out=out, settings=RunConfig()).run()
-    record, sleeper = (
-        (out / "run.json").read_bytes(),
-        subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE),
-    )
+    record = (out / "run.json").read_bytes()
+    sleeper = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     try:
         store.write_json(out / "lock", {"pid": sleeper.pid, "host": socket.gethostname()})
         with pytest.raises(ResourceError, match="another process is working in this folder"):
@@ -138,15 +138,12 @@ def test_two_runs_in_one_folder_at_a_time(
 
 def test_a_recorded_log_is_adapted_to(tmp_path: Path, verbs: dict[str, Any]) -> None:
     verbs["teaches"] = (False, "")
-    Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+    chain(tmp_path)
     assert verbs["calls"] == [*CHAIN[:3], "adapt", *CHAIN[3:]]
     adapt = verbs["adapt"]
     fitted = tmp_path / "out" / "fit" / "street_gaussians"
-    assert (
-        adapt.settings.model == "embedded"
-        and adapt.settings.cameras == RunConfig().synthesize.cameras
-        and adapt.fitted == fitted
-    )
+    assert adapt.settings.model == "embedded" and adapt.fitted == fitted
+    assert adapt.settings.cameras == RunConfig().synthesize.cameras
     assert verbs["synthesize"].settings.model == str(tmp_path / "out" / "adapt" / "model")
     assert verbs["synthesize"].fitted == fitted
 
@@ -165,9 +162,7 @@ def test_no_adaptation_where_it_is_not_wanted_or_not_possible(
 ) -> None:
     verbs["teaches"] = teaches
     plain = RunConfig(adaptation=when)
-    Run(
-        source="city", out=tmp_path / "out", settings=replace(plain, synthesize=replace(plain.synthesize, model=model))
-    ).run()
+    chain(tmp_path, replace(plain, synthesize=replace(plain.synthesize, model=model)))
     assert verbs["calls"] == CHAIN
     assert verbs["synthesize"].settings.model == model
     assert (verbs["synthesize"].fitted is not None) == renders
@@ -176,29 +171,29 @@ def test_no_adaptation_where_it_is_not_wanted_or_not_possible(
 def test_adaptation_that_is_asked_for_but_not_possible_is_refused(tmp_path: Path, verbs: dict[str, Any]) -> None:
     verbs["teaches"] = (False, "too short")
     with pytest.raises(UsageError, match="adapted"):
-        Run(source="city", out=tmp_path / "out", settings=RunConfig(adaptation="on")).run()
+        chain(tmp_path, RunConfig(adaptation="on"))
 
 
 def test_a_repeat_makes_no_second_report_unless_it_was_touched(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
-    before = Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()["seconds"]
+    chain(tmp_path)
+    before = chain(tmp_path)["seconds"]
     assert verbs["calls"] == [*CHAIN, *CHAIN[:-2]]
     assert "report" in before
     store.write_text(tmp_path / "out" / "report.html", "scribble")
-    Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+    chain(tmp_path)
     assert verbs["calls"][-1] == "report"
     assert (tmp_path / "out" / "report.html").read_text() == "page"
 
 
 def test_run_yaml_repeats_the_run(tmp_path: Path, verbs: dict[str, Any]) -> None:
     config = with_seed(run_preset("fast"), 5)
-    Run(source="city", out=tmp_path / "out", settings=config).run()
+    chain(tmp_path, config)
     assert configuration.load(RunConfig, None, tmp_path / "out" / "run.yaml") == config
 
 
 def test_a_scene_without_labels_is_annotated_and_then_used(tmp_path: Path, verbs: dict[str, Any]) -> None:
     verbs["labelled"] = False
-    Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+    chain(tmp_path)
     assert verbs["calls"] == [CHAIN[0], "annotate", *CHAIN[1:]]
     for label in ("fuse", "synthesize", "fit:mudg_s", "render:mudg_s", "score"):
         assert verbs[label].scene == tmp_path / "out" / "annotate"
@@ -216,12 +211,12 @@ def test_a_scene_needs_no_ingest(tmp_path: Path, verbs: dict[str, Any]) -> None:
 def test_an_interruption_is_recorded_and_the_repeat_continues(tmp_path: Path, verbs: dict[str, Any]) -> None:
     verbs["trouble"]["synthesize"] = KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt):
-        Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+        chain(tmp_path)
     ledger = store.read_json(tmp_path / "out" / "run.json")
     assert ledger["state"] == "interrupted"
     assert ledger["steps"]["synthesize"]["state"] == "interrupted"
     assert "score" not in ledger["steps"]
-    Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+    chain(tmp_path)
     assert store.read_json(tmp_path / "out" / "run.json")["state"] == "complete"
 
 
@@ -240,30 +235,30 @@ def test_seconds_add_up_over_continuations_and_reuse_adds_none(
     monkeypatch.setattr(Step, "run", costing)
     verbs["trouble"]["synthesize"] = KeyboardInterrupt()
     with pytest.raises(KeyboardInterrupt):
-        Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
-    seconds = Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()["seconds"]
+        chain(tmp_path)
+    seconds = chain(tmp_path)["seconds"]
     assert (seconds["ingest"], seconds["fuse"], seconds["synthesize"]) == (10.0, 2.0, 42.0)
 
 
 def test_other_settings_are_refused_at_once_and_named(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+    chain(tmp_path)
     verbs["calls"].clear()
     with pytest.raises(UsageError) as refused:
-        Run(source="city", out=tmp_path / "out", settings=with_seed(RunConfig(), 3)).run()
+        chain(tmp_path, with_seed(RunConfig(), 3))
     assert "fit.seed: 0 there, 3 asked" in str(refused.value)
     assert verbs["calls"] == []
-    Run(source="city", out=tmp_path / "out", overwrite=True, settings=with_seed(RunConfig(), 3)).run()
+    chain(tmp_path, with_seed(RunConfig(), 3), overwrite=True)
     assert verbs["calls"] == CHAIN
     assert all(verbs[label].overwrite for label in CHAIN[:-2])
 
 
 def test_an_altered_record_of_a_run_is_not_taken(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+    chain(tmp_path)
     record = store.read_json(tmp_path / "out" / "run.json")
     record["steps"]["fuse"]["seconds"] = 0.125
     store.write_json(tmp_path / "out" / "run.json", record)
     with pytest.raises(IntegrityError, match="altered"):
-        Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+        chain(tmp_path)
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path: Path, verbs: dict[str, Any]) -> None:
@@ -283,11 +278,11 @@ def test_no_such_log(tmp_path: Path, verbs: dict[str, Any]) -> None:
 def test_an_error_in_a_step_keeps_what_was_done(tmp_path: Path, verbs: dict[str, Any]) -> None:
     verbs["trouble"]["fit"] = NumericsError("a loss is not finite")
     with pytest.raises(NumericsError):
-        Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+        chain(tmp_path)
     ledger = store.read_json(tmp_path / "out" / "run.json")
     assert ledger["state"] == "failed"
     assert ledger["steps"]["fuse"]["state"] == "complete"
-    Run(source="city", out=tmp_path / "out", settings=RunConfig()).run()
+    chain(tmp_path)
 
 
 def test_ctrl_c_prints_how_to_continue(
@@ -319,7 +314,7 @@ def test_the_real_chain_ends_with_a_report_and_continues_after_a_kill(tmp_path: 
 
 
 def test_a_fit_from_nothing_is_given_no_start(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    Run(source="city", out=tmp_path / "out", settings=RunConfig(continue_fit=False)).run()
+    chain(tmp_path, RunConfig(continue_fit=False))
     guided = verbs["fit:mudg_s"]
     assert guided.start_from is None
     assert guided.settings.iterations == verbs["fit:street_gaussians"].settings.iterations

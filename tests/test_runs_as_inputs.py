@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 from test_edit_run import run  # noqa: F401
+from test_engine import ANSWERS
 from toy_fitted import write_toy_run
 
 import mudg
@@ -89,22 +90,12 @@ WRONG_PATHS = [
     ("export ply TOY/fit --scene TOY/none --out OUT.ply", 3, "no such file or folder"),
 ]
 
-ANSWERS = """
-import contextlib, io, json, sys
-from mudg import app
-for line in json.loads(sys.argv[1]):
-    with contextlib.redirect_stderr(io.StringIO()) as said:
-        code = app.main(line.split())
-    print(json.dumps([code, said.getvalue(), "torch" in sys.modules]))
-"""
-
 
 def test_wrong_paths_are_refused_before_anything_heavy_is_loaded(tmp_path: Path) -> None:
     write_toy_run(tmp_path)
     lines = [line.replace("TOY", str(tmp_path)).replace("OUT", str(tmp_path / "out")) for line, _, _ in WRONG_PATHS]
-    done = subprocess.run(
-        [sys.executable, "-c", ANSWERS, json.dumps(lines)], capture_output=True, text=True, check=True
-    )
+    command = [sys.executable, "-c", ANSWERS, json.dumps(lines)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     answers = [json.loads(answer) for answer in done.stdout.splitlines()]
     for (line, code, said), (left, message, torch_loaded) in zip(WRONG_PATHS, answers, strict=True):
         assert left == code and said.replace("TOY", str(tmp_path)) in message, (line, message)

@@ -34,6 +34,10 @@ def brighter(step: int) -> object:
     return change
 
 
+def scored(scene: Path, out: Path, settings: ScoreConfig = PLAIN, **views: Path) -> dict:
+    return store.read_json(Score(scene=scene, views=views, out=out, settings=settings).run() / "metrics.json")
+
+
 def value(document: dict, method: str, trajectory: str, metric: str) -> object:
     found = [r for r in document["results"] if r["method"] == method and r["trajectory"] == trajectory]
     assert len(found) == 1
@@ -48,10 +52,7 @@ def scene(tmp_path: Path) -> Path:
 def test_known_colour_error_gives_known_psnr(tmp_path: Path, scene: Path) -> None:
     plain = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), brighter(5))
     worse = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,), brighter(20))
-    out = Score(
-        scene=scene, views={"street_gaussians": plain, "mudg_s": worse}, out=tmp_path / "score", settings=PLAIN
-    ).run()
-    document = store.read_json(out / "metrics.json")
+    document = scored(scene, tmp_path / "score", street_gaussians=plain, mudg_s=worse)
     for method, step in (("street_gaussians", 5), ("mudg_s", 20)):
         assert value(document, method, "front_recorded", "psnr") == pytest.approx(20 * math.log10(255 / step), abs=1e-4)
     assert value(document, "mudg_s", "front_recorded", "miou") == 1.0
@@ -63,9 +64,7 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
         return seen if index % 2 else dataclasses.replace(seen, rgb=torch.zeros_like(seen.rgb))
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), spoil_training_frames)
-    document = store.read_json(
-        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
-    )
+    document = scored(scene, tmp_path / "score", a=views)
     assert document["results"][0]["views"] == 2
     assert value(document, "a", "front_recorded", "psnr") == 100.0  # equal pictures
 
@@ -73,9 +72,7 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
 def test_without_held_out_frames_all_count_and_the_rules_say_so(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", test_every=0)
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    document = store.read_json(
-        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
-    )
+    document = scored(scene, tmp_path / "score", a=views)
     assert document["results"][0]["views"] == 4
     assert any("No frame was held out" in rule for rule in document["rules"])
 
@@ -96,9 +93,7 @@ def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Pat
         return dataclasses.replace(seen, depth=None, semantics=None)
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), color_only)
-    document = store.read_json(
-        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
-    )
+    document = scored(scene, tmp_path / "score", a=views)
     assert value(document, "a", "front_recorded", "abs_rel") == "not produced"
     assert value(document, "a", "front_recorded", "miou") == "not produced"
     assert value(document, "a", "front_recorded", "psnr") == 100.0
@@ -107,9 +102,7 @@ def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Pat
 def test_labels_that_the_log_lacks_are_no_truth(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", labels=False)
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    document = store.read_json(
-        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
-    )
+    document = scored(scene, tmp_path / "score", a=views)
     assert value(document, "a", "front_recorded", "miou") == score_tables.NO_TRUTH
     assert value(document, "a", "front_recorded", "abs_rel") == score_tables.NO_TRUTH
 
@@ -119,9 +112,7 @@ def test_missing_depth_counts_as_the_limit(tmp_path: Path, scene: Path) -> None:
         return dataclasses.replace(seen, depth=torch.full_like(seen.depth, torch.nan))
 
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), no_depth_anywhere)
-    document = store.read_json(
-        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
-    )
+    document = scored(scene, tmp_path / "score", a=views)
     true = toy_views.depths()[np.isfinite(toy_views.depths())].astype(np.float64)
     expected = float(np.mean((80.0 - true) / true))
     assert value(document, "a", "front_recorded", "abs_rel") == pytest.approx(expected, rel=1e-4)
@@ -129,21 +120,13 @@ def test_missing_depth_counts_as_the_limit(tmp_path: Path, scene: Path) -> None:
 
 def test_methods_of_other_sizes_are_compared_at_the_cameras_size(tmp_path: Path, scene: Path) -> None:
     def half(_index: int, seen: Observation) -> Observation:
-        view = seen.view.resized(toy_views.WIDTH // 2, toy_views.HEIGHT // 2)
-        return dataclasses.replace(
-            seen,
-            view=view,
-            rgb=torch.full((3, toy_views.HEIGHT // 2, toy_views.WIDTH // 2), 0.5),
-            depth=seen.depth[:, ::2, ::2],
-            semantics=seen.semantics[::2, ::2],
-            confidence=seen.confidence[:, ::2, ::2],
-            mask=seen.mask[:, ::2, ::2],
-        )
+        view, gray = seen.view.resized(toy_views.WIDTH // 2, toy_views.HEIGHT // 2), torch.full_like(seen.rgb, 0.5)
+        planes = {"rgb": gray, **{name: getattr(seen, name) for name in ("depth", "semantics", "confidence", "mask")}}
+        return dataclasses.replace(seen, view=view, **{name: of[..., ::2, ::2] for name, of in planes.items()})
 
     small = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), half)
     full = toy_views.write_views(scene, tmp_path / "b", "b", (0.0,))
-    out = Score(scene=scene, views={"a": small, "b": full}, out=tmp_path / "score", settings=PLAIN).run()
-    document = store.read_json(out / "metrics.json")
+    document = scored(scene, tmp_path / "score", a=small, b=full)
     course = document["trajectories"][0]
     assert (course["width"], course["height"]) == (toy_views.WIDTH, toy_views.HEIGHT)
     assert value(document, "b", "front_recorded", "psnr") == 100.0
@@ -164,9 +147,7 @@ def test_only_views_that_all_methods_have_are_compared(tmp_path: Path, scene: Pa
     index = store.read_json(part / "front_recorded" / "observations.json")
     index["observations"] = index["observations"][:3]
     store.write_json(part / "front_recorded" / "observations.json", index)
-    document = store.read_json(
-        Score(scene=scene, views={"a": full, "b": part}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
-    )
+    document = scored(scene, tmp_path / "score", a=full, b=part)
     assert document["trajectories"][0]["views"] == 3
     assert {r["views"] for r in document["results"]} == {1}
 
@@ -198,18 +179,12 @@ def test_two_runs_give_the_same_bytes(tmp_path: Path, scene: Path) -> None:
 def test_large_images_score_as_small_ones_do(tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Views one after the other and methods beside each other, perceptual distances in bands; the images are not
     halved."""
-    views = {
-        name: toy_views.write_views(scene, tmp_path / name, name, (0.0,), brighter(9 * len(name)))
-        for name in ("a", "bb")
-    }
-    small = store.read_json(
-        Score(scene=scene, views=views, out=tmp_path / "small", settings=ScoreConfig()).run() / "metrics.json"
-    )["results"]
+    shade = lambda name: toy_views.write_views(scene, tmp_path / name, name, (0.0,), brighter(9 * len(name)))  # noqa: E731
+    views = {name: shade(name) for name in ("a", "bb")}
+    small = scored(scene, tmp_path / "small", ScoreConfig(), **views)["results"]
     monkeypatch.setattr(score, "WHOLE_PIXELS", 0)
     monkeypatch.setattr(featnets, "WHOLE_PIXELS", 0)
-    large = store.read_json(
-        Score(scene=scene, views=views, out=tmp_path / "large", settings=ScoreConfig()).run() / "metrics.json"
-    )["results"]
+    large = scored(scene, tmp_path / "large", ScoreConfig(), **views)["results"]
     assert [one["method"] for one in small] == [one["method"] for one in large] == ["a", "bb"]
     for one, other in zip(small, large, strict=True):
         assert isinstance(one["values"]["perceptual"], float)
@@ -220,16 +195,9 @@ def test_large_images_score_as_small_ones_do(tmp_path: Path, scene: Path, monkey
 
 def test_distances_average_both_sides_and_mark_the_best() -> None:
     courses = [{"name": n, "shift_m": s} for n, s in (("l", 2.0), ("r", -2.0), ("here", 0.0), ("odd", None))]
-    results = [
-        {"method": m, "trajectory": t, "values": {"psnr": v}}
-        for m, t, v in (
-            ("a", "l", 20.0),
-            ("a", "r", 24.0),
-            ("a", "here", 30.0),
-            ("b", "l", 21.0),
-            ("b", "r", "no truth"),
-        )
-    ]
+    of_a, of_b = {"l": 20.0, "r": 24.0, "here": 30.0}, {"l": 21.0, "r": "no truth"}
+    pairs = [(m, t, v) for m, of in (("a", of_a), ("b", of_b)) for t, v in of.items()]
+    results = [{"method": m, "trajectory": t, "values": {"psnr": v}} for m, t, v in pairs]
     table = score_tables.by_distance(courses, ["a", "b"], results, ["psnr"])
     found = {(row["method"], row["distance_m"]): row["values"]["psnr"] for row in table}
     assert found == {("a", 0.0): 30.0, ("b", 0.0): "not produced", ("a", 2.0): 22.0, ("b", 2.0): 21.0}
@@ -254,31 +222,23 @@ def test_baseline_fills_holes_with_the_nearest_point(scene: Path) -> None:
     rows, columns = np.mgrid[2 : toy_views.HEIGHT : 4, 4:12:4]
     left = geometry.unproject(view, np.stack([columns, rows], -1).reshape(-1, 2) + 0.5, np.full(rows.size, 10.0))
     right = geometry.unproject(view, np.stack([columns + 32, rows], -1).reshape(-1, 2) + 0.5, np.full(rows.size, 20.0))
-    cloud = FusedCloud(
-        PointCloud(
-            np.concatenate([left, right]).astype(np.float32),
-            np.repeat(np.array([[255, 0, 0], [0, 255, 0]], np.uint8), rows.size, 0),
-            "world",
-            np.repeat(np.array([0, 13], np.uint8), rows.size),
-        ),
-        {},
-    )
+    xyz = np.concatenate([left, right]).astype(np.float32)
+    rgb = np.repeat(np.array([[255, 0, 0], [0, 255, 0]], np.uint8), rows.size, 0)
+    cloud = FusedCloud(PointCloud(xyz, rgb, "world", np.repeat(np.array([0, 13], np.uint8), rows.size)), {})
     seen = score.nearest_fill(cloud, {}, view)
     middle = (8 + 36) // 2 + 1
     assert bool((seen.rgb[0, :, : middle - 4] == 1).all())
     assert bool((seen.rgb[1, :, middle + 4 :] == 1).all())
     assert seen.depth is not None and seen.semantics is not None
-    assert torch.allclose(seen.depth[0, :, 0], torch.tensor(10.0)) and torch.allclose(
-        seen.depth[0, :, -1], torch.tensor(20.0)
-    )
+    for column, depth in ((0, 10.0), (-1, 20.0)):
+        assert torch.allclose(seen.depth[0, :, column], torch.tensor(depth))
     assert set(seen.semantics.unique().tolist()) == {0, 13}
 
 
 def test_baseline_of_a_view_that_sees_nothing() -> None:
     view = View(toy_views.CAMERA, toy_views.EGO_FROM_CAM, 0.0)
-    behind = PointCloud(
-        np.array([[-5.0, 0, 1]], np.float32), np.zeros((1, 3), np.uint8), "world", np.zeros(1, np.uint8)
-    )
+    xyz, rgb = np.array([[-5.0, 0, 1]], np.float32), np.zeros((1, 3), np.uint8)
+    behind = PointCloud(xyz, rgb, "world", np.zeros(1, np.uint8))
     seen = score.nearest_fill(FusedCloud(behind, {}), {}, view)
     assert seen.depth is not None and bool(torch.isnan(seen.depth).all())
     assert seen.semantics is not None and set(seen.semantics.unique().tolist()) == {255}
@@ -286,14 +246,7 @@ def test_baseline_of_a_view_that_sees_nothing() -> None:
 
 def test_lidar_is_the_depth_truth_of_a_log_without_depth_labels(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", labels=False, lidar=True)
-    views = toy_views.write_views(
-        scene,
-        tmp_path / "a",
-        "a",
-        (0.0,),
-        lambda _i, seen: dataclasses.replace(seen, depth=torch.full_like(seen.depth, 12.0)),
-    )
-    document = store.read_json(
-        Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=PLAIN).run() / "metrics.json"
-    )
+    at_12_m = lambda _, seen: dataclasses.replace(seen, depth=torch.full_like(seen.depth, 12.0))  # noqa: E731
+    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), at_12_m)
+    document = scored(scene, tmp_path / "score", a=views)
     assert value(document, "a", "front_recorded", "rmse_m") == pytest.approx(2.0, abs=1e-4)  # the wall stands at 10 m

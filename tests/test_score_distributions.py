@@ -80,17 +80,14 @@ def test_a_log_is_compared_with_its_recorded_frames_off_its_path_too(tmp_path: P
     assert shifted["b"] > 1.0
     assert values(document, "front_shift+2.0", "kid")["a"] < values(document, "front_shift+2.0", "kid")["b"]
     sizes = {r["trajectory"]: (r["distribution"]["n"], r["distribution"]["n_reference"]) for r in document["results"]}
-    assert sizes == {
-        "front_recorded": (2, 4),
-        "front_shift+2.0": (4, 4),
-    }  # held-out frames against the whole recorded video
+    # held-out frames against the whole recorded video
+    assert sizes == {"front_recorded": (2, 4), "front_shift+2.0": (4, 4)}
     made = document["distributions"]
     assert made["weights_sha256"] == store.sha256_file(quick)
     assert not made["published_weights"]
     assert made["resize"] == "pytorch-fid"
-    assert any(
-        "weights that are not the published file" in rule and "pytorch-fid" in rule for rule in document["rules"]
-    )
+    words = ("weights that are not the published file", "pytorch-fid")
+    assert any(all(word in rule for word in words) for rule in document["rules"])
     sets = {(one["trajectory"], one["method"]): one for one in made["sets"]}
     kept = lambda name: store.read_safetensors(out / "features" / name)["features"]  # noqa: E731
     of_b = sets["front_shift+2.0", "b"]
@@ -114,9 +111,8 @@ def test_the_numbers_are_those_of_the_pure_functions(tmp_path: Path, quick: Path
     assert values(document, "front_shift+2.0", "fid")["b"] == pytest.approx(expected, rel=2e-2)
     floor = document["distributions"]["floors"][0]
     assert floor["how"] == "every second recorded frame against the others"
-    assert floor["fid"] == pytest.approx(
-        feature_distances.frechet_distance(features(1.0)[::2], features(1.0)[1::2]), abs=1e-5
-    )
+    expected = feature_distances.frechet_distance(features(1.0)[::2], features(1.0)[1::2])
+    assert floor["fid"] == pytest.approx(expected, abs=1e-5)
 
 
 def test_features_are_kept_by_content_and_not_computed_twice(tmp_path: Path, quick: Path) -> None:
@@ -182,17 +178,15 @@ def test_without_weights_the_tables_name_the_flag(tmp_path: Path) -> None:
     views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
     out = Score(scene=scene, views={"a": views}, out=tmp_path / "score", settings=ScoreConfig(perceptual_views=0)).run()
     document = store.read_json(out / "metrics.json")
-    assert {values(document, "front_recorded", name)["a"] for name in ("fid", "kid", "fvd", "lpips")} == {
-        "not computed"
-    }
+    for name in ("fid", "kid", "fvd", "lpips"):
+        assert values(document, "front_recorded", name)["a"] == "not computed"
     assert "distributions" not in document
     assert not (out / "features").exists()
     assert "FVD (--fvd-weights)" in (out / "metrics.md").read_text()
     shown = page._score_values(document)
     assert "FID (Inception weights: mudg score --fid-weights FILE)" in shown["not_computed"]
-    assert "not computed (--fid-weights)" in {
-        cell["text"] for row in shown["score_groups"][-1]["rows"] for cell in row["cells"]
-    }
+    cells = [cell["text"] for row in shown["score_groups"][-1]["rows"] for cell in row["cells"]]
+    assert "not computed (--fid-weights)" in cells
 
 
 def test_the_page_and_the_terminal_show_the_floor_below_the_methods(tmp_path: Path, quick: Path) -> None:
@@ -207,22 +201,16 @@ def test_the_page_and_the_terminal_show_the_floor_below_the_methods(tmp_path: Pa
 
 def test_weights_are_checked_before_the_work(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene")
-    views = {"a": toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))}
-    with pytest.raises(InputError, match="nothing.pth"):
-        Score(
-            scene=scene,
-            views=views,
-            out=tmp_path / "score",
-            settings=ScoreConfig(fid_weights=str(tmp_path / "nothing.pth")),
-        ).run()
-    other = tmp_path / "other.safetensors"
-    store.write_safetensors(other, {"conv1.weight": np.zeros(3, np.float32)})
-    with pytest.raises(InputError, match="Conv2d_1a_3x3.conv.weight"):
-        Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig(fid_weights=str(other))).run()
-    assert not (tmp_path / "score" / "truth").exists()
-    inside = tmp_path / "score" / "weights.safetensors"
-    with pytest.raises(UsageError, match="fid-weights"):
-        Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig(fid_weights=str(inside))).run()
+    views, out = {"a": toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))}, tmp_path / "score"
+    store.write_safetensors(tmp_path / "other.safetensors", {"conv1.weight": np.zeros(3, np.float32)})
+    for weights, error, what in (
+        (tmp_path / "nothing.pth", InputError, "nothing.pth"),
+        (tmp_path / "other.safetensors", InputError, "Conv2d_1a_3x3.conv.weight"),
+        (out / "weights.safetensors", UsageError, "fid-weights"),
+    ):
+        with pytest.raises(error, match=what):
+            Score(scene=scene, views=views, out=out, settings=ScoreConfig(fid_weights=str(weights))).run()
+        assert not (out / "truth").exists()
 
 
 @pytest.mark.parametrize("suffix", [pytest.param(".pth", marks=pytest.mark.slow), ".safetensors"])

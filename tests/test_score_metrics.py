@@ -30,10 +30,8 @@ from mudg.steps.render import Score
 
 
 def pair(**given) -> Pair:
-    empty = dict.fromkeys(
-        ("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics")
-    )
-    return Pair(**{**empty, **given})
+    names = ("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics")
+    return Pair(**{**dict.fromkeys(names), **given})
 
 
 @pytest.fixture(scope="module")
@@ -42,9 +40,8 @@ def pictures():
     found = []
     for seed in (11, 12):
         world = CityWorld(CityConfig(seed=seed, n_frames=4, width=192, height=128, cameras=("front",)))
-        found.append(
-            torch.from_numpy(world.render(world.frame_views("front")[2]).rgb.copy()).permute(2, 0, 1).contiguous()
-        )
+        rgb = world.render(world.frame_views("front")[2]).rgb.copy()
+        found.append(torch.from_numpy(rgb).permute(2, 0, 1).contiguous())
     return found
 
 
@@ -98,9 +95,8 @@ def test_degradations_are_ordered_as_people_see_them_where_psnr_is_not(pictures,
     truth = pictures[0]
     darker, moved = truth * 0.9, torch.roll(truth, 1, 2)
     soft, wrong = blurred(truth, 2.0), scrambled(truth)
-    apart = {
-        name: distance(x, truth) for name, x in (("darker", darker), ("moved", moved), ("soft", soft), ("wrong", wrong))
-    }
+    changed = {"darker": darker, "moved": moved, "soft": soft, "wrong": wrong}
+    apart = {name: distance(x, truth) for name, x in changed.items()}
     assert apart["darker"] < apart["moved"] < apart["soft"] < apart["wrong"]
     assert apart["wrong"] > 3 * apart["soft"]  # the wrong texture is farther than none
     assert distance(pictures[1], truth) > 3 * apart["soft"]
@@ -171,44 +167,24 @@ def lpips_state(trunk="alex"):
     return state
 
 
-def lpips_twin(made, truth, state):
-    """LPIPS in float64 from torch's layers and the paper's equation, written down a second time."""
-    conv = torch.nn.Conv2d
-    trunk = torch.nn.Sequential(
-        conv(3, 64, 11, 4, 2),
-        torch.nn.ReLU(),
-        torch.nn.MaxPool2d(3, 2),
-        conv(64, 192, 5, padding=2),
-        torch.nn.ReLU(),
-        torch.nn.MaxPool2d(3, 2),
-        conv(192, 384, 3, padding=1),
-        torch.nn.ReLU(),
-        conv(384, 256, 3, padding=1),
-        torch.nn.ReLU(),
-        conv(256, 256, 3, padding=1),
-        torch.nn.ReLU(),
-    ).double()
+def lpips_twin(made, truth, state, trunk, taps, scaled=True):
+    """LPIPS in float64 from torch's layers and the paper's equation, written down a second time, and the number of
+    layers after which features are read."""
+    trunk = trunk.double()
     trunk.load_state_dict({name.split(".", 2)[2]: v.double() for name, v in state.items() if name.startswith("net.")})
-    x = torch.stack([made, truth]).double() * 2 - 1
-    x = (x - torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)) / torch.tensor(
-        [0.458, 0.448, 0.450]
-    ).double().view(3, 1, 1)
-    total, stage = 0.0, 0
+    x = torch.stack([made, truth]).double()
+    mean, deviation = (
+        torch.tensor(row).double().view(3, 1, 1) for row in ([-0.030, -0.088, -0.188], [0.458, 0.448, 0.450])
+    )
+    x, total, stage = ((x * 2 - 1 if scaled else x) - mean) / deviation, 0.0, 0
     with torch.no_grad():
-        for layer in trunk:
+        for number, layer in enumerate(trunk):
             x = layer(x)
-            if isinstance(layer, torch.nn.ReLU):
+            if number in taps:
                 a, b = functional.normalize(x, dim=1)
                 total += float(((a - b) ** 2 * state[f"lin{stage}.model.1.weight"][0].double()).sum(0).mean())
                 stage += 1
-    return total
-
-
-def test_lpips_equals_its_float64_twin(pictures):
-    state, truth = lpips_state(), pictures[0][:, :96, :100]
-    network = LpipsFeatures(state)
-    apart = PerceptualDistance(network, network.channel_weights)(pair(rgb=blurred(truth, 1.0), truth_rgb=truth))
-    assert apart == pytest.approx(lpips_twin(blurred(truth, 1.0), truth, state), rel=1e-4)
+    return total, stage
 
 
 def test_incomplete_lpips_weights_are_refused_and_named(tmp_path):
@@ -231,13 +207,8 @@ def still_pair(number, made_noise):
     view = View(Camera("front", 16, 12, 20.0, 20.0, 8.0, 6.0), np.eye(4), 0.1 * number)
     depth, ids = torch.full((1, 12, 16), 10.0), torch.full((12, 16), 2)
     depth[:, :3], ids[:3] = 0.0, 10  # sky: no depth
-    return pair(
-        rgb=wall + sign * made_noise / 2,
-        truth_rgb=wall + sign * 0.05,
-        truth_depth=depth,
-        truth_semantics=ids,
-        view=view,
-    )
+    true = {"truth_rgb": wall + sign * 0.05, "truth_depth": depth, "truth_semantics": ids}
+    return pair(rgb=wall + sign * made_noise / 2, view=view, **true)
 
 
 def test_flicker_is_change_of_static_surfaces_over_that_of_the_truth():
@@ -296,20 +267,19 @@ def test_a_recorded_log_has_a_perceptual_distance_but_no_flicker_and_no_dynamic_
 
     plain = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
     views = {"a": plain, "b": toy_views.write_views(scene, tmp_path / "b", "b", (0.0,), grey)}
-    document = store.read_json(
-        Score(scene=scene, views=views, out=tmp_path / "score", settings=ScoreConfig()).run() / "metrics.json"
-    )
-    values = {r["method"]: r["values"] for r in document["results"]}
+
+    def scored(name, config):
+        out = Score(scene=scene, views=views, out=tmp_path / name, settings=config).run()
+        return {r["method"]: r["values"] for r in store.read_json(out / "metrics.json")["results"]}
+
+    values = scored("score", ScoreConfig())
     assert values["a"]["perceptual"] == pytest.approx(0.0, abs=1e-6)
     assert values["b"]["perceptual"] > 0.05
     assert values["a"]["flicker"] == values["a"]["psnr_movers"] == score_tables.NO_TRUTH
     assert values["a"]["lpips"] == "not computed"
     store.write_safetensors(tmp_path / "lpips.safetensors", {name: v.numpy() for name, v in lpips_state().items()})
     config = ScoreConfig(perceptual_views=0, lpips_weights=str(tmp_path / "lpips.safetensors"))
-    other = store.read_json(
-        Score(scene=scene, views=views, out=tmp_path / "other", settings=config).run() / "metrics.json"
-    )
-    values = {r["method"]: r["values"] for r in other["results"]}
+    values = scored("other", config)
     assert values["a"]["perceptual"] == score_tables.NOT_REQUESTED
     assert values["a"]["lpips"] == pytest.approx(0.0, abs=1e-6) != values["b"]["lpips"]
 
@@ -330,11 +300,8 @@ class Fire(torch.nn.Module):
     def __init__(self, into, between, each):
         super().__init__()
         conv = torch.nn.Conv2d
-        self.squeeze, self.expand1x1, self.expand3x3 = (
-            conv(into, between, 1),
-            conv(between, each, 1),
-            conv(between, each, 3, padding=1),
-        )
+        self.squeeze, self.expand1x1 = conv(into, between, 1), conv(between, each, 1)
+        self.expand3x3 = conv(between, each, 3, padding=1)
 
     def forward(self, x):
         x = functional.relu(self.squeeze(x))
@@ -344,6 +311,11 @@ class Fire(torch.nn.Module):
 def torchvision_trunk(name):
     """Layers in torchvision's numbering, and after which of them features are read."""
     conv, relu, pool = torch.nn.Conv2d, torch.nn.ReLU, torch.nn.MaxPool2d
+    if name == "alex":
+        layers = [conv(3, 64, 11, 4, 2), relu(), pool(3, 2), conv(64, 192, 5, padding=2), relu(), pool(3, 2)]
+        for into, out in ((192, 384), (384, 256), (256, 256)):
+            layers += [conv(into, out, 3, padding=1), relu()]
+        return torch.nn.Sequential(*layers), (1, 4, 7, 9, 11)
     if name == "vgg":
         layers, into = [], 3
         for out in (64, 64, "M", 128, 128, "M", 256, 256, 256, "M", 512, 512, 512, "M", 512, 512, 512):
@@ -351,48 +323,19 @@ def torchvision_trunk(name):
             into = into if out == "M" else out
         return torch.nn.Sequential(*layers), (3, 8, 15, 22, 29)
     squeeze = pool(3, 2, ceil_mode=True)
-    layers = [
-        conv(3, 64, 3, 2),
-        relu(),
-        squeeze,
-        Fire(64, 16, 64),
-        Fire(128, 16, 64),
-        squeeze,
-        Fire(128, 32, 128),
-        Fire(256, 32, 128),
-        squeeze,
-        Fire(256, 48, 192),
-        Fire(384, 48, 192),
-        Fire(384, 64, 256),
-        Fire(512, 64, 256),
-    ]
+    fires = [(64, 16, 64), (128, 16, 64), None, (128, 32, 128), (256, 32, 128), None]
+    fires += [(256, 48, 192), (384, 48, 192), (384, 64, 256), (512, 64, 256)]
+    layers = [conv(3, 64, 3, 2), relu(), squeeze, *(Fire(*sizes) if sizes else squeeze for sizes in fires)]
     return torch.nn.Sequential(*layers), (1, 4, 7, 9, 10, 11, 12)
 
 
-@pytest.mark.parametrize("name", [pytest.param("vgg", marks=pytest.mark.slow), "squeeze"])
+@pytest.mark.parametrize("name", ["alex", pytest.param("vgg", marks=pytest.mark.slow), "squeeze"])
 @pytest.mark.parametrize("given", ["correct", "unscaled"])
-def test_lpips_with_vgg_and_squeeze_equals_its_float64_twin(pictures, name, given):
+def test_lpips_equals_its_float64_twin(pictures, name, given):
     state, truth = lpips_state(name), pictures[0][:, :70, :75]
-    trunk, taps = torchvision_trunk(name)
-    trunk.double().load_state_dict(
-        {key.split(".", 2)[2]: v.double() for key, v in state.items() if key.startswith("net.")}
-    )
     made = blurred(truth, 1.0)
-    x = torch.stack([made, truth]).double()
-    x = x * 2 - 1 if given == "correct" else x
-    x = (x - torch.tensor([-0.030, -0.088, -0.188]).double().view(3, 1, 1)) / torch.tensor(
-        [0.458, 0.448, 0.450]
-    ).double().view(3, 1, 1)
-    total, stage = 0.0, 0
-    with torch.no_grad():
-        for number, layer in enumerate(trunk):
-            x = layer(x)
-            if number in taps:
-                a, b = functional.normalize(x, dim=1)
-                total += float(((a - b) ** 2 * state[f"lin{stage}.model.1.weight"][0].double()).sum(0).mean())
-                stage += 1
+    total, stage = lpips_twin(made, truth, state, *torchvision_trunk(name), scaled=given == "correct")
     network = LpipsFeatures(state, "file", name, given)
     assert stage == len(network.channel_weights)
-    assert PerceptualDistance(network, network.channel_weights)(pair(rgb=made, truth_rgb=truth)) == pytest.approx(
-        total, rel=1e-4
-    )
+    apart = PerceptualDistance(network, network.channel_weights)(pair(rgb=made, truth_rgb=truth))
+    assert apart == pytest.approx(total, rel=1e-4)

@@ -92,29 +92,12 @@ def test_a_wrong_script_is_told_with_its_line(toy: Toy, tmp_path: Path, script: 
 
 
 def test_an_exact_frame_is_the_render_of_the_edited_fit(toy: Toy, tmp_path: Path) -> None:
-    import io
-
-    from PIL import Image
-
     desk, model = desk_of(toy, tmp_path / "edits.yaml"), toy[2]
     wanted = STREET.view(0.4, 80, 48)
     pose, camera = wanted.world_from_cam, wanted.camera
-    asked = FrameRequest(
-        scene=0,
-        layer="color",
-        time_s=0.4,
-        hidden=[],
-        edits=SCRIPT,
-        camera="front",
-        width=80,
-        height=48,
-        fx=camera.fx,
-        fy=camera.fy,
-        cx=camera.cx,
-        cy=camera.cy,
-        eye=pose[:3, 3].tolist(),
-        axes=pose[:3, :3].T.tolist(),
-    )
+    lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    at = {"eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist()}
+    asked = FrameRequest(scene=0, layer="color", time_s=0.4, hidden=[], edits=SCRIPT, camera="front", **lens, **at)
     scene = read_scene(toy[0] / "scene")
     source = FrameSource(desk.edited, scene, 1600, torch.device("cpu"))
 
@@ -146,20 +129,15 @@ def test_a_street_is_closed_once_and_only_for_frames(toy: Toy, tmp_path: Path, m
 
     monkeypatch.setattr(desk_module, "street_left", counted)
     scene = read_scene(toy[0] / "scene")
-    desk, scripts = (
-        desk_of(toy, tmp_path / "edits.yaml"),
-        [f"- move: {{id: car-1, left_m: {x}, close_street: true}}\n" for x in (1, 2, 3)],
-    )
+    desk = desk_of(toy, tmp_path / "edits.yaml")
+    scripts = [f"- move: {{id: car-1, left_m: {x}, close_street: true}}\n" for x in (1, 2, 3)]
     notes = [said(desk, script)["notes"] for script in scripts]
     assert all(any("close the street" in note for note in of) for of in notes) and True not in calls
     for script in scripts:
         made, plain = desk.edited(script)[0], carry_out(parse_edits(script, "edits.yaml"), toy[2], scene).model(toy[2])
-        assert torch.equal(made.table["means"], plain.table["means"]) and torch.equal(
-            made.table["sh_dc"], plain.table["sh_dc"]
-        )
-        assert np.array_equal(
-            motion_of(made.dynamic_object("car-1")).poses, motion_of(plain.dynamic_object("car-1")).poses
-        )
+        assert all(torch.equal(made.table[name], plain.table[name]) for name in ("means", "sh_dc"))
+        one, two = (motion_of(model.dynamic_object("car-1")).poses for model in (made, plain))
+        assert np.array_equal(one, two)
     assert calls.count(True) == 1
     desk.edited("- remove: {ids: [car-1], close_street: true}\n")
     assert calls.count(True) == 2
@@ -172,10 +150,8 @@ def test_a_page_may_insert_objects_of_its_own_run_and_of_no_other(toy: Toy, tmp_
     (run / "fuse").mkdir()
     (run / "fuse" / "fuse.json").write_text("{}")
     desk = desk_for([toy[2]], read_scene(run / "scene"), None, run, EditFiles(out=tmp_path / "edits.yaml"))
-    script = (
-        f'- insert: {{asset: {{run: "{desk.run}", id: car-1}}, near: {{id: ego, at_s: 0.2, ahead_m: 12}}, ground:'
-        " false}\n"
-    )
+    near = "near: {id: ego, at_s: 0.2, ahead_m: 12}, ground: false"
+    script = f'- insert: {{asset: {{run: "{desk.run}", id: car-1}}, {near}}}\n'
     told = said(desk, script)
     (edited,) = desk.edited(script)
     (name,) = told["inserted"]
@@ -207,17 +183,16 @@ def test_saved_edits_are_rendered_and_carried_out_alike(toy: Toy, tmp_path: Path
     place, scene = tmp_path / "edits.yaml", toy[0] / "scene"
     said(desk_of(toy, place), SCRIPT, save=True)
     config = RenderConfig(shifts_m=(0.0,), video=False)
-    drawn = RenderViews(scene=scene, model=toy[1], edits=place, out=tmp_path / "drawn", settings=config).run()
+
+    def images(name: str, model: Path, edits: Path | None = None) -> torch.Tensor:
+        step = RenderViews(scene=scene, model=model, edits=edits, out=tmp_path / name, settings=config)
+        seen = read_observations(step.run() / "front_recorded")
+        return torch.stack([seen[i].rgb for i in range(len(seen))])
+
     made = Edit(source=toy[1], script=place, scene=scene, out=tmp_path / "made", settings=EditConfig()).run()
-    again = RenderViews(scene=scene, model=made, out=tmp_path / "again", settings=config).run()
-    plain = RenderViews(scene=scene, model=toy[1], out=tmp_path / "plain", settings=config).run()
-
-    def images(folder: Path) -> list[torch.Tensor]:
-        seen = read_observations(folder / "front_recorded")
-        return [seen[i].rgb for i in range(len(seen))]
-
-    assert all(torch.equal(one, two) for one, two in zip(images(drawn), images(again), strict=True))
-    assert not all(torch.equal(one, two) for one, two in zip(images(drawn), images(plain), strict=True))
+    drawn = images("drawn", toy[1], place)
+    assert torch.equal(drawn, images("again", made))
+    assert not torch.equal(drawn, images("plain", toy[1]))
 
 
 def test_edits_are_never_saved_into_a_result(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -297,9 +272,8 @@ def test_the_page_moves_objects_as_the_program_does(
     monkeypatch.setattr("mudg.editing.apply.ground_of", lambda cloud, model: hilly())
     drive = carry_out(parse_edits(script, "edits.yaml"), model)
     edited = drive.model(model)
-    entries = [
-        {e.verb: e.settings.model_dump(mode="json", by_alias=True, exclude_unset=True)} for e in drive.script.edits
-    ]
+    as_given = {"mode": "json", "by_alias": True, "exclude_unset": True}
+    entries = [{e.verb: e.settings.model_dump(**as_given)} for e in drive.script.edits]
     opened.run(f"window.mudg.editor.set({json.dumps(entries)}); 1")
     for name in ("car-1", PERSON):
         motion = motion_of(next(node for node in edited.nodes if node.name == name))
@@ -331,34 +305,29 @@ HANDLES = """(() => { const app = window.mudg, {view, area, ratio} = app.last;
 
 @pytest.mark.slow
 def test_an_object_is_picked_moved_and_turned_with_its_handles(opened: Browser, tmp_path: Path) -> None:
-    opened.run(
-        "document.getElementById('stage').setPointerCapture = () => {}; window.mudg.change({mode: 'top', height: 30, t:"
-        " 0.4}); 1"
-    )
+    def press(*events: tuple[str, float, float]) -> None:
+        for kind, x, y in events:
+            opened.run(f"(({PRESS})('{kind}', {x}, {y}), 1)")
+
+    opened.run("document.getElementById('stage').setPointerCapture = () => {}; 1")
+    opened.run("window.mudg.change({mode: 'top', height: 30, t: 0.4}); 1")
     opened.wait("window.mudg.sharp")
     middle = opened.run(
         "(() => { const app = window.mudg, track = app.tracks.find((one) => one.id === 'car-1'); app.state.selected ="
         f" 'car-1';const found = {HANDLES}; app.state.selected = null; return found.free; }})()"
     )
-    opened.run(
-        f"(({PRESS})('pointerdown', {middle[0]}, {middle[1]}), ({PRESS})('pointerup', {middle[0]}, {middle[1]}), 1)"
-    )
+    press(("pointerdown", *middle), ("pointerup", *middle))
     assert opened.run("window.mudg.state.selected") == "car-1"
     places = opened.run(HANDLES)
     (x0, y0), (x1, y1) = places["free"], places["along"]
-    drag = [("pointerdown", x1, y1), ("pointermove", x1 + (x1 - x0), y1 + (y1 - y0)), ("pointerup", x1, y1)]
-    for kind, x, y in drag:
-        opened.run(f"(({PRESS})('{kind}', {x}, {y}), 1)")
+    press(("pointerdown", x1, y1), ("pointermove", x1 + (x1 - x0), y1 + (y1 - y0)), ("pointerup", x1, y1))
     ((verb, given),) = opened.run("window.mudg.state.edits")[0].items()
     size = opened.run("window.mudg.tracks.find((one) => one.id === 'car-1').size_m[0]")
     assert verb == "move" and set(given) == {"id", "along_m"}
     assert abs(given["along_m"] - (size / 2 + 0.9)) < 0.15  # the picture has perspective
     opened.wait("window.mudg.sharp")
     x, y = opened.run(HANDLES)["yaw"]
-    opened.run(
-        f"(({PRESS})('pointerdown', {x}, {y}), ({PRESS})('pointermove', {x - 30}, {y}), ({PRESS})('pointerup', {x},"
-        f" {y}), 1)"
-    )
+    press(("pointerdown", x, y), ("pointermove", x - 30, y), ("pointerup", x, y))
     edits = opened.run("window.mudg.state.edits")
     assert len(edits) == 1 and abs(edits[0]["move"]["yaw_deg"]) > 3
     key = "(key, more = {}) => document.body.dispatchEvent(new KeyboardEvent('keydown', {key, bubbles: true, ...more}))"

@@ -28,16 +28,13 @@ from mudg.scoring import detections
 from mudg.scoring import tables as score_tables
 from mudg.steps.render import DrawTruth, Score
 
+HERE = "front_shift+2.0"
 QUICK = ScoreConfig(perceptual_views=0, error_pictures=False)
-Change = Callable[[Observation], Observation]
+Change, Look = Callable[[Observation], Observation], Callable[[View], Observation]
 
 
 def written(
-    scene: Scene,
-    out: Path,
-    look: Callable[[View], Observation],
-    shifts_m: tuple[float, ...],
-    change: Change | None = None,
+    scene: Scene, out: Path, look: Look, shifts_m: tuple[float, ...] = (2.0,), change: Change | None = None
 ) -> Path:
     """Views of a scene as something sees them."""
     for shift_m in shifts_m:
@@ -46,6 +43,10 @@ def written(
             for view in path.views:
                 writer.add(look(view) if change is None else change(look(view)))
     return out
+
+
+def scored(scene: Path, views: dict[str, Path], out: Path, config: ScoreConfig = QUICK, **truth: Path) -> dict:
+    return store.read_json(Score(scene=scene, views=views, **truth, out=out, settings=config).run() / "metrics.json")
 
 
 def value(document: dict, method: str, trajectory: str, metric: str) -> object:
@@ -84,53 +85,48 @@ def log_scores(log_scene: Path, tmp_path_factory: pytest.TempPathFactory) -> dic
         name: written(scene, folder / name, toy_world.truth, (0.0, 2.0), change)
         for name, change in {"right": None, "far": farther, "gray": gray}.items()
     }
-    out = Score(scene=log_scene, views=methods, out=folder / "score", settings=QUICK).run()
-    return store.read_json(out / "metrics.json")
+    return scored(log_scene, methods, folder / "score")
 
 
 def test_lidar_points_measure_depth_and_color_beside_the_path_of_a_log(log_scores: dict) -> None:
-    here = "front_shift+2.0"
-    assert value(log_scores, "right", here, "psnr") == score_tables.NO_TRUTH
+    assert value(log_scores, "right", HERE, "psnr") == score_tables.NO_TRUTH
     # measured 0.007: a point is not at its pixel's centre
-    assert value(log_scores, "right", here, "lidar_abs_rel") < 0.02
-    assert value(log_scores, "far", here, "lidar_abs_rel") == pytest.approx(0.1, abs=0.01)
-    assert value(log_scores, "far", here, "lidar_delta1") > 0.95
-    assert value(log_scores, "right", here, "lidar_psnr") > 18  # measured 21.6: edges
-    assert value(log_scores, "gray", here, "lidar_psnr") < 16
-    (row,) = (r for r in log_scores["results"] if (r["method"], r["trajectory"]) == ("far", here))
+    assert value(log_scores, "right", HERE, "lidar_abs_rel") < 0.02
+    assert value(log_scores, "far", HERE, "lidar_abs_rel") == pytest.approx(0.1, abs=0.01)
+    assert value(log_scores, "far", HERE, "lidar_delta1") > 0.95
+    assert value(log_scores, "right", HERE, "lidar_psnr") > 18  # measured 21.6: edges
+    assert value(log_scores, "gray", HERE, "lidar_psnr") < 16
+    (row,) = (r for r in log_scores["results"] if (r["method"], r["trajectory"]) == ("far", HERE))
     parts = row["details"]["points"]
     assert parts["lidar_abs_rel_static"] == pytest.approx(0.1, abs=0.01)
     assert parts["lidar_abs_rel_dynamic"] == pytest.approx(0.1, abs=0.02)
 
 
 def test_classes_carried_by_points_agree_with_those_of_the_truth_and_not_with_one_class(log_scores: dict) -> None:
-    for here in ("front_recorded", "front_shift+2.0"):
+    for here in ("front_recorded", HERE):
         assert value(log_scores, "right", here, "agreement") > 0.8
         assert value(log_scores, "gray", here, "agreement") < 0.35
     assert "agreement" in {anchor["metric"] for anchor in log_scores["anchors"]}
 
 
 def test_lanes_of_a_log_are_carried_over_by_the_ground(log_scores: dict) -> None:
-    here = "front_shift+2.0"
-    assert value(log_scores, "right", here, "lane_correlation") > 0.8
-    assert value(log_scores, "right", here, "lane_psnr") > 20
-    assert value(log_scores, "gray", here, "lane_psnr") < 15
-    assert value(log_scores, "right", here, "lane_iou") == score_tables.NO_TRUTH  # nobody marked the lanes
-    assert value(log_scores, "right", here, "agent_iou") == score_tables.NO_TRUTH
-    assert value(log_scores, "right", here, "warp_error") == score_tables.NO_TRUTH
+    assert value(log_scores, "right", HERE, "lane_correlation") > 0.8
+    assert value(log_scores, "right", HERE, "lane_psnr") > 20
+    assert value(log_scores, "gray", HERE, "lane_psnr") < 15
+    assert value(log_scores, "right", HERE, "lane_iou") == score_tables.NO_TRUTH  # nobody marked the lanes
+    assert value(log_scores, "right", HERE, "agent_iou") == score_tables.NO_TRUTH
+    assert value(log_scores, "right", HERE, "warp_error") == score_tables.NO_TRUTH
 
 
 def test_a_still_video_does_not_flicker(log_scores: dict) -> None:
-    assert value(log_scores, "gray", "front_shift+2.0", "temporal_flickering") == 1.0
-    assert 0.8 < value(log_scores, "right", "front_shift+2.0", "temporal_flickering") < 0.99
+    assert value(log_scores, "gray", HERE, "temporal_flickering") == 1.0
+    assert 0.8 < value(log_scores, "right", HERE, "temporal_flickering") < 0.99
 
 
 def test_missing_files_name_their_flags(log_scores: dict) -> None:
     text = score_tables.markdown(log_scores)
-    for flag in (
-        *("--detections", "--lanes", "--dino-weights", "--clip-weights", "--video-features", "--lpips-vgg-weights"),
-    ):
-        assert flag in text
+    for flag in "detections lanes dino-weights clip-weights video-features lpips-vgg-weights".split():
+        assert f"--{flag}" in text
 
 
 def boxes_json(
@@ -159,34 +155,25 @@ def test_nta_iou_from_a_file_of_boxes(
     tmp_path: Path, log_scene: Path, moved: float, confidence: float, category: int, expected: float, cars: float
 ) -> None:
     scene = read_scene(log_scene)
-    views = written(scene, tmp_path / "right", toy_world.truth, (2.0,))
+    views = written(scene, tmp_path / "right", toy_world.truth)
     boxes = boxes_json(tmp_path / "boxes.json", scene, "right", moved, confidence, category)
-    out = Score(
-        scene=log_scene,
-        views={"right": views, "other": views},
-        out=tmp_path / "score",
-        settings=dataclasses.replace(QUICK, detections=str(boxes)),
-    ).run()
-    document = store.read_json(out / "metrics.json")
+    config = dataclasses.replace(QUICK, detections=str(boxes))
+    document = scored(log_scene, {"right": views, "other": views}, tmp_path / "score", config)
     (row,) = (r for r in document["results"] if r["method"] == "right")
     assert row["values"]["nta_iou"] == pytest.approx(expected)
     assert row["nta"]["car_and_bus"] == pytest.approx(cars)
     assert row["nta"]["truths"] >= 2
-    assert value(document, "other", "front_shift+2.0", "nta_iou") == score_tables.NO_DETECTIONS
-    assert anchors(document, "front_shift+2.0", "nta_iou")["recorded"] == pytest.approx(expected)
+    assert value(document, "other", HERE, "nta_iou") == score_tables.NO_DETECTIONS
+    assert anchors(document, HERE, "nta_iou")["recorded"] == pytest.approx(expected)
     made = document["detections"]["nta_iou"]
     assert made["fewest_points"] == 10 and made["file_sha256"] == store.sha256_file(boxes)
     assert any("cut at the near plane" in rule for rule in document["rules"])
 
 
 def test_boxes_of_images_of_another_size_are_scaled(tmp_path: Path) -> None:
-    store.write_json(
-        tmp_path / "boxes.json",
-        {
-            "images": [{"id": 4, "file_name": "m/t/000001.jpg", "width": 960, "height": 320}],
-            "annotations": [{"image_id": 4, "category_id": 5, "bbox": [100, 10, 20, 30], "score": 0.7}],
-        },
-    )
+    images = [{"id": 4, "file_name": "m/t/000001.jpg", "width": 960, "height": 320}]
+    boxes = [{"image_id": 4, "category_id": 5, "bbox": [100, 10, 20, 30], "score": 0.7}]
+    store.write_json(tmp_path / "boxes.json", {"images": images, "annotations": boxes})
     ((name, (found,)),) = detections.read_detections(tmp_path / "boxes.json").items()
     assert name == "m/t/000001"
     assert found.box.tolist() == [50, 10, 60, 40]
@@ -209,15 +196,11 @@ def test_malformed_boxes_are_refused(tmp_path: Path, content: object, said: str)
 
 
 def test_detected_lanes_of_a_log_are_refused(tmp_path: Path, log_scene: Path) -> None:
-    views = written(read_scene(log_scene), tmp_path / "right", toy_world.truth, (2.0,))
+    views = written(read_scene(log_scene), tmp_path / "right", toy_world.truth)
     (tmp_path / "lanes").mkdir()
+    config = dataclasses.replace(QUICK, lanes=str(tmp_path / "lanes"))
     with pytest.raises(InputError, match="no lane lines"):
-        Score(
-            scene=log_scene,
-            views={"right": views},
-            out=tmp_path / "score",
-            settings=dataclasses.replace(QUICK, lanes=str(tmp_path / "lanes")),
-        ).run()
+        scored(log_scene, {"right": views}, tmp_path / "score", config)
 
 
 def test_boxes_with_few_points_do_not_count(tmp_path: Path, log_scene: Path) -> None:
@@ -256,24 +239,22 @@ def city_run(city: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path
             store.write_image(target, (lanes & masks).astype(np.uint8) * 255)
     truth = DrawTruth(scene=city, trajectories=(path,), out=folder / "drawn").run()
     config = dataclasses.replace(QUICK, lanes=str(folder / "lanes"))
-    out = Score(scene=city, views=methods, truth=truth, out=folder / "score", settings=config).run()
-    drawn = Score(scene=city, views=methods, out=folder / "score_drawn", settings=QUICK).run()
-    stored, again = (store.read_json(o / "metrics.json") for o in (out, drawn))
+    stored = scored(city, methods, folder / "score", config, truth=truth)
+    again = scored(city, methods, folder / "score_drawn")
     for name in ("agent_iou", "lane_iou", "lane_correlation", "warp_error", "lidar_abs_rel", "temporal_flickering"):
         close = pytest.approx(value(again, "right", path.name, name), abs=2e-2)  # stored truth has 8 bits
         assert value(stored, "right", path.name, name) == close, name
-    return out, stored
+    return folder / "score", stored
 
 
 def test_vehicles_and_lanes_of_a_city_have_ceilings(city_run: tuple[Path, dict]) -> None:
     out, document = city_run
-    here = "front_shift+2.0"
     for metric, least in (("agent_iou", 0.5), ("lane_iou", 0.6)):
-        beside = anchors(document, here, metric)
-        assert value(document, "right", here, metric) == pytest.approx(beside["truth"], abs=0.02)
+        beside = anchors(document, HERE, metric)
+        assert value(document, "right", HERE, metric) == pytest.approx(beside["truth"], abs=0.02)
         assert beside["truth"] > least and beside["recorded"] > least
-        assert value(document, "gray", here, metric) < 0.05
-    assert value(document, "right", here, "lane_correlation") > 0.99
+        assert value(document, "gray", HERE, metric) < 0.05
+    assert value(document, "right", HERE, "lane_correlation") > 0.99
     (row,) = (r for r in document["results"] if r["method"] == "right")
     assert row["details"]["agents"] >= 4
     assert 50 < row["details"]["lane_mean_of_classes"] < 100
@@ -283,12 +264,11 @@ def test_vehicles_and_lanes_of_a_city_have_ceilings(city_run: tuple[Path, dict])
 
 def test_ntl_iou_from_masks(city_run: tuple[Path, dict]) -> None:
     _, document = city_run
-    here = "front_shift+2.0"
-    assert value(document, "right", here, "ntl_iou") == 100
-    assert 45 < value(document, "gray", here, "ntl_iou") < 50
+    assert value(document, "right", HERE, "ntl_iou") == 100
+    assert 45 < value(document, "gray", HERE, "ntl_iou") < 50
     (row,) = (r for r in document["results"] if r["method"] == "gray")
     assert row["ntl"]["lanes"] == 0 and 45 < row["ntl"]["against_detector"] < 50
-    assert anchors(document, here, "ntl_iou") == {"trajectory": here, "metric": "ntl_iou", "truth": 100.0}
+    assert anchors(document, HERE, "ntl_iou") == {"trajectory": HERE, "metric": "ntl_iou", "truth": 100.0}
 
 
 def test_a_missing_mask_is_named(city: Path, city_run: tuple[Path, dict]) -> None:
@@ -347,9 +327,8 @@ def test_warp_error_follows_vehicles_by_their_boxes() -> None:
         made[..., left : left + 4] = car
         return made
 
-    step_m = 2 / 20 * 9.0
     poses = np.stack([np.eye(4), np.eye(4)])
-    poses[1, 0, 3] = step_m
+    poses[1, 0, 3] = 2 / 20 * 9.0
     track = Track("car-005", "car", np.ones(3), np.array([0.0, 0.1]), poses)
     metric = view_metrics.WarpError(view_metrics.ExactMotion([(5, track)]))
     first, second = wall_pair(0, frame(8), 8), wall_pair(1, frame(10), 10)

@@ -10,6 +10,7 @@ import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -50,21 +51,9 @@ def question(times_s: tuple[float, ...] = (0.0, 0.2, 0.4), **changes: Any) -> di
     """A video of the front camera."""
     views = [STREET.view(t, 160, 96) for t in times_s]
     camera = views[0].camera
-    return {
-        "scene": 0,
-        "layer": "color",
-        "hidden": [],
-        "edits": "",
-        "camera": "front",
-        "width": 160,
-        "height": 96,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "fps": 10,
-        "moments": [moment(v) for v in views],
-    } | changes
+    lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    what = {"scene": 0, "layer": "color", "hidden": [], "edits": "", "camera": "front", "fps": 10}
+    return {**what, **lens, "moments": [moment(v) for v in views], **changes}
 
 
 def moment(view: View) -> dict[str, Any]:
@@ -93,6 +82,18 @@ def allowed(port: int, token: str) -> dict[str, str]:
 
 def psnr(a: np.ndarray, b: np.ndarray) -> float:
     return float(-10 * np.log10(np.square(a / 255.0 - b).mean()))
+
+
+@contextmanager
+def shown(port: int, address: str, folder: Path) -> Iterator[Browser]:
+    """A browser with the page of a server, without errors to the end."""
+    one = Browser(folder / "profile", size=(700, 500))
+    try:
+        one.open(f"http://127.0.0.1:{port}/?token={address}")
+        yield one
+        assert one.errors == []
+    finally:
+        one.close()
 
 
 def test_a_video_shows_what_the_rasterizer_draws(served: tuple[int, str], toy: Toy) -> None:
@@ -183,9 +184,8 @@ def test_a_video_that_nobody_waits_for_is_given_up(toy: Toy, monkeypatch: pytest
 
     monkeypatch.setattr(frames, "render_view", noted)
     with serving(toy[1], toy[0] / "scene") as (port, token):
-        connection, answer = begin(
-            port, "POST", "/video", question(tuple(0.001 * k for k in range(700))), **allowed(port, token)
-        )
+        long = question(tuple(0.001 * k for k in range(700)))
+        connection, answer = begin(port, "POST", "/video", long, **allowed(port, token))
         assert json.loads(answer.readline()) == {"frame": 1, "frames": 700}
         answer.close()
         assert connection.sock is None or connection.sock.shutdown(socket.SHUT_RDWR) is None
@@ -218,6 +218,10 @@ def test_a_problem_on_the_way_is_told_in_the_answer(toy: Toy, monkeypatch: pytes
     assert "cannot be drawn" in lines[-1]["problem"]
 
 
+KEEP = """window.saved = []; const real = URL.createObjectURL;
+URL.createObjectURL = (blob) => { if (blob.type === 'video/mp4') window.saved.push(blob); return real(blob); }; 1"""
+SAVED = """saved[0].arrayBuffer().then((b) => { let text = '';
+  for (const v of new Uint8Array(b)) text += String.fromCharCode(v); return btoa(text); })"""
 CLICK = "document.getElementById('mp4').click()"
 
 
@@ -225,21 +229,11 @@ CLICK = "document.getElementById('mp4').click()"
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 def test_the_page_saves_a_video_and_cancels_one(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with serving(toy[1], toy[0] / "scene") as (port, token):
-        one = Browser(tmp_path / "profile", size=(700, 500))
-        try:
-            one.open(f"http://127.0.0.1:{port}/?token={token}#m=recorded&c=front&t=0.2&s=1.5")
-            one.run(
-                "window.saved = []; const real = URL.createObjectURL;URL.createObjectURL = (blob) => { if (blob.type"
-                " === 'video/mp4') window.saved.push(blob); return real(blob); }; 1"
-            )
+        with shown(port, f"{token}#m=recorded&c=front&t=0.2&s=1.5", tmp_path) as one:
+            one.run(KEEP)
             one.run(f"{CLICK}; 1")
             one.wait("window.saved.length === 1")
-            content = base64.b64decode(
-                one.run(
-                    "saved[0].arrayBuffer().then((b) => { let text = '';"
-                    "for (const v of new Uint8Array(b)) text += String.fromCharCode(v); return btoa(text); })"
-                )
-            )
+            content = base64.b64decode(one.run(SAVED))
             assert one.run("document.getElementById('note').textContent").startswith("Saved toy-street_color_0.20s.mp4")
             seen = pictures(content)
             assert len(seen) == 9  # 0.8 s, 10 per second
@@ -264,9 +258,6 @@ def test_the_page_saves_a_video_and_cancels_one(toy: Toy, tmp_path: Path, monkey
             assert one.run("[saved.length, document.getElementById('mp4').textContent]") == [1, "Exact video (MP4)"]
             one.run("mudg.change({layer: 'normal'}); 1")
             assert one.run("document.getElementById('mp4').disabled")
-            assert one.errors == []
-        finally:
-            one.close()
 
 
 PIXELS = """(() => { const {area} = mudg.last;
@@ -282,21 +273,16 @@ def drawn(page: Browser, source: str) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 def test_exact_frames_are_compared_with_what_they_are_compared_with(toy: Toy, tmp_path: Path) -> None:
-    shown = "document.getElementById('canvas'), ...mudg.last.area"
+    canvas = "document.getElementById('canvas'), ...mudg.last.area"
     with serving(toy[1], toy[0] / "scene", compare=toy[1], images=5) as (port, token):
-        one = Browser(tmp_path / "profile", size=(700, 500))
-        try:
-            one.open(f"http://127.0.0.1:{port}/?token={token}#m=recorded&c=front&t=0.4&v=divider-recorded&d=0")
+        with shown(port, f"{token}#m=recorded&c=front&t=0.4&v=divider-recorded&d=0", tmp_path) as one:
             one.wait("!document.getElementById('exact').hidden")
             photograph = drawn(one, "mudg.image(mudg.drive.nearestFrame('front', 0.4))")
-            assert np.abs(drawn(one, shown)[:, 4:] - photograph[:, 4:]).mean() < 6
+            assert np.abs(drawn(one, canvas)[:, 4:] - photograph[:, 4:]).mean() < 6
             one.run("mudg.change({divider: 1}); 1")
             one.wait("!document.getElementById('exact').hidden")
-            assert np.abs(drawn(one, shown) - photograph).mean() > 12
+            assert np.abs(drawn(one, canvas) - photograph).mean() > 12
             one.run("mudg.change({compare: 'difference-scene'}); 1")  # the same fit twice
             one.wait("!document.getElementById('exact').hidden")
             assert one.run("mudg.exact.images.length") == 2
-            assert drawn(one, shown).max() == 0
-            assert one.errors == []
-        finally:
-            one.close()
+            assert drawn(one, canvas).max() == 0

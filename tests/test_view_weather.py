@@ -88,11 +88,8 @@ def test_streaks_stand_where_the_program_draws_them(opened: tuple[Browser, Scene
     fall = particles.Falling(particles.snow_sizes(4), (0.5, 0.0), 8.0, 0.01, "flakes")
     velocity = page.run("mudg.drive.velocity(0.4)")
     covered = 1 - np.exp(-particles.falling(wanted, depth, fall, tuple(velocity), SEED))
-    air = np.mean(
-        page.run("import('mudg/weather').then((w) => w.preview(mudg.renderer.conditions, mudg.loaded[0].scene.sky))")[
-            "fog"
-        ][:3]
-    )
+    preview = "w.preview(mudg.renderer.conditions, mudg.loaded[0].scene.sky)"
+    air = np.mean(page.run(f"import('mudg/weather').then((w) => {preview})")["fog"][:3])
     ground = np.s_[55:]  # dark, so that flakes show; their edges, because the veil changes everything a little
     shown, true = ((part - uniform_filter(part, 9))[ground] for part in (snowy - dry, covered * (air - dry)))
     assert np.corrcoef(shown.ravel(), true.ravel())[0, 1] > 0.7
@@ -124,15 +121,13 @@ def test_the_sliders_write_what_the_program_reads(opened: tuple[Browser, SceneMo
 
     for name, position in (("rain", 4), ("snow", 3), ("cover", 2), ("fog", 2)):
         slide(name, position)
-    (tmp_path / "edits.yaml").write_text(
-        page.run("import('mudg/edits').then((e) => e.scriptText(mudg.state.edits))"), encoding="utf-8"
-    )
+    script = page.run("import('mudg/edits').then((e) => e.scriptText(mudg.state.edits))")
+    (tmp_path / "edits.yaml").write_text(script, encoding="utf-8")
     (edit,) = read_edits(tmp_path / "edits.yaml").edits
     made = edit.settings
     assert (made.rain.mm_h, made.snow.mm_h, made.snow.cover, made.fog.visibility_m) == (25, 2, 0.5, 500)
-    texts = [
-        page.run(f"document.getElementById('{name}-text').textContent") for name in ("rain", "snow", "cover", "fog")
-    ]
+    text = "document.getElementById('{}-text').textContent"
+    texts = [page.run(text.format(name)) for name in ("rain", "snow", "cover", "fog")]
     assert texts == ["25 mm/h", "2 mm/h of water", "50 % white", "visibility 500 m"]
     for name in ("snow", "fog", "rain"):
         slide(name, 0)

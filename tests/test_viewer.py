@@ -6,6 +6,7 @@ import base64
 import gzip
 import hashlib
 import http.server
+import io
 import json
 import re
 import threading
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 from browser import CHROMIUM, NO_BROWSER, Browser, BrowserError
+from PIL import Image
 from toy_fitted import STREET, toy_fitted, write_toy_run
 from view_server import ask, serving
 
@@ -29,6 +31,7 @@ from mudg.base.types import Camera
 from mudg.core.trajectory import at_shift
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
+from mudg.scene.read import read_scene
 from mudg.viewer import page as viewer_page
 from mudg.viewer import view
 from mudg.viewer.page import (
@@ -45,6 +48,7 @@ from mudg.viewer.page import (
 from mudg.viewer.server import token_for
 from mudg.viewer.settings import PageConfig
 
+Toy = tuple[Path, Path, SceneModel]
 needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 
 
@@ -118,10 +122,8 @@ def test_every_gaussian_is_in_one_chunk_and_the_first_ones_matter_most() -> None
     assert 0 < len(chunks[-1]) <= size
     assert [level_of(k) for k in range(8)] == [0, 1, 1, 2, 2, 2, 2, 3]
     worth = coverage(columns_of(model), model.table.labels["node"].numpy(), path)
-    levels = [
-        np.concatenate([c for k, c in enumerate(chunks) if level_of(k) == n])
-        for n in range(level_of(len(chunks) - 1) + 1)
-    ]
+    of_level = lambda n: [c for k, c in enumerate(chunks) if level_of(k) == n]  # noqa: E731
+    levels = [np.concatenate(of_level(n)) for n in range(level_of(len(chunks) - 1) + 1)]
     for one, following in zip(levels, levels[1:]):
         assert worth[one].min() >= worth[following].max()
 
@@ -196,7 +198,7 @@ def test_json_in_a_page_cannot_end_its_element() -> None:
 
 
 @pytest.fixture(scope="module")
-def toy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, SceneModel]:
+def toy(tmp_path_factory: pytest.TempPathFactory) -> Toy:
     """Scene, fit and page folders of the toy."""
     root = tmp_path_factory.mktemp("viewer")
     scene, fit, _, model = write_toy_run(root)
@@ -205,14 +207,14 @@ def toy(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path, SceneMode
     return root, fit, model
 
 
-def test_the_page_names_no_place_of_this_machine(toy: tuple[Path, Path, SceneModel]) -> None:
+def test_the_page_names_no_place_of_this_machine(toy: Toy) -> None:
     text = (toy[0] / "page.html").read_text(encoding="utf-8")
     assert str(toy[0]) not in text
     assert "http://" not in text and "https://" not in text
     assert "<script>alert" not in text
 
 
-def test_a_page_is_not_replaced_without_being_asked(toy: tuple[Path, Path, SceneModel]) -> None:
+def test_a_page_is_not_replaced_without_being_asked(toy: Toy) -> None:
     with pytest.raises(UsageError, match="exists"):
         view.run_page(PageConfig(), toy[1], toy[0] / "page.html", scene=toy[0] / "scene")
     with pytest.raises(UsageError, match="scene of this fit is not known"):
@@ -220,14 +222,13 @@ def test_a_page_is_not_replaced_without_being_asked(toy: tuple[Path, Path, Scene
 
 
 def folder_page(
-    toy: tuple[Path, Path, SceneModel], root: Path, monkeypatch: pytest.MonkeyPatch, config: PageConfig | None = None
+    toy: Toy, root: Path, monkeypatch: pytest.MonkeyPatch, config: PageConfig | None = None
 ) -> tuple[Path, dict[str, Any]]:
     """A page in a folder with chunks of 64 Gaussians, and its facts."""
     monkeypatch.setattr(view, "ONE_FILE_BYTES", 1000)
     monkeypatch.setattr(view, "CHUNK", 64)
-    made = view.run_page(
-        config or PageConfig(images=3), toy[1], root / "page.html", scene=toy[0] / "scene", overwrite=True
-    )
+    settings = config or PageConfig(images=3)
+    made = view.run_page(settings, toy[1], root / "page.html", scene=toy[0] / "scene", overwrite=True)
     assert made["page"] == root / "page_page" / "index.html"
     text = made["page"].read_text(encoding="utf-8")
     found = re.search(r'<script type="application/json" id="facts">(.*?)</script>', text, re.DOTALL)
@@ -236,19 +237,14 @@ def folder_page(
 
 
 def test_a_large_page_becomes_a_folder_whose_files_it_knows(
-    toy: tuple[Path, Path, SceneModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "page.html").write_text("an older page")
     folder, facts = folder_page(toy, tmp_path, monkeypatch)
     (scene,) = facts["scenes"]
     assert len(scene["chunks"]) > 10
     assert sum(chunk["rows"] for chunk in scene["chunks"]) == scene["rows"]
-    records = [
-        facts["log"]["file"],
-        facts["images"]["file"],
-        scene["file"],
-        *(chunk["file"] for chunk in scene["chunks"]),
-    ]
+    records = [one["file"] for one in (facts["log"], facts["images"], scene, *scene["chunks"])]
     for record in records:
         content = (folder / record["url"]).read_bytes()
         assert record["bytes"] == len(content)
@@ -256,16 +252,13 @@ def test_a_large_page_becomes_a_folder_whose_files_it_knows(
     assert {path.name for path in folder.iterdir()} == {"index.html", *(record["url"] for record in records)}
     assert not (tmp_path / "page.html").exists()
     (tmp_path / "again").mkdir()
-    view.run_page(
-        PageConfig(images=0), toy[1], tmp_path / "again" / "page.html", scene=toy[0] / "scene", report="report.html"
-    )
+    out = tmp_path / "again" / "page.html"
+    view.run_page(PageConfig(images=0), toy[1], out, scene=toy[0] / "scene", report="report.html")
     index = (tmp_path / "again" / "page_page" / "index.html").read_text(encoding="utf-8")
     assert 'href="../report.html"' in index  # which lies beside the folder
 
 
-def test_a_folder_is_made_alike_twice(
-    toy: tuple[Path, Path, SceneModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_is_made_alike_twice(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def content() -> dict[str, bytes]:
         folder, _ = folder_page(toy, tmp_path, monkeypatch)
         return {path.name: path.read_bytes() for path in folder.iterdir()}
@@ -274,18 +267,14 @@ def test_a_folder_is_made_alike_twice(
     assert content() == first
 
 
-def test_a_folder_of_something_else_is_not_replaced(
-    toy: tuple[Path, Path, SceneModel], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_folder_of_something_else_is_not_replaced(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "page_page").mkdir()
     (tmp_path / "page_page" / "notes.txt").write_text("mine")
     with pytest.raises(UsageError, match="not a page"):
         folder_page(toy, tmp_path, monkeypatch)
 
 
-def test_what_a_page_takes_is_said_before_it_is_written(toy: tuple[Path, Path, SceneModel]) -> None:
-    from mudg.scene.read import read_scene
-
+def test_what_a_page_takes_is_said_before_it_is_written(toy: Toy) -> None:
     scene = read_scene(toy[0] / "scene")
     page = view.page_of(PageConfig(images=0, budget=500), view.Shown(scene, (("fit", toy[2]),)))
     said = view.needs_text(page, "page.html", "0.1 MB")
@@ -295,11 +284,7 @@ def test_what_a_page_takes_is_said_before_it_is_written(toy: tuple[Path, Path, S
     assert page.graphics_bytes() == 500 * (5 * 16 + 4)  # degree 3: five texels
 
 
-def test_a_page_stays_within_the_memory_that_it_may_take(
-    toy: tuple[Path, Path, SceneModel], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from mudg.scene.read import read_scene
-
+def test_a_page_stays_within_the_memory_that_it_may_take(toy: Toy, monkeypatch: pytest.MonkeyPatch) -> None:
     for degree in range(4):
         for size in (64, 65_536):
             for limit in (5_000, 60_000, 1_234_567, 300_000_000):
@@ -310,9 +295,8 @@ def test_a_page_stays_within_the_memory_that_it_may_take(
     monkeypatch.setattr(view, "MEGABYTE", 1e5)
     page = view.page_of(PageConfig(images=0, memory_mb=1), shown)
     assert 9e4 < page.graphics_bytes() + page.heap_bytes() <= 1e5
-    assert f"{page.scenes[0][1].layout.visible - page.scenes[0][1].kept} left out for the budget" in view.needs_text(
-        page, "page.html", ""
-    )
+    kept = page.scenes[0][1]
+    assert f"{kept.layout.visible - kept.kept} left out for the budget" in view.needs_text(page, "page.html", "")
     assert view.page_of(PageConfig(images=0, memory_mb=1, budget=100), shown).scenes[0][1].kept == 100
 
 
@@ -328,7 +312,7 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 
 @pytest.fixture(scope="module")
-def opened(toy: tuple[Path, Path, SceneModel], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+def opened(toy: Toy, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
     if CHROMIUM is None:
         pytest.skip(NO_BROWSER)
     one = Browser(tmp_path_factory.mktemp("profile"), size=(360, 300))
@@ -341,18 +325,15 @@ def opened(toy: tuple[Path, Path, SceneModel], tmp_path_factory: pytest.TempPath
 
 @pytest.mark.slow
 @needs_browser
-def test_a_browser_draws_what_the_rasterizer_draws(opened: Browser, toy: tuple[Path, Path, SceneModel]) -> None:
-    from mudg.scene.read import read_scene
-
+def test_a_browser_draws_what_the_rasterizer_draws(opened: Browser, toy: Toy) -> None:
     scene, model = read_scene(toy[0] / "scene"), toy[2]
     for time_s, shift_m in ((0.0, 0.0), (0.4, 0.0), (0.4, 2.0), (0.6, -2.0), (0.8, 0.5)):
         wanted = next(v for v in at_shift(scene, "front", shift_m).views if abs(v.time_s - time_s) < 1e-6)
         true = render_view(model, wanted, raster_of(model))
         seen = opened.measure(["color", "depth", "class", "confidence"], camera="front", t=time_s, shift=shift_m)
         assert psnr(seen["color"][..., :3] / 255.0, true.rgb.permute(1, 2, 0).numpy()) >= 38
-        depth = np.where(
-            seen["depth"][..., 3] >= 0.5, seen["depth"][..., 0] / np.maximum(seen["depth"][..., 3], 1e-6), np.nan
-        )
+        total, weight = seen["depth"][..., 0], seen["depth"][..., 3]
+        depth = np.where(weight >= 0.5, total / np.maximum(weight, 1e-6), np.nan)
         both = np.isfinite(depth) & np.isfinite(true.depth[0].numpy())
         assert np.median(np.abs(depth[both] / true.depth[0].numpy()[both] - 1)) <= 0.01
         assert (seen["class"] == true.semantics.numpy()).mean() >= 0.97
@@ -373,7 +354,7 @@ VIEWS = {
 @needs_browser
 @pytest.mark.parametrize("name", VIEWS)
 def test_the_sign_tells_how_much_of_a_view_is_determined_and_how_much_is_empty(
-    name: str, opened: Browser, toy: tuple[Path, Path, SceneModel]
+    name: str, opened: Browser, toy: Toy
 ) -> None:
     """Against pictures of the program's own rasterizer, and what the page drew, counted here."""
     state, words = VIEWS[name]
@@ -394,10 +375,8 @@ def test_the_sign_tells_how_much_of_a_view_is_determined_and_how_much_is_empty(
     covered = np.isfinite(drawn.depth_m)
     assert (covered == (alpha >= 0.5)).mean() > 0.95
     x, y = np.meshgrid(np.arange(small["width"]) + 0.5, np.arange(small["height"]) + 0.5)
-    rays = (
-        np.stack([(x - small["cx"]) / small["fx"], (y - small["cy"]) / small["fy"], np.ones_like(x)], -1)
-        @ pose[:3, :3].T
-    )
+    ahead = np.stack([(x - small["cx"]) / small["fx"], (y - small["cy"]) / small["fy"], np.ones_like(x)], -1)
+    rays = ahead @ pose[:3, :3].T
     below = rays[..., 2] / np.linalg.norm(rays, axis=-1) < -0.03  # 1.7 degrees below the horizon
     ground = covered | below
     assert found["empty"] == pytest.approx((~covered & below).sum() / ground.sum(), abs=0.04)
@@ -435,7 +414,7 @@ def test_a_link_shows_the_same(opened: Browser) -> None:
 
 @pytest.mark.slow
 @needs_browser
-def test_hidden_objects_are_gone(opened: Browser, toy: tuple[Path, Path, SceneModel]) -> None:
+def test_hidden_objects_are_gone(opened: Browser, toy: Toy) -> None:
     with_car = opened.measure(["class"], camera="front", t=0.4)["class"]
     without = opened.measure(["class"], camera="front", t=0.4, hidden=["car-1"])["class"]
     assert (with_car == ID["car"]).sum() > 20
@@ -455,9 +434,7 @@ def test_what_is_hidden_is_an_edit_script(opened: Browser, tmp_path: Path) -> No
 
 @pytest.mark.slow
 @needs_browser
-def test_names_from_a_log_do_not_run(opened: Browser, toy: tuple[Path, Path, SceneModel], tmp_path: Path) -> None:
-    from mudg.scene.read import read_scene
-
+def test_names_from_a_log_do_not_run(opened: Browser, toy: Toy, tmp_path: Path) -> None:
     name = "</script><script>document.documentElement.dataset.foreign=1</script><img src=x onerror='document.title=1'>"
     scene = read_scene(toy[0] / "scene")
     hostile = replace(scene, id=name, tracks=(replace(scene.tracks[0], id=name, label=name),))
@@ -509,33 +486,31 @@ AT = {"camera": "front", "t": 0.4, "shift": 1.0}
 @pytest.mark.slow
 @needs_browser
 def test_a_page_in_chunks_shows_what_one_chunk_shows(
-    toy: tuple[Path, Path, SceneModel], web: tuple[Path, str], fresh: Browser, monkeypatch: pytest.MonkeyPatch
+    toy: Toy, web: tuple[Path, str], fresh: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder_page(toy, web[0], monkeypatch)
     fresh.open(f"{web[1]}/page_page/#m=recorded&c=front&t=0.4")
     fresh.wait("document.documentElement.dataset.arrival === 'whole'")
     chunked = fresh.measure(["color", "depth", "class"], **AT)
     assert fresh.run("document.getElementById('arrival').hidden")
-    assert (
-        len([address for address in fresh.requests if "scene-0-0" in address])
-        == fresh.run("mudg.arrival.all.length")
-        > 10
-    )
+    asked = [address for address in fresh.requests if "scene-0-0" in address]
+    assert len(asked) == fresh.run("mudg.arrival.all.length") > 10
     assert fresh.errors == []
+
     # one file whose chunks are the same holds the same picture to the bit
-    config = PageConfig(images=3)
-    inside = view.page_of(config, view.find_shown(config, toy[1], toy[0] / "scene", None))
-    (web[0] / "one.html").write_bytes(whole_page(inside))
-    fresh.open(f"file://{web[0] / 'one.html'}")
+    def open_one_file() -> None:
+        config = PageConfig(images=3)
+        page = view.page_of(config, view.find_shown(config, toy[1], toy[0] / "scene", None))
+        (web[0] / "one.html").write_bytes(whole_page(page))
+        fresh.open(f"file://{web[0] / 'one.html'}")
+
+    open_one_file()
     one = fresh.measure(["color", "depth", "class"], **AT)
     for layer, values in chunked.items():
         assert np.array_equal(values, one[layer]), layer
     # one chunk of everything has other blocks: the same within rounding
     monkeypatch.setattr(view, "CHUNK", 65_536)
-    (web[0] / "one.html").write_bytes(
-        whole_page(view.page_of(config, view.find_shown(config, toy[1], toy[0] / "scene", None)))
-    )
-    fresh.open(f"file://{web[0] / 'one.html'}")
+    open_one_file()
     assert psnr(fresh.measure(["color"], **AT)["color"] / 255.0, chunked["color"] / 255.0) > 45
 
 
@@ -546,12 +521,7 @@ def test_a_page_in_chunks_shows_what_one_chunk_shows(
     [("missing", "404"), ("truncated", "of"), ("foreign", "its content is not what this page was made with")],
 )
 def test_a_chunk_that_fails_is_told_and_can_be_tried_again(
-    toy: tuple[Path, Path, SceneModel],
-    web: tuple[Path, str],
-    fresh: Browser,
-    monkeypatch: pytest.MonkeyPatch,
-    damage: str,
-    told: str,
+    toy: Toy, web: tuple[Path, str], fresh: Browser, monkeypatch: pytest.MonkeyPatch, damage: str, told: str
 ) -> None:
     folder, facts = folder_page(toy, web[0], monkeypatch)
     record = facts["scenes"][0]["chunks"][4]["file"]
@@ -574,15 +544,13 @@ def test_a_chunk_that_fails_is_told_and_can_be_tried_again(
     fresh.wait("document.documentElement.dataset.arrival === 'whole'")
     assert fresh.run("document.getElementById('arrival').hidden")
     assert fresh.run("mudg.loaded[0].present") == facts["scenes"][0]["rows"]
-    assert len(fresh.errors) and all("scene-0-004" in error or "integrity" in error for error in fresh.errors), (
-        fresh.errors
-    )
+    assert fresh.errors and all("scene-0-004" in e or "integrity" in e for e in fresh.errors), fresh.errors
 
 
 @pytest.mark.slow
 @needs_browser
 def test_a_folder_opened_from_the_disk_says_what_to_do(
-    toy: tuple[Path, Path, SceneModel], tmp_path: Path, fresh: Browser, monkeypatch: pytest.MonkeyPatch
+    toy: Toy, tmp_path: Path, fresh: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, _ = folder_page(toy, tmp_path, monkeypatch)
     with pytest.raises(BrowserError, match="python -m http.server"):
@@ -594,7 +562,7 @@ def test_a_folder_opened_from_the_disk_says_what_to_do(
 
 
 @pytest.fixture(scope="module")
-def served(toy: tuple[Path, Path, SceneModel]) -> Iterator[tuple[int, str]]:
+def served(toy: Toy) -> Iterator[tuple[int, str]]:
     with serving(toy[1], toy[0] / "scene") as found:
         yield found
 
@@ -619,29 +587,13 @@ def test_the_server_answers_only_to_its_own_page(served: tuple[int, str]) -> Non
     assert status == 400 and b"request" in text
 
 
-def test_the_server_draws_exact_frames(served: tuple[int, str], toy: tuple[Path, Path, SceneModel]) -> None:
-    import io
-
-    from PIL import Image
-
+def test_the_server_draws_exact_frames(served: tuple[int, str], toy: Toy) -> None:
     port, token = served
     wanted = STREET.view(0.4, 160, 96)
     pose, camera = wanted.world_from_cam, wanted.camera
-    body = {
-        "scene": 0,
-        "layer": "color",
-        "time_s": 0.4,
-        "hidden": [],
-        "camera": "front",
-        "width": 160,
-        "height": 96,
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "cx": camera.cx,
-        "cy": camera.cy,
-        "eye": pose[:3, 3].tolist(),
-        "axes": pose[:3, :3].T.tolist(),
-    }
+    lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    at = {"eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist(), "time_s": 0.4, "camera": "front"}
+    body = {"scene": 0, "layer": "color", "hidden": [], **lens, **at}
     here = {"Origin": f"http://localhost:{port}", "Host": f"localhost:{port}"}
     status, content = ask(port, "POST", "/frame", body, X_Mudg_Token=token, **here)
     assert status == 200
@@ -658,7 +610,7 @@ def test_other_machines_need_a_token() -> None:
     assert len(token_for("127.0.0.1", "")) >= 16
 
 
-def test_fits_of_different_logs_are_not_compared(toy: tuple[Path, Path, SceneModel], tmp_path: Path) -> None:
+def test_fits_of_different_logs_are_not_compared(toy: Toy, tmp_path: Path) -> None:
     from mudg.gaussians.storage import save_model
 
     save_model(replace(toy[2], facts={**toy[2].facts, "scene": "another"}), tmp_path / "fit")

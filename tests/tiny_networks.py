@@ -1,5 +1,5 @@
-"""Tiny random networks of transformers and diffusers, saved as those packages save the real ones. Without the packages:
-skip."""
+"""Tiny random networks: of transformers and diffusers, saved as those packages save the real ones (without the
+packages: skip); and settings of a small diffusion model."""
 
 from __future__ import annotations
 
@@ -12,7 +12,19 @@ from typing import Any
 import pytest
 import torch
 
+from mudg.diffusion.model import MDMConfig
+from mudg.networks.codec import CodecConfig
+
 NAMES = {0: "Road", 1: "traffic light", 2: "sky", 3: "unicorn"}
+LABELS = {"id2label": NAMES, "label2id": {name: number for number, name in NAMES.items()}}
+
+
+def small_mdm(**changes: Any) -> MDMConfig:
+    """Settings of a diffusion model that is made in a moment."""
+    size = {"widths": (16, 32), "blocks": (1, 1), "refine_widths": (8, 16), "refine_blocks": (1, 1), "embed_width": 16}
+    attention = {"spatial_attention": (False, True), "temporal_attention": (False, True)}
+    codec = CodecConfig(decoder_width=8, decoder_blocks=1)
+    return MDMConfig(**{**size, **attention, "codec": codec, "patch": 2, "window": 4, "area_px": 24576, **changes})
 
 
 def package(name: str) -> Any:
@@ -39,103 +51,47 @@ def seeded(network: torch.nn.Module, seed: int = 0, gain: float = 1.0) -> torch.
 def segformer(folder: Path) -> Any:
     """SegFormer of 24 thousand parameters."""
     t = package("transformers")
-    config = t.SegformerConfig(
-        depths=[1] * 4,
-        hidden_sizes=[8, 8, 16, 16],
-        num_attention_heads=[1, 1, 2, 2],
-        decoder_hidden_size=16,
-        id2label=NAMES,
-        label2id={name: n for n, name in NAMES.items()},
-    )
+    size = {"depths": [1] * 4, "hidden_sizes": [8, 8, 16, 16], "num_attention_heads": [1, 1, 2, 2]}
+    config = t.SegformerConfig(**size, decoder_hidden_size=16, **LABELS)
     return _saved(seeded(t.SegformerForSemanticSegmentation(config)), folder)
 
 
 def mask2former(folder: Path) -> Any:
     """Mask2Former on a Swin backbone."""
     t = package("transformers")
-    swin = t.SwinConfig(
-        image_size=64,
-        embed_dim=8,
-        depths=[1] * 4,
-        num_heads=[1, 1, 2, 2],
-        window_size=4,
-        out_features=["stage1", "stage2", "stage3", "stage4"],
-    )
-    config = t.Mask2FormerConfig(
-        backbone_config=swin,
-        feature_size=32,
-        mask_feature_size=32,
-        hidden_dim=32,
-        encoder_feedforward_dim=32,
-        dim_feedforward=32,
-        encoder_layers=1,
-        decoder_layers=2,
-        num_attention_heads=2,
-        num_queries=6,
-        id2label=NAMES,
-        label2id={name: n for n, name in NAMES.items()},
-    )
+    stages, tower = [f"stage{number}" for number in range(1, 5)], {"depths": [1] * 4, "num_heads": [1, 1, 2, 2]}
+    swin = t.SwinConfig(image_size=64, embed_dim=8, **tower, window_size=4, out_features=stages)
+    names = ("feature_size", "mask_feature_size", "hidden_dim", "encoder_feedforward_dim", "dim_feedforward")
+    size = {**dict.fromkeys(names, 32), "encoder_layers": 1, "decoder_layers": 2, "num_attention_heads": 2}
+    config = t.Mask2FormerConfig(backbone_config=swin, **size, num_queries=6, **LABELS)
     return _saved(seeded(t.Mask2FormerForUniversalSegmentation(config)), folder)
 
 
 def eomt(folder: Path) -> Any:
     """EoMT that reads squares of 64 px."""
     t = package("transformers")
-    config = t.EomtConfig(
-        hidden_size=16,
-        num_hidden_layers=2,
-        num_attention_heads=2,
-        image_size=64,
-        patch_size=16,
-        num_queries=6,
-        num_blocks=1,
-        num_upscale_blocks=1,
-        id2label=NAMES,
-        label2id={name: n for n, name in NAMES.items()},
-    )
+    tower = {"hidden_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2, "image_size": 64, "patch_size": 16}
+    config = t.EomtConfig(**tower, num_queries=6, num_blocks=1, num_upscale_blocks=1, **LABELS)
     return _saved(seeded(t.EomtForUniversalSegmentation(config)), folder)
 
 
 def depth_anything(folder: Path, *, with_lidar: bool = False, metric: bool = False) -> Any:
     """Depth Anything or PromptDepthAnything on a DINOv2 backbone, for images whose shorter side is 42 px."""
     t = package("transformers")
-    backbone = t.Dinov2Config(
-        hidden_size=16,
-        num_hidden_layers=4,
-        num_attention_heads=2,
-        intermediate_size=16,
-        image_size=42,
-        patch_size=14,
-        out_indices=[1, 2, 3, 4],
-        reshape_hidden_states=False,
-        apply_layernorm=True,
-    )
+    tower = {"hidden_size": 16, "num_hidden_layers": 4, "num_attention_heads": 2, "intermediate_size": 16}
+    outputs = {"out_indices": [1, 2, 3, 4], "reshape_hidden_states": False, "apply_layernorm": True}
+    backbone = t.Dinov2Config(**tower, image_size=42, patch_size=14, **outputs)
     config_class = t.PromptDepthAnythingConfig if with_lidar else t.DepthAnythingConfig
-    config = config_class(
-        backbone_config=backbone,
-        reassemble_hidden_size=16,
-        patch_size=14,
-        neck_hidden_sizes=[8] * 4,
-        fusion_hidden_size=8,
-        head_hidden_size=8,
-        depth_estimation_type="metric" if metric or with_lidar else "relative",
-        max_depth=80 if metric else 1,
-    )
+    neck = {"reassemble_hidden_size": 16, "neck_hidden_sizes": [8] * 4, "fusion_hidden_size": 8, "head_hidden_size": 8}
+    kind = "metric" if metric or with_lidar else "relative"
+    limits = {"depth_estimation_type": kind, "max_depth": 80 if metric else 1}
+    config = config_class(backbone_config=backbone, patch_size=14, **neck, **limits)
     network_class = t.PromptDepthAnythingForDepthEstimation if with_lidar else t.DepthAnythingForDepthEstimation
     network = _saved(seeded(network_class(config), gain=1.5), folder)
-    described = {
-        "size": {"height": 42, "width": 42},
-        "keep_aspect_ratio": True,
-        "ensure_multiple_of": 14,
-        "do_resize": True,
-        "resample": 3,
-        "do_rescale": True,
-        "rescale_factor": 1 / 255,
-        "do_normalize": True,
-        "image_mean": [0.485, 0.456, 0.406],
-        "image_std": [0.229, 0.224, 0.225],
-        "do_pad": False,
-    }
+    steps = {f"do_{name}": name != "pad" for name in ("resize", "rescale", "normalize", "pad")}
+    described = {"size": {"height": 42, "width": 42}, "keep_aspect_ratio": True, "ensure_multiple_of": 14, **steps}
+    described |= {"resample": 3, "rescale_factor": 1 / 255}
+    described |= {"image_mean": [0.485, 0.456, 0.406], "image_std": [0.229, 0.224, 0.225]}
     (folder / "preprocessor_config.json").write_text(json.dumps(described))
     return network
 
@@ -143,47 +99,18 @@ def depth_anything(folder: Path, *, with_lidar: bool = False, metric: bool = Fal
 def marigold(folder: Path, *, prediction_type: str = "v_prediction", longest_px: int = 48) -> Any:
     """Folder of a Marigold pipeline: latents of half the size, two tokens of text."""
     t, d = package("transformers"), package("diffusers")
-    unet = d.UNet2DConditionModel(
-        in_channels=8,
-        out_channels=4,
-        block_out_channels=(8, 16),
-        layers_per_block=1,
-        norm_num_groups=4,
-        cross_attention_dim=8,
-        attention_head_dim=4,
-        down_block_types=("DownBlock2D", "CrossAttnDownBlock2D"),
-        up_block_types=("CrossAttnUpBlock2D", "UpBlock2D"),
-    )
-    vae = d.AutoencoderKL(
-        block_out_channels=(8, 16),
-        norm_num_groups=4,
-        latent_channels=4,
-        down_block_types=("DownEncoderBlock2D",) * 2,
-        up_block_types=("UpDecoderBlock2D",) * 2,
-        layers_per_block=1,
-    )
-    text = t.CLIPTextModel(
-        t.CLIPTextConfig(
-            vocab_size=8,
-            hidden_size=8,
-            intermediate_size=8,
-            num_hidden_layers=1,
-            num_attention_heads=2,
-            max_position_embeddings=8,
-            bos_token_id=6,
-            eos_token_id=7,
-        )
-    )
-    scheduler = d.DDIMScheduler(
-        beta_start=0.00085,
-        beta_end=0.012,
-        beta_schedule="scaled_linear",
-        clip_sample=False,
-        set_alpha_to_one=False,
-        steps_offset=1,
-        prediction_type=prediction_type,
-        timestep_spacing="trailing",
-    )
+    size = {"block_out_channels": (8, 16), "layers_per_block": 1, "norm_num_groups": 4}
+    down, up = ("DownBlock2D", "CrossAttnDownBlock2D"), ("CrossAttnUpBlock2D", "UpBlock2D")
+    width = {"in_channels": 8, "out_channels": 4, "cross_attention_dim": 8, "attention_head_dim": 4, **size}
+    unet = d.UNet2DConditionModel(**width, down_block_types=down, up_block_types=up)
+    down, up = ("DownEncoderBlock2D",) * 2, ("UpDecoderBlock2D",) * 2
+    vae = d.AutoencoderKL(**size, latent_channels=4, down_block_types=down, up_block_types=up)
+    tower = {"hidden_size": 8, "intermediate_size": 8, "num_hidden_layers": 1, "num_attention_heads": 2}
+    words = {"vocab_size": 8, "max_position_embeddings": 8, "bos_token_id": 6, "eos_token_id": 7}
+    text = t.CLIPTextModel(t.CLIPTextConfig(**tower, **words))
+    betas = {"beta_start": 0.00085, "beta_end": 0.012, "beta_schedule": "scaled_linear"}
+    steps = {"steps_offset": 1, "prediction_type": prediction_type, "timestep_spacing": "trailing"}
+    scheduler = d.DDIMScheduler(**betas, clip_sample=False, set_alpha_to_one=False, **steps)
     for seed, (name, network) in enumerate({"unet": unet, "vae": vae, "text_encoder": text}.items()):
         seeded(network, seed).save_pretrained(folder / name)
     scheduler.save_pretrained(folder / "scheduler")
@@ -191,34 +118,17 @@ def marigold(folder: Path, *, prediction_type: str = "v_prediction", longest_px:
     words = {w: n for n, w in enumerate(["a", "b", "c", "a</w>", "b</w>", "c</w>", "<|startoftext|>", "<|endoftext|>"])}
     (folder / "tokenizer" / "vocab.json").write_text(json.dumps(words))
     (folder / "tokenizer" / "merges.txt").write_text("#version: 0.2\n")
-    (folder / "tokenizer" / "tokenizer_config.json").write_text(
-        json.dumps({"tokenizer_class": "CLIPTokenizer", "model_max_length": 8})
-    )
-    index = {
-        "_class_name": "MarigoldDepthPipeline",
-        "_diffusers_version": d.__version__,
-        "prediction_type": "depth",
-        "scale_invariant": True,
-        "shift_invariant": True,
-        "default_denoising_steps": 3,
-        "default_processing_resolution": longest_px,
-        "unet": ["diffusers", "UNet2DConditionModel"],
-        "vae": ["diffusers", "AutoencoderKL"],
-        "scheduler": ["diffusers", "DDIMScheduler"],
-        "text_encoder": ["transformers", "CLIPTextModel"],
-        "tokenizer": ["transformers", "CLIPTokenizer"],
-    }
+    described = {"tokenizer_class": "CLIPTokenizer", "model_max_length": 8}
+    (folder / "tokenizer" / "tokenizer_config.json").write_text(json.dumps(described))
+    defaults = {"default_denoising_steps": 3, "default_processing_resolution": longest_px}
+    index = {"_class_name": "MarigoldDepthPipeline", "_diffusers_version": d.__version__, "prediction_type": "depth"}
+    index |= {"scale_invariant": True, "shift_invariant": True, **defaults}
+    index |= {"unet": ["diffusers", "UNet2DConditionModel"], "vae": ["diffusers", "AutoencoderKL"]}
+    index |= {"text_encoder": ["transformers", "CLIPTextModel"], "tokenizer": ["transformers", "CLIPTokenizer"]}
+    index["scheduler"] = ["diffusers", "DDIMScheduler"]
     (folder / "model_index.json").write_text(json.dumps(index))
-    return d.MarigoldDepthPipeline(
-        unet,
-        vae,
-        scheduler,
-        text,
-        t.CLIPTokenizer.from_pretrained(str(folder / "tokenizer")),
-        prediction_type="depth",
-        default_denoising_steps=3,
-        default_processing_resolution=longest_px,
-    )
+    tokenizer = t.CLIPTokenizer.from_pretrained(str(folder / "tokenizer"))
+    return d.MarigoldDepthPipeline(unet, vae, scheduler, text, tokenizer, prediction_type="depth", **defaults)
 
 
 def depthlab(folder: Path) -> dict[str, Any]:
@@ -228,13 +138,9 @@ def depthlab(folder: Path) -> dict[str, Any]:
     base = marigold(folder / "marigold-depth-v1-0")
     config = {name: value for name, value in base.unet.config.items() if not name.startswith("_")}
     tower = {"hidden_size": 16, "intermediate_size": 16, "num_hidden_layers": 2, "num_attention_heads": 2}
-    clip = t.CLIPModel(
-        t.CLIPConfig(
-            text_config={**tower, "vocab_size": 8, "max_position_embeddings": 8, "bos_token_id": 6, "eos_token_id": 7},
-            vision_config={**tower, "image_size": 28, "patch_size": 14},
-            projection_dim=6,
-        )
-    )
+    words = {"vocab_size": 8, "max_position_embeddings": 8, "bos_token_id": 6, "eos_token_id": 7}
+    parts = {"text_config": {**tower, **words}, "vision_config": {**tower, "image_size": 28, "patch_size": 14}}
+    clip = t.CLIPModel(t.CLIPConfig(**parts, projection_dim=6))
     seeded(clip, 8)
     made = {
         "denoising_unet": seeded(d.UNet2DConditionModel(**{**config, "in_channels": 12}), 5),

@@ -14,7 +14,7 @@ import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,33 +46,27 @@ from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
 from mudg.viewer.report import FPS, panel_grid, panel_size, shift_title
 
-
-class BenchJob(Protocol):
-    """What is worked on at a time, in terms that another process understands."""
-
-    @property
-    def title(self) -> str:
-        """For the progress bar."""
-
-    def measure(self) -> dict[str, Any]:
-        """Do the work; values for JSON."""
+Facts = Mapping[str, Any]
+"""What was measured, by name, as in JSON."""
 
 
 def compare(
     out: Path,
-    jobs: Sequence[BenchJob],
+    jobs: Mapping[str, Callable[[], dict[str, Any]]],
     config: BenchConfig,
     document: Callable[[list[dict[str, Any]]], dict[str, Any]],
-    texts: Mapping[str, Callable[[Mapping[str, Any]], str]],
+    texts: Mapping[str, Callable[[Facts], str]],
 ) -> Path:
-    """Do all jobs, several at a time with one thread each; write ``bench.json`` and its texts. Results do not depend on
-    how many run at a time; finished steps of an interrupted benchmark are reused. ``document``: what ``bench.json``
-    holds, from what the jobs measured, in their order. ``texts``: file -> its text, from the document."""
-    measured: dict[int, dict[str, Any]] = {}
+    """Do all jobs (title -> what another process can measure), several at a time with one thread each; write
+    ``bench.json`` and its texts. Results do not depend on how many run at a time; finished steps of an interrupted
+    benchmark are reused. ``document``: what ``bench.json`` holds, from what the jobs measured, in their order.
+    ``texts``: file -> its text, from the document."""
+    measured, titles = {}, list(jobs)
     with log.task("logs", len(jobs)) as bar, native.one_thread():
-        for index, facts in run_in_processes(_measure, [(job,) for job in jobs], min(at_once(config), len(jobs))):
+        work = [(measure,) for measure in jobs.values()]
+        for index, facts in run_in_processes(_measure, work, min(at_once(config), len(jobs))):
             measured[index] = facts
-            bar.update(jobs[index].title)
+            bar.update(titles[index])
             bar.advance()
     content = document([measured[index] for index in range(len(jobs))])
     store.write_json(out / "bench.json", content)
@@ -81,8 +75,8 @@ def compare(
     return out
 
 
-def _measure(job: BenchJob) -> dict[str, Any]:
-    return job.measure()
+def _measure(measure: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+    return measure()
 
 
 def at_once(config: BenchConfig) -> int:
@@ -230,11 +224,8 @@ class Chain:
         return model
 
     def _fit(self, settings: FitConfig, out: Path, virtual: Sequence[Path] = (), begun: Path | None = None) -> Path:
-        observations = tuple(virtual)
-        step = Fit(
-            scene=self.scene, fused=self.fused, observations=observations, start_from=begun, out=out, settings=settings
-        )
-        return self.run(step)
+        read = {"scene": self.scene, "fused": self.fused, "observations": tuple(virtual), "start_from": begun}
+        return self.run(Fit(**read, out=out, settings=settings))
 
 
 def repair_settings(generator: SynthesizeConfig, share: float) -> SynthesizeConfig:

@@ -47,7 +47,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -202,45 +202,35 @@ CASES = (("noise", "learnt"), ("noise", "smoothed"), ("noise", "fixed"), ("drift
 """Kind of boxes, and what is done about their poses."""
 
 
-@dataclass(frozen=True)
-class Errors:
-    """Root mean square over an object's seen keys, metres and radians; ``keys`` how many."""
-
-    position_m: float
-    yaw_rad: float
-    keys: int
-
-
 def measure_poses(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     """Fit every city with boxes as they are, with noise and with offsets, poses fixed and learnt; numbers and a table.
     Rows that an interrupted run wrote are taken as they are."""
     cities, rows = LISTS[config.cities][: config.count], []
     with log.task("fitting", len(cities) * len(CASES)) as bar:
         for city in cities:
-            scene = city_scene(city, out / "cities" / str(city))
-            for kind in dict.fromkeys(kind for kind, _ in CASES):
-                case = cache(partial(_case, scene, kind, config.seed + city))  # the same for all ways to fit it
-                for poses in (poses for other, poses in CASES if other == kind):
-                    path = out / "rows" / f"{city}_{kind}_{poses}.json"
-                    row = {"city": city, "boxes": kind, "poses": poses}
-                    rows.append(finished(path, partial(_measured, config, scene, case, row, out / "fits" / path.stem)))
-                    bar.advance()
+            for row in _pose_rows(config, city, out):
+                rows.append(row)
+                bar.advance()
     result = {"cities": list(cities), "iterations": config.pose_iterations, "rows": rows, "summary": summary(rows)}
     return result, table(result)
 
 
-def _case(scene: Scene, kind: str, seed: int) -> tuple[Scene, FusedCloud]:
-    """A city with disturbed boxes, and its clouds."""
-    disturbed_scene = replace(scene, tracks=disturbed(scene.tracks, kind, seed))
-    return disturbed_scene, cloud_of(disturbed_scene)
+def _pose_rows(config: BenchConfig, city: int, out: Path) -> Iterator[dict[str, Any]]:
+    """The rows of a city, with the errors of their fits."""
+    scene = city_scene(city, out / "cities" / str(city))
 
+    @cache  # disturbed boxes and their clouds, the same for all ways to fit them
+    def case(kind: str) -> tuple[Scene, FusedCloud]:
+        boxes = replace(scene, tracks=disturbed(scene.tracks, kind, config.seed + city))
+        return boxes, cloud_of(boxes)
 
-def _measured(
-    config: BenchConfig, truth: Scene, case: Callable[[], tuple[Scene, FusedCloud]], row: Mapping[str, Any], out: Path
-) -> dict[str, Any]:
-    """A row with the errors of its fit."""
-    scene, cloud = case()
-    return {**row, **row_of(truth, scene, fitted(scene, cloud, fit_settings(config, row["poses"]), out).model)}
+    def measured(kind: str, poses: str) -> dict[str, Any]:
+        (boxes, cloud), folder = case(kind), out / "fits" / f"{city}_{kind}_{poses}"
+        model = fitted(boxes, cloud, fit_settings(config, poses), folder).model
+        return {"city": city, "boxes": kind, "poses": poses, **row_of(scene, boxes, model)}
+
+    for kind, poses in CASES:
+        yield finished(out / "rows" / f"{city}_{kind}_{poses}.json", partial(measured, kind, poses))
 
 
 def cloud_of(scene: Scene) -> FusedCloud:
@@ -319,14 +309,14 @@ def seen_keys(scene: Scene) -> dict[str, NDArray[np.intp]]:
     return found
 
 
-def pose_errors(truth: NDArray[np.float64], keys: NDArray[np.float64], free: bool = True) -> Errors:
-    """Errors of poses f64[K, 4, 4] against the truth; ``free``: after the best constant motion in the box frame is
-    taken out."""
+def pose_errors(truth: NDArray[np.float64], keys: NDArray[np.float64], free: bool = True) -> tuple[float, float]:
+    """Root mean square errors of poses f64[K, 4, 4] against the truth, metres and radians; ``free``: after the best
+    constant motion in the box frame is taken out."""
     local = np.einsum("kji,kj->ki", keys[:, :3, :3], truth[:, :3, 3] - keys[:, :3, 3])
     turn = np.array([geometry.yaw_of(geometry.invert(b) @ a) for a, b in zip(truth, keys)])
     if free:
         local, turn = local - local.mean(0), turn - turn.mean()
-    return Errors(float(np.sqrt((local**2).sum(1).mean())), float(np.sqrt((turn**2).mean())), len(keys))
+    return float(np.sqrt((local**2).sum(1).mean())), float(np.sqrt((turn**2).mean()))
 
 
 def row_of(truth: Scene, given: Scene, model: SceneModel) -> dict[str, Any]:
@@ -341,8 +331,7 @@ def row_of(truth: Scene, given: Scene, model: SceneModel) -> dict[str, Any]:
         row = {"object": node.name, "keys": len(seen)}
         for name, keys in (("before", before), ("after", after)):
             for place, free in ((name, True), (f"{name}_absolute", False)):
-                errors = pose_errors(exact, keys, free)
-                row |= {f"{place}_m": errors.position_m, f"{place}_rad": errors.yaw_rad}
+                row[f"{place}_m"], row[f"{place}_rad"] = pose_errors(exact, keys, free)
         objects.append(row)
     return {"objects": objects, "psnr_moving": moving_psnr(truth, model)}
 

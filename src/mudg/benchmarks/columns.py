@@ -220,9 +220,9 @@ class _Maker:
         """The maps of a view that the protocol needs; None if it needs points and there are none."""
         view, wanted = _view_of(self.scene, frame, shift_m), self.protocol.maps
         points = self.points.of_moment(view.time_s)
+        if points is None and "photo" not in wanted:
+            return None
         if points is None:
-            if "photo" not in wanted:
-                return None
             points = OwnedPoints(np.zeros((0, 3), np.float32), np.zeros(0, np.int32), np.zeros(0, np.uint8), 0.4)
         world = self.points.placed(points, view.time_s)
         depth, index = lidar.visible(view, world, points.gap_deg)
@@ -324,6 +324,7 @@ _MOST_DB: Final = 100.0
 
 Sum = NDArray[np.float64]
 Sums = Mapping[str, Sum]
+Distance = Callable[[metrics.Pair], float | None]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -337,7 +338,7 @@ class Sight:
     depth: Tensor | None
     semantics: Tensor | None
     photo: Tensor | None
-    distance: Callable[[metrics.Pair], float | None] | None
+    distance: Distance | None
 
     def mask(self, name: str) -> Tensor | None:
         """A mask bool[1, H, W] by the name of its map; ``upper``: the upper third of the image. None where the truth
@@ -388,16 +389,12 @@ class Column:
         return "" if found is None else f"x{found:.3f}" if self.ratio else f"{found:+.{self.digits}f}"
 
 
-def _mean(total: Sum) -> float | None:
-    return float(total[0] / total[1]) if total[1] else None
+def _of_mean(of: Callable[[float], float]) -> Callable[[Sum], float | None]:
+    return lambda total: of(total[0] / total[1]) if total[1] else None
 
 
-def _root(total: Sum) -> float | None:
-    return float(math.sqrt(total[0] / total[1])) if total[1] else None
-
-
-def _decibels(total: Sum) -> float | None:
-    return min(_MOST_DB, -10.0 * math.log10(max(total[0] / total[1], 1e-12))) if total[1] else None
+_mean, _root = _of_mean(float), _of_mean(math.sqrt)
+_decibels = _of_mean(lambda mean: min(_MOST_DB, -10.0 * math.log10(max(mean, 1e-12))))
 
 
 def _mean_iou(total: Sum) -> float | None:
@@ -485,18 +482,15 @@ def _relative(made: Tensor, true: Tensor) -> Tensor:
     return (made - true).abs() / true
 
 
-def _squared(made: Tensor, true: Tensor) -> Tensor:
-    return (made - true) ** 2
-
-
 def _within(made: Tensor, true: Tensor) -> Tensor:
     return (torch.maximum(made.clamp_min(1e-6) / true, true / made.clamp_min(1e-6)) < 1.25).double()
 
 
 def _part_columns(part: str) -> dict[str, Column]:
+    squared = lambda made, true: (made - true) ** 2  # noqa: E731
     return {
         f"abs_rel_{part}": Column(f"AbsRel, {part}", 4, _depth(_relative, part), _mean, ratio=True),
-        f"rmse_{part}": Column(f"RMSE m, {part}", 2, _depth(_squared, part), _root, ratio=True),
+        f"rmse_{part}": Column(f"RMSE m, {part}", 2, _depth(squared, part), _root, ratio=True),
         f"delta1_{part}": Column(f"delta1, {part}", 4, _depth(_within, part), _mean),
     }
 
@@ -555,7 +549,9 @@ class ScoreTargets(Output):
         scene, targets, finder = read_scene(self.log), read_targets(self.truth), ViewFinder(self.views)
         protocol, sampled, features = self.protocol, set(), None
         if any(name.startswith("perceptual") for name in protocol.columns):
-            sampled = _perceptual_views(targets)
+            places = [record["place"] for record in targets.records]
+            own = [[n for n, place in enumerate(places) if place == one] for one in dict.fromkeys(places)]
+            sampled = {number for numbers in own for number in evenly(numbers, PERCEPTUAL_VIEWS)}
         if sampled:
             network = choose_device(self.device, "networks of the scores")
             features = PerceptualDistance(shipped_features(network), device=network)
@@ -580,14 +576,6 @@ def _add(total: dict[str, Sum], part: Mapping[str, Sum | None]) -> None:
             total[name] = total[name] + value if name in total else value
 
 
-def _perceptual_views(targets: Targets) -> set[int]:
-    """Numbers of the views at which the perceptual distance is computed."""
-    by_place: dict[str, list[int]] = {}
-    for number, record in enumerate(targets.records):
-        by_place.setdefault(record["place"], []).append(number)
-    return {number for own in by_place.values() for number in evenly(own, PERCEPTUAL_VIEWS)}
-
-
 def values_of(protocol: Protocol, sums: Mapping[str, Sums]) -> dict[str, Any]:
     """Values by place, and their mean or that of all together, from the sums; a column without a number says so."""
 
@@ -610,13 +598,7 @@ def mean_values(rows: list[dict[str, float | str]], columns: tuple[str, ...]) ->
     return {name: round(sum(values) / len(values), 6) if values else NONE for name, values in numbers.items()}
 
 
-def sight_of(
-    target: Target,
-    seen: Observation,
-    scene: Scene,
-    protocol: Protocol,
-    distance: Callable[[metrics.Pair], float | None] | None,
-) -> Sight:
+def sight_of(target: Target, seen: Observation, scene: Scene, protocol: Protocol, distance: Distance | None) -> Sight:
     """A method's view brought to the size and the colours of its target."""
     height, width = target.view.camera.height, target.view.camera.width
     rgb = resize_rgb(seen.rgb, height, width)

@@ -31,7 +31,7 @@ from mudg.base.errors import InputError
 from mudg.base.html import ARROWS, PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown_table
 from mudg.base.html import markdown as rendered
 from mudg.base.run_folder import refuse_overlap
-from mudg.benchmarks.chain import compare, films, refuse_foreign, render_page, seconds_of
+from mudg.benchmarks.chain import Facts, compare, films, refuse_foreign, render_page, seconds_of
 from mudg.benchmarks.places import (
     TRUTH,
     ListedCity,
@@ -88,11 +88,6 @@ Values = dict[str, dict[str, Any]]
 class PaperLog(Views):
     """One log under a table."""
 
-    @property
-    def title(self) -> str:
-        """For the progress bar."""
-        return self.log.name
-
     def measure(self) -> dict[str, Any]:
         """Facts of the log, per row and place the values with their numbers of views, and seconds."""
         views, truth, out = self.of_rows(), self.truth, self.out.parent
@@ -141,38 +136,29 @@ class PaperLog(Views):
 def run(
     config: BenchConfig, sources: Sequence[Path], out: Path, *, preset: PresetName = "default", overwrite: bool = False
 ) -> Path:
-    """Fill a table; returns ``out`` with ``bench.json``, the table as Markdown, CSV and LaTeX, and ``page.html``.
-
-    Args:
-        config: see ``BenchConfig``; fields marked paper, and model, precision, iterations and seed. preset: what it
-            started from.
-        sources: ``city:reported`` (or another list of cities), or folders of recorded logs.
-        out: what lies there of the same settings is reused; logs and methods may be added later.
-        overwrite: replace what other settings left there.
-
-    Raises:
-        UsageError: an unknown method or list, a setting that no row of the table uses, or ``out`` holds something else.
-            InputError: methods have different numbers of views. Whatever a verb raises.
-    """
+    """Fill a table; returns ``out`` with ``bench.json``, the table as Markdown, CSV and LaTeX, and ``page.html``; what
+    lies there of the same settings is reused, and logs and methods may be added later. ``sources``: ``city:reported``
+    (or another list of cities), or folders of recorded logs. ``preset``: what ``config`` started from. ``overwrite``:
+    replace what other settings left in ``out``. UsageError: an unknown method or list, a setting that no row of the
+    table uses, or ``out`` holds something else. InputError: methods have different numbers of views. Whatever a verb
+    raises."""
     table, out = TABLES[config.table], Path(out)
     rows = paper_rows(config, table, preset)
     logs = logs_of(config, sources, table)
     read = {f"log {log.name}": log.source for log in logs if not isinstance(log, ListedCity)}
     weights = _weights_of(config.score)
-    refuse_overlap(
-        out, {"model": mdm_files.folder_of(config.model), "freevs-model": config.freevs_model, **read, **weights}
-    )
+    models = {"model": mdm_files.folder_of(config.model), "freevs-model": config.freevs_model}
+    refuse_overlap(out, {**models, **read, **weights})
     digests = {name: store.digest(Path(path)) for name, path in weights.items()}  # before any work: one may be missing
     digests |= {"freevs_model": mdm_files.digest(config.freevs_model)} if config.freevs_model else {}
     refuse_foreign(out, PAGES, lambda doc: doc["bench"] == "paper" and doc["table"]["name"] == table.name)
     generates = [row.changes for row in rows if METHODS[row.method].made_by == "synthesize" and not row.left_out]
     refuse_unfit(config, preset, rows, [replace(generator_of(config), **changes) for changes in generates])
     measured, renders = score_settings(config, table), mdm_files.uses_renders(config.model)
-    fill = Row(FILL, ANCHORS[FILL])
-    jobs = [
-        PaperLog(log, out / log.name, table, (fill, *rows), config, of_log(measured, log.name), renders, overwrite)
-        for log in logs
-    ]
+    jobs, first = {}, (table, (Row(FILL, ANCHORS[FILL]), *rows), config)
+    for log in logs:
+        own = of_log(measured, log.name)
+        jobs[log.name] = PaperLog(log, out / log.name, *first, own, renders, overwrite).measure
     settings = {
         "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "",
         "missing_scenes": missing_scenes(table, logs),
@@ -204,7 +190,7 @@ def further_columns(exact: bool) -> tuple[PaperColumn, ...]:
 # ---- values of one log at a place ----
 
 
-def at_place(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
+def at_place(documents: Sequence[Facts], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
     """Values of one method on one log at a place. ``documents``: contents of ``metrics.json`` that hold its
     trajectories, one method each. ``names``: trajectories of the place; the mean over them, and the sum of their
     numbers of views."""
@@ -214,7 +200,7 @@ def at_place(documents: Sequence[Mapping[str, Any]], names: Sequence[str], colum
     return {column.key: _value(column, rows) if column.key in known else {"value": NOT_SCORED} for column in columns}
 
 
-def _value(column: PaperColumn, rows: Sequence[Mapping[str, Any] | None]) -> dict[str, Any]:
+def _value(column: PaperColumn, rows: Sequence[Facts | None]) -> dict[str, Any]:
     values = [None if row is None else row["values"].get(column.key, NOT_COMPUTED) for row in rows]
     reasons = [value for value in values if isinstance(value, str)]
     if reasons or None in values:
@@ -231,7 +217,7 @@ def _reason(column: PaperColumn, reason: str) -> str:
     return "no truth off the path on a recorded log" if reason == NO_TRUTH else reason
 
 
-def floors_at(documents: Sequence[Mapping[str, Any]], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
+def floors_at(documents: Sequence[Facts], names: Sequence[str], columns: Sequence[PaperColumn]) -> Values:
     """What the truth itself scores on a recorded log at a place: the scorer's floors, for measures of sets of views
     alone."""
     result: Values = {}
@@ -248,7 +234,7 @@ def floors_at(documents: Sequence[Mapping[str, Any]], names: Sequence[str], colu
     return result
 
 
-def _made_of(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def _made_of(documents: Sequence[Facts]) -> dict[str, Any]:
     """How distances of sets were made: networks, digests of their weights, resize rules, epsilon, clips."""
     result: dict[str, Any] = {"depth_rule": documents[0]["rules"][3] if len(documents[0]["rules"]) > 3 else ""}
     for document in documents:
@@ -261,7 +247,7 @@ def _made_of(documents: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 # ---- sets of all logs ----
 
 
-def files_at(documents: Mapping[Path, Mapping[str, Any]], names: Sequence[str], out: Path) -> Files:
+def files_at(documents: Mapping[Path, Facts], names: Sequence[str], out: Path) -> Files:
     """Files of features of one method on one log at a place; an entry that lacks a trajectory is left out.
     ``documents``: folder of scores -> its metrics.json, one method each. ``names``: trajectories of the place. ``out``:
     of the benchmark."""
@@ -279,7 +265,7 @@ def files_at(documents: Mapping[Path, Mapping[str, Any]], names: Sequence[str], 
     return result
 
 
-def pooled(logs: Sequence[Mapping[str, Any]], out: Path) -> dict[str, dict[str, Values]]:
+def pooled(logs: Sequence[Facts], out: Path) -> dict[str, dict[str, Values]]:
     """Cells of pooled sets, row -> place -> metric -> mean and standard error; only where every log has its features.
     ``logs``: per log its facts, with ``features[row][place]`` as from `files_at`. ``out``: folder of the benchmark."""
     result: dict[str, dict[str, Values]] = {}
@@ -322,23 +308,15 @@ def _sets(
 
 def document(
     table: PaperTable,
-    logs: Sequence[Mapping[str, Any]],
-    rows: Sequence[Mapping[str, Any]],
-    settings: Mapping[str, Any],
+    logs: Sequence[Facts],
+    rows: Sequence[Facts],
+    settings: Facts,
     pooled: Mapping[str, Mapping[str, Values]] = MappingProxyType({}),
 ) -> dict[str, Any]:
-    """Everything ``bench.json`` holds.
-
-    Args:
-        logs: per log its facts, ``exact``, ``values[row][place][key]`` as from `at_place`, ``made``, ``films``,
-            ``columns``, seconds.
-        rows: name, title, method and changes of what was computed. settings: of the benchmark.
-        pooled: row -> place -> metric -> mean and standard error of the sets of all logs together, where there are
-            such.
-
-    Raises:
-        InputError: methods have different numbers of views.
-    """
+    """Everything ``bench.json`` holds. ``logs``: per log its facts, ``exact``, ``values[row][place][key]`` as from
+    `at_place`, ``made``, ``films``, ``columns``, seconds. ``rows``: name, title, method and changes of what was
+    computed. ``pooled``: row -> place -> metric -> mean and standard error of the sets of all logs together, where
+    there are such. InputError: methods have different numbers of views."""
     exact = all(entry["exact"] for entry in logs)
     every = [*({"name": name, "title": title, "method": "", "changes": {}} for name, title in ANCHORS.items()), *rows]
     columns = further_columns(exact)
@@ -372,9 +350,7 @@ def document(
     }
 
 
-def _cell(
-    logs: Sequence[Mapping[str, Any]], row: str, place: str, column: PaperColumn, pooled: Mapping[str, Any] | None
-) -> dict[str, Any]:
+def _cell(logs: Sequence[Facts], row: str, place: str, column: PaperColumn, pooled: Facts | None) -> dict[str, Any]:
     """Mean over all logs, or the value of their ``pooled`` sets; or the reason why there is none."""
     values = [entry["values"][row][place].get(column.key, {"value": NOT_SCORED}) for entry in logs]
     if row == TRUTH and column.key in BY_DEFINITION:
@@ -410,14 +386,14 @@ def _refuse_other_counts(cells: dict[str, dict[str, Values]], place: str, column
 # ---- texts ----
 
 
-def heading(doc: Mapping[str, Any]) -> str:
+def heading(doc: Facts) -> str:
     """What the table is, and what it is filled with."""
     count, name = len(doc["logs"]), doc["settings"]["list"]
     logs = f"{count} log{'s' if count != 1 else ''}"
     return f"{doc['table']['title']}, on {logs} " + (f"of generated cities ({name})" if name else "recorded")
 
 
-def notes_of(doc: Mapping[str, Any]) -> list[str]:
+def notes_of(doc: Facts) -> list[str]:
     """What is to be said of a table, one sentence or two per line."""
     table, settings = doc["table"], doc["settings"]
     sizes = dict.fromkeys(f"{e['size']}, {e['frames']} frames, {e['held_out']} images held out" for e in doc["logs"])
@@ -436,7 +412,7 @@ def notes_of(doc: Mapping[str, Any]) -> list[str]:
     ]
 
 
-def _notes_of_sets(made: Mapping[str, Any]) -> list[str]:
+def _notes_of_sets(made: Facts) -> list[str]:
     notes, sets, videos = [], made.get("distributions"), made.get("videos")
     if sets:
         whose = "published weights" if sets["published_weights"] else "weights that are not the published file"
@@ -453,17 +429,17 @@ def _notes_of_sets(made: Mapping[str, Any]) -> list[str]:
     return notes
 
 
-def _columns(doc: Mapping[str, Any]) -> dict[str, Mapping[str, Any]]:
+def _columns(doc: Facts) -> dict[str, Facts]:
     return {column["key"]: column for column in (*doc["further"], *doc["table"]["columns"])}
 
 
-def _shared_reason(doc: Mapping[str, Any], place: str, key: str) -> str:
+def _shared_reason(doc: Facts, place: str, key: str) -> str:
     """Why no row at all has a number in a column; empty if one has, or if reasons differ."""
     reasons = {of[place][key].get("reason", "") for of in doc["cells"].values()}
     return reasons.pop() if len(reasons) == 1 else ""
 
 
-def _empty_columns(doc: Mapping[str, Any]) -> dict[str, dict[str, None]]:
+def _empty_columns(doc: Facts) -> dict[str, dict[str, None]]:
     """Reason -> titles of the columns in which no row has a number."""
     wanted = [*doc["table"]["cells"], *((p["name"], c["key"]) for p in doc["table"]["places"] for c in doc["further"])]
     of: dict[str, dict[str, None]] = {}
@@ -473,7 +449,7 @@ def _empty_columns(doc: Mapping[str, Any]) -> dict[str, dict[str, None]]:
     return of
 
 
-def main_table(doc: Mapping[str, Any]) -> TextTable:
+def main_table(doc: Facts) -> TextTable:
     """The table: published rows, ours, and the numbers of views."""
     wanted, columns = [tuple(cell) for cell in doc["table"]["cells"]], _columns(doc)
     titles = {place["name"]: place["title"] for place in doc["table"]["places"]}
@@ -488,18 +464,18 @@ def main_table(doc: Mapping[str, Any]) -> TextTable:
     return TextTable(tuple(heads), (*lines, *_ours(doc, wanted)))
 
 
-def further_tables(doc: Mapping[str, Any]) -> list[TextTable]:
+def further_tables(doc: Facts) -> list[TextTable]:
     """The further columns, one table per place."""
     columns, places = doc["further"], doc["table"]["places"] if doc["further"] else ()
     lines = {place["name"]: _ours(doc, [(place["name"], column["key"]) for column in columns]) for place in places}
     return [TextTable(("", *map(_headed, columns)), tuple(lines[p["name"]]), p["title"]) for p in places]
 
 
-def _headed(column: Mapping[str, Any]) -> str:
+def _headed(column: Facts) -> str:
     return f"{column['title']} {ARROWS[column['better']]}"
 
 
-def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> Iterator[TextLine]:
+def _ours(doc: Facts, wanted: Sequence[tuple[str, str]]) -> Iterator[TextLine]:
     shared = {cell: _shared_reason(doc, *cell) for cell in wanted}
     for row in doc["rows"]:
         empty = {cell: TextCell(NONE, reason=reason) for cell, reason in shared.items() if reason}
@@ -508,7 +484,7 @@ def _ours(doc: Mapping[str, Any], wanted: Sequence[tuple[str, str]]) -> Iterator
     yield TextLine("n", tuple(TextCell(_count(doc, *cell)) for cell in wanted), "n")
 
 
-def _printed(doc: Mapping[str, Any], row: str, place: str, key: str) -> TextCell:
+def _printed(doc: Facts, row: str, place: str, key: str) -> TextCell:
     result, column = doc["cells"][row][place][key], _columns(doc)[key]
     if "mean" not in result:
         return TextCell(result["reason"], reason=result["reason"])
@@ -517,11 +493,11 @@ def _printed(doc: Mapping[str, Any], row: str, place: str, key: str) -> TextCell
     return TextCell(_digits(result["mean"], column) + behind, row in doc["best"][place][key])
 
 
-def _digits(value: float, column: Mapping[str, Any]) -> str:
+def _digits(value: float, column: Facts) -> str:
     return f"{value:.{column['digits']}f}"
 
 
-def _count(doc: Mapping[str, Any], place: str, key: str) -> str:
+def _count(doc: Facts, place: str, key: str) -> str:
     """Views (or clips) behind the numbers of a column, over all logs; the same for every row that has one."""
     counts = next((of[place][key] for of in doc["cells"].values() if "n" in of[place][key]), None)
     if counts is None:
@@ -533,14 +509,14 @@ def _count(doc: Mapping[str, Any], place: str, key: str) -> str:
 LOG_HEADS: Final = ("log", "dataset", "cameras", "frames", "size", "images held out", "tracked boxes", "seconds")
 
 
-def _log_cells(entry: Mapping[str, Any]) -> list[str]:
+def _log_cells(entry: Facts) -> list[str]:
     """A log's row under ``LOG_HEADS``."""
     facts = [str(entry[key]) for key in ("frames", "size", "held_out", "tracks")]
     seconds = f"{sum(entry['seconds'].values()):.0f}"
     return [entry["log"], entry["dataset"], ", ".join(entry["cameras"]), *facts, seconds]
 
 
-def markdown(doc: Mapping[str, Any]) -> str:
+def markdown(doc: Facts) -> str:
     """The table for people."""
     lines = [f"# {heading(doc)}", "", *(f"* {note}" for note in notes_of(doc)), "", *rendered(main_table(doc)), ""]
     for table in further_tables(doc):
@@ -548,7 +524,7 @@ def markdown(doc: Mapping[str, Any]) -> str:
     return "\n".join([*lines, "## Logs", "", *markdown_table(LOG_HEADS, map(_log_cells, doc["logs"])), ""])
 
 
-def as_latex(doc: Mapping[str, Any]) -> str:
+def as_latex(doc: Facts) -> str:
     """The tables as LaTeX ``tabular``; notes as comments above them."""
     further = [replace(table, title=f"{doc['further_title']}: {table.title}") for table in further_tables(doc)]
     lines = [f"% {note}" for note in (heading(doc), *notes_of(doc))]
@@ -557,7 +533,7 @@ def as_latex(doc: Mapping[str, Any]) -> str:
     return "\n".join(lines)
 
 
-def as_csv(doc: Mapping[str, Any]) -> str:
+def as_csv(doc: Facts) -> str:
     """One line per number: ``kind,row,source,place,metric,value,standard_error,logs,n,n_reference,reason,best``."""
     rows: list[list[Any]] = []
     for row in doc["published"]:
@@ -576,7 +552,7 @@ def as_csv(doc: Mapping[str, Any]) -> str:
     return csv_text("kind row source place metric value standard_error logs n n_reference reason best".split(), rows)
 
 
-def page(doc: Mapping[str, Any]) -> str:
+def page(doc: Facts) -> str:
     """The whole page from what ``bench.json`` holds."""
     lead, *notes = notes_of(doc)
     further = [{"title": doc["further_title"], "tables": further_tables(doc)}] if doc["further"] else []

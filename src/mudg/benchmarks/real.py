@@ -28,7 +28,7 @@ from mudg.base.html import markdown as rendered
 from mudg.base.layout import SCENE_FILES
 from mudg.base.run_folder import RunDir, refuse_overlap
 from mudg.base.types import Scene
-from mudg.benchmarks.chain import Chain, compare, refuse_foreign, render_page, run_step, wall
+from mudg.benchmarks.chain import Chain, Facts, compare, refuse_foreign, render_page, run_step, wall
 from mudg.benchmarks.columns import COLUMNS, MakeTargets, ScoreTargets, mean_values, read_targets
 from mudg.benchmarks.places import (
     SPLITS,
@@ -89,20 +89,12 @@ def run(
     overwrite: bool = False,
     adaptation: AdaptConfig | None = None,
 ) -> Path:
-    """Compare methods on real logs; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``.
-
-    Args:
-        config: see ``BenchConfig``; fields marked real, and model, precision and seed. preset: what it started from.
-        sources: folders of dataset logs, or scenes made by ``mudg ingest``.
-        out: what lies there of the same settings is reused; logs, protocols and methods may be added later.
-        overwrite: replace what other settings left there.
-        adaptation: how the diffusion model is adapted to a log; its model, cameras, precision and seed are those of
-            ``config``.
-
-    Raises:
-        UsageError: no log, an unknown method or protocol, a setting that no row uses, two logs of one name, or ``out``
-            holds something else. Whatever a verb raises.
-    """
+    """Compare methods on real logs; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``; what lies
+    there of the same settings is reused, and logs, protocols and methods may be added later. ``sources``: folders of
+    dataset logs, or scenes made by ``mudg ingest``. ``preset``: what ``config`` started from. ``overwrite``: replace
+    what other settings left in ``out``. ``adaptation``: how the diffusion model is adapted to a log; its model,
+    cameras, precision and seed are those of ``config``. UsageError: no log, an unknown method or protocol, a setting
+    that no row uses, two logs of one name, or ``out`` holds something else. Whatever a verb raises."""
     rows, protocols, logs, out = real_rows(config, preset), protocols_of(config.protocols), names_of(sources), Path(out)
     read = {f"log {name}": path for name, path in logs.items()}
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read})
@@ -134,11 +126,13 @@ def run(
     }
 
     def filled(measured: list[dict[str, Any]]) -> dict[str, Any]:
-        of_log = {name: [result for job, result in zip(jobs, measured) if job.out.name == name] for name in scenes}
-        entries = [_entry(name, scenes[name], of_log[name]) for name in scenes]
+        pairs = list(zip(jobs, measured, strict=True))
+        of = lambda name: [result for job, result in pairs if job.out.name == name]  # noqa: E731
+        entries = [_entry(name, scenes[name], of(name)) for name in scenes]
         return document(entries, list(map(_row_values, rows)), protocols, settings)
 
-    return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": lambda doc: page_of(doc, out)})
+    work = {f"{job.out.name} {job.split.name}": job.measure for job in jobs}
+    return compare(out, work, config, filled, {"bench.md": markdown, "page.html": lambda doc: page_of(doc, out)})
 
 
 # ---- one log under one way of hiding ----
@@ -166,11 +160,6 @@ class SplitJob:
     config: BenchConfig
     adapt: AdaptConfig
     overwrite: bool
-
-    @property
-    def title(self) -> str:
-        """For the progress bar."""
-        return f"{self.out.name} {self.split.name}"
 
     @property
     def folder(self) -> Path:
@@ -309,10 +298,8 @@ def _row_values(row: Row) -> dict[str, Any]:
 def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """A log with its facts and all its values."""
     loaded = read_scene(scene)
-    cameras = {}
-    for camera_name, camera in loaded.cameras.items():
-        frames = len(loaded.frames_of(camera_name))
-        cameras[camera_name] = {"size_px": [camera.width, camera.height], "frames": frames}
+    sizes = {name: [camera.width, camera.height] for name, camera in loaded.cameras.items()}
+    cameras = {camera: {"size_px": of, "frames": len(loaded.frames_of(camera))} for camera, of in sizes.items()}
     return {
         "log": name,
         "id": loaded.id,
@@ -328,10 +315,7 @@ def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str
 
 
 def document(
-    logs: Sequence[Mapping[str, Any]],
-    rows: Sequence[Mapping[str, Any]],
-    protocols: Sequence[Protocol],
-    settings: Mapping[str, Any],
+    logs: Sequence[Facts], rows: Sequence[Facts], protocols: Sequence[Protocol], settings: Facts
 ) -> dict[str, Any]:
     """Everything ``bench.json`` holds: per protocol, log and method the values by place and their mean; the means over
     the logs that have a number; and differences (or ratios) to the fit without diffusion."""
@@ -344,9 +328,7 @@ def document(
         for name in names if BASE in names else ():
             if name != BASE:
                 of, base = pooled[name], pooled[BASE]
-                against[name] = {
-                    column: COLUMNS[column].compared(of[column], base[column]) for column in protocol.columns
-                }
+                against[name] = {c: COLUMNS[c].compared(of[c], base[c]) for c in protocol.columns}
         result[protocol.name] = {
             "row": asdict(protocol),
             "logs": entries,
@@ -362,7 +344,7 @@ def document(
 # ---- text ----
 
 
-def table_of(doc: Mapping[str, Any], protocol: str, values: Mapping[str, Mapping[str, Any]]) -> TextTable:
+def table_of(doc: Facts, protocol: str, values: Mapping[str, Facts]) -> TextTable:
     """A method's values, each in brackets with its comparison with the fit without diffusion."""
     columns = doc["protocols"][protocol]["row"]["columns"]
     rows, base = [], values.get(BASE)
@@ -374,7 +356,7 @@ def table_of(doc: Mapping[str, Any], protocol: str, values: Mapping[str, Mapping
     return TextTable.of_texts(["method", *(COLUMNS[name].title for name in columns)], rows)
 
 
-def notes_of(doc: Mapping[str, Any], protocol: str) -> list[str]:
+def notes_of(doc: Facts, protocol: str) -> list[str]:
     """Sentences about a protocol: what was held out of each log, what was left out, and the colour maps of cameras."""
     result, lines = doc["protocols"][protocol], []
     for log in doc["logs"]:
@@ -404,19 +386,19 @@ def notes_of(doc: Mapping[str, Any], protocol: str) -> list[str]:
     return lines
 
 
-def heading_of(doc: Mapping[str, Any], protocol: str) -> str:
+def heading_of(doc: Facts, protocol: str) -> str:
     """Title of a protocol."""
     return f"{protocol}: {doc['protocols'][protocol]['row']['title']}"
 
 
-def summary_of(doc: Mapping[str, Any]) -> str:
+def summary_of(doc: Facts) -> str:
     """One line about the whole."""
     settings, count = doc["settings"], len(doc["logs"])
     logs, iterations = f"{count} log{'s' if count != 1 else ''}", f"{settings['iterations']} iterations per fit"
     return f"{logs}, {iterations}, {virtual_fits_of(settings)}; seed {settings['seed']}."
 
 
-def markdown(doc: Mapping[str, Any]) -> str:
+def markdown(doc: Facts) -> str:
     """The tables for people; those of single places stand only where a log has several."""
     lines = [
         "# Real logs",
@@ -443,7 +425,7 @@ BRACKETS: Final = f"In brackets: difference to {BASE}, or the ratio (x) where lo
 LOG_HEADS: Final = ("log", "dataset", "cameras", "frames", "size", "sweeps", "tracked boxes")
 
 
-def log_cells(log: Mapping[str, Any]) -> list[str]:
+def log_cells(log: Facts) -> list[str]:
     """A log's row under ``LOG_HEADS``."""
     cameras = log["cameras"]
     sizes = dict.fromkeys(f"{of['size_px'][0]}x{of['size_px'][1]}" for of in cameras.values())
@@ -452,7 +434,7 @@ def log_cells(log: Mapping[str, Any]) -> list[str]:
     return [log["log"], log["dataset"], *names, str(log["sweeps"]), str(log["tracks"])]
 
 
-def page_of(doc: Mapping[str, Any], out: Path) -> str:
+def page_of(doc: Facts, out: Path) -> str:
     """The whole page, which holds its pictures (those in the benchmark's folder ``out``): the truth beside every method
     for some views of each protocol."""
     logs = TextTable.of_texts(LOG_HEADS, map(log_cells, doc["logs"]))
@@ -460,7 +442,7 @@ def page_of(doc: Mapping[str, Any], out: Path) -> str:
     return render_page("Real logs", "mudg bench real", summary_of(doc), sections)
 
 
-def _section(doc: Mapping[str, Any], name: str, out: Path) -> dict[str, Any]:
+def _section(doc: Facts, name: str, out: Path) -> dict[str, Any]:
     result, walls = doc["protocols"][name], []
     counted = {log: entry for log, entry in result["logs"].items() if "left_out" not in entry}
     for log, entry in counted.items():

@@ -13,13 +13,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
 from mudg.base import config as configuration
 from mudg.base.html import TextTable, markdown_table
 from mudg.base.run_folder import refuse_overlap
-from mudg.benchmarks.chain import compare, films, refuse_foreign, render_page, seconds_of
+from mudg.benchmarks.chain import Facts, compare, films, refuse_foreign, render_page, seconds_of
 from mudg.benchmarks.places import Views, listed_cities, score_settings
 from mudg.benchmarks.rows import (
     BASE,
@@ -67,6 +68,7 @@ COMPARISONS: Final = (
     (DIFFUSION, FILL, SHIFTED, "psnr perceptual abs_rel miou"),
 )
 """A method, that against which it is held, a place, and metrics."""
+VARIANT: Final = "psnr perceptual abs_rel miou"
 ABLATION_ROWS: Final = {
     BASE: "none",
     "only_I": "+ I",
@@ -83,11 +85,6 @@ _PAGES: Final = ("bench.json", "bench.md", "page.html")
 @dataclass(frozen=True)
 class ShiftLog(Views):
     """One log of the list."""
-
-    @property
-    def title(self) -> str:
-        """For the progress bar."""
-        return self.log.name
 
     def measure(self) -> dict[str, Any]:
         """Facts of the log, scores of each method by distance, and seconds of each step."""
@@ -121,18 +118,11 @@ def run(
     rules: LogRules = STANDARD,
     distances_m: Sequence[float] = (2.0, 3.0, 4.0),
 ) -> Path:
-    """Compare methods on the logs of a list; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``.
-
-    Args:
-        config: see ``BenchConfig``; fields marked shift, and model, precision and seed. preset: what it started from.
-        out: what lies there of the same settings is reused; other methods and variants may be added later.
-        overwrite: replace what other settings left there.
-        rules: frames, size and cameras of the logs. distances_m: lateral distances, each to both sides.
-
-    Raises:
-        UsageError: an unknown method, a malformed variant, a setting that no row uses, or ``out`` holds logs of other
-            settings. Whatever a verb raises.
-    """
+    """Compare methods on the logs of a list; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``; what
+    lies there of the same settings is reused, and methods and variants may be added later. ``preset``: what ``config``
+    started from. ``overwrite``: replace what other settings left in ``out``. ``rules``: frames, size and cameras of the
+    logs. ``distances_m``: lateral distances, each to both sides. UsageError: an unknown method, a malformed variant, a
+    setting that no row uses, or ``out`` holds logs of other settings. Whatever a verb raises."""
     rows, out = shift_rows(config, preset), Path(out)
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
     own = lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc  # noqa: E731
@@ -142,7 +132,7 @@ def run(
     table, renders = PaperTable(name="shift", places=places, columns=[]), mdm_files.uses_renders(config.model)
     last = (config, score_settings(config, table), renders, overwrite, "synthesize")
     logs = listed_cities(config.list, config.logs, rules)
-    jobs = [ShiftLog(log, out / log.name, table, rows, *last, on_path=False) for log in logs]
+    jobs = {log.name: ShiftLog(log, out / log.name, table, rows, *last, on_path=False).measure for log in logs}
     refuse_unfit(config, preset, rows, [generator_of(config)] * any(row.method == DIFFUSION for row in rows))
     settings = {
         "list": config.list,
@@ -167,10 +157,7 @@ def run(
 
 
 def document(
-    logs: Sequence[Mapping[str, Any]],
-    rows: Sequence[Mapping[str, Any]],
-    distances_m: Sequence[float],
-    settings: Mapping[str, Any],
+    logs: Sequence[Facts], rows: Sequence[Facts], distances_m: Sequence[float], settings: Facts
 ) -> dict[str, Any]:
     """Everything ``bench.json`` holds. ``logs``: per log its facts, ``values[method][distance][metric]`` (a number, or
     why there is none) and seconds. ``rows``: name, title and fit of each method. ``distances_m``: lateral shifts off
@@ -180,12 +167,11 @@ def document(
     names = [row["name"] for row in rows]
     every = (RECORDED, *shifted, SHIFTED)
     of = lambda entry, name, p, m: entry["values"][name].get(p, {}).get(m, "not produced")  # noqa: E731
-    pooled = {
-        name: {p: {m: _pooled([of(entry, name, p, m) for entry in full]) for m in COLUMNS} for p in every}
-        for name in names
-    }
+    at = lambda name, p: {m: _pooled([of(entry, name, p, m) for entry in full]) for m in COLUMNS}  # noqa: E731
+    pooled = {name: {p: at(name, p) for p in every} for name in names}
     fitted = [row["name"] for row in rows if row["fit"] is not None and row["name"] not in ("gs3d", BASE, FULL)]
     held = lambda a, b, place, metrics: against(full, a, b, place, metrics) if {a, b} <= {*names} else []  # noqa: E731
+    of_variant = lambda name: [c for p in (SHIFTED, RECORDED) for c in held(name, FULL, p, VARIANT)]  # noqa: E731
     return {
         "schema": 1,
         "settings": dict(settings),
@@ -195,20 +181,11 @@ def document(
         "logs": full,
         "pooled": pooled,
         "comparisons": [comparison for comparison_of in COMPARISONS for comparison in held(*comparison_of)],
-        "variants": [
-            {
-                "name": name,
-                "against_mudg_s": [
-                    c for p in (SHIFTED, RECORDED) for c in held(name, FULL, p, "psnr perceptual abs_rel miou")
-                ],
-            }
-            for name in fitted
-            if FULL in names
-        ],
+        "variants": [{"name": name, "against_mudg_s": of_variant(name)} for name in fitted if FULL in names],
     }
 
 
-def with_mean(of: Mapping[str, Mapping[str, Any]], shifted: Sequence[str]) -> dict[str, dict[str, Any]]:
+def with_mean(of: Mapping[str, Facts], shifted: Sequence[str]) -> dict[str, dict[str, Any]]:
     """The values of one method and log by distance, with the mean over the distances off the recorded path."""
     mean: dict[str, Any] = {}
     for metric in COLUMNS:
@@ -226,18 +203,15 @@ def _pooled(values: Sequence[Any]) -> Any:
     return {"mean": _mean(numbers), "standard_error": standard_error(_mean, numbers), "logs": len(numbers)}
 
 
-def against(logs: Sequence[Mapping[str, Any]], a: str, b: str, place: str, metrics: str) -> list[dict[str, Any]]:
-    """Comparisons of two methods over the logs that have both numbers, one per metric.
-
-    The difference of the means over logs, or their ratio; the standard error is the jackknife's over logs (for a
-    difference: the spread of the differences of single logs over the root of their number). None with fewer than two
-    logs.
-    """
+def against(logs: Sequence[Facts], a: str, b: str, place: str, metrics: str) -> list[dict[str, Any]]:
+    """Comparisons of two methods over the logs that have both numbers, one per metric: the difference of the means over
+    logs, or their ratio; the standard error is the jackknife's over logs (for a difference: the spread of the
+    differences of single logs over the root of their number), None with fewer than two logs."""
     comparisons = []
     for metric in metrics.split():
         pairs = [tuple(entry["values"].get(m, {}).get(place, {}).get(metric, "") for m in (a, b)) for entry in logs]
         known = [None if any(isinstance(value, str) for value in pair) else tuple(map(float, pair)) for pair in pairs]
-        both, of = [pair for pair in known if pair is not None], _ratio if metric in RATIOS else _difference
+        both, of = [pair for pair in known if pair is not None], partial(_compared_means, ratio=metric in RATIOS)
         per_log = [None if pair is None else of([pair]) for pair in known]
         where = "recorded path" if place == RECORDED else "off the recorded path"
         comparisons.append(
@@ -261,13 +235,9 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
 
-def _difference(pairs: Sequence[tuple[float, float]]) -> float:
-    return _mean([a for a, _ in pairs]) - _mean([b for _, b in pairs])
-
-
-def _ratio(pairs: Sequence[tuple[float, float]]) -> float | None:
-    below = _mean([b for _, b in pairs])
-    return _mean([a for a, _ in pairs]) / below if below else None
+def _compared_means(pairs: Sequence[tuple[float, float]], *, ratio: bool) -> float | None:
+    a, b = (_mean(side) for side in zip(*pairs, strict=True))
+    return a - b if not ratio else a / b if b else None
 
 
 def standard_error(of: Callable[[Sequence[Any]], float | None], items: Sequence[Any]) -> float | None:
@@ -284,19 +254,19 @@ def standard_error(of: Callable[[Sequence[Any]], float | None], items: Sequence[
 # ---- text ----
 
 
-def virtual_fits_of(settings: Mapping[str, Any]) -> str:
+def virtual_fits_of(settings: Facts) -> str:
     """How many iterations fits under virtual views have, as part of a sentence."""
     share = settings["continued_share"]
     more = "under virtual views {:g} times as many more after the fit on recorded views"
     return more.format(share) if share else "those under virtual views too, from nothing"
 
 
-def _summary(settings: Mapping[str, Any]) -> str:
+def _summary(settings: Facts) -> str:
     seen = " with renders of the fit on recorded views" if settings["renders"] else " without renders"
     return f"{settings['iterations']} iterations per fit, {virtual_fits_of(settings)}; generated{seen}"
 
 
-def markdown(doc: Mapping[str, Any]) -> str:
+def markdown(doc: Facts) -> str:
     """The tables for people."""
     settings = doc["settings"]
     width, height = settings["size_px"]
@@ -334,7 +304,7 @@ def markdown(doc: Mapping[str, Any]) -> str:
     return "\n".join([*lines, "## Seconds per log", "", *markdown_table(heads, seconds), ""])
 
 
-def page(doc: Mapping[str, Any]) -> str:
+def page(doc: Facts) -> str:
     """The whole page from what ``bench.json`` holds."""
     settings, names = doc["settings"], [row["name"] for row in doc["methods"]]
     *places, mean = _places(doc)
@@ -359,17 +329,17 @@ def page(doc: Mapping[str, Any]) -> str:
     )
 
 
-def _places(doc: Mapping[str, Any]) -> list[str]:
+def _places(doc: Facts) -> list[str]:
     """The recorded path, the distances from it, and their mean."""
     return [RECORDED, *(f"{d:g}" for d in sorted(doc["distances_m"])), SHIFTED]
 
 
-def _logs_text(doc: Mapping[str, Any]) -> str:
+def _logs_text(doc: Facts) -> str:
     count = len(doc["logs"])
     return f"{count} log{'s' if count != 1 else ''}"
 
 
-def _place_title(doc: Mapping[str, Any], place: str) -> str:
+def _place_title(doc: Facts, place: str) -> str:
     if place == RECORDED:
         return "Recorded path, held-out frames"
     if place == SHIFTED:
@@ -377,7 +347,7 @@ def _place_title(doc: Mapping[str, Any], place: str) -> str:
     return f"{place} m to either side"
 
 
-def _cells(values: Mapping[str, Any], metrics: Sequence[str] = tuple(COLUMNS), with_error: bool = False) -> list[str]:
+def _cells(values: Facts, metrics: Sequence[str] = tuple(COLUMNS), with_error: bool = False) -> list[str]:
     """Values by metric as text, pooled (with the standard error where that is wanted and known) or of one log; or the
     reason for none."""
     cells = []
@@ -395,13 +365,13 @@ def _cells(values: Mapping[str, Any], metrics: Sequence[str] = tuple(COLUMNS), w
 FACTS: Final = ("log", "turn, degrees", "length, m", "dynamic vehicles in view", "their share of the image", "city")
 
 
-def _facts(entry: Mapping[str, Any]) -> list[str]:
+def _facts(entry: Facts) -> list[str]:
     """Cells of a log's row under ``FACTS``."""
     numbers = [f"{entry['turn_deg']:.1f}", f"{entry['length_m']:.0f}", str(entry["movers"])]
     return [str(entry["log"]), *numbers, f"{entry['mover_share']:.1%}", entry["words"]]
 
 
-def _compared(comparison: Mapping[str, Any]) -> tuple[str, str]:
+def _compared(comparison: Facts) -> tuple[str, str]:
     """A comparison's value and standard error as text."""
     is_difference, error = comparison["kind"] == "difference", comparison["standard_error"]
     digits, sign = (COLUMNS[comparison["metric"]][1], "+") if is_difference else (3, "")
@@ -410,7 +380,7 @@ def _compared(comparison: Mapping[str, Any]) -> tuple[str, str]:
     return f"{comparison['value']:{sign}.{digits}f}", "-" if error is None else f"{error:.{digits}f}"
 
 
-def _comparison_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _comparison_table(rows: Sequence[Facts]) -> list[str]:
     cells = []
     for row in rows:
         each = " ".join("-" if v is None else f"{v:.3g}" for v in row["per_log"])
