@@ -159,9 +159,15 @@ def render_view(model: SceneModel, view: View, raster: RasterConfig, source: str
 
 
 @torch.no_grad()
-def render_condition(model: SceneModel, view: View, raster: RasterConfig | None = None) -> RenderedCondition:
-    """Render one view of a fitted scene with the certainty of its pixels, on the CPU; see ``render_view``."""
-    gaussians, certainty = compose(model, view.time_s), model.certainty
+def render_condition(
+    model: SceneModel, view: View, raster: RasterConfig | None = None, composed: Gaussians | None = None
+) -> RenderedCondition:
+    """Render one view of a fitted scene with the certainty of its pixels, on the CPU; see ``render_view``.
+
+    Args:
+        composed: what ``compose`` made of the model at the view's time, if it is at hand.
+    """
+    gaussians, certainty = compose(model, view.time_s) if composed is None else composed, model.certainty
     if certainty is not None:
         known = certainty.float()[:, None]
         gaussians = replace(

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import UNLABELLED
-from mudg.base.types import Camera, Scene, View
+from mudg.base.types import Camera, Gaussians, Scene, View
 from mudg.core.pictures import to_bytes
 from mudg.core.raster.rasterize import MAX_EXTRA_CHANNELS, Shutter, drawing_device, rasterize
 from mudg.editing.apply import carry_out
@@ -218,6 +218,7 @@ class Session:
         self.scene: Scene | None = scene
         self.model = run.to(drawing_device(device, "sim"))
         self._nodes = {node.name: node for node in self.model.nodes if isinstance(node, RigidNode)}
+        self._last: tuple[tuple[float, dict[str, bytes] | None], SceneModel, Gaussians] | None = None
         frames = () if scene is None else scene.frames
         self._recorded = np.stack([frame.view.world_from_cam for frame in frames]) if frames else np.zeros((0, 4, 4))
 
@@ -282,15 +283,24 @@ class Session:
         pose = moment.objects.get(node.name)
         return Absent(node.name) if pose is None else Posed(node, pose, moment.time_s)
 
+    def _composed_at(self, moment: Instant) -> tuple[SceneModel, Gaussians]:
+        """The scene at a moment and its Gaussians in the world; the last ones are kept for other sensors of it."""
+        poses = None if moment.objects is None else {name: pose.tobytes() for name, pose in moment.objects.items()}
+        if self._last is None or self._last[0] != (moment.time_s, poses):
+            model = self.at(moment)
+            with torch.no_grad():
+                self._last = (moment.time_s, poses), model, compose(model, moment.time_s)
+        return self._last[1:]
+
     def poses(self, moment: Instant) -> dict[str, Matrix]:
         """Poses of the objects that are there at a moment."""
         return self.objects(moment.time_s) if moment.objects is None else dict(moment.objects)
 
     def pinhole(self, view: View, moment: Instant, instances: bool = False) -> Planes:
         """A pinhole view of the scene at a moment; ``view.time_s`` is that of the moment."""
-        model = self.at(moment)
+        model, gaussians = self._composed_at(moment)
         raster = raster_of(model)
-        seen = render_condition(model, view, raster)
+        seen = render_condition(model, view, raster, gaussians)
         if not instances:
             return Planes(seen, None)
         owner = {node.name: index for index, node in enumerate(model.nodes)}
@@ -298,7 +308,6 @@ class Session:
         shape = tuple(seen.alpha.shape)
         weights, first = torch.zeros((0, *shape)), torch.zeros(0, dtype=torch.int64)
         inside = [k for k, name in enumerate(names) if self._reaches(view, name, moment)]
-        gaussians = compose(model, view.time_s, semantics=False)
         for begin in range(0, len(inside), MAX_EXTRA_CHANNELS):
             chosen = inside[begin : begin + MAX_EXTRA_CHANNELS]
             marks = torch.stack([(gaussians.node == owner[names[k]]).float() for k in chosen], 1)
