@@ -36,10 +36,9 @@ from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
 from mudg.labels import street_net
 from mudg.labels.by_geometry import RULES
-from mudg.labels.depth.inputs import DepthInput, DepthNetwork, DepthOptions
 from mudg.labels.depth.networks import align_to_lidar, enough_returns, kind_of, load_depth_network
 from mudg.labels.ground import driven_path
-from mudg.labels.inputs import LabelInput, Labels
+from mudg.labels.inputs import DepthInput, DepthNetwork, DepthOptions, LabelInput, Labels
 from mudg.labels.labellers import labeller
 from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import CPU, Place, find, title

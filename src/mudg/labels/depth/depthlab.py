@@ -39,8 +39,8 @@ from mudg.base.config import STRICT
 from mudg.base.errors import InputError, UsageError
 from mudg.core.pictures import resize_bicubic
 from mudg.labels.depth import marigold
-from mudg.labels.depth.inputs import PLAIN, DepthInput, DepthOptions, Prediction
 from mudg.labels.depth.marigold import check_steps, ddim_scheduler, working_size
+from mudg.labels.inputs import PLAIN, DepthInput, DepthOptions, Prediction
 from mudg.networks import clip, folders
 from mudg.networks.folders import CPU, Place
 
