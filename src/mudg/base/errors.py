@@ -53,9 +53,8 @@ def similar_path(path: str | os.PathLike[str]) -> str:
     for part in (whole, *whole.parents):
         if not part.exists() and part.parent.is_dir():
             with contextlib.suppress(OSError):
-                near = nearest(
-                    part.name, [entry.name for entry in part.parent.iterdir() if not entry.name.startswith(".")]
-                )
+                names = [entry.name for entry in part.parent.iterdir() if not entry.name.startswith(".")]
+                near = nearest(part.name, names)
                 return f"did you mean {part.parent / near / whole.relative_to(part)}?" if near else ""
     return ""
 

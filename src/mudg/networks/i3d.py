@@ -142,12 +142,8 @@ class I3DFeatures(nn.Module):
         Returns:
             ``[n, 400]``.
         """
-        if (
-            clips.dim() != 5
-            or clips.shape[1::2] != (3, SIDE_PX)
-            or clips.shape[4] != SIDE_PX
-            or clips.shape[2] < SHORTEST
-        ):
+        fits = clips.dim() == 5 and clips.shape[1] == 3 and clips.shape[3:] == (SIDE_PX, SIDE_PX)
+        if not fits or clips.shape[2] < SHORTEST:
             expected = f"[n, 3, T >= {SHORTEST}, {SIDE_PX}, {SIDE_PX}]"
             raise InputError("FVD's network takes clips of one size", expected=expected, got=str(tuple(clips.shape)))
         x = clips
