@@ -21,8 +21,7 @@ from mudg.labels import annotate
 from mudg.labels import annotate as annotate_depth
 from mudg.labels.annotate import nearest_sweeps, steady_bottom
 from mudg.labels.by_geometry import find_sky, label_by_geometry
-from mudg.labels.depth.inputs import Prediction
-from mudg.labels.inputs import TRAIN_ID_OF, LabelInput, box_outline
+from mudg.labels.inputs import TRAIN_ID_OF, LabelInput, Prediction, box_outline
 from mudg.labels.labellers import LABELLERS, labeller
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.check import check_scene

@@ -17,9 +17,9 @@ from mudg.base.errors import InputError, ResourceError
 from mudg.base.location import Location
 from mudg.fleet import status, work
 from mudg.fleet.child import Ending, Stop
-from mudg.fleet.inputs import FOLDER, InputStore
 from mudg.fleet.plan import BatchPlan, BatchStage, Entry
 from mudg.fleet.records import BatchFolder, Ended
+from mudg.fleet.work import FOLDER, InputStore
 
 pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
 

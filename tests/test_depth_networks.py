@@ -15,7 +15,6 @@ from tiny_networks import package
 
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.core.depth import CompletionRules
-from mudg.labels.depth.inputs import DepthInput, DepthOptions, Prediction
 from mudg.labels.depth.marigold import Marigold
 from mudg.labels.depth.networks import (
     KINDS,
@@ -25,6 +24,7 @@ from mudg.labels.depth.networks import (
     load_depth_network,
     residual_confidence,
 )
+from mudg.labels.inputs import DepthInput, DepthOptions, Prediction
 from mudg.networks.folders import Place
 
 RULES = CompletionRules()

@@ -28,8 +28,8 @@ from mudg.diffusion.settings import ConvertConfig
 from mudg.labels.depth import depthlab
 from mudg.labels.depth import depthlab as conversion
 from mudg.labels.depth.depthlab import DepthLab, DepthLabSampling, clip_crop, known_depth, linear_fill, prepare
-from mudg.labels.depth.inputs import DepthInput, DepthOptions
 from mudg.labels.depth.networks import kind_of, load_depth_network
+from mudg.labels.inputs import DepthInput, DepthOptions
 from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import Place
 from mudg.scene.labels import read_label

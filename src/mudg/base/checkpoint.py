@@ -197,9 +197,8 @@ def latest(folder: Path) -> Checkpoint | None:
     Raises:
         IntegrityError: checkpoints exist but not one verifies (nothing is deleted).
     """
-    candidates = sorted(
-        (p for p in folder.glob(f"{_PREFIX}*") if p.is_dir() and p.name[len(_PREFIX) :].isdigit()), reverse=True
-    )
+    steps = (path for path in folder.glob(f"{_PREFIX}*") if path.is_dir())
+    candidates = sorted((path for path in steps if path.name[len(_PREFIX) :].isdigit()), reverse=True)
     problems = []
     for path in candidates:
         try:

@@ -68,17 +68,15 @@ def choose_device(wanted: str, purpose: str, kinds: tuple[str, ...] = ("cpu", "c
     name = usual_device(kinds) if wanted == "auto" else wanted
     kind, _, number = name.partition(":")
     if kind not in PROBLEMS or not re.match(DevicePattern, wanted):
-        raise UsageError(
-            "unknown device", where="--device", expected=f"auto, {', '.join(PROBLEMS)} or cuda:N", got=wanted
-        )
+        where = "--device"
+        raise UsageError("unknown device", where=where, expected=f"auto, {', '.join(PROBLEMS)} or cuda:N", got=wanted)
     if SAME_CODE.get(kind, kind) not in kinds:
         what = f"{purpose}: not implemented on this device"
         raise UsageError(what, where="--device", expected=f"auto, {', '.join(kinds)}", got=wanted, remedy=REMEDY)
     problem = PROBLEMS[kind](int(number or 0))
     if problem:
-        raise ResourceError(
-            f"{purpose}: this device cannot be used", where="--device", expected=wanted, got=problem, remedy=REMEDY
-        )
+        what = f"{purpose}: this device cannot be used"
+        raise ResourceError(what, where="--device", expected=wanted, got=problem, remedy=REMEDY)
     chosen = torch.device("cpu") if kind == "cpu" else torch.device(kind, int(number or 0))
     log.info_once(f"{purpose}: {described(chosen)}")
     return chosen

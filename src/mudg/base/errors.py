@@ -53,9 +53,8 @@ def similar_path(path: str | os.PathLike[str]) -> str:
     for part in (whole, *whole.parents):
         if not part.exists() and part.parent.is_dir():
             with contextlib.suppress(OSError):
-                near = nearest(
-                    part.name, [entry.name for entry in part.parent.iterdir() if not entry.name.startswith(".")]
-                )
+                names = [entry.name for entry in part.parent.iterdir() if not entry.name.startswith(".")]
+                near = nearest(part.name, names)
                 return f"did you mean {part.parent / near / whole.relative_to(part)}?" if near else ""
     return ""
 
@@ -87,13 +86,8 @@ class MudgError(Exception):
         self.expected = _listed(expected, ", ", 1000)
         self.got = _listed(got.replace("\n  ", "; "), "; ", 800)  # of an error that holds another one
         self.remedy = _CONTINUED.join(_listed(line, ", ", 1000) for line in remedy.split(_CONTINUED)[:100])
-        super().__init__(self._text())
-
-    def _text(self) -> str:
-        lines = [self.what]
         fields = (("where", self.where), ("expected", self.expected), ("got", self.got), ("what to do", self.remedy))
-        lines.extend(f"  {name}: {value}" for name, value in fields if value)
-        return "\n".join(lines)
+        super().__init__("\n".join([self.what, *(f"  {name}: {value}" for name, value in fields if value)]))
 
     @property
     def fields(self) -> dict[str, str]:

@@ -11,9 +11,8 @@ from typing import Final
 from mudg.base import memory
 from mudg.base.errors import MudgError, ResourceError
 
-SMALLER: Final = (
-    "take smaller images, fewer frames or fewer processes, close other programs, or use a machine with more memory"
-)
+_LESS: Final = "take smaller images, fewer frames or fewer processes"
+SMALLER: Final = f"{_LESS}, close other programs, or use a machine with more memory"
 _NO_MEMORY: Final = (
     "DefaultCPUAllocator,not enough memory,Cannot allocate memory,out of memory,failed to map segment,"
     "can't allocate memory,can't start new thread,bad_alloc,error return without exception set"

@@ -64,9 +64,8 @@ class TextTable:
 
 def markdown(table: TextTable) -> list[str]:
     """Lines of a Markdown table; the best numbers are bold."""
-    rows = [
-        (line.title, *(f"**{cell.text}**" if cell.best else cell.text for cell in line.cells)) for line in table.lines
-    ]
+    shown = lambda cell: f"**{cell.text}**" if cell.best else cell.text  # noqa: E731
+    rows = [(line.title, *map(shown, line.cells)) for line in table.lines]
     first, *others = ("| " + " | ".join(cells) + " |" for cells in (table.heads, *rows))
     return [first, "|---" * len(table.heads) + "|", *others]
 
@@ -84,9 +83,8 @@ def cells(row: Mapping[str, Any], forms: Mapping[str, str]) -> list[str]:
 def latex(table: TextTable) -> list[str]:
     """Lines of a LaTeX ``tabular``; reasons behind cells without a number (--) are comments above it."""
     heads = table.heads[1:]
-    reasons = dict.fromkeys(
-        f"{h}: {c.reason}" for line in table.lines for h, c in zip(heads, line.cells, strict=True) if c.reason
-    )
+    cells = (pair for line in table.lines for pair in zip(heads, line.cells, strict=True))
+    reasons = dict.fromkeys(f"{head}: {cell.reason}" for head, cell in cells if cell.reason)
     lines = [*([f"% {table.title}"] if table.title else []), *(f"% -- {reason}" for reason in reasons)]
     first = " & ".join(map(escaped, table.heads)) + r" \\"
     lines += [r"\begin{tabular}{l" + "r" * len(heads) + "}", r"\hline", first, r"\hline"]

@@ -408,11 +408,12 @@ class Location:
         store.make_folder(to if kind == "directory" else to.parent)
         with log.task(f"fetching {self}", len(missing)) as bar:
             for names in _grouped(missing, 4 * _FILES_AT_ONCE):
-                parts = {name: _part(to / name if name else to) for name in names}
+                places = {name: to / name if name else to for name in names}
+                parts = {name: at.with_name(f".{at.name}.fetching.part") for name, at in places.items()}
                 self._get(parts)
                 for name, part in parts.items():
                     _verify(part, wanted[name], f"{self}/{name}" if name else self.text)
-                    store.take_place(part, to / name if name else to)
+                    store.take_place(part, places[name])
                     bar.advance()
         if mirror and kind == "directory":
             for path in [path for path in to.rglob("*") if not path.is_dir()]:
@@ -539,10 +540,6 @@ class Location:
 
 def _grouped(names: Sequence[str], count: int) -> Iterable[Sequence[str]]:
     return (names[begin : begin + count] for begin in range(0, len(names), count))
-
-
-def _part(path: Path) -> Path:
-    return path.with_name(f".{path.name}.fetching.part")
 
 
 def _is_here(path: Path, wanted: Expected) -> bool:

@@ -67,9 +67,8 @@ class ForeignRecord(StrictRecord):
         """Names of the fields that were passed over, those of records within as ``record.field``."""
         own = [prefix + name for name in self.model_extra or ()]
         inner = {name: getattr(self, name) for name in type(self).model_fields}
-        return own + [
-            n for name, one in inner.items() if isinstance(one, ForeignRecord) for n in one.unknown(f"{prefix}{name}.")
-        ]
+        records = {name: one for name, one in inner.items() if isinstance(one, ForeignRecord)}
+        return own + [field for name, one in records.items() for field in one.unknown(f"{prefix}{name}.")]
 
 
 @functools.cache
@@ -151,9 +150,8 @@ def _refuse_sizes(values: object, where: str) -> None:
     parts = values.items() if isinstance(values, Mapping) else enumerate(values) if isinstance(values, list) else ()
     for name, value in parts:
         if isinstance(value, int) and abs(value) > _LARGEST_SIZE:
-            raise InputError(
-                "a size is too large", where=place(where, name), expected=f"at most {_LARGEST_SIZE}", got=str(value)
-            )
+            what = "a size is too large"
+            raise InputError(what, where=place(where, name), expected=f"at most {_LARGEST_SIZE}", got=str(value))
         _refuse_sizes(value, place(where, name))
 
 
@@ -164,9 +162,8 @@ def _compare_fields(stated: Any, complete: Mapping[str, Any], where: str) -> Non
         raise problem.located(place(where)) from problem
     for name, value in complete.items():
         if name not in stated:
-            raise InputError(
-                f"the field {name!r} is missing", where=place(where), got=", ".join(stated) or "an empty object"
-            )
+            what = f"the field {name!r} is missing"
+            raise InputError(what, where=place(where), got=", ".join(stated) or "an empty object")
         if isinstance(value, Mapping):
             _compare_fields(stated[name], value, place(where, name))
 
@@ -177,15 +174,14 @@ def first_problem(error: ValidationError, where: str, error_type: type[ErrorType
     kind, loc, value = first["type"], first["loc"], first["input"]
     if kind == "missing":
         got = ", ".join(value) if isinstance(value, dict) else ""
-        return error_type(
-            f"the field {loc[-1]!r} is missing", where=place(where, *loc[:-1]), got=got or "an empty object"
-        )
+        what, where = f"the field {loc[-1]!r} is missing", place(where, *loc[:-1])
+        return error_type(what, where=where, got=got or "an empty object")
     where = place(where, *loc)
     own = first.get("ctx", {}).get("error")
     if isinstance(own, _FieldProblem):
         problem = own.problem
         where = place(where, problem.where) if problem.where else where
-        return error_type(problem.what, where=where, expected=problem.expected, got=problem.got, remedy=problem.remedy)
+        return error_type(problem.what, **{**problem.fields, "where": where})
     kind = "finite_number" if kind == "float_type" and type(value) is int else kind  # a whole number beyond 1e308
     what, expected = _MEANINGS.get(kind, ("value is not valid", first["msg"].removeprefix("Input should be ")))
     got = short(repr(value), 80) + (f" (and {count - 1} more problems)" if count > 1 else "")
@@ -216,9 +212,8 @@ def understood(what: str, where: str) -> Iterator[None]:
         if failures.in_words(error) is not None:  # want of memory
             raise
         got, remedy = f"{type(error).__name__}: {error}", "make it again, or take an undamaged copy"
-        raise InputError(
-            f"this cannot be read as {what}: parts are missing, or do not fit", where=where, got=got, remedy=remedy
-        ) from error
+        problem = f"this cannot be read as {what}: parts are missing, or do not fit"
+        raise InputError(problem, where=where, got=got, remedy=remedy) from error
 
 
 @contextlib.contextmanager

@@ -501,15 +501,12 @@ class RunDir:
         if state != "running":
             self._meter.stop()
         spent = self.spent_before().then(self._meter.usage()).record()
+        own = sum(folder_bytes(self.path / name) for name in (_STATE, _LOCK))  # the first holds the size
         values = {"schema": store.RUN_SCHEMA, "verb": self.verb, "key": self.key, "inputs": self.inputs, "state": state}
-        values |= {**spent, "written_bytes": self._written_bytes(), "files": list(self._output.files)}
+        values |= {**spent, "written_bytes": folder_bytes(self.path) - own, "files": list(self._output.files)}
         values |= {"environment": environment(), "summary": dict(summary)}
         values |= {"paths": self._paths} if self._paths else {}
         store.write_json(self.path / _STATE, store.sealed(values, self.path) if state == "complete" else values)
-
-    def _written_bytes(self) -> int:
-        """Size of the folder's files, without the record in which this number stands."""
-        return folder_bytes(self.path) - sum(folder_bytes(self.path / name) for name in (_STATE, _LOCK))
 
     def spent_before(self) -> Usage:
         """What earlier, interrupted runs of this same key have taken."""

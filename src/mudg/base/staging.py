@@ -37,9 +37,8 @@ def refuse_secrets(words: Sequence[str]) -> None:
             if scheme_of(found) in PACKAGES:
                 checked_address(found)
             elif "@" in found.partition("://")[2].partition("/")[0]:
-                raise UsageError(
-                    "an address holds a user or a password", where=f"{scheme_of(found)}://...", remedy="leave them out"
-                )
+                where = f"{scheme_of(found)}://..."
+                raise UsageError("an address holds a user or a password", where=where, remedy="leave them out")
 
 
 def run_staged(
@@ -112,9 +111,8 @@ class _Staging:
         if location is None:
             return value
         if name == "config":
-            raise UsageError(
-                "--config is a file of this machine", where="--config", got=str(location), remedy="fetch it first"
-            )
+            got = str(location)
+            raise UsageError("--config is a file of this machine", where="--config", got=got, remedy="fetch it first")
         place = location.local
         if place is None:
             known, part = (self.outputs, "out") if name in _OUTPUTS else (self.inputs, "in")

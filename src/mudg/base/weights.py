@@ -126,9 +126,8 @@ def _read(archive: zipfile.ZipFile, folder: str, found: PickledObject, where: st
     reach = offset + sum((n - 1) * s for n, s in zip(size, stride, strict=True)) + 1 if math.prod(size) else 0
     content = archive.read(folder + key)
     if len(content) != count * dtype.itemsize or reach > count:
-        raise InputError(
-            "a tensor does not fit its storage", where=where, expected=f"{count} values", got=f"{len(content)} bytes"
-        )
+        got = f"{len(content)} bytes"
+        raise InputError("a tensor does not fit its storage", where=where, expected=f"{count} values", got=got)
     flat = torch.frombuffer(bytearray(content), dtype=dtype) if count else torch.zeros(0, dtype=dtype)
     return flat.as_strided(size, stride, offset).clone()
 
@@ -476,9 +475,8 @@ def refuse_bad_values(tensors: Mapping[str, Tensor], where: str) -> None:
     """InputError for the first tensor that does not hold finite floating-point numbers; ``where``: its file."""
     for name, value in tensors.items():
         if not value.is_floating_point():
-            raise InputError(
-                "a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=str(value.dtype)
-            )
+            got = str(value.dtype)
+            raise InputError("a tensor does not hold floating-point numbers", where=f"{where}: {name}", got=got)
         if not bool(torch.isfinite(value).all()):
             raise InputError("a tensor holds values that are not finite", where=f"{where}: {name}")
 

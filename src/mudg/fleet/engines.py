@@ -232,6 +232,4 @@ def _option(text: str) -> tuple[str, str | bool]:
     return name, value if separator else True
 
 
-_OWN_OPTIONS: Final = frozenset(
-    {"array", "job-name", "signal", "requeue", "no-requeue", "open-mode", "output", "error", "cpus-per-task"}
-)
+_OWN_OPTIONS: Final = set("array job-name signal requeue no-requeue open-mode output error cpus-per-task".split())

@@ -91,9 +91,8 @@ def run_listed(
 
 def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: Path | None) -> None:
     """UsageError where a scene's output touches any source or the list, or the status would replace another file."""
-    read: dict[str, Path | str | None] = {
-        f"source of {entry.name}": entry.source for entry in entries if entry.source != CITY
-    }
+    logs = (entry for entry in entries if entry.source != CITY)
+    read: dict[str, Path | str | None] = {f"source of {entry.name}": entry.source for entry in logs}
     read["list"] = listed if listed is not None and listed.is_file() else None
     refuse_overlaps([status, *(out / entry.name for entry in entries)], read)
     if status.exists():

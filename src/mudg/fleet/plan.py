@@ -248,9 +248,8 @@ def plan_of(
         if COMMAND not in names:
             names = (*names, COMMAND)
         if "{out}" not in " ".join(command):
-            raise UsageError(
-                "a command must be told where to write", where="--command", expected="{out} among its words"
-            )
+            expected = "{out} among its words"
+            raise UsageError("a command must be told where to write", where="--command", expected=expected)
     known = {**lines, **({COMMAND: command} if command else {})}
     stages: list[BatchStage] = []
     for name in names:

@@ -36,10 +36,9 @@ from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
 from mudg.labels import street_net
 from mudg.labels.by_geometry import RULES
-from mudg.labels.depth.inputs import DepthInput, DepthNetwork, DepthOptions
 from mudg.labels.depth.networks import align_to_lidar, enough_returns, kind_of, load_depth_network
 from mudg.labels.ground import driven_path
-from mudg.labels.inputs import LabelInput, Labels
+from mudg.labels.inputs import DepthInput, DepthNetwork, DepthOptions, LabelInput, Labels
 from mudg.labels.labellers import labeller
 from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import CPU, Place, find, title
@@ -191,15 +190,6 @@ MAX_GAP_S = 2.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Returns:
-    """``xyz_world`` f32[N, 3] metres; largest angle between neighbouring beams, and elevation of the highest beam."""
-
-    xyz_world: NDArray[np.float32]
-    beam_gap_deg: float
-    highest_rad: float
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class _Separated:
     """Static points of a sweep in the world, those of each dynamic object in its frame, and the sweep's beams."""
 
@@ -224,8 +214,9 @@ class NearbyReturns:
             self._sensors.setdefault(sweep.sensor, []).append(sweep)
         self._kept: dict[str, _Separated] = {}
 
-    def of(self, frame: Frame) -> Returns:
-        """Static points and dynamic objects as they stand at the frame's time; no points where no sweep is near."""
+    def of(self, frame: Frame) -> tuple[NDArray[np.float32], float, float]:
+        """Static points and dynamic objects as they stand at the frame's time, f32[N, 3] metres in the world (none
+        where no sweep is near); the largest angle between neighbouring beams, and the highest beam's elevation."""
         time_s = frame.view.time_s
         chosen = [s for sweeps in self._sensors.values() for s in nearest_sweeps(sweeps, time_s, self._count)]
         ids = {sweep.id for sweep in chosen}
@@ -234,7 +225,7 @@ class NearbyReturns:
         for sweep in known:
             parts += [sweep.static, *self._dynamic_points_at(time_s, sweep.owned)]
         gap = min((sweep.gap_deg for sweep in known), default=0.6)
-        return Returns(np.concatenate(parts), gap, max((sweep.highest_rad for sweep in known), default=0.0))
+        return np.concatenate(parts), gap, max((sweep.highest_rad for sweep in known), default=0.0)
 
     def _dynamic_points_at(self, time_s: float, owned: dict[int, NDArray[np.float32]]) -> Iterator[NDArray[np.float32]]:
         for index, xyz_object in owned.items():
@@ -428,9 +419,9 @@ def label_into_staging(config: AnnotateConfig, scene: Scene, ids: Sequence[str],
     frames = {frame.id: frame for frame in scene.frames}
     for frame_id in ids:
         frame = frames[frame_id]
-        near = returns.of(frame)
-        seen = (near.xyz_world, scene.tracks, path, near.beam_gap_deg, near.highest_rad, returns.moving)
-        given = LabelInput(frame.view, read_image(scene, frame), *seen)
+        xyz_world, *beams = returns.of(frame)
+        seen = (read_image(scene, frame), xyz_world, scene.tracks, path, *beams, returns.moving)
+        given = LabelInput(frame.view, *seen)
         with one_torch_thread():
             labels = label(given)
             if network is not None and "depth" not in frame.labels:

@@ -89,9 +89,8 @@ class StreetNet(nn.Module):
         widths = config.widths
         self.stem = nn.Conv2d(4 * (3 + PLANE_COUNT), widths[0], 3, padding=1)
         self.down = nn.ModuleList(nn.Conv2d(a, b, 3, 2, padding=1) for a, b in zip(widths, widths[1:]))
-        self.encode = nn.ModuleList(
-            nn.Sequential(*(_Block(w) for _ in range(n))) for w, n in zip(widths, config.blocks)
-        )
+        sizes = zip(widths, config.blocks)
+        self.encode = nn.ModuleList(nn.Sequential(*(_Block(w) for _ in range(n))) for w, n in sizes)
         self.context = nn.Linear(widths[-1], widths[-1])
         self.up = nn.ModuleList(nn.Conv2d(b, a, 1) for a, b in zip(widths, widths[1:]))
         self.merge = nn.ModuleList(nn.Conv2d(2 * w, w, 3, padding=1) for w in widths[:-1])
@@ -146,9 +145,8 @@ def load(folder: Path | str = EMBEDDED) -> StreetNet:
     where = _described(folder)
     content = store.parse_json(store.read_bytes(where), str(where))
     if not isinstance(content, dict) or content.get("schema") != 1 or content.get("kind") != "street_net":
-        raise InputError(
-            "not a segmentation network of this package", where=str(where), expected="kind street_net, schema 1"
-        )
+        expected = "kind street_net, schema 1"
+        raise InputError("not a segmentation network of this package", where=str(where), expected=expected)
     with records.understood("a segmentation network", str(where)):
         net = StreetNet(records.parse_dataclass(StreetNetConfig, content.get("config"), f"{where}: config"))
     state = checkpoint.read_shards(where.parent, content.get("files"))

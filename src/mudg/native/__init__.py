@@ -134,9 +134,8 @@ def _load() -> tuple[ctypes.CDLL | None, str]:
     found.mudg_set_threads(default_threads())
     wanted = os.environ.get("MUDG_ISA", "").strip()
     if wanted and found.mudg_set_isa(wanted.encode()) != 0:
-        raise UsageError(
-            "MUDG_ISA names an instruction set that cannot run here", got=wanted, expected="avx512, avx2, portable"
-        )
+        expected = "avx512, avx2, portable"
+        raise UsageError("MUDG_ISA names an instruction set that cannot run here", got=wanted, expected=expected)
     return found, ""
 
 

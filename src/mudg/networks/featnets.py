@@ -411,9 +411,8 @@ class PerceptualDistance:
         """
         network, truth, mask = self._features, pairs[0].truth_rgb, pairs[0].mask
         if truth is None or not isinstance(network, CodecFeatures):
-            raise UsageError(
-                "only distances in the features of the codec are made band by band", where="PerceptualDistance.of_all"
-            )
+            where = "PerceptualDistance.of_all"
+            raise UsageError("only distances in the features of the codec are made band by band", where=where)
         images = [reduced(pair.rgb) for pair in pairs if pair.rgb is not None]
         mask = None if mask is None else reduced(mask.float())
         given = _Compared(network, self._device, images, reduced(truth), mask)

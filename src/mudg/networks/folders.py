@@ -151,9 +151,8 @@ def package(name: Literal["transformers", "diffusers", "huggingface_hub"]) -> Mo
             "huggingface_hub": lambda: importlib.import_module("huggingface_hub"),
         }[name]()
     except ImportError as error:
-        raise ResourceError(
-            f"the {name} package is missing", where="pretrained network", got=str(error), remedy=_REMEDY
-        ) from error
+        where = "pretrained network"
+        raise ResourceError(f"the {name} package is missing", where=where, got=str(error), remedy=_REMEDY) from error
     switch = getattr(getattr(getattr(found, "utils", None), "logging", None), "disable_progress_bar", None)
     if switch is not None:  # its bars would run through ours
         switch()

@@ -130,7 +130,9 @@ class I3DFeatures(nn.Module):
     def __init__(self, state: Mapping[str, Tensor], where: str = "I3D weights", epsilon: float = NORM_EPSILON) -> None:
         super().__init__()
         self.epsilon = epsilon
-        for name, value in _checked(state, where).items():
+        found, names = {_renamed(n): value for n, value in state.items()}, {_renamed(n): n for n in state}
+        owner = "FVD's network"
+        for name, value in checked_state(found, tensor_shapes(), where, "I3D", owner=owner, names=names).items():
             self.register_buffer(name.replace(".", "/"), value)
 
     def forward(self, clips: Tensor) -> Tensor:
@@ -142,12 +144,8 @@ class I3DFeatures(nn.Module):
         Returns:
             ``[n, 400]``.
         """
-        if (
-            clips.dim() != 5
-            or clips.shape[1::2] != (3, SIDE_PX)
-            or clips.shape[4] != SIDE_PX
-            or clips.shape[2] < SHORTEST
-        ):
+        fits = clips.dim() == 5 and clips.shape[1] == 3 and clips.shape[3:] == (SIDE_PX, SIDE_PX)
+        if not fits or clips.shape[2] < SHORTEST:
             expected = f"[n, 3, T >= {SHORTEST}, {SIDE_PX}, {SIDE_PX}]"
             raise InputError("FVD's network takes clips of one size", expected=expected, got=str(tuple(clips.shape)))
         x = clips
@@ -205,11 +203,6 @@ def _renamed(name: str) -> str:
     for old, new in _OTHER_NAMES:
         name = name.replace(old, new)
     return name
-
-
-def _checked(state: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
-    found, names = {_renamed(name): value for name, value in state.items()}, {_renamed(name): name for name in state}
-    return checked_state(found, tensor_shapes(), where, "I3D", owner="FVD's network", names=names)
 
 
 def prepared_frame(rgb: NDArray[np.uint8], rule: VideoRule) -> Tensor:

@@ -185,7 +185,9 @@ class InceptionFeatures(nn.Module):
     def __init__(self, state: Mapping[str, Tensor], where: str = "Inception weights") -> None:
         super().__init__()
         self._units = {name: unit for name, _, unit in _units()}
-        for name, value in _checked(state, where).items():
+        complete = "use pt_inception-2015-12-05-6726825d.pth or a copy of it as safetensors"
+        words = {"owner": "FID's network", "remedies": (complete, "torchvision's Inception-v3 is another network")}
+        for name, value in checked_state(state, tensor_shapes(), where, "Inception", **words).items():
             self.register_buffer(name.replace(".", "/"), value)
 
     def forward(self, images: Tensor, taps: Sequence[Tap] = ("2048",)) -> dict[str, Tensor]:
@@ -252,12 +254,6 @@ def _pooled(kind: str, x: Tensor) -> Tensor:
     if kind == _AVERAGE:
         return F.avg_pool2d(x, 3, 1, 1, count_include_pad=False)
     return F.max_pool2d(x, 3, 2) if kind == _MAXIMUM_HALF else F.max_pool2d(x, 3, 1, 1)
-
-
-def _checked(state: Mapping[str, Tensor], where: str) -> dict[str, Tensor]:
-    complete = "use pt_inception-2015-12-05-6726825d.pth or a copy of it as safetensors"
-    remedies = complete, "torchvision's Inception-v3 is another network"
-    return checked_state(state, tensor_shapes(), where, "Inception", owner="FID's network", remedies=remedies)
 
 
 # ---- images in ----

@@ -39,8 +39,8 @@ from mudg.base.config import STRICT
 from mudg.base.errors import InputError, UsageError
 from mudg.core.pictures import resize_bicubic
 from mudg.labels.depth import marigold
-from mudg.labels.depth.inputs import PLAIN, DepthInput, DepthOptions, Prediction
 from mudg.labels.depth.marigold import check_steps, ddim_scheduler, working_size
+from mudg.labels.inputs import PLAIN, DepthInput, DepthOptions, Prediction
 from mudg.networks import clip, folders
 from mudg.networks.folders import CPU, Place
 
@@ -136,9 +136,8 @@ def blank_parts(configs: Mapping[str, Mapping[str, Any]]) -> dict[str, nn.Module
             for name, make in makers.items():
                 made[name] = make(dict(configs[name]))
     except (ValueError, TypeError, KeyError, AttributeError, RuntimeError, NotImplementedError) as error:
-        raise InputError(
-            "a network cannot be made as it is described", where=f"DepthLab: {name}", got=str(error)[:300]
-        ) from error
+        got = str(error)[:300]
+        raise InputError("a network cannot be made as it is described", where=f"DepthLab: {name}", got=got) from error
     reference: Any = made["reference_unet"]
     reference.conv_norm_out, reference.conv_out = None, nn.Identity()
     return made
@@ -387,9 +386,8 @@ class DepthLab:
         parts, sampling, device = self._parts, self._sampling, self._place.device
         noise = noise.to(device)
         with torch.inference_mode():
-            depth, known, mask, image = (
-                self._encoded(plane) for plane in (made.nearest, made.linear, 2 * made.missing - 1, made.image)
-            )
+            planes = (made.nearest, made.linear, 2 * made.missing - 1, made.image)
+            depth, known, mask, image = map(self._encoded, planes)
             # one pixel of every cell decides, as published
             missing = functional.interpolate(made.missing, size=noise.shape[2:], mode="nearest").to(device)
             with self._place.autocast():
@@ -460,9 +458,8 @@ class Sources:
         for name in _ENCODER_FILES:
             if (self.encoder / name).is_file():
                 return self.encoder / name
-        raise InputError(
-            "the image encoder has no weight file", where=str(self.encoder), expected=" or ".join(_ENCODER_FILES)
-        )
+        where = str(self.encoder)
+        raise InputError("the image encoder has no weight file", where=where, expected=" or ".join(_ENCODER_FILES))
 
 
 def find(folder: Path) -> Sources:
@@ -516,9 +513,8 @@ def described(sources: Sources) -> tuple[dict[str, dict[str, Any]], dict[str, An
     try:
         vision_config = folders.member(transformers, "CLIPVisionConfig").from_dict(vision).to_dict()
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise InputError(
-            "the image encoder has no description", where=str(sources.encoder / "config.json"), got=str(error)[:300]
-        ) from error
+        where = str(sources.encoder / "config.json")
+        raise InputError("the image encoder has no description", where=where, got=str(error)[:300]) from error
     file = sources.base / marigold.SCHEDULE_FILE
     schedule = folders.read_settings(file)
     marigold.ddim_scheduler(schedule, str(file))
@@ -541,9 +537,8 @@ def read(sources: Sources, configs: Mapping[str, Mapping[str, Any]]) -> dict[str
     autoencoder = folders.member(folders.package("diffusers"), "AutoencoderKL")
     found["vae"] = dict(folders.load_network(autoencoder, sources.base, subfolder="vae").state_dict())
     encoder = weights.read_checkpoint(sources.encoder_file())
-    found["image_encoder"] = {
-        name: value for name, value in encoder.items() if name.startswith(_ENCODER) and name != _PLACES
-    }
+    known = [name for name in encoder if name.startswith(_ENCODER) and name != _PLACES]
+    found["image_encoder"] = {name: encoder[name] for name in known}
     files = {part: sources.pickles / name for part, name in PICKLES.items()}
     files |= {"vae": sources.base / "vae", "image_encoder": sources.encoder_file()}
     for part, network in blank_parts(configs).items():

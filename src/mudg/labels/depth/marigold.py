@@ -31,7 +31,7 @@ from torch.nn import functional
 from mudg.base import seeds
 from mudg.base.errors import InputError, UsageError
 from mudg.core.depth import AffineFit, Space, fit_affine
-from mudg.labels.depth.inputs import PLAIN, DepthInput, DepthOptions, Prediction
+from mudg.labels.inputs import PLAIN, DepthInput, DepthOptions, Prediction
 from mudg.networks import folders
 from mudg.networks.folders import CPU, Place
 

@@ -31,8 +31,8 @@ from mudg.base.errors import InputError, ResourceError
 from mudg.core.depth import MIN_POINTS, AffineFit, CompletionRules, DenseDepth, Space, fit_affine
 from mudg.core.pictures import resize_bicubic
 from mudg.labels.depth.depthlab import DepthLab
-from mudg.labels.depth.inputs import PLAIN, DepthInput, DepthNetwork, DepthOptions, Prediction
 from mudg.labels.depth.marigold import Marigold
+from mudg.labels.inputs import PLAIN, DepthInput, DepthNetwork, DepthOptions, Prediction
 from mudg.networks import folders
 from mudg.networks.folders import CPU, Place
 
