@@ -71,7 +71,6 @@ from mudg.scene.write import PlacedSweep, write_photos
 
 ASPECTS: Final = (1.5, 4 / 3, 16 / 9, 2.4, 3.4)
 """Width over height of the images; city number n has the n-th, counted round."""
-
 LIDARS: Final = (
     (64, -24.8, 2.0),
     (64, -17.6, 2.4),
@@ -84,11 +83,8 @@ LIDARS: Final = (
 )
 """Beams and elevation range, degrees."""
 LIDAR_SHARES: Final = (0.3, 0.18, 0.12, 0.12, 0.08, 0.06, 0.06, 0.08)
-
-
 SIDE_CAMERAS: Final = 0.35
 """Share of the cities with two cameras beside the front one."""
-
 MARGIN_M: Final = 4.2
 """Largest lateral shift of a clip, metres. Nearly half of the cities have less, so that lorries may stand right beside
 the camera; their clips are shifted by as much less."""
@@ -296,12 +292,10 @@ def _photos(world: CityWorld, sensors: SensorFaults, errors: NDArray[np.float64]
 HELD_OUT = 1_000_000
 """Numbers of cities, and of clips of logs, from here on are for scoring, never for training. Such cities have the
 standard rig, all cameras, and shifts of exactly 2, 3 and 4 m, whatever the seed."""
-
 DEVELOPMENT = tuple(range(HELD_OUT, HELD_OUT + 6))
 """Cities for choosing between variants; also what `learn` watches."""
 REPORTED = tuple(range(HELD_OUT + 100, HELD_OUT + 106))
 """Cities whose scores are reported and on which nothing is chosen."""
-
 LISTS: dict[str, tuple[int, ...]] = {"development": DEVELOPMENT, "reported": REPORTED}
 
 Realism = Literal["plain", "varied", "mixed"]

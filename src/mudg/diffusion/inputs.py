@@ -160,8 +160,6 @@ the points alone, without recorded images and renders. concat: points and that i
 and without renders. repair: renders of a fit and that image, without anything measured. Of published-type models
 reference and points leave out the other; concat shows the image in frame 0, beside the points, and not in the image
 tokens."""
-
-
 COVERED = 0.5
 """Opacity above which a render covers a pixel."""
 

@@ -132,28 +132,21 @@ class Losses:
 
 TRUSTED_ERROR = 0.08
 """Expected error of the colour (of 1) at which the confidence is 1/e; models with a refiner."""
-
 COPY_BIAS = 4.0
 """Start value of the copy gates' logits where the cell is seen (minus this for the backdrop); 0 where it is not."""
-
 CONDITION_PLANES = 3 * 4 + 2 * PatchCodec.factor**2 + CLASSES + 1
 """Planes of a condition: latents of colour, depth and backdrop, two masks at pixel resolution, class shares and their
 sum."""
-
 GATES = 4
 """Outputs that say how much of the condition is copied: its colour, its depth, the backdrop's colour, its classes."""
-
 RENDER_PLANES = 2 * 4 + 2 + CLASSES + 1
 """Further planes of models that use renders: latents of their colour and depth, coverage and certainty, class shares
 and their sum."""
-
 RENDER_GATES = 2
 """Their further outputs: how much of the render's colour and of its depth is copied."""
-
 SURROUNDINGS = 8
 """Latent cells beside a patch that are refined with it in training. What lies farther away changes the losses by 1e-4
 of their value."""
-
 LOSS_SHARES: dict[Modality, float] = {"rgb": 1.0, "depth": 1.0, "semantics": 0.3}
 """Weights of the modalities in the joint loss."""
 

@@ -24,7 +24,6 @@ MODEL_FILE = "model.json"
 EMBEDDED: dict[str, Path] = {"embedded": SHIPPED, "embedded-tiny": SHIPPED.with_name("mdm_tiny")}
 """Models that come with the package, by the names that stand for their folders."""
 SHARD_BYTES = 15 * 1024 * 1024
-
 FORMER_FIELDS: dict[str, dict[str, Any]] = {
     "top": {
         "joint": True,
@@ -40,7 +39,6 @@ FORMER_FIELDS: dict[str, dict[str, Any]] = {
 }
 """Fields of earlier model files whose variants were taken out (`docs/diffusion.md`), each with the one value that is
 still built."""
-
 LATER_FIELDS: dict[str, Any] = {"renders": False, "finish_widths": [], "finish_blocks": []}
 """Fields that earlier model files lack, with what their models are."""
 

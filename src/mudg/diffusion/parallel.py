@@ -174,11 +174,8 @@ def join_processes(wanted: str) -> Iterator[Ranks]:
         yield _ranks_on_device(0, 1, wanted)
         return
     place = _ranks_on_device(rank, size, wanted)
-    if (
-        place.leads
-        and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True"
-        and os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
-    ):
+    restarts = os.environ.get("TORCHELASTIC_MAX_RESTARTS", "0") != "0"
+    if place.leads and restarts and os.environ.get("TORCHELASTIC_USE_AGENT_STORE") == "True":
         log.warn(
             "learn: restarted processes may find each other's old addresses in the launcher's store and fail; "
             "start torchrun with TORCH_DISABLE_SHARE_RDZV_TCP_STORE=1"
@@ -370,9 +367,8 @@ def agreed_terms(
     Raises:
         NumericsError: in every process, if a term is not finite in any; names the terms, the step and the processes.
     """
-    bad = [
-        float(not all(map(math.isfinite, terms.values()))) if rank == ranks.rank else 0.0 for rank in range(ranks.size)
-    ]
+    own = float(not all(map(math.isfinite, terms.values())))
+    bad = [own if rank == ranks.rank else 0.0 for rank in range(ranks.size)]
     sums = ranks.total([*terms.values(), float(stop), *bad])
     mean = {name: value / (ranks.size * portions) for name, value in zip(terms, sums)}
     flags = sums[len(terms) + 1 :]

@@ -57,16 +57,13 @@ from mudg.networks.codec import MODALITIES, Modality
 
 LABELS: dict[Modality, int] = {"rgb": 0, "semantics": 1, "depth": 500}
 """Modality labels of the published checkpoints; fed through a sinusoid like a time step."""
-
 GUIDANCE = 7.5
 """Weight of the guided over the unguided velocity, where a request has none; 1 switches guidance off and halves the
 work."""
 GUIDANCE_RESCALE = 0.7
 """Share of the guided velocity whose spread is pulled back to that of the conditional one."""
-
 MEASURED_SLACK_PX = 1
 """Points are measured on a finer grid than the network's."""
-
 SCALE_ENTRIES = 1400
 """Length of the published table of the dynamic rescale; one entry per noise step is used, the rest repeats the last."""
 
@@ -179,7 +176,6 @@ class ContextDropout:
 PAPER_DROPOUT = ContextDropout()
 """The reference is missing in 20 % of the clips, as the paper says; the released training code does each of the three
 in 5 %."""
-
 MODALITY_SHARES: dict[Modality, float] = {"rgb": 0.5, "semantics": 0.25, "depth": 0.25}
 """How often a training clip shows which modality."""
 
