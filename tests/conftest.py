@@ -68,6 +68,23 @@ def shared_data() -> Callable[[str], Path]:
     return find
 
 
+@pytest.fixture(scope="session")
+def street_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder like that of ``mudg run``: a street of four frames, its clouds, and a fit. Tests leave it as it is."""
+    from fit_settings import fit_config
+    from toy_world import fused_cloud, write_scene
+
+    from mudg.scene.clouds import write_fused
+    from mudg.steps.fit import Fit
+
+    root = tmp_path_factory.mktemp("log") / "street"
+    write_scene(root / "scene", frames=4, cameras=("front",), width=60, height=40)
+    write_fused(root / "fuse", fused_cloud(4), {"tracks": {"car": {"moving": True}}})
+    config = fit_config(method="street_gaussians", iterations=60, start__gaussians=900, densify__max_gaussians=1500)
+    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
+    return root
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _no_network() -> Iterator[None]:
     """Refuse every connection except to this machine."""

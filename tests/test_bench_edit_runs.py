@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 import torch
 from fit_settings import fit_config
-from toy_world import fused_cloud, write_scene
 
 from mudg.base import geometry, store
 from mudg.base.errors import InputError, UsageError
@@ -26,7 +25,6 @@ from mudg.editing.script import parse_edits
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians.storage import load_model
 from mudg.labels.settings import AnnotateConfig
-from mudg.scene.clouds import write_fused
 from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
 from mudg.steps.ingest import Annotate, Fuse, Ingest
@@ -35,14 +33,9 @@ FRAMES = 4
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(street_run: Path) -> Path:
     """A folder like that of ``mudg run``, of a car that drives ahead."""
-    root = tmp_path_factory.mktemp("log") / "street"
-    write_scene(root / "scene", frames=FRAMES, cameras=("front",), width=60, height=40)
-    write_fused(root / "fuse", fused_cloud(FRAMES), {"tracks": {"car": {"moving": True}}})
-    config = fit_config(method="street_gaussians", iterations=60, start__gaussians=900, densify__max_gaussians=1500)
-    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
-    return root
+    return street_run
 
 
 @pytest.fixture(scope="module")

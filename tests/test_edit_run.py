@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
 from scipy.spatial import cKDTree
-from toy_world import CAR_SIZE, car_pose, ego_pose, fused_cloud, write_scene
+from toy_world import CAR_SIZE, car_pose, ego_pose
 
 import mudg
 from mudg import app
@@ -28,13 +27,12 @@ from mudg.editing.script import parse_edits
 from mudg.editing.settings import EditConfig, RenderConfig
 from mudg.gaussians.storage import load_model
 from mudg.scene.check import check_scene
-from mudg.scene.clouds import read_fused, write_fused
+from mudg.scene.clouds import read_fused
 from mudg.scene.labels import read_label
 from mudg.scene.observations import ObservationSet, read_observations
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.edit import Edit
-from mudg.steps.fit import Fit
 from mudg.steps.ingest import Fuse
 from mudg.steps.render import RenderViews
 
@@ -42,15 +40,9 @@ FRAMES = 4
 LAST_S = 0.3 * (FRAMES - 1)
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
-    """A folder like that of ``mudg run``."""
-    root = tmp_path_factory.mktemp("run")
-    write_scene(root / "scene", frames=FRAMES, cameras=("front",), width=60, height=40)
-    write_fused(root / "fuse", fused_cloud(FRAMES), {"tracks": {"car": {"moving": True}}})
-    config = fit_config(method="street_gaussians", iterations=60, start__gaussians=900, densify__max_gaussians=1500)
-    Fit(scene=root / "scene", fused=root / "fuse", out=root / "fit" / "street_gaussians", settings=config).run()
-    return root
+@pytest.fixture
+def run(street_run: Path) -> Path:
+    return street_run
 
 
 def script(folder: Path, text: str, name: str = "edits.yaml") -> Path:

@@ -3,6 +3,7 @@ keeps."""
 
 from __future__ import annotations
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from fit_settings import fit_config
 from test_clips import RULES, image_of_wall, stripes, view_at, wall
 from tiny_networks import small_mdm
 from toy_published import write_tiny
-from toy_world import fused_cloud, write_scene
+from toy_world import write_scene
 
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
@@ -43,7 +44,7 @@ from mudg.editing.recorded import boxes_mask, cleared_cloud, ground_mask, photos
 from mudg.editing.script import parse_edits
 from mudg.editing.settings import EditConfig, RenderConfig
 from mudg.gaussians import fit
-from mudg.scene.clouds import read_fused, write_fused
+from mudg.scene.clouds import read_fused
 from mudg.scene.labels import read_label
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_image, read_scene
@@ -241,13 +242,10 @@ FIT = {"method": "street_gaussians", "start__gaussians": 900, "densify__max_gaus
 
 
 @pytest.fixture(scope="module")
-def run(tmp_path_factory) -> Path:
+def run(street_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder like that of ``mudg run``, and a tiny diffusion model."""
-    root = tmp_path_factory.mktemp("run")
-    write_scene(root / "scene", frames=FRAMES, cameras=("front",), width=60, height=40)
-    write_fused(root / "fuse", fused_cloud(FRAMES), {"tracks": {"car": {"moving": True}}})
-    settings = fit_config(iterations=40, **FIT)
-    Fit(scene=root / "scene", fused=root / "fuse", out=root / FITTED, settings=settings).run()
+    root = tmp_path_factory.mktemp("run") / "run"
+    shutil.copytree(street_run, root)
     torch.manual_seed(0)
     files.save(MDM(small_mdm(window=3, refine_widths=(16, 32), area_px=48 * 32, renders=True)), root / "model", "", {})
     return root

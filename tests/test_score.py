@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -38,6 +39,11 @@ def scored(scene: Path, out: Path, settings: ScoreConfig = PLAIN, **views: Path)
     return store.read_json(Score(scene=scene, views=views, out=out, settings=settings).run() / "metrics.json")
 
 
+def of_one(scene: Path, folder: Path, *change: Any) -> dict:
+    """Scores of a method on the recorded path."""
+    return scored(scene, folder / "score", a=toy_views.write_views(scene, folder / "a", "a", (0.0,), *change))
+
+
 def value(document: dict, method: str, trajectory: str, metric: str) -> object:
     found = [r for r in document["results"] if r["method"] == method and r["trajectory"] == trajectory]
     assert len(found) == 1
@@ -63,16 +69,14 @@ def test_only_held_out_frames_count_on_the_recorded_path(tmp_path: Path, scene: 
     def spoil_training_frames(index: int, seen: Observation) -> Observation:
         return seen if index % 2 else dataclasses.replace(seen, rgb=torch.zeros_like(seen.rgb))
 
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), spoil_training_frames)
-    document = scored(scene, tmp_path / "score", a=views)
+    document = of_one(scene, tmp_path, spoil_training_frames)
     assert document["results"][0]["views"] == 2
     assert value(document, "a", "front_recorded", "psnr") == 100.0  # equal pictures
 
 
 def test_without_held_out_frames_all_count_and_the_rules_say_so(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", test_every=0)
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    document = scored(scene, tmp_path / "score", a=views)
+    document = of_one(scene, tmp_path)
     assert document["results"][0]["views"] == 4
     assert any("No frame was held out" in rule for rule in document["rules"])
 
@@ -92,8 +96,7 @@ def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Pat
     def color_only(_index: int, seen: Observation) -> Observation:
         return dataclasses.replace(seen, depth=None, semantics=None)
 
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), color_only)
-    document = scored(scene, tmp_path / "score", a=views)
+    document = of_one(scene, tmp_path, color_only)
     assert value(document, "a", "front_recorded", "abs_rel") == "not produced"
     assert value(document, "a", "front_recorded", "miou") == "not produced"
     assert value(document, "a", "front_recorded", "psnr") == 100.0
@@ -101,8 +104,7 @@ def test_what_a_method_does_not_produce_is_not_a_zero(tmp_path: Path, scene: Pat
 
 def test_labels_that_the_log_lacks_are_no_truth(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", labels=False)
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,))
-    document = scored(scene, tmp_path / "score", a=views)
+    document = of_one(scene, tmp_path)
     assert value(document, "a", "front_recorded", "miou") == score_tables.NO_TRUTH
     assert value(document, "a", "front_recorded", "abs_rel") == score_tables.NO_TRUTH
 
@@ -111,8 +113,7 @@ def test_missing_depth_counts_as_the_limit(tmp_path: Path, scene: Path) -> None:
     def no_depth_anywhere(_index: int, seen: Observation) -> Observation:
         return dataclasses.replace(seen, depth=torch.full_like(seen.depth, torch.nan))
 
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), no_depth_anywhere)
-    document = scored(scene, tmp_path / "score", a=views)
+    document = of_one(scene, tmp_path, no_depth_anywhere)
     true = toy_views.depths()[np.isfinite(toy_views.depths())].astype(np.float64)
     expected = float(np.mean((80.0 - true) / true))
     assert value(document, "a", "front_recorded", "abs_rel") == pytest.approx(expected, rel=1e-4)
@@ -247,6 +248,5 @@ def test_baseline_of_a_view_that_sees_nothing() -> None:
 def test_lidar_is_the_depth_truth_of_a_log_without_depth_labels(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", labels=False, lidar=True)
     at_12_m = lambda _, seen: dataclasses.replace(seen, depth=torch.full_like(seen.depth, 12.0))  # noqa: E731
-    views = toy_views.write_views(scene, tmp_path / "a", "a", (0.0,), at_12_m)
-    document = scored(scene, tmp_path / "score", a=views)
+    document = of_one(scene, tmp_path, at_12_m)
     assert value(document, "a", "front_recorded", "rmse_m") == pytest.approx(2.0, abs=1e-4)  # the wall stands at 10 m

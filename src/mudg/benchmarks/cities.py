@@ -87,7 +87,7 @@ from mudg.diffusion.model import MDM
 from mudg.diffusion.requests import SampleRequest, generated
 from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
 from mudg.diffusion.views import windows
-from mudg.editing.apply import EditedDrive, carry_out, complete_asset, write_asset
+from mudg.editing.apply import Drawer, EditedDrive, carry_out, complete_asset, write_asset
 from mudg.editing.harmonised import repairing
 from mudg.editing.model import linear_of
 from mudg.editing.recorded import DriveChange, EditedImages, write_edited_scene
@@ -413,8 +413,6 @@ NEARBY_PX: Final = 3
 EVERY_FRAMES: Final = 3
 FEWEST_PX: Final = 30
 """A frame counts for a vehicle of another city if it shows so many pixels of it."""
-Draw = Callable[[View], torch.Tensor]
-"""The image f32[3, H, W] of a view."""
 Seen = tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]
 """Render and truth f32[H, W, 3], and the vehicle's pixels bool[H, W]."""
 
@@ -521,7 +519,7 @@ def city_keys(motion: Motion, height_m: float) -> NDArray[np.float64]:
 
 
 def _compared(
-    case: EditCase, truth: CityWorld, edited: Draw, unedited: Draw, models: tuple[SceneModel, SceneModel] | None = None
+    case: EditCase, truth: CityWorld, edited: Drawer, unedited: Drawer, models: Sequence[SceneModel] = ()
 ) -> dict[str, Any]:
     """Scores of one way to make the edited frames, beside the fit without the edit; with both ``models`` also the
     overlap of the vehicle, without them the perceptual distance."""
@@ -530,7 +528,7 @@ def _compared(
     outside, distances, counts = [], [], np.zeros((2, 2), np.int64)
     for frame in case.scene.frames[::EVERY_FRAMES]:
         now, then = truth.render(frame.view), case.world.render(frame.view)
-        made, usual = (draw(frame.view).permute(1, 2, 0).numpy() for draw in (edited, unedited))
+        made, usual = (draw(frame.view).rgb.permute(1, 2, 0).numpy() for draw in (edited, unedited))
         mask = np.abs(now.rgb - then.rgb).max(-1) > CHANGED
         new, old, mine = made - now.rgb, usual - then.rgb, now.instance == case.instance
         parts = {
@@ -544,14 +542,14 @@ def _compared(
             errors.setdefault(place, []).append(part)
         far = np.logical_not(ndimage.binary_dilation(mask, iterations=NEARBY_PX))
         outside.append((np.abs(made - usual).max(-1) > SAME)[far])
-        for row, (seen, model) in enumerate(zip((now, then), models or ())):
+        for row, (seen, model) in enumerate(zip((now, then), models)):
             true, drawn = seen.instance == case.instance, drawn_pixels(model, case.name, frame.view)
             counts[row] += (true & drawn).sum(), (true | drawn).sum()
-        if models is None and mask.any():
+        if not models and mask.any():
             distances.append(distance_in(made, now.rgb, mask))
     psnr = {place: psnr_in(found) for place, found in errors.items()}
     away = float(np.concatenate(outside).mean())
-    if models is None:
+    if not models:
         parts = {place: psnr[place] for place in ("inside", "vehicle", "uncovered")}
         return {**parts, "outside": away, "perceptual": _mean(distances)}
     overlaps = [float(a / b) if b else None for a, b in counts]
@@ -559,9 +557,10 @@ def _compared(
     return {"pixels": pixels, **psnr, "outside": away, "overlap": overlaps[0], "overlap_before": overlaps[1]}
 
 
-def drawer(model: SceneModel) -> Draw:
-    """What draws the images of a scene."""
-    return lambda view: render_view(model, view, raster_of(model)).rgb
+def drawer(model: SceneModel) -> Drawer:
+    """What draws views of a fitted scene."""
+    raster = raster_of(model)
+    return lambda view: render_view(model, view, raster)
 
 
 def drawn_pixels(model: SceneModel, name: str, view: View) -> NDArray[np.bool_]:
@@ -688,7 +687,7 @@ def _seen(case: EditCase, world: CityWorld, model: SceneModel) -> list[Seen]:
     for frame in case.scene.frames[::EVERY_FRAMES]:
         truth = world.render(frame.view)
         if (truth.instance == case.instance).sum() >= FEWEST_PX:
-            seen.append((draw(frame.view).permute(1, 2, 0).numpy(), truth.rgb, truth.instance == case.instance))
+            seen.append((draw(frame.view).rgb.permute(1, 2, 0).numpy(), truth.rgb, truth.instance == case.instance))
     return seen
 
 
@@ -720,7 +719,7 @@ def _repaired_rows(config: BenchConfig, case: EditCase, name: str, out: Path) ->
         frames[frame.view.time_s] = next((images.repaired or {})[frame.view.camera.name])
     images = replace(images, repaired={name: iter(frames.values()) for name in case.scene.cameras})
     refitted = _refitted(config, case, drive, images, out / "edited" / f"{case.city}_{name.replace(' ', '_')}")
-    ways: list[Draw] = [drawer(edited), lambda view: frames[view.time_s].rgb, drawer(refitted)]
+    ways = [drawer(edited), lambda view: frames[view.time_s], drawer(refitted)]
     if name == "remove":
         ways.append(drawer(_never_there(config, case, truth, out)))
     row, usual = {"city": case.city, "object": case.name, "edit": name}, drawer(case.model)

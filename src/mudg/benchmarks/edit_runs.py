@@ -43,7 +43,7 @@ from mudg.base.html import TextTable, cells, markdown_table
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
 from mudg.base.types import Frame, FusedCloud, Observation, Scene, Track, View
 from mudg.benchmarks.chain import finished, render_page, wall
-from mudg.benchmarks.cities import drawn_pixels
+from mudg.benchmarks.cities import drawer, drawn_pixels
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core import lidar, metrics, pictures, street_scores, view_metrics
 from mudg.core import metrics as flicker
@@ -69,7 +69,6 @@ from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import EditScript, conditions_of, parse_edits
 from mudg.formats.exporters.video import jpeg_bytes
 from mudg.gaussians.model import SceneModel
-from mudg.gaussians.rendering import raster_of, render_view
 from mudg.gaussians.storage import model_of_scene
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_image, read_scene
@@ -237,12 +236,6 @@ def _videos(case: RunCase, drive: EditedDrive) -> tuple[Video, Video, bool]:
         if actor := world.actors.get(name):
             video.actor, video.motion, video.size_m = name, actor.motion, actor.size_m
     return usual, edited, conditions is not None
-
-
-def drawer(model: SceneModel) -> Drawer:
-    """What draws views of a fitted scene."""
-    raster = raster_of(model)
-    return lambda view: render_view(model, view, raster)
 
 
 def _regions(plan: EditPlan, view: View, stood: Mask, stands: Mask) -> tuple[Mask, Mask]:

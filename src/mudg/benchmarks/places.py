@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final, Literal
@@ -112,7 +112,7 @@ def _cities(config: BenchConfig, name: str, table: PaperTable) -> tuple[Log, ...
     return listed_cities(name, config.logs, LogRules(frames[1] if frames else STANDARD.frames, width, height, cameras))
 
 
-def listed_cities(name: str, count: int, rules: LogRules) -> tuple[Log, ...]:
+def listed_cities(name: str, count: int, rules: LogRules) -> tuple[ListedCity, ...]:
     """The first cities of a list."""
     return tuple(ListedCity(str(seed), seed, rules) for seed in city_logs.LISTS[name][:count])
 
@@ -146,9 +146,7 @@ def missing_scenes(table: PaperTable, logs: Sequence[Log]) -> list[str]:
     return [one.segment for one in SCENE_LISTS.get(table.scenes, ()) if identities and one.segment not in identities]
 
 
-def names_of(
-    sources: Sequence[Path], pages: Sequence[str] = ("bench.json", "bench.md", "page.html")
-) -> dict[str, Path]:
+def names_of(sources: Sequence[Path]) -> dict[str, Path]:
     """Name -> log: the last part of its path, in characters that every file system takes. UsageError: no log, two of
     one name, or one that is the name of a page."""
     if not sources:
@@ -157,7 +155,7 @@ def names_of(
     for source in map(Path, sources):
         last = source.resolve().stem if source.suffix == ".zip" else source.resolve().name
         name = _NAME.sub("_", last).strip("._-") or "log"
-        if name in named or name in pages:
+        if name in named or name in ("bench.json", "bench.md", "page.html"):
             remedy = "rename one, or prepare it with mudg ingest in a folder of another name"
             raise UsageError("two logs have the same name", where=str(source), got=name, remedy=remedy)
         named[name] = source
@@ -249,14 +247,10 @@ MapName = Literal["photo", "depth", "seen", "dynamic", "color", "classes"]
 
 @dataclass(frozen=True)
 class Split:
-    """What of a log the methods see.
-
-    Args:
-        name: also of its folder. block: length of the blocks of held-out moments (0 = none). by_camera: only the chosen
-            cameras are shown. all_cameras: views of all cameras are asked for that have held-out frames; else of the
-            first camera.
-        shifts_m: lateral shifts of the views that are asked for, metres, positive to the left.
-    """
+    """What of a log the methods see. ``name``: also of its folder. ``block``: length of the blocks of held-out moments
+    (0 = none). ``by_camera``: only the chosen cameras are shown. ``all_cameras``: views of all cameras are asked for
+    that have held-out frames; else of the first. ``shifts_m``: of the views that are asked for, positive to the
+    left."""
 
     name: str
     block: int = 0
@@ -267,16 +261,11 @@ class Split:
 
 @dataclass(frozen=True)
 class Protocol:
-    """Which views are scored, against what, in which columns.
-
-    Args:
-        name: in tables. family: as asked for with ``--protocols``. title: heading. split: name of a ``Split``.
-        shifts_m: lateral shifts of the scored views. every: every n-th view of a camera counts, beginning with the
-            second where n > 1.
-        maps: what the truth of a view holds. columns: names in ``columns.COLUMNS``, in the order of the table.
-        pooled: a log's value is that of all its places together, so that a place weighs what it adds to the sums; else
-            their mean.
-    """
+    """Which views are scored, against what, in which columns. ``family``: as asked for with ``--protocols``.
+    ``split``: name of a ``Split``. ``maps``: what the truth of a view holds. ``columns``: names in
+    ``columns.COLUMNS``, in the order of the table. ``shifts_m``: of the scored views. ``every``: every n-th view of a
+    camera counts, beginning with the second where n > 1. ``pooled``: a log's value is that of all its places together,
+    so that a place weighs what it adds to the sums; else their mean."""
 
     name: str
     family: str
@@ -330,7 +319,7 @@ class HeldOut:
 
     frames: tuple[str, ...] = ()
     sweeps: tuple[str, ...] = ()
-    facts: tuple[tuple[str, Any], ...] = ()
+    facts: Mapping[str, Any] = field(default_factory=dict)
     reason: str = ""
 
     def places(self, scene: Scene) -> tuple[Frame, ...]:
@@ -340,11 +329,8 @@ class HeldOut:
 
 
 def blocks_of(moments: int, length: int) -> tuple[range, ...]:
-    """Blocks of ``length`` held-out moments, spread evenly among ``moments``; the first and the last one are shown.
-
-    As many as leave ``SHOWN_BETWEEN`` shown moments before, between and after them, but at least one; none where it
-    does not fit.
-    """
+    """Blocks of ``length`` held-out moments, spread evenly among ``moments``; the first and the last one are shown. As
+    many as leave ``SHOWN_BETWEEN`` shown moments before, between and after them, but at least one, where it fits."""
     if moments < length + 2:
         return ()
     count = max(1, (moments - SHOWN_BETWEEN) // (length + SHOWN_BETWEEN))
@@ -353,24 +339,20 @@ def blocks_of(moments: int, length: int) -> tuple[range, ...]:
     return tuple(range(start, start + length) for start in starts)
 
 
-def shown_cameras(scene: Scene, wanted: Sequence[str]) -> tuple[str, ...]:
-    """The cameras that are shown by the split by cameras: those asked for, else ``front``, else the first."""
-    return tuple(wanted) or (("front",) if "front" in scene.cameras else tuple(scene.cameras)[:1])
-
-
 def first_camera(scene: Scene, wanted: Sequence[str]) -> str:
-    """The camera of the views beside the recorded path."""
-    return shown_cameras(scene, wanted)[0]
+    """The camera of the views beside the recorded path: the first of those asked for, else ``front``, else the first of
+    all."""
+    return next(iter(wanted), "front" if "front" in scene.cameras else next(iter(scene.cameras)))
 
 
 def held_out(scene: Scene, split: Split, wanted: Sequence[str]) -> HeldOut:
     """What a split hides of a scene; ``wanted`` are the cameras to show by the split by cameras (empty = the
     default)."""
     if split.by_camera:
-        shown = shown_cameras(scene, wanted)
+        shown = tuple(wanted) or (first_camera(scene, ()),)
         hidden = [name for name in scene.cameras if name not in shown]
         frames = tuple(frame.id for frame in scene.frames if frame.view.camera.name in hidden)
-        facts = (("shown_cameras", list(shown)), ("hidden_cameras", hidden), ("held_out_frames", len(frames)))
+        facts = {"shown_cameras": list(shown), "hidden_cameras": hidden, "held_out_frames": len(frames)}
         return HeldOut(frames, (), facts, "" if frames else "the log has no camera besides those that are shown")
     return _hidden_blocks(scene, split.block) if split.block else HeldOut()
 
@@ -386,13 +368,8 @@ def _hidden_blocks(scene: Scene, length: int) -> HeldOut:
     is_hidden = lambda time_s: int(np.argmin(np.abs(times - time_s))) in hidden  # noqa: E731
     frames = tuple(frame.id for frame in scene.frames if is_hidden(frame.view.time_s))
     sweeps = tuple(sweep.id for sweep in scene.sweeps if is_hidden(sweep.time_s))
-    facts = (
-        ("moments", len(times)),
-        ("blocks", [[block.start, block.stop - 1] for block in blocks]),
-        ("held_out_frames", len(frames)),
-        ("held_out_sweeps", len(sweeps)),
-    )
-    return HeldOut(frames, sweeps, facts)
+    facts = {"moments": len(times), "blocks": [[block.start, block.stop - 1] for block in blocks]}
+    return HeldOut(frames, sweeps, {**facts, "held_out_frames": len(frames), "held_out_sweeps": len(sweeps)})
 
 
 TRUTH: Final = "truth"
@@ -404,15 +381,10 @@ PER_LOG: Final = ("detections", "lanes", "video_features")
 
 @dataclass(frozen=True)
 class Views:
-    """The views of one log at the places of a table.
-
-    Args:
-        out: folder of the log. rows: those that are scored, in order. renders: whether the diffusion model uses those
-            of a fit.
-        score: how every row is scored. overwrite: replace what other settings left there.
-        virtual: folder of the views that fits learn from. on_path: the diffusion model's own rows have views of the
-            recorded path, too.
-    """
+    """The views of one log, in the folder ``out``, at the places of a table. ``rows``: those that are scored, in order.
+    ``score``: how every row is scored. ``renders``: whether the diffusion model uses those of a fit. ``virtual``:
+    folder of the views that fits learn from. ``on_path``: the diffusion model's own rows have views of the recorded
+    path, too."""
 
     log: Log
     out: Path

@@ -233,10 +233,8 @@ class SplitJob:
 
     def views(self, row: Row, chain: Chain, cameras: tuple[str, ...]) -> tuple[Path, DiffusionUse | None]:
         """The folder with a method's views at all places that are asked for, made if need be; and how it used the
-        diffusion model.
-
-        Fits learn from generated views beside the recorded path, and where views of hidden frames are asked for.
-        """
+        diffusion model. Fits learn from generated views beside the recorded path, and where views of hidden frames are
+        asked for."""
         places = self.folder / "asked" if (self.folder / "asked").is_dir() else chain.scene
         drawn = RenderConfig(cameras=cameras, shifts_m=self.split.shifts_m, video=False, device=self.config.device)
         if row.name == FILL:
@@ -257,10 +255,7 @@ class SplitJob:
 
     def use(self, sees: Sees, chain: Chain) -> DiffusionUse:
         """How the diffusion model is used where a method asks for ``sees``; adapted to what the method sees of the log
-        if need be.
-
-        What the model or the log does not allow is left out, and the note says so.
-        """
+        if need be. What the model or the log does not allow is left out, and the note says so."""
         model = self.config.model
         if sees == "points":
             return DiffusionUse("points", model)

@@ -238,15 +238,10 @@ _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 
 @dataclass(frozen=True)
 class Row:
-    """A row that is computed.
-
-    Args:
-        name: in tables and folders. title: for people. method: of `METHODS`; empty = fused points, holes filled.
-        fit: settings of its fit (those of the first fit where it is ``LONGER``); None = no fit.
-        changes: other settings of its fit or of synthesize; ``model: ""`` = there is no model, so the row has no
-            numbers.
-        sees: how it uses the diffusion model, where benchmarks let it choose. varied: its settings stand in the table.
-    """
+    """A row that is computed. ``method``: of `METHODS`; empty = fused points, holes filled. ``fit``: settings of its
+    fit (those of the first fit where it is ``LONGER``); None = no fit. ``changes``: other settings of its fit or of
+    synthesize; ``model: ""`` = there is no model, so the row has no numbers. ``sees``: how it uses the diffusion model,
+    where benchmarks let it choose. ``varied``: its settings stand in the table."""
 
     name: str
     title: str
@@ -322,24 +317,16 @@ def flag_of(name: str) -> str:
 def refuse_unfit(
     config: BenchConfig, preset: PresetName, rows: Sequence[Row], generators: Sequence[SynthesizeConfig]
 ) -> None:
-    """Refuse, before anything is written, what the rows of a benchmark cannot follow or do not use.
-
-    Args:
-        preset: what the configuration started from. generators: settings behind all views that are generated for a row
-            itself.
-
-    Raises:
-        UsageError: a setting that no row uses, weights that are asked for and not given, or a method that the model
-            cannot serve.
-        InputError: there is no such model.
-    """
+    """Refuse, before anything is written, what the rows of a benchmark cannot follow or do not use. ``generators``:
+    settings behind all views that are generated for a row itself. UsageError: a setting that no row uses (beyond the
+    preset), weights that are asked for and not given, or a method that the model cannot serve. InputError: there is no
+    such model."""
     fits = [row.fit for row in rows if row.fit is not None]
     virtual = [fit for fit in fits if {"virtual", "repaired"} & set(METHODS[fit.method].supervision)]
     renders = model_files.uses_renders(config.model)
     if any(fit.method == REPAIRED for fit in fits) and not renders:
-        what, remedy = "repairs renders, and this diffusion model uses none", "choose another --model"
-        remedy = f"leave {REPAIRED} out, or {remedy}"
-        raise UsageError(f"{REPAIRED} {what}", where="--methods", got=config.model, remedy=remedy)
+        what, remedy = "repairs renders, and this diffusion model uses none", f"leave {REPAIRED} out, or choose"
+        raise UsageError(f"{REPAIRED} {what}", where="--methods", got=config.model, remedy=f"{remedy} another --model")
     if fits and not config.continue_fit and LONGER in config.methods:
         what = f"with --no-continue-fit every fit has the same iterations, so this row is that of {BASE}"
         raise UsageError(what, where="--methods", got=LONGER, remedy="leave it out")
