@@ -132,7 +132,7 @@ class Kernels:
         drawn = (depths >= near) & (depths <= far) & (seen >= ALPHA_MIN) & (size > clip).any(-1)
         drawn &= ((means2d + size > 0) & (means2d - size < limit)).all(-1)
         radii = torch.where(drawn[..., None], size, 0).int()
-        like = lambda tensor: drawn.view(*drawn.shape, *[1] * (tensor.ndim - 2))  # noqa: E731
+        like = lambda tensor: drawn.view(*drawn.shape, *[1] * (tensor.ndim - 2))
         poisoned = [torch.where(like(tensor), tensor, torch.nan) for tensor in (means2d, depths, conics)]
         return radii, *poisoned, torch.where(drawn, factor, 0) if compensate else None
 

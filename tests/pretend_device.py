@@ -191,7 +191,7 @@ def run(func, args, kwargs):
         raise RuntimeError(f"{name}: expected a generator of {DEVICE}, found one of cpu")
     if kwargs.get("pin_memory"):
         kwargs = {**kwargs, "pin_memory": False}
-    open_ = lambda x: x.inner if isinstance(x, Pretend) else x  # noqa: E731
+    open_ = lambda x: x.inner if isinstance(x, Pretend) else x
     out = func(*pytree.tree_map(open_, args), **pytree.tree_map(open_, kwargs))
     mutated = {id(a.inner): a for a in there}
 

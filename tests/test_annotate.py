@@ -275,7 +275,7 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
     answers = iter([0.02 * truth[plain.frames[0].id] + 3, np.full((48, 96), 7, np.float32)])
     (tmp_path / "weights").mkdir()
     (tmp_path / "weights" / "config.json").write_text('{"model_type": "depth_anything"}')
-    network = lambda given: Prediction(next(answers), "depth")  # noqa: E731
+    network = lambda given: Prediction(next(answers), "depth")
     monkeypatch.setattr(annotate_depth, "load_depth_network", lambda *_: network)
     config = AnnotateConfig(depth_network=str(tmp_path / "weights"), processes=1)
     scene = read_scene(Annotate(scene=tmp_path / "plain", out=tmp_path / "out", settings=config).run())
@@ -297,7 +297,7 @@ def test_depth_comes_from_the_network_where_it_fits_the_lidar(tmp_path: Path, mo
 def test_a_frame_without_lidar_keeps_its_depth(tmp_path: Path) -> None:
     given = replace(given_at(STREET)[0], xyz_world=np.zeros((0, 3), np.float32))
     labels = label_by_geometry(given)
-    network = lambda _: pytest.fail("asked")  # noqa: E731
+    network = lambda _: pytest.fail("asked")
     assert annotate_depth.with_network(network, given, labels, "front/000000", tmp_path) is labels
     assert (tmp_path / "front" / "000000.filled.json").is_file()
 

@@ -251,7 +251,7 @@ def dgp_clouds(record: dict[str, Any]) -> None:
 
 def long_column(name: str) -> Callable[[Path], None]:
     def spoil(root: Path) -> None:
-        change = lambda c: c.update({name: np.full(len(c["category"]), LONG, object)})  # noqa: E731
+        change = lambda c: c.update({name: np.full(len(c["category"]), LONG, object)})
         write_av2.edit(root / "annotations.feather", change)
 
     return spoil

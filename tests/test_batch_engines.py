@@ -175,7 +175,7 @@ def test_a_node_of_ray_that_goes_down(tmp_path: Path, monkeypatch: pytest.Monkey
         doomed = cluster.add_node(num_cpus=1)
         cluster.wait_for_nodes()
         running = made.start(out, "--engine", "ray", "--ray-address", cluster.address, STEP_S="0.5", **RAY)
-        nodes = lambda: {line for path in made.tallies() for line in path.read_text().splitlines()}  # noqa: E731
+        nodes = lambda: {line for path in made.tallies() for line in path.read_text().splitlines()}
         wait_until(lambda: len(nodes()) == 2, 180)
         cluster.remove_node(doomed, allow_graceful=False)
         assert running.wait(400) == 11

@@ -53,7 +53,7 @@ def test_the_command_edits_cities_and_puts_vehicles_of_one_into_the_other(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     fitted, case_of = [], cities.case_of
-    noted = lambda config, city, out: (fitted.append(city), case_of(config, city, out))[1]  # noqa: E731
+    noted = lambda config, city, out: (fitted.append(city), case_of(config, city, out))[1]
     monkeypatch.setattr(cities, "case_of", noted)
     out = bench.run("edit", BenchConfig(cities="development", count=2, pose_iterations=40), tmp_path / "out")
     content = json.loads((out / "bench.json").read_text())

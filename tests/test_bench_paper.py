@@ -211,7 +211,7 @@ def toy_logs(fids, exact=False):
     facts = {"dataset": "city", "cameras": ["front"], "frames": 24, "size": "384x256", "held_out": 6, "tracks": 2}
     facts |= {"note": "", "made": {}, "films": ["front_shift+2.0"], "columns": ["truth", "gs3d"], "features": {}}
     for number in range(len(fids["gs3d"])):
-        fid = lambda row, more, n=number: {"value": fids[row][n] + more, "n": 12, "n_reference": 48}  # noqa: E731
+        fid = lambda row, more, n=number: {"value": fids[row][n] + more, "n": 12, "n_reference": 48}
         values = {row: {p: {"fid": fid(row, m), "fvd": without} for p, m in (("2", 0), ("3", 1))} for row in fids}
         seconds = {"fuse": 1.0, "fit/gs3d": 2.0}
         logs.append({"log": str(number), **facts, "exact": exact, "values": values, "seconds": seconds})
@@ -281,7 +281,7 @@ def test_views_of_all_logs_are_one_set(tmp_path):
     assert cells["kid"]["mean"] == pytest.approx(kernel_distance(made, reference), abs=1e-5)
     assert cells["kid"]["standard_error"] is None or cells["kid"]["standard_error"] > 0
     assert cells["fvd"]["mean"] == pytest.approx(frechet_distance(made, reference), abs=1e-5)
-    of_log = lambda kept: frechet_distance(np.concatenate([kept[n] for n in NAMES]), kept["reference"])  # noqa: E731
+    of_log = lambda kept: frechet_distance(np.concatenate([kept[n] for n in NAMES]), kept["reference"])
     single = np.mean(list(map(of_log, parts)))
     assert abs(cells["fid"]["mean"] - single) > 0.01  # not the mean over logs
     one, other = (np.concatenate([kept["reference"][start::2] for kept in parts]) for start in (0, 1))
@@ -403,7 +403,7 @@ def test_pictures_without_truth(recorded, tmp_path):
     scene = read_scene(recorded)
     paths = [trajectory.shifted(scene, "front", 2.0), trajectory.named(scene, "front", "lane+0.1")]
     fused = Fuse(scene=recorded, out=tmp_path / "fused", settings=FuseConfig()).run()
-    fill = lambda n: FillViews(scene=recorded, fused=fused, paths=tuple(paths[:n]), out=tmp_path / f"fill{n}")  # noqa: E731
+    fill = lambda n: FillViews(scene=recorded, fused=fused, paths=tuple(paths[:n]), out=tmp_path / f"fill{n}")
     views = {"one": (fill(1).run(),), "both": (fill(2).run(),)}
     out = chain.Film(views=views, paths=tuple(paths), videos=False, out=tmp_path / "film").run()
     assert sorted(path.name for path in out.glob("*.jpg")) == ["front_lane+0.1.jpg", "front_shift+2.0.jpg"]
@@ -417,7 +417,7 @@ def test_pictures_without_truth(recorded, tmp_path):
 
 def test_the_command_writes_every_form_of_the_table(tmp_path, monkeypatch):
     def stand_in(job):
-        cell = lambda: {"fid": {"value": 3.0, "n": 4, "n_reference": 4}, "fvd": {"value": "x"}}  # noqa: E731
+        cell = lambda: {"fid": {"value": 3.0, "n": 4, "n_reference": 4}, "fvd": {"value": "x"}}
         names = ("truth", *(row.name for row in job.rows))
         values = {name: {place: cell() for place in "234"} for name in names}
         return {**toy_logs(FIDS)[0], "log": job.log.name, "values": values}
@@ -488,7 +488,7 @@ def test_a_table_on_cities_end_to_end(filled):
     seed = document["logs"][0]["log"]
     assert (out / seed / "film" / "front_shift+3.0.jpg").is_file()
     names = ("fit/mudg_s", "virtual", "score/mudg_s")
-    stamps = lambda: [(out / seed / name / "run.json").stat().st_mtime_ns for name in names]  # noqa: E731
+    stamps = lambda: [(out / seed / name / "run.json").stat().st_mtime_ns for name in names]
     before = stamps()
     more = dataclasses.replace(config, methods=("gs3d", LONGER, "mudg_s"))
     bench.run("paper", more, out, sources=("city:development",))

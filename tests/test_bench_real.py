@@ -239,7 +239,7 @@ def test_a_point_is_seen_if_it_is_not_behind_the_surface():
     shown = [lidar.ShownFrame(VIEW, np.full((30, 40), 10.0, np.float32), np.full((30, 40, 3), 77, np.uint8))]
     xyz = np.array([[0, 0, 9.9], [0, 0, 10.5], [0, 0, 14.0], [100, 0, 5.0], [0, 0, -5.0]], np.float32)
     points = lidar.OwnedPoints(xyz, np.full(5, STATIC, np.int32), np.zeros(5, np.uint8), 0.4)
-    place = lambda points, _: points.xyz  # noqa: E731
+    place = lambda points, _: points.xyz
     seen, colors = lidar.seen_by(place, points, shown, 0.0)
     assert seen.tolist() == [True, True, False, False, False]
     assert colors[0].tolist() == [77, 77, 77] and not colors[2].any()
@@ -280,7 +280,7 @@ def test_columns_by_hand():
     colored = (depth > 0).astype(np.uint8)
     maps = {"depth": depth, "dynamic": dynamic, "color": color, "colored": colored}
     seen = sight(maps, depth=torch.full((1, 30, 40), 12.0))
-    value = lambda name: columns.COLUMNS[name].close(columns.COLUMNS[name].of(seen))  # noqa: E731
+    value = lambda name: columns.COLUMNS[name].close(columns.COLUMNS[name].of(seen))
     assert value("abs_rel") == pytest.approx((0.2 + 0.4) / 2)
     assert (value("abs_rel_static"), value("abs_rel_dynamic")) == (pytest.approx(0.2), pytest.approx(0.4))
     assert (value("rmse_static"), value("rmse_dynamic")) == (pytest.approx(2.0), pytest.approx(8.0))

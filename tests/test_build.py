@@ -92,7 +92,7 @@ def _build(mc: ModuleType, tmp_path: Path, mode: str, failing: set[str], working
         library.write_bytes(b"library")
         return []
 
-    check = lambda _: mc.ProbeResult(True, version="1")  # noqa: E731
+    check = lambda _: mc.ProbeResult(True, version="1")
     how = {"candidates": candidates, "check": check, "compile_with": compile_with}
     return mc.build(tmp_path, tmp_path / "objects", {"MUDG_NATIVE": mode}, **how)
 

@@ -102,7 +102,7 @@ def test_noise_has_the_stated_size_and_follows_the_key() -> None:
 def test_blur_and_bloom_and_compression_do_what_they_say() -> None:
     edge = np.zeros((40, 60, 3), np.float32)
     edge[:, 30:] = 0.6
-    width = lambda image: int(((image[20, :, 0] > 15) & (image[20, :, 0] < 140)).sum())  # noqa: E731
+    width = lambda image: int(((image[20, :, 0] > 15) & (image[20, :, 0] < 140)).sum())
     assert width(recorded(edge, CameraFaults(), 0)) == 0
     assert width(recorded(edge, CameraFaults(defocus_px=1.5), 0)) >= 3
     assert width(recorded(edge, CameraFaults(motion_px=5), 0)) >= 3

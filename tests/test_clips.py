@@ -217,7 +217,7 @@ def test_fine_grid_gives_the_same_geometry_and_cleaner_colour():
 
 def some_clip(frames=3, height=16, width=24):
     generator = torch.Generator().manual_seed(0)
-    draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    draw = lambda *shape: torch.rand(*shape, generator=generator)
     camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
     condition = Condition(
         tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames)),

@@ -378,7 +378,7 @@ def twin(made: dict[str, Any], inputs: depthlab.Prepared, noise: Tensor, samplin
     first = sampling.steps - int(sampling.steps * sampling.strength)
     times = [1000 - n * stride - 1 for n in range(sampling.steps)][first:]
     noise = noise.double()
-    noisy = lambda t: kept[t].sqrt() * depth + (1 - kept[t]).sqrt() * noise  # noqa: E731
+    noisy = lambda t: kept[t].sqrt() * depth + (1 - kept[t]).sqrt() * noise
     x = noisy(times[0])
     for t, after in zip(times, [*times[1:], None]):
         out = reader(torch.cat([x, mask, known], 1).repeat(2, 1, 1, 1), torch.tensor(t), encoder_hidden_states=both)

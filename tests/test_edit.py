@@ -69,7 +69,7 @@ def test_a_displacement_at_all_times_is_exact() -> None:
 def test_a_displacement_comes_about_within_its_ramp() -> None:
     motion = straight(speed=0.0)
     made = edit.moved(motion, Displacement(ahead_m=2.0, from_s=1.0, ramp_s=2.0))
-    x = lambda t: made.pose_at(t)[0, 3]  # noqa: E731
+    x = lambda t: made.pose_at(t)[0, 3]
     assert x(0.99) == pytest.approx(0.0, abs=1e-12)
     assert x(2.0) == pytest.approx(1.0)  # half of the way at half of the time
     assert x(3.0) == pytest.approx(2.0)
@@ -109,7 +109,7 @@ def test_what_stands_cannot_change_lanes() -> None:
 
 def test_braking_takes_the_way_and_the_time_that_physics_says() -> None:
     made = edit.stopped(straight(speed=8.0), 1.0, 4.0)
-    x = lambda t: made.pose_at(t)[0, 3]  # noqa: E731
+    x = lambda t: made.pose_at(t)[0, 3]
     assert x(1.0) == pytest.approx(8.0)
     assert x(2.0) == pytest.approx(8.0 + 8.0 - 2.0, abs=0.01)
     assert x(3.0) == pytest.approx(8.0 + 8.0, abs=0.01)  # v^2 / 2a = 8 m, 2 s
@@ -555,7 +555,7 @@ def test_the_ready_scripts_fit_the_demo(repository: Path) -> None:
     scripts = sorted((repository / "docs" / "examples" / "edits").glob("*.yaml"))
     assert len(scripts) == 3
     city = CityWorld(CityConfig(seed=DEMO_CITY, n_frames=24))
-    motion = lambda track: Motion.recorded(track.times_s, track.world_from_object)  # noqa: E731
+    motion = lambda track: Motion.recorded(track.times_s, track.world_from_object)
     actors = {t.id: Actor(t.label, tuple(t.size_m), motion(t)) for t in city.tracks()}
     ego = city.ego_path()
     world = EditWorld(actors, Motion.recorded(ego.times_s, ego.world_from_ego))

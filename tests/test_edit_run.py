@@ -99,7 +99,7 @@ def test_renders_show_weather_and_light(run: Path, tmp_path: Path) -> None:
     assert torch.equal(foggy.semantics, plain.semantics)
     solid = torch.isfinite(plain.depth[0]) & (plain.depth[0] > 0)
     far = solid & (plain.depth[0] > plain.depth[0][solid].median())
-    spread = lambda seen, where: float(seen.rgb[:, where].std(1).mean())  # noqa: E731
+    spread = lambda seen, where: float(seen.rgb[:, where].std(1).mean())
     assert spread(foggy, far) < 0.7 * spread(plain, far)
     assert spread(foggy, far) / spread(plain, far) < spread(foggy, solid & ~far) / spread(plain, solid & ~far)
 
@@ -270,7 +270,7 @@ def test_streets_of_recordings_are_closed_and_those_of_generated_cities_stay(run
 
     assert closed(scene) == ("car",) and closed(city) == closed(None) == ()
     assert closed(scene, ", close_street: false") == () and closed(city, ", close_street: true") == ("car",)
-    kinds = lambda drive: [note["kind"] for note in drive.notes]  # noqa: E731
+    kinds = lambda drive: [note["kind"] for note in drive.notes]
     assert kinds(carried(None, ", close_street: true")) == ["street not closed"]
     for drive in (carried(None), carried(scene), carried(city, ", close_street: true")):
         assert "street not closed" not in kinds(drive)

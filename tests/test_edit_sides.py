@@ -35,7 +35,7 @@ VIEWS = [View(CAMERA, geometry.from_rotation_translation(FORWARD, (t, 0, 1.2)), 
 
 def behind(label: str = "car", flank: float | None = None) -> SceneModel:
     """The rear of a vehicle, red below and blue above; with its left flank (y = ``flank``) where that is given."""
-    axis = lambda a, b: np.arange(a, b, 0.08)  # noqa: E731
+    axis = lambda a, b: np.arange(a, b, 0.08)
     y, z = (part.ravel() for part in np.meshgrid(axis(-0.88, 0.9), axis(-0.7, 0.75)))
     places = [np.column_stack([np.full(len(y), -1.95), y, z])]
     if flank is not None:

@@ -25,9 +25,9 @@ FINISHING = replace(TINY, renders=True, finish_widths=(8, 16), finish_blocks=(1,
 def some_pixels(height, width, frames=2, seed=0):
     """A condition of random pixels, with renders."""
     generator = torch.Generator().manual_seed(seed)
-    image = lambda c: torch.rand(frames, c, height, width, generator=generator) * 2 - 1  # noqa: E731
-    mask = lambda: (image(1) > 0).float()  # noqa: E731
-    ids = lambda: torch.randint(0, 19, (frames, 1, height, width), generator=generator, dtype=torch.uint8)  # noqa: E731
+    image = lambda c: torch.rand(frames, c, height, width, generator=generator) * 2 - 1
+    mask = lambda: (image(1) > 0).float()
+    ids = lambda: torch.randint(0, 19, (frames, 1, height, width), generator=generator, dtype=torch.uint8)
     return ConditionPixels(
         image(3), image(3), image(1), mask(), mask(), ids(), ids(), image(3), image(1), mask(), image(1).abs(), ids()
     )
@@ -35,7 +35,7 @@ def some_pixels(height, width, frames=2, seed=0):
 
 def some_made(height, width, frames=2, seed=1):
     generator = torch.Generator().manual_seed(seed)
-    image = lambda c: torch.rand(frames, c, height, width, generator=generator) * 2 - 1  # noqa: E731
+    image = lambda c: torch.rand(frames, c, height, width, generator=generator) * 2 - 1
     ids = torch.randint(0, 19, (frames, 1, height, width), generator=generator, dtype=torch.uint8)
     return Made(image(3), image(1), ids, image(1) - 3)
 
@@ -116,8 +116,8 @@ def test_memory_is_that_of_a_tile(monkeypatch):
 def test_enlarging_is_what_interpolation_does():
     made = some_made(12, 16)
     whole = made.enlarged((36, 48), (0, 36), (0, 48))
-    smooth = lambda x: functional.interpolate(x, size=(36, 48), mode="bilinear", align_corners=False)  # noqa: E731
-    sharp = lambda x: functional.interpolate(x.float(), size=(36, 48), mode="nearest-exact")  # noqa: E731
+    smooth = lambda x: functional.interpolate(x, size=(36, 48), mode="bilinear", align_corners=False)
+    sharp = lambda x: functional.interpolate(x.float(), size=(36, 48), mode="nearest-exact")
     assert torch.allclose(whole.rgb, smooth(made.rgb), atol=1e-5)
     assert torch.allclose(whole.log_error, smooth(made.log_error), atol=1e-5)
     assert torch.equal(whole.depth_code, sharp(made.depth_code))

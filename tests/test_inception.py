@@ -114,7 +114,7 @@ def neighbours(x: np.ndarray, reduce) -> np.ndarray:
 def test_the_last_blocks_against_a_twin_in_numpy(network, state, name: str, pool) -> None:
     width = 1280 if name == "Mixed_7b" else 2048
     x = torch.rand(1, width, 3, 4, generator=torch.Generator().manual_seed(1))
-    of = lambda y, unit: convolved(y, state, f"{name}.{unit}")  # noqa: E731
+    of = lambda y, unit: convolved(y, state, f"{name}.{unit}")
     one = x[0].double().numpy()
     middle = of(one, "branch3x3_1")
     double = of(of(one, "branch3x3dbl_1"), "branch3x3dbl_2")

@@ -133,7 +133,7 @@ def test_tiles_of_a_condition_are_those_of_the_whole() -> None:
     noise = torch.Generator().manual_seed(3)
     camera = Camera("front", 44, 36, 40.0, 40.0, 22.0, 18.0)
     views = tuple(View(camera, torch.eye(4, dtype=torch.float64).numpy(), 0.1 * t) for t in range(2))
-    one = lambda *shape: torch.rand(*shape, generator=noise)  # noqa: E731
+    one = lambda *shape: torch.rand(*shape, generator=noise)
     planes = (one(2, 3, 36, 44), one(2, 1, 36, 44), one(2, 1, 36, 44) > 0.5, one(3, 36, 44))
     whole = Condition(views, *planes, backdrop=one(2, 3, 36, 44))
     part = cropped(whole, slice(4, 20), slice(8, 40))

@@ -52,7 +52,7 @@ def street(tmp_path_factory):
 
 def corner(clip):
     """The upper left 16x16 pixels: enough for a loss."""
-    cut = lambda value, *names: {name: getattr(value, name)[..., :16, :16] for name in names}  # noqa: E731
+    cut = lambda value, *names: {name: getattr(value, name)[..., :16, :16] for name in names}
     given = clip.condition
     condition = Condition(given.views, **cut(given, "color", "depth", "valid", "reference"))
     return replace(clip, condition=condition, **cut(clip, "rgb", "depth", "depth_valid", "semantics"))

@@ -88,7 +88,7 @@ def test_images_that_an_edit_rendered_in_part_are_no_photographs(log):
     assert {f.id for f in scene.frames_in("train")} - {f.id for f in photographs(changed)} == {"front/000006"}
     assert all("front/000006" not in w.frames for w in log_clips.log_windows(changed, RULES))
     assert any("front/000006" in w.frames for w in log_clips.log_windows(scene, RULES))
-    names = lambda of: {f.id for block in adapt.blocks_of(of, AdaptConfig()) for f in block}  # noqa: E731
+    names = lambda of: {f.id for block in adapt.blocks_of(of, AdaptConfig()) for f in block}
     assert names(scene) - names(changed) == {"front/000006"}
 
 

@@ -37,7 +37,7 @@ def some_condition(frames=3, height=16, width=24, seed=0):
     generator = torch.Generator().manual_seed(seed)
     camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
     views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
-    draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    draw = lambda *shape: torch.rand(*shape, generator=generator)
     return Condition(
         views,
         draw(frames, 3, height, width),

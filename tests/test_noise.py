@@ -215,7 +215,7 @@ def test_second_order_solver_comes_nearer_to_the_exact_flow_than_ddim(prediction
 def test_second_order_solver_follows_the_published_update():
     """Three steps written out in log-SNR and exponentials, from a level that has a log-SNR."""
     schedule = Schedule()
-    denoise = lambda x, t: 0.3 * torch.tanh(x) + 0.0005 * t  # noqa: E731
+    denoise = lambda x, t: 0.3 * torch.tanh(x) + 0.0005 * t
     start = torch.linspace(-1, 1, 5, dtype=torch.float64)
     indices = [899, 599, 299, 49]
     alpha, sigma = schedule.alpha_bar[indices].sqrt(), (1 - schedule.alpha_bar[indices]).sqrt()
@@ -235,13 +235,13 @@ def test_first_steps_of_the_second_order_solver_are_those_of_ddim():
     """From pure noise the first two steps have nothing to extrapolate from."""
     schedule = Schedule()
     start = torch.randn(1, 6, generator=torch.Generator().manual_seed(0))
-    denoise = lambda x, t: 0.3 * torch.tanh(x) + 0.001 * t  # noqa: E731
+    denoise = lambda x, t: 0.3 * torch.tanh(x) + 0.001 * t
     indices = noise.trailing_steps(1000, 20)[:3]
     seen = {}
     for sampler in (noise.ddim, noise.dpm_solver):
         estimates = []
         settings = {"eta": 0.0} if sampler is noise.ddim else {}
-        watched = lambda x, t, kept=estimates: kept.append(denoise(x, t)) or kept[-1]  # noqa: E731
+        watched = lambda x, t, kept=estimates: kept.append(denoise(x, t)) or kept[-1]
         sampler(watched, start, schedule, indices, **settings)
         seen[sampler] = estimates
     for a, b in zip(seen[noise.ddim], seen[noise.dpm_solver]):
@@ -299,7 +299,7 @@ def test_second_order_solver_follows_the_flow_under_the_dynamic_rescale(predicti
 def test_second_order_solver_with_rescale_follows_the_update_of_the_scaled_level():
     """As `test_second_order_solver_follows_the_published_update`, with alpha times the rescale in place of alpha."""
     schedule = Schedule(ScheduleConfig(base_scale=0.7))
-    output = lambda x, t: 0.3 * torch.tanh(x) + 0.0005 * t  # noqa: E731
+    output = lambda x, t: 0.3 * torch.tanh(x) + 0.0005 * t
     start = torch.linspace(-1, 1, 5, dtype=torch.float64)
     indices = [899, 599, 299, 49]
     scale = schedule.scale[indices].double()

@@ -58,7 +58,7 @@ def some_condition(frames=4, height=8, width=12, seed=0):
     generator = torch.Generator().manual_seed(seed)
     camera = Camera("front", width, height, 20.0, 20.0, width / 2, height / 2)
     views = tuple(View(camera, np.eye(4), 0.1 * t) for t in range(frames))
-    draw = lambda *shape: torch.rand(*shape, generator=generator)  # noqa: E731
+    draw = lambda *shape: torch.rand(*shape, generator=generator)
     return Condition(
         views,
         draw(frames, 3, height, width),
@@ -227,7 +227,7 @@ def test_missing_is_zero_and_the_reference_is_frame_zero():
     model.config = config
     condition = some_condition()
     planes = model.encode_condition(condition).planes
-    encode = lambda image: model.codec.encode(image).detach()  # noqa: E731
+    encode = lambda image: model.codec.encode(image).detach()
     color = condition.color * condition.valid
     assert torch.allclose(planes[0, 0, :4], encode(condition.reference * 2 - 1), atol=1e-5)
     assert torch.allclose(planes[0, 1, :4], encode(color[1] * 2 - 1), atol=1e-5)
@@ -430,7 +430,7 @@ def test_shares_of_modalities_and_missing_context(model):
     tower, model.image_tokens = model.image_tokens, torch.nn.Identity()
     model.velocity_loss(small, many, torch.Generator().manual_seed(0))
     model.predict, model.image_tokens = original, tower
-    share = lambda flags: float(torch.tensor(flags).float().mean())  # noqa: E731
+    share = lambda flags: float(torch.tensor(flags).float().mean())
     for name, wanted in (("rgb", 0.5), ("semantics", 0.25), ("depth", 0.25)):
         assert share([n == name for n in seen["names"]]) == pytest.approx(wanted, abs=0.03)
     no_text = (seen["text"] == model.text[1]).flatten(1).all(1)
@@ -575,7 +575,7 @@ def test_memory_is_counted_right():
 @pytest.mark.slow
 def test_stage_two_freezes_the_published_number_of_weights():
     model = memory_plan.meta_model(PublishedConfig(), torch.float32)
-    count = lambda parameters: sum(p.numel() for p in parameters)  # noqa: E731
+    count = lambda parameters: sum(p.numel() for p in parameters)
     assert count(choose_trainable(model, 1)) == 1_440_917_060 + 48_787_456
     assert count(choose_trainable(model, 2)) == 1_440_917_060 - 272_850_880 + 48_787_456
     fewer = 272_850_880 + 266_891_520 + 5_580_736

@@ -16,8 +16,8 @@ def some(count=4, height=16, width=24, seed=0):
     latents = {
         m: torch.randn(count, c, height // 2, width // 2, generator=generator) for m, c in codec.channels.items()
     }
-    image = lambda c: torch.rand(count, c, height, width, generator=generator) * 2 - 1  # noqa: E731
-    ids = lambda: torch.randint(0, 19, (count, 1, height, width), generator=generator, dtype=torch.uint8)  # noqa: E731
+    image = lambda c: torch.rand(count, c, height, width, generator=generator) * 2 - 1
+    ids = lambda: torch.randint(0, 19, (count, 1, height, width), generator=generator, dtype=torch.uint8)
     given = ConditionPixels(image(3), image(3), image(1), image(1) > 0, image(1) > 0, ids(), ids())
     return codec, refiner, latents, given
 

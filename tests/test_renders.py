@@ -37,7 +37,7 @@ def flat_render(view, depth=40.0, alpha=1.0, color=(0.8, 0.2, 0.1), label=2):
 def with_renders(condition, seed=5):
     generator = torch.Generator().manual_seed(seed)
     t, _, h, w = condition.color.shape
-    draw = lambda c: torch.rand(t, c, h, w, generator=generator)  # noqa: E731
+    draw = lambda c: torch.rand(t, c, h, w, generator=generator)
     alpha = draw(1)
     planes = RenderPlanes(draw(3), 3 + 60 * draw(1), alpha, alpha * draw(1), some_ids(generator, t, h, w))
     return replace(condition, renders=planes)
@@ -62,7 +62,7 @@ def test_planes_have_one_shape():
 def test_renders_tell_the_depth_beyond_the_reach_of_measured_pixels():
     """A wall at 12 m whose upper part no point was measured on; the render says 12.5 m and red, all over."""
     cloud, view = FusedCloud(wall(12.0, stripes, z_range=(-9, 1)), {}), view_at()
-    render = lambda view: flat_render(view, 12.5)  # noqa: E731
+    render = lambda view: flat_render(view, 12.5)
     plain = build_conditions(cloud, [], [view], [], RULES)[0]
     helped = build_conditions(cloud, [], [view], [], RULES, render_at=render)[0]
     measured = plain.valid[0, 0]
@@ -126,7 +126,7 @@ def test_what_a_render_shows_in_the_box_of_an_object_moves_with_it():
     poses[0, :3, 3], poses[1, :3, 3] = (12.0, -6.0, 0.0), (12.0, 0.0, 0.0)
     track = Track("car", "car", np.array([4.0, 4.0, 4.0]), np.array([0.0, 1.0]), poses)
     cloud, now = FusedCloud(NOTHING.static, {"car": corner}), view_at(time_s=1.0)
-    car = lambda view: flat_render(view, 10.1, label=palette.ID["car"])  # noqa: E731
+    car = lambda view: flat_render(view, 10.1, label=palette.ID["car"])
     green = Photo(view_at(), np.full((32, 48, 3), (0, 255, 0), np.uint8))
     made = build_conditions(cloud, [track], [now], [green], RULES, render_at=car)[0]
     across = (torch.arange(48) + 0.5 - 24).abs() / 40 * 10.1
@@ -159,7 +159,7 @@ def test_a_hole_below_the_horizon_is_no_sky(recorded, above):
     if recorded is not None:
         name = np.uint8(palette.UNLABELLED if recorded == "unlabelled" else palette.ID[recorded])
         photos = [Photo(view, np.zeros((32, 48, 3), np.uint8), np.full((32, 48), name))]
-    empty = lambda view: flat_render(view, 1000.0, 0.1, (0.5, 0.7, 1.0), palette.ID["sky"])  # noqa: E731
+    empty = lambda view: flat_render(view, 1000.0, 0.1, (0.5, 0.7, 1.0), palette.ID["sky"])
     rules = replace(RULES, warp=recorded is not None, hidden_share=-100.0)
     made = build_conditions(FusedCloud(points, {}), [], [view], photos, rules, render_at=empty)[0]
     depth, ids, shown = made.depth[0, 0], made.semantics[0, 0], made.renders
@@ -182,7 +182,7 @@ def test_ground_that_no_image_shows_is_level():
     xyz = np.stack([x.ravel(), y.ravel(), np.full(x.size, -1.6)], 1).astype(np.float32)
     view = view_at()
     falls = ((torch.arange(32) + 0.5 - 16) / 40)[:, None].expand(32, 48)
-    empty = lambda view: flat_render(view, 1000.0, 0.0, label=palette.ID["sky"])  # noqa: E731
+    empty = lambda view: flat_render(view, 1000.0, 0.0, label=palette.ID["sky"])
     for name in ("road", "building"):
         cloud = PointCloud(
             xyz, np.zeros((x.size, 3), np.uint8), "world", semantics=np.full(x.size, palette.ID[name], np.uint8)

@@ -216,7 +216,7 @@ def crowd(tmp_path_factory: pytest.TempPathFactory) -> Path:
     scene, _, _, small = write_toy_run(root, degree=0)
     rng = np.random.default_rng(0)
     rows = torch.from_numpy(rng.integers(0, 720, 95_003))
-    noise = lambda values: 0.01 * torch.from_numpy(rng.standard_normal(values.shape, np.float32))  # noqa: E731
+    noise = lambda values: 0.01 * torch.from_numpy(rng.standard_normal(values.shape, np.float32))
     columns = {name: values[rows] + noise(values[rows]) for name, values in small.table.columns.items()}
     some = torch.randn(4096, generator=torch.Generator().manual_seed(0)) * 2
     whole, alone = torch.sigmoid(some), torch.stack([torch.sigmoid(one) for one in some])  # in vectors, and one by one

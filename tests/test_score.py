@@ -180,7 +180,7 @@ def test_two_runs_give_the_same_bytes(tmp_path: Path, scene: Path) -> None:
 def test_large_images_score_as_small_ones_do(tmp_path: Path, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Views one after the other and methods beside each other, perceptual distances in bands; the images are not
     halved."""
-    shade = lambda name: toy_views.write_views(scene, tmp_path / name, name, (0.0,), brighter(9 * len(name)))  # noqa: E731
+    shade = lambda name: toy_views.write_views(scene, tmp_path / name, name, (0.0,), brighter(9 * len(name)))
     views = {name: shade(name) for name in ("a", "bb")}
     small = scored(scene, tmp_path / "small", ScoreConfig(), **views)["results"]
     monkeypatch.setattr(score, "WHOLE_PIXELS", 0)
@@ -247,6 +247,6 @@ def test_baseline_of_a_view_that_sees_nothing() -> None:
 
 def test_lidar_is_the_depth_truth_of_a_log_without_depth_labels(tmp_path: Path) -> None:
     scene = toy_views.write_scene(tmp_path / "scene", labels=False, lidar=True)
-    at_12_m = lambda _, seen: dataclasses.replace(seen, depth=torch.full_like(seen.depth, 12.0))  # noqa: E731
+    at_12_m = lambda _, seen: dataclasses.replace(seen, depth=torch.full_like(seen.depth, 12.0))
     document = of_one(scene, tmp_path, at_12_m)
     assert value(document, "a", "front_recorded", "rmse_m") == pytest.approx(2.0, abs=1e-4)  # the wall stands at 10 m

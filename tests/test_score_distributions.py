@@ -89,7 +89,7 @@ def test_a_log_is_compared_with_its_recorded_frames_off_its_path_too(tmp_path: P
     words = ("weights that are not the published file", "pytorch-fid")
     assert any(all(word in rule for word in words) for rule in document["rules"])
     sets = {(one["trajectory"], one["method"]): one for one in made["sets"]}
-    kept = lambda name: store.read_safetensors(out / "features" / name)["features"]  # noqa: E731
+    kept = lambda name: store.read_safetensors(out / "features" / name)["features"]
     of_b = sets["front_shift+2.0", "b"]
     again = feature_distances.frechet_distance(kept(of_b["made"]), kept(of_b["reference"]))
     assert shifted["b"] == pytest.approx(again, abs=1e-5)

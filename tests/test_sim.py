@@ -217,7 +217,7 @@ def test_motion_of_an_object_is_that_of_its_box() -> None:
 @pytest.mark.parametrize("shutter", ["top_to_bottom", "bottom_to_top", "left_to_right", "right_to_left"])
 def test_a_rolling_shutter_reads_every_strip_at_its_own_pose(shutter: str) -> None:
     session, start, end = Session(wall()), Instant(0.0, placed(z=0)), Instant(0.1, placed(y=2.0, z=0))
-    rolled = session.render([CameraRequest(optics=PLAIN, start=start, end=end, shutter=shutter)])[0].layers["rgb"]  # type: ignore[arg-type]
+    rolled = session.render([CameraRequest(optics=PLAIN, start=start, end=end, shutter=shutter)])[0].layers["rgb"]
     length = 64 if shutter.endswith(("right", "left")) else 48
     for strip in range(8):
         first, last = strip * length // 8, (strip + 1) * length // 8
@@ -284,7 +284,7 @@ def test_beams_measure_the_wall_while_the_vehicle_drives() -> None:
     """A turning sensor at 10 m/s: every beam measures from where the sensor is at its time, and the points, carried to
     the end of the sweep, lie on the wall."""
     beams = BeamTable.spinning(np.linspace(-20, 20, 16), 1.0, (0.5, 30.0))
-    pose = lambda x: geometry.yaw_matrix(0.0, (x, 0.0, 0.0))  # noqa: E731
+    pose = lambda x: geometry.yaw_matrix(0.0, (x, 0.0, 0.0))
     reply = sweep(
         Session(wall()), LidarRequest(beams=beams, start=Instant(0.0, pose(0.0)), end=Instant(0.1, pose(1.0)))
     )

@@ -203,7 +203,7 @@ def test_later_parts_add_up_and_the_peak_is_the_highest() -> None:
 
 
 def test_a_run_folder_notes_what_it_took_over_all_its_runs(tmp_path: Path) -> None:
-    open_it = lambda: RunDir.open(tmp_path / "out", OUTPUT, {"a": 1}, {})  # noqa: E731
+    open_it = lambda: RunDir.open(tmp_path / "out", OUTPUT, {"a": 1}, {})
     first = open_it()
     wait_until(time.process_time() + 0.1)
     first.pause()

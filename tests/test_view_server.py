@@ -33,8 +33,8 @@ def _no_memory(_asked: object) -> tuple[bytes, str]:
 
 
 def site() -> Site:
-    echo = lambda asked: (json.dumps(asked).encode(), "application/json")  # noqa: E731
-    film = lambda asked, send: [send(b"x" * 100_000) for _ in range(100)]  # noqa: E731
+    echo = lambda asked: (json.dumps(asked).encode(), "application/json")
+    film = lambda asked, send: [send(b"x" * 100_000) for _ in range(100)]
     answers = {"echo": echo, "broken": _broken, "no_memory": _no_memory}
     return Site({"": PAGE, "small": b"small"}, answers, TOKEN, {"film": film})
 

@@ -122,7 +122,7 @@ def test_every_gaussian_is_in_one_chunk_and_the_first_ones_matter_most() -> None
     assert 0 < len(chunks[-1]) <= size
     assert [level_of(k) for k in range(8)] == [0, 1, 1, 2, 2, 2, 2, 3]
     worth = coverage(columns_of(model), model.table.labels["node"].numpy(), path)
-    of_level = lambda n: [c for k, c in enumerate(chunks) if level_of(k) == n]  # noqa: E731
+    of_level = lambda n: [c for k, c in enumerate(chunks) if level_of(k) == n]
     levels = [np.concatenate(of_level(n)) for n in range(level_of(len(chunks) - 1) + 1)]
     for one, following in zip(levels, levels[1:]):
         assert worth[one].min() >= worth[following].max()

@@ -83,7 +83,7 @@ def test_the_map_of_names_is_one_to_one(wanted):
 
 
 def test_published_counts_of_parameters(published_keys):
-    count = lambda prefix: sum(  # noqa: E731
+    count = lambda prefix: sum(
         int(torch.Size(shape).numel()) for name, shape in published_keys.items() if name.startswith(prefix)
     )
     assert count("model.diffusion_model.") == 1_440_917_060

@@ -85,13 +85,13 @@ class CameraColors:
 
     def record(self) -> dict[str, Any]:
         """As JSON values; inverse of ``of_record``."""
-        values = lambda m: {"gain": list(m.gain), "offset": list(m.offset), "pairs": m.pairs}  # noqa: E731
+        values = lambda m: {"gain": list(m.gain), "offset": list(m.offset), "pairs": m.pairs}
         return {"reference": self.reference, "to_common": {name: values(m) for name, m in self.to_common.items()}}
 
     @classmethod
     def of_record(cls, values: Mapping[str, Any]) -> CameraColors:
         """From JSON values. KeyError, TypeError or ValueError if they are malformed."""
-        map_of = lambda m: ColorMap(_triple(m["gain"]), _triple(m["offset"]), int(m["pairs"]))  # noqa: E731
+        map_of = lambda m: ColorMap(_triple(m["gain"]), _triple(m["offset"]), int(m["pairs"]))
         maps = {str(name): map_of(m) for name, m in values["to_common"].items()}
         if any(min(m.gain) <= 0 for m in maps.values()):
             raise ValueError("a gain is not positive")

@@ -14,7 +14,7 @@ def cropped(condition: Condition, rows: slice, columns: slice) -> Condition:
     width, height = columns.stop - columns.start, rows.stop - rows.start
     lens = {"width": width, "height": height, "cx": width / 2, "cy": height / 2}
     views = tuple(replace(view, camera=replace(view.camera, **lens)) for view in condition.views)
-    cut = lambda x: x[..., rows, columns].contiguous()  # noqa: E731
+    cut = lambda x: x[..., rows, columns].contiguous()
     found = {name: getattr(condition, name) for name in _MAPS}
     maps = {name: cut(x) for name, x in found.items() if x is not None}
     renders = None if condition.renders is None else condition.renders.map(cut)

@@ -64,7 +64,7 @@ class TextTable:
 
 def markdown(table: TextTable) -> list[str]:
     """Lines of a Markdown table; the best numbers are bold."""
-    shown = lambda cell: f"**{cell.text}**" if cell.best else cell.text  # noqa: E731
+    shown = lambda cell: f"**{cell.text}**" if cell.best else cell.text
     rows = [(line.title, *map(shown, line.cells)) for line in table.lines]
     first, *others = ("| " + " | ".join(cells) + " |" for cells in (table.heads, *rows))
     return [first, "|---" * len(table.heads) + "|", *others]

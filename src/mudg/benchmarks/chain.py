@@ -305,7 +305,7 @@ class Film(Output):
         return settings if self.videos else {**settings, "videos": False}
 
     def make(self, work: RunDir) -> dict[str, Any]:
-        sets_of = lambda folders: {k: v for one in folders for k, v in list_observation_sets(one).items()}  # noqa: E731
+        sets_of = lambda folders: {k: v for one in folders for k, v in list_observation_sets(one).items()}
         listed = {name: sets_of(folders) for name, folders in self.views.items()}
         playable = self.videos and bool(video_encoders())
         for path in self.paths:
@@ -337,7 +337,7 @@ def _frames(
 
 def wall(title: str, pictures: Mapping[str, Path], notes: Sequence[str] = ()) -> dict[str, Any]:
     """Pictures side by side, by title, which a page holds."""
-    inside = lambda path: base64.b64encode(store.read_bytes(path)).decode("ascii")  # noqa: E731
+    inside = lambda path: base64.b64encode(store.read_bytes(path)).decode("ascii")
     cells = [{"title": name, "src": "data:image/jpeg;base64," + inside(path)} for name, path in pictures.items()]
     return {"title": title, "notes": notes, "cells": cells}
 

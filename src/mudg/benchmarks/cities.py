@@ -176,7 +176,7 @@ def seam(model: MDM, config: BenchConfig, request: SampleRequest) -> dict[str, A
     pairs = metrics.changes(torch.stack(frames), rgb, true_frames)
     ratios = [m / t if t > 0 else math.nan for m, t in pairs]
     seams = {span.start + usual.overlap - 1 for span in spans[1:-1]} | {spans[-2].stop - 1}
-    mean = lambda kept: sum(kept) / len(kept) if kept else math.nan  # noqa: E731
+    mean = lambda kept: sum(kept) / len(kept) if kept else math.nan
     across = mean([r for i, r in enumerate(ratios) if i in seams])
     within = mean([r for i, r in enumerate(ratios) if i not in seams])
     return {
@@ -452,7 +452,7 @@ def measure_edits(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
                 bar.advance()
         return found
 
-    edits = lambda city: [_edited_row(case(city), name, text) for name, text in EDITS.items()]  # noqa: E731
+    edits = lambda city: [_edited_row(case(city), name, text) for name, text in EDITS.items()]
     edited = rows("editing", {"edits": edits})
     first = dict.fromkeys(("edit", "cities", "outside"))  # the order of these in bench.json
     means = [{**first, **row} for row in EDITED.summary(edited)]
@@ -461,12 +461,12 @@ def measure_edits(config: BenchConfig, out: Path) -> tuple[dict[str, Any], str]:
     text = replace(EDITED, title=title).table(means)
     if len(names) > 1:
         giver = dict(zip(names, [*names[1:], *names[:1]], strict=True))
-        insert = lambda city: _replaced_rows(case(city), case(giver[city]), out)  # noqa: E731
+        insert = lambda city: _replaced_rows(case(city), case(giver[city]), out)
         replaced = rows("inserting vehicles of other cities", {"insert": insert})
         result["insert"] = {"rows": replaced, "summary": REPLACED.summary(replaced)}
         text += REPLACED.table(result["insert"]["summary"])
     if config.harmonize:
-        repairs = lambda edit: lambda city: _repaired_rows(config, case(city), edit, out)  # noqa: E731
+        repairs = lambda edit: lambda city: _repaired_rows(config, case(city), edit, out)
         parts = {f"{edit.replace(' ', '_')}_diffusion": repairs(edit) for edit in REPAIRED_EDITS}
         repaired = rows("editing with diffusion", parts)
         result["diffusion"] = {"rows": repaired, "summary": REPAIRED.summary(repaired)}

@@ -487,7 +487,7 @@ def _within(made: Tensor, true: Tensor) -> Tensor:
 
 
 def _part_columns(part: str) -> dict[str, Column]:
-    squared = lambda made, true: (made - true) ** 2  # noqa: E731
+    squared = lambda made, true: (made - true) ** 2
     return {
         f"abs_rel_{part}": Column(f"AbsRel, {part}", 4, _depth(_relative, part), _mean, ratio=True),
         f"rmse_{part}": Column(f"RMSE m, {part}", 2, _depth(squared, part), _root, ratio=True),

@@ -229,7 +229,7 @@ class ShownFrames(Output):
                 got=f"{len(times)} frames of camera {camera}",
                 remedy="give the whole log, or choose --frames",
             )
-        moment = lambda time_s: int(np.argmin(np.abs(times - time_s)))  # noqa: E731
+        moment = lambda time_s: int(np.argmin(np.abs(times - time_s)))
         chosen = [frame for frame in scene.frames if first <= moment(frame.view.time_s) <= last]
         if self.table.front_only:
             chosen = [frame for frame in chosen if frame.view.camera.name == camera]
@@ -365,7 +365,7 @@ def _hidden_blocks(scene: Scene, length: int) -> HeldOut:
     if not blocks:
         return HeldOut(reason=f"its {len(times)} frames are too few for a block of {length} between shown ones")
     hidden = {moment for block in blocks for moment in block}
-    is_hidden = lambda time_s: int(np.argmin(np.abs(times - time_s))) in hidden  # noqa: E731
+    is_hidden = lambda time_s: int(np.argmin(np.abs(times - time_s))) in hidden
     frames = tuple(frame.id for frame in scene.frames if is_hidden(frame.view.time_s))
     sweeps = tuple(sweep.id for sweep in scene.sweeps if is_hidden(sweep.time_s))
     facts = {"moments": len(times), "blocks": [[block.start, block.stop - 1] for block in blocks]}

@@ -127,7 +127,7 @@ def run(
 
     def filled(measured: list[dict[str, Any]]) -> dict[str, Any]:
         pairs = list(zip(jobs, measured, strict=True))
-        of = lambda name: [result for job, result in pairs if job.out.name == name]  # noqa: E731
+        of = lambda name: [result for job, result in pairs if job.out.name == name]
         entries = [_entry(name, scenes[name], of(name)) for name in scenes]
         return document(entries, list(map(_row_values, rows)), protocols, settings)
 

@@ -135,7 +135,7 @@ class PaperTable(StrictRecord):
 
     def values(self) -> dict[str, Any]:
         """For JSON, without published rows."""
-        pick = lambda *names: {name: getattr(self, name) for name in names}  # noqa: E731
+        pick = lambda *names: {name: getattr(self, name) for name in names}
         return {
             **pick("name", "title", "data", "scenes", "notes"),
             "places": [place.model_dump() for place in self.places],

@@ -125,7 +125,7 @@ def run(
     setting that no row uses, or ``out`` holds logs of other settings. Whatever a verb raises."""
     rows, out = shift_rows(config, preset), Path(out)
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model)})
-    own = lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc  # noqa: E731
+    own = lambda doc: doc["schema"] == 1 and "bench" not in doc and "methods" in doc
     refuse_foreign(out, _PAGES, own, lambda entry: entry.name.isdigit())
     shifts = {RECORDED: [0.0], **{f"{d:g}": [d, -d] for d in distances_m}}
     places = [PaperPlace(name=name, title="", shifts_m=shifts_m) for name, shifts_m in shifts.items()]
@@ -149,7 +149,7 @@ def run(
     }
     fits = [None if row.fit is None else configuration.result_settings(row.fit) for row in rows]
     values = [{"name": row.name, "title": row.title, "fit": of} for row, of in zip(rows, fits, strict=True)]
-    filled = lambda logs: document(logs, values, list(distances_m), settings)  # noqa: E731
+    filled = lambda logs: document(logs, values, list(distances_m), settings)
     return compare(out, jobs, config, filled, {"bench.md": markdown, "page.html": page})
 
 
@@ -166,12 +166,12 @@ def document(
     full = [{**entry, "values": {m: with_mean(of, shifted) for m, of in entry["values"].items()}} for entry in logs]
     names = [row["name"] for row in rows]
     every = (RECORDED, *shifted, SHIFTED)
-    of = lambda entry, name, p, m: entry["values"][name].get(p, {}).get(m, "not produced")  # noqa: E731
-    at = lambda name, p: {m: _pooled([of(entry, name, p, m) for entry in full]) for m in COLUMNS}  # noqa: E731
+    of = lambda entry, name, p, m: entry["values"][name].get(p, {}).get(m, "not produced")
+    at = lambda name, p: {m: _pooled([of(entry, name, p, m) for entry in full]) for m in COLUMNS}
     pooled = {name: {p: at(name, p) for p in every} for name in names}
     fitted = [row["name"] for row in rows if row["fit"] is not None and row["name"] not in ("gs3d", BASE, FULL)]
-    held = lambda a, b, place, metrics: against(full, a, b, place, metrics) if {a, b} <= {*names} else []  # noqa: E731
-    of_variant = lambda name: [c for p in (SHIFTED, RECORDED) for c in held(name, FULL, p, VARIANT)]  # noqa: E731
+    held = lambda a, b, place, metrics: against(full, a, b, place, metrics) if {a, b} <= {*names} else []
+    of_variant = lambda name: [c for p in (SHIFTED, RECORDED) for c in held(name, FULL, p, VARIANT)]
     return {
         "schema": 1,
         "settings": dict(settings),
@@ -310,7 +310,7 @@ def page(doc: Facts) -> str:
     *places, mean = _places(doc)
     heads = ["method", *(heading for heading, _ in COLUMNS.values())]
     compared = [[c["title"], *_compared(c), c["kind"], str(c["logs"])] for c in doc["comparisons"]]
-    rows = lambda place: [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names]  # noqa: E731
+    rows = lambda place: [[name, *_cells(doc["pooled"][name][place], with_error=True)] for name in names]
     scores = [TextTable.of_texts(heads, rows(place), _place_title(doc, place)) for place in (mean, *places)]
     videos = films(doc, ["truth", *(name for name in names if name in SHOWN)], videos=True, choice=True)
     table = TextTable.of_texts(["", "value", "standard error", "as", "logs"], compared)

@@ -169,7 +169,7 @@ def draw_sensors(seed: int, city: int, config: CityConfig) -> SensorFaults:
 
 def _camera_faults(rng: np.random.Generator, scale: float) -> CameraFaults:
     """``scale``: blur in pixels grows with the size of the image."""
-    chance = lambda share, value: float(value) if rng.random() < share else 0.0  # noqa: E731
+    chance = lambda share, value: float(value) if rng.random() < share else 0.0
     return CameraFaults(
         noise=float(rng.choice([rng.uniform(0.002, 0.01), rng.uniform(0.01, 0.035)], p=[0.65, 0.35])),
         grain_px=float(rng.uniform(0, 0.9)),
@@ -544,7 +544,7 @@ def cut_patch(full: Clip, scale: int, side_px: int, rng: np.random.Generator) ->
 
 def cropped(clip: Clip, rows: slice, columns: slice) -> Clip:
     """A rectangle of a clip and of its condition. Its cameras only say how large it is: they look straight ahead."""
-    cut = lambda x: x[..., rows, columns].contiguous()  # noqa: E731
+    cut = lambda x: x[..., rows, columns].contiguous()
     own = {name: cut(getattr(clip, name)) for name in ("rgb", "depth", "depth_valid", "semantics")}
     condition = crop.cropped(clip.condition, rows, columns)
     return replace(clip, condition=condition, **own, fine=None, point_color=None)

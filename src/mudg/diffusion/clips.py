@@ -265,9 +265,9 @@ def _read_part(shard: Any, prefix: str, clip: int, frames: Sequence[int], path: 
     x = {name: torch.from_numpy(shard.get_slice(prefix + name)[clip][np.asarray(frames)]) for name in chosen}
     shift_m = float(shard.get_tensor(f"{prefix}shift_m")[clip])
     _check_values({**x, "shift_m": torch.tensor(shift_m)}, path)
-    image = lambda name: x[name].float() / 255  # noqa: E731
-    plane = lambda name: x[name].float().unsqueeze(1)  # noqa: E731
-    ids = lambda name: x[name].unsqueeze(1)  # noqa: E731
+    image = lambda name: x[name].float() / 255
+    plane = lambda name: x[name].float().unsqueeze(1)
+    ids = lambda name: x[name].unsqueeze(1)
     height, width = x["rgb"].shape[-2:]
     views = tuple(
         View(Camera("clip", width, height, *lens.tolist()), pose.numpy(), float(frame))
@@ -350,7 +350,7 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
 
 def _mirrored(clip: Clip) -> Clip:
     """The mirror image of a clip without its patch; the poses stay."""
-    flip = lambda x: x.flip(-1)  # noqa: E731
+    flip = lambda x: x.flip(-1)
     given = clip.condition
     names = ("color", "depth", "valid", "reference", "warped", "backdrop", "semantics", "backdrop_semantics")
     turned = {name: flip(getattr(given, name)) for name in names}

@@ -111,7 +111,7 @@ def _pulled(color: Tensor, weight: Tensor) -> Tensor:
         return color.sum((-2, -1), keepdim=True) / weight.sum((-2, -1), keepdim=True).clamp(
             min=1e-6
         ) + torch.zeros_like(color)
-    pool = lambda x: functional.avg_pool2d(x, 2, ceil_mode=True, count_include_pad=False)  # noqa: E731
+    pool = lambda x: functional.avg_pool2d(x, 2, ceil_mode=True, count_include_pad=False)
     share = pool(weight)
     coarse = pool(color) / share.clamp(min=1e-6)
     coarse = _pulled(coarse * (share > 0), (share > 0).float())
@@ -257,7 +257,7 @@ class DrawnCloud:
             render, color=torch.where(hidden, color, render.color), semantics=torch.where(hidden, ids, render.semantics)
         )
         shown = torch.where(solid, render.depth[0], torch.full_like(depth, rules.far_m)).clamp(max=rules.far_m)
-        pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)  # noqa: E731
+        pick = lambda mine, theirs: torch.where(near | hidden, mine, theirs)
         depth = pick(depth, shown)
         depth = depth if vacated is None else ground_behind(depth, valid, vacated)
         moving = (moving & near) | self._in_objects(view, depth, ~near & torch.isin(render.semantics[0], MOVING_IDS))
@@ -496,7 +496,7 @@ def build_conditions(
         return functional.interpolate(x.float(), size=(rules.height, rules.width), mode="area")
 
     small_size = (rules.height, rules.width)
-    picked = lambda x: functional.interpolate(x, size=small_size, mode="nearest-exact")  # noqa: E731
+    picked = lambda x: functional.interpolate(x, size=small_size, mode="nearest-exact")
     small_renders = None
     if renders is not None:
         small_renders = RenderPlanes(

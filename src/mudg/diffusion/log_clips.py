@@ -243,7 +243,7 @@ def _truth(log: OpenLog, frame: Frame, recorded: Photo, view: View) -> tuple[Ten
     depth, known = measured_depth(scene, view)
     confidence, sky = known.astype(np.float32), (ids == SKY) & ~known
     if log.rules.depth == "annotated" and "depth" in frame.labels:
-        label = lambda name: resize_nearest(read_label(scene, frame, name), height, width)  # noqa: E731
+        label = lambda name: resize_nearest(read_label(scene, frame, name), height, width)
         labelled = label("depth")
         sure = label("depth_confidence") if "depth_confidence" in frame.labels else np.float32(1)
         more = ~known & ~sky & np.isfinite(labelled) & ~(label("ego") if "ego" in frame.labels else np.False_)

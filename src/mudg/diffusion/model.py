@@ -508,7 +508,7 @@ class MDM(nn.Module):
         sizes = [self.codec.channels[m] for m in MODALITIES]
         generator = torch.Generator().manual_seed(seeds.key(request.seed, request.index * 64, "sample"))
         device, shared = encoded.planes.device, self.config.shared_noise
-        draw = lambda: noise.video_noise((*lead, sum(sizes), *cell), generator, shared).to(device)  # noqa: E731
+        draw = lambda: noise.video_noise((*lead, sum(sizes), *cell), generator, shared).to(device)
         known = None if request.known is None else torch.cat([request.known[m] for m in MODALITIES], 1)[None].to(device)
         begun = None
         if request.start is not None:  # the latents that the sample begins from, and the freedom of their cells
@@ -529,7 +529,7 @@ class MDM(nn.Module):
         # around all steps: the weights are converted once
         with torch.autocast(device.type, torch.bfloat16, enabled=request.bf16):
             x, estimates = denoised(denoise, draw, self.schedule, request, "x0")
-        color = lambda z: z[:, :, : sizes[0]]  # noqa: E731
+        color = lambda z: z[:, :, : sizes[0]]
         return dict(zip(MODALITIES, x.split(sizes, 2))), mean_change([color(e) for e in estimates], color(x))
 
 
@@ -594,7 +594,7 @@ class Stacked:
             torch.full_like(batch[0].valid, palette.UNLABELLED, dtype=torch.uint8),
             torch.zeros_like(batch[0].depth),
         )
-        no_render = lambda c: RenderPlanes(c.color, c.depth, nothing + NO_RENDER, nothing, unknown)  # noqa: E731
+        no_render = lambda c: RenderPlanes(c.color, c.depth, nothing + NO_RENDER, nothing, unknown)
         renders = [no_render(c) if c.renders is None else c.renders for c in batch]
         return cls(
             *(torch.stack([getattr(c, name) for c in batch]) for name in ("color", "depth")),

@@ -342,7 +342,7 @@ _AFTER_DENOISER = {"refine_widths": (), "refine_blocks": (), "finish_widths": ()
 def same_denoiser(one: MDMConfig, other: MDMConfig) -> bool:
     """Whether two networks differ at most in what follows the denoiser, in the use of renders, and in the size trained
     at."""
-    without = lambda config: replace(config, **_AFTER_DENOISER, renders=False, area_px=0)  # noqa: E731
+    without = lambda config: replace(config, **_AFTER_DENOISER, renders=False, area_px=0)
     return without(one) == without(other)
 
 

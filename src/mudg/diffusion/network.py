@@ -441,7 +441,7 @@ class Refiner(CellNet):
     ) -> Refined:
         """`latents` [N,C,h,w] of all modalities (N = clips times frames, frames innermost) -> pixels."""
         rgb, depth, scores = codec.decode_raw(latents)
-        fold = lambda x: functional.pixel_unshuffle(x, 2)  # noqa: E731
+        fold = lambda x: functional.pixel_unshuffle(x, 2)
         seen = [given.color, given.backdrop, given.depth_code, given.valid, given.warped]
         planes = [*(latents[m] for m in MODALITIES), *map(fold, (rgb, depth, *seen))]
         planes += [shares(given.ids), shares(given.backdrop_ids)]
@@ -593,7 +593,7 @@ class Finisher(CellNet):
         depths = torch.stack([made.depth_code, given.depth_code, given.render_code], 1)
         ids = torch.stack([made.ids, given.ids, given.backdrop_ids, given.render_ids], 1)
         masks = [given.valid, given.warped, given.alpha, given.certainty]
-        fold = lambda x: functional.pixel_unshuffle(x, 2)  # noqa: E731
+        fold = lambda x: functional.pixel_unshuffle(x, 2)
         agree = (ids[:, 1:] == ids[:, :1]).float().flatten(1, 2)
         planes = [*map(fold, (colors.flatten(1, 2), depths.flatten(1, 2), *masks, made.log_error))]
         planes.append(functional.avg_pool2d(agree, 2))
@@ -614,7 +614,7 @@ def with_detail(rgb: Tensor, given: ConditionPixels) -> Tensor:
     """Finished colours f32[N,3,H,W] in [-1,1] with the finest structure of the images warped in (the difference from
     the mean of 3x3 pixels) in place of their own, where the two agree but for that: the more, the better they agree.
     What is learned by squared error is blurred where it is unsure; a warped photograph is not."""
-    coarse = lambda x: functional.avg_pool2d(functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, 1)  # noqa: E731
+    coarse = lambda x: functional.avg_pool2d(functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, 1)
     mine, theirs = coarse(rgb), coarse(given.color)
     apart = (mine - theirs).abs().amax(1, keepdim=True)
     weight = (1 - apart / DETAIL_APART).clamp(0, 1) * given.warped
@@ -658,7 +658,7 @@ def finish_in_tiles(
     small, device = made.rgb.shape[-2:], made.rgb.device
     scale = torch.full((frames,), (size[0] * size[1] / (small[0] * small[1])) ** 0.5, device=device)
     margin = finisher.margin_px
-    empty = lambda c, kind=torch.float32: torch.empty(frames, c, *size, dtype=kind, device=device)  # noqa: E731
+    empty = lambda c, kind=torch.float32: torch.empty(frames, c, *size, dtype=kind, device=device)
     whole = Made(empty(3), empty(1), empty(1, torch.uint8), empty(1))
     for top, bottom in spans(size[0], tile_px):
         for left, right in spans(size[1], tile_px):

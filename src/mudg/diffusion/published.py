@@ -546,7 +546,7 @@ class PublishedMDM(nn.Module):
         _, frames, _, h, w = encoded.planes.shape
         shape = (1, frames, self.config.codec.latent_channels, h, w)
         streams = [seeds.torch_generator(request.seed, request.index * 64, f"sample {m}") for m in names]
-        draw = lambda: torch.cat([noise.video_noise(shape, g) for g in streams]).to(self.device)  # noqa: E731
+        draw = lambda: torch.cat([noise.video_noise(shape, g) for g in streams]).to(self.device)
         velocity = self._guided(encoded, names, tokens, request)
         ends = {"last": "first_alpha"} if request.sampler == "ddim" else {}
         x, estimates = denoised(velocity, draw, self.schedule, request, "v", **ends)
@@ -564,7 +564,7 @@ class PublishedMDM(nn.Module):
         rescale = GUIDANCE_RESCALE if request.guidance_rescale is None else request.guidance_rescale
         count, both = len(names), slice(0, 1 if guidance == 1 else 2)  # 0: with caption and reference, 1: without
         halves = [both] if self.split.guidance_together or guidance == 1 else [slice(0, 1), slice(1, 2)]
-        twice = lambda x, half: x[half].repeat_interleave(count, 0)  # noqa: E731
+        twice = lambda x, half: x[half].repeat_interleave(count, 0)
         told = [
             self._told(names * len(self.text[half]), twice(self.text, half), twice(tokens, half), ahead=True)
             for half in halves

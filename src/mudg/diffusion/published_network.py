@@ -686,12 +686,12 @@ class VideoUNet(nn.Module):
             Velocity [B,T,channels_out,h,w].
         """
         batch, frames = x.shape[:2]
-        wave = lambda value: sinusoid(value, self.config.width).to(x.dtype)  # noqa: E731
+        wave = lambda value: sinusoid(value, self.config.width).to(x.dtype)
         embedding = self.time(wave(t)) + self.label(wave(label)) + self.fps(wave(fps))
         embedding = embedding.repeat_interleave(frames, 0)
         context = Context(text, image.flatten(0, 1))
         ready = iter(keys or ())
-        seen = lambda stage: context if keys is None or stage.spatial is None else next(ready)  # noqa: E731
+        seen = lambda stage: context if keys is None or stage.spatial is None else next(ready)
         h = x.flatten(0, 1)
         skips = []
         for number, stage in enumerate(self.down):

@@ -249,8 +249,8 @@ def depth_agreement(depth: Tensor, condition: Condition, slack_px: int = 0) -> T
             measurements of a finer grid than the image's, which lie anywhere in a pixel: near the horizon, and at
             edges, depth changes within one.
     """
-    pool = lambda x: functional.avg_pool2d(x, 5, stride=1, padding=2, count_include_pad=True)  # noqa: E731
-    top = lambda x: functional.max_pool2d(x, 2 * slack_px + 1, stride=1, padding=slack_px)  # noqa: E731
+    pool = lambda x: functional.avg_pool2d(x, 5, stride=1, padding=2, count_include_pad=True)
+    top = lambda x: functional.max_pool2d(x, 2 * slack_px + 1, stride=1, padding=slack_px)
     points, agreement = condition.measurement, torch.empty_like(depth)
     for number, (made, measured, valid) in enumerate(zip(depth, points.depth, points.valid, strict=True)):
         seen = valid.float()  # one frame at a time: they may be large

@@ -103,7 +103,7 @@ def score_clip(clip: Clip, sample: GeneratedClip) -> tuple[dict[str, float], Ten
     backdrop = given.color if given.backdrop is None else given.backdrop
     frames = [TrueFrame.of(*one) for one in zip(given.views, depth, ids, strict=True)]
     solid = (depth < 90.0) & (ids.unsqueeze(1) != SKY)
-    flat = lambda x: x.transpose(0, 1).flatten(1, 2)  # noqa: E731 - [T,C,H,W] -> [C,T*H,W]
+    flat = lambda x: x.transpose(0, 1).flatten(1, 2)
     error = metrics.depth_errors(flat(sample.depth), flat(depth), flat(solid))
     filled = given.depth if given.measured is None else filled_depth(given.measured)
     nearest = metrics.depth_errors(flat(filled), flat(depth), flat(solid))

@@ -228,7 +228,7 @@ def windows(frames: int, window: int, overlap: int) -> list[range]:
 def recorded_images(scene: Scene, config: SynthesizeConfig) -> list[Photo]:
     """Recorded images that may be warped in, of all cameras, with the classes that may be given."""
     frames = scene.frames_in("train")
-    classes = lambda frame: read_trusted_classes(scene, frame) if config.given_classes else None  # noqa: E731
+    classes = lambda frame: read_trusted_classes(scene, frame) if config.given_classes else None
     return [
         Photo(frame.view, read_image(scene, frame), classes(frame), recorded_pixels(scene, frame)) for frame in frames
     ]
@@ -365,7 +365,7 @@ def enlarge(
     measured depth where it is within a tenth of the generated one; and the fine class where the clip has it in that
     pixel or beside it.
     """
-    nearest = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")  # noqa: E731
+    nearest = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")
     depth, ids = nearest(clip.depth), nearest(clip.semantics.unsqueeze(1).float())[:, 0].long()
     if conditions is None:
         rgb = functional.interpolate(clip.rgb, size=size, mode="bicubic", align_corners=False).clamp(0, 1)
@@ -402,7 +402,7 @@ def add_detail(rgb: Tensor, small: Condition, full: Condition) -> Tensor:
     of 0.12.
     """
     size = full.color.shape[-2:]
-    larger = lambda x: functional.interpolate(x, size=size, mode="bicubic", align_corners=False)  # noqa: E731
+    larger = lambda x: functional.interpolate(x, size=size, mode="bicubic", align_corners=False)
     reduced = functional.interpolate(full.color, size=rgb.shape[-2:], mode="area")
     detail = full.color - larger(reduced)
     apart = torch.maximum((rgb - small.color).abs(), (rgb - reduced).abs()).amax(1, keepdim=True)

@@ -365,7 +365,7 @@ def carry_out(
         raise InputError(what, where="weather, light, season", remedy=remedy)
     ground = ground_of(cloud, model)
     world = EditWorld.of_model(model, ground) if scene is None else EditWorld.of_scene(scene, ground)
-    background = lambda name: background_of(find_run(script.path_of(name)), name)  # noqa: E731
+    background = lambda name: background_of(find_run(script.path_of(name)), name)
     closes = scene is not None and is_recording(scene)
     plan = plan_edits(script, world, EditSources(opener(script), background, close_street=closes))
     plan.views = () if scene is None else tuple(frame.view for frame in scene.frames)
@@ -411,7 +411,7 @@ def background_of(parts: RunParts, name: str) -> Background:
 
 def opener(script: EditScript) -> Callable[[AssetSource], Asset]:
     """What reads the objects that a script names."""
-    from_run = lambda source: asset_from(find_run(script.path_of(source.run or "")), source.id or "")  # noqa: E731
+    from_run = lambda source: asset_from(find_run(script.path_of(source.run or "")), source.id or "")
     return lambda source: from_run(source) if source.file is None else read_asset(script.path_of(source.file))
 
 

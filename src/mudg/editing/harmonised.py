@@ -158,8 +158,8 @@ def soft_edge(mask: NDArray[np.bool_]) -> Tensor:
 def start_clip(renders: Sequence[Observation], freedom: Sequence[Tensor], size: tuple[int, int]) -> StartClip:
     """Renders, of whatever size, as the clip of height and width ``size`` that a sample begins from; ``freedom``
     f32[H,W] of them."""
-    area = lambda x: functional.interpolate(x, size=size, mode="area")  # noqa: E731
-    picked = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")  # noqa: E731
+    area = lambda x: functional.interpolate(x, size=size, mode="area")
+    picked = lambda x: functional.interpolate(x, size=size, mode="nearest-exact")
     unknown = torch.full_like(renders[0].rgb[0], 255)
     depth = [torch.full_like(unknown, FAR_M)[None] if r.depth is None else r.depth.nan_to_num(FAR_M) for r in renders]
     ids = [unknown if r.semantics is None else r.semantics.float() for r in renders]

@@ -84,7 +84,7 @@ def with_motions(model: SceneModel, motions: Mapping[str, Motion]) -> SceneModel
     """A copy with some objects on other paths; it shares the table of Gaussians. UsageError: an object that the scene
     has no node for."""
     wanted = {model.dynamic_object(name).name for name in motions}
-    other = lambda node: isinstance(node, RigidNode) and node.name in wanted  # noqa: E731
+    other = lambda node: isinstance(node, RigidNode) and node.name in wanted
     nodes = tuple(node_along(node, motions[node.name]) if other(node) else node for node in model.nodes)
     return replace(model, nodes=nodes, facts=dict(model.facts))
 
@@ -187,7 +187,7 @@ def with_background(model: SceneModel, other: SceneModel, world_from_other: NDAr
             if train_id in other.classes:
                 channels[:, channel] = given["semantics"][:, other.classes.index(train_id)]
         columns["semantics"] = channels
-    blank = lambda value, **kind: torch.zeros(len(rows), *value.shape[1:], **kind)  # noqa: E731
+    blank = lambda value, **kind: torch.zeros(len(rows), *value.shape[1:], **kind)
     labels = {key: blank(value, dtype=value.dtype) for key, value in model.table.labels.items()}
     if CERTAINTY in labels and other.certainty is not None:
         labels[CERTAINTY] = other.certainty[rows].cpu().to(labels[CERTAINTY].dtype)

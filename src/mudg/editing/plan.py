@@ -90,7 +90,7 @@ class EditWorld:
     @classmethod
     def of_scene(cls, scene: Scene, ground: HeightMap | None) -> EditWorld:
         """All boxes of a scene and its vehicle."""
-        motion = lambda track: Motion.recorded(track.times_s, track.world_from_object)  # noqa: E731
+        motion = lambda track: Motion.recorded(track.times_s, track.world_from_object)
         actors = {track.id: Actor(track.label, _three(track.size_m), motion(track)) for track in scene.tracks}
         return cls(actors, Motion.recorded(scene.ego.times_s, scene.ego.world_from_ego), ground)
 
@@ -401,7 +401,7 @@ def place_background(world: EditWorld, other: Background) -> np.ndarray:
     if world.ego is None or world.ground is None:
         raise InputError("where the other street belongs is not known", remedy="give --scene")
     # without pitch and roll
-    level = lambda pose: geometry.yaw_matrix(geometry.yaw_of(pose), pose[:3, 3])  # noqa: E731
+    level = lambda pose: geometry.yaw_matrix(geometry.yaw_of(pose), pose[:3, 3])
     pose = level(world.ego.poses[0]) @ geometry.invert(level(other.ego.poses[0]))
     xy = world.ego.poses[:, :2, 3]
     there = HeightMap.from_points(geometry.transform_points(pose, other.ground_xyz))

@@ -276,7 +276,7 @@ def _hidden_by(view: View, boxes: Boxes, plan: EditPlan) -> NDArray[np.bool_]:
     in front, nor on that ground where one stands anywhere."""
     if not boxes:
         return np.zeros((view.camera.height, view.camera.width), bool)
-    ahead = lambda box: float((view.cam_from_world @ box[0])[2, 3])  # noqa: E731
+    ahead = lambda box: float((view.cam_from_world @ box[0])[2, 3])
     rest, nearest = others(plan, view.time_s), min(map(ahead, boxes))
     covered = boxes_mask(view, boxes) | (ground_mask(view, boxes) & ~boxes_mask(view, rest))
     return covered & ~boxes_mask(view, [box for box in rest if ahead(box) < nearest])

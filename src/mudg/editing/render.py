@@ -189,7 +189,7 @@ def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
     for camera in cameras:
         paths += [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
         paths += [trajectory.named(scene, camera, name) for name in config.paths]
-    small = lambda path: tuple(resized_view(view, config.width_px) for view in path.views)  # noqa: E731
+    small = lambda path: tuple(resized_view(view, config.width_px) for view in path.views)
     return tuple(Trajectory(path.name, small(path), path.origin) for path in paths)
 
 

@@ -92,7 +92,7 @@ def continued(xy: Array, places: Array, colors: Array, weights: Array) -> tuple[
     _, owner = np.unique(np.floor(places / SOURCE_M).astype(np.int64), axis=0, return_inverse=True)
     owner = owner.ravel()
     total = np.bincount(owner, weights)
-    mean = lambda values: np.bincount(owner, weights * values) / total  # noqa: E731
+    mean = lambda values: np.bincount(owner, weights * values) / total
     centres = np.column_stack([mean(places[:, axis]) for axis in (0, 1)])
     middles = np.column_stack([mean(colors[:, channel]) for channel in (0, 1, 2)])
     bright = middles @ LUMINANCE

@@ -155,7 +155,7 @@ def _roughness(measured: NDArray[np.float32], gap_deg: float, fy_px: float) -> N
     value = np.where(known, np.log(np.where(known, measured, 1)), 0)
     rows, columns = np.indices(measured.shape)
     u, v = columns - measured.shape[1] / 2, rows - measured.shape[0] / 2
-    mean = lambda x: ndimage.uniform_filter(np.where(known, x, 0).astype(np.float64), 2 * reach + 1)  # noqa: E731
+    mean = lambda x: ndimage.uniform_filter(np.where(known, x, 0).astype(np.float64), 2 * reach + 1)
     count = np.maximum(mean(np.ones_like(value)), 1e-9)
     mu, mv, md = mean(u) / count, mean(v) / count, mean(value) / count
     uu, vv, uv = mean(u * u) / count - mu**2 + 1, mean(v * v) / count - mv**2 + 1, mean(u * v) / count - mu * mv

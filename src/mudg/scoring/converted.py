@@ -42,7 +42,7 @@ class ScoreNetwork:
 
 
 def _lpips(trunk: LpipsTrunk, flag: str) -> ScoreNetwork:
-    named = lambda found: {name: found[name] for name in lpips_shapes(trunk) if name in found}  # noqa: E731
+    named = lambda found: {name: found[name] for name in lpips_shapes(trunk) if name in found}
     return ScoreNetwork(flag, lambda state, where: LpipsFeatures(state, where, trunk), named, {})
 
 

@@ -211,7 +211,7 @@ class LaneDetections:
             values.append(street_scores.ntl_iou(found, true))
             union = int((found | true).sum())
             lanes.append(float((found & true).sum() / union) if union else 0.0)
-        mean = lambda numbers: round(sum(numbers) / len(numbers), 6)  # noqa: E731
+        mean = lambda numbers: round(sum(numbers) / len(numbers), 6)
         return {"frames": len(values), "value": mean(values), "lanes": mean(lanes)}
 
     def against(self, images: ViewImages, true: ViewImages) -> float | None:

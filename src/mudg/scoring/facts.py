@@ -233,7 +233,7 @@ class Reference:
 def trajectories_of(config: ScoreConfig, scene: Scene, methods: Mapping[str, Path]) -> list[ScoredTrajectory]:
     """The trajectories that some method has, by camera and distance. InputError: there are none, or methods disagree
     about a trajectory's views."""
-    read = lambda folder: {n: read_observations(path) for n, path in list_observation_sets(folder).items()}  # noqa: E731
+    read = lambda folder: {n: read_observations(path) for n, path in list_observation_sets(folder).items()}
     sets = {method: read(folder) for method, folder in methods.items()}
     names = sorted({name for found in sets.values() for name in found}, key=_order)
     if not names:
@@ -272,6 +272,6 @@ def _matched(config: ScoreConfig, scene: Scene, name: str, sets: Mapping[str, Ob
     shift_m = float(found["shift"] or 0.0) if found is not None and not found["more"] else None
     camera_name = views[0].camera.name
     frames = scene.frames_of(camera_name) if shift_m == 0.0 else ()
-    at = lambda view: next((f for f in frames if abs(f.view.time_s - view.time_s) <= SAME_TIME_S), None)  # noqa: E731
+    at = lambda view: next((f for f in frames if abs(f.view.time_s - view.time_s) <= SAME_TIME_S), None)
     kept = {method: tuple(own) for method, own in indices.items()}
     return ScoredTrajectory(name, camera_name, shift_m, tuple(views), tuple(map(at, views)), sets, kept)

@@ -210,7 +210,7 @@ def _score(
     """Score all methods on one trajectory; writes its truth, its baseline and its error picture."""
     names = [*([BASELINE] if reference.baseline is not None else []), *trajectory.sets]
     motion, exact_motion = metrics.StaticMotion(), view_metrics.ExactMotion(reference.vehicles)
-    build = lambda: metrics.build_all(reference.distances, motion, view_metrics.build_facts(exact_motion))  # noqa: E731
+    build = lambda: metrics.build_all(reference.distances, motion, view_metrics.build_facts(exact_motion))
     sums = {name: build() for name in names} | {TRUTH: view_metrics.build_facts(exact_motion)}
     counted = trajectory.counted(reference.held_out)
     wanted = _wanted(trajectory, reference, counted)
@@ -225,7 +225,7 @@ def _score(
     with native.one_thread() if _is_small(trajectory) else contextlib.nullcontext(), contextlib.ExitStack() as stack:
         truths = fills = None
         exact = reference.truth.exact
-        writer = lambda folder, *kind: ObservationWriter(out / folder / trajectory.name, trajectory.name, *kind)  # noqa: E731
+        writer = lambda folder, *kind: ObservationWriter(out / folder / trajectory.name, trajectory.name, *kind)
         if not reference.truth.stored and (exact or all(frame is not None for frame in trajectory.frames)):
             truths = stack.enter_context(writer("truth", "truth", "recorded"))
         if reference.baseline is not None:

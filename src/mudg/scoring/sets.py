@@ -511,7 +511,7 @@ class EmbeddingScores:
             nearest = int(np.argmin(np.abs(times - views[place].time_s)))
             if abs(times[nearest] - views[place].time_s) <= SAME_TIME_S:
                 pairs.append((place, nearest))
-        embedded = lambda images: self._files.of(images.resized(sets.width, sets.height))  # noqa: E731
+        embedded = lambda images: self._files.of(images.resized(sets.width, sets.height))
         for method, images in sets.methods.items():
             rows = embedded(images)
             found[method] = self._compared(rows[list(counted)], reference)

@@ -281,7 +281,7 @@ def _has_numbers(values: Sequence[Mapping[str, Any]], metrics: Sequence[Mapping[
 def markdown(document: Mapping[str, Any]) -> str:
     """All trajectories and metrics as Markdown, with the rules."""
     lines = [f"# Scores of {document['scene']['id']}", "", *(f"* {rule}" for rule in document["rules"])]
-    missing = lambda metric: all(r["values"].get(metric["name"]) == NOT_COMPUTED for r in document["results"])  # noqa: E731
+    missing = lambda metric: all(r["values"].get(metric["name"]) == NOT_COMPUTED for r in document["results"])
     absent = [metric for metric in document["metrics"] if missing(metric)]
     names = [m["name"] for m in document["metrics"] if m not in absent]
     if absent and document["results"]:
@@ -294,7 +294,7 @@ def markdown(document: Mapping[str, Any]) -> str:
         results = [r for r in document["results"] if r["trajectory"] == trajectory["name"]]
         unknown = [n for n in names if results and all(r["values"].get(n) == NO_TRUTH for r in results)]
         shown = [n for n in names if n not in unknown]
-        texts = lambda values: (number_text(name, values.get(name)) for name in shown)  # noqa: B023, E731
+        texts = lambda values: (number_text(name, values.get(name)) for name in shown)  # noqa: B023
         rows = [[title_of(r["method"]), str(r["views"]), *texts(r["values"])] for r in results]
         lines += ["", f"## {trajectory['name']}", ""]
         if any(isinstance(r["values"].get(n), float) for r in results for n in shown):

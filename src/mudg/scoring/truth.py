@@ -133,7 +133,7 @@ def stored_truth(folder: Path) -> Truth:
         distance_m = apart_m(there, view)
         same_size = (there.camera.width, there.camera.height) == (view.camera.width, view.camera.height)
         if abs(there.time_s - view.time_s) > SAME_TIME_S or distance_m > SAME_PLACE_M or not same_size:
-            size = lambda view: f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}"  # noqa: E731
+            size = lambda view: f"{view.time_s:.4f} s, {view.camera.width}x{view.camera.height}"
             what, where = "the stored ground truth shows another view", f"{folder / name}, view {index}"
             got = f"{size(there)}, {distance_m:.3f} m apart"
             raise InputError(what, where=where, expected=size(view), got=got)

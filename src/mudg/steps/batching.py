@@ -138,7 +138,7 @@ def plan_for(batch: BatchConfig, settings: RunConfig, lines: Mapping[str, Sequen
     elsewhere."""
     values = _with_absolute_paths(configuration.to_dict(settings))
     own = bool(batch.command) and batch.stages == BatchConfig().stages
-    is_file = lambda word: "/" in word and "{" not in word and os.path.isfile(word)  # noqa: E731
+    is_file = lambda word: "/" in word and "{" not in word and os.path.isfile(word)
     command = tuple(os.path.abspath(word) if is_file(word) else word for word in batch.command)
     names = () if own else tuple(name for name in batch.stages if name != COMMAND or command)
     return plan_of(names, lines, values, command)

@@ -151,7 +151,7 @@ def _card(one: GalleryEntry, name: str, out: Path, width: int) -> dict[str, Any]
     scene = {} if one.scores is None else one.scores["scene"]
     frames = f"{scene['frames']} frames of {len(scene['cameras'])} cameras" if scene else ""
     facts = [one.kind, scene.get("id", ""), scene.get("dataset", ""), frames, one.facts]
-    address = lambda path: quote(os.path.relpath(path, out.parent).replace(os.sep, "/"))  # noqa: E731
+    address = lambda path: quote(os.path.relpath(path, out.parent).replace(os.sep, "/"))
     links = [{"title": title, "href": address(path)} for title, path in one.pages.items()]
     shown = [str(fact) for fact in facts if fact]
     return {"name": name, "facts": shown, "links": links, "picture": _thumbnail(one.picture, width)}

@@ -97,7 +97,7 @@ class EditDesk:
         if self.begin is None:
             return []
         script = parse_edits(self.begin.text(), "edits", Path()) if self.begin.files() else self.begin
-        said = lambda settings: settings.model_dump(mode="json", by_alias=True, exclude_unset=True)  # noqa: E731
+        said = lambda settings: settings.model_dump(mode="json", by_alias=True, exclude_unset=True)
         return [{edit.verb: said(edit.settings)} for edit in script.edits]
 
     def edited(self, text: str) -> list[SceneModel]:

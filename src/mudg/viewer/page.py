@@ -696,7 +696,7 @@ def scene_bytes(rows: int, size: int, degree: int) -> tuple[int, int]:
 def most_within(limit_bytes: float, degree: int, size: int) -> int:
     """The most rows whose graphics memory and memory for sorting are together within a limit."""
     most = int(limit_bytes // (16 * TEXELS[degree] + 4 + SORT_BYTES))
-    needed = lambda rows: sum(scene_bytes(rows, chunk_rows(rows, size), degree))  # noqa: E731
+    needed = lambda rows: sum(scene_bytes(rows, chunk_rows(rows, size), degree))
     return bisect.bisect_right(range(most + 1), limit_bytes, key=needed) - 1
 
 
@@ -708,14 +708,14 @@ def asset(name: str) -> str:
 def import_map() -> str:
     """The viewer's modules as an import map of data addresses: a page opened by double click may not load files beside
     it."""
-    coded = lambda name: base64.b64encode(asset(f"{name}.js").encode()).decode()  # noqa: E731
+    coded = lambda name: base64.b64encode(asset(f"{name}.js").encode()).decode()
     addresses = {f"mudg/{name}": "data:text/javascript;base64," + coded(name) for name in MODULES}
     return script_json({"imports": addresses})
 
 
 def policy(*scripts: str) -> str:
     """A content security policy under which only these inline scripts run, and nothing is loaded from elsewhere."""
-    digest = lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()  # noqa: E731
+    digest = lambda text: base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     hashes = " ".join(f"'sha256-{digest(text)}'" for text in scripts)
     return (
         f"default-src 'none'; script-src {hashes} data: blob:; worker-src blob:; style-src 'unsafe-inline'; img-src"

@@ -298,7 +298,7 @@ def _player_values(
     first = max((v for v in videos if v.shift_m), key=lambda v: v.shift_m or 0.0, default=next(iter(videos), None))
     steps = np.geomspace(NEAR_M, FAR_M, 8).astype(np.float32)[None]
     stops = ", ".join("#{:02x}{:02x}{:02x}".format(*c) for c in depth_colors(steps, NEAR_M, FAR_M)[0])
-    choice = lambda v: {"camera": v.camera, "name": v.name, "title": v.place, "checked": v is first}  # noqa: E731
+    choice = lambda v: {"camera": v.camera, "name": v.name, "title": v.place, "checked": v is first}
     trajectories = []
     for index, v in enumerate(videos):
         if v.video:
@@ -350,7 +350,7 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
         cells = [{"text": number_text(m["name"], NOT_COMPUTED), "classes": "absent"} for m in shown]
         rows = [{"method": m["name"], "title": m["title"], "cells": cells} for m in scores["methods"]]
         groups.append({"title": "Perceptual", "distances": [], "metrics": shown, "rows": rows})
-    has_number = lambda name: any(isinstance(r["values"].get(name), float) for r in scores["results"])  # noqa: E731
+    has_number = lambda name: any(isinstance(r["values"].get(name), float) for r in scores["results"])
     numeric = [metric for metric in metrics.values() if has_number(metric["name"])]
     results = []
     for trajectory in scores["trajectories"]:
@@ -466,7 +466,7 @@ def _chart(scores: Mapping[str, Any], metric: Mapping[str, Any]) -> dict[str, An
 def _time_values(ledger: Mapping[str, Any]) -> dict[str, Any]:
     seconds = {name: step["seconds"] for name, step in ledger.get("steps", {}).items()}
     total, longest = sum(seconds.values()) or 1.0, max(seconds.values(), default=1.0) or 1.0
-    size = lambda step, name: memory.in_words(step[name]) if step.get(name) else ""  # noqa: E731
+    size = lambda step, name: memory.in_words(step[name]) if step.get(name) else ""
     steps = [
         {
             "name": name,

@@ -221,7 +221,7 @@ def page_of(config: PageConfig, shown: Shown, report: str = "", live: dict[str, 
     """The page of what is shown."""
     scene, begin = shown.scene, pages.begin_of(shown.scene)
     path = np.stack([frame.view.center_world for frame in scene.frames])
-    most = lambda model: _most(config, model, len(shown.fits))  # noqa: E731
+    most = lambda model: _most(config, model, len(shown.fits))
     packed = [(name, pages.pack_scene(model, begin, path, most(model), CHUNK)) for name, model in shown.fits]
     width = PAGE_IMAGE_PX if live is None else LIVE_IMAGE_PX
     facts = pages.log_facts(scene, shown.fits[0][1].colors, width, config.images)

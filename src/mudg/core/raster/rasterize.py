@@ -390,7 +390,7 @@ def scene() -> tuple[Gaussians, View]:
     z = np.exp(rng.uniform(np.log(3.0), np.log(80.0), GAUSSIANS))
     means = np.stack([rng.uniform(-0.6, 0.6, GAUSSIANS) * z, rng.uniform(-0.4, 0.4, GAUSSIANS) * z, z], 1)
     scales = z[:, None] * np.exp(rng.uniform(np.log(0.002), np.log(0.01), (GAUSSIANS, 3)))
-    f32 = lambda values: torch.from_numpy(np.asarray(values, np.float32))  # noqa: E731
+    f32 = lambda values: torch.from_numpy(np.asarray(values, np.float32))
     quats = torch.zeros(GAUSSIANS, 4)
     quats[:, 0] = 1
     gaussians = Gaussians(

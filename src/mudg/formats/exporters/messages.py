@@ -289,7 +289,7 @@ class FoxgloveMessages(LogMessages):
     def _of_sweeps(self) -> Iterator[LogMessage]:
         for sweep in self._scene.sweeps:
             yield self._tf(sweep.time_s, f"lidar/{sweep.sensor}", sweep.world_from_lidar)
-            points = lambda s=sweep: self._sweep(s)  # noqa: E731
+            points = lambda s=sweep: self._sweep(s)
             yield LogMessage(f"/lidar/{sweep.sensor}", "foxglove.PointCloud", sweep.time_s, points)
 
     def _of_objects(self) -> Iterator[LogMessage]:
