@@ -333,7 +333,6 @@ class PlannedAdaptation:
         Raises:
             InputError: the log is too short, inputs malformed. UsageError: a model that does not use renders.
         """
-        model = model_files.load(config.model)
         if not model_files.uses_renders(config.model):
             raise UsageError(
                 "this model was not trained with renders of a fitted scene",
@@ -341,7 +340,7 @@ class PlannedAdaptation:
                 got=config.model,
                 remedy="choose another model; `embedded` is one that was",
             )
-        loaded = read_scene(scene)
+        model, loaded = model_files.load(config.model), read_scene(scene)
         model_of_scene(fitted, loaded)  # refuses the fit of another scene
         names = cameras_of(loaded, config)
         unknown = [name for name in names if name not in loaded.cameras]
