@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
@@ -29,11 +30,14 @@ class BrowserError(Exception):
 
 
 class Browser:
-    """One page of one browser. ``errors`` collects what it writes to its console as errors, and what it throws."""
+    """One page of one browser, in a ``with``; a test is skipped where there is none. ``errors`` collects what it writes
+    to its console as errors, and what it throws."""
 
     def __init__(
         self, profile: Path, size: tuple[int, int] = (960, 640), scale: float = 1.0, dark: bool = False
     ) -> None:
+        if CHROMIUM is None:
+            pytest.skip(NO_BROWSER)
         ours, theirs = os.pipe(), os.pipe()  # what it reads, what it writes
         address = [f"--user-data-dir={profile}", f"--window-size={size[0]},{size[1]}", "about:blank"]
         plumbing = f'exec "$@" 3<&{ours[0]} 4>&{theirs[1]}'  # the protocol's pipes have fixed numbers
@@ -149,6 +153,12 @@ class Browser:
             values = np.frombuffer(base64.b64decode(text), kind).reshape(size)
             made[name] = values[..., 0] if name == "class" else values
         return made
+
+    def __enter__(self) -> Browser:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
     def close(self) -> None:
         """End the browser and wait for it."""

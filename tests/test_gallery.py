@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, NO_BROWSER, Browser
+from browser import Browser
 
 import mudg
 from mudg import app
@@ -113,13 +113,11 @@ def test_a_page_is_replaced_on_demand_only(tmp_path: Path, capsys: pytest.Captur
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 def test_the_table_sorts_and_filters_in_a_browser(tmp_path: Path) -> None:
     for name, psnr in (("x", 25.0), ("y", 27.5), ("z", 26.0)):
         run_of(tmp_path / name, scene=f"city-{name}", psnr=psnr)
     gallery.run([tmp_path / name for name in "xyz"], tmp_path / "all.html")
-    browser = Browser(tmp_path / "profile", size=(390, 844))
-    try:
+    with Browser(tmp_path / "profile", size=(390, 844)) as browser:
         ready = "document.readyState === 'complete' && !!document.getElementById('scores')"
         browser.open((tmp_path / "all.html").as_uri(), ready)
         rows = "[...document.querySelectorAll('#scores tbody tr')].filter(r => !r.hidden)"
@@ -144,5 +142,3 @@ def test_the_table_sorts_and_filters_in_a_browser(tmp_path: Path) -> None:
         # a phone scrolls the table, not the page
         assert browser.run("document.documentElement.scrollWidth <= innerWidth")
         assert not browser.errors and all(request.startswith("file:") for request in browser.requests)
-    finally:
-        browser.close()

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from browser import CHROMIUM, NO_BROWSER, Browser
+from browser import Browser
 from PIL import Image
 from toy_fitted import STREET, write_toy_run
+from view_server import serving
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
@@ -238,20 +239,15 @@ def hilly() -> HeightMap:
 
 @pytest.fixture(scope="module")
 def opened(toy: Toy, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    if CHROMIUM is None:
-        pytest.skip(NO_BROWSER)
     root = tmp_path_factory.mktemp("page")
     made = view.page_of(PageConfig(images=0), view.Shown(read_scene(toy[0] / "scene"), (("fit", toy[2]),)))
     made = replace(made, log=with_ground(made.log, hilly()))
     facts: dict = {}
     files = list(made.files(facts))
     (root / "page.html").write_bytes(made.one_file(files, facts))
-    one = Browser(tmp_path_factory.mktemp("profile"), size=(900, 600))
-    try:
+    with Browser(tmp_path_factory.mktemp("profile"), size=(900, 600)) as one:
         one.open(f"file://{root / 'page.html'}#m=recorded&c=front&t=0.4")
         yield one
-    finally:
-        one.close()
 
 
 SCRIPTS = (
@@ -348,37 +344,24 @@ def test_an_object_is_picked_moved_and_turned_with_its_handles(opened: Browser, 
 
 @pytest.mark.slow
 def test_a_page_with_a_server_checks_and_saves(toy: Toy, tmp_path: Path) -> None:
-    import threading
-
-    from mudg.viewer.settings import ViewConfig
-
-    if CHROMIUM is None:
-        pytest.skip(NO_BROWSER)
     (tmp_path / "mine.yaml").write_text("- speed: {id: car-1, factor: 0.5}\n")
     files = EditFiles(tmp_path / "mine.yaml", tmp_path / "edits.yaml")
-    config = ViewConfig(images=0, browser=False, device="cpu")
-    server, site = view.server_of(config, toy[1], None, toy[0] / "scene", files)
-    threading.Thread(target=server.serve_forever, daemon=True).start()
-    one = Browser(tmp_path / "profile", size=(700, 500))
-    try:
-        one.open(view.address_of(server, site) + "#m=recorded&c=front&t=0.6")
-        one.wait("window.mudg.editor.told !== null")
-        drive = carry_out(read_edits(tmp_path / "mine.yaml"), toy[2], read_scene(toy[0] / "scene"))
-        true = motion_of(next(n for n in drive.model(toy[2]).nodes if n.name == "car-1")).pose_at(0.6)
-        shown = one.run("window.mudg.loaded[0].scene.nodes.find((n) => n.name === 'car-1').pose.at(0.6).position")
-        assert np.abs(np.array(shown) - true[:3, 3]).max() < 1e-3
-        one.run("window.mudg.editor.set([...window.mudg.state.edits, {move: {id: 'nobody', left_m: 1}}]); 1")
-        one.wait("!document.getElementById('edit-problem').hidden")
-        assert "line 2: move.id" in one.run("document.getElementById('edit-problem').textContent")
-        one.run("window.mudg.editor.undo(); 1")
-        one.run("document.getElementById('edits').click(); 1")
-        one.wait("document.getElementById('note').textContent.startsWith('Saved')")
-        assert (tmp_path / "edits.yaml").read_text() == desk_module.MARK + '- speed: {id: "car-1", factor: 0.5}\n'
-        one.wait("!document.getElementById('exact').hidden")
-    finally:
-        one.close()
-        server.shutdown()
-        server.server_close()
+    with serving(toy[1], toy[0] / "scene", files=files) as (port, token):
+        with Browser(tmp_path / "profile", size=(700, 500)) as one:
+            one.open(f"http://127.0.0.1:{port}/?token={token}#m=recorded&c=front&t=0.6")
+            one.wait("window.mudg.editor.told !== null")
+            drive = carry_out(read_edits(tmp_path / "mine.yaml"), toy[2], read_scene(toy[0] / "scene"))
+            true = motion_of(next(n for n in drive.model(toy[2]).nodes if n.name == "car-1")).pose_at(0.6)
+            shown = one.run("window.mudg.loaded[0].scene.nodes.find((n) => n.name === 'car-1').pose.at(0.6).position")
+            assert np.abs(np.array(shown) - true[:3, 3]).max() < 1e-3
+            one.run("window.mudg.editor.set([...window.mudg.state.edits, {move: {id: 'nobody', left_m: 1}}]); 1")
+            one.wait("!document.getElementById('edit-problem').hidden")
+            assert "line 2: move.id" in one.run("document.getElementById('edit-problem').textContent")
+            one.run("window.mudg.editor.undo(); 1")
+            one.run("document.getElementById('edits').click(); 1")
+            one.wait("document.getElementById('note').textContent.startsWith('Saved')")
+            assert (tmp_path / "edits.yaml").read_text() == desk_module.MARK + '- speed: {id: "car-1", factor: 0.5}\n'
+            one.wait("!document.getElementById('exact').hidden")
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ import av
 import numpy as np
 import pytest
 import torch
-from browser import CHROMIUM, NO_BROWSER, Browser
+from browser import Browser
 from toy_fitted import STREET, write_toy_run
 from view_server import ask, begin, serving
 
@@ -87,13 +87,10 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 @contextmanager
 def shown(port: int, address: str, folder: Path) -> Iterator[Browser]:
     """A browser with the page of a server, without errors to the end."""
-    one = Browser(folder / "profile", size=(700, 500))
-    try:
+    with Browser(folder / "profile", size=(700, 500)) as one:
         one.open(f"http://127.0.0.1:{port}/?token={address}")
         yield one
         assert one.errors == []
-    finally:
-        one.close()
 
 
 def test_a_video_shows_what_the_rasterizer_draws(served: tuple[int, str], toy: Toy) -> None:
@@ -226,7 +223,6 @@ CLICK = "document.getElementById('mp4').click()"
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 def test_the_page_saves_a_video_and_cancels_one(toy: Toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     with serving(toy[1], toy[0] / "scene") as (port, token):
         with shown(port, f"{token}#m=recorded&c=front&t=0.2&s=1.5", tmp_path) as one:
@@ -271,7 +267,6 @@ def drawn(page: Browser, source: str) -> np.ndarray:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 def test_exact_frames_are_compared_with_what_they_are_compared_with(toy: Toy, tmp_path: Path) -> None:
     canvas = "document.getElementById('canvas'), ...mudg.last.area"
     with serving(toy[1], toy[0] / "scene", compare=toy[1], images=5) as (port, token):

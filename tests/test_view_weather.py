@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from browser import CHROMIUM, NO_BROWSER, Browser
+from browser import Browser
 from scipy.ndimage import uniform_filter
 from toy_fitted import STREET, write_toy_run
 
@@ -23,7 +23,7 @@ from mudg.gaussians.rendering import raster_of, render_view
 from mudg.viewer import view
 from mudg.viewer.settings import PageConfig
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)]
+pytestmark = pytest.mark.slow
 RAIN, SNOW = 25, 2
 
 
@@ -32,12 +32,9 @@ def opened(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Browser, 
     root = tmp_path_factory.mktemp("weather")
     scene, fit, _, model = write_toy_run(root)
     view.run_page(PageConfig(images=0), fit, root / "page.html", scene=scene)
-    one = Browser(tmp_path_factory.mktemp("profile"), size=(700, 500))
-    try:
+    with Browser(tmp_path_factory.mktemp("profile"), size=(700, 500)) as one:
         one.open(f"file://{root / 'page.html'}#m=recorded&c=front&t=0.4")
         yield one, model
-    finally:
-        one.close()
 
 
 def seen_by(one: View) -> str:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from browser import CHROMIUM, NO_BROWSER, Browser, BrowserError
+from browser import Browser, BrowserError
 from PIL import Image
 from toy_fitted import STREET, toy_fitted, write_toy_run
 from view_server import ask, serving
@@ -49,7 +49,6 @@ from mudg.viewer.server import token_for
 from mudg.viewer.settings import PageConfig
 
 Toy = tuple[Path, Path, SceneModel]
-needs_browser = pytest.mark.skipif(CHROMIUM is None, reason=NO_BROWSER)
 
 
 # what is packed -----------------------------------------------------------------------------------
@@ -313,18 +312,12 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 
 @pytest.fixture(scope="module")
 def opened(toy: Toy, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    if CHROMIUM is None:
-        pytest.skip(NO_BROWSER)
-    one = Browser(tmp_path_factory.mktemp("profile"), size=(360, 300))
-    try:
+    with Browser(tmp_path_factory.mktemp("profile"), size=(360, 300)) as one:
         one.open(f"file://{toy[0] / 'page.html'}#m=recorded&c=front&t=0.4")
         yield one
-    finally:
-        one.close()
 
 
 @pytest.mark.slow
-@needs_browser
 def test_a_browser_draws_what_the_rasterizer_draws(opened: Browser, toy: Toy) -> None:
     scene, model = read_scene(toy[0] / "scene"), toy[2]
     for time_s, shift_m in ((0.0, 0.0), (0.4, 0.0), (0.4, 2.0), (0.6, -2.0), (0.8, 0.5)):
@@ -351,7 +344,6 @@ VIEWS = {
 
 
 @pytest.mark.slow
-@needs_browser
 @pytest.mark.parametrize("name", VIEWS)
 def test_the_sign_tells_how_much_of_a_view_is_determined_and_how_much_is_empty(
     name: str, opened: Browser, toy: Toy
@@ -390,13 +382,11 @@ def test_the_sign_tells_how_much_of_a_view_is_determined_and_how_much_is_empty(
 
 
 @pytest.mark.slow
-@needs_browser
 def test_the_page_loads_nothing(opened: Browser) -> None:
     assert all(address.startswith(("file://", "blob:", "data:")) for address in opened.requests)
 
 
 @pytest.mark.slow
-@needs_browser
 def test_a_link_shows_the_same(opened: Browser) -> None:
     opened.run("location.hash = '#m=recorded&c=front&t=0.6&l=depth&s=1.5&v=difference-scene&o=boxes'; 1")
     opened.wait("window.mudg.state.layer === 'depth' && window.mudg.sharp")
@@ -413,7 +403,6 @@ def test_a_link_shows_the_same(opened: Browser) -> None:
 
 
 @pytest.mark.slow
-@needs_browser
 def test_hidden_objects_are_gone(opened: Browser, toy: Toy) -> None:
     with_car = opened.measure(["class"], camera="front", t=0.4)["class"]
     without = opened.measure(["class"], camera="front", t=0.4, hidden=["car-1"])["class"]
@@ -422,7 +411,6 @@ def test_hidden_objects_are_gone(opened: Browser, toy: Toy) -> None:
 
 
 @pytest.mark.slow
-@needs_browser
 def test_what_is_hidden_is_an_edit_script(opened: Browser, tmp_path: Path) -> None:
     from mudg.editing.script import read_edits
 
@@ -433,7 +421,6 @@ def test_what_is_hidden_is_an_edit_script(opened: Browser, tmp_path: Path) -> No
 
 
 @pytest.mark.slow
-@needs_browser
 def test_names_from_a_log_do_not_run(opened: Browser, toy: Toy, tmp_path: Path) -> None:
     name = "</script><script>document.documentElement.dataset.foreign=1</script><img src=x onerror='document.title=1'>"
     scene = read_scene(toy[0] / "scene")
@@ -471,20 +458,14 @@ def web(tmp_path: Path) -> Iterator[tuple[Path, str]]:
 
 @pytest.fixture
 def fresh(tmp_path: Path) -> Iterator[Browser]:
-    if CHROMIUM is None:
-        pytest.skip(NO_BROWSER)
-    one = Browser(tmp_path / "profile", size=(360, 300))
-    try:
+    with Browser(tmp_path / "profile", size=(360, 300)) as one:
         yield one
-    finally:
-        one.close()
 
 
 AT = {"camera": "front", "t": 0.4, "shift": 1.0}
 
 
 @pytest.mark.slow
-@needs_browser
 def test_a_page_in_chunks_shows_what_one_chunk_shows(
     toy: Toy, web: tuple[Path, str], fresh: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -515,7 +496,6 @@ def test_a_page_in_chunks_shows_what_one_chunk_shows(
 
 
 @pytest.mark.slow
-@needs_browser
 @pytest.mark.parametrize(
     ("damage", "told"),
     [("missing", "404"), ("truncated", "of"), ("foreign", "its content is not what this page was made with")],
@@ -548,7 +528,6 @@ def test_a_chunk_that_fails_is_told_and_can_be_tried_again(
 
 
 @pytest.mark.slow
-@needs_browser
 def test_a_folder_opened_from_the_disk_says_what_to_do(
     toy: Toy, tmp_path: Path, fresh: Browser, monkeypatch: pytest.MonkeyPatch
 ) -> None:
