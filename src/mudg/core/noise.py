@@ -195,7 +195,10 @@ def ddim(
 
     With a dynamic rescale the estimate of x0 is multiplied by scale_previous / scale_t at each step, and the final
     result keeps the factor of the last step visited, as the published sampler does.
-    Returns [B,...]. Raises UsageError when eta > 0 without `draw`.
+    Returns [B,...].
+
+    Raises:
+        UsageError: eta > 0 without `draw`.
     """
     if eta > 0 and draw is None:
         raise UsageError("stochastic sampling needs a source of noise", where="noise.ddim", got=f"eta = {eta}")

@@ -183,8 +183,12 @@ def _with_poses(files: Mapping[int, Path], ego: EgoPath, zero_ns: int, sensor: s
 
 
 def read_feather(path: Path, columns: Sequence[str]) -> common.Columns:
-    """Named columns of a Feather (Arrow IPC) file as arrays of one length. Raises ResourceError: pyarrow is not
-    installed. InputError: missing, cut off, without one of the columns, or with empty values."""
+    """Named columns of a Feather (Arrow IPC) file as arrays of one length.
+
+    Raises:
+        ResourceError: pyarrow is not installed. InputError: missing, cut off, without one of the columns, or with
+            empty values.
+    """
     with common.arrow_files(path):
         import pyarrow.feather
 
@@ -282,8 +286,11 @@ def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()
     """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time.
 
     Beams without a return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it,
-    f64[3] each. Raises InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one
-    turn."""
+    f64[3] each.
+
+    Raises:
+        InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn.
+    """
     where = str(path)
     columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
     returns = common.returns_of(columns, where, places)

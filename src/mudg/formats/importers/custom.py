@@ -228,8 +228,12 @@ class CustomLog:
 
 
 def read_log(root: Path, complain: schema.Complain = schema.raise_first) -> CustomLog:
-    """Parse ``root/log.json``. Raises InputError: the frame of the file or the vehicle's path is wrong, or ``complain``
-    raised. ``complain``: called with each problem; a record with a problem is left out."""
+    """Parse ``root/log.json``.
+
+    Raises:
+        InputError: the frame of the file or the vehicle's path is wrong, or ``complain`` raised. ``complain``: called
+            with each problem; a record with a problem is left out.
+    """
     where = str(root / INDEX)
     top = _parse_index(schema.parse_object(store.read_bytes(root / INDEX), where), where)
     cameras = schema.parse_table(top.cameras, f"{where}: cameras", _parse_camera, complain)
@@ -394,9 +398,12 @@ def looks_like_custom(source: Path) -> bool:
 
 
 def import_custom(source: Path, out: Path, options: ImportOptions) -> Scene:
-    """Import a log in the neutral layout into the scene directory ``out``. Raises UsageError: an option that this
-    format does not have, or a camera that the log does not have. InputError: something is missing, malformed or
-    contradictory; nothing is left at ``out``."""
+    """Import a log in the neutral layout into the scene directory ``out``.
+
+    Raises:
+        UsageError: an option that this format does not have, or a camera that the log does not have. InputError:
+            something is missing, malformed or contradictory; nothing is left at ``out``.
+    """
     common.refuse_options(options, "neutral-layout", "sequence", "poses", "boxes")
     read, notes = read_log(source), []
     read = replace(read, ego=common.mended_path(read.ego, options, notes))
@@ -513,8 +520,12 @@ def refuse_grey(path: Path) -> None:
 
 
 def read_sweep(content: CustomLog, sweep: LogItem, options: ImportOptions) -> SweepPoints:
-    """The points of a sweep, motion-compensated to its time. Raises InputError: no points, a field that was declared is
-    not there, intensities above the declared largest one, points that need their times and have none."""
+    """The points of a sweep, motion-compensated to its time.
+
+    Raises:
+        InputError: no points, a field that was declared is not there, intensities above the declared largest one,
+            points that need their times and have none.
+    """
     lidar, path = content.lidars[sweep.sensor], _file(content, sweep)
     cloud = read_cloud(path, known=(lidar.intensity_field, lidar.time_field))
     if len(cloud.xyz) == 0:

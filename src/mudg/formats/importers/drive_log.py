@@ -114,8 +114,11 @@ def write_scene(content: SceneContent[Item], out: Path, options: ImportOptions) 
     turned back; both are counted in the scene's notes.
 
     Images whose size is kept are copied byte for byte, after a check that they are complete and of their camera's size.
-    At most two items per worker are in memory, beside the few that wait for the disk. Raises InputError: an item is
-    missing or damaged, or what is written contradicts itself. Nothing is left at ``out``."""
+    At most two items per worker are in memory, beside the few that wait for the disk.
+
+    Raises:
+        InputError: an item is missing or damaged, or what is written contradicts itself. Nothing is left at ``out``.
+    """
     dataset = content.source.dataset
     types.foreign_name(content.name, f"{dataset}: name of the log")
     moments: list[tuple[int, str]] = []
@@ -262,8 +265,12 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
 
     Tracks reach 0.05 s beyond their boxes, so that images at their ends are covered. Boxes of moving objects are
     brought to the sweeps' times (``box_times``), unless ``untwist`` is ``no``: then every sweep counts as one moment,
-    without point times, and boxes stay as drawn. Raises UsageError: no frame lies in the chosen range. InputError: a
-    file is missing or damaged; poses, times and units contradict each other. Nothing is left at ``out``."""
+    without point times, and boxes stay as drawn.
+
+    Raises:
+        UsageError: no frame lies in the chosen range. InputError: a file is missing or damaged; poses, times and
+            units contradict each other. Nothing is left at ``out``.
+    """
     common.check_motion(drive.ego, drive.where)
     chosen = _outside_gaps(_without_missing(_choose_frames(drive, options), options), drive, options)
     records = sorted(chosen, key=lambda record: record.time_s)
@@ -599,10 +606,13 @@ class BoxTracks:
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
-        Raises InputError: an object has two boxes at one moment; length and width are swapped. ``speeds``: how
-        velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box -> times of the
-        first and last image that show the object; a track reaches from the first image of its first box to the last one
-        of its last. None = from box to box."""
+
+        Raises:
+            InputError: an object has two boxes at one moment; length and width are swapped. ``speeds``: how
+                velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box ->
+                times of the first and last image that show the object; a track reaches from the first image of its
+                first box to the last one of its last. None = from box to box.
+        """
         tracks: list[Track] = []
         split = 0
         for name, boxed in self._boxeds.items():

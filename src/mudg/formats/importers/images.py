@@ -197,8 +197,10 @@ def resized(width: int, height: int, resolution: Resolution | None, where: str =
 
 def covering_camera(camera: Camera, lens: Lens) -> Camera:
     """The pinhole camera of the recorded size with the shortest focal length, not below the lens', that sees no border.
-    Raises InputError: it would be more than ``MAX_FOCAL_GAIN`` times the lens', or the polynomial turns back inside
-    it."""
+
+    Raises:
+        InputError: it would be more than ``MAX_FOCAL_GAIN`` times the lens', or the polynomial turns back inside it.
+    """
     low, high = 1.0, MAX_FOCAL_GAIN
 
     def at(gain: float) -> Camera:

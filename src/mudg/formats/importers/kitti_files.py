@@ -34,7 +34,10 @@ _TURN_STEPS: Final = 36
 
 def read_scan(path: Path) -> SweepPoints:
     """A velodyne scan: float32 rows x, y, z, reflectance (0..1). Beams without a return are left out and counted.
-    Raises InputError: cut off, values that are not finite, or a reflectance outside of 0..1."""
+
+    Raises:
+        InputError: cut off, values that are not finite, or a reflectance outside of 0..1.
+    """
     rows, returns = read_float_rows(path, 4)
     rows = rows[returns]
     dt_s = np.zeros(len(rows), np.float32)
@@ -116,7 +119,11 @@ class KittiCalibration:
 
 def pinhole_camera(projection: Matrix, name: str, size: tuple[int, int], where: str) -> Camera:
     """The rectified pinhole camera of a KITTI projection matrix f64[3, 4], whose pixels are counted from the centre of
-    the top-left one. Raises InputError: skew, another last row than 0 0 1, or a focal length that is not positive."""
+    the top-left one.
+
+    Raises:
+        InputError: skew, another last row than 0 0 1, or a focal length that is not positive.
+    """
     if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
         what = "projection matrix is not of a rectified pinhole camera"
         raise InputError(what, where=where, expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()))
@@ -152,8 +159,11 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
 def table_entry(
     table: Mapping[str, NDArray[np.float64]], keys: tuple[str, ...], shape: tuple[int, ...], where: object
 ) -> Matrix:
-    """The first entry of ``keys`` that the table has, as an array of ``shape``. Raises InputError: there is none of
-    them, or it has another number of values."""
+    """The first entry of ``keys`` that the table has, as an array of ``shape``.
+
+    Raises:
+        InputError: there is none of them, or it has another number of values.
+    """
     key = next((key for key in keys if key in table), None)
     if key is None:
         what, expected = f"calibration lacks {keys[0]}", " or ".join(keys)
@@ -306,8 +316,12 @@ def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, 
     """Seconds by number: plain seconds, or ``2011-09-26 13:02:25.964389445`` (nanoseconds kept; seconds of the epoch).
 
     Line k is number k, and an empty line a number without a stamp. A file without empty lines that is too short for
-    that, but has just one line per recorded file, counts those instead. Raises InputError: no times, or too few.
-    ``numbers``: of the recorded files, increasing. ``last``: the highest number that is needed."""
+    that, but has just one line per recorded file, counts those instead.
+
+    Raises:
+        InputError: no times, or too few. ``numbers``: of the recorded files, increasing. ``last``: the highest number
+            that is needed.
+    """
     lines = read_lines(path)
     stamps = {number: _stamp(line, f"{path}: line {number + 1}") for number, line in lines.items()}
     count = len(store.read_text(path).splitlines())
@@ -377,8 +391,11 @@ def rect0_from_box(bottom_centre_m: Sequence[float], height_m: float, rotation_y
 
 def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
     """Boxes of a tracking label file (17 columns and optionally a score), or, with the number of its ``frame``, of an
-    object label file (15). They are given in rectified camera 0; ``DontCare`` regions are left out. Raises InputError:
-    another number of columns, values that are no finite numbers, or a size that makes no sense."""
+    object label file (15). They are given in rectified camera 0; ``DontCare`` regions are left out.
+
+    Raises:
+        InputError: another number of columns, values that are no finite numbers, or a size that makes no sense.
+    """
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
     skip = 2 if frame is None else 0

@@ -111,7 +111,10 @@ def foreign_reader(where: str) -> Iterator[None]:
 
 def check_store(path: Path) -> None:
     """Refuse a store that is cut off, that contradicts itself, or that would take more memory than its files can need.
-    Raises InputError: so it is; nothing of the size that was promised has been allocated."""
+
+    Raises:
+        InputError: so it is; nothing of the size that was promised has been allocated.
+    """
     members = _members_of_folder(path) if path.is_dir() else _members_of_tar(path)
     where = f"{path}: {METADATA}"
     if METADATA not in members:

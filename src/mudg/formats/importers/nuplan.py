@@ -315,8 +315,11 @@ def _finite(value: Any, where: str) -> float:
 
 @contextmanager
 def open_log(path: Path) -> Iterator[NuplanLog]:
-    """Open a log database read-only and check its schema. Raises InputError: missing, not SQLite, damaged, or another
-    schema."""
+    """Open a log database read-only and check its schema.
+
+    Raises:
+        InputError: missing, not SQLite, damaged, or another schema.
+    """
     if not path.is_file():
         raise InputError("log database does not exist", where=str(path), expected="a .db file")
     connection = None

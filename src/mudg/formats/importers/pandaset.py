@@ -95,8 +95,11 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
 
 
 def read_frame(path: Path) -> dict[str, NDArray[Any]]:
-    """Columns of a pickled data frame, gzipped or not, by their names. Raises InputError: missing, cut off, not a data
-    frame, or it asks for something that is not plain data."""
+    """Columns of a pickled data frame, gzipped or not, by their names.
+
+    Raises:
+        InputError: missing, cut off, not a data frame, or it asks for something that is not plain data.
+    """
     content = store.read_bytes(path)
     if content[:2] == b"\x1f\x8b":
         content = gunzip(content, str(path))
@@ -104,7 +107,11 @@ def read_frame(path: Path) -> dict[str, NDArray[Any]]:
 
 
 def gunzip(content: bytes, where: str) -> bytes:
-    """Unpack gzip, not beyond ``MAX_BYTES``. Raises InputError: cut off, damaged, or larger than that."""
+    """Unpack gzip, not beyond ``MAX_BYTES``.
+
+    Raises:
+        InputError: cut off, damaged, or larger than that.
+    """
     unpacker = zlib.decompressobj(wbits=31)
     try:
         unpacked = unpacker.decompress(content, MAX_BYTES + 1)

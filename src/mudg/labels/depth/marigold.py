@@ -78,7 +78,11 @@ class Marigold:
         longest_px: int = PROCESSING_PX,
         place: Place = CPU,
     ) -> None:
-        """``longest_px``: longest side for the networks. Raises: UsageError: more steps than the noise schedule has."""
+        """``longest_px``: longest side for the networks.
+
+        Raises:
+            UsageError: more steps than the noise schedule has.
+        """
         check_steps(parts.scheduler, steps)
         self._parts, self._space, self._steps, self._guided = parts, space, steps, guided
         self._longest_px, self._place = longest_px, place

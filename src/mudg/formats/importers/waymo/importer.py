@@ -108,8 +108,12 @@ def files_of_waymo(source: Path, options: ImportOptions) -> LogFiles:
 
 
 def open_log(source: Path, options: ImportOptions) -> WaymoLog:
-    """The log that ``source`` and ``options.sequence`` name, its facts read and checked. Raises UsageError: there are
-    several, and none or more than one was meant. InputError: there is none, or it is damaged."""
+    """The log that ``source`` and ``options.sequence`` name, its facts read and checked.
+
+    Raises:
+        UsageError: there are several, and none or more than one was meant. InputError: there is none, or it is
+            damaged.
+    """
     record, segment = _find(source, options)
     return TfrecordLog(record, options.frames) if record is not None else ParquetLog(source, segment, options.frames)
 
@@ -437,7 +441,11 @@ def points_of_scan(
 
     Where pixels have poses of their own (top LiDAR), a point is carried from where the vehicle was when it was measured
     to where the vehicle was at the frame's pose. The other LiDARs are recorded as if all was measured at the frame's
-    pose. Raises InputError: shapes that contradict each other, or values that are not finite."""
+    pose.
+
+    Raises:
+        InputError: shapes that contradict each other, or values that are not finite.
+    """
     shape = scan.returns[0].shape[:2]
     if any(image.shape[:2] != shape for image in (*scan.returns, *scan.projections)) or (
         scan.poses is not None and scan.poses.shape[:2] != shape
@@ -615,8 +623,11 @@ def vehicle_from_cam(calibration: records.CameraCalibration) -> Matrix:
 
 
 def panoptic_ids(label: records.Panoptic, camera: Camera, where: str) -> NDArray[np.int32]:
-    """Values of a panoptic label, i32[H, W]: class * divisor + instance. Raises InputError: no 16-bit PNG of the
-    camera's size, or no divisor."""
+    """Values of a panoptic label, i32[H, W]: class * divisor + instance.
+
+    Raises:
+        InputError: no 16-bit PNG of the camera's size, or no divisor.
+    """
     if label.divisor < 1:
         what = "panoptic label has no divisor"
         raise InputError(what, where=where, expected="a positive number", got=str(label.divisor))
