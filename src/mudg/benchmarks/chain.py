@@ -369,7 +369,7 @@ def _shift_of(name: str) -> float:
 
 def render_page(title: str, command: str, lead: str, sections: Sequence[Mapping[str, Any]], footer: str = "") -> str:
     """A page. ``command``: what makes it. ``lead``: first sentence. ``sections``: each with ``title``, and any of
-    ``tables`` (``report.tables.TextTable``), ``notes`` above and ``below`` them, the values of `films`, and ``walls``.
+    ``tables`` (``base.html.TextTable``), ``notes`` above and ``below`` them, the values of `films`, and ``walls``.
     ``footer``: where the pictures lie."""
     usual = {"tables": (), "notes": (), "below": (), "films": (), "walls": (), "log_choices": (), "shift_choices": ()}
     whole = [{**usual, **section} for section in sections]

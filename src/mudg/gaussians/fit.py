@@ -1,8 +1,8 @@
 """fit: recorded frames (and virtual observations) in, a dynamic Gaussian scene out.
 
 The loop is ``optimise`` and reads top to bottom. What it calls: ``gaussians/views.py`` (what a view is),
-``gaussians/start.py`` (where the Gaussians start), ``models.scene.model.compose`` (the scene at a time),
-``core.raster`` (the renderer), ``core.losses`` (every loss), ``models.scene.densify``. Nothing else touches the
+``gaussians/start.py`` (where the Gaussians start), ``gaussians.model.compose`` (the scene at a time),
+``core.raster`` (the renderer), ``core.losses`` (every loss), ``gaussians.densify``. Nothing else touches the
 parameters.
 
     OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``) and its certainty

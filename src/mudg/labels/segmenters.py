@@ -1,7 +1,7 @@
 """Classes by a pretrained segmentation network from a folder on disk: SegFormer, Mask2Former or EoMT with Cityscapes
 classes.
 
-The networks come from the ``transformers`` package (see ``models.folders``); nothing is downloaded: the folder holds
+The networks come from the ``transformers`` package (see ``networks.folders``); nothing is downloaded: the folder holds
 ``config.json``, ``preprocessor_config.json`` and ``model.safetensors`` as that package writes them. Class names of the
 folder are matched with ours by name. Large images are cut into overlapping tiles whose probabilities are averaged. EoMT
 reads squares of one size only: images are scaled until their shorter side has that size.

@@ -7,7 +7,7 @@ to scale and shift.
 With guidance, after Viola et al., "Marigold-DC: zero-shot monocular depth completion with guided diffusion" (2024): at
 every step the clean latent that the network foresees is decoded and compared with LiDAR; the noisy latent is moved down
 the gradient of the difference, which is brought to the length of the foreseen noise, by Adam. Scale and shift are not
-learnt along, as there, but fitted anew at every step (``core.align.fit_affine``), which needs no rate and lets go of
+learnt along, as there, but fitted anew at every step (``core.depth.fit_affine``), which needs no rate and lets go of
 wrong returns.
 
 Only the networks in the folder are used, not the package's pipeline: it would import what a file names. The noise is

@@ -4,11 +4,11 @@
 |---|---|---|
 | PromptDepthAnything | metric depth | image and a small map of depth from LiDAR |
 | Depth Anything, V1 and V2 | inverse depth up to scale and shift, or metric depth | image alone |
-| Marigold (``models.depth.marigold``) | depth up to scale and shift | diffusion; LiDAR may steer it |
-| DepthLab (``models.depth.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
+| Marigold (``labels.depth.marigold``) | depth up to scale and shift | diffusion; LiDAR may steer it |
+| DepthLab (``labels.depth.depthlab``) | depth, nearly metric | diffusion; completes LiDAR |
 
 The result is aligned to the visible LiDAR returns with one robust scale and shift per frame
-(``core.align.fit_affine``), the sky gets its fixed distance, and the confidence follows from the error of the aligned
+(``core.depth.fit_affine``), the sky gets its fixed distance, and the confidence follows from the error of the aligned
 depth at the returns near a pixel. There is no result where too few returns are visible, or where the network's depth
 does not fit them.
 """
