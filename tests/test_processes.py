@@ -49,9 +49,15 @@ def test_an_error_crosses_a_process_boundary_as_it_is() -> None:
     assert error.exit_code == 6
 
 
+def mark(folder: Path) -> None:
+    """Say which process works in a folder, at once and whole."""
+    (folder / "starting").write_text(str(os.getpid()))
+    (folder / "starting").rename(folder / "started")
+
+
 def sleep_long(folder: Path) -> None:
     """Says which process it is, and works for longer than any test waits."""
-    (folder / "started").write_text(str(os.getpid()))
+    mark(folder)
     time.sleep(600)
 
 
@@ -103,7 +109,7 @@ def test_workers_of_a_parent_that_is_killed_end(tmp_path: Path) -> None:
 def work_in_steps(folder: Path) -> None:
     """Works like a fit: a signal is taken at the end of a step, and a checkpoint is written."""
     with Interruption() as interruption:
-        (folder / "started").write_text(str(os.getpid()))
+        mark(folder)
         while not interruption.requested:
             time.sleep(0.05)
         time.sleep(0.5)
@@ -121,7 +127,7 @@ def work_with_cleanup(folder: Path) -> None:
 
 def fail_soon(folder: Path) -> None:
     """Fails when the other call has begun."""
-    (folder / "started").write_text(str(os.getpid()))
+    mark(folder)
     wait_for(folder.parent / "1cleanup" / "started")
     raise NumericsError("a loss is not finite")
 
