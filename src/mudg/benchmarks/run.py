@@ -8,6 +8,7 @@ edit           edits of a fitted scene against the city regenerated with them (`
                (``benchmarks/edit_runs.py``)
 shift          whole methods beside the recorded path, on lists of generated logs (``benchmarks/shift.py``)
 real           whole methods on real logs, against what the methods did not see of them (``benchmarks/real.py``)
+loop           a pilot drives in fitted scenes, against the exact city (``benchmarks/loop.py``)
 paper          a table of a paper, on generated cities or real logs (``benchmarks/paper.py``)
 
 The first three are one folder, with OUT/clips/ (or cities, fits, ...), OUT/bench.json, OUT/bench.md and pictures; the
@@ -28,7 +29,7 @@ from mudg.base.config import result_settings
 from mudg.base.devices import NETWORK_KINDS, choose_device
 from mudg.base.errors import UsageError
 from mudg.base.run_folder import RunDir, VerbOutput, refuse_overlap
-from mudg.benchmarks import cities, edit_runs, paper, real, shift
+from mudg.benchmarks import cities, edit_runs, loop, paper, real, shift
 from mudg.benchmarks.rows import changed_settings, flag_of, generator_of
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files
@@ -38,8 +39,8 @@ from mudg.steps.pipeline import refuse_missing
 from mudg.steps.settings import PresetName
 
 _FILES = ("bench.json", "bench.md", "*.png", "clips/*", "cities/", "edited/", "fits/", "rows/*.json")
-EDIT, SHIFT, REAL, PAPER = "edit", "shift", "real", "paper"
-CHAINS = (SHIFT, REAL, PAPER)
+EDIT, SHIFT, REAL, PAPER, LOOP = "edit", "shift", "real", "paper", "loop"
+CHAINS = (SHIFT, REAL, PAPER, LOOP)
 """Benchmarks of complete methods: they take the chain of `mudg run`, with its presets."""
 RUNS = "edit RUN"
 """The benchmark edit of finished runs."""
@@ -56,8 +57,9 @@ USED: Final[Mapping[str, tuple[str, ...]]] = {
         (("mdm", "poses", EDIT, *CHAINS), "seed"),
         (("mdm", "poses", EDIT, RUNS, *CHAINS), "device"),
         (CHAINS, "methods iterations continue_fit processes fuse synthesize fit"),
-        ((SHIFT,), "list"),
-        ((SHIFT, PAPER), "logs videos"),
+        ((SHIFT, LOOP), "list"),
+        ((SHIFT, PAPER, LOOP), "logs"),
+        ((SHIFT, PAPER), "videos"),
         ((SHIFT, REAL), "ablation variant"),
         ((REAL,), "protocols shown"),
         ((REAL, PAPER), "resolution frames"),
@@ -101,8 +103,8 @@ def run(
         raise UsageError(
             "this benchmark makes its own logs", where=f"mudg bench {name}", got=", ".join(map(str, sources))
         )
-    if name == SHIFT:
-        return shift.run(config, out, preset=preset, overwrite=overwrite)
+    if name in (SHIFT, LOOP):
+        return (shift if name == SHIFT else loop).run(config, out, preset=preset, overwrite=overwrite)
     inputs = {"model": model_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
     refuse_overlap(out, {"model": model_files.folder_of(config.model) if inputs else ""})
     choose_device(config.device, "benchmark", NETWORK_KINDS)  # refused before anything is written

@@ -45,20 +45,22 @@ class BenchOwn:
     seed: int = 0
     """Seed of all random numbers; the same seed gives the same result."""
     list: Literal["development", "reported"] = "development"
-    """shift: list of logs. Choose settings on development; report results on reported, on which nothing was chosen."""
+    """shift, loop: list of logs. Choose settings on development; report results on reported, on which nothing was
+    chosen."""
     logs: int = setting(default=8, ge=1, le=8)
-    """shift; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4)."""
+    """shift, loop; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has
+    4)."""
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
-    """shift, real: methods to compare: those of the default; pvg, s3gaussian, bezier, omnire, emernerf and difix; and
-    street_gaussians-longer, which goes on for as many steps as mudg_s, without generated views. real also has
-    mudg_r-no-adapt, mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to
-    the log, and with points alone in its input. paper: any of these of shift, and freevs; with the default, all of
-    them."""
+    """shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian,
+    bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on for as many steps as mudg_s, without
+    generated views. real also has mudg_r-no-adapt, mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without
+    adapting the diffusion model to the log, and with points alone in its input. paper: any of these of shift, and
+    freevs; with the default, all of them."""
     iterations: int = setting(default=1000, ge=1)
-    """shift, real, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as
-    many more."""
+    """shift, real, loop, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for
+    half as many more."""
     continue_fit: bool = True
-    """shift, real, paper: make fits under virtual views from the one without, with half as many steps. Off: from
+    """shift, real, loop, paper: make fits under virtual views from the one without, with half as many steps. Off: from
     nothing with all steps, as published."""
     ablation: bool = False
     """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and
@@ -67,8 +69,8 @@ class BenchOwn:
     """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is
     a setting such as virtual.color_weight. Both of its fits have them."""
     processes: int = setting(default=0, ge=0)
-    """shift, real, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread
-    each (0 = one per core). Results do not depend on it."""
+    """shift, real, loop, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one
+    thread each (0 = one per core). Results do not depend on it."""
     videos: bool = True
     """shift, paper: also write videos of all methods side by side."""
     table: Literal[

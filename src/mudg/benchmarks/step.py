@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Bench(Output):
-    """Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of
+    """Run a benchmark: mdm, poses, edit, shift or loop against exact truth, real on real logs, paper for tables of
     papers."""
 
     section = "benchmarks"
@@ -24,6 +24,7 @@ class Bench(Output):
         *("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses"),
         *("mudg bench edit --out runs/edits", "mudg bench edit runs/a runs/b --out runs/edited"),
         *("mudg bench shift --list development --logs 1 --variant strong=virtual.probability:0.4 --out runs/shift",),
+        *("mudg bench loop --list reported --out runs/loop",),
         *("mudg bench real logs/pandaset_002 --frames 32:56 --resolution 960 --protocols gap camera --out runs/real",),
         *("mudg bench paper city:reported --table mudg1 --out runs/mudg1",),
         *("mudg bench paper logs/* --table mudg2 --preset paper --model models/mudg_1024 --out runs/mudg2",),
@@ -35,17 +36,19 @@ class Bench(Output):
         "edit": "Measure edits of fitted scenes.",
         "shift": "Measure complete methods off the recorded path, against exact truth.",
         "real": "Measure complete methods on real logs.",
+        "loop": "Drive in fitted scenes, against the exact city.",
         "paper": "Fill a table of a paper.",
     }
     name: Annotated[str, Flag("BENCHMARK", "first")]
     """Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift
-    (complete methods off the recorded path), real (complete methods on real logs) or paper (a table of a paper)."""
+    (complete methods off the recorded path), loop (drives in fitted scenes), real (complete methods on real logs) or
+    paper (a table of a paper)."""
     sources: Annotated[tuple[Path, ...], Flag("[LOG ...]", "rest")] = ()
     """real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or
     city:development, a list of generated cities. edit: folders of finished runs, whose drives are edited in place of
     generated cities."""
     preset: PresetName = "default"
-    """shift, real, paper: settings of clouds, generated views and fits to start from, as for mudg run
+    """shift, real, loop, paper: settings of clouds, generated views and fits to start from, as for mudg run
     (docs/presets.md). paper: the published set-up, with a published-type model."""
     settings: BenchConfig
 
@@ -63,7 +66,7 @@ class Bench(Output):
         if name == "name":
             return False
         if "." in name:
-            return part == "paper" or (not name.startswith("score.") and part in ("shift", "real"))
+            return part == "paper" or (not name.startswith("score.") and part in ("shift", "real", "loop"))
         tags = [re.findall(r"[a-z0-9]+", tag) for tag in re.findall(r"(?:^|\. )([a-z0-9,; ]+): ", text)]
         named = {word for tag in tags for word in tag if word in cls.parts}
         return not named or part in named

@@ -450,6 +450,10 @@ class CityWorld:
             mask[rows, columns] = rec.painted(self.plan, self._handle.street(xyz[:, :2]), xyz[:, :2])
         return mask
 
+    def beyond_kerb_m(self, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance f64[N] of places f64[N, 2] from the kerb, metres; negative on the road."""
+        return self._handle.street(xy)[:, 2]
+
     def lane_lines(self) -> list[NDArray[np.float64]]:
         """Road lines, road edges and crosswalks as a map has them: lines f64[N, 3] in the world, metres."""
         return rec.lane_lines(self.plan)

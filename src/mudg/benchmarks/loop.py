@@ -1,0 +1,289 @@
+"""``mudg bench loop``: a pilot drives in the reconstruction of a generated log, off its recorded path.
+
+Every picture that it saw is scored against the exact city at the pose that it drove to. The same pilot drives in the
+exact city, too, and sees exact pictures there. How far the two drives part, what they hit and whether they leave the
+road is what a simulator's user wants to know. Road users move as recorded in both, and both are judged by the exact
+city: its boxes, parked vehicles included, and its kerbs.
+
+    OUT/<log>/...   see ``benchmarks/places.py``     OUT/<log>/drives/<row>-<pilot>.json, .jpg   one drive
+    OUT/bench.json   every number                    OUT/bench.md   the tables
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mudg.base import geometry, store
+from mudg.base.errors import UsageError
+from mudg.base.html import markdown_table
+from mudg.base.run_folder import refuse_overlap
+from mudg.base.types import Camera, View
+from mudg.benchmarks.chain import Facts, compare, finished, refuse_foreign
+from mudg.benchmarks.places import Views, listed_cities, score_settings
+from mudg.benchmarks.rows import BASE, FULL, PaperPlace, PaperTable, chain_settings, refuse_unfit, shift_rows
+from mudg.benchmarks.settings import BenchConfig
+from mudg.benchmarks.shift import standard_error
+from mudg.city import logs as city_logs
+from mudg.city.logs import STANDARD, LogRules
+from mudg.city.world import CityWorld
+from mudg.core import metrics
+from mudg.diffusion import model_files
+from mudg.sim.cockpit import Cockpit
+from mudg.sim.drive import Actor, Drive, Following, Road, beginning
+from mudg.sim.pilots import RoutePilot, Sight
+from mudg.sim.session import Session
+from mudg.steps.settings import PresetName
+
+EXACT: Final = "exact city"
+"""The row of the drive in the city itself."""
+AIMS_M: Final = {"left": 3.0, "right": -3.0}
+"""Pilot -> where it aims, metres to the left of the recorded path, from the first step on."""
+SEEN: Final = ("rgb", "depth", "classes")
+FAR_M: Final = 80.0
+"""Depth counts up to here."""
+COLUMNS: Final[Mapping[str, tuple[str, int]]] = {
+    "psnr": ("PSNR dB", 2),
+    "abs_rel": ("AbsRel", 4),
+    "miou": ("mIoU", 3),
+    "shift_m": ("largest shift, m", 2),
+    "parting_m": ("apart, mean, m", 3),
+    "parted_m": ("apart at the end, m", 3),
+    "speed_off_mps": ("speed off, m/s", 3),
+    "collisions": ("collisions", 2),
+    "departures": ("off the road", 2),
+}
+_PAGES: Final = ("bench.json", "bench.md")
+
+
+@dataclass(frozen=True)
+class LoopLog(Views):
+    """One log of the list."""
+
+    rules: LogRules = STANDARD
+
+    def measure(self) -> dict[str, Any]:
+        """What every row measured with every pilot."""
+        self.chain.fuse()
+        course = Course.of(CityWorld(city_logs.log_config(int(self.log.name), self.rules)))
+        drives = self.out / "drives"
+        exact = {
+            pilot: finished(drives / f"exact-{pilot}.json", partial(measure_drive, course, aim))
+            for pilot, aim in AIMS_M.items()
+        }
+        values = {EXACT: {pilot: parting(of["path"], of["path"]) for pilot, of in exact.items()}}
+        for row in self.rows:
+            virtual: tuple[Path, ...] = ()
+            if row.learns_virtual:
+                virtual = (self.chain.generated(self.off_path, self.out / self.virtual, renders=self.renders),)
+            cockpit = Cockpit(Session(self.chain.fitted(row, virtual), scene=self.scene), (), 0, SEEN)
+            values[row.name] = {}
+            for pilot, aim in AIMS_M.items():
+                name = f"{row.name}-{pilot}"
+                eyes = lambda drive, cockpit=cockpit: next(iter(cockpit.see(drive).values())).layers
+                go = partial(measure_drive, course, aim, eyes, drives / f"{name}.jpg")
+                drive = finished(drives / f"{name}.json", go)
+                scores = {key: value for key, value in drive.items() if key != "path"}
+                values[row.name][pilot] = {**scores, **parting(drive["path"], exact[pilot]["path"])}
+        return {"log": int(self.log.name), "values": values}
+
+
+# ---- drives ----
+
+Eyes = Callable[[Drive], Mapping[str, NDArray[Any]]]
+"""Layers rgb, depth and classes of the first camera at a moment of a drive."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """What a drive is taken in: the exact city, its first camera and how that is mounted."""
+
+    world: CityWorld
+    camera: Camera
+    mount: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, world: CityWorld) -> Course:
+        """The course of a generated log."""
+        name = world.config.cameras[0]
+        view = world.frame_views(name)[0]
+        return cls(world, view.camera, geometry.invert(world.frame_pose(view.time_s)) @ view.world_from_cam)
+
+    def begin(self) -> Drive:
+        """The vehicle at the first frame, among all vehicles and people of the city."""
+        world, first = self.world, self.world.frame_time(0)
+        actors = {t.id: Actor(t.times_s, t.world_from_object, tuple(t.size_m.tolist())) for t in world.tracks()}
+        ego = world.ego_path()
+        speed = Actor(ego.times_s, ego.world_from_ego, ()).speed_at(first)
+        return Drive(Road(ego.world_from_ego), actors, beginning(world.frame_pose(first), speed), first)
+
+    def exact(self, drive: Drive) -> dict[str, NDArray[Any]]:
+        """What the camera would see in the exact city."""
+        truth = self.world.render(View(self.camera, drive.pose @ self.mount, drive.time_s))
+        return {"rgb": truth.rgb_u8, "depth": truth.depth, "classes": truth.semantics}
+
+    def go(self, aim_m: float, eyes: Eyes) -> Iterator[tuple[Drive, Mapping[str, NDArray[Any]]]]:
+        """Drive to the end of the log; at every step the drive, before it moves on, and what the pilot saw."""
+        drive, step_s = self.begin(), 1 / self.world.config.rate_hz
+        pilot = RoutePilot(Following(drive.motion.speed_mps), aim_m)
+        for _ in range(self.world.config.n_frames - 1):
+            seen = eyes(drive)
+            yield drive, seen
+            motion, pose = drive.motion, drive.pose
+            now = (drive.time_s, step_s, motion.speed_mps, motion.steer_rad, drive.road.route(pose), pose)
+            drive.step(pilot.drive(Sight(*now, self.camera, self.mount, **seen)), step_s)
+
+    def judge(self, drive: Drive) -> dict[str, Any]:
+        """Where the vehicle is, what it hits, and whether a corner of it is beyond a kerb."""
+        motion = drive.motion
+        station, shift = drive.road.locate((motion.x_m, motion.y_m))
+        beyond_m = self.world.beyond_kerb_m(drive.car.box(drive.pose).footprint())
+        return {
+            "xy": [motion.x_m, motion.y_m],
+            "speed_mps": motion.speed_mps,
+            "station_m": station,
+            "shift_m": shift,
+            "hit": drive.collision(),
+            "off_road": bool((beyond_m > 0).any()),
+        }
+
+
+def measure_drive(
+    course: Course, aim_m: float, eyes: Eyes | None = None, picture: Path | None = None
+) -> dict[str, Any]:
+    """One drive: where it led, and how right its pictures were. ``eyes``: None: the exact city, whose pictures need no
+    score. ``picture``: where one of them is written beside the exact one."""
+    path, errors, shown = [], [], []
+    counts = torch.zeros((), dtype=torch.int64)
+    for drive, seen in course.go(aim_m, eyes or course.exact):
+        path.append(course.judge(drive))
+        if eyes is None:
+            continue
+        truth = course.exact(drive)
+        shown.append((truth["rgb"], seen["rgb"]))
+        both = np.isfinite(truth["depth"]) & np.isfinite(seen["depth"]) & (truth["depth"] < FAR_M)
+        off = np.abs(seen["depth"] - truth["depth"])[both] / truth["depth"][both]
+        error = (seen["rgb"].astype(np.float64) - truth["rgb"]) / 255
+        errors.append({"psnr": -10 * math.log10(float((error**2).mean())), "abs_rel": float(off.mean())})
+        counts = counts + metrics.confusion(*(torch.from_numpy(of["classes"].astype(np.int64)) for of in (seen, truth)))
+    if picture is not None and shown:
+        store.write_image(picture, np.concatenate(shown[3 * len(shown) // 4], 1), quality=90)
+    means = {name: float(np.mean([one[name] for one in errors])) for name in (errors[0] if errors else {})}
+    if errors:
+        means["miou"] = float(np.mean(list(metrics.iou_of(counts).values())))
+    return {"path": path, **means}
+
+
+def parting(path: Sequence[Facts], exact: Sequence[Facts]) -> dict[str, float]:
+    """How far a drive is from that in the exact city, time by time, and what befell it."""
+    apart = [math.dist(a["xy"], b["xy"]) for a, b in zip(path, exact, strict=True)]
+    speeds = [abs(a["speed_mps"] - b["speed_mps"]) for a, b in zip(path, exact, strict=True)]
+    return {
+        "shift_m": max(abs(at["shift_m"]) for at in path),
+        "parting_m": float(np.mean(apart)),
+        "parted_m": apart[-1],
+        "speed_off_mps": float(np.mean(speeds)),
+        "collisions": float(any(at["hit"] for at in path)),
+        "departures": float(any(at["off_road"] for at in path)),
+    }
+
+
+# ---- numbers ----
+
+
+def run(
+    config: BenchConfig,
+    out: Path,
+    *,
+    preset: PresetName = "default",
+    overwrite: bool = False,
+    rules: LogRules = STANDARD,
+) -> Path:
+    """Drive in the logs of a list; returns ``out`` with ``bench.json`` and ``bench.md``. Arguments and errors as of
+    ``shift.run``."""
+    if config.methods == BenchConfig().methods:
+        config = replace(config, methods=(BASE, FULL))
+    rows, out = shift_rows(config, preset), Path(out)
+    without = [row.name for row in rows if row.fit is None]
+    if without:
+        raise UsageError("nobody can drive in this row: it fits no scene", where="--methods", got=", ".join(without))
+    refuse_overlap(out, {"model": model_files.folder_of(config.model)})
+    own = lambda doc: doc.get("bench") == "loop"
+    refuse_foreign(out, _PAGES, own, lambda entry: entry.name.isdigit())
+    refuse_unfit(config, preset, rows, [])
+    shifts_m = [d * side for d in (2.0, 3.0, 4.0) for side in (1, -1)]
+    table = PaperTable(name="loop", places=[PaperPlace(name="off", title="", shifts_m=shifts_m)], columns=[])
+    renders = model_files.uses_renders(config.model)
+    last = (config, score_settings(config, table), renders, overwrite, "synthesize")
+    logs = listed_cities(config.list, config.logs, rules)
+    jobs = {log.name: LoopLog(log, out / log.name, table, rows, *last, rules=rules).measure for log in logs}
+    settings = {
+        "list": config.list,
+        "iterations": config.iterations,
+        "seed": config.seed,
+        "model": model_files.digest(config.model),
+        "frames": rules.frames,
+        "size_px": [rules.width, rules.height],
+        "aims_m": AIMS_M,
+        **chain_settings(config, preset),
+    }
+    names = [EXACT, *(row.name for row in rows)]
+    filled = lambda logs: {"schema": 1, "bench": "loop", "settings": settings, "rows": names, **pooled(names, logs)}
+    return compare(out, jobs, config, filled, {"bench.md": markdown})
+
+
+def pooled(names: Sequence[str], logs: Sequence[Facts]) -> dict[str, Any]:
+    """The logs, and for every row and column the mean over logs and pilots with the standard error over logs."""
+    means: dict[str, Any] = {}
+    for name in names:
+        per_log = [list(entry["values"][name].values()) for entry in logs]
+        means[name] = {}
+        for column in COLUMNS:
+            values = [float(np.mean([drive[column] for drive in drives])) for drives in per_log if column in drives[0]]
+            if values:
+                error = standard_error(lambda items: sum(items) / len(items), values)
+                means[name][column] = {"mean": float(np.mean(values)), "standard_error": error}
+    return {"logs": list(logs), "pooled": means}
+
+
+def markdown(doc: Facts) -> str:
+    """The tables for people."""
+    settings = doc["settings"]
+    frames = settings["frames"]
+    aims = ", ".join(f"{aim:+g} m" for aim in settings["aims_m"].values())
+    heads = ["row", *(title for title, _ in COLUMNS.values())]
+    rows = [[name, *_cells({c: of["mean"] for c, of in doc["pooled"][name].items()})] for name in doc["rows"]]
+    each = [
+        [str(entry["log"]), name, pilot, *_cells(drive)]
+        for entry in doc["logs"]
+        for name in doc["rows"]
+        for pilot, drive in entry["values"][name].items()
+    ]
+    return "\n".join(
+        [
+            f"# Closed loop: {len(doc['logs'])} logs of the {settings['list']} list",
+            "",
+            f"{frames} frames at 10 Hz; a pilot aims at {aims} from the recorded path and keeps its"
+            " distance to whoever it sees. Pictures are scored at the poses driven to; apart: from the drive of the"
+            " same pilot in the exact city.",
+            "",
+            *markdown_table(heads, rows),
+            "",
+            "## Each drive",
+            "",
+            *markdown_table(["log", "row", "aim", *heads[1:]], each),
+            "",
+        ]
+    )
+
+
+def _cells(values: Facts) -> list[str]:
+    return [f"{values[c]:.{digits}f}" if c in values else "" for c, (_, digits) in COLUMNS.items()]

@@ -1,0 +1,362 @@
+"""A vehicle that drives in a scene: how it moves, where the road is, who else is on it, and what it runs into.
+
+Nothing here draws a picture. The world is that of the log (metres, z up); the vehicle's frame is the log's: x forward,
+y left, z up, its origin taken for the middle of the rear axle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import Final, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mudg.base import geometry
+from mudg.base.errors import InputError, UsageError
+
+Matrix = NDArray[np.float64]
+Traffic = Literal["log", "idm"]
+SURROUNDINGS: Final = "surroundings"
+"""What a vehicle hits that hits no object."""
+LEAST_STEP_M: Final = 0.2
+"""Recorded poses nearer to the last one than this add nothing to a road."""
+SOLID_ABOVE_M: Final = (0.4, 1.4)
+"""Height above the road between which Gaussians stop a vehicle."""
+FEWEST_SOLID: Final = 12
+"""Solid Gaussians within its body from which on a vehicle hits the surroundings."""
+MARGIN_M: Final = 0.15
+"""The body is this much narrower and shorter there, for Gaussians have a size of their own."""
+
+
+@dataclass(frozen=True, slots=True)
+class Car:
+    """Size and limits of the vehicle that drives, in metres, seconds and radians. ``overhang_m``: from the rear bumper
+    to the rear axle."""
+
+    length_m: float = 4.6
+    width_m: float = 1.85
+    height_m: float = 1.6
+    wheelbase_m: float = 2.8
+    overhang_m: float = 0.9
+    largest_steer_rad: float = 0.6
+    largest_speed_mps: float = 40.0
+
+    def box(self, world_from_vehicle: Matrix) -> Box:
+        """Its body at a pose."""
+        centre = np.eye(4)
+        centre[:3, 3] = (self.length_m / 2 - self.overhang_m, 0, self.height_m / 2)
+        return Box(world_from_vehicle @ centre, (self.length_m, self.width_m, self.height_m))
+
+
+@dataclass(frozen=True, slots=True)
+class Controls:
+    """What a driver asks for until the next step: acceleration m/s^2 (negative: brakes), steering rate rad/s of the
+    front wheels (positive: to the left)."""
+
+    acceleration_mps2: float = 0.0
+    steer_rate_radps: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Motion:
+    """Where the rear axle is in the plane, and how it moves: metres, radians (0 = along x, positive to the left)."""
+
+    x_m: float
+    y_m: float
+    heading_rad: float
+    speed_mps: float
+    steer_rad: float = 0.0
+
+    def after(self, controls: Controls, step_s: float, car: Car) -> Motion:
+        """The kinematic bicycle after a step: steering first, then a circle's arc of the way that even acceleration
+        makes. It does not roll backwards."""
+        limit = car.largest_steer_rad
+        steer = min(max(self.steer_rad + controls.steer_rate_radps * step_s, -limit), limit)
+        speed = min(max(self.speed_mps + controls.acceleration_mps2 * step_s, 0.0), car.largest_speed_mps)
+        way = (self.speed_mps + speed) / 2 * step_s
+        if speed == 0.0 and controls.acceleration_mps2 < 0:
+            way = self.speed_mps**2 / (-2 * controls.acceleration_mps2)
+        turn = way * math.tan(steer) / car.wheelbase_m
+        chord = way * (math.sin(turn / 2) / (turn / 2) if abs(turn) > 1e-9 else 1.0)
+        along = self.heading_rad + turn / 2
+        x, y = self.x_m + chord * math.cos(along), self.y_m + chord * math.sin(along)
+        return Motion(x, y, self.heading_rad + turn, speed, steer)
+
+
+class Road:
+    """The path that was recorded, by arc length; height and tilt of the ground beside it are those of the path.
+
+    Args:
+        poses: world-from-vehicle f64[N, 4, 4] along it. Beyond its ends the road goes straight on.
+
+    Raises:
+        InputError: the poses do not move by a metre.
+    """
+
+    def __init__(self, poses: Matrix) -> None:
+        chosen = [0]
+        for index in range(1, len(poses)):
+            if np.linalg.norm(poses[index, :2, 3] - poses[chosen[-1], :2, 3]) >= LEAST_STEP_M:
+                chosen.append(index)
+        self.poses = poses[chosen]
+        steps = np.linalg.norm(np.diff(self.poses[:, :2, 3], axis=0), axis=1)
+        self.stations_m = np.concatenate([[0.0], np.cumsum(steps)])
+        if self.length_m < 1:
+            what = "the recorded vehicle stands, so there is no road to drive on"
+            raise InputError(what, expected="at least 1 m of way", got=f"{self.length_m:.2f} m")
+
+    @property
+    def length_m(self) -> float:
+        """Length of the recorded path."""
+        return float(self.stations_m[-1])
+
+    def recorded(self, station_m: float) -> Matrix:
+        """Pose f64[4, 4] of the recorded vehicle at an arc length, straight on beyond the ends."""
+        inside = min(max(station_m, 0.0), self.length_m)
+        index = min(int(np.searchsorted(self.stations_m, inside, "right")) - 1, len(self.stations_m) - 2)
+        share = (inside - self.stations_m[index]) / (self.stations_m[index + 1] - self.stations_m[index])
+        pose = geometry.interpolate_pose(self.poses[index], self.poses[index + 1], float(share))
+        pose[:3, 3] += (station_m - inside) * pose[:3, 0]
+        return pose
+
+    def locate(self, xy: ArrayLike) -> tuple[float, float]:
+        """Arc length, and metres to the left of the path, of a place."""
+        point, path = np.asarray(xy, np.float64)[:2], self.poses[:, :2, 3]
+        along = np.diff(path, axis=0)
+        lengths = np.linalg.norm(along, axis=1)
+        unit = along / lengths[:, None]
+        reach = ((point - path[:-1]) * unit).sum(1)
+        low, high = np.zeros(len(reach)), lengths.copy()
+        low[0], high[-1] = -np.inf, np.inf
+        at = np.clip(reach, low, high)
+        foot = path[:-1] + at[:, None] * unit
+        nearest = int(np.linalg.norm(point - foot, axis=1).argmin())
+        off = point - foot[nearest]
+        side = unit[nearest, 0] * off[1] - unit[nearest, 1] * off[0]
+        return float(self.stations_m[nearest] + at[nearest]), float(math.copysign(np.linalg.norm(off), side))
+
+    def place(self, motion: Motion) -> Matrix:
+        """World-from-vehicle f64[4, 4] of a vehicle on the ground."""
+        station, _ = self.locate((motion.x_m, motion.y_m))
+        recorded = self.recorded(station)
+        up = recorded[:3, 2]
+        dx, dy = motion.x_m - recorded[0, 3], motion.y_m - recorded[1, 3]
+        z = recorded[2, 3] - (up[0] * dx + up[1] * dy) / up[2]
+        ahead = np.array([math.cos(motion.heading_rad), math.sin(motion.heading_rad), 0.0])
+        ahead[2] = -(up[0] * ahead[0] + up[1] * ahead[1]) / up[2]
+        ahead /= np.linalg.norm(ahead)
+        axes = np.stack([ahead, np.cross(up, ahead), up], 1)
+        return geometry.from_rotation_translation(axes, (motion.x_m, motion.y_m, z))
+
+    def route(self, pose: Matrix, shift_m: float = 0.0, length_m: float = 60.0, step_m: float = 2.0) -> Matrix:
+        """The road ahead of a vehicle f64[N, 3] in its frame, moved to the left."""
+        station, _ = self.locate(pose[:2, 3])
+        stations = station + np.arange(0.0, length_m, step_m)
+        points = [geometry.transform_points(self.recorded(s), np.array([[0.0, shift_m, 0.0]]))[0] for s in stations]
+        return geometry.transform_points(geometry.invert(pose), np.stack(points))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Box:
+    """A body: pose f64[4, 4] of its centre (x forward, z up), and length, width and height in metres."""
+
+    world_from_box: Matrix
+    size_m: tuple[float, ...]
+
+    def footprint(self) -> Matrix:
+        """Its four corners on the ground f64[4, 2], in turn."""
+        half = np.array(self.size_m) / 2
+        corners = np.array([[1, 1, 0], [-1, 1, 0], [-1, -1, 0], [1, -1, 0]]) * half
+        return geometry.transform_points(self.world_from_box, corners)[:, :2]
+
+    def meets(self, other: Box) -> bool:
+        """Whether two bodies overlap: as rectangles from above, by separating axes, and in height."""
+        apart = abs(self.world_from_box[2, 3] - other.world_from_box[2, 3])
+        if apart >= (self.size_m[2] + other.size_m[2]) / 2:
+            return False
+        ours, theirs = self.footprint(), other.footprint()
+        for corners in (ours, theirs):
+            for edge in (corners[1] - corners[0], corners[2] - corners[1]):
+                a, b = ours @ edge, theirs @ edge
+                if a.max() <= b.min() or b.max() <= a.min():
+                    return False
+        return True
+
+
+@dataclass(frozen=True, slots=True)
+class Following:
+    """The intelligent driver model (Treiber, Hennecke and Helbing 2000): metres and seconds. ``speed_mps``: wished
+    for."""
+
+    speed_mps: float
+    headway_s: float = 1.5
+    gap_m: float = 2.0
+    acceleration_mps2: float = 1.5
+    braking_mps2: float = 2.0
+
+    def acceleration(self, speed_mps: float, gap_m: float = math.inf, closing_mps: float = 0.0) -> float:
+        """Acceleration, at least -8 m/s^2, behind somebody at a gap that closes with a speed."""
+        free = 1 - (speed_mps / max(self.speed_mps, 0.1)) ** 4
+        hard = 2 * math.sqrt(self.acceleration_mps2 * self.braking_mps2)
+        wished = self.gap_m + max(0.0, speed_mps * self.headway_s + speed_mps * closing_mps / hard)
+        return max(self.acceleration_mps2 * (free - (wished / max(gap_m, 0.1)) ** 2), -8.0)
+
+
+@dataclass(slots=True)
+class Follower:
+    """A road user that keeps to its recorded path and follows whoever is ahead on it."""
+
+    road: Road
+    size_m: tuple[float, ...]
+    station_m: float
+    speed_mps: float
+    rule: Following
+
+    def box(self) -> Box:
+        """Where it is."""
+        return Box(self.road.recorded(self.station_m), self.size_m)
+
+    def ahead(self, others: Mapping[str, tuple[Box, float]]) -> tuple[float, float]:
+        """Gap to the nearest body ahead on the path, metres, and how fast it closes; none: infinite."""
+        gap, closing = math.inf, 0.0
+        for box, speed in others.values():
+            station, lateral = self.road.locate(box.world_from_box[:2, 3])
+            free = station - self.station_m - (self.size_m[0] + box.size_m[0]) / 2
+            beside = abs(lateral) > (self.size_m[1] + box.size_m[1]) / 2 + 0.3
+            if beside or station <= self.station_m or free >= gap:
+                continue
+            along = math.cos(geometry.yaw_of(box.world_from_box) - geometry.yaw_of(self.road.recorded(station)))
+            gap, closing = free, self.speed_mps - speed * along
+        return gap, closing
+
+    def move(self, others: Mapping[str, tuple[Box, float]], step_s: float) -> None:
+        """Drive for a step."""
+        speed = max(0.0, self.speed_mps + step_s * self.rule.acceleration(self.speed_mps, *self.ahead(others)))
+        self.station_m += (self.speed_mps + speed) / 2 * step_s
+        self.speed_mps = speed
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Actor:
+    """A recorded road user: times f64[K] in seconds, poses world-from-box f64[K, 4, 4], and size."""
+
+    times_s: NDArray[np.float64]
+    poses: Matrix
+    size_m: tuple[float, ...]
+
+    def box_at(self, time_s: float) -> Box | None:
+        """Where it was; None outside its track."""
+        pose = geometry.pose_at(self.times_s, self.poses, time_s)
+        return None if pose is None else Box(pose, self.size_m)
+
+    def speed_at(self, time_s: float) -> float:
+        """Its speed around a time, m/s."""
+        times = np.clip([time_s - 0.1, time_s + 0.1], self.times_s[0], self.times_s[-1])
+        if times[1] <= times[0]:
+            return 0.0
+        places = [np.array([np.interp(t, self.times_s, self.poses[:, axis, 3]) for axis in (0, 1)]) for t in times]
+        return float(np.linalg.norm(places[1] - places[0]) / (times[1] - times[0]))
+
+
+@dataclass(slots=True)
+class Drive:
+    """One drive: the vehicle, the other road users, and the clock.
+
+    Args:
+        road: the recorded path. actors: recorded road users by name. motion, time_s: where and when it begins.
+        traffic: ``log``: they move as recorded. idm: those that moved by more than a metre keep to their recorded path
+            and follow whoever is ahead, this vehicle included, by the intelligent driver model.
+        solid: f32[N, 3] centres of opaque Gaussians that stand still; empty: the surroundings stop nobody.
+        car: the vehicle.
+    """
+
+    road: Road
+    actors: Mapping[str, Actor]
+    motion: Motion
+    time_s: float
+    traffic: Traffic = "log"
+    solid: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
+    car: Car = field(default_factory=Car)
+    _followers: dict[str, Follower] = field(default_factory=dict, init=False)
+
+    @property
+    def pose(self) -> Matrix:
+        """World-from-vehicle f64[4, 4]."""
+        return self.road.place(self.motion)
+
+    @property
+    def progress_m(self) -> float:
+        """Arc length of the road at the vehicle."""
+        return self.road.locate((self.motion.x_m, self.motion.y_m))[0]
+
+    def boxes(self) -> dict[str, Box]:
+        """The other road users that are there."""
+        return dict(self._boxes())
+
+    def _boxes(self) -> Iterator[tuple[str, Box]]:
+        for name, actor in self.actors.items():
+            follower = self._follower(name, actor)
+            box = actor.box_at(self.time_s) if follower is None else follower.box()
+            if box is not None:
+                yield name, box
+
+    def _follower(self, name: str, actor: Actor) -> Follower | None:
+        """A road user that drives by itself, from when its track begins."""
+        moved = np.linalg.norm(actor.poses[-1, :2, 3] - actor.poses[0, :2, 3]) > 1
+        if self.traffic == "log" or not moved or not actor.times_s[0] <= self.time_s:
+            return None
+        if name not in self._followers and actor.box_at(self.time_s) is not None:
+            road, steps = Road(actor.poses), np.diff(actor.times_s)
+            speeds = np.linalg.norm(np.diff(actor.poses[:, :2, 3], axis=0), axis=1) / steps
+            pose = geometry.pose_at(actor.times_s, actor.poses, self.time_s)
+            station = road.locate(pose[:2, 3])[0] if pose is not None else 0.0
+            rule = Following(max(float(np.quantile(speeds, 0.9)), 1.0))
+            self._followers[name] = Follower(road, actor.size_m, station, actor.speed_at(self.time_s), rule)
+        return self._followers.get(name)
+
+    def step(self, controls: Controls, step_s: float) -> None:
+        """Everybody moves for a step.
+
+        Raises:
+            UsageError: controls that are no finite numbers.
+        """
+        if not (math.isfinite(controls.acceleration_mps2) and math.isfinite(controls.steer_rate_radps)):
+            raise UsageError("controls are not finite", where="action", got=str(controls))
+        now = self.boxes()
+        speeds = {name: self._speed(name) for name in now}
+        bodies = {name: (box, speeds[name]) for name, box in now.items()}
+        bodies[""] = (self.car.box(self.pose), self.motion.speed_mps)
+        for name, follower in self._followers.items():
+            follower.move({other: body for other, body in bodies.items() if other != name}, step_s)
+        self.motion = self.motion.after(controls, step_s, self.car)
+        self.time_s += step_s
+
+    def _speed(self, name: str) -> float:
+        follower = self._followers.get(name)
+        return self.actors[name].speed_at(self.time_s) if follower is None else follower.speed_mps
+
+    def collision(self) -> str:
+        """Name of the object that the vehicle overlaps, ``SURROUNDINGS``, or empty."""
+        body = self.car.box(self.pose)
+        for name, box in self._boxes():
+            if body.meets(box):
+                return name
+        return SURROUNDINGS if self._solid_inside() >= FEWEST_SOLID else ""
+
+    def _solid_inside(self) -> int:
+        if not len(self.solid):
+            return 0
+        x, y, z = geometry.transform_points(geometry.invert(self.pose), self.solid).T
+        rear = MARGIN_M - self.car.overhang_m
+        inside = (x > rear) & (x < rear + self.car.length_m - 2 * MARGIN_M)
+        inside &= (abs(y) < self.car.width_m / 2 - MARGIN_M) & (z > SOLID_ABOVE_M[0]) & (z < SOLID_ABOVE_M[1])
+        return int(inside.sum())
+
+
+def beginning(pose: Matrix, speed_mps: float, shift_m: float = 0.0) -> Motion:
+    """The motion of a vehicle that begins at a recorded pose, moved to the left."""
+    x, y, _ = geometry.transform_points(pose, np.array([[0.0, shift_m, 0.0]]))[0]
+    return Motion(float(x), float(y), geometry.yaw_of(pose), speed_mps)

@@ -1,0 +1,146 @@
+"""Drivers for a closed loop: what they see, and two that decide by it.
+
+A pilot gets a `Sight` at every step and answers with `Controls`. `RoutePilot` knows the road by its route and keeps its
+distance to whoever it sees ahead; `PlanPilot` drives along the plans of a policy.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry
+from mudg.base.palette import DYNAMIC_IDS
+from mudg.base.types import Camera
+from mudg.sim.drive import Car, Controls, Following, Matrix
+
+STEER_RATE: Final = 0.8
+"""Fastest turn of the front wheels, rad/s."""
+LEAST_LOOKAHEAD_M: Final = 6.0
+FEWEST_PIXELS: Final = 20
+"""Pixels of road users in its lane from which on a pilot believes in somebody ahead."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Sight:
+    """What a pilot sees at a step.
+
+    Args:
+        time_s, step_s: now, and how long its answer holds. speed_mps, steer_rad: of the vehicle.
+        route: the road ahead f64[N, 3] in the vehicle's frame, metres (x forward, y left, z up).
+        pose: world-from-vehicle f64[4, 4]. camera, vehicle_from_camera: of the pictures.
+        rgb: u8[H, W, 3]. depth: f32[H, W] camera z in metres, not finite where there is no surface. classes: u8[H, W].
+    """
+
+    time_s: float
+    step_s: float
+    speed_mps: float
+    steer_rad: float
+    route: Matrix
+    pose: Matrix
+    camera: Camera
+    vehicle_from_camera: Matrix
+    rgb: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    classes: NDArray[np.uint8]
+
+    def points(self, ids: tuple[int, ...]) -> Matrix:
+        """Surface points f64[N, 3] of some classes in the vehicle's frame."""
+        rows, columns = np.nonzero(np.isin(self.classes, ids) & np.isfinite(self.depth) & (self.depth > 0))
+        x, y = geometry.pinhole_ray(self.camera.intrinsics, columns + 0.5, rows + 0.5)
+        z = self.depth[rows, columns].astype(np.float64)
+        return geometry.transform_points(self.vehicle_from_camera, np.stack([x * z, y * z, z], 1))
+
+
+class Pilot(Protocol):
+    """Who drives."""
+
+    def drive(self, sight: Sight) -> Controls:
+        """What to do until the next step."""
+        ...
+
+
+def pursue(target: Matrix, sight: Sight, car: Car) -> float:
+    """Steering rate of pure pursuit (Coulter 1992): the circle through the rear axle and a target f64[2] ahead."""
+    x, y = target
+    steer = math.atan(car.wheelbase_m * 2 * y / max(x * x + y * y, 1.0))
+    steer = min(max(steer, -car.largest_steer_rad), car.largest_steer_rad)
+    return min(max((steer - sight.steer_rad) / sight.step_s, -STEER_RATE), STEER_RATE)
+
+
+@dataclass(slots=True)
+class RoutePilot:
+    """Follows the route by pure pursuit, and keeps its distance to what it sees ahead by the intelligent driver model.
+
+    Args:
+        rule: how fast, and how near. shift_m: to drive this far to the left of the route. car: the vehicle.
+    """
+
+    rule: Following
+    shift_m: float = 0.0
+    car: Car = field(default_factory=Car)
+    _gap_m: float = math.inf
+
+    def drive(self, sight: Sight) -> Controls:
+        """See ``Pilot``."""
+        return Controls(self.accelerate(sight), pursue(self.target(sight), sight, self.car))
+
+    def lookahead_m(self, sight: Sight) -> float:
+        """How far ahead it aims."""
+        return max(LEAST_LOOKAHEAD_M, sight.speed_mps)
+
+    def target(self, sight: Sight) -> Matrix:
+        """Where it aims f64[2]."""
+        arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(sight.route[:, :2], axis=0), axis=1))])
+        reach = self.lookahead_m(sight) + np.array([0.0, 1.0])
+        aim, beyond = np.stack([np.interp(reach, arc, sight.route[:, axis]) for axis in (0, 1)], 1)
+        along = (beyond - aim) / max(float(np.linalg.norm(beyond - aim)), 1e-9)
+        return aim + self.shift_m * np.array([-along[1], along[0]])
+
+    def accelerate(self, sight: Sight) -> float:
+        """Acceleration by the gap that it sees, and by how that changed."""
+        gap, before = self.gap_m(sight), self._gap_m
+        closing = (before - gap) / sight.step_s if math.isfinite(before) and math.isfinite(gap) else 0.0
+        self._gap_m = gap
+        return self.rule.acceleration(sight.speed_mps, gap, min(max(closing, -10.0), 20.0))
+
+    def gap_m(self, sight: Sight) -> float:
+        """Metres from its bumper to road users in its way; infinite where it sees none."""
+        points = sight.points(DYNAMIC_IDS)
+        target, bumper = self.target(sight), self.car.length_m - self.car.overhang_m
+        bend = 2 * target[1] / max(float(target @ target), 1.0)
+        way = points[:, 1] - bend * points[:, 0] ** 2 / 2
+        ahead = points[(points[:, 0] > bumper) & (abs(way) < self.car.width_m / 2 + 0.2) & (points[:, 2] > 0.2)]
+        if len(ahead) < FEWEST_PIXELS:
+            return math.inf
+        return max(float(np.quantile(ahead[:, 0], 0.02)) - bumper, 0.1)
+
+
+@dataclass(slots=True)
+class PlanPilot:
+    """Drives along the plans of a policy.
+
+    Args:
+        policy: what answers a `Sight` with a plan f64[N, 4]: seconds from now, x and y in metres and heading in radians
+            in the vehicle's frame.
+    """
+
+    policy: Any
+    car: Car = field(default_factory=Car)
+
+    def drive(self, sight: Sight) -> Controls:
+        """See ``Pilot``."""
+        times, x, y, _ = self.policy.plan(sight).T
+        if not len(times):
+            return Controls(-3.0, 0.0)
+        reach = np.hypot(x, y)
+        index = min(int(np.searchsorted(reach, max(LEAST_LOOKAHEAD_M, sight.speed_mps))), len(reach) - 1)
+        horizon = min(1.0, float(times[-1]))
+        way = float(np.interp(horizon, np.concatenate([[0.0], times]), np.concatenate([[0.0], reach])))
+        acceleration = 2 * (way - sight.speed_mps * horizon) / horizon**2
+        target = np.array([x[index], y[index]])
+        return Controls(min(max(acceleration, -6.0), 3.0), pursue(target, sight, self.car))
