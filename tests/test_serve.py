@@ -16,9 +16,12 @@ from PIL import Image
 from test_edit import toy
 
 from mudg.base import geometry
-from mudg.base.errors import ResourceError, UsageError
-from mudg.base.types import Scene
+from mudg.base.errors import InputError, ResourceError, UsageError
+from mudg.base.types import Camera, Scene
 from mudg.sim import CameraRequest, Instant, Pinhole, Session, wire
+from mudg.sim.drive import Drive, Motion, Road
+from mudg.sim.driver import Policy
+from mudg.sim.pilots import PlanPilot, Sight
 from mudg.sim.server import serving
 from mudg.sim.settings import ServeConfig
 
@@ -269,3 +272,41 @@ def test_a_port_that_is_taken_is_said(address: str, session: Session) -> None:
     taken = ServeConfig(port=int(address.rpartition(":")[2]))
     with pytest.raises(ResourceError, match="cannot listen"), serving(session, NAME, taken):
         pass
+
+
+# -- policies --------------------------------------------------------------------------------------
+
+
+def test_a_public_policy_drives_fifty_steps_on_pictures_of_our_server(address: str, client_messages: Any) -> None:
+    """carla-driver-interface's route follower, over gRPC in both directions; it follows the route to within 0.2 m."""
+    server = pytest.importorskip("carla_driver_interface.server", reason="no public policy is installed")
+    policies = pytest.importorskip("carla_driver_interface.policies.route_follower")
+    camera = Camera("front", 64, 48, 50.0, 50.0, 32.0, 24.0)
+    mount = geometry.yaw_matrix(0.0, (1.4, 0.0, 1.5)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
+    road = Road(np.stack([geometry.yaw_matrix(0.0, (x, 0.0, 0.0)) for x in np.arange(-5.0, 80.0)]))
+    drive = Drive(road, {}, Motion(0.0, 1.0, 0.1, 4.0), 0.5)
+    follower = policies.RouteFollowerPolicy(cruise_speed_mps=8.0)
+    pictures = []
+    with server.serving(follower) as port, Policy(f"localhost:{port}", "front", camera, mount, NAME) as policy:
+        assert "carla-driver-interface" in policy.version
+        pilot = PlanPilot(policy)
+        for _ in range(50):
+            request = picture_request(client_messages)
+            for end in ("start_pose", "end_pose"):
+                write_pose(getattr(request.sensor_pose, end), drive.pose @ mount)
+            reply = call(address, "render_rgb", request, client_messages.RGBRenderReturn)
+            rgb = np.asarray(Image.open(io.BytesIO(reply.image_bytes)))
+            pictures.append(rgb)
+            motion, blank = drive.motion, np.full(rgb.shape[:2], np.inf, np.float32)
+            now = (drive.time_s, 0.1, motion.speed_mps, motion.steer_rad, road.route(drive.pose), drive.pose)
+            drive.step(pilot.drive(Sight(*now, camera, mount, rgb, blank, np.zeros(rgb.shape[:2], np.uint8))), 0.1)
+    assert len(pictures) == 50
+    assert np.abs(pictures[0].astype(int) - pictures[-1]).max() > 20
+    assert abs(drive.motion.y_m) < 0.2
+    assert drive.motion.speed_mps == pytest.approx(8.0, abs=0.5)
+
+
+def test_a_policy_that_is_not_there_is_named() -> None:
+    camera = Camera("front", 64, 48, 50.0, 50.0, 32.0, 24.0)
+    with pytest.raises(InputError, match="did not answer"):
+        Policy("127.0.0.1:9", "front", camera, np.eye(4))

@@ -8,6 +8,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mudg.sim.cockpit import Cockpit
+    from mudg.sim.drive import Car, Controls, Drive
+    from mudg.sim.env import Env
     from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest
     from mudg.sim.optics import Fisheye, FTheta, Pinhole
     from mudg.sim.session import CameraReply, CameraRequest, Instant, Session, Trust
@@ -16,6 +19,11 @@ __all__ = [
     "BeamTable",
     "CameraReply",
     "CameraRequest",
+    "Car",
+    "Cockpit",
+    "Controls",
+    "Drive",
+    "Env",
     "FTheta",
     "Fisheye",
     "LidarReply",
@@ -30,6 +38,10 @@ __all__ = [
 def __getattr__(name: str) -> Any:
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    from mudg.sim import lidar, optics, session
+    if name == "Env":
+        from mudg.sim import env
 
-    return next(vars(home)[name] for home in (session, lidar, optics) if name in vars(home))
+        return env.Env
+    from mudg.sim import cockpit, drive, lidar, optics, session
+
+    return next(vars(home)[name] for home in (session, lidar, optics, drive, cockpit) if name in vars(home))

@@ -25,13 +25,14 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from mudg.base import geometry, log
-from mudg.base.errors import MudgError, ResourceError, UsageError
+from mudg.base.errors import MudgError, ResourceError
 from mudg.base.versions import version
 from mudg.sim import wire
 from mudg.sim.lidar import BeamTable, LidarRequest
 from mudg.sim.optics import Fisheye, FTheta, Optics, Pinhole
 from mudg.sim.session import CameraRequest, Instant, Session
 from mudg.sim.settings import ServeConfig
+from mudg.sim.wire import matrix_of, pose_of
 from mudg.viewer.server import is_loopback, token_for
 
 THREADS: Final = 16
@@ -110,7 +111,7 @@ class Renderer:
             if ego is None:
                 continue
             one = made.available_cameras.add(logical_id=name)
-            one.rig_to_camera.CopyFrom(self._pose(geometry.invert(ego) @ view.world_from_cam))
+            one.rig_to_camera.CopyFrom(pose_of(geometry.invert(ego) @ view.world_from_cam))
             spec = one.intrinsics
             spec.logical_id, spec.resolution_h, spec.resolution_w, spec.shutter_type = (
                 name,
@@ -129,7 +130,7 @@ class Renderer:
         if scene is not None:
             poses = made.available_trajectories.add().trajectory.poses
             for time_s, matrix in zip(scene.ego.times_s, scene.ego.world_from_ego, strict=True):
-                poses.add(pose=self._pose(matrix), timestamp_us=max(0, round(float(time_s) * 1e6)))
+                poses.add(pose=pose_of(matrix), timestamp_us=max(0, round(float(time_s) * 1e6)))
         return made
 
     # -- what is drawn -----------------------------------------------------------------------------
@@ -194,11 +195,6 @@ class Renderer:
             what = f"scene_id: there is no such scene; expected {self.name!r}, got {request.scene_id[:200]!r}"
             raise Refused("NOT_FOUND", what)
 
-    def _pose(self, matrix: NDArray[np.float64]) -> Any:
-        w, x, y, z = geometry.quaternion_from_matrix(matrix)
-        place = self.types.Vec3(x=matrix[0, 3], y=matrix[1, 3], z=matrix[2, 3])
-        return self.types.Pose(vec=place, quat=self.types.Quat(w=w, x=x, y=y, z=z))
-
     def _instant(self, request: Any, end: str) -> Instant:
         """Sensor and objects at the start or the end of a request."""
         micros, pair = getattr(request, f"frame_{end}_us"), request.sensor_pose
@@ -250,20 +246,6 @@ class Renderer:
                 linear if lens.HasField("linear_cde") else (1.0, 0.0, 0.0),
             )
         raise Refused("INVALID_ARGUMENT", "camera_intrinsics: expected a pinhole, fisheye or f-theta lens")
-
-
-def matrix_of(pose: Any, where: str) -> NDArray[np.float64]:
-    """f64[4, 4] of a pose on the wire; float32 quaternions are brought to length 1.
-
-    Raises:
-        UsageError: not finite, or a quaternion far from length 1.
-    """
-    quaternion = np.array([pose.quat.w, pose.quat.x, pose.quat.y, pose.quat.z])
-    place, length = np.array([pose.vec.x, pose.vec.y, pose.vec.z]), float(np.linalg.norm(quaternion))
-    if not (np.isfinite(place).all() and 0.99 < length < 1.01):
-        got = f"place {place.tolist()}, quaternion {quaternion.tolist()}"
-        raise UsageError("a pose is not rigid", where=where, expected="finite numbers, a unit quaternion", got=got)
-    return geometry.from_rotation_translation(geometry.matrix_from_quaternion(quaternion / length), place)
 
 
 def encoded(rgb: NDArray[np.uint8], image_format: int, quality: float) -> bytes:

@@ -1,6 +1,7 @@
-"""Messages of AlpaSim's SensorsimService on the wire: names, numbers and types of their fields, as the public interface
-has them (alpasim_grpc v0, NVIDIA, Apache-2.0). Only these facts are taken; the messages are built from the table below
-when the service is first used, in a pool of their own, so that a client's generated classes may live beside them.
+"""Messages of AlpaSim's SensorsimService and EgodriverService on the wire: names, numbers and types of their fields, as
+the public interface has them (alpasim_grpc v0, NVIDIA, Apache-2.0). Only these facts are taken; the messages are built
+from the table below when a service is first used, in a pool of their own, so that a client's generated classes may live
+beside them.
 """
 
 from __future__ import annotations
@@ -10,7 +11,11 @@ import importlib
 from types import SimpleNamespace
 from typing import Any, Final
 
-from mudg.base.errors import ResourceError
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry
+from mudg.base.errors import ResourceError, UsageError
 
 SERVICES: Final = (
     "nre.grpc.protos.sensorsim.SensorsimService",
@@ -18,6 +23,7 @@ SERVICES: Final = (
     "sensorsim.SensorsimService",
 )
 """Full names under which simulators of different years call the same service."""
+DRIVER: Final = "egodriver.EgodriverService"
 HEALTH: Final = "grpc.health.v1.Health"
 PNG, JPEG, RGB_PLANAR = 1, 2, 4
 SHUTTERS: Final = {
@@ -78,6 +84,20 @@ MESSAGES: Final = {
     "BatchRGBRenderReturn": "*BatchReply items 1",
     "AggregatedRenderRequest": "*RGBRenderRequest rgb_requests 1, *LidarRenderRequest lidar_requests 2",
     "AggregatedRenderReturn": "*RGBRenderReturn rgb_returns 1, *LidarRenderReturn lidar_returns 2, bytes driver_data 3",
+    "DynamicState": "Vec3 angular_velocity 1, Vec3 linear_velocity 2, Vec3 linear_acceleration 3",
+    "VehicleDefinition": "*AvailableCamera available_cameras 3",
+    "RolloutSpec": "VehicleDefinition vehicle 1",
+    "DriveScene": "string scene_id 1",
+    "DriveSessionRequest": "string session_uuid 1, fixed64 random_seed 2, DriveScene debug_info 4, "
+    "RolloutSpec rollout_spec 5",
+    "DriveSessionCloseRequest": "string session_uuid 1",
+    "CameraImage": "fixed64 frame_start_us 2, fixed64 frame_end_us 3, bytes image_bytes 4, string logical_id 5",
+    "RolloutCameraImage": "string session_uuid 1, CameraImage camera_image 3",
+    "RolloutEgoTrajectory": "string session_uuid 1, Trajectory trajectory 3, *DynamicState dynamic_states 5",
+    "Route": "*Vec3 waypoints 1, fixed64 timestamp_us 2",
+    "RouteRequest": "string session_uuid 1, Route route 3",
+    "DriveRequest": "string session_uuid 1, fixed64 time_now_us 3, fixed64 time_query_us 4",
+    "DriveResponse": "Trajectory trajectory 2, bool terminate_session 4",
     "HealthRequest": "string service 1",
     "HealthReply": "int32 status 1",
 }
@@ -93,6 +113,16 @@ METHODS: Final = {
     "get_available_cameras": ("SceneRequest", "AvailableCamerasReturn"),
     "get_available_trajectories": ("SceneRequest", "AvailableTrajectoriesReturn"),
     "get_available_ego_masks": ("Empty", "AvailableEgoMasksReturn"),
+}
+
+DRIVER_METHODS: Final = {
+    "get_version": ("Empty", "VersionId"),
+    "start_session": ("DriveSessionRequest", "Empty"),
+    "close_session": ("DriveSessionCloseRequest", "Empty"),
+    "submit_image_observation": ("RolloutCameraImage", "Empty"),
+    "submit_egomotion_observation": ("RolloutEgoTrajectory", "Empty"),
+    "submit_route": ("RouteRequest", "Empty"),
+    "drive": ("DriveRequest", "DriveResponse"),
 }
 
 
@@ -131,3 +161,24 @@ def messages() -> SimpleNamespace:
     pool.Add(file)
     find = pool.FindMessageTypeByName
     return SimpleNamespace(**{n: message_factory.GetMessageClass(find(f"mudg.sensorsim.{n}")) for n in MESSAGES})
+
+
+def pose_of(matrix: NDArray[np.float64]) -> Any:
+    """The message ``Pose`` of a rigid f64[4, 4]."""
+    types, (w, x, y, z) = messages(), geometry.quaternion_from_matrix(matrix)
+    place = types.Vec3(x=matrix[0, 3], y=matrix[1, 3], z=matrix[2, 3])
+    return types.Pose(vec=place, quat=types.Quat(w=w, x=x, y=y, z=z))
+
+
+def matrix_of(pose: Any, where: str) -> NDArray[np.float64]:
+    """f64[4, 4] of a pose on the wire; float32 quaternions are brought to length 1.
+
+    Raises:
+        UsageError: not finite, or a quaternion far from length 1.
+    """
+    quaternion = np.array([pose.quat.w, pose.quat.x, pose.quat.y, pose.quat.z])
+    place, length = np.array([pose.vec.x, pose.vec.y, pose.vec.z]), float(np.linalg.norm(quaternion))
+    if not (np.isfinite(place).all() and 0.99 < length < 1.01):
+        got = f"place {place.tolist()}, quaternion {quaternion.tolist()}"
+        raise UsageError("a pose is not rigid", where=where, expected="finite numbers, a unit quaternion", got=got)
+    return geometry.from_rotation_translation(geometry.matrix_from_quaternion(quaternion / length), place)

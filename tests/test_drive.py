@@ -1,0 +1,312 @@
+"""A vehicle that drives in a scene: kinematics, roads, collisions and followers against independent computations."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from toy_fitted import toy_fitted, write_toy_run
+
+from mudg.base import geometry
+from mudg.base.errors import InputError, UsageError
+from mudg.base.types import Camera
+from mudg.sim.cockpit import Cockpit
+from mudg.sim.drive import SURROUNDINGS, Actor, Box, Car, Controls, Drive, Following, Motion, Road
+from mudg.sim.pilots import PlanPilot, RoutePilot, Sight
+from mudg.sim.session import Session
+
+CAR = Car()
+
+
+def arc(radius_m: float = 30.0, slope: float = 0.0) -> Road:
+    """A left turn about (0, radius), on ground that rises with y."""
+    poses = []
+    for angle in np.linspace(0, 1.5, 60):
+        pose = geometry.yaw_matrix(angle, (radius_m * math.sin(angle), radius_m * (1 - math.cos(angle)), 0.0))
+        tilt = math.atan(slope)
+        lean = np.eye(4)
+        lean[:3, :3] = [[1, 0, 0], [0, math.cos(tilt), -math.sin(tilt)], [0, math.sin(tilt), math.cos(tilt)]]
+        pose = lean @ pose
+        poses.append(pose)
+    return Road(np.stack(poses))
+
+
+def straight(length_m: float = 60.0) -> Road:
+    return Road(np.stack([geometry.yaw_matrix(0.0, (x, 0.0, 0.0)) for x in np.arange(0.0, length_m, 1.0)]))
+
+
+def parked(x: float, y: float = 0.0) -> Actor:
+    pose = geometry.yaw_matrix(0.0, (x, y, 0.8))
+    return Actor(np.array([0.0, 20.0]), np.stack([pose, pose]), (4.0, 1.8, 1.6))
+
+
+def driving(x: float, speed: float, until_s: float = 10.0) -> Actor:
+    times = np.linspace(0, until_s, 50)
+    return Actor(times, np.stack([geometry.yaw_matrix(0.0, (x + speed * t, 0.0, 0.8)) for t in times]), (4.0, 1.8, 1.6))
+
+
+# -- kinematics ------------------------------------------------------------------------------------
+
+
+def test_a_step_of_the_bicycle_is_the_sum_of_many_small_ones() -> None:
+    start = Motion(1.0, 2.0, 0.3, 7.0, 0.1)
+    controls = Controls(1.5, 0.0)
+    after = start.after(controls, 0.4, CAR)
+    x, y, heading, speed, small = start.x_m, start.y_m, start.heading_rad, start.speed_mps, 1e-5
+    for _ in range(40_000):
+        x += speed * math.cos(heading) * small
+        y += speed * math.sin(heading) * small
+        heading += speed * math.tan(0.1) / CAR.wheelbase_m * small
+        speed += 1.5 * small
+    assert (after.x_m, after.y_m, after.heading_rad, after.speed_mps) == pytest.approx((x, y, heading, speed), abs=1e-4)
+
+
+def test_brakes_stop_where_energy_says_and_never_reverse() -> None:
+    motion, way = Motion(0.0, 0.0, 0.0, 9.0), 9.0**2 / (2 * 4)
+    for _ in range(40):
+        motion = motion.after(Controls(-4.0, 0.0), 0.1, CAR)
+    assert motion.speed_mps == 0
+    assert motion.x_m == pytest.approx(way, abs=1e-9)
+
+
+def test_steering_stays_within_its_limit() -> None:
+    motion = Motion(0.0, 0.0, 0.0, 1.0)
+    for _ in range(100):
+        motion = motion.after(Controls(0.0, 0.8), 0.1, CAR)
+    assert motion.steer_rad == CAR.largest_steer_rad
+
+
+# -- roads -----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("station, shift", [(3.0, 0.0), (20.0, 2.5), (31.0, -4.0), (-5.0, 1.0), (60.0, -1.0)])
+def test_a_place_beside_a_road_is_found_again(station: float, shift: float) -> None:
+    road = arc()
+    pose = road.recorded(station)
+    x, y, _ = geometry.transform_points(pose, np.array([[0.0, shift, 0.0]]))[0]
+    assert road.locate((x, y)) == pytest.approx((station, shift), abs=0.05 if 0 < station < road.length_m else 0.25)
+
+
+def test_a_vehicle_beside_the_path_stands_on_the_slope() -> None:
+    road = arc(slope=0.1)
+    recorded = road.recorded(20.0)
+    x, y, z = geometry.transform_points(recorded, np.array([[0.0, 3.0, 0.0]]))[0]
+    pose = road.place(Motion(float(x), float(y), 0.9, 5.0))
+    assert geometry.rigid_problem(pose) is None
+    assert pose[2, 3] == pytest.approx(0.1 * pose[1, 3] / math.hypot(1, 0.0), abs=0.02)
+    assert pose[:3, 2] == pytest.approx(recorded[:3, 2])
+    assert z == pytest.approx(pose[2, 3], abs=0.02)
+
+
+def test_a_vehicle_that_never_moved_tells_no_road() -> None:
+    with pytest.raises(InputError, match="stands"):
+        Road(np.tile(np.eye(4), (5, 1, 1)))
+
+
+# -- bodies ----------------------------------------------------------------------------------------
+
+
+def test_bodies_meet_exactly_where_points_of_one_lie_in_the_other() -> None:
+    rng = np.random.default_rng(4)
+    grid = np.stack(np.meshgrid(*[np.linspace(-0.5, 0.5, 61)] * 2), -1).reshape(-1, 2)
+    agreed = {True: 0, False: 0}
+    for _ in range(200):
+        sizes = [tuple(rng.uniform(1, 5, 2)) + (1.5,) for _ in range(2)]
+        poses = [geometry.yaw_matrix(rng.uniform(-3, 3), (*rng.uniform(-3, 3, 2), 0.7)) for _ in range(2)]
+        a, b = (Box(pose, size) for pose, size in zip(poses, sizes, strict=True))
+        points = np.column_stack([grid * sizes[0][:2], np.zeros(len(grid))])
+        inside = geometry.transform_points(geometry.invert(poses[1]) @ poses[0], points)[:, :2]
+        depth = (np.array(sizes[1][:2]) / 2 - np.abs(inside)).min(1).max()
+        if abs(depth) > 0.15:
+            assert a.meets(b) == b.meets(a) == (depth > 0)
+            agreed[bool(depth > 0)] += 1
+    assert min(agreed.values()) > 30
+
+
+def test_a_bridge_is_no_collision() -> None:
+    road = CAR.box(np.eye(4))
+    assert road.meets(Box(geometry.yaw_matrix(0.0, (1.0, 0.0, 1.0)), (4.0, 2.0, 1.0)))
+    assert not road.meets(Box(geometry.yaw_matrix(0.0, (1.0, 0.0, 6.0)), (4.0, 2.0, 1.0)))
+
+
+def test_solid_gaussians_stop_a_vehicle_and_those_of_the_road_do_not() -> None:
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.uniform(11.9, 12.1, 900), rng.uniform(-3, 3, 900), rng.uniform(0, 2, 900)])
+    ground = np.column_stack([rng.uniform(0, 40, 9000), rng.uniform(-3, 3, 9000), rng.normal(0, 0.05, 9000)])
+    drive = Drive(straight(), {}, Motion(0.0, 0.0, 0.0, 8.0), 0.0, solid=np.concatenate([wall, ground]).astype("f4"))
+    hits = []
+    for _ in range(15):
+        drive.step(Controls(), 0.1)
+        hits.append((drive.motion.x_m, drive.collision()))
+    first = next(x for x, hit in hits if hit)
+    bumper = CAR.length_m - CAR.overhang_m
+    assert dict(hits)[first] == SURROUNDINGS
+    assert 11.9 < first + bumper < 13.0
+
+
+# -- road users ------------------------------------------------------------------------------------
+
+
+def test_the_driver_model_rests_where_its_paper_says() -> None:
+    rule, speed = Following(15.0), 10.0
+    rest = (rule.gap_m + speed * rule.headway_s) / math.sqrt(1 - (speed / 15.0) ** 4)
+    assert rule.acceleration(speed, rest, 0.0) == pytest.approx(0.0, abs=1e-9)
+    assert rule.acceleration(15.0) == pytest.approx(0.0)
+    assert rule.acceleration(speed, rest / 2, 0.0) < 0 < rule.acceleration(speed, rest * 2, 0.0)
+
+
+def test_a_follower_stops_behind_a_vehicle_that_stops_where_a_recorded_one_drives_through_it() -> None:
+    met = {}
+    for traffic in ("log", "idm"):
+        drive = Drive(straight(90.0), {"behind": driving(-25.0, 8.0)}, Motion(0.0, 0.0, 0.0, 0.0), 0.0, traffic)
+        for _ in range(90):
+            drive.step(Controls(), 0.1)
+            met[traffic] = met.get(traffic) or drive.collision()
+        rest = drive.boxes()["behind"].world_from_box[0, 3]
+    assert met == {"log": "behind", "idm": ""}
+    assert -8.0 < rest + 2.0 - (0.0 - CAR.overhang_m) < 0.0
+
+
+def test_an_even_follower_goes_where_it_went() -> None:
+    drive = Drive(straight(), {"ahead": driving(12.0, 6.0)}, Motion(0.0, 40.0, 0.0, 0.0), 0.0, "idm")
+    for _ in range(40):
+        drive.step(Controls(), 0.1)
+    assert drive.boxes()["ahead"].world_from_box[0, 3] == pytest.approx(12 + 6 * 4.0, abs=1.0)
+
+
+def test_controls_that_are_no_numbers_are_refused() -> None:
+    drive = Drive(straight(), {}, Motion(0.0, 0.0, 0.0, 1.0), 0.0)
+    with pytest.raises(UsageError, match="not finite"):
+        drive.step(Controls(math.nan, 0.0), 0.1)
+
+
+# -- pilots ----------------------------------------------------------------------------------------
+
+CAMERA = Camera("front", 96, 64, 60.0, 60.0, 48.0, 32.0)
+MOUNT = geometry.yaw_matrix(0.0, (1.4, 0.0, 1.5)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
+
+
+def sight_of(drive: Drive, obstacle_m: float = math.inf) -> Sight:
+    """Empty road; a wall of a car ahead of the camera at a depth."""
+    depth, classes = np.full((64, 96), np.inf, np.float32), np.zeros((64, 96), np.uint8)
+    if math.isfinite(obstacle_m):
+        depth[20:40, 40:56], classes[20:40, 40:56] = obstacle_m, 13
+    motion, pose = drive.motion, drive.pose
+    now = (drive.time_s, 0.1, motion.speed_mps, motion.steer_rad, drive.road.route(pose, step_m=1.0), pose)
+    return Sight(*now, CAMERA, MOUNT, np.zeros((64, 96, 3), np.uint8), depth, classes)
+
+
+@pytest.mark.parametrize("shift", [0.0, 2.0, -3.0])
+def test_a_pilot_comes_to_its_line_on_a_bend_and_keeps_its_speed(shift: float) -> None:
+    drive = Drive(arc(60.0), {}, Motion(0.0, 0.0, 0.0, 7.0), 0.0)
+    pilot = RoutePilot(Following(7.0), shift)
+    for _ in range(90):
+        drive.step(pilot.drive(sight_of(drive)), 0.1)
+    assert drive.road.locate((drive.motion.x_m, drive.motion.y_m))[1] == pytest.approx(shift, abs=0.25)
+    assert drive.motion.speed_mps == pytest.approx(7.0, abs=0.2)
+
+
+def test_a_pilot_sees_how_far_ahead_somebody_is_and_brakes() -> None:
+    drive = Drive(straight(), {}, Motion(0.0, 0.0, 0.0, 10.0), 0.0)
+    pilot = RoutePilot(Following(10.0))
+    assert pilot.gap_m(sight_of(drive)) == math.inf
+    gap = 12.0 + 1.4 - (CAR.length_m - CAR.overhang_m)
+    assert pilot.gap_m(sight_of(drive, 12.0)) == pytest.approx(gap, abs=0.01)
+    assert pilot.drive(sight_of(drive, 12.0)).acceleration_mps2 < -2
+
+
+class Planned:
+    """Plans to go on at a speed along a line to the left."""
+
+    def plan(self, sight: Sight) -> np.ndarray:
+        times = np.arange(1, 41) * 0.1
+        return np.column_stack([times, 6.0 * times, 0 * times, 0 * times])
+
+
+def test_plans_are_driven_along() -> None:
+    drive = Drive(straight(), {}, Motion(0.0, 0.0, 0.0, 3.0), 0.0)
+    pilot = PlanPilot(Planned())
+    for _ in range(60):
+        drive.step(pilot.drive(sight_of(drive)), 0.1)
+    assert drive.motion.speed_mps == pytest.approx(6.0, abs=0.1)
+    assert abs(drive.motion.y_m) < 1e-6
+
+
+# -- in a reconstruction ---------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    scene, fit, _, _ = write_toy_run(tmp_path_factory.mktemp("toy"))
+    return scene, fit
+
+
+def test_the_vehicle_begins_where_it_was_recorded(run: tuple[Path, Path]) -> None:
+    scene, fit = run
+    cockpit = Cockpit(Session(fit, scene=scene), width_px=80, layers=("rgb", "depth"))
+    drive = cockpit.drive()
+    ego = cockpit.ego.pose_at(drive.time_s)
+    assert ego is not None
+    assert drive.pose == pytest.approx(ego, abs=1e-6)
+    (reply,) = cockpit.see(drive).values()
+    view = cockpit.session.scene.frames[0].view
+    assert reply.layers["rgb"].shape == (48, 80, 3)
+    assert drive.pose @ cockpit.mounts[view.camera.name] == pytest.approx(view.world_from_cam, abs=1e-6)
+
+
+def test_refusals_of_a_cockpit(run: tuple[Path, Path]) -> None:
+    scene, fit = run
+    with pytest.raises(InputError, match="needs the log"):
+        Cockpit(Session(toy_fitted()))
+    session = Session(fit, scene=scene)
+    with pytest.raises(UsageError, match="no such camera"):
+        Cockpit(session, "rear")
+    with pytest.raises(UsageError, match="outside the log"):
+        Cockpit(session).drive(time_s=1e4)
+
+
+def test_the_environment_keeps_gymnasiums_contract(run: tuple[Path, Path]) -> None:
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed (extra sim)")
+    from gymnasium.utils.env_checker import check_env
+
+    from mudg.sim.env import LIMITS, Env
+
+    scene, fit = run
+    env = Env(fit, scene=scene, width_px=48, layers=tuple(LIMITS), step_s=0.2)
+    with pytest.warns(UserWarning, match="Box|spec"):  # without a registered name it cannot try other ways to render
+        check_env(env)
+    with pytest.raises(UsageError, match="two finite numbers"):
+        env.step([math.nan, 0.0])
+    with pytest.raises(UsageError, match="no such option"):
+        env.reset(options={"speed": 3})
+    with pytest.raises(UsageError, match="no such layer"):
+        Env(fit, scene=scene, layers=("motion",))
+    with pytest.raises(UsageError, match="positive time"):
+        Env(fit, scene=scene, step_s=0.0)
+    with pytest.raises(UsageError, match="no drive has begun"):
+        Env(fit, scene=scene).step([0.0, 0.0])
+
+
+def test_equal_drives_are_equal_and_rewards_add_up_to_the_way(run: tuple[Path, Path]) -> None:
+    pytest.importorskip("gymnasium", reason="gymnasium is not installed (extra sim)")
+    from mudg.sim.env import Env
+
+    scene, fit = run
+    drives = []
+    for _ in range(2):
+        env = Env(fit, scene=scene, width_px=48, layers=("rgb",), step_s=0.1)
+        _, info = env.reset(options={"shift_m": 0.5})
+        begin, total, pictures, over = info["progress_m"], 0.0, [], False
+        assert info["shift_m"] == pytest.approx(0.5, abs=1e-6)
+        while not over:
+            seen, reward, lost, over, info = env.step([0.0, 0.0])
+            total += reward
+            pictures.append(seen["front"]["rgb"].tobytes())
+            over = over or lost
+        assert total == pytest.approx(info["progress_m"] - begin)
+        assert info["time_s"] <= env.cockpit.session.time_range_s[1] + 1e-6
+        drives.append(pictures)
+    assert len(drives[0]) > 3
+    assert drives[0] == drives[1]
