@@ -12,8 +12,9 @@ from toy_fitted import toy_fitted, write_toy_run
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera
+from mudg.scene.road import Road
 from mudg.sim.cockpit import Cockpit
-from mudg.sim.drive import SURROUNDINGS, Actor, Box, Car, Controls, Drive, Following, Motion, Road
+from mudg.sim.drive import SURROUNDINGS, Actor, Box, Car, Controls, Drive, Following, Motion
 from mudg.sim.pilots import PlanPilot, RoutePilot, Sight
 from mudg.sim.session import Session
 
@@ -93,7 +94,7 @@ def test_a_vehicle_beside_the_path_stands_on_the_slope() -> None:
     road = arc(slope=0.1)
     recorded = road.recorded(20.0)
     x, y, z = geometry.transform_points(recorded, np.array([[0.0, 3.0, 0.0]]))[0]
-    pose = road.place(Motion(float(x), float(y), 0.9, 5.0))
+    pose = road.place(float(x), float(y), 0.9)
     assert geometry.rigid_problem(pose) is None
     assert pose[2, 3] == pytest.approx(0.1 * pose[1, 3] / math.hypot(1, 0.0), abs=0.02)
     assert pose[:3, 2] == pytest.approx(recorded[:3, 2])

@@ -18,8 +18,9 @@ from test_edit import toy
 from mudg.base import geometry
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.types import Camera, Scene
+from mudg.scene.road import Road
 from mudg.sim import CameraRequest, Instant, Pinhole, Session, wire
-from mudg.sim.drive import Drive, Motion, Road
+from mudg.sim.drive import Drive, Motion
 from mudg.sim.driver import Policy
 from mudg.sim.pilots import PlanPilot, Sight
 from mudg.sim.server import serving

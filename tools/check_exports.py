@@ -41,7 +41,7 @@ from mudg.scene.read import read_points, read_scene
 from mudg.steps.export import Export
 
 SINGLE = ("ply", "spz", "compressed-ply", "sog", "splat")
-FOREIGN = re.compile(r"'(metadata\.yaml|\w+\.json|mesh_ground\.ply)' in package .* unsupported extension")
+FOREIGN = re.compile(r"'(metadata\.yaml|\w+\.json|mesh_ground\.ply|map\.xodr)' in package .* unsupported extension")
 """What USD says of the files for AlpaSim in a package, which the standard does not allow there."""
 AHEAD = np.random.default_rng(0).uniform([-3, -2, 8], [3, 2, 40], (50, 3))
 """Points that every camera sees, in its axes, metres."""

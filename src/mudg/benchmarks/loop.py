@@ -37,8 +37,9 @@ from mudg.city.logs import STANDARD, LogRules
 from mudg.city.world import CityWorld
 from mudg.core import metrics
 from mudg.diffusion import model_files
+from mudg.scene.road import Road
 from mudg.sim.cockpit import Cockpit
-from mudg.sim.drive import Actor, Drive, Following, Road, beginning
+from mudg.sim.drive import Actor, Drive, Following, beginning
 from mudg.sim.pilots import RoutePilot, Sight
 from mudg.sim.session import Session
 from mudg.steps.settings import PresetName

@@ -402,8 +402,14 @@ def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
         scene = replace(scene, sky=None)
     facts = {**scene.facts, "generator": f"mudg {version()}"}
     scene = replace(scene, file_from_world=file_from_world(name, config.axes), facts=facts)
-    ground = _ground(given) if name == "alpasim" else None
-    return WriteRequest(scene, None if whole else moment, config.spz_version, given.log, ground)
+    ground, road = (_ground(given), _road(given)) if name == "alpasim" else (None, None)
+    return WriteRequest(scene, None if whole else moment, config.spz_version, given.log, ground, road)
+
+
+def _road(given: Exported) -> NDArray[np.floating] | None:
+    """Fused points of the road f[N, 3]; None where no point has a class."""
+    static = None if given.parts.fused is None else read_fused(given.parts.fused).static
+    return None if static is None or static.semantics is None else static.xyz[static.semantics == ID["road"]]
 
 
 def _ground(given: Exported) -> HeightMap | None:

@@ -13,7 +13,7 @@ objects move as they were recorded.
 
 from __future__ import annotations
 
-from typing import ClassVar, Final
+from typing import Final
 
 import numpy as np
 from carla_canvas import CameraFrame, CameraView, Renderer, WorldInfo

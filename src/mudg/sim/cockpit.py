@@ -14,7 +14,8 @@ from mudg.base.types import Camera
 from mudg.gaussians.model import compose
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.views import resized_view
-from mudg.sim.drive import Actor, Car, Drive, Road, Traffic, beginning
+from mudg.scene.road import Road
+from mudg.sim.drive import Actor, Car, Drive, Traffic, beginning
 from mudg.sim.optics import Pinhole
 from mudg.sim.session import CameraReply, CameraRequest, Instant, Layer, Session
 

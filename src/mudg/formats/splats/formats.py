@@ -216,7 +216,8 @@ class WriteRequest:
 
     Args:
         scene: with the axes of the file. time_s: the moment, or None = all of the motion. spz_version: 3 or 4. log:
-            whose cameras are listed, where a format can. ground: where a format needs it.
+            whose cameras are listed, where a format can. ground, road: height and surface f[N, 3], where a format needs
+            them.
     """
 
     scene: SplatScene
@@ -224,6 +225,7 @@ class WriteRequest:
     spz_version: int = 3
     log: Scene | None = None
     ground: HeightMap | None = None
+    road: NDArray[np.floating] | None = None
 
     @property
     def cloud(self) -> SplatCloud:
@@ -292,7 +294,9 @@ FORMATS: Final[Mapping[str, SplatFormat]] = {
     ),
     "usda": _format(".usda .usd", axes.WORLD, _MOVING, lambda r: usd.to_text(r.scene, r.time_s, log=r.log)),
     "usdz": _format(".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_package(r.scene, r.time_s, r.log)),
-    "alpasim": _format(".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_alpasim(r.scene, r.log, r.ground)),
+    "alpasim": _format(
+        ".usdz", axes.WORLD, f"{_MOVING} sky", lambda r: usd.to_alpasim(r.scene, r.log, r.ground, r.road)
+    ),
     "compressed-ply": _format(
         ".compressed.ply .ply",
         "RDF",
