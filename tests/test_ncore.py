@@ -207,7 +207,7 @@ def test_shutters_masks_classes_and_sensors_that_move(truth: Scene, tmp_path: Pa
 
 
 @needs_package
-def test_other_peoples_recordings(truth: Scene, tmp_path: Path) -> None:
+def test_other_peoples_recordings(truth: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Stores per sensor, single-precision poses, boxes told in a sensor's frame, a lens, two returns: as NVIDIA's
     converters write."""
     v4, data = package().v4, package().data
@@ -227,12 +227,14 @@ def test_other_peoples_recordings(truth: Scene, tmp_path: Path) -> None:
     camera = writer.register_component_writer(v4.CameraSensorComponent.Writer, "camera:front wide", "front")
     image = open_files(truth.root).read(truth.frames[0].image.path)
     for end in (1_100_000, 1_300_000):
-        camera.store_frame(image, "png", np.array([end - 20_000, end], np.uint64), {}, {})
+        camera.store_frame(image, "png", np.array([end - 20_000, end], np.uint64), {}, {"gain": 2})
     lidar = writer.register_component_writer(v4.LidarSensorComponent.Writer, "top", "top")
     rays = np.array([[1, 0, 0], [0, 1, 0], [0, 0, -1]], np.float32)
     distance = np.array([[10, 20, np.nan], [12, np.nan, np.nan]], np.float32)
     times, span = np.array([1_200_000, 1_250_000, 1_300_000], np.uint64), np.array([1_200_000, 1_300_000], np.uint64)
-    lidar.store_frame(rays, times, None, distance, (0 * distance + 0.5).astype(np.float32), span, {}, {})
+    lidar.store_frame(
+        rays, times, None, distance, (0 * distance + 0.5).astype(np.float32), span, {"velocity": times}, {}
+    )
     box = data.BBox3((8.0, 1.0, -1.0), (4.5, 1.9, 1.6), (0.0, 0.0, 0.3))
     made = partial(data.CuboidTrackObservation, "a", "automobile")
     seen = [made(at, "top", at, box, data.LabelSource.AUTOLABEL) for at in (1_100_000, 1_300_000)]
@@ -240,6 +242,10 @@ def test_other_peoples_recordings(truth: Scene, tmp_path: Path) -> None:
     writer.finalize()
 
     scene = ingest(tmp_path, tmp_path / "back", test_every=0)
+    assert [line for line in capsys.readouterr().err.splitlines() if "passed over" in line] == [
+        "passed over: 'gain' in the camera frames of the recording, which this program does not know",
+        "passed over: 'velocity' in the LiDAR frames of the recording, which this program does not know",
+    ]
     name = "camera_front_wide"
     assert list(scene.cameras) == [name] and scene.cameras[name].readout_s == pytest.approx(0.02)
     assert all(word in "\n".join(scene.source.notes) for word in ("rectified", "left to right"))

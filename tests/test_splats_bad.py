@@ -278,3 +278,51 @@ def test_places_of_a_splat_file_that_are_no_numbers_are_refused() -> None:
     content[32:36] = struct.pack("<f", np.nan)
     with pytest.raises(InputError, match="Gaussian 1"):
         read(bytes(content), "splat")
+
+
+# --- frames of zstandard, in SPZ of version 4 -------------------------------------------------------
+
+
+def with_first_plane(content: bytes, frame: bytes, raw: int | None = None) -> bytes:
+    """An SPZ file of version 4 with another compressed first plane."""
+    streams, toc = content[15], int.from_bytes(content[16:20], "little")
+    table = [list(struct.unpack_from("<QQ", content, toc + 16 * n)) for n in range(streams)]
+    begin = toc + 16 * streams
+    rest = content[begin + table[0][0] :]
+    table[0] = [len(frame), table[0][1] if raw is None else raw]
+    return content[:toc] + b"".join(struct.pack("<QQ", *row) for row in table) + frame + rest
+
+
+def broken_frames() -> dict[str, Callable[[Any, bytes], bytes]]:
+    """What happens to the frame of a plane: name -> from the package and the plane's bytes to a frame."""
+    frame = lambda package, plane: package.ZstdCompressor(write_content_size=True).compress(plane)
+
+    def flipped(package: Any, plane: bytes) -> bytes:
+        made = bytearray(package.ZstdCompressor(write_checksum=True).compress(plane))
+        made[-6] ^= 0x55
+        return bytes(made)
+
+    return {
+        "truncated": lambda package, plane: frame(package, plane)[:-9],
+        "flipped": flipped,
+        "another size": lambda package, plane: frame(package, plane[:-9]),
+        "bomb": lambda package, plane: frame(package, bytes(1 << 30)),
+        "no frame": lambda package, plane: plane[:64],
+        "empty": lambda package, plane: b"",
+        "dictionary": lambda package, plane: b"\x28\xb5\x2f\xfd\x23\xff\xff\xff\x7f" + frame(package, plane)[5:],
+    }
+
+
+@pytest.mark.parametrize("kind", broken_frames())
+def test_broken_frames_of_zstandard_are_refused_in_words_and_little_memory(kind: str) -> None:
+    package = pytest.importorskip("zstandard", reason="zstandard is not installed")
+    content = spz.to_bytes(toy_splats.cloud(300), 4)
+    streams, toc = content[15], int.from_bytes(content[16:20], "little")
+    size = struct.unpack_from("<Q", content, toc)[0]
+    begin = toc + 16 * streams
+    plane = package.ZstdDecompressor().decompress(content[begin : begin + size])
+    whole = package.ZstdCompressor().compress(plane)
+    assert len(spz.from_bytes(with_first_plane(content, whole), "x").cloud.means) == 300
+    bad = with_first_plane(content, broken_frames()[kind](package, plane))
+    with within(32 << 20), pytest.raises(InputError, match="bad.file"):
+        read(bad, "spz")

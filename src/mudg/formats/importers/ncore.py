@@ -272,6 +272,8 @@ def _blosc_size(chunk: _StoredMember, where: str) -> int:
 
 # importer -----------------------------------------------------------------------------------------
 Record = TypeVar("Record", ImageRecord, SweepRecord)
+_WITH_FRAMES: Final = frozenset({SWEEP_TIME, POINT_CLASSES})
+"""What this program stores with a frame."""
 _LIST: Final = known(
     "sequence_id sequence_timestamp_interval_us generic_meta_data version",
     component_stores=known("path md5 components"),
@@ -602,6 +604,7 @@ def _picture(reader: Any, frame: int, where: str) -> bytes:
     """The encoded image of a frame."""
     with foreign_reader(where):
         content = bytes(reader.get_frame_data(frame).get_encoded_image_data())
+        _note_frame(reader, frame, "camera")
     if content[:4] != b"\x89PNG" and content[:2] != b"\xff\xd8":
         what = "image is of a kind that is not read"
         raise InputError(what, where=where, expected="PNG or JPEG", got=repr(content[:8]))
@@ -642,6 +645,7 @@ def _points(
             for name in ("distance_m", "intensity")
         )
         begin, end = (int(time) for time in reader.get_frame_timestamps_us(frame))
+        _note_frame(reader, frame, "LiDAR")
         classes = _classes(reader, frame, len(ray))
     pairs = ray.shape == (len(times), 3) and distance.ndim == 2 and distance.shape[1] == len(ray)
     if not pairs or intensity.shape != distance.shape:
@@ -665,6 +669,12 @@ def _points(
     dt_s = ((times - at) / MICRO).astype(np.float32)
     given, no_returns = None if classes is None else classes[which], int((distance == 0).sum())
     return SweepPoints(xyz.astype(np.float32), seen, dt_s, given, no_returns)
+
+
+def _note_frame(reader: Any, frame: int, sensor: str) -> None:
+    """Note what else is stored with a frame."""
+    names = [*reader.get_frame_generic_data_names(frame), *reader.get_frame_generic_meta_data(frame)]
+    note_unknown(f"the {sensor} frames of the recording", names, _WITH_FRAMES)
 
 
 def _classes(reader: Any, frame: int, count: int) -> NDArray[np.uint8] | None:
