@@ -14,8 +14,8 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Camera
 from mudg.scene.road import Road
 from mudg.sim.cockpit import Cockpit
-from mudg.sim.drive import SURROUNDINGS, Actor, Box, Car, Controls, Drive, Following, Motion
-from mudg.sim.pilots import PlanPilot, RoutePilot, Sight
+from mudg.sim.drive import SURROUNDINGS, BicycleState, Box, Car, Controls, Drive, Following, RoadUser
+from mudg.sim.pilots import DriverView, PlanPilot, RoutePilot
 from mudg.sim.session import Session
 
 CAR = Car()
@@ -38,21 +38,23 @@ def straight(length_m: float = 60.0) -> Road:
     return Road(np.stack([geometry.yaw_matrix(0.0, (x, 0.0, 0.0)) for x in np.arange(0.0, length_m, 1.0)]))
 
 
-def parked(x: float, y: float = 0.0) -> Actor:
+def parked(x: float, y: float = 0.0) -> RoadUser:
     pose = geometry.yaw_matrix(0.0, (x, y, 0.8))
-    return Actor(np.array([0.0, 20.0]), np.stack([pose, pose]), (4.0, 1.8, 1.6))
+    return RoadUser(np.array([0.0, 20.0]), np.stack([pose, pose]), (4.0, 1.8, 1.6))
 
 
-def driving(x: float, speed: float, until_s: float = 10.0) -> Actor:
+def driving(x: float, speed: float, until_s: float = 10.0) -> RoadUser:
     times = np.linspace(0, until_s, 50)
-    return Actor(times, np.stack([geometry.yaw_matrix(0.0, (x + speed * t, 0.0, 0.8)) for t in times]), (4.0, 1.8, 1.6))
+    return RoadUser(
+        times, np.stack([geometry.yaw_matrix(0.0, (x + speed * t, 0.0, 0.8)) for t in times]), (4.0, 1.8, 1.6)
+    )
 
 
 # -- kinematics ------------------------------------------------------------------------------------
 
 
 def test_a_step_of_the_bicycle_is_the_sum_of_many_small_ones() -> None:
-    start = Motion(1.0, 2.0, 0.3, 7.0, 0.1)
+    start = BicycleState(1.0, 2.0, 0.3, 7.0, 0.1)
     controls = Controls(1.5, 0.0)
     after = start.after(controls, 0.4, CAR)
     x, y, heading, speed, small = start.x_m, start.y_m, start.heading_rad, start.speed_mps, 1e-5
@@ -65,7 +67,7 @@ def test_a_step_of_the_bicycle_is_the_sum_of_many_small_ones() -> None:
 
 
 def test_brakes_stop_where_energy_says_and_never_reverse() -> None:
-    motion, way = Motion(0.0, 0.0, 0.0, 9.0), 9.0**2 / (2 * 4)
+    motion, way = BicycleState(0.0, 0.0, 0.0, 9.0), 9.0**2 / (2 * 4)
     for _ in range(40):
         motion = motion.after(Controls(-4.0, 0.0), 0.1, CAR)
     assert motion.speed_mps == 0
@@ -73,7 +75,7 @@ def test_brakes_stop_where_energy_says_and_never_reverse() -> None:
 
 
 def test_steering_stays_within_its_limit() -> None:
-    motion = Motion(0.0, 0.0, 0.0, 1.0)
+    motion = BicycleState(0.0, 0.0, 0.0, 1.0)
     for _ in range(100):
         motion = motion.after(Controls(0.0, 0.8), 0.1, CAR)
     assert motion.steer_rad == CAR.largest_steer_rad
@@ -136,7 +138,9 @@ def test_solid_gaussians_stop_a_vehicle_and_those_of_the_road_do_not() -> None:
     rng = np.random.default_rng(0)
     wall = np.column_stack([rng.uniform(11.9, 12.1, 900), rng.uniform(-3, 3, 900), rng.uniform(0, 2, 900)])
     ground = np.column_stack([rng.uniform(0, 40, 9000), rng.uniform(-3, 3, 9000), rng.normal(0, 0.05, 9000)])
-    drive = Drive(straight(), {}, Motion(0.0, 0.0, 0.0, 8.0), 0.0, solid=np.concatenate([wall, ground]).astype("f4"))
+    drive = Drive(
+        straight(), {}, BicycleState(0.0, 0.0, 0.0, 8.0), 0.0, solid=np.concatenate([wall, ground]).astype("f4")
+    )
     hits = []
     for _ in range(15):
         drive.step(Controls(), 0.1)
@@ -161,7 +165,7 @@ def test_the_driver_model_rests_where_its_paper_says() -> None:
 def test_a_follower_stops_behind_a_vehicle_that_stops_where_a_recorded_one_drives_through_it() -> None:
     met = {}
     for traffic in ("log", "idm"):
-        drive = Drive(straight(90.0), {"behind": driving(-25.0, 8.0)}, Motion(0.0, 0.0, 0.0, 0.0), 0.0, traffic)
+        drive = Drive(straight(90.0), {"behind": driving(-25.0, 8.0)}, BicycleState(0.0, 0.0, 0.0, 0.0), 0.0, traffic)
         for _ in range(90):
             drive.step(Controls(), 0.1)
             met[traffic] = met.get(traffic) or drive.collision()
@@ -171,14 +175,14 @@ def test_a_follower_stops_behind_a_vehicle_that_stops_where_a_recorded_one_drive
 
 
 def test_an_even_follower_goes_where_it_went() -> None:
-    drive = Drive(straight(), {"ahead": driving(12.0, 6.0)}, Motion(0.0, 40.0, 0.0, 0.0), 0.0, "idm")
+    drive = Drive(straight(), {"ahead": driving(12.0, 6.0)}, BicycleState(0.0, 40.0, 0.0, 0.0), 0.0, "idm")
     for _ in range(40):
         drive.step(Controls(), 0.1)
     assert drive.boxes()["ahead"].world_from_box[0, 3] == pytest.approx(12 + 6 * 4.0, abs=1.0)
 
 
 def test_controls_that_are_no_numbers_are_refused() -> None:
-    drive = Drive(straight(), {}, Motion(0.0, 0.0, 0.0, 1.0), 0.0)
+    drive = Drive(straight(), {}, BicycleState(0.0, 0.0, 0.0, 1.0), 0.0)
     with pytest.raises(UsageError, match="not finite"):
         drive.step(Controls(math.nan, 0.0), 0.1)
 
@@ -189,19 +193,19 @@ CAMERA = Camera("front", 96, 64, 60.0, 60.0, 48.0, 32.0)
 MOUNT = geometry.yaw_matrix(0.0, (1.4, 0.0, 1.5)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
 
 
-def sight_of(drive: Drive, obstacle_m: float = math.inf) -> Sight:
+def sight_of(drive: Drive, obstacle_m: float = math.inf) -> DriverView:
     """Empty road; a wall of a car ahead of the camera at a depth."""
     depth, classes = np.full((64, 96), np.inf, np.float32), np.zeros((64, 96), np.uint8)
     if math.isfinite(obstacle_m):
         depth[20:40, 40:56], classes[20:40, 40:56] = obstacle_m, 13
     motion, pose = drive.motion, drive.pose
     now = (drive.time_s, 0.1, motion.speed_mps, motion.steer_rad, drive.road.route(pose, step_m=1.0), pose)
-    return Sight(*now, CAMERA, MOUNT, np.zeros((64, 96, 3), np.uint8), depth, classes)
+    return DriverView(*now, CAMERA, MOUNT, np.zeros((64, 96, 3), np.uint8), depth, classes)
 
 
 @pytest.mark.parametrize("shift", [0.0, 2.0, -3.0])
 def test_a_pilot_comes_to_its_line_on_a_bend_and_keeps_its_speed(shift: float) -> None:
-    drive = Drive(arc(60.0), {}, Motion(0.0, 0.0, 0.0, 7.0), 0.0)
+    drive = Drive(arc(60.0), {}, BicycleState(0.0, 0.0, 0.0, 7.0), 0.0)
     pilot = RoutePilot(Following(7.0), shift)
     for _ in range(90):
         drive.step(pilot.drive(sight_of(drive)), 0.1)
@@ -210,7 +214,7 @@ def test_a_pilot_comes_to_its_line_on_a_bend_and_keeps_its_speed(shift: float) -
 
 
 def test_a_pilot_sees_how_far_ahead_somebody_is_and_brakes() -> None:
-    drive = Drive(straight(), {}, Motion(0.0, 0.0, 0.0, 10.0), 0.0)
+    drive = Drive(straight(), {}, BicycleState(0.0, 0.0, 0.0, 10.0), 0.0)
     pilot = RoutePilot(Following(10.0))
     assert pilot.gap_m(sight_of(drive)) == math.inf
     gap = 12.0 + 1.4 - (CAR.length_m - CAR.overhang_m)
@@ -221,13 +225,13 @@ def test_a_pilot_sees_how_far_ahead_somebody_is_and_brakes() -> None:
 class Planned:
     """Plans to go on at a speed along a line to the left."""
 
-    def plan(self, sight: Sight) -> np.ndarray:
+    def plan(self, sight: DriverView) -> np.ndarray:
         times = np.arange(1, 41) * 0.1
         return np.column_stack([times, 6.0 * times, 0 * times, 0 * times])
 
 
 def test_plans_are_driven_along() -> None:
-    drive = Drive(straight(), {}, Motion(0.0, 0.0, 0.0, 3.0), 0.0)
+    drive = Drive(straight(), {}, BicycleState(0.0, 0.0, 0.0, 3.0), 0.0)
     pilot = PlanPilot(Planned())
     for _ in range(60):
         drive.step(pilot.drive(sight_of(drive)), 0.1)

@@ -12,7 +12,7 @@ from pathlib import Path
 from mudg import sim
 from mudg.formats.exporters.video import write_mp4
 from mudg.sim.drive import Following
-from mudg.sim.pilots import RoutePilot, Sight
+from mudg.sim.pilots import DriverView, RoutePilot
 
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("run", type=Path)
@@ -32,7 +32,7 @@ while len(pictures) * STEP_S < given.seconds and drive.time_s + STEP_S <= last_s
     seen = cockpit.see(drive)[name].layers
     motion, route = drive.motion, drive.road.route(drive.pose)
     now = (drive.time_s, STEP_S, motion.speed_mps, motion.steer_rad, route, drive.pose)
-    drive.step(pilot.drive(Sight(*now, camera, cockpit.mounts[name], **seen)), STEP_S)
+    drive.step(pilot.drive(DriverView(*now, camera, cockpit.mounts[name], **seen)), STEP_S)
     pictures.append(seen["rgb"])
     if drive.collision():
         break

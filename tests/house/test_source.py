@@ -614,7 +614,11 @@ def test_product_text_speaks_to_users(repository: Path, package_dir: Path) -> No
     problems = []
     for path in product_texts(repository, package_dir):
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-            simulated = path.parent.name == "sim" or path.stem == "simulator"  # ``sim.Session`` is what a user opens
+            simulated = path.parent.name in ("sim", "simulate") or path.stem in (
+                "simulator",
+                "loop",
+                "serve",
+            )  # ``sim.Session`` is what a user opens
             found = WORDS_THAT_DO_NOT_BELONG.search(
                 re.sub(r"(?i)\bsession\b" if simulated else r"sim[./][Ss]ession", "", line)
             )

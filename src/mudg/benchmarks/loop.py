@@ -39,8 +39,8 @@ from mudg.core import metrics
 from mudg.diffusion import model_files
 from mudg.scene.road import Road
 from mudg.sim.cockpit import Cockpit
-from mudg.sim.drive import Actor, Drive, Following, beginning
-from mudg.sim.pilots import RoutePilot, Sight
+from mudg.sim.drive import Drive, Following, RoadUser, beginning
+from mudg.sim.pilots import DriverView, RoutePilot
 from mudg.sim.session import Session
 from mudg.steps.settings import PresetName
 
@@ -121,9 +121,9 @@ class Course:
     def begin(self) -> Drive:
         """The vehicle at the first frame, among all vehicles and people of the city."""
         world, first = self.world, self.world.frame_time(0)
-        actors = {t.id: Actor(t.times_s, t.world_from_object, tuple(t.size_m.tolist())) for t in world.tracks()}
+        actors = {t.id: RoadUser(t.times_s, t.world_from_object, tuple(t.size_m.tolist())) for t in world.tracks()}
         ego = world.ego_path()
-        speed = Actor(ego.times_s, ego.world_from_ego, ()).speed_at(first)
+        speed = RoadUser(ego.times_s, ego.world_from_ego, ()).speed_at(first)
         return Drive(Road(ego.world_from_ego), actors, beginning(world.frame_pose(first), speed), first)
 
     def exact(self, drive: Drive) -> dict[str, NDArray[Any]]:
@@ -140,7 +140,7 @@ class Course:
             yield drive, seen
             motion, pose = drive.motion, drive.pose
             now = (drive.time_s, step_s, motion.speed_mps, motion.steer_rad, drive.road.route(pose), pose)
-            drive.step(pilot.drive(Sight(*now, self.camera, self.mount, **seen)), step_s)
+            drive.step(pilot.drive(DriverView(*now, self.camera, self.mount, **seen)), step_s)
 
     def judge(self, drive: Drive) -> dict[str, Any]:
         """Where the vehicle is, what it hits, and whether a corner of it is beyond a kerb."""

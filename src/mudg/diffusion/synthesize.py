@@ -68,7 +68,7 @@ WINDOW_FRAMES = 8
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Drive:
+class DriveInputs:
     """What all trajectories are made from, read; ``images``: the recorded ones, as they have been prepared for views of
     a size."""
 
@@ -92,14 +92,14 @@ class JobInputs:
     scene: Path
     fused: Path
     fitted: Path | None = None
-    edited: Callable[[SynthesizeConfig, JobInputs], Drive] | None = None
+    edited: Callable[[SynthesizeConfig, JobInputs], DriveInputs] | None = None
 
 
-def recorded_drive(config: SynthesizeConfig, given: JobInputs) -> Drive:
+def recorded_drive(config: SynthesizeConfig, given: JobInputs) -> DriveInputs:
     """The drive as it was recorded."""
     scene = read_scene(given.scene)
     fit = None if given.fitted is None else load_model(given.fitted)
-    return Drive(scene, read_fused(given.fused), recorded_images(scene, config), fit)
+    return DriveInputs(scene, read_fused(given.fused), recorded_images(scene, config), fit)
 
 
 def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, work: RunDir) -> dict[str, Any]:

@@ -21,7 +21,7 @@ from mudg.base.types import FusedCloud, Scene
 from mudg.core.raster.rasterize import drawing_device
 from mudg.diffusion.published import is_published
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.diffusion.synthesize import Drive, JobInputs
+from mudg.diffusion.synthesize import DriveInputs, JobInputs
 from mudg.diffusion.views import FREEVS, recorded_images
 from mudg.editing.apply import EditedDrive, carry_out, weather_of
 from mudg.editing.harmonised import check_paths, repairing
@@ -137,7 +137,7 @@ def edited_scene(script: EditScript, config: SynthesizeConfig, given: JobInputs,
     return drive_of_edits(script, scene, read_fused(given.fused), fitted, told=told).scene
 
 
-def edited_drive(script: EditScript, config: SynthesizeConfig, given: JobInputs) -> Drive:
+def edited_drive(script: EditScript, config: SynthesizeConfig, given: JobInputs) -> DriveInputs:
     """The drive as the script leaves it: its scene, clouds and fit, recorded images without what they show wrongly, and
     its weather."""
     scene, cloud = read_scene(given.scene), read_fused(given.fused)
@@ -148,7 +148,7 @@ def edited_drive(script: EditScript, config: SynthesizeConfig, given: JobInputs)
         draw = functools.partial(render_view, drive.model, raster=raster_of(drive.model))
         weather = weather_of(draw, conditions, drive.scene)
     recorded = photos_of_edited(recorded_images(scene, config), drive.plan)
-    return Drive(drive.scene, drive.cloud, recorded, drive.model, vacated_at(drive.plan), weather)
+    return DriveInputs(drive.scene, drive.cloud, recorded, drive.model, vacated_at(drive.plan), weather)
 
 
 def shows_weather(config: SynthesizeConfig, script: EditScript, fitted: bool) -> bool:

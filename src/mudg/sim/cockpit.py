@@ -15,7 +15,7 @@ from mudg.gaussians.model import compose
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.views import resized_view
 from mudg.scene.road import Road
-from mudg.sim.drive import Actor, Car, Drive, Traffic, beginning
+from mudg.sim.drive import Drive, RoadUser, Traffic, beginning
 from mudg.sim.optics import Pinhole
 from mudg.sim.session import CameraReply, CameraRequest, Instant, Layer, Session
 
@@ -57,14 +57,12 @@ class Cockpit:
             if isinstance(node, RigidNode):
                 keys = [(time, pose) for time in node.times_s if (pose := node.pose_matrix(float(time))) is not None]
                 times, poses = zip(*keys, strict=True)
-                self.actors[node.name] = Actor(np.array(times), np.stack(poses), node.size_m)
+                self.actors[node.name] = RoadUser(np.array(times), np.stack(poses), node.size_m)
         begin = session.time_range_s[0]
         still = compose(session.at(Instant(begin, np.eye(4), {})), begin)
         self.solid = still.means[still.opacity > OPAQUE].detach().cpu().numpy()
 
-    def drive(
-        self, time_s: float | None = None, shift_m: float = 0.0, traffic: Traffic = "log", car: Car | None = None
-    ) -> Drive:
+    def drive(self, time_s: float | None = None, shift_m: float = 0.0, traffic: Traffic = "log") -> Drive:
         """A drive that begins where the recorded vehicle was, moved to the left, at its speed. ``time_s``: None: as
         early as objects and vehicle were recorded.
 
@@ -77,9 +75,9 @@ class Cockpit:
         if pose is None:
             span = f"{self.ego.times_s[0]:.2f} to {self.ego.times_s[-1]:.2f} s"
             raise UsageError("the drive begins outside the log", where="time_s", expected=span, got=f"{begin:.2f} s")
-        speed = Actor(self.ego.times_s, self.ego.world_from_ego, ()).speed_at(begin)
+        speed = RoadUser(self.ego.times_s, self.ego.world_from_ego, ()).speed_at(begin)
         motion = beginning(pose, speed, shift_m)
-        return Drive(self.road, self.actors, motion, begin, traffic, self.solid, car or Car())
+        return Drive(self.road, self.actors, motion, begin, traffic, self.solid)
 
     def see(self, drive: Drive) -> dict[str, CameraReply]:
         """What the cameras see, by name; where road users move as recorded, all that the scene knows."""

@@ -60,7 +60,7 @@ class Controls:
 
 
 @dataclass(frozen=True, slots=True)
-class Motion:
+class BicycleState:
     """Where the rear axle is in the plane, and how it moves: metres, radians (0 = along x, positive to the left)."""
 
     x_m: float
@@ -69,7 +69,7 @@ class Motion:
     speed_mps: float
     steer_rad: float = 0.0
 
-    def after(self, controls: Controls, step_s: float, car: Car) -> Motion:
+    def after(self, controls: Controls, step_s: float, car: Car) -> BicycleState:
         """The kinematic bicycle after a step: steering first, then a circle's arc of the way that even acceleration
         makes. It does not roll backwards."""
         limit = car.largest_steer_rad
@@ -82,7 +82,7 @@ class Motion:
         chord = way * (math.sin(turn / 2) / (turn / 2) if abs(turn) > 1e-9 else 1.0)
         along = self.heading_rad + turn / 2
         x, y = self.x_m + chord * math.cos(along), self.y_m + chord * math.sin(along)
-        return Motion(x, y, self.heading_rad + turn, speed, steer)
+        return BicycleState(x, y, self.heading_rad + turn, speed, steer)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -166,7 +166,7 @@ class Follower:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Actor:
+class RoadUser:
     """A recorded road user: times f64[K] in seconds, poses world-from-box f64[K, 4, 4], and size."""
 
     times_s: NDArray[np.float64]
@@ -200,8 +200,8 @@ class Drive:
     """
 
     road: Road
-    actors: Mapping[str, Actor]
-    motion: Motion
+    actors: Mapping[str, RoadUser]
+    motion: BicycleState
     time_s: float
     traffic: Traffic = "log"
     solid: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 3), np.float32))
@@ -229,7 +229,7 @@ class Drive:
             if box is not None:
                 yield name, box
 
-    def _follower(self, name: str, actor: Actor) -> Follower | None:
+    def _follower(self, name: str, actor: RoadUser) -> Follower | None:
         """A road user that drives by itself, from when its track begins."""
         moved = np.linalg.norm(actor.poses[-1, :2, 3] - actor.poses[0, :2, 3]) > 1
         if self.traffic == "log" or not moved or not actor.times_s[0] <= self.time_s:
@@ -282,7 +282,7 @@ class Drive:
         return int(inside.sum())
 
 
-def beginning(pose: Matrix, speed_mps: float, shift_m: float = 0.0) -> Motion:
+def beginning(pose: Matrix, speed_mps: float, shift_m: float = 0.0) -> BicycleState:
     """The motion of a vehicle that begins at a recorded pose, moved to the left."""
     x, y, _ = geometry.transform_points(pose, np.array([[0.0, shift_m, 0.0]]))[0]
-    return Motion(float(x), float(y), geometry.yaw_of(pose), speed_mps)
+    return BicycleState(float(x), float(y), geometry.yaw_of(pose), speed_mps)

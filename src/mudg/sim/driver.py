@@ -23,7 +23,7 @@ from mudg.base import geometry
 from mudg.base.errors import InputError
 from mudg.base.types import Camera
 from mudg.sim import wire
-from mudg.sim.pilots import Sight
+from mudg.sim.pilots import DriverView
 
 REVISION: Final = (("carla-driver-interface-contract", "2"),)
 """Says that a camera's pose in the rig is that of its optical frame, as AlpaSim has it."""
@@ -80,7 +80,7 @@ class Policy:
         if self._own:
             self._channel.close()
 
-    def plan(self, sight: Sight) -> NDArray[np.float64]:
+    def plan(self, sight: DriverView) -> NDArray[np.float64]:
         """The policy's plan f64[N, 4] in the vehicle's frame: seconds from now (positive), x and y in metres, heading
         in radians; no rows: it wants to stop.
 

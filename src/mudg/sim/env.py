@@ -19,10 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from mudg.base.errors import UsageError
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import Scene
-from mudg.editing.script import EditScript
-from mudg.gaussians.model import SceneModel
 from mudg.sim.cockpit import Cockpit
-from mudg.sim.drive import Car, Controls, Drive, Traffic
+from mudg.sim.drive import Controls, Drive, Traffic
 from mudg.sim.session import CameraReply, Layer, Session
 
 LEAST: Final = (-8.0, -0.8)
@@ -53,9 +51,9 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
     empty), ``trust`` by camera, and ``boxes`` of the road users: pose f64[4, 4] and size.
 
     Args:
-        run, edits, scene, device: as for ``Session``. cameras: names (empty: the first one). width_px: of the pictures
+        run, scene: as for ``Session``, or one that is open. cameras: names (empty: the first one). width_px: of the pictures
             (0 = as recorded). layers: of the pictures; motion is not among them. step_s: seconds per step.
-        traffic: ``log``: road users as recorded; ``idm``: they follow whoever is ahead. car: size and limits.
+        traffic: ``log``: road users as recorded; ``idm``: they follow whoever is ahead.
         largest_shift_m: see above.
 
     Raises:
@@ -66,8 +64,7 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
 
     def __init__(
         self,
-        run: str | Path | SceneModel,
-        edits: str | Path | EditScript | None = None,
+        run: str | Path | Session,
         scene: Scene | str | Path | None = None,
         *,
         cameras: str | Sequence[str] = (),
@@ -75,9 +72,7 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
         layers: Sequence[Layer] = ("rgb",),
         step_s: float = 0.1,
         traffic: Traffic = "log",
-        car: Car | None = None,
         largest_shift_m: float = 6.0,
-        device: str = "auto",
         render_mode: str | None = "rgb_array",
     ) -> None:
         unknown = [layer for layer in layers if layer not in LIMITS]
@@ -85,9 +80,11 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
             raise UsageError("no such layer", where="layers", expected=", ".join(LIMITS), got=", ".join(unknown))
         if not (math.isfinite(step_s) and step_s > 0):
             raise UsageError("a step takes a positive time", where="step_s", got=str(step_s))
-        self.cockpit = Cockpit(Session(run, edits, scene, device), cameras, width_px, layers)
+        self.cockpit = Cockpit(
+            run if isinstance(run, Session) else Session(run, scene=scene), cameras, width_px, layers
+        )
         self.step_s, self.largest_shift_m, self.render_mode = step_s, largest_shift_m, render_mode
-        self._begin: dict[str, Any] = {"traffic": traffic, "car": car}
+        self.traffic: Traffic = traffic
         self.metadata = {**self.metadata, "render_fps": round(1 / step_s)}
         self.action_space = gym.spaces.Box(np.array(LEAST, np.float32), np.array(MOST, np.float32))
         layer_space = lambda camera, low, high, kind, last: gym.spaces.Box(
@@ -115,7 +112,7 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
         unknown = sorted(set(options or {}) - {"time_s", "shift_m"})
         if unknown:
             raise UsageError("no such option", where="options", expected="time_s, shift_m", got=", ".join(unknown))
-        self.drive = self.cockpit.drive(**dict(options or {}), **self._begin)
+        self.drive = self.cockpit.drive(**dict(options or {}), traffic=self.traffic)
         return self._look(self.drive)
 
     def step(self, action: ArrayLike) -> tuple[Observation, float, bool, bool, dict[str, Any]]:

@@ -1,7 +1,7 @@
 """Drivers for a closed loop: what they see, and two that decide by it.
 
-A pilot gets a `Sight` at every step and answers with `Controls`. `RoutePilot` knows the road by its route and keeps its
-distance to whoever it sees ahead; `PlanPilot` drives along the plans of a policy.
+A pilot gets a `DriverView` at every step and answers with `Controls`. `RoutePilot` knows the road by its route and keeps
+its distance to whoever it sees ahead; `PlanPilot` drives along the plans of a policy.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FEWEST_PIXELS: Final = 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Sight:
+class DriverView:
     """What a pilot sees at a step.
 
     Args:
@@ -59,12 +59,12 @@ class Sight:
 class Pilot(Protocol):
     """Who drives."""
 
-    def drive(self, sight: Sight) -> Controls:
+    def drive(self, sight: DriverView) -> Controls:
         """What to do until the next step."""
         ...
 
 
-def pursue(target: Matrix, sight: Sight, car: Car) -> float:
+def pursue(target: Matrix, sight: DriverView, car: Car) -> float:
     """Steering rate of pure pursuit (Coulter 1992): the circle through the rear axle and a target f64[2] ahead."""
     x, y = target
     steer = math.atan(car.wheelbase_m * 2 * y / max(x * x + y * y, 1.0))
@@ -85,15 +85,15 @@ class RoutePilot:
     car: Car = field(default_factory=Car)
     _gap_m: float = math.inf
 
-    def drive(self, sight: Sight) -> Controls:
+    def drive(self, sight: DriverView) -> Controls:
         """See ``Pilot``."""
         return Controls(self.accelerate(sight), pursue(self.target(sight), sight, self.car))
 
-    def lookahead_m(self, sight: Sight) -> float:
+    def lookahead_m(self, sight: DriverView) -> float:
         """How far ahead it aims."""
         return max(LEAST_LOOKAHEAD_M, sight.speed_mps)
 
-    def target(self, sight: Sight) -> Matrix:
+    def target(self, sight: DriverView) -> Matrix:
         """Where it aims f64[2]."""
         arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(sight.route[:, :2], axis=0), axis=1))])
         reach = self.lookahead_m(sight) + np.array([0.0, 1.0])
@@ -101,14 +101,14 @@ class RoutePilot:
         along = (beyond - aim) / max(float(np.linalg.norm(beyond - aim)), 1e-9)
         return aim + self.shift_m * np.array([-along[1], along[0]])
 
-    def accelerate(self, sight: Sight) -> float:
+    def accelerate(self, sight: DriverView) -> float:
         """Acceleration by the gap that it sees, and by how that changed."""
         gap, before = self.gap_m(sight), self._gap_m
         closing = (before - gap) / sight.step_s if math.isfinite(before) and math.isfinite(gap) else 0.0
         self._gap_m = gap
         return self.rule.acceleration(sight.speed_mps, gap, min(max(closing, -10.0), 20.0))
 
-    def gap_m(self, sight: Sight) -> float:
+    def gap_m(self, sight: DriverView) -> float:
         """Metres from its bumper to road users in its way; infinite where it sees none."""
         points = sight.points(DYNAMIC_IDS)
         target, bumper = self.target(sight), self.car.length_m - self.car.overhang_m
@@ -125,14 +125,14 @@ class PlanPilot:
     """Drives along the plans of a policy.
 
     Args:
-        policy: what answers a `Sight` with a plan f64[N, 4]: seconds from now, x and y in metres and heading in radians
-            in the vehicle's frame.
+        policy: what answers a `DriverView` with a plan f64[N, 4]: seconds from now, x and y in metres and heading in
+            radians in the vehicle's frame.
     """
 
     policy: Any
     car: Car = field(default_factory=Car)
 
-    def drive(self, sight: Sight) -> Controls:
+    def drive(self, sight: DriverView) -> Controls:
         """See ``Pilot``."""
         times, x, y, _ = self.policy.plan(sight).T
         if not len(times):

@@ -144,15 +144,15 @@ def bench(
     fit: Mapping[str, Any] = ...,
     score: Mapping[str, Any] = ...,
 ) -> Any:
-    """Run a benchmark: mdm, poses, edit or shift against exact ground truth, real on real logs, paper for tables of
+    """Run a benchmark: mdm, poses, edit, shift or loop against exact truth, real on real logs, paper for tables of
     papers.
 
     Args:
-        name: Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off the recorded path), real (complete methods on real logs) or paper (a table of a paper).
+        name: Benchmark to run: mdm (diffusion model), poses (correction of box tracks), edit (edits of fitted scenes), shift (complete methods off the recorded path), loop (drives in fitted scenes), real (complete methods on real logs) or paper (a table of a paper).
         sources: real, paper: folders of dataset logs, or scenes made by ingest. paper also takes city:reported or city:development, a list of generated cities. edit: folders of finished runs, whose drives are edited in place of generated cities.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
-        preset: shift, real, paper: settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the published set-up, with a published-type model.
+        preset: shift, real, loop, paper: settings of clouds, generated views and fits to start from, as for mudg run (docs/presets.md). paper: the published set-up, with a published-type model.
         config: YAML file of settings, read before those given here.
         model: Diffusion model: "embedded" or "embedded-tiny", both shipped with the package, or a model folder written by learn or convert.
         cities: mdm, poses, edit: list of cities. Choose settings on development; report results on reported, on which nothing was chosen.
@@ -164,14 +164,14 @@ def bench(
         harmonize: edit: add rows with the diffusion model: edited frames that it repaired, and fits that go on with them.
         threads: mdm, poses, edit: number of torch threads.
         seed: Seed of all random numbers; the same seed gives the same result.
-        list: shift: list of logs. Choose settings on development; report results on reported, on which nothing was chosen.
-        logs: shift; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4).
-        methods: shift, real: methods to compare: those of the default; pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on for as many steps as mudg_s, without generated views. real also has mudg_r-no-adapt, mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and with points alone in its input. paper: any of these of shift, and freevs; with the default, all of them.
-        iterations: shift, real, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more.
-        continue_fit: shift, real, paper: make fits under virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published.
+        list: shift, loop: list of logs. Choose settings on development; report results on reported, on which nothing was chosen.
+        logs: shift, loop; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4).
+        methods: shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on for as many steps as mudg_s, without generated views. real also has mudg_r-no-adapt, mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and with points alone in its input. paper: any of these of shift, and freevs; with the default, all of them.
+        iterations: shift, real, loop, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more.
+        continue_fit: shift, real, loop, paper: make fits under virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published.
         ablation: shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact views instead of generated ones. real: add the rows without adaptation and without renders.
         variant: shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such as virtual.color_weight. Both of its fits have them.
-        processes: shift, real, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
+        processes: shift, real, loop, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
         videos: shift, paper: also write videos of all methods side by side.
         table: paper: the table to fill (docs/paper_tables.md).
         freevs_model: paper: diffusion model for the row freevs, learned with `--data.condition freevs` (empty = the row has no numbers).
