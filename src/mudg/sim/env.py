@@ -51,7 +51,7 @@ class Env(gym.Env[Observation, NDArray[np.float32]]):
     empty), ``trust`` by camera, and ``boxes`` of the road users: pose f64[4, 4] and size.
 
     Args:
-        run, scene: as for ``Session``, or one that is open. cameras: names (empty: the first one). width_px: of the pictures
+        run, scene: as for ``Session``, or an open one. cameras: names (empty: the first one). width_px: of the pictures
             (0 = as recorded). layers: of the pictures; motion is not among them. step_s: seconds per step.
         traffic: ``log``: road users as recorded; ``idm``: they follow whoever is ahead.
         largest_shift_m: see above.

@@ -6,6 +6,7 @@ Axes are those of a camera: x right, y down, z forward; the centre of the top-le
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -197,6 +198,14 @@ def check_optics(optics: Optics, positive: Sequence[float], numbers: Sequence[fl
         raise UsageError("focal lengths and angles must be positive", where=where, got=str(list(positive)))
     if not all(math.isfinite(value) for value in numbers):
         raise UsageError("a lens coefficient is not finite", where=where, got=str(list(numbers)))
+
+
+@functools.lru_cache(maxsize=8)
+def rays_of(optics: Optics) -> Floats:
+    """The rays of a lens f64[H, W, 3], computed once and not to be written to: a simulator asks for the same cameras."""
+    rays = optics.rays()
+    rays.setflags(write=False)
+    return rays
 
 
 def unit(vectors: Floats) -> Floats:

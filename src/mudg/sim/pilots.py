@@ -1,7 +1,7 @@
 """Drivers for a closed loop: what they see, and two that decide by it.
 
-A pilot gets a `DriverView` at every step and answers with `Controls`. `RoutePilot` knows the road by its route and keeps
-its distance to whoever it sees ahead; `PlanPilot` drives along the plans of a policy.
+A pilot gets a `DriverView` at every step and answers with `Controls`. `RoutePilot` knows the road by its route and
+keeps its distance to whoever it sees ahead; `PlanPilot` drives along the plans of a policy.
 """
 
 from __future__ import annotations

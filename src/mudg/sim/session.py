@@ -30,7 +30,7 @@ from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
 from mudg.gaussians.rendering import COVERED, RenderedCondition, raster_of, render_condition
 from mudg.gaussians.storage import load_model
 from mudg.scene.read import read_scene
-from mudg.sim.optics import Face, Optics, Pinhole, bilinear, faces_of, nearest, rays_per_radian, surface
+from mudg.sim.optics import Face, Optics, Pinhole, bilinear, faces_of, nearest, rays_of, rays_per_radian, surface
 
 Layer = Literal["rgb", "depth", "distance", "classes", "instances", "normals", "confidence", "motion"]
 LAYERS: Final[tuple[Layer, ...]] = get_args(Layer)
@@ -341,7 +341,7 @@ class Session:
         """What a camera sees."""
         width, height = request.optics.width, request.optics.height
         name = request.colors_of or next(iter(self.cameras), "sim")
-        rays, canvas = request.optics.rays(), Canvas(width, height)
+        rays, canvas = rays_of(request.optics), Canvas(width, height)
         wants_instances = "instances" in request.layers or "motion" in request.layers
         for rows, columns, moment in _parts(request, width, height):
             pose, part = moment.world_from_sensor, rays[rows, columns]
@@ -359,9 +359,10 @@ class Session:
                 planes = self.pinhole(View(camera, pose @ turned, moment.time_s), moment, wants_instances)
                 canvas.sample((rows, columns), planes, face)
         middle = request.start if request.end is None else request.start.towards(request.end, 0.5)
-        world_rays = rays @ middle.world_from_sensor[:3, :3].T
         layers = {layer: self._layer(layer, canvas, request, rays, middle) for layer in request.layers}
-        return CameraReply(layers, tuple(sorted(self._nodes)), self._trust(canvas, middle, world_rays))
+        return CameraReply(
+            layers, tuple(sorted(self._nodes)), self._trust(canvas, middle, rays @ middle.world_from_sensor[2, :3])
+        )
 
     def _layer(
         self, layer: Layer, canvas: Canvas, request: CameraRequest, rays: Matrix, middle: Instant
@@ -405,11 +406,11 @@ class Session:
         flow.reshape(-1, 2)[seen] = np.stack([u - columns - 0.5, v - rows - 0.5], 1)[seen]
         return flow
 
-    def _trust(self, canvas: Canvas, middle: Instant, world_rays: Matrix) -> Trust:
+    def _trust(self, canvas: Canvas, middle: Instant, upwards: Matrix) -> Trust:
         solid = np.isfinite(canvas.distance)
         with np.errstate(invalid="ignore"):
-            below = world_rays[..., 2] < 0
-        counted = (solid | below) & np.isfinite(world_rays[..., 2])
+            below = upwards < 0
+        counted = (solid | below) & np.isfinite(upwards)
         sure = solid & (canvas.certainty > CERTAIN)
         share = float(sure.sum() / counted.sum()) if counted.any() else 1.0
         if not len(self._recorded):
