@@ -202,7 +202,7 @@ def check_optics(optics: Optics, positive: Sequence[float], numbers: Sequence[fl
 
 @functools.lru_cache(maxsize=8)
 def rays_of(optics: Optics) -> Floats:
-    """The rays of a lens f64[H, W, 3], computed once and not to be written to: a simulator asks for the same cameras."""
+    """The rays of a lens f64[H, W, 3], computed once and read-only: a simulator asks for the same cameras again."""
     rays = optics.rays()
     rays.setflags(write=False)
     return rays
