@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from mudg.base.errors import MudgError
     from mudg.base.types import Camera, Gaussians, Observation, PointCloud, Render, Scene, Track, Trajectory, View
     from mudg.core.raster.rasterize import rasterize
+    from mudg.datasets.tensors import as_dataset, collate
     from mudg.scene.observations import read_observations
     from mudg.steps.fitted import FittedScene, Picture, read_scene
     from mudg.steps.functions import (
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
         annotate,
         bench,
         convert,
+        dataset,
         demo,
         doctor,
         edit,
@@ -63,6 +65,8 @@ _HOMES = {
     "Track": "mudg.base.types",
     "Trajectory": "mudg.base.types",
     "View": "mudg.base.types",
+    "as_dataset": "mudg.datasets.tensors",
+    "collate": "mudg.datasets.tensors",
     "rasterize": "mudg.core.raster.rasterize",
     "read_observations": "mudg.scene.observations",
     "read_scene": "mudg.steps.fitted",
@@ -70,6 +74,7 @@ _HOMES = {
     "annotate": _FUNCTIONS,
     "bench": _FUNCTIONS,
     "convert": _FUNCTIONS,
+    "dataset": _FUNCTIONS,
     "demo": _FUNCTIONS,
     "doctor": _FUNCTIONS,
     "edit": _FUNCTIONS,
@@ -104,8 +109,11 @@ __all__ = [
     "__version__",
     "adapt",
     "annotate",
+    "as_dataset",
     "bench",
+    "collate",
     "convert",
+    "dataset",
     "demo",
     "doctor",
     "edit",

@@ -31,7 +31,11 @@ def objects_only(gaussians: Gaussians) -> Gaussians:
     """The rows of dynamic objects (node above 0), without class channels."""
     if gaussians.node is None:
         raise ValueError("the Gaussians have no node index")
-    rows = gaussians.node > 0
+    return rows_of(gaussians, gaussians.node > 0)
+
+
+def rows_of(gaussians: Gaussians, rows: Tensor) -> Gaussians:
+    """Some rows bool[N], without class channels."""
     return replace(
         gaussians,
         means=gaussians.means[rows],

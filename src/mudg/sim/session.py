@@ -27,7 +27,7 @@ from mudg.editing.runs import find_run, scene_at
 from mudg.editing.script import EditScript, read_edits
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
-from mudg.gaussians.rendering import COVERED, RenderedCondition, raster_of, render_condition
+from mudg.gaussians.rendering import COVERED, RenderedCondition, raster_of, render_condition, rows_of
 from mudg.gaussians.storage import load_model
 from mudg.scene.read import read_scene
 from mudg.sim.optics import Face, Optics, Pinhole, bilinear, faces_of, nearest, rays_of, rays_per_radian, surface
@@ -321,6 +321,18 @@ class Session:
             own = (most > 1 - weights.sum(0)) & (most >= COVERED / 2)
             found = torch.where(own, first[which] + 1, 0).numpy().astype(np.int32)
         return Planes(seen, found)
+
+    def alone(self, view: View, moment: Instant, name: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Alpha f32[H, W] and depth f32[H, W] in metres of one object drawn alone; alpha is 0 where it is absent."""
+        model, gaussians = self._composed_at(moment)
+        owner = next(index for index, node in enumerate(model.nodes) if node.name == name)
+        rows = gaussians.node == owner
+        if not rows.any() or not self._reaches(view, name, moment):
+            nothing = np.zeros((view.camera.height, view.camera.width), np.float32)
+            return nothing, nothing
+        with torch.no_grad():
+            drawn = rasterize(rows_of(gaussians, rows), view, raster_of(model))
+        return drawn.alpha[0].cpu().numpy(), drawn.depth[0].cpu().numpy()
 
     def _reaches(self, view: View, name: str, moment: Instant) -> bool:
         """Whether any corner of an object's box may lie in a view."""

@@ -29,6 +29,7 @@ _HOMES: Final[Mapping[str, str]] = {
     "asset export": "mudg.steps.edit:AssetExport",
     "asset import": "mudg.steps.edit:AssetImport",
     "export": "mudg.steps.export:Export",
+    "dataset": "mudg.steps.dataset:Dataset",
     "batch run": "mudg.steps.batch:BatchRun",
     "batch status": "mudg.steps.batch:BatchProgress",
     "batch retry": "mudg.steps.batch:BatchRetry",

@@ -10,7 +10,7 @@ from mudg import steps
 from mudg.steps.step import python_function
 
 VERBS: Final = {
-    **{name: name for name in "adapt annotate bench convert demo doctor edit export".split()},
+    **{name: name for name in "adapt annotate bench convert dataset demo doctor edit export".split()},
     "export_asset": "asset export",
     "fit": "fit",
     "fuse": "fuse",

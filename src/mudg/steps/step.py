@@ -211,6 +211,7 @@ HOMES: Final[Mapping[str, str]] = {
     "AnnotateConfig": "mudg.labels.settings",
     "BatchConfig": "mudg.fleet.settings",
     "ConvertConfig": "mudg.diffusion.settings",
+    "DatasetConfig": "mudg.datasets.settings",
     "FitConfig": "mudg.gaussians.settings",
     "FuseConfig": "mudg.scene.settings",
     "HarmonizeConfig": "mudg.diffusion.settings",

@@ -1,0 +1,106 @@
+"""COCO: instances with masks as run lengths, and panoptic segmentation. Categories are the 19 classes of Cityscapes.
+
+Source: the data format page of cocodataset.org. Category ids are train ids plus 1; a panoptic id is
+``R + 256 G + 65536 B``; run lengths count down the columns and begin with pixels outside the mask.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import store
+from mudg.base.palette import CLASSES, DISPLAY_COLORS, DYNAMIC_IDS, ID, UNLABELLED
+from mudg.base.versions import version
+from mudg.datasets.samples import LabelledView, ObjectBox, around
+
+FILES: Final = ("images/*.png", "panoptic/*.png", "annotations/*.json", "provenance.jsonl")
+CATEGORY_OF: Final = {
+    **dict.fromkeys(("vehicle", "van"), "car"),
+    **dict.fromkeys(("pedestrian", "adult", "child", "person_sitting"), "person"),
+    **dict.fromkeys(("cyclist", "bicyclist", "motorcyclist"), "rider"),
+    "tram": "train",
+}
+"""Label -> class, where they differ."""
+
+
+def write_view(folder: Path, number: int, view: LabelledView) -> dict[str, Any]:
+    """The image, its panoptic image, and its annotations."""
+    classes, instances = view.layers["classes"], view.layers["instances"]
+    height, width = classes.shape
+    store.write_image(folder / "images" / f"{number:06d}.png", view.layers["rgb"])
+    segments, ids, annotations = [], np.zeros((height, width), np.uint32), []
+    for box in view.boxes:
+        mask = instances == box.number
+        category, segment = 1 + class_of(box, classes[mask]), len(segments) + 1
+        ids[mask] = segment
+        rectangle = _rectangle(mask)
+        whole = {"id": segment, "category_id": category, "area": box.pixels, "bbox": rectangle, "iscrowd": 0}
+        segments.append(whole)
+        mask_of = {"size": [height, width], "counts": run_lengths(mask)}
+        annotations.append(
+            {**whole, "segmentation": mask_of, "track_id": box.track_id, "seen_from_deg": box.seen_from_deg}
+        )
+    for train_id in np.unique(classes[ids == 0]).tolist():
+        stuff = (classes == train_id) & (ids == 0)
+        if train_id == UNLABELLED:
+            continue
+        segment, crowd = len(segments) + 1, int(train_id in DYNAMIC_IDS)
+        ids[stuff] = segment
+        about = {"id": segment, "category_id": 1 + train_id, "area": int(stuff.sum()), "bbox": _rectangle(stuff)}
+        segments.append({**about, "iscrowd": crowd})
+    store.write_image(
+        folder / "panoptic" / f"{number:06d}.png", np.stack([(ids >> s) & 255 for s in (0, 8, 16)], -1).astype(np.uint8)
+    )
+    image = {"id": number, "file_name": f"{number:06d}.png", "width": width, "height": height}
+    return {"entry": image, "annotations": annotations, "segments": segments}
+
+
+def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
+    """``annotations/instances.json`` and ``annotations/panoptic.json``."""
+    things = set(DYNAMIC_IDS)
+    categories = [
+        {"id": index + 1, "name": name, "isthing": int(index in things), "color": DISPLAY_COLORS[index].tolist()}
+        for index, name in enumerate(CLASSES)
+    ]
+    info = {"description": "rendered by mudg", "version": version()}
+    images = [record["entry"] for record in records]
+    each = ({**one, "image_id": record["entry"]["id"]} for record in records for one in record["annotations"])
+    annotations = [{**one, "id": number + 1} for number, one in enumerate(each)]
+    whole = {"info": info, "licenses": [], "images": images, "categories": categories}
+    store.write_json(folder / "annotations" / "instances.json", {**whole, "annotations": annotations})
+    panoptic = [
+        {
+            "image_id": record["entry"]["id"],
+            "file_name": record["entry"]["file_name"],
+            "segments_info": record["segments"],
+        }
+        for record in records
+    ]
+    store.write_json(folder / "annotations" / "panoptic.json", {**whole, "annotations": panoptic})
+
+
+def class_of(box: ObjectBox, seen: NDArray[np.uint8]) -> int:
+    """The class of an object: of its label, or most of its pixels where the label is none of the classes."""
+    name = CATEGORY_OF.get(box.label, box.label)
+    if name in ID:
+        return ID[name]
+    known = seen[np.isin(seen, DYNAMIC_IDS)]
+    return int(np.bincount(known).argmax()) if len(known) else ID["car"]
+
+
+def run_lengths(mask: NDArray[np.bool_]) -> list[int]:
+    """Lengths of runs of pixels outside and inside a mask in turn, down the columns."""
+    flat = mask.T.reshape(-1)
+    edges = np.flatnonzero(np.diff(flat)) + 1
+    lengths = np.diff(np.concatenate([[0], edges, [len(flat)]])).tolist()
+    return [0, *lengths] if flat[0] else lengths
+
+
+def _rectangle(mask: NDArray[np.bool_]) -> list[float]:
+    left, top, right, bottom = around(mask)
+    return [left, top, right - left, bottom - top]
