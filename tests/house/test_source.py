@@ -23,6 +23,7 @@ ROOMS = (
     "app",
     "benchmarks",
     "steps",
+    "datasets",
     "sim",
     "viewer",
     "fleet",
@@ -614,7 +615,7 @@ def test_product_text_speaks_to_users(repository: Path, package_dir: Path) -> No
     problems = []
     for path in product_texts(repository, package_dir):
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-            simulated = path.parent.name in ("sim", "simulate") or path.stem in (
+            simulated = path.parent.name in ("sim", "simulate", "datasets") or path.stem in (
                 "simulator",
                 "loop",
                 "serve",

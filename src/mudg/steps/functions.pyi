@@ -215,6 +215,43 @@ def convert(
     """
     ...
 
+def dataset(
+    format: str,
+    run_folder: str | Path,
+    *,
+    out: str | Path,
+    overwrite: bool = False,
+    scene: str | Path | None = None,
+    edits: str | Path | None = None,
+    config: str | Path | None = None,
+    cameras: tuple[str, ...] = (),
+    shifts_m: tuple[float, ...] = (0.0,),
+    every: int = 1,
+    width_px: int = 0,
+    least_pixels: int = 25,
+    farthest_seen_deg: float = 180.0,
+    device: str = 'auto',
+) -> Any:
+    """Write labelled images of a reconstruction as a data set: kitti or coco.
+
+    Args:
+        format: kitti: images, calibration and 3D boxes as in KITTI's object benchmark. coco: instances with masks, and panoptic segmentation.
+        run_folder: Folder of a finished mudg run, or of a fit (with --scene).
+        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
+        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        scene: Scene directory that a fit belongs to. A run has its own.
+        edits: Edit script (docs/edit.md) to carry out before.
+        config: YAML file of settings, read before those given here.
+        cameras: Cameras of the log (empty = all).
+        shifts_m: Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path. Several make one data set.
+        every: Take every n-th frame.
+        width_px: Image width in pixels (0 = as recorded); the height follows.
+        least_pixels: Leave out objects of which fewer pixels are visible.
+        farthest_seen_deg: Leave out objects that are seen from this many degrees or more beside every direction from which the log recorded them: that side of them is guesswork. 60 is strict.
+        device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
+    """
+    ...
+
 def demo(
     *,
     out: str | Path = ...,
