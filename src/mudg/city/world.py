@@ -532,7 +532,8 @@ class CityWorld:
         first, last = (float(np.clip(end, *self.span_s)) for end in (times_s.min(), times_s.max()))
         middle = (first + last) / 2
         share = ((times_s - first) / (last - first)).clip(0, 1) if last > first else np.zeros(len(times_s))
-        turns = 0.1 * (np.arange(len(times_s)) % 6)  # neighbours fire apart, so that no two share their candidates
+        # neighbours fire apart, so that no two share their candidates
+        turns = np.asarray(0.1 * (np.arange(len(times_s)) % 6), np.float64)
         cos, sin, zero = np.cos(turns), np.sin(turns), np.zeros(len(turns))
         back = np.stack([cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1], 1).reshape(-1, 3, 3)
         poses = np.concatenate([_axes_along(directions) @ back, places[:, :, None]], 2)
@@ -541,8 +542,10 @@ class CityWorld:
         key = seeds.key(self.config.seed, round(middle * 1e6), "exact beams")
         xyz, intensity, _, _ = self._handle.sweep(*objects, np.zeros(1), turns, poses, share, settings, key)
         returned = intensity[:, 0] >= 0
-        away = np.linalg.norm(xyz[:, 0].astype(np.float64) - places, axis=1)
-        return np.where(returned, away, np.nan), np.where(returned, intensity[:, 0], np.nan).astype(np.float64)
+        range_m, light = np.full(len(times_s), np.nan), np.full(len(times_s), np.nan)
+        range_m[returned] = np.linalg.norm(xyz[returned, 0].astype(np.float64) - places[returned], axis=1)
+        light[returned] = intensity[returned, 0]
+        return range_m, light
 
     def lidar_sweep(self, index: int, scan: sensors.LidarScan | None = None) -> CitySweep:
         """The sweep around the time of frame ``index``: it starts and ends half a turn away from it, looking backwards.

@@ -25,6 +25,8 @@ LAYER_GAP: Final = 0.04
 """if two of them, next to each other in depth, differ by at least this share."""
 NEARER: Final = 1.3
 """The front surface is met unless its nearest return is this much farther from the beam than the back one's."""
+HELD: Final = 0.001
+"""How much slopes are held towards 0, as a share of the weights."""
 OUTLIER: Final = 0.01
 """Relative error at which a return counts half."""
 VOXEL_M: Final = 0.03
@@ -58,9 +60,8 @@ class Returns:
 
     def taken(self, rows: NDArray[np.integer] | NDArray[np.bool_]) -> Returns:
         """Some of them."""
-        return Returns(
-            *(column[rows] for column in (self.xyz, self.seen_from, self.intensity, self.count, self.missed))
-        )
+        xyz, seen_from, intensity = self.xyz[rows], self.seen_from[rows], self.intensity[rows]
+        return Returns(xyz, seen_from, intensity, self.count[rows], self.missed[rows])
 
     def averaged(self) -> Returns:
         """Neighbours averaged; cubes grow with the range in powers of two."""
@@ -72,12 +73,11 @@ class Returns:
         key = np.ravel_multi_index(
             tuple((cell - cell.min(0)).T) + (level,), (*(np.ptp(cell, 0) + 1), int(level.max()) + 1)
         )
-        _, of, sizes = np.unique(key, return_inverse=True, return_counts=True)
-        mean = lambda values: np.bincount(of, values * self.count) / np.bincount(of, self.count)
-        columns = (np.stack([mean(axis) for axis in block.T], 1) for block in (self.xyz, self.seen_from))
-        return Returns(
-            *columns, mean(self.intensity), np.bincount(of, self.count), np.bincount(of, self.missed, len(sizes))
-        )
+        of = np.unique(key, return_inverse=True)[1]
+        count, missed = (np.asarray(np.bincount(of, own), np.float64) for own in (self.count, self.missed))
+        mean = lambda values: np.bincount(of, values * self.count) / count
+        xyz, seen_from = (np.stack([mean(axis) for axis in block.T], 1) for block in (self.xyz, self.seen_from))
+        return Returns(xyz, seen_from, mean(self.intensity), count, missed)
 
     def with_missed(self, missed: Floats) -> Returns:
         """The same with other counts of lost beams."""
@@ -137,7 +137,7 @@ def first_surface(beams: Floats, xyz: Floats) -> Met:
     away = np.linalg.norm(xyz, axis=1)
     directions = xyz / away[:, None]
     tree = KDTree(directions, balanced_tree=False, compact_nodes=False)
-    gaps, rows = tree.query(beams, NEIGHBOURS, distance_upper_bound=REACH_RAD, workers=-1)
+    gaps, rows = map(np.asarray, tree.query(beams, NEIGHBOURS, distance_upper_bound=REACH_RAD, workers=-1))
     own = np.flatnonzero(np.isfinite(gaps[:, 0]))
     if not len(own):
         return found
@@ -194,7 +194,7 @@ def _plane(u: Floats, v: Floats, inverse: Floats, weights: Floats) -> tuple[Floa
     relative error f64[B, k] of every return."""
     total = weights.sum(1)
     sums = lambda values: (weights * values).sum(1)
-    su, sv, suu, suv, svv = sums(u), sums(v), sums(u * u) + 0.03 * total, sums(u * v), sums(v * v) + 0.03 * total
+    su, sv, suu, suv, svv = sums(u), sums(v), sums(u * u) + HELD * total, sums(u * v), sums(v * v) + HELD * total
     sq, squ, sqv = sums(inverse), sums(inverse * u), sums(inverse * v)
     # Cramer's rule for the symmetric 3x3 system
     a, b, c = suu * svv - suv * suv, suv * sv - su * svv, su * suv - suu * sv

@@ -27,6 +27,7 @@ SAME_MOMENT_S: Final = 0.06
 ROW_BIN_DEG: Final = 0.01
 ROWS_APART_DEG: Final = 0.12
 ROW_SIGMA_DEG: Final = 0.05
+DOUBLED_SHARE: Final = 0.6
 FEWEST_IN_ROW: Final = 0.1
 """Least height of a row's peak, as a share of the middle one."""
 
@@ -157,8 +158,22 @@ def row_elevations(elevation_deg: Floats) -> Floats:
     peaks, found = signal.find_peaks(smooth, height=0.0, prominence=0.0, distance=ROWS_APART_DEG / ROW_BIN_DEG)
     if not len(peaks):
         return np.zeros(0)
-    least = FEWEST_IN_ROW * float(np.median(found["prominences"][found["prominences"] > 0.2 * smooth.max()]))
-    return (edges[peaks] + edges[peaks + 1])[found["prominences"] >= least] / 2
+    height = found["prominences"]
+    kept = np.flatnonzero(height >= FEWEST_IN_ROW * float(np.median(height[height > 0.2 * smooth.max()])))
+    rows, height = (edges[peaks] + edges[peaks + 1])[kept] / 2, height[kept]
+    return rows[~_doubled(rows, height)]
+
+
+def _doubled(rows: Floats, height: Floats) -> NDArray[np.bool_]:
+    """Which peaks bool[R] are another row's second one: the lower of two that stand much nearer than rows around do."""
+    gaps = np.diff(rows)
+    usual = ndimage.median_filter(gaps, 9, mode="nearest")
+    near = gaps < DOUBLED_SHARE * usual
+    lower = height[:-1] < height[1:]
+    found = np.zeros(len(rows), bool)
+    found[:-1] |= near & lower
+    found[1:] |= near & ~lower
+    return found
 
 
 # which sweeps -------------------------------------------------------------------------------------

@@ -111,12 +111,12 @@ def _read_set(folder: Path) -> SweepSet:
 
 
 def _sweep(record: Mapping[str, Any], folder: Path) -> SimulatedSweep:
-    poses = [np.array(record[name], np.float64) for name in ("start", "end")]
-    for pose in poses:
+    start, end = (np.array(record[name], np.float64) for name in ("start", "end"))
+    for pose in (start, end):
         if problem := geometry.rigid_problem(pose):
             raise InputError(f"a pose of a simulated sweep is not rigid: {problem}", where=str(folder / INDEX))
     name = str(record["file"])
     if "/" in name or not name.endswith(".safetensors") or name.startswith("."):
         raise InputError("a simulated sweep lies elsewhere", where=str(folder / INDEX), got=name[:80])
     times = float(record["start_s"]), float(record["end_s"])
-    return SimulatedSweep(str(record["id"]), bool(record["own_beams"]), *poses, *times, name)
+    return SimulatedSweep(str(record["id"]), bool(record["own_beams"]), start, end, times[0], times[1], name)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
+from mudg.base.errors import InputError
 from mudg.base.types import Scene, Sweep
 from mudg.city.world import CityWorld
 from mudg.scene.beams import Beams, beams_of, held_out, moving_tracks, placed, returns_of, training_sweeps, with_silent
@@ -134,8 +135,11 @@ def _judged(scene: Scene, world: CityWorld | None, found: SweepSet) -> Iterator[
         beams = Beams(directions, share, nan, nan, sweep.start, sweep.end, *times)
         if found.shift_m == 0 and sweep.own_beams and sweep.id in recorded:
             true = with_silent(beams_of(scene, recorded[sweep.id]))
-            if len(true) == len(beams):
-                yield sweep, beams, Measured(true.range_m, true.intensity)
+            if len(true) != len(beams):
+                what, where = "a simulated sweep has other beams than the recorded one", str(found.folder / sweep.file)
+                remedy = "render it again with this version"
+                raise InputError(what, where=where, expected=str(len(true)), got=str(len(beams)), remedy=remedy)
+            yield sweep, beams, Measured(true.range_m, true.intensity)
         elif world is not None:
             yield sweep, beams, _exact(world, beams)
 
@@ -194,9 +198,9 @@ def first_points(beams: Floats, xyz: Floats, candidates: int) -> NDArray[np.int6
     if not len(xyz) or not len(beams):
         return np.full(len(beams), -1)
     away = np.linalg.norm(xyz, axis=1)
-    gaps, rows = KDTree(xyz / away[:, None]).query(
-        beams, np.arange(1, min(candidates, len(xyz)) + 1), distance_upper_bound=MATCH_RAD, workers=-1
-    )
+    count = min(candidates, len(xyz))
+    found = KDTree(xyz / away[:, None]).query(beams, count, distance_upper_bound=MATCH_RAD, workers=-1)
+    gaps, rows = (np.asarray(block).reshape(len(beams), count) for block in found)
     known = np.isfinite(gaps)
     depth = np.where(known, away[np.where(known, rows, 0)], np.inf)
     first = depth.min(1)

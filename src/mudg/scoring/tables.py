@@ -63,7 +63,7 @@ LIDAR_COLUMNS: Final[Mapping[str, tuple[str, str, int]]] = {
 """Column -> title, unit, digits."""
 LIDAR_TITLES: Final = {"nearest": "nearest sweep, moved", "fused": "8 sweeps, fused"}
 LIDAR_RULES: Final = (
-    "LiDAR: a beam is right where it returns as in the truth (F1). Errors of range (median) and of intensity (mean) are "
+    "LiDAR: a beam is right where it returns as in the truth (F1). Errors of range (median) and intensity (mean) are "
     "those of beams that return in both; chamfer is the mean of both directions.",
     "LiDAR on the recorded path: held-out sweeps with their own beams; those without a return are estimated from the "
     "sensor's rows and columns. No row uses the held-out sweeps, but the clouds that the fit started from hold them.",

@@ -234,6 +234,10 @@ def _meet(
     hits.lost[chosen] = ~known.returns(met)[seen]
     number = np.array([1 + names.index(name) if name in names else 0 for name in parts], np.uint16)
     hits.instances[chosen] = number[known.owners()[row]]
+    other = own[np.isfinite(hits.distance[own]) & ~seen & (hits.instances[own] == 0)]
+    ends = beams[np.searchsorted(own, other)] * hits.distance[other][:, None]
+    places = geometry.transform_points(moment.world_from_sensor, ends)
+    hits.distance[other[known.contradicts(places, poses)]] = np.nan
 
 
 def _carried(points: NDArray[np.float32], share: Floats, start: Instant, end: Instant) -> NDArray[np.float32]:

@@ -10,14 +10,14 @@ whose returns are not in the cloud. Where the log measured nothing, the Gaussian
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from mudg.base import log
+from mudg.base import geometry, log
 from mudg.base.types import Scene, Sweep, Track
 from mudg.core.returns import Met, Returns, first_surface
 from mudg.scene.beams import WORLD, Beams, beams_of, moving_tracks, placed, returns_of, training_sweeps, with_silent
@@ -33,6 +33,8 @@ MARGIN_RAD: Final = 0.03
 ROUNDS: Final = 12
 DAMPING: Final = 1e-3
 CERTAIN: Final = 1e-6
+HIDDEN_SHARE: Final = 0.95
+"""A surface is hidden from a station that meets another one nearer than this share of its distance."""
 GONE_M: Final = 0.3
 """A return belongs to the background that an edit took away if the nearest Gaussian, at most this far, is gone."""
 
@@ -44,11 +46,15 @@ class LogReturns:
     Args:
         parts: by object, and ``WORLD``. tracks: of the objects. weights: of the regression (``features``); None: too
             little to learn from, and a beam returns where it meets something.
+        stations: world-from-sensor f64[S, 4, 4] of the sweeps. field: sines f64[2] of the lowest and highest elevation
+            of their returns.
     """
 
     parts: Mapping[str, Returns]
     tracks: Mapping[str, Track]
     weights: Floats | None
+    stations: Floats
+    field: Floats
 
     def poses(self, time_s: float, known: Mapping[str, Floats]) -> dict[str, Floats]:
         """Poses of all objects at a time: those that are known, else those of the tracks."""
@@ -98,12 +104,29 @@ class LogReturns:
         seen = np.isfinite(met.range_m)
         return seen if self.weights is None else seen & (self.features(met) @ self.weights > 0)
 
+    def contradicts(self, places: Floats, poses: Mapping[str, Floats]) -> NDArray[np.bool_]:
+        """Which surfaces at places f64[N, 3] in the world cannot be there: the nearest station had them in its field
+        and in reach, and measured nothing before them."""
+        found = np.zeros(len(places), bool)
+        if not len(places):
+            return found
+        nearest = KDTree(self.stations[:, :3, 3]).query(places, workers=-1)[1]
+        for number in np.unique(nearest):
+            own, station = np.flatnonzero(nearest == number), self.stations[number]
+            local = geometry.transform_points(geometry.invert(station), places[own])
+            away = np.maximum(np.linalg.norm(local, axis=1), 1e-6)
+            beams = local / away[:, None]
+            met = self.meet(beams, station, poses)
+            hidden = np.isfinite(met.range_m) & (met.range_m < HIDDEN_SHARE * away)
+            found[own] = ~hidden & (beams[:, 2] >= self.field[0]) & (beams[:, 2] <= self.field[1])
+        return found
+
     def without(self, gone: Callable[[Floats], NDArray[np.bool_]]) -> LogReturns:
         """Without those returns of the world at places f64[N, 3] that are gone."""
         if WORLD not in self.parts:
             return self
         kept = self.parts[WORLD].taken(~gone(self.parts[WORLD].xyz))
-        return LogReturns({**self.parts, WORLD: kept}, self.tracks, self.weights)
+        return replace(self, parts={**self.parts, WORLD: kept})
 
 
 def learn_returns(scene: Scene) -> LogReturns | None:
@@ -114,13 +137,21 @@ def learn_returns(scene: Scene) -> LogReturns | None:
         return None
     log.info(f"LiDAR: surfaces, intensity and lost beams from {len(sweeps)} sweeps")
     tracks = {track.id: track for track in moving_tracks(scene)}
+    own = (tracks, None, np.stack([sweep.world_from_lidar for sweep in sweeps]), _field(scene, sweeps))
     tested = _evenly(sweeps[1:-1], MOST_TESTED) if len(sweeps) >= 4 else ()
     weights = None
     if tested:
         rest = tuple(sweep for sweep in sweeps if sweep not in tested)
-        trial = _with_losses(scene, rest, LogReturns(_averaged(scene, rest), tracks, None))
+        trial = _with_losses(scene, rest, LogReturns(_averaged(scene, rest), *own))
         weights = _regression(*_samples(scene, tested, trial))
-    return _with_losses(scene, sweeps, LogReturns(_averaged(scene, sweeps), tracks, weights))
+    return replace(_with_losses(scene, sweeps, LogReturns(_averaged(scene, sweeps), *own)), weights=weights)
+
+
+def _field(scene: Scene, sweeps: Sequence[Sweep]) -> Floats:
+    """Sines of the lowest and the highest elevation at which sweeps have returns."""
+    sines = [beams_of(scene, sweep).directions[:, 2] for sweep in _evenly(sweeps, MOST_SILENT)]
+    ends = np.array([(rows.min(initial=0.0), rows.max(initial=0.0)) for rows in sines])
+    return np.array([ends[:, 0].min(), ends[:, 1].max()])
 
 
 def _averaged(scene: Scene, sweeps: Sequence[Sweep]) -> dict[str, Returns]:
@@ -147,7 +178,7 @@ def _with_losses(scene: Scene, sweeps: Sequence[Sweep], found: LogReturns) -> Lo
     missed *= len(sweeps) / max(1, len(chosen))
     blocks = np.split(missed, np.cumsum(sizes)[:-1])
     parts = {name: part.with_missed(own) for (name, part), own in zip(found.parts.items(), blocks, strict=True)}
-    return LogReturns(parts, found.tracks, found.weights)
+    return replace(found, parts=parts)
 
 
 def _parts(beams: Beams, chosen: NDArray[np.int64]) -> list[tuple[float, NDArray[np.int64]]]:

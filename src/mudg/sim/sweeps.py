@@ -15,8 +15,6 @@ from mudg.base import log, store
 from mudg.base.errors import UsageError
 from mudg.base.types import Scene, Sweep
 from mudg.core.trajectory import ego_left_world, trajectory_name
-from mudg.editing.runs import scene_at
-from mudg.editing.script import EditScript
 from mudg.editing.settings import RenderConfig
 from mudg.scene.beams import beams_of, with_silent
 from mudg.scene.read import read_scene
@@ -57,12 +55,11 @@ def wanted_sweeps(name: str, scene: Scene) -> WantedSweeps:
     raise UsageError("no such LiDAR", where="--lidar", expected=expected, got=name)
 
 
-def write_sweeps(config: RenderConfig, scene: Path, model: Path, script: EditScript | None, out: Path) -> list[str]:
-    """Simulate every sweep of the log at every shift; returns names of the trajectories. Sweeps that an interrupted run
-    wrote are kept."""
-    loaded = read_scene(scene_at(scene))
+def write_sweeps(config: RenderConfig, scene: Path, session: Session, out: Path) -> list[str]:
+    """Simulate every sweep of the log ``scene`` at every shift; returns names of the trajectories. Sweeps that an
+    interrupted run wrote are kept."""
+    loaded = read_scene(scene)
     wanted = wanted_sweeps(config.lidar, loaded)
-    session = Session(model, script, loaded, config.device)
     sweeps = [sweep for sweep in loaded.sweeps if sweep.sensor == wanted.sensor]
     names = []
     with log.task("render LiDAR", len(sweeps) * len(config.shifts_m)) as bar:

@@ -72,12 +72,13 @@ class RenderViews(Output):
             return views
         from mudg.scene.read import read_scene
         from mudg.sim import sweeps
+        from mudg.sim.session import Session
 
         sweeps.wanted_sweeps(self.settings.lidar, read_scene(self.scene))
 
         def make(work: RunDir) -> dict[str, Any]:
-            summary = views(work)
-            return summary | {"lidar": sweeps.write_sweeps(self.settings, self.scene, model, script, work.path)}
+            summary, session = views(work), Session(model, script, self.scene, self.settings.device)
+            return summary | {"lidar": sweeps.write_sweeps(self.settings, self.scene, session, work.path)}
 
         return make
 
