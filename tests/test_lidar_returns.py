@@ -220,10 +220,10 @@ def test_a_surface_that_the_log_looked_through_is_no_answer(city: Scene) -> None
     far = np.flatnonzero(beams.range_m > 15)[::40]
     at = lambda share: geometry.transform_points(station, beams.directions[far] * (share * beams.range_m[far])[:, None])
     poses = found.poses(city.sweeps[2].time_s, {})
-    assert found.contradicts(at(0.5), poses).mean() > 0.85  # seen through
-    assert found.contradicts(at(1.5), poses).mean() < 0.1  # hidden: nobody knows
+    assert found.contradicts(at(0.5), station, poses).mean() > 0.95  # seen through
+    assert found.contradicts(at(1.5), station, poses).mean() < 0.1  # hidden: nobody knows
     above = geometry.transform_points(station, np.array([[1.0, 0.0, 30.0]]))
-    assert not found.contradicts(above, poses).any()  # out of its field
+    assert not found.contradicts(above, station, poses).any()  # out of its field
 
 
 def test_returns_of_what_an_edit_took_away_go_with_it() -> None:

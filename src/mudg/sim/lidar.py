@@ -32,6 +32,8 @@ SLICES: Final = 8
 AXES: Final = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """Rotation sensor-from-camera: a LiDAR looks along x, y is left, z up."""
 MOST_BEAMS: Final = 4_000_000
+MOST_MOMENTS: Final = 4096
+"""Beams of more moments than these are carried to the end of the sweep by the nearest of so many."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -237,14 +239,18 @@ def _meet(
     other = own[np.isfinite(hits.distance[own]) & ~seen & (hits.instances[own] == 0)]
     ends = beams[np.searchsorted(own, other)] * hits.distance[other][:, None]
     places = geometry.transform_points(moment.world_from_sensor, ends)
-    hits.distance[other[known.contradicts(places, poses)]] = np.nan
+    hits.distance[other[known.contradicts(places, moment.world_from_sensor, poses)]] = np.nan
 
 
 def _carried(points: NDArray[np.float32], share: Floats, start: Instant, end: Instant) -> NDArray[np.float32]:
     """Points f32[n, 3] in the frames of their moments, in that of the end."""
     carried = np.empty_like(points)
     end_from_world = geometry.invert(end.world_from_sensor)
-    for at in np.unique(share):
+    moments = np.unique(share)
+    if len(moments) > MOST_MOMENTS:  # beams that are fired one by one
+        share = np.round(share * MOST_MOMENTS) / MOST_MOMENTS
+        moments = np.unique(share)
+    for at in moments:
         own = share == at
         pose = geometry.interpolate_pose(start.world_from_sensor, end.world_from_sensor, float(at))
         carried[own] = geometry.transform_points(end_from_world @ pose, points[own])

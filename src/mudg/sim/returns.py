@@ -40,21 +40,44 @@ GONE_M: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class Field:
+    """Where a sensor looks: sines of its lowest and highest elevation, and which degrees of azimuth bool[360]."""
+
+    low: float
+    high: float
+    azimuths: NDArray[np.bool_]
+
+    @classmethod
+    def of(cls, directions: Floats) -> Field:
+        """Where it has returns, directions f64[N, 3]."""
+        azimuths = np.bincount(cls._degree(directions), minlength=360) > 0
+        return cls(float(directions[:, 2].min(initial=1.0)), float(directions[:, 2].max(initial=-1.0)), azimuths)
+
+    @staticmethod
+    def _degree(directions: Floats) -> NDArray[np.int64]:
+        return np.floor(np.degrees(np.arctan2(directions[:, 1], directions[:, 0]))).astype(np.int64) % 360
+
+    def holds(self, directions: Floats) -> NDArray[np.bool_]:
+        """Which directions f64[N, 3] it looks in."""
+        level = (directions[:, 2] >= self.low) & (directions[:, 2] <= self.high)
+        return level & self.azimuths[self._degree(directions)]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LogReturns:
     """Returns of a log.
 
     Args:
         parts: by object, and ``WORLD``. tracks: of the objects. weights: of the regression (``features``); None: too
             little to learn from, and a beam returns where it meets something.
-        stations: world-from-sensor f64[S, 4, 4] of the sweeps. field: sines f64[2] of the lowest and highest elevation
-            of their returns.
+        stations: world-from-sensor f64[S, 4, 4] of the sweeps of one sensor, and its field.
     """
 
     parts: Mapping[str, Returns]
     tracks: Mapping[str, Track]
     weights: Floats | None
     stations: Floats
-    field: Floats
+    field: Field
 
     def poses(self, time_s: float, known: Mapping[str, Floats]) -> dict[str, Floats]:
         """Poses of all objects at a time: those that are known, else those of the tracks."""
@@ -104,22 +127,18 @@ class LogReturns:
         seen = np.isfinite(met.range_m)
         return seen if self.weights is None else seen & (self.features(met) @ self.weights > 0)
 
-    def contradicts(self, places: Floats, poses: Mapping[str, Floats]) -> NDArray[np.bool_]:
-        """Which surfaces at places f64[N, 3] in the world cannot be there: the nearest station had them in its field
-        and in reach, and measured nothing before them."""
-        found = np.zeros(len(places), bool)
+    def contradicts(self, places: Floats, world_from_sensor: Floats, poses: Mapping[str, Floats]) -> NDArray[np.bool_]:
+        """Which surfaces at places f64[N, 3] in the world cannot be there: the recorded sensor nearest to the simulated
+        one had them in its field and met nothing before them."""
         if not len(places):
-            return found
-        nearest = KDTree(self.stations[:, :3, 3]).query(places, workers=-1)[1]
-        for number in np.unique(nearest):
-            own, station = np.flatnonzero(nearest == number), self.stations[number]
-            local = geometry.transform_points(geometry.invert(station), places[own])
-            away = np.maximum(np.linalg.norm(local, axis=1), 1e-6)
-            beams = local / away[:, None]
-            met = self.meet(beams, station, poses)
-            hidden = np.isfinite(met.range_m) & (met.range_m < HIDDEN_SHARE * away)
-            found[own] = ~hidden & (beams[:, 2] >= self.field[0]) & (beams[:, 2] <= self.field[1])
-        return found
+            return np.zeros(0, bool)
+        apart = np.linalg.norm(self.stations[:, :3, 3] - world_from_sensor[:3, 3], axis=1)
+        station = self.stations[apart.argmin()]
+        local = geometry.transform_points(geometry.invert(station), places)
+        away = np.maximum(np.linalg.norm(local, axis=1), 1e-6)
+        met = self.meet(local / away[:, None], station, poses)
+        hidden = np.isfinite(met.range_m) & (met.range_m < HIDDEN_SHARE * away)
+        return ~hidden & self.field.holds(local / away[:, None])
 
     def without(self, gone: Callable[[Floats], NDArray[np.bool_]]) -> LogReturns:
         """Without those returns of the world at places f64[N, 3] that are gone."""
@@ -137,7 +156,9 @@ def learn_returns(scene: Scene) -> LogReturns | None:
         return None
     log.info(f"LiDAR: surfaces, intensity and lost beams from {len(sweeps)} sweeps")
     tracks = {track.id: track for track in moving_tracks(scene)}
-    own = (tracks, None, np.stack([sweep.world_from_lidar for sweep in sweeps]), _field(scene, sweeps))
+    turning = [sweep for sweep in sweeps if sweep.sensor == sweeps[0].sensor]
+    looks = np.concatenate([beams_of(scene, sweep).directions for sweep in _evenly(turning, MOST_SILENT)])
+    own = (tracks, None, np.stack([sweep.world_from_lidar for sweep in turning]), Field.of(looks))
     tested = _evenly(sweeps[1:-1], MOST_TESTED) if len(sweeps) >= 4 else ()
     weights = None
     if tested:
@@ -145,13 +166,6 @@ def learn_returns(scene: Scene) -> LogReturns | None:
         trial = _with_losses(scene, rest, LogReturns(_averaged(scene, rest), *own))
         weights = _regression(*_samples(scene, tested, trial))
     return replace(_with_losses(scene, sweeps, LogReturns(_averaged(scene, sweeps), *own)), weights=weights)
-
-
-def _field(scene: Scene, sweeps: Sequence[Sweep]) -> Floats:
-    """Sines of the lowest and the highest elevation at which sweeps have returns."""
-    sines = [beams_of(scene, sweep).directions[:, 2] for sweep in _evenly(sweeps, MOST_SILENT)]
-    ends = np.array([(rows.min(initial=0.0), rows.max(initial=0.0)) for rows in sines])
-    return np.array([ends[:, 0].min(), ends[:, 1].max()])
 
 
 def _averaged(scene: Scene, sweeps: Sequence[Sweep]) -> dict[str, Returns]:
