@@ -103,6 +103,7 @@ class LidarRequest:
         beams: what is fired. start, end: of the sweep; ``end`` None: all at one moment.
         weather: fog and rain that take from and add to it, or None. seed: of the noise of weather.
         focal_px: pixels per radian of the views that are sampled.
+        like: the LiDAR of the log that it resembles: what that one measured counts. Empty: the log's first.
     """
 
     beams: BeamTable
@@ -111,6 +112,7 @@ class LidarRequest:
     weather: WeatherSettings | None = None
     seed: int = 0
     focal_px: float = 700.0
+    like: str = ""
 
     def answer(self, session: Session) -> LidarReply:
         """The sweep. Beams into the sky, beyond the range or into what the recording never saw return nothing."""
@@ -146,7 +148,7 @@ class LidarReply:
 
 def _sweep(session: Session, request: LidarRequest) -> LidarReply:
     beams, start, end = request.beams, request.start, request.end or request.start
-    hits, known = Hits(len(beams.share)), session.log_returns()
+    hits, known = Hits(len(beams.share)), session.log_returns(request.like)
     edges = np.linspace(0, 1, (SLICES if request.end is not None else 1) + 1)
     for first, last in zip(edges[:-1], edges[1:], strict=True):
         own = np.flatnonzero((beams.share >= first) & ((beams.share < last) | (last == 1)))

@@ -18,9 +18,10 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from mudg.base import geometry, log
+from mudg.base.errors import UsageError
 from mudg.base.types import Scene, Sweep, Track
 from mudg.core.returns import Met, Returns, first_surface
-from mudg.scene.beams import WORLD, Beams, beams_of, moving_tracks, placed, returns_of, training_sweeps, with_silent
+from mudg.scene.beams import WORLD, beams_of, moving_tracks, placed, returns_of, training_sweeps, with_silent
 
 Floats = NDArray[np.float64]
 MOST_SILENT: Final = 4
@@ -33,6 +34,10 @@ MARGIN_RAD: Final = 0.03
 ROUNDS: Final = 12
 DAMPING: Final = 1e-3
 CERTAIN: Final = 1e-6
+THROUGH_M: Final = 0.3
+"""A beam goes through a surface if it ends this far, and 5 %, behind it."""
+UNDECIDED: Final = 0.2
+"""Weight of beams that says nothing."""
 HIDDEN_SHARE: Final = 0.95
 """A surface is hidden from a station that meets another one nearer than this share of its distance."""
 GONE_M: Final = 0.3
@@ -40,7 +45,7 @@ GONE_M: Final = 0.3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Field:
+class FieldOfView:
     """Where a sensor looks: sines of its lowest and highest elevation, and which degrees of azimuth bool[360]."""
 
     low: float
@@ -48,7 +53,7 @@ class Field:
     azimuths: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, directions: Floats) -> Field:
+    def of(cls, directions: Floats) -> FieldOfView:
         """Where it has returns, directions f64[N, 3]."""
         azimuths = np.bincount(cls._degree(directions), minlength=360) > 0
         return cls(float(directions[:, 2].min(initial=1.0)), float(directions[:, 2].max(initial=-1.0)), azimuths)
@@ -70,14 +75,14 @@ class LogReturns:
     Args:
         parts: by object, and ``WORLD``. tracks: of the objects. weights: of the regression (``features``); None: too
             little to learn from, and a beam returns where it meets something.
-        stations: world-from-sensor f64[S, 4, 4] of the sweeps of one sensor, and its field.
+        stations: world-from-sensor f64[S, 4, 4] of the sweeps. field: of the sensor.
     """
 
     parts: Mapping[str, Returns]
     tracks: Mapping[str, Track]
     weights: Floats | None
     stations: Floats
-    field: Field
+    field: FieldOfView
 
     def poses(self, time_s: float, known: Mapping[str, Floats]) -> dict[str, Floats]:
         """Poses of all objects at a time: those that are known, else those of the tracks."""
@@ -148,17 +153,26 @@ class LogReturns:
         return replace(self, parts={**self.parts, WORLD: kept})
 
 
-def learn_returns(scene: Scene) -> LogReturns | None:
-    """What the sweeps of a log tell, those of held-out frames left out; None without sweeps. The same log gives the
-    same numbers."""
-    sweeps = training_sweeps(scene)
+def learn_returns(scene: Scene, sensor: str = "") -> LogReturns | None:
+    """What the sweeps of a log's sensor tell, those of held-out frames left out; None without sweeps. The same log
+    gives the same numbers.
+
+    Args:
+        sensor: empty: the log's first. Others lie centimetres beside it, and their intensity means something else.
+
+    Raises:
+        UsageError: the log has no such sensor.
+    """
+    known = list(dict.fromkeys(sweep.sensor for sweep in scene.sweeps))
+    if sensor and sensor not in known:
+        raise UsageError("the log has no such LiDAR", expected=", ".join(known) or "none", got=sensor[:80])
+    sweeps = tuple(sweep for sweep in training_sweeps(scene) if sweep.sensor == (sensor or known[0]))
     if not sweeps:
         return None
-    log.info(f"LiDAR: surfaces, intensity and lost beams from {len(sweeps)} sweeps")
+    log.info(f"LiDAR: surfaces, intensity and lost beams from {len(sweeps)} sweeps of {sweeps[0].sensor}")
     tracks = {track.id: track for track in moving_tracks(scene)}
-    turning = [sweep for sweep in sweeps if sweep.sensor == sweeps[0].sensor]
-    looks = np.concatenate([beams_of(scene, sweep).directions for sweep in _evenly(turning, MOST_SILENT)])
-    own = (tracks, None, np.stack([sweep.world_from_lidar for sweep in turning]), Field.of(looks))
+    looks = np.concatenate([beams_of(scene, sweep).directions for sweep in _evenly(sweeps, MOST_SILENT)])
+    own = (tracks, None, np.stack([sweep.world_from_lidar for sweep in sweeps]), FieldOfView.of(looks))
     tested = _evenly(sweeps[1:-1], MOST_TESTED) if len(sweeps) >= 4 else ()
     weights = None
     if tested:
@@ -178,26 +192,27 @@ def _evenly(sweeps: Sequence[Sweep], most: int) -> tuple[Sweep, ...]:
 
 
 def _with_losses(scene: Scene, sweeps: Sequence[Sweep], found: LogReturns) -> LogReturns:
-    """The same with ``Returns.missed``: every beam of these sweeps that was lost counts, by weight, at the returns that
-    it met."""
+    """The same with ``Returns.missed``: every beam of some of these sweeps that was lost counts, by weight, at the
+    returns that it met. Returns that more beams went through than met are traces of what moved; they are left out."""
     chosen = _evenly(sweeps, MOST_SILENT)
     sizes = [len(part) for part in found.parts.values()]
-    missed = np.zeros(sum(sizes))
+    missed, met_here, gone_through = (np.zeros(sum(sizes)) for _ in range(3))
     for sweep in chosen:
         beams = with_silent(beams_of(scene, sweep))
-        silent = np.flatnonzero(~beams.returned)
-        for share, own in _parts(beams, silent):
+        for share, own in beams.parts(SECTORS):
             met = found.meet(beams.directions[own], beams.pose(share), found.poses(beams.time_s(share), {}))
-            missed += np.bincount(met.rows.reshape(-1), met.weights.reshape(-1), len(missed))
+            away, surface = beams.range_m[own], met.range_m
+            with np.errstate(invalid="ignore"):
+                kinds = (np.isnan(away), away <= 1.05 * surface + THROUGH_M, away > 1.05 * surface + THROUGH_M)
+            for sums, kind in zip((missed, met_here, gone_through), kinds, strict=True):
+                sums += np.bincount(met.rows[kind].reshape(-1), met.weights[kind].reshape(-1), len(sums))
     missed *= len(sweeps) / max(1, len(chosen))
-    blocks = np.split(missed, np.cumsum(sizes)[:-1])
-    parts = {name: part.with_missed(own) for (name, part), own in zip(found.parts.items(), blocks, strict=True)}
+    parts, first = {}, 0
+    for name, part in found.parts.items():
+        own = slice(first, first + len(part))
+        parts[name] = part.with_missed(missed[own]).taken(gone_through[own] <= met_here[own] + UNDECIDED)
+        first += len(part)
     return replace(found, parts=parts)
-
-
-def _parts(beams: Beams, chosen: NDArray[np.int64]) -> list[tuple[float, NDArray[np.int64]]]:
-    parts = ((share, np.intersect1d(own, chosen, assume_unique=True)) for share, own in beams.parts(SECTORS))
-    return [(share, own) for share, own in parts if len(own)]
 
 
 def _samples(scene: Scene, sweeps: Sequence[Sweep], found: LogReturns) -> tuple[Floats, NDArray[np.bool_]]:

@@ -218,7 +218,7 @@ class Session:
             script, before = edits if isinstance(edits, EditScript) else read_edits(edits), _background(run)
             run = carry_out(script, run, scene).model(run, keep_ego=True)
             self._gone = places_gone(before, _background(run))
-        self._returns: LogReturns | None = None
+        self._returns: dict[str, LogReturns | None] = {}
         self.scene: Scene | None = scene
         self.model = run.to(drawing_device(device, "sim"))
         self._nodes = {node.name: node for node in self.model.nodes if isinstance(node, RigidNode)}
@@ -251,13 +251,17 @@ class Session:
         """Recorded pose world-from-vehicle f64[4, 4] at a time; None outside the log."""
         return None if self.scene is None else self.scene.ego.pose_at(time_s)
 
-    def log_returns(self) -> LogReturns | None:
-        """What the log's sweeps tell about surfaces, intensity and lost beams, learnt at the first call (seconds); None
-        without a log or its sweeps."""
-        if self._returns is None and self.scene is not None:
-            found = learn_returns(self.scene)
-            self._returns = found if found is None or self._gone is None else found.without(self._gone)
-        return self._returns
+    def log_returns(self, sensor: str = "") -> LogReturns | None:
+        """What the sweeps of a LiDAR of the log (empty: its first) tell about surfaces, intensity and lost beams,
+        learnt at the first call (seconds); None without a log or its sweeps.
+
+        Raises:
+            UsageError: the log has no such LiDAR.
+        """
+        if sensor not in self._returns and self.scene is not None and self.scene.sweeps:
+            found = learn_returns(self.scene, sensor)
+            self._returns[sensor] = found if found is None or self._gone is None else found.without(self._gone)
+        return self._returns.get(sensor)
 
     def render(self, requests: Iterable[SensorRequest[Reply]]) -> list[Reply]:
         """What cameras and LiDARs measure, in the order of the requests.

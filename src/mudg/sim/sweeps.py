@@ -15,6 +15,7 @@ from mudg.base import log, store
 from mudg.base.errors import UsageError
 from mudg.base.types import Scene, Sweep
 from mudg.core.trajectory import ego_left_world, trajectory_name
+from mudg.editing.script import EditScript
 from mudg.editing.settings import RenderConfig
 from mudg.scene.beams import beams_of, with_silent
 from mudg.scene.read import read_scene
@@ -55,6 +56,11 @@ def wanted_sweeps(name: str, scene: Scene) -> WantedSweeps:
     raise UsageError("no such LiDAR", where="--lidar", expected=expected, got=name)
 
 
+def simulate_log(config: RenderConfig, scene: Path, model: Path, script: EditScript | None, out: Path) -> list[str]:
+    """``write_sweeps`` of a fitted scene on disk, edited if there is a script."""
+    return write_sweeps(config, scene, Session(model, script, scene, config.device), out)
+
+
 def write_sweeps(config: RenderConfig, scene: Path, session: Session, out: Path) -> list[str]:
     """Simulate every sweep of the log ``scene`` at every shift; returns names of the trajectories. Sweeps that an
     interrupted run wrote are kept."""
@@ -71,7 +77,7 @@ def write_sweeps(config: RenderConfig, scene: Path, session: Session, out: Path)
                 start, end = (_without(session, moment, config.remove_tracks) for moment in (start, end))
                 file = folder / f"{number:06d}.safetensors"
                 if not file.is_file():
-                    reply = session.render([LidarRequest(beams=beams, start=start, end=end)])[0]
+                    reply = session.render([LidarRequest(beams=beams, start=start, end=end, like=wanted.sensor)])[0]
                     store.write_safetensors(file, _arrays(beams, reply))
                 poses = (start.world_from_sensor, end.world_from_sensor, start.time_s, end.time_s)
                 records.append(SimulatedSweep(sweep.id, wanted.beams is None, *poses, file.name))

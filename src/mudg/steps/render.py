@@ -72,13 +72,12 @@ class RenderViews(Output):
             return views
         from mudg.scene.read import read_scene
         from mudg.sim import sweeps
-        from mudg.sim.session import Session
 
         sweeps.wanted_sweeps(self.settings.lidar, read_scene(self.scene))
 
         def make(work: RunDir) -> dict[str, Any]:
-            summary, session = views(work), Session(model, script, self.scene, self.settings.device)
-            return summary | {"lidar": sweeps.write_sweeps(self.settings, self.scene, session, work.path)}
+            summary = views(work)
+            return summary | {"lidar": sweeps.simulate_log(self.settings, self.scene, model, script, work.path)}
 
         return make
 
