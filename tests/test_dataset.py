@@ -138,6 +138,7 @@ def test_coco_agrees_with_its_panoptic_images(run: tuple[Path, Path], tmp_path: 
             assert segment["bbox"] == [xs.min(), ys.min(), np.ptp(xs) + 1, np.ptp(ys) + 1]
 
 
+@pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 def test_pycocotools_reads_the_masks(run: tuple[Path, Path], tmp_path: Path) -> None:
     tools = pytest.importorskip("pycocotools.coco", reason="pycocotools is not installed")
     out = write_set(run, "coco", tmp_path / "coco", cameras=("front",), least_pixels=1)

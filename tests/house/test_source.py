@@ -611,15 +611,15 @@ def product_texts(repository: Path, package_dir: Path) -> list[Path]:
     return sorted(texts)
 
 
+SIMULATED = ("sim", "simulate", "datasets", "simulator", "loop", "serve", "dataset", "sweeps", "returns")
+"""Folders and files that speak of a simulator's sessions."""
+
+
 def test_product_text_speaks_to_users(repository: Path, package_dir: Path) -> None:
     problems = []
     for path in product_texts(repository, package_dir):
         for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-            simulated = path.parent.name in ("sim", "simulate", "datasets") or path.stem in (
-                "simulator",
-                "loop",
-                "serve",
-            )  # ``sim.Session`` is what a user opens
+            simulated = path.parent.name in SIMULATED or path.stem in SIMULATED  # ``sim.Session`` is what a user opens
             found = WORDS_THAT_DO_NOT_BELONG.search(
                 re.sub(r"(?i)\bsession\b" if simulated else r"sim[./][Ss]ession", "", line)
             )

@@ -523,6 +523,34 @@ class CityWorld:
         rgb, depth, semantics, instance = zip(*parts, strict=True)
         return CityTruth(*(np.concatenate(column) for column in (rgb, depth, semantics, instance)))
 
+    def ranges(
+        self, places: NDArray[np.float64], directions: NDArray[np.float64], times_s: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Exact range f64[N] in metres and intensity f64[N] of single beams; NaN: nothing returns (glass and weak
+        surfaces lose beams as in a sweep). Without noise.
+
+        Args:
+            places, directions: f64[N, 3] in the world, directions of length 1. times_s: f64[N]; limbs of people keep
+                their pose of the middle.
+        """
+        first, last = (float(np.clip(end, *self.span_s)) for end in (times_s.min(), times_s.max()))
+        middle = (first + last) / 2
+        share = ((times_s - first) / (last - first)).clip(0, 1) if last > first else np.zeros(len(times_s))
+        # neighbours fire apart, so that no two share their candidates
+        turns = np.asarray(0.1 * (np.arange(len(times_s)) % 6), np.float64)
+        cos, sin, zero = np.cos(turns), np.sin(turns), np.zeros(len(turns))
+        back = np.stack([cos, sin, zero, -sin, cos, zero, zero, zero, zero + 1], 1).reshape(-1, 3, 3)
+        poses = np.concatenate([_axes_along(directions) @ back, places[:, :, None]], 2)
+        objects = (self._object_keys_at(np.array([first, middle, last])), self._phases(middle))
+        settings = (self.config.lidar_range_m, 0.0, 0.0, 0.55)
+        key = seeds.key(self.config.seed, round(middle * 1e6), "exact beams")
+        xyz, intensity, _, _ = self._handle.sweep(*objects, np.zeros(1), turns, poses, share, settings, key)
+        returned = intensity[:, 0] >= 0
+        range_m, light = np.full(len(times_s), np.nan), np.full(len(times_s), np.nan)
+        range_m[returned] = np.linalg.norm(xyz[returned, 0].astype(np.float64) - places[returned], axis=1)
+        light[returned] = intensity[returned, 0]
+        return range_m, light
+
     def lidar_sweep(self, index: int, scan: sensors.LidarScan | None = None) -> CitySweep:
         """The sweep around the time of frame ``index``: it starts and ends half a turn away from it, looking backwards.
         Vehicle and objects move during the turn; the limbs of people keep their pose of the middle. ``scan``: another
@@ -557,6 +585,14 @@ class CityWorld:
             time_s -= scan.delay_s
             world_from_lidar = self.frame_pose(time_s) @ mount
         return CitySweep(time_s, world_from_lidar, points, semantics[hit], instance[hit])
+
+
+def _axes_along(directions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotations f64[N, 3, 3] whose x axis is each of some unit vectors f64[N, 3]."""
+    helper = np.where(np.abs(directions[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[1.0, 0.0, 0.0]])
+    left = np.cross(helper, directions)
+    left /= np.linalg.norm(left, axis=1, keepdims=True)
+    return np.stack([directions, left, np.cross(directions, left)], 2)
 
 
 def _interpolated_poses(

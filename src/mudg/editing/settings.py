@@ -36,6 +36,9 @@ class RenderConfig:
     """Image width in pixels (0 = as recorded); the height follows."""
     remove_tracks: tuple[str, ...] = ()
     """Ids of tracked objects to leave out, as listed in the scene."""
+    lidar: str = ""
+    """Also simulate the log's LiDAR sweeps at every shift: a sensor of the scene, pandar128, at128, hdl64, vlp16, or a
+    JSON file of beams (docs/simulator.md). Empty = none."""
     video: bool = True
     """Also write one MP4 video per trajectory."""
     harmonize: HarmonizeConfig = setting(default_factory=HarmonizeConfig)

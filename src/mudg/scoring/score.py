@@ -49,6 +49,7 @@ from mudg.scoring.facts import (
     trajectories_of,
     vehicles_of,
 )
+from mudg.scoring.sweeps import sweep_scores
 from mudg.scoring.truth import ViewTruth, stored_truth, truth_of
 from mudg.scoring.whole_sets import BASELINE, anchors_of, set_scores_of
 
@@ -111,6 +112,8 @@ def write_scores(
     made = {"depth_limit_m": DEPTH_LIMIT_M, "anchors": anchors_of(results, trajectories, reference)}
     made |= {"lpips": _lpips_record(config), **sets.records()}
     records, exact = [trajectory.record() for trajectory in trajectories], reference.truth.exact
+    if sweeps := sweep_scores(recorded, methods):
+        made["sweeps"] = sweeps
     document = score_tables.document(recorded, exact, records, names, results, rows, made)
     store.write_json(out / "metrics.json", document)
     store.write_text(out / "metrics.md", score_tables.markdown(document))

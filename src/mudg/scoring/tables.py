@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 from mudg.base import html
@@ -54,6 +54,20 @@ TITLES: Final[dict[str, str]] = {
 TERMINAL_METRICS: Final = ("psnr", "ssim", "perceptual", "abs_rel", "rmse_m", "delta1", "miou")
 WITHOUT_TRUTH: Final = ("lidar_abs_rel", "lidar_rmse_m", "lidar_psnr", "agreement", "lane_correlation")
 """Shown in a terminal where no true image exists."""
+LIDAR_COLUMNS: Final[Mapping[str, tuple[str, str, int]]] = {
+    "median_range_m": ("median range error", "m", 3),
+    "chamfer_m": ("chamfer", "m", 3),
+    "f1": ("F1 of returns", "", 3),
+    "intensity": ("intensity error", "", 3),
+}
+"""Column -> title, unit, digits."""
+LIDAR_TITLES: Final = {"nearest": "nearest sweep, moved", "fused": "8 sweeps, fused"}
+LIDAR_RULES: Final = (
+    "LiDAR: a beam is right where it returns as in the truth (F1). Errors of range (median) and intensity (mean) are "
+    "those of beams that return in both; chamfer is the mean of both directions.",
+    "LiDAR on the recorded path: held-out sweeps with their own beams; those without a return are estimated from the "
+    "sensor's rows and columns. No row uses the held-out sweeps, but the clouds that the fit started from hold them.",
+)
 _DIGITS: Final = {
     **dict.fromkeys(("fid", "fvd", "fd_dinov2"), 1),
     **dict.fromkeys(("psnr", "psnr_movers", "flicker", "rmse_m"), 2),
@@ -110,6 +124,7 @@ def document(
         *([_rule_of_sets(distributions)] if distributions else []),
         *([_rule_of_videos(videos)] if videos else []),
         *_further_rules(made),
+        *(LIDAR_RULES if made.get("sweeps") else ()),
     ]
     return {
         "schema": 1,
@@ -271,6 +286,12 @@ def plain(document: Mapping[str, Any]) -> str:
             cells = [f"{text:>{width}}" for text, width in zip(found, widths, strict=True)]
             lines.append(f"  {FLOOR:<28}" + "".join(cells))
         lines.append("")
+    for title, heads, rows in _lidar_tables(document):
+        widths = [len(head) + 3 for head in heads[1:]]
+        texts = ([title, *heads[1:]], *rows)
+        for first, *cells in texts:
+            lines.append(f"  {first:<32}" + "".join(f"{c:>{w}}" for c, w in zip(cells, widths, strict=True)))
+        lines.append("")
     return plain_lines(lines).rstrip()
 
 
@@ -303,7 +324,23 @@ def markdown(document: Mapping[str, Any]) -> str:
         else:
             lines.append("Nothing to score against: there is no truth here.")
         lines += [*_lines_of_sets(document, trajectory["name"]), *_lines_of_anchors(document, trajectory["name"])]
+    for title, heads, rows in _lidar_tables(document):
+        lines += ["", f"## LiDAR: {title}", "", *html.markdown_table(heads, rows)]
     return "\n".join(lines) + "\n"
+
+
+def _lidar_tables(document: Mapping[str, Any]) -> Iterator[tuple[str, list[str], list[list[str]]]]:
+    """Title, heads and cells of the tables of simulated sweeps, one per trajectory."""
+    heads = ["method", *(f"{title} {unit}".strip() for title, unit, _ in LIDAR_COLUMNS.values())]
+    sweeps = document.get("sweeps", ())
+    for name in dict.fromkeys(row["trajectory"] for row in sweeps):
+        own = [row for row in sweeps if row["trajectory"] == name]
+        cells = []
+        for row in own:
+            numbers = ((row["values"].get(column), digits) for column, (_, _, digits) in LIDAR_COLUMNS.items())
+            texts = ["none" if value is None else f"{value:.{digits}f}" for value, digits in numbers]
+            cells.append([LIDAR_TITLES.get(row["method"], row["method"]), *texts])
+        yield f"{name}, {own[0]['sweeps']} sweeps", heads, cells
 
 
 def _lines_of_sets(document: Mapping[str, Any], trajectory: str) -> list[str]:

@@ -1,7 +1,11 @@
-"""A simulated LiDAR: beams through a fitted scene, sampled from pinhole views drawn along the turn.
+"""A simulated LiDAR: beams into a fitted scene and into what the log's own sweeps measured.
 
 A sweep is cut into slices of its firing order. Each slice is drawn at the pose and time of its middle, so that a
 turning sensor on a moving vehicle measures what it would have measured; its beams are then placed by their own poses.
+
+With a log, a beam meets the surface that the log's sweeps measured (``sim/returns.py``), with the intensity measured
+there, or is lost as beams were lost there. Where they measured nothing, and without a log, beams meet the Gaussians,
+sampled from pinhole views.
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ from mudg.base.types import SweepPoints, View
 from mudg.base.weather_settings import WeatherSettings
 from mudg.core.weather.lidar import SOFT, sweep_in_weather
 from mudg.sim.optics import faces_of, nearest, surface
+from mudg.sim.returns import LogReturns
 from mudg.sim.session import Instant, Session
 
 Floats = NDArray[np.float64]
@@ -27,6 +32,8 @@ SLICES: Final = 8
 AXES: Final = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """Rotation sensor-from-camera: a LiDAR looks along x, y is left, z up."""
 MOST_BEAMS: Final = 4_000_000
+MOST_MOMENTS: Final = 4096
+"""Beams of more moments than these are carried to the end of the sweep by the nearest of so many."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,6 +103,7 @@ class LidarRequest:
         beams: what is fired. start, end: of the sweep; ``end`` None: all at one moment.
         weather: fog and rain that take from and add to it, or None. seed: of the noise of weather.
         focal_px: pixels per radian of the views that are sampled.
+        like: the LiDAR of the log that it resembles: what that one measured counts. Empty: the log's first.
     """
 
     beams: BeamTable
@@ -104,6 +112,7 @@ class LidarRequest:
     weather: WeatherSettings | None = None
     seed: int = 0
     focal_px: float = 700.0
+    like: str = ""
 
     def answer(self, session: Session) -> LidarReply:
         """The sweep. Beams into the sky, beyond the range or into what the recording never saw return nothing."""
@@ -117,8 +126,11 @@ class LidarReply:
     Args:
         beam: i64[N], their numbers in the table. range_m: f32[N] from the sensor at the moment of the beam, metres.
         xyz: f32[N, 3] metres, in the sensor's frame at the end of the sweep. dt_s: f32[N], seconds after the end.
-        intensity: f32[N] in [0, 1]: how well the surface faces the beam, times 0.5 (the scene knows no reflectance).
+        intensity: f32[N] in [0, 1]: as the log's sweeps measured it there; elsewhere how well the surface faces the
+            beam, times 0.5.
         classes: u8[N] train ids, 255 = none. instances: u16[N], 1 + index into ``objects``, 0 = none.
+        surface_m: f32[B] of all beams of the table: range of what each meets, also where it is lost; NaN: nothing.
+        facing: f32[B], how well that surface faces the beam, [0, 1].
     """
 
     beam: NDArray[np.int64]
@@ -130,20 +142,25 @@ class LidarReply:
     classes: NDArray[np.uint8]
     instances: NDArray[np.uint16]
     objects: tuple[str, ...]
+    surface_m: NDArray[np.float32]
+    facing: NDArray[np.float32]
 
 
 def _sweep(session: Session, request: LidarRequest) -> LidarReply:
     beams, start, end = request.beams, request.start, request.end or request.start
-    count = len(beams.share)
-    hits = Hits(count)
+    hits, known = Hits(len(beams.share)), session.log_returns(request.like)
     edges = np.linspace(0, 1, (SLICES if request.end is not None else 1) + 1)
     for first, last in zip(edges[:-1], edges[1:], strict=True):
         own = np.flatnonzero((beams.share >= first) & ((beams.share < last) | (last == 1)))
         if len(own):
-            _draw(session, start.towards(end, (first + last) / 2), beams.directions[own] @ AXES, own, request, hits)
+            moment = start.towards(end, (first + last) / 2)
+            _draw(session, moment, beams.directions[own] @ AXES, own, request, hits)
+            if known is not None:
+                _meet(session, known, moment, beams.directions[own], own, hits)
     near, far = beams.range_m
     with np.errstate(invalid="ignore"):
-        kept = np.flatnonzero((hits.distance >= near) & (hits.distance <= far))
+        within = (hits.distance >= near) & (hits.distance <= far)
+    kept = np.flatnonzero(within & ~hits.lost)
     points = (beams.directions[kept] * hits.distance[kept][:, None]).astype(np.float32)
     intensity, classes, fog = hits.intensity[kept], hits.classes[kept], np.zeros(len(kept), bool)
     if request.weather is not None:
@@ -165,6 +182,8 @@ def _sweep(session: Session, request: LidarRequest) -> LidarReply:
         classes,
         np.where(fog, 0, hits.instances[kept]).astype(np.uint16),
         tuple(sorted(session.sizes_m())),
+        np.where(within, hits.distance, np.nan).astype(np.float32),
+        hits.facing,
     )
 
 
@@ -173,7 +192,9 @@ class Hits:
 
     def __init__(self, count: int) -> None:
         self.distance = np.full(count, np.nan)
+        self.facing = np.zeros(count, np.float32)
         self.intensity = np.zeros(count, np.float32)
+        self.lost = np.zeros(count, bool)
         self.classes = np.full(count, UNLABELLED, np.uint8)
         self.instances = np.zeros(count, np.uint16)
 
@@ -191,17 +212,47 @@ def _draw(
         z, facing = surface(depth, face.uv, face.camera)
         x, y = geometry.pinhole_ray(face.camera.intrinsics, *face.uv.T)
         hits.distance[target] = z * np.sqrt(x * x + y * y + 1)
+        hits.facing[target] = facing
         hits.intensity[target] = 0.5 * facing
         hits.classes[target] = nearest(planes.seen.semantics.numpy(), face.uv)
         if planes.instances is not None:
             hits.instances[target] = nearest(planes.instances, face.uv)
 
 
+def _meet(
+    session: Session, known: LogReturns, moment: Instant, beams: Floats, own: NDArray[np.int64], hits: Hits
+) -> None:
+    """Let beams of a slice meet what the log's sweeps measured, unless they meet an object before it that no sweep
+    measured."""
+    poses = session.poses(moment)
+    poses = known.poses(moment.time_s, poses) if moment.objects is None else poses
+    met = known.meet(beams, moment.world_from_sensor, poses)
+    names, parts = sorted(session.sizes_m()), list(known.parts)
+    bare = np.array([False, *(name not in known.parts for name in names)])
+    with np.errstate(invalid="ignore"):
+        before = bare[hits.instances[own]] & ~(hits.distance[own] >= met.range_m)
+    seen = np.isfinite(met.range_m) & ~before
+    chosen, row = own[seen], met.rows[np.arange(len(own)), met.weights.argmax(1)][seen]
+    hits.distance[chosen], hits.facing[chosen] = met.range_m[seen], met.facing[seen]
+    hits.intensity[chosen] = met.mean(known.column("intensity"))[seen].clip(0, 1)
+    hits.lost[chosen] = ~known.returns(met)[seen]
+    number = np.array([1 + names.index(name) if name in names else 0 for name in parts], np.uint16)
+    hits.instances[chosen] = number[known.owners()[row]]
+    other = own[np.isfinite(hits.distance[own]) & ~seen & (hits.instances[own] == 0)]
+    ends = beams[np.searchsorted(own, other)] * hits.distance[other][:, None]
+    places = geometry.transform_points(moment.world_from_sensor, ends)
+    hits.distance[other[known.contradicts(places, moment.world_from_sensor, poses)]] = np.nan
+
+
 def _carried(points: NDArray[np.float32], share: Floats, start: Instant, end: Instant) -> NDArray[np.float32]:
     """Points f32[n, 3] in the frames of their moments, in that of the end."""
     carried = np.empty_like(points)
     end_from_world = geometry.invert(end.world_from_sensor)
-    for at in np.unique(share):
+    moments = np.unique(share)
+    if len(moments) > MOST_MOMENTS:  # beams that are fired one by one
+        share = np.round(share * MOST_MOMENTS) / MOST_MOMENTS
+        moments = np.unique(share)
+    for at in moments:
         own = share == at
         pose = geometry.interpolate_pose(start.world_from_sensor, end.world_from_sensor, float(at))
         carried[own] = geometry.transform_points(end_from_world @ pose, points[own])

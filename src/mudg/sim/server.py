@@ -32,6 +32,7 @@ from mudg.sim.lidar import BeamTable, LidarRequest
 from mudg.sim.optics import Fisheye, FTheta, Optics, Pinhole
 from mudg.sim.session import CameraRequest, Instant, Session
 from mudg.sim.settings import ServeConfig
+from mudg.sim.tables import TABLES
 from mudg.sim.wire import matrix_of, pose_of
 from mudg.viewer.server import is_loopback, token_for
 
@@ -42,22 +43,8 @@ WAITING: Final = 64
 MESSAGE_MB: Final = 64
 MOST_OBJECTS: Final = 10_000
 LATEST_US: Final = 10**15
-LIDARS: Final[dict[int, Callable[[], BeamTable]]] = {
-    0: lambda: BeamTable.spinning(np.linspace(-25.0, 15.0, 128), 0.2, (0.3, 200.0)),  # PANDAR128, rows evenly spread
-    1: lambda: forward(np.linspace(-12.7, 12.7, 128), 120.0, 0.1, (0.5, 200.0)),  # AT128
-}
-"""``LidarSpec.lidar_type`` -> beams."""
-
-
-def forward(
-    elevations_deg: NDArray[np.float64], field_deg: float, step_deg: float, range_m: tuple[float, float]
-) -> BeamTable:
-    """A LiDAR that sweeps a field ahead of it from left to right."""
-    turn = BeamTable.spinning(elevations_deg, step_deg, range_m)
-    inside = np.abs(np.degrees(np.arctan2(turn.directions[:, 1], turn.directions[:, 0]))) <= field_deg / 2
-    share = turn.share[inside]
-    share = (share - share.min()) / max(float(np.ptp(share)), 1e-9)
-    return BeamTable(turn.directions[inside], turn.ring[inside], share, range_m)
+LIDARS: Final = {0: "pandar128", 1: "at128"}
+"""``LidarSpec.lidar_type`` -> name of the beam table."""
 
 
 class Refused(Exception):
@@ -158,7 +145,7 @@ class Renderer:
         kind = request.lidar_config.lidar_type
         if kind not in LIDARS:
             raise Refused("INVALID_ARGUMENT", f"lidar_config.lidar_type: expected one of {list(LIDARS)}, got {kind}")
-        beams = self._beams.setdefault(kind, LIDARS[kind]())
+        beams = self._beams.setdefault(kind, TABLES[LIDARS[kind]]())
         sweep = LidarRequest(beams=beams, start=self._instant(request, "start"), end=self._instant(request, "end"))
         with self._drawing:
             reply = self.session.render([sweep])[0]

@@ -31,6 +31,7 @@ from mudg.gaussians.rendering import COVERED, RenderedCondition, raster_of, rend
 from mudg.gaussians.storage import load_model
 from mudg.scene.read import read_scene
 from mudg.sim.optics import Face, Optics, Pinhole, bilinear, faces_of, nearest, rays_of, rays_per_radian, surface
+from mudg.sim.returns import LogReturns, learn_returns, places_gone
 
 Layer = Literal["rgb", "depth", "distance", "classes", "instances", "normals", "confidence", "motion"]
 LAYERS: Final[tuple[Layer, ...]] = get_args(Layer)
@@ -212,9 +213,12 @@ class Session:
             run = load_model(parts.model)
         if isinstance(scene, str | Path):
             scene = read_scene(scene_at(Path(scene)))
+        self._gone = None
         if edits is not None:
-            script = edits if isinstance(edits, EditScript) else read_edits(edits)
+            script, before = edits if isinstance(edits, EditScript) else read_edits(edits), _background(run)
             run = carry_out(script, run, scene).model(run, keep_ego=True)
+            self._gone = places_gone(before, _background(run))
+        self._returns: dict[str, LogReturns | None] = {}
         self.scene: Scene | None = scene
         self.model = run.to(drawing_device(device, "sim"))
         self._nodes = {node.name: node for node in self.model.nodes if isinstance(node, RigidNode)}
@@ -246,6 +250,18 @@ class Session:
     def ego_pose(self, time_s: float) -> Matrix | None:
         """Recorded pose world-from-vehicle f64[4, 4] at a time; None outside the log."""
         return None if self.scene is None else self.scene.ego.pose_at(time_s)
+
+    def log_returns(self, sensor: str = "") -> LogReturns | None:
+        """What the sweeps of a LiDAR of the log (empty: its first) tell about surfaces, intensity and lost beams,
+        learnt at the first call (seconds); None without a log or its sweeps.
+
+        Raises:
+            UsageError: the log has no such LiDAR.
+        """
+        if sensor not in self._returns and self.scene is not None and self.scene.sweeps:
+            found = learn_returns(self.scene, sensor)
+            self._returns[sensor] = found if found is None or self._gone is None else found.without(self._gone)
+        return self._returns.get(sensor)
 
     def render(self, requests: Iterable[SensorRequest[Reply]]) -> list[Reply]:
         """What cameras and LiDARs measure, in the order of the requests.
@@ -466,6 +482,11 @@ class Canvas:
         self.certainty[place] = nearest(_certainty(seen), face.uv)
         if planes.instances is not None:
             self.instances[place] = nearest(planes.instances, face.uv)
+
+
+def _background(model: SceneModel) -> Matrix:
+    """Places f64[N, 3] of the Gaussians that stand still."""
+    return model.table["means"].detach()[: model.counts()[0]].cpu().numpy().astype(np.float64)
 
 
 def _certainty(seen: RenderedCondition) -> NDArray[np.float32]:

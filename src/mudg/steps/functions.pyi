@@ -654,6 +654,7 @@ def render(
     paths: tuple[str, ...] = (),
     width_px: int = 0,
     remove_tracks: tuple[str, ...] = (),
+    lidar: str = '',
     video: bool = True,
     harmonize: Mapping[str, Any] = ...,
     raster: Literal['auto', 'cpu', 'torch', 'gsplat'] = 'auto',
@@ -674,6 +675,7 @@ def render(
         paths: Further paths by name. up+1: raised by 1 m. lane+0.1: a lane change, 0.1 m further to the left with every frame. speed+0.1: 0.1 m further ahead with every frame. A minus means down, right, slower.
         width_px: Image width in pixels (0 = as recorded); the height follows.
         remove_tracks: Ids of tracked objects to leave out, as listed in the scene.
+        lidar: Also simulate the log's LiDAR sweeps at every shift: a sensor of the scene, pandar128, at128, hdl64, vlp16, or a JSON file of beams (docs/simulator.md). Empty = none.
         video: Also write one MP4 video per trajectory.
         harmonize: With an edit script: let the diffusion model repair what the edits touch.
         raster: Rasteriser backend. auto picks the fastest one available and prints its name.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
 from mudg.base.errors import UsageError
-from mudg.base.layout import OBSERVATION_FILES, below
+from mudg.base.layout import OBSERVATION_FILES, SWEEP_FILES, below
 from mudg.steps.engine import Make, Output, script_of
 from mudg.steps.step import FILE_YAML, SCENE, Flag
 
@@ -29,9 +29,9 @@ class RenderViews(Output):
     smaller = "smaller views (--width-px), fewer --cameras"
     result = "views"
     from_run = ("model",)
-    version, files = 2, ("*.mp4", *below("*", OBSERVATION_FILES))
+    version, files = 2, ("*.mp4", *below("*", OBSERVATION_FILES), *below("lidar/*", SWEEP_FILES))
     short = (
-        *("cameras", "shifts_m", "paths", "width_px", "video", "remove_tracks", "device"),
+        *("cameras", "shifts_m", "paths", "width_px", "lidar", "video", "remove_tracks", "device"),
         *("harmonize.on", "harmonize.model"),
     )
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
@@ -54,7 +54,8 @@ class RenderViews(Output):
         return self
 
     def inputs(self) -> dict[str, str]:
-        read = self.digests({"scene": self.scene, "model": self.model, "edits": self.edits})
+        table = Path(self.settings.lidar) if self.settings.lidar.endswith(".json") else None
+        read = self.digests({"scene": self.scene, "model": self.model, "edits": self.edits, "lidar": table})
         if not self.settings.harmonize.on:
             return read
         from mudg.diffusion.model_files import digest
@@ -66,7 +67,19 @@ class RenderViews(Output):
 
         model, script = cast("Path", self.model), script_of(self.edits)
         edited = render.prepare(self.settings, self.scene, model, script, self.fused)
-        return partial(render.write_views, self.settings, self.scene, model, edited)
+        views = partial(render.write_views, self.settings, self.scene, model, edited)
+        if not self.settings.lidar:
+            return views
+        from mudg.scene.read import read_scene
+        from mudg.sim import sweeps
+
+        sweeps.wanted_sweeps(self.settings.lidar, read_scene(self.scene))
+
+        def make(work: RunDir) -> dict[str, Any]:
+            summary = views(work)
+            return summary | {"lidar": sweeps.simulate_log(self.settings, self.scene, model, script, work.path)}
+
+        return make
 
 
 _FILES = (

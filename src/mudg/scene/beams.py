@@ -1,0 +1,250 @@
+"""Beams of recorded sweeps: where each was fired and what it measured, which of them returned nothing, and the returns
+of many sweeps as one cloud per rigid part of the world."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage, signal
+
+from mudg.base import geometry
+from mudg.base.types import EgoPath, Scene, Sweep, SweepPoints, Track
+from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, separate
+from mudg.core.returns import Returns
+from mudg.scene.read import read_points
+
+Floats = NDArray[np.float64]
+WORLD: Final = ""
+"""Name of what stands still, beside the ids of tracks."""
+MOMENTS: Final = 64
+"""Parts of a sweep whose beams share a pose."""
+SAME_MOMENT_S: Final = 0.06
+"""A sweep belongs to the frames that were taken this near in time."""
+ROW_BIN_DEG: Final = 0.01
+ROWS_APART_DEG: Final = 0.12
+ROW_SIGMA_DEG: Final = 0.05
+DOUBLED_SHARE: Final = 0.6
+FEWEST_IN_ROW: Final = 0.1
+"""Least height of a row's peak, as a share of the middle one."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Beams:
+    """Beams of a sweep.
+
+    Args:
+        directions: unit vectors f64[B, 3] in the sensor's frame when each is fired. share: f64[B] in [0, 1], when.
+        range_m: f64[B], NaN: nothing returned. intensity: f64[B], NaN likewise.
+        start, end: world-from-sensor f64[4, 4]. start_s, end_s: on the scene's clock.
+    """
+
+    directions: Floats
+    share: Floats
+    range_m: Floats
+    intensity: Floats
+    start: Floats
+    end: Floats
+    start_s: float
+    end_s: float
+
+    def __len__(self) -> int:
+        return len(self.share)
+
+    @property
+    def returned(self) -> NDArray[np.bool_]:
+        """Which returned, bool[B]."""
+        return np.isfinite(self.range_m)
+
+    def parts(self, count: int) -> list[tuple[float, NDArray[np.int64]]]:
+        """Consecutive parts: middle share, and numbers of the beams; those without any are left out."""
+        if self.start_s == self.end_s:
+            return [(0.0, np.arange(len(self)))]
+        part = np.minimum((self.share * count).astype(np.int64), count - 1)
+        rows = ((k, np.flatnonzero(part == k)) for k in range(count))
+        return [((k + 0.5) / count, own) for k, own in rows if len(own)]
+
+    def pose(self, share: float) -> Floats:
+        """World-from-sensor at a share of the sweep."""
+        return geometry.interpolate_pose(self.start, self.end, share)
+
+    def time_s(self, share: float) -> float:
+        """Time at a share of the sweep."""
+        return self.start_s + share * (self.end_s - self.start_s)
+
+
+def sensor_pose(ego: EgoPath, sweep: Sweep, time_s: float) -> Floats:
+    """World-from-sensor at a time about the sweep's; outside the path it stays at the path's end."""
+    first, last = float(ego.times_s[0]), float(ego.times_s[-1])
+    poses = [ego.pose_at(min(max(at, first), last)) for at in (sweep.time_s, time_s)]
+    if poses[0] is None or poses[1] is None:
+        return sweep.world_from_lidar
+    return poses[1] @ geometry.invert(poses[0]) @ sweep.world_from_lidar
+
+
+def beams_of(scene: Scene, sweep: Sweep, points: SweepPoints | None = None) -> Beams:
+    """The beams of a sweep that returned, in the order of its points."""
+    points = read_points(scene, sweep) if points is None else points
+    dt_s, xyz = points.dt_s.astype(np.float64), points.xyz.astype(np.float64)
+    first, last = (float(dt_s.min()), float(dt_s.max())) if len(dt_s) else (0.0, 0.0)
+    turns = last - first > 1e-6
+    share = (dt_s - first) / (last - first) if turns else np.zeros(len(dt_s))
+    start, end = (sensor_pose(scene.ego, sweep, sweep.time_s + at) for at in (first, last))
+    times = (sweep.time_s + first, sweep.time_s + (last if turns else first))
+    empty = np.zeros(len(xyz))
+    found = Beams(xyz, share, empty, points.intensity.astype(np.float64), start, end, *times)
+    own = xyz.copy()
+    for at, rows in found.parts(MOMENTS):
+        own[rows] = geometry.transform_points(geometry.invert(found.pose(at)) @ sweep.world_from_lidar, xyz[rows])
+    away = np.linalg.norm(own, axis=1)
+    directions = own / np.maximum(away, 1e-9)[:, None]
+    return Beams(directions, share, away, found.intensity, start, end, *times)
+
+
+def with_silent(beams: Beams) -> Beams:
+    """The same and, behind them, the beams that returned nothing: places of the sensor's grid of rows and columns
+    without a return. Rows are peaks of elevation; where there are none, nothing is added."""
+    x, y, z = beams.directions.T
+    azimuth, elevation = np.arctan2(y, x), np.degrees(np.arcsin(z.clip(-1, 1)))
+    rows = row_elevations(elevation)
+    if len(rows) < 2 or len(beams) < 100:
+        return beams
+    row = np.searchsorted((rows[:-1] + rows[1:]) / 2, elevation)
+    order = np.lexsort((azimuth, row))
+    steps = np.diff(azimuth[order])[np.diff(row[order]) == 0]
+    steps = steps[steps > np.radians(0.01)]
+    if not len(steps):
+        return beams
+    step = float(np.median(steps))
+    first, last = float(azimuth.min()), float(azimuth.max())
+    whole = last - first > np.radians(355)
+    columns = round(2 * np.pi / step) if whole else max(1, round((last - first) / step))
+    begin, step = (-np.pi, 2 * np.pi / columns) if whole else (first, (last - first) / columns)
+    at = (azimuth - begin) / step
+    taken = np.zeros((len(rows), columns), bool)
+    for shift in (-0.25, 0.0, 0.25):
+        column = np.floor(at + shift).astype(np.int64)
+        column = column % columns if whole else column.clip(0, columns - 1)
+        taken[row, column] = True
+    silent_row, column = np.nonzero(~taken)
+    angle, tilt = begin + (column + 0.5) * step, np.radians(rows[silent_row])
+    level = np.cos(tilt)
+    directions = np.stack([np.cos(angle) * level, np.sin(angle) * level, np.sin(tilt)], 1)
+    bin_of = np.floor(at).astype(np.int64).clip(0, columns - 1)
+    counts = np.bincount(bin_of, minlength=columns)
+    known = np.flatnonzero(counts)
+    share = np.interp(column, known, np.bincount(bin_of, beams.share, columns)[known] / counts[known])
+    nan = np.full(len(column), np.nan)
+    join = lambda a, b: np.concatenate([a, b])
+    return Beams(
+        join(beams.directions, directions),
+        join(beams.share, share.clip(0, 1)),
+        join(beams.range_m, nan),
+        join(beams.intensity, nan),
+        *(beams.start, beams.end, beams.start_s, beams.end_s),
+    )
+
+
+def row_elevations(elevation_deg: Floats) -> Floats:
+    """Elevations of a turning sensor's rows, degrees, rising: peaks of how often an elevation occurs."""
+    if not len(elevation_deg):
+        return np.zeros(0)
+    low, high = float(elevation_deg.min()) - 1, float(elevation_deg.max()) + 1
+    counts, edges = np.histogram(elevation_deg, round((high - low) / ROW_BIN_DEG), (low, high))
+    smooth = ndimage.gaussian_filter1d(counts.astype(np.float64), ROW_SIGMA_DEG / ROW_BIN_DEG, mode="constant")
+    peaks, found = signal.find_peaks(smooth, height=0.0, prominence=0.0, distance=ROWS_APART_DEG / ROW_BIN_DEG)
+    if not len(peaks):
+        return np.zeros(0)
+    height = found["prominences"]
+    kept = np.flatnonzero(height >= FEWEST_IN_ROW * float(np.median(height[height > 0.2 * smooth.max()])))
+    rows, height = (edges[peaks] + edges[peaks + 1])[kept] / 2, height[kept]
+    return rows[~_doubled(rows, height)]
+
+
+def _doubled(rows: Floats, height: Floats) -> NDArray[np.bool_]:
+    """Which peaks bool[R] are another row's second one: the lower of two that stand much nearer than rows around do."""
+    gaps = np.diff(rows)
+    usual = ndimage.median_filter(gaps, 9, mode="nearest")
+    near = gaps < DOUBLED_SHARE * usual
+    lower = height[:-1] < height[1:]
+    found = np.zeros(len(rows), bool)
+    found[:-1] |= near & lower
+    found[1:] |= near & ~lower
+    return found
+
+
+# which sweeps -------------------------------------------------------------------------------------
+
+
+def held_out(scene: Scene) -> frozenset[str]:
+    """Ids of the sweeps of held-out frames: of every sensor the one nearest in time to each of them."""
+    found = set()
+    for frame in scene.frames_in("test"):
+        for sensor in {sweep.sensor for sweep in scene.sweeps}:
+            own = [sweep for sweep in scene.sweeps if sweep.sensor == sensor]
+            best = min(own, key=lambda sweep: abs(sweep.time_s - frame.view.time_s))
+            if abs(best.time_s - frame.view.time_s) <= SAME_MOMENT_S:
+                found.add(best.id)
+    return frozenset(found)
+
+
+def training_sweeps(scene: Scene) -> tuple[Sweep, ...]:
+    """The sweeps that may be learnt from."""
+    gone = held_out(scene)
+    return tuple(sweep for sweep in scene.sweeps if sweep.id not in gone)
+
+
+# returns of many sweeps ---------------------------------------------------------------------------
+
+
+def moving_tracks(scene: Scene) -> tuple[Track, ...]:
+    """Tracks of objects that move."""
+    return tuple(track for track in scene.tracks if judge_track(track, FusionRules()).moving)
+
+
+def returns_of(scene: Scene, sweeps: Sequence[Sweep]) -> dict[str, Returns]:
+    """Returns of sweeps by what they belong to: ``WORLD`` in the world, moving tracks each in the frame of its box."""
+    tracks, parts = moving_tracks(scene), dict[str, list[tuple[Floats, Floats, Floats]]]()
+    for sweep in sweeps:
+        points = read_points(scene, sweep)
+        intensity = points.intensity.astype(np.float64)
+        owner, owned = separate(SweepShots(sweep.time_s, sweep.world_from_lidar, points, ()), tracks, FusionRules())
+        still = owner == STATIC
+        world = geometry.transform_points(sweep.world_from_lidar, points.xyz[still].astype(np.float64))
+        place = sweep.world_from_lidar[:3, 3]
+        parts.setdefault(WORLD, []).append((world, np.broadcast_to(place, world.shape), intensity[still]))
+        for number, xyz in owned.items():
+            pose = tracks[number].pose_at(sweep.time_s)
+            if pose is not None:
+                seen_from = np.broadcast_to(geometry.transform_points(geometry.invert(pose), place[None]), xyz.shape)
+                own = (xyz.astype(np.float64), seen_from, intensity[owner == number])
+                parts.setdefault(tracks[number].id, []).append(own)
+    return {name: Returns.of(own) for name, own in parts.items()}
+
+
+def placed(
+    parts: Mapping[str, Returns], poses: Mapping[str, Floats], origin: Floats
+) -> tuple[Floats, NDArray[np.int64]]:
+    """Returns where their objects are, without those that were seen from behind.
+
+    Args:
+        parts: by name. poses: world-from-box of the objects; those that are not named are left out. origin: f64[3].
+
+    Returns:
+        Places f64[N, 3] relative to the origin in the world's axes, and numbers i64[N] among all returns of ``parts``.
+    """
+    xyz, numbers, first = [], [], 0
+    for name, part in parts.items():
+        if name == WORLD or name in poses:
+            points, seen_from = part.xyz, part.seen_from
+            if name != WORLD:
+                points, seen_from = (geometry.transform_points(poses[name], block) for block in (points, seen_from))
+            away = points - origin
+            shown = ((away * (points - seen_from)).sum(1) > 0) & ((away**2).sum(1) > 0.25)
+            xyz.append(away[shown])
+            numbers.append(first + np.flatnonzero(shown))
+        first += len(part)
+    return (np.concatenate(xyz), np.concatenate(numbers)) if xyz else (np.zeros((0, 3)), np.zeros(0, np.int64))
