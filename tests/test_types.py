@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mudg.base import palette, seeds
-from mudg.base.errors import InputError
+from mudg.base.errors import InputError, UsageError
 from mudg.base.types import (
     Camera,
     Clip,
@@ -143,3 +143,11 @@ def test_seeds_depend_on_every_argument_and_repeat() -> None:
     a = torch.randn(4, generator=seeds.torch_generator(3, 4, "x"))
     b = torch.randn(4, generator=seeds.torch_generator(3, 4, "x"))
     assert torch.equal(a, b)
+
+
+def test_a_camera_of_a_field_of_view_sees_just_that_angle() -> None:
+    camera = Camera.from_fov("a", 640, 480, 90.0)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == pytest.approx((320.0, 320.0, 320.0, 240.0))
+    for wrong in (0.0, 180.0, float("nan")):
+        with pytest.raises(UsageError, match="field of view"):
+            Camera.from_fov("a", 640, 480, wrong)

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
     from mudg.base.types import Camera, Gaussians, Observation, PointCloud, Render, Scene, Track, Trajectory, View
     from mudg.core.raster.rasterize import rasterize
     from mudg.datasets.tensors import as_dataset, collate
+    from mudg.scene.labels import read_label
     from mudg.scene.observations import read_observations
+    from mudg.scene.read import read_image, read_points
     from mudg.steps.fitted import FittedScene, Picture, read_scene
     from mudg.steps.functions import (
         adapt,
@@ -68,7 +70,10 @@ _HOMES = {
     "as_dataset": "mudg.datasets.tensors",
     "collate": "mudg.datasets.tensors",
     "rasterize": "mudg.core.raster.rasterize",
+    "read_image": "mudg.scene.read",
+    "read_label": "mudg.scene.labels",
     "read_observations": "mudg.scene.observations",
+    "read_points": "mudg.scene.read",
     "read_scene": "mudg.steps.fitted",
     "adapt": _FUNCTIONS,
     "annotate": _FUNCTIONS,
@@ -126,7 +131,10 @@ __all__ = [
     "learn",
     "page",
     "rasterize",
+    "read_image",
+    "read_label",
     "read_observations",
+    "read_points",
     "read_scene",
     "render",
     "report",

@@ -7,6 +7,7 @@ imports no torch, so that facts can be read without it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from mudg.base import geometry
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
-from mudg.base.errors import InputError, short
+from mudg.base.errors import InputError, UsageError, short
 
 if TYPE_CHECKING:
     import torch
@@ -242,6 +243,21 @@ class Camera:
     def matrix(self) -> Matrix:
         """Intrinsics f64[3, 3]."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    @classmethod
+    def from_fov(cls, name: str, width: int, height: int, horizontal_deg: float) -> Camera:
+        """A pinhole camera with square pixels that looks through the middle of its image.
+
+        Args:
+            width, height: pixels. horizontal_deg: field of view from left to right, degrees.
+
+        Raises:
+            UsageError: an angle that is none.
+        """
+        if not 0 < horizontal_deg < 180:
+            raise UsageError("no field of view", expected="0 to 180 degrees", got=str(horizontal_deg))
+        focal = width / 2 / math.tan(math.radians(horizontal_deg) / 2)
+        return cls(name, width, height, focal, focal, width / 2, height / 2)
 
     def resized(self, width: int, height: int) -> Camera:
         """The same optics sampled on another pixel grid (anisotropic if the aspect ratio differs)."""

@@ -7,9 +7,11 @@ OUT/<trajectory>.mp4 colour, depth, semantics side by side
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -34,6 +36,7 @@ from mudg.editing.harmonised import EditedSources, RepairedViews
 from mudg.editing.script import EditScript, conditions_of
 from mudg.editing.settings import RenderConfig
 from mudg.formats.exporters.video import write_mp4
+from mudg.formats.paths import read_path
 from mudg.gaussians.fit import load_model, render_view
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of
@@ -57,10 +60,17 @@ Edited = tuple[Scene, SceneModel, EditedDrive | None]
 
 
 def prepare(
-    config: RenderConfig, scene: Path, model: Path, script: EditScript | None, fused: Path | None
+    config: RenderConfig,
+    scene: Path,
+    model: Path,
+    script: EditScript | None,
+    fused: Path | None,
+    path: Path | None = None,
 ) -> Edited | None:
     """Carry out the edit script, if there is one: what cannot be done is told before anything is written. ``fused``:
-    fused clouds of the scene, for ``config.harmonize``."""
+    fused clouds of the scene, for ``config.harmonize``. ``path``: as of ``trajectories``."""
+    if path is not None:
+        trajectories(read_scene(scene), config, path)
     radiance = kind_of(model) == RADIANCE
     if radiance and (config.remove_tracks or script is not None):
         what = "a radiance field has no objects to leave out or to edit"
@@ -72,10 +82,13 @@ def prepare(
     return edited
 
 
-def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited | None, work: RunDir) -> dict[str, Any]:
+def write_views(
+    config: RenderConfig, scene: Path, model: Path, edited: Edited | None, work: RunDir, *, path: Path | None = None
+) -> dict[str, Any]:
     """Render every camera and shift of the configuration, one observation folder (and video) per trajectory; returns a
     summary. An interrupted run continues with the next missing view. ``scene``: gives cameras, times and the path of
-    the vehicle. ``model``: folder made by fit. ``edited``: what ``prepare`` made of them."""
+    the vehicle. ``model``: folder made by fit. ``edited``: what ``prepare`` made of them. ``path``: as of
+    ``trajectories``."""
     followers, out = list[RepairedViews](), work.path
     if kind_of(model) == RADIANCE:
         device = choose_device(config.device, "render")
@@ -94,7 +107,7 @@ def write_views(config: RenderConfig, scene: Path, model: Path, edited: Edited |
             if config.harmonize.on and drive is not None and harmonised.harmonises_weather(config.harmonize, how):
                 draw = _corrected(config, drive, fitted, scene, draw, how)
                 followers.append(draw)
-    paths = trajectories(loaded, config)
+    paths = trajectories(loaded, config, path)
     _require_memory(paths)
     threads = 1 if followers or device.type != "cpu" else native.threads()
     with (
@@ -178,10 +191,15 @@ def _field_drawer(config: RenderConfig, model: Path, device: torch.device) -> tu
     return functools.partial(observe, field.to(device), budget=budget, source=source), source
 
 
-def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
-    """The trajectories a configuration names: every camera at every shift (0 = recorded), and on every further path.
-    UsageError: an unknown camera, or nothing to render."""
+def trajectories(scene: Scene, config: RenderConfig, path: Path | None = None) -> tuple[Trajectory, ...]:
+    """The trajectories a configuration names: every camera at every shift (0 = recorded), and on every further path; or
+    that in the file ``path`` alone, with the optics of the first camera. UsageError: an unknown camera, or nothing to
+    render. InputError: the file holds no path."""
     cameras = config.cameras or tuple(scene.cameras)[:1]
+    if path is not None:
+        camera = scene.frames_of(cameras[0])[0].view.camera
+        found = read_path(path, scene, camera)
+        return (Trajectory(found.name, tuple(_optics(view, config) for view in found.views), found.origin),)
     if not config.shifts_m and not config.paths:
         what, remedy = "nothing to render: no shifts were given", "at least one of --shifts-m; 0 is the recorded path"
         raise UsageError(what, remedy=remedy)
@@ -189,8 +207,17 @@ def trajectories(scene: Scene, config: RenderConfig) -> tuple[Trajectory, ...]:
     for camera in cameras:
         paths += [trajectory.at_shift(scene, camera, shift_m) for shift_m in config.shifts_m]
         paths += [trajectory.named(scene, camera, name) for name in config.paths]
-    small = lambda path: tuple(resized_view(view, config.width_px) for view in path.views)
-    return tuple(Trajectory(path.name, small(path), path.origin) for path in paths)
+    return tuple(
+        Trajectory(found.name, tuple(_optics(view, config) for view in found.views), found.origin) for found in paths
+    )
+
+
+def _optics(view: View, config: RenderConfig) -> View:
+    """A view with the field of view and the width that are asked for."""
+    if config.fov_deg:
+        focal = view.camera.width / 2 / math.tan(math.radians(config.fov_deg) / 2)
+        view = replace(view, camera=replace(view.camera, fx=focal, fy=focal * view.camera.fy / view.camera.fx))
+    return resized_view(view, config.width_px)
 
 
 def _several(draw: Drawer, threads: int) -> Drawers:

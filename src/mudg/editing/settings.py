@@ -34,6 +34,8 @@ class RenderConfig:
     speed+0.1: 0.1 m further ahead with every frame. A minus means down, right, slower."""
     width_px: int = setting(default=0, ge=0)
     """Image width in pixels (0 = as recorded); the height follows."""
+    fov_deg: float = setting(default=0.0, ge=0, lt=170)
+    """Horizontal field of view in degrees (0 = the camera's own)."""
     remove_tracks: tuple[str, ...] = ()
     """Ids of tracked objects to leave out, as listed in the scene."""
     lidar: str = ""

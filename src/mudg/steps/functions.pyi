@@ -648,11 +648,13 @@ def render(
     overwrite: bool = False,
     edits: str | Path | None = None,
     fused: str | Path | None = None,
+    path: str | Path | None = None,
     config: str | Path | None = None,
     cameras: tuple[str, ...] = ('front',),
     shifts_m: tuple[float, ...] = (0.0, 2.0, -2.0, 3.0, -3.0, 4.0, -4.0),
     paths: tuple[str, ...] = (),
     width_px: int = 0,
+    fov_deg: float = 0.0,
     remove_tracks: tuple[str, ...] = (),
     lidar: str = '',
     video: bool = True,
@@ -669,11 +671,13 @@ def render(
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         edits: Edit script (docs/edit.md) to carry out before rendering.
         fused: Point clouds written by fuse; for --harmonize.on.
+        path: Camera path to draw in place of the shifts: poses in the format of TUM or KITTI (.txt), or nerfstudio's transforms.json, on the scene's clock and in its world. It has the optics of the first camera.
         config: YAML file of settings, read before those given here.
         cameras: Cameras to render (empty = the first camera). A name that the scene lacks is an error.
         shifts_m: Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path.
         paths: Further paths by name. up+1: raised by 1 m. lane+0.1: a lane change, 0.1 m further to the left with every frame. speed+0.1: 0.1 m further ahead with every frame. A minus means down, right, slower.
         width_px: Image width in pixels (0 = as recorded); the height follows.
+        fov_deg: Horizontal field of view in degrees (0 = the camera's own).
         remove_tracks: Ids of tracked objects to leave out, as listed in the scene.
         lidar: Also simulate the log's LiDAR sweeps at every shift: a sensor of the scene, pandar128, at128, hdl64, vlp16, or a JSON file of beams (docs/simulator.md). Empty = none.
         video: Also write one MP4 video per trajectory.

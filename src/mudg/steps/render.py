@@ -31,7 +31,7 @@ class RenderViews(Output):
     from_run = ("model",)
     version, files = 2, ("*.mp4", *below("*", OBSERVATION_FILES), *below("lidar/*", SWEEP_FILES))
     short = (
-        *("cameras", "shifts_m", "paths", "width_px", "lidar", "video", "remove_tracks", "device"),
+        *("cameras", "shifts_m", "paths", "width_px", "fov_deg", "lidar", "video", "remove_tracks", "device"),
         *("harmonize.on", "harmonize.model"),
     )
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
@@ -43,6 +43,9 @@ class RenderViews(Output):
     """Edit script (docs/edit.md) to carry out before rendering."""
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
     """Point clouds written by fuse; for --harmonize.on."""
+    path: Annotated[Path | None, Flag("FILE")] = None
+    """Camera path to draw in place of the shifts: poses in the format of TUM or KITTI (.txt), or nerfstudio's
+    transforms.json, on the scene's clock and in its world. It has the optics of the first camera."""
     settings: RenderConfig
 
     def checked(self) -> Self:
@@ -51,11 +54,15 @@ class RenderViews(Output):
             got = f"no --{'edits' if self.edits is None else 'fused'}"
             remedy = "give --edits and --fused, or leave it out"
             raise UsageError(what, where="--harmonize.on", got=got, remedy=remedy)
+        if self.path is not None and (self.settings.harmonize.on or self.settings.lidar):
+            what, remedy = "a path of your own is drawn without repairs and sweeps", "leave one of them out"
+            raise UsageError(what, where="--path", got="--harmonize.on or --lidar", remedy=remedy)
         return self
 
     def inputs(self) -> dict[str, str]:
         table = Path(self.settings.lidar) if self.settings.lidar.endswith(".json") else None
-        read = self.digests({"scene": self.scene, "model": self.model, "edits": self.edits, "lidar": table})
+        files = {"edits": self.edits, "lidar": table, "path": self.path}
+        read = self.digests({"scene": self.scene, "model": self.model, **files})
         if not self.settings.harmonize.on:
             return read
         from mudg.diffusion.model_files import digest
@@ -66,8 +73,8 @@ class RenderViews(Output):
         from mudg.editing import render
 
         model, script = cast("Path", self.model), script_of(self.edits)
-        edited = render.prepare(self.settings, self.scene, model, script, self.fused)
-        views = partial(render.write_views, self.settings, self.scene, model, edited)
+        edited = render.prepare(self.settings, self.scene, model, script, self.fused, self.path)
+        views = partial(render.write_views, self.settings, self.scene, model, edited, path=self.path)
         if not self.settings.lidar:
             return views
         from mudg.scene.read import read_scene

@@ -1,0 +1,122 @@
+"""Camera paths from files: TUM and KITTI poses, and nerfstudio's ``transforms.json``.
+
+====================== ===========================================================================================
+file                   rows
+====================== ===========================================================================================
+``.txt``, 8 numbers    TUM: time, position x y z, quaternion x y z w; camera axes x right, y down, z forward
+``.txt``, 12 numbers   KITTI: the rows of world-from-camera 3x4, same axes; no times
+``.json``              nerfstudio: ``frames`` with ``transform_matrix`` (camera axes x right, y up, z back), ``time``
+====================== ===========================================================================================
+
+Places are metres in the scene's world. Where no time is given, the views are spread evenly over the log.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mudg.base import geometry, log, store
+from mudg.base.errors import InputError
+from mudg.base.types import Camera, Scene, Trajectory, View
+
+FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+FAR_M = 5.0
+"""Views farther than this from every recorded camera are warned of."""
+MOST_VIEWS = 100_000
+Rows = list[tuple[float | None, NDArray[np.float64], str]]
+"""Time or None, world-from-camera f64[4, 4], and where it stands in the file."""
+
+
+def read_path(file: Path, scene: Scene, camera: Camera) -> Trajectory:
+    """The path in a file, seen by a camera.
+
+    Args:
+        scene: the log, whose clock and world the path is in.
+
+    Raises:
+        InputError: not such a file, a pose that is not rigid, or times that do not increase or lie outside the log.
+    """
+    rows = _of_json(file) if file.suffix == ".json" else _of_text(file)
+    if not 0 < len(rows) <= MOST_VIEWS:
+        raise InputError(
+            "no usable number of poses", where=str(file), expected=f"1 to {MOST_VIEWS}", got=str(len(rows))
+        )
+    recorded = [frame.view for frame in scene.frames]
+    first, last = min(view.time_s for view in recorded), max(view.time_s for view in recorded)
+    timed = [time for time, _, _ in rows if time is not None]
+    if timed and len(timed) < len(rows):
+        raise InputError("some poses have a time and others have none", where=str(file))
+    times = np.array(timed) if timed else np.linspace(first, last, len(rows))
+    for (_, pose, where), time_s in zip(rows, times.tolist(), strict=True):
+        problem = geometry.rigid_problem(pose)
+        if problem:
+            raise InputError(
+                "a pose of the path is not rigid", where=where, expected="a rotation and metres", got=problem
+            )
+        if not first - 1e-6 <= time_s <= last + 1e-6:
+            expected, remedy = f"{first:.3f} to {last:.3f} s", "times are those of the scene's clock"
+            raise InputError(
+                "the path leaves the time of the log", where=where, expected=expected, got=f"{time_s} s", remedy=remedy
+            )
+    if (np.diff(times) < 0).any():
+        raise InputError("times of the path do not increase", where=rows[int(np.argmax(np.diff(times) < 0)) + 1][2])
+    places = np.stack([view.center_world for view in recorded])
+    away = np.array([np.linalg.norm(places - pose[:3, 3], axis=1).min() for _, pose, _ in rows])
+    if away.max() > FAR_M:
+        count = int((away > FAR_M).sum())
+        far = f"more than {FAR_M:g} m from every recorded camera (up to {away.max():.1f} m)"
+        log.warn(f"{file.name}: {count} of {len(rows)} views are {far}: do not trust them")
+    views = tuple(View(camera, pose, time_s) for (_, pose, _), time_s in zip(rows, times.tolist(), strict=True))
+    return Trajectory(file.stem, views, "shifted")
+
+
+def _of_text(file: Path) -> Rows:
+    rows: Rows = []
+    for number, line in enumerate(store.read_text(file).splitlines(), 1):
+        words, where = line.partition("#")[0].split(), f"{file}, line {number}"
+        if not words:
+            continue
+        try:
+            values = np.array([float(word) for word in words])
+        except ValueError as error:
+            raise InputError("not a number", where=where, got=line[:60]) from error
+        if len(values) not in (8, 12) or not np.isfinite(values).all():
+            expected = "8 finite numbers (TUM) or 12 (KITTI)"
+            raise InputError("not a pose", where=where, expected=expected, got=f"{len(values)} words: {line[:60]}")
+        if len(values) == 12:
+            rows.append((None, np.vstack([values.reshape(3, 4), [0, 0, 0, 1]]), where))
+            continue
+        length = float(np.linalg.norm(values[4:]))
+        if not 0.99 < length < 1.01:
+            raise InputError("not a unit quaternion", where=where, expected="length 1", got=f"{length:.4f}")
+        turn = geometry.matrix_from_quaternion(values[[7, 4, 5, 6]] / length)
+        rows.append((float(values[0]), geometry.from_rotation_translation(turn, values[1:4]), where))
+    return rows
+
+
+def _of_json(file: Path) -> Rows:
+    content = store.read_json(file)
+    frames: Any = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(frames, list):
+        raise InputError("no list of frames", where=str(file), expected="transforms.json of nerfstudio")
+    rows: Rows = []
+    for number, frame in enumerate(frames):
+        where = f"{file}, frames[{number}]"
+        matrix = frame.get("transform_matrix") if isinstance(frame, dict) else None
+        try:
+            pose = np.array(matrix, np.float64)
+        except (TypeError, ValueError) as error:
+            raise InputError("not a matrix", where=f"{where}.transform_matrix", expected="4x4 numbers") from error
+        if pose.shape != (4, 4):
+            raise InputError(
+                "not a matrix", where=f"{where}.transform_matrix", expected="4x4 numbers", got=str(pose.shape)
+            )
+        time_s = frame.get("time")
+        if time_s is not None and (isinstance(time_s, bool) or not isinstance(time_s, int | float)):
+            raise InputError("not a time", where=f"{where}.time", expected="seconds", got=repr(time_s)[:40])
+        rows.append((time_s, pose @ FROM_OPENGL, where))
+    return rows
