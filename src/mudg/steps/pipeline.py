@@ -105,7 +105,7 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
     if reels is not None:  # written last, when the seconds of all steps are known
         run_report.write_page(out, reels)
         ledger.remember_report(key)
-    text = _closing_text(out, page, ledger)
+    text = _closing_text(out, str(source), page, ledger)
     return {"report": page, "metrics": out / "score" / "metrics.json", "seconds": ledger.seconds(), "text": text}
 
 
@@ -282,8 +282,10 @@ def _digests(out: Path) -> dict[str, str]:
     return {name: store.sha256_file(out / name / store.MANIFEST) for name in names if ".part" not in name}
 
 
-def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
+def _closing_text(out: Path, source: str, report: Path, ledger: _Ledger) -> str:
+    """Scores, what the steps took, where the pages lie, and what to do next."""
     from mudg.scoring import score
+    from mudg.viewer.report import next_commands
 
     form = "  {:<26}{:8.1f} s{:11.1f} s{:>12}{:>12}"
     rows = [
@@ -292,7 +294,13 @@ def _closing_text(out: Path, report: Path, ledger: _Ledger) -> str:
     ]
     head = f"  {'step':<26}{'time':>10}{'processor':>13}{'memory':>12}{'written':>12}"
     total = f"  {'total':<26}{sum(ledger.seconds().values()):8.1f} s"
-    return "\n".join([score.summary_table(out / "score"), "", head, *rows, total, "", f"report: {report.resolve()}"])
+    viewer = out / "viewer.html"
+    pages = [f"report: {report.resolve()}", *([f"viewer: {viewer.resolve()}"] if viewer.is_file() else [])]
+    wanted = {"view": "fly through it", "export": "take it elsewhere", "dataset": "train on it", "run": "your own log"}
+    lines = [line for _, block in next_commands(out, source) for line in block]
+    first = {verb: next(line for line in lines if line.startswith(f"mudg {verb} ")) for verb in wanted}
+    after = ["next:", *(f"  {first[verb]:<58}  {what}" for verb, what in wanted.items())]
+    return "\n".join([score.summary_table(out / "score"), "", head, *rows, total, "", *pages, "", *after])
 
 
 class _StepRecord(ForeignRecord):

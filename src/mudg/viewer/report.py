@@ -82,6 +82,10 @@ def next_commands(out: Path, source: str) -> list[tuple[str, tuple[str, ...]]]:
         ("Change the drive, and look at it", changes),
         ("Pictures, depth and classes of another path", [views]),
         ("Files for other programs (docs: export)", files),
+        (
+            "Labelled images beside the path, to train on",
+            [["dataset", "coco", run, "--shifts-m", "0", "2", "--out", f"{run}_coco"]],
+        ),
         ("The same on your own log", [["run", "LOG", "--out", "runs/mine"]]),
     ]
     return [(title, tuple(map(_line, lines))) for title, lines in blocks]
