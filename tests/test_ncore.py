@@ -579,6 +579,35 @@ FRONT = "intrinsics/default/cameras/front/.zattrs"
 RIG_POSES, BOXES = "poses/default/dynamic_poses/.zattrs", "cuboids/default/cuboids/.zattrs"
 
 
+@needs_package
+def test_fields_inside_components_are_named_once(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def add(metadata: dict[str, Any]) -> None:
+        metadata[FRONT]["foo"] = metadata[FRONT]["camera_model_parameters"]["skew"] = 1
+        for name in ("masks/default/cameras/front", "cameras/front/frames", "lidars/lidar/frames"):
+            metadata[f"{name}/.zattrs"]["foo"] = 1
+        for name in metadata:
+            if name.endswith("image/.zattrs"):
+                metadata[name]["quality"] = 90
+        for box in metadata[BOXES]["cuboid_track_observations"]:
+            box["speed"] = box["bbox3"]["score"] = 1
+
+    ingest(altered(recording, tmp_path, add), tmp_path / "out")
+    said = [line for line in capsys.readouterr().err.splitlines() if "passed over" in line]
+    assert sorted(said) == sorted(
+        f"passed over: {names} of the recording, which this program does not know"
+        for names in (
+            "'foo' in the LiDAR components",
+            "'foo' in the camera components",
+            "'foo' in the masks",
+            "'foo', 'camera_model_parameters.skew' in the camera models",
+            "'cuboid_track_observations.speed', 'cuboid_track_observations.bbox3.score' in the boxes",
+            "'quality' in the images",
+        )
+    )
+
+
 def each_pose(change: Callable[[np.ndarray], np.ndarray]) -> Callable[[dict[str, Any]], object]:
     def spoil(metadata: dict[str, Any]) -> None:
         path = metadata[RIG_POSES]["('rig', 'world')"]

@@ -18,6 +18,7 @@ import struct
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from functools import partial
 from pathlib import Path
 from typing import Any, Final, TypeVar
@@ -78,6 +79,27 @@ _BLOSC_HEADER: Final = struct.Struct("<4B3I")
 _KINDS: Final = "biufS"
 COMPONENTS: Final = frozenset("poses intrinsics masks cameras lidars radars cuboids point_clouds camera_labels".split())
 """Components of the format, read or not."""
+_CAMERA: Final = known(
+    "camera_model_type external_distortion_type",
+    camera_model_parameters=known(
+        "resolution shutter_type external_distortion_type external_distortion_parameters principal_point focal_length "
+        "radial_coeffs tangential_coeffs thin_prism_coeffs max_angle reference_poly pixeldist_to_angle_poly "
+        "angle_to_pixeldist_poly linear_cde"
+    ),
+)
+_BOX: Final = known(
+    "track_id class_id timestamp_us reference_frame_id reference_frame_timestamp_us source source_version",
+    bbox3=known("centroid dim rot"),
+)
+_FIELDS: Final = {
+    "intrinsics/*/cameras/*/.zattrs": ("the camera models", _CAMERA),
+    "masks/*/cameras/*/.zattrs": ("the masks", known("mask_names format")),
+    "cuboids/*/cuboids/.zattrs": ("the boxes", known("", cuboid_track_observations=_BOX)),
+    "cameras/*/frames/.zattrs": ("the camera components", known("frames_timestamps_us")),
+    "lidars/*/frames/.zattrs": ("the LiDAR components", known("frames_timestamps_us")),
+    "cameras/*/image/.zattrs": ("the images", known("format")),
+}
+"""Attributes inside components that are read: pattern of their names -> what holds them, fields of the format."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,6 +151,9 @@ def check_store(path: Path) -> None:
             if name.endswith(".zarray"):
                 place = name.removesuffix(".zarray")
                 _check_array(about, chunks.get(place, {}), f"{path}: {place.rstrip('/')}")
+            for pattern, (kind, fields) in _FIELDS.items():
+                if fnmatchcase(name, pattern):
+                    note_unknown_within(f"{kind} of the recording", about, fields)
 
 
 # --- containers -----------------------------------------------------------------------------------
