@@ -37,6 +37,7 @@ FOREIGN_FLAGS = {
         " signals-to-handle shutdown-timeout",
         "mudg": "version help help-all",
         "pytest": "dist",
+        "zensical": "strict",
         "docker": "rm network gpus build-arg user",
         "sbatch": "nodes ntasks-per-node signal",
     }.items()
