@@ -171,9 +171,9 @@ def measure_drive(
         truth = course.exact(drive)
         shown.append((truth["rgb"], seen["rgb"]))
         both = np.isfinite(truth["depth"]) & np.isfinite(seen["depth"]) & (truth["depth"] < FAR_M)
-        off = np.abs(seen["depth"] - truth["depth"])[both] / truth["depth"][both]
+        off = np.abs(seen["depth"][both] - truth["depth"][both]) / truth["depth"][both]
         error = (seen["rgb"].astype(np.float64) - truth["rgb"]) / 255
-        errors.append({"psnr": -10 * math.log10(float((error**2).mean())), "abs_rel": float(off.mean())})
+        errors.append({"psnr": -10 * math.log10(max(float((error**2).mean()), 1e-10)), "abs_rel": float(off.mean())})
         counts = counts + metrics.confusion(*(torch.from_numpy(of["classes"].astype(np.int64)) for of in (seen, truth)))
     if picture is not None and shown:
         store.write_image(picture, np.concatenate(shown[3 * len(shown) // 4], 1), quality=90)

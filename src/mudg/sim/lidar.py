@@ -32,6 +32,8 @@ SLICES: Final = 8
 AXES: Final = np.array([[0.0, 0, 1], [-1, 0, 0], [0, -1, 0]])
 """Rotation sensor-from-camera: a LiDAR looks along x, y is left, z up."""
 MOST_BEAMS: Final = 4_000_000
+COARSE: Final = 0.5
+"""Size of the views where the log's sweeps tell most ranges, as a share of those without a log."""
 MOST_MOMENTS: Final = 4096
 """Beams of more moments than these are carried to the end of the sweep by the nearest of so many."""
 
@@ -149,12 +151,13 @@ class LidarReply:
 def _sweep(session: Session, request: LidarRequest) -> LidarReply:
     beams, start, end = request.beams, request.start, request.end or request.start
     hits, known = Hits(len(beams.share)), session.log_returns(request.like)
+    focal_px = request.focal_px * (1.0 if known is None else COARSE)
     edges = np.linspace(0, 1, (SLICES if request.end is not None else 1) + 1)
     for first, last in zip(edges[:-1], edges[1:], strict=True):
         own = np.flatnonzero((beams.share >= first) & ((beams.share < last) | (last == 1)))
         if len(own):
             moment = start.towards(end, (first + last) / 2)
-            _draw(session, moment, beams.directions[own] @ AXES, own, request, hits)
+            _draw(session, moment, beams.directions[own] @ AXES, own, focal_px, hits)
             if known is not None:
                 _meet(session, known, moment, beams.directions[own], own, hits)
     near, far = beams.range_m
@@ -199,12 +202,10 @@ class Hits:
         self.instances = np.zeros(count, np.uint16)
 
 
-def _draw(
-    session: Session, moment: Instant, rays: Floats, own: NDArray[np.int64], request: LidarRequest, hits: Hits
-) -> None:
+def _draw(session: Session, moment: Instant, rays: Floats, own: NDArray[np.int64], focal_px: float, hits: Hits) -> None:
     """Draw a slice of a sweep; ``rays`` f64[n, 3] in camera axes."""
     world_from_camera = moment.world_from_sensor @ geometry.from_rotation_translation(AXES, (0.0, 0.0, 0.0))
-    for face in faces_of(rays, request.focal_px):
+    for face in faces_of(rays, focal_px):
         turned = geometry.from_rotation_translation(face.cam_from_face, (0.0, 0.0, 0.0))
         view = View(face.camera, world_from_camera @ turned, moment.time_s)
         planes = session.pinhole(view, moment, instances=True)
@@ -248,12 +249,10 @@ def _carried(points: NDArray[np.float32], share: Floats, start: Instant, end: In
     """Points f32[n, 3] in the frames of their moments, in that of the end."""
     carried = np.empty_like(points)
     end_from_world = geometry.invert(end.world_from_sensor)
-    moments = np.unique(share)
-    if len(moments) > MOST_MOMENTS:  # beams that are fired one by one
+    if len(np.unique(share)) > MOST_MOMENTS:  # beams that are fired one by one
         share = np.round(share * MOST_MOMENTS) / MOST_MOMENTS
-        moments = np.unique(share)
-    for at in moments:
-        own = share == at
-        pose = geometry.interpolate_pose(start.world_from_sensor, end.world_from_sensor, float(at))
+    order = np.argsort(share, kind="stable")
+    for own in np.split(order, np.flatnonzero(np.diff(share[order])) + 1) if len(order) else ():
+        pose = geometry.interpolate_pose(start.world_from_sensor, end.world_from_sensor, float(share[own[0]]))
         carried[own] = geometry.transform_points(end_from_world @ pose, points[own])
     return carried

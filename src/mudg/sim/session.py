@@ -253,7 +253,7 @@ class Session:
 
     def log_returns(self, sensor: str = "") -> LogReturns | None:
         """What the sweeps of a LiDAR of the log (empty: its first) tell about surfaces, intensity and lost beams,
-        learnt at the first call (seconds); None without a log or its sweeps.
+        learnt at the first call (half a minute); None without a log or its sweeps.
 
         Raises:
             UsageError: the log has no such LiDAR.

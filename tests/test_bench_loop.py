@@ -1,0 +1,100 @@
+"""``mudg bench loop``: drives scored against the exact city, the exact city itself among them."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from roundtrip import needs_native
+
+from mudg.base.errors import UsageError
+from mudg.benchmarks import loop
+from mudg.benchmarks.settings import BenchConfig
+from mudg.city.logs import LISTS, LogRules, log_config
+from mudg.city.world import CityWorld
+
+pytestmark = needs_native
+RULES = LogRules(frames=8, width=96, height=64, cameras=("front",))
+
+
+@pytest.fixture(scope="module")
+def course() -> loop.Course:
+    return loop.Course.of(CityWorld(log_config(LISTS["development"][0], RULES)))
+
+
+def test_exact_eyes_make_the_exact_drive_and_perfect_scores(course: loop.Course) -> None:
+    alone = loop.measure_drive(course, 3.0)
+    seen = loop.measure_drive(course, 3.0, course.exact)
+    assert seen["path"] == alone["path"]
+    assert (seen["psnr"], seen["abs_rel"], seen["miou"]) == (100.0, 0.0, 1.0)
+    parted = loop.parting(seen["path"], alone["path"])
+    assert parted["parting_m"] == parted["parted_m"] == parted["speed_off_mps"] == 0.0
+    assert 0.3 < alone["path"][-1]["shift_m"] < 3.0
+
+
+def test_drives_to_both_sides_leave_the_path_the_right_way(course: loop.Course) -> None:
+    ends = {aim: loop.measure_drive(course, aim)["path"][-1]["shift_m"] for aim in (3.0, -3.0)}
+    assert ends[3.0] > 0.2 and ends[-3.0] < -0.2
+
+
+def test_worse_pictures_score_worse_by_what_was_done_to_them(course: loop.Course) -> None:
+    def worse(drive: object) -> dict[str, np.ndarray]:
+        exact = course.exact(drive)
+        rgb = np.clip(exact["rgb"].astype(int), 20, 235) + 20
+        return {"rgb": rgb.astype(np.uint8), "depth": exact["depth"] * np.float32(1.25), "classes": exact["classes"]}
+
+    seen = loop.measure_drive(course, 0.0, worse)
+    assert seen["abs_rel"] == pytest.approx(0.25, abs=1e-5)
+    assert seen["psnr"] == pytest.approx(20 * math.log10(255 / 20), abs=1.0)
+    assert seen["miou"] == 1.0
+
+
+def test_blind_eyes_drive_faster_where_somebody_is_ahead(course: loop.Course) -> None:
+    """Without depth nobody is ahead: the pilot keeps its speed, and the drives part."""
+
+    def blind(drive: object) -> dict[str, np.ndarray]:
+        exact = course.exact(drive)
+        return {**exact, "depth": np.where(exact["depth"] < 8, exact["depth"], np.float32(np.inf))}
+
+    exact, seen = loop.measure_drive(course, 0.0), loop.measure_drive(course, 0.0, blind)
+    speeds = [path[-1]["speed_mps"] for path in (exact["path"], seen["path"])]
+    assert speeds[1] >= speeds[0]
+    parted = loop.parting(seen["path"], exact["path"])
+    assert (parted["speed_off_mps"] > 0) == (speeds[1] > speeds[0])
+
+
+def test_a_vehicle_on_the_sidewalk_and_in_another_is_judged(course: loop.Course) -> None:
+    drive = course.begin()
+    assert not course.judge(drive)["off_road"] and not course.judge(drive)["hit"]
+    name, box = next(iter(drive.boxes().items()))
+    x, y = box.world_from_box[:2, 3]
+    drive.motion = type(drive.motion)(float(x), float(y), drive.motion.heading_rad, 0.0)
+    assert course.judge(drive)["hit"]
+    aside = course.begin()
+    left = np.array([-math.sin(aside.motion.heading_rad), math.cos(aside.motion.heading_rad)]) * 30
+    aside.motion = type(aside.motion)(
+        aside.motion.x_m + left[0], aside.motion.y_m + left[1], aside.motion.heading_rad, 0.0
+    )
+    assert course.judge(aside)["off_road"]
+
+
+def test_the_benchmark_fits_drives_and_is_reused(tmp_path: Path) -> None:
+    config = BenchConfig(logs=1, methods=("street_gaussians",), iterations=8, processes=1)
+    out = loop.run(config, tmp_path / "loop", rules=RULES)
+    doc = json.loads((out / "bench.json").read_text())
+    (entry,) = doc["logs"]
+    assert set(entry["values"]) == {"exact city", "street_gaussians"} == set(doc["rows"])
+    drive = entry["values"]["street_gaussians"]["left"]
+    assert 5 < drive["psnr"] < 40 and 0 < drive["abs_rel"] and math.isfinite(drive["parting_m"])
+    mean = np.mean([of["psnr"] for of in entry["values"]["street_gaussians"].values()])
+    assert doc["pooled"]["street_gaussians"]["psnr"]["mean"] == pytest.approx(mean)
+    assert "street_gaussians" in (out / "bench.md").read_text()
+    times = {path: path.stat().st_mtime_ns for path in out.rglob("drives/*")}
+    assert len(times) == 6
+    loop.run(config, tmp_path / "loop", rules=RULES)
+    assert times == {path: path.stat().st_mtime_ns for path in out.rglob("drives/*")}
+    with pytest.raises(UsageError, match="fits no scene"):
+        loop.run(BenchConfig(logs=1, methods=("mudg_r",)), tmp_path / "other", rules=RULES)
