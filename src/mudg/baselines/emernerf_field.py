@@ -24,9 +24,6 @@ from mudg.base.errors import InputError
 from mudg.core.grids import HashGrid, encode
 
 # sampling -----------------------------------------------------------------------------------------
-#
-# Where rays are sampled and what samples weigh: spacing, contraction of space, volume rendering weights, resampling,
-# and the loss that teaches proposal networks.
 
 
 def contract(xyz: Tensor, center: Tensor, half: Tensor) -> Tensor:
@@ -135,22 +132,24 @@ def interlevel_loss(edges: Tensor, weights: Tensor, proposed: Tensor, proposal: 
 
 # field --------------------------------------------------------------------------------------------
 
-
 OCTAVES = 5
 DIRECTION_WIDTH = 3 + 6 * OCTAVES
 TABLE_START = 1e-4
 LARGEST_LOG_DENSITY = 12.0
 
 
+Grid = tuple[int, int, int, int, int]
+"""Levels, features per level, coarsest, finest, log2 of the entries of a level."""
+
+
 @dataclass(frozen=True)
 class FieldSizes:
-    """Sizes of all networks; a grid is (levels, features per level, coarsest, finest, log2 of the entries of a
-    level)."""
+    """Sizes of all networks."""
 
-    static: tuple[int, int, int, int, int]
-    dynamic: tuple[int, int, int, int, int]
-    flow: tuple[int, int, int, int, int]
-    proposals: tuple[tuple[int, int, int, int, int], ...]
+    static: Grid
+    dynamic: Grid
+    flow: Grid
+    proposals: tuple[Grid, ...]
     width: int
     proposal_width: int
     appearance: int = 16
@@ -158,28 +157,15 @@ class FieldSizes:
 
 SIZES: Final[Mapping[str, FieldSizes]] = {
     "small": FieldSizes(
-        static=(8, 2, 16, 1024, 17),
-        dynamic=(8, 2, 8, 256, 17),
-        flow=(8, 2, 8, 128, 15),
-        proposals=((5, 1, 16, 128, 16), (5, 1, 16, 512, 16)),
-        width=32,
-        proposal_width=16,
+        *((8, 2, 16, 1024, 17), (8, 2, 8, 256, 17), (8, 2, 8, 128, 15)),
+        *(((5, 1, 16, 128, 16), (5, 1, 16, 512, 16)), 32, 16),
     ),
     "published": FieldSizes(
-        static=(10, 4, 16, 8192, 20),
-        dynamic=(10, 4, 32, 8192, 18),
-        flow=(10, 4, 16, 4096, 18),
-        proposals=((8, 1, 16, 512, 20), (8, 1, 16, 2048, 20)),
-        width=64,
-        proposal_width=64,
+        *((10, 4, 16, 8192, 20), (10, 4, 32, 8192, 18), (10, 4, 16, 4096, 18)),
+        *(((8, 1, 16, 512, 20), (8, 1, 16, 2048, 20)), 64, 64),
     ),
     "tiny": FieldSizes(
-        static=(3, 2, 4, 16, 10),
-        dynamic=(3, 2, 4, 16, 10),
-        flow=(2, 2, 4, 8, 9),
-        proposals=((2, 1, 4, 8, 9), (2, 1, 4, 16, 9)),
-        width=8,
-        proposal_width=8,
+        *((3, 2, 4, 16, 10), (3, 2, 4, 16, 10), (2, 2, 4, 8, 9)), *(((2, 1, 4, 8, 9), (2, 1, 4, 16, 9)), 8, 8)
     ),
 }
 """By setting; tiny tries out the code. Grids of space and time with more places than entries share them."""
@@ -292,12 +278,8 @@ class RadianceField(nn.Module):
 
     def description(self) -> dict[str, Any]:
         """Everything but the parameters, as JSON values."""
-        return {
-            "sizes": asdict(self.sizes),
-            "extent": asdict(self.extent),
-            "cameras": list(self.cameras),
-            "facts": self.facts,
-        }
+        sizes, extent = asdict(self.sizes), asdict(self.extent)
+        return {"sizes": sizes, "extent": extent, "cameras": list(self.cameras), "facts": self.facts}
 
     @classmethod
     def from_state(cls, values: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> RadianceField:
@@ -316,11 +298,8 @@ class RadianceField(nn.Module):
         given = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
         if wanted != given:
             odd = sorted(name for name in wanted.keys() | given.keys() if wanted.get(name) != given.get(name))
-            raise InputError(
-                "the parameters do not fit the radiance field",
-                got=", ".join(odd[:4]),
-                expected=f"{len(wanted)} tensors",
-            )
+            what, expected = "the parameters do not fit the radiance field", f"{len(wanted)} tensors"
+            raise InputError(what, got=", ".join(odd[:4]), expected=expected)
         field.load_state_dict(dict(tensors))
         return field
 
@@ -368,9 +347,7 @@ class _Mlp(nn.Module):
 class _GridNet(nn.Module):
     """A hash grid and the network that reads it."""
 
-    def __init__(
-        self, dimensions: int, grid: tuple[int, int, int, int, int], layers: Sequence[int], draw: torch.Generator
-    ) -> None:
+    def __init__(self, dimensions: int, grid: Grid, layers: Sequence[int], draw: torch.Generator) -> None:
         super().__init__()
         self.grid = HashGrid(dimensions, *grid)
         self.table = nn.Parameter(TABLE_START * (2 * torch.rand(self.grid.table_shape, generator=draw) - 1))
@@ -411,8 +388,7 @@ def _drawn(inner: int, outer: int, draw: torch.Generator, columns: int = 0) -> n
     return nn.Parameter(limit * (2 * torch.rand(outer, columns or inner, generator=draw) - 1))
 
 
-# rays through the radiance field: samples, light, distance, and the loss terms of a batch of rays -
-
+# rays through the field ---------------------------------------------------------------------------
 
 MIDDLE_RANGE_M = 200.0
 PULSE_RADII = (0.03, 0.003)
@@ -435,13 +411,11 @@ class Rays:
 
     def to(self, device: torch.device) -> Rays:
         """The same rays on a device."""
-        return Rays(
-            *(t.to(device, non_blocking=True) for t in (self.origins, self.directions, self.times, self.cameras))
-        )
+        return Rays(*(t.to(device, non_blocking=True) for t in vars(self).values()))
 
     def part(self, begin: int, end: int) -> Rays:
         """Some of them."""
-        return Rays(*(t[begin:end] for t in (self.origins, self.directions, self.times, self.cameras)))
+        return Rays(*(t[begin:end] for t in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -599,11 +573,8 @@ def pixel_terms(
     wanted, counts, sky = truth
     rgb, shadow = colors(field, rays, marched)
     error = (rgb - wanted).square().mean(1) * counts
-    terms = {
-        "color": error.mean(),
-        "shadow": weights.shadow * shadow.square().mean(),
-        **_of_motion(field, marched, draws, weights),
-    }
+    terms = {"color": error.mean(), "shadow": weights.shadow * shadow.square().mean()}
+    terms |= _of_motion(field, marched, draws, weights)
     if sky is not None and weights.sky:
         opacity = marched.opacity.clamp(1e-4, 1 - 1e-4)
         entropy = -torch.where(sky, torch.log1p(-opacity), opacity.log())
@@ -648,9 +619,8 @@ def _of_motion(field: RadianceField, marched: Marched, draws: RayDraws, weights:
     values, chosen = marched.values, draws.cycle
     terms: dict[str, Any] = {"dynamic": weights.dynamic * values.dynamic_density.mean()}
     if weights.cycle:
-        terms["cycle"] = weights.cycle * field.cycle_loss(
-            marched.xyz[chosen], marched.times[chosen], values.flow[chosen]
-        )
+        missed = field.cycle_loss(marched.xyz[chosen], marched.times[chosen], values.flow[chosen])
+        terms["cycle"] = weights.cycle * missed
     return terms
 
 

@@ -474,3 +474,26 @@ def random_step(
     gate = torch.sigmoid(settings.gate_sharpness * (settings.gate_opacity - opacity))[:, None]
     spread = torch.minimum(rate * settings.step_per_m2 * scales_m**2, scales_m)
     return rotate(quats, gate * spread * noise)
+
+
+def densify_if_due(
+    model: SceneModel,
+    stats: DensifyStats,
+    schedule: DensifySettings | McmcSettings | None,
+    step: int,
+    rate_m: float,
+    run_seed: int,
+) -> dict[str, Any]:
+    """What the schedule has for a step, after the optimiser's; a report if rows changed, as new statistics begin then.
+    ``rate_m``: present learning rate of the centres."""
+    report: dict[str, Any] = {}
+    if isinstance(schedule, McmcSettings):
+        if schedule.due(step):
+            report = relocate_and_grow(model, step, schedule, run_seed)
+        drift(model, step, rate_m, schedule, run_seed)
+    elif schedule is not None:
+        if schedule.due(step):
+            report = densify(model, stats, step, schedule, run_seed)
+        if schedule.reset_due(step):
+            reset_opacity(model, schedule)
+    return report

@@ -116,7 +116,7 @@ class SceneModel:
 
     def node_tables(self) -> dict[str, Table]:
         """The optimisable tables beside the shared one, by name (pose offsets; the sky's panorama)."""
-        tables = {f"node.{node.name}": own for node in self.nodes if (own := node.parameters()) is not None}
+        tables = {f"node.{node.name}": own for node in self.nodes if (own := node.learnt) is not None}
         return tables | ({"sky": self.sky.table} if self.sky is not None else {})
 
     def node_names(self) -> tuple[str, ...]:

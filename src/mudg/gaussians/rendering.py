@@ -13,12 +13,11 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from mudg.base import geometry, palette
-from mudg.base.errors import UsageError
 from mudg.base.types import Gaussians, Observation, Render, RenderPlanes, View
-from mudg.core.raster.rasterize import Backend, RasterConfig, rasterize, refuse_settings
+from mudg.core.raster.rasterize import Backend, RasterConfig, rasterize
 from mudg.gaussians.model import SceneModel, compose, composite_semantics, composite_sky
 from mudg.gaussians.nodes import RigidNode
-from mudg.gaussians.settings import DrawingConfig, FitConfig
+from mudg.gaussians.settings import DrawingConfig
 
 # dynamic objects by themselves: their Gaussians alone, and where their boxes lie in a view --------
 
@@ -111,41 +110,14 @@ class RenderedCondition:
     certainty: Tensor | None
 
 
-def raster_of(model: SceneModel, backend: Backend = "auto", packed: bool = False) -> RasterConfig:
+def raster_of(model: SceneModel, backend: Backend = "auto") -> RasterConfig:
     """How a fitted scene is drawn: as it was while it was fitted."""
-    return RasterConfig(backend=backend, near_m=NEAR_M, packed=packed, **model.facts.get(DRAWING, {}))
+    return RasterConfig(backend=backend, near_m=NEAR_M, **model.facts.get(DRAWING, {}))
 
 
 def drawing_facts(config: DrawingConfig) -> dict[str, Any]:
     """What a model notes of these settings: nothing if they are the usual ones."""
-    chosen, usual = asdict(config), asdict(DrawingConfig())
-    changed = {name: value for name, value in chosen.items() if name != "packed" and value != usual[name]}
-    return {DRAWING: changed} if changed else {}
-
-
-def check_drawing(config: FitConfig, device: torch.device) -> None:
-    """Refuse before the work what no step could draw.
-
-    Raises:
-        UsageError: settings that exclude each other, that the backend of this device lacks, or that give no gradients
-            for what is to be learnt.
-    """
-    wanted = config.drawing
-    backend = config.raster if config.raster != "auto" else "gsplat" if device.type == "cuda" else "cpu"
-    refuse_settings(backend, RasterConfig(backend=config.raster, near_m=NEAR_M, **asdict(wanted)))
-    if (wanted.projection, wanted.primitive) != ("linear", "ellipsoid") and config.densify.kind == "gradient":
-        raise UsageError(
-            "this way of drawing has no gradients of projected means, by which Gaussians are added",
-            where="--drawing",
-            got=f"{wanted.projection}, {wanted.primitive}",
-            remedy="add --densify.kind mcmc",
-        )
-    if wanted.projection == "unscented" and config.appearance.cameras:
-        raise UsageError(
-            "unscented projection has no gradients of camera poses",
-            where="--appearance.cameras",
-            remedy="leave it out, or set --drawing.projection linear",
-        )
+    return {DRAWING: asdict(config)} if config != DrawingConfig() else {}
 
 
 COVERED = 0.5

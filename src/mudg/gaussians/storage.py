@@ -18,7 +18,7 @@ from mudg.base.records import understood
 from mudg.base.run_folder import run_state
 from mudg.base.types import Camera, Scene, View
 from mudg.core.table import Table
-from mudg.gaussians.appearance import CAMERA_POSE, RECORDED_COLOR, Appearance
+from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.rendering import DRAWING, drawing_facts, raster_of, render_view
@@ -289,9 +289,5 @@ def continued_appearance(start: StartFit, fresh: Appearance) -> Appearance:
     """The corrections that a new fit starts from, with those that the finished one learnt about the same images and
     cameras."""
     learnt = load_appearance(start.folder)
-    kept = {
-        group: learnt.tables[group]
-        for group in (RECORDED_COLOR, CAMERA_POSE)
-        if group in fresh.names and learnt.names.get(group) == fresh.names[group]
-    }
+    kept = {group: learnt.tables[group] for group, names in fresh.names.items() if learnt.names.get(group) == names}
     return Appearance(fresh.names, {**fresh.tables, **kept})
