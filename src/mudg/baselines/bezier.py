@@ -57,14 +57,10 @@ def bernstein(tau: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class BezierPath:
-    """A cubic curve and the parameter that belongs to a time.
-
-    Args:
-        control: f64[4, 3] metres. clock: coefficients of the cubic in time, highest power first. middle_s, span_s: time
-            that it is a polynomial in, ``(t - middle) / span``.
-        tau: parameters of the keys, f64[K]. error_m: root mean square distance of the curve from the keys at their
-            times.
-    """
+    """A cubic curve and the parameter that belongs to a time. ``control``: f64[4, 3] metres. ``clock``: coefficients of
+    the cubic in time, highest power first. ``middle_s``, ``span_s``: time that it is a polynomial in,
+    ``(t - middle) / span``. ``tau``: parameters of the keys, f64[K]. ``error_m``: root mean square distance of the
+    curve from the keys at their times."""
 
     control: Array
     clock: Array
@@ -84,10 +80,7 @@ class BezierPath:
 
 def fit_path(times_s: Array, positions: Array) -> BezierPath:
     """The curve of a track: from parameters along the chord, and from such in proportion to the time; the better one.
-
-    Args:
-        times_s: f64[K], rising. positions: f64[K, 3] metres.
-    """
+    ``times_s``: f64[K], rising. ``positions``: f64[K, 3] metres."""
     times = np.asarray(times_s, np.float64)
     span = max(float(times[-1] - times[0]), 1e-6)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)

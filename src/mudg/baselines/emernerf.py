@@ -301,11 +301,8 @@ def save_field(field: RadianceField, budget: Budget, folder: Path) -> None:
 
 
 def load_field(folder: Path) -> tuple[RadianceField, Budget]:
-    """Inverse of ``save_field``.
-
-    Raises:
-        InputError: not the folder of a finished fit of a radiance field. IntegrityError: a file was altered.
-    """
+    """Inverse of ``save_field``. InputError: not the folder of a finished fit of a radiance field. IntegrityError: a
+    file was altered."""
     folder = Path(folder)
     if kind_of(folder) != RADIANCE:
         expected = "made by `mudg fit --method emernerf`"

@@ -41,11 +41,8 @@ INPUTS: Final = 3 * (1 + 2 * PLACE_OCTAVES) + (1 + 2 * TIME_OCTAVES) + EMBEDDING
 class DeformationField(StaticNode):
     """The network that deforms, and the embeddings of its objects.
 
-    Its table: ``network`` [1, P] (``FlatNetwork``) and ``embeddings`` [1, K, 16].
-
-    Args:
-        span_s: first and last time of the log, seconds. layers, width: of the network.
-    """
+    Its table: ``network`` [1, P] (``FlatNetwork``) and ``embeddings`` [1, K, 16]. ``span_s``: first and last time of
+    the log, seconds. ``layers``, ``width``: of the network."""
 
     kind = "deformation"
 
@@ -65,11 +62,8 @@ class DeformationField(StaticNode):
         return cls("deformation field", span_s, layers, width, Table({"network": network, "embeddings": embeddings}))
 
     def displacement(self, place: Tensor, time_s: float, instance: int) -> Tensor:
-        """How far Gaussians move at a time, ``[n, 3]`` metres in the frame of the box.
-
-        Args:
-            place: ``[n, 3]``, -1 to 1 within the box. instance: number of the object's embedding.
-        """
+        """How far Gaussians move at a time, ``[n, 3]`` metres in the frame of the box. ``place``: ``[n, 3]``, -1 to 1
+        within the box. ``instance``: number of the object's embedding."""
         first, last = self.span_s
         moment = place.new_full((1, 1), 2 * (time_s - first) / max(last - first, 1e-6) - 1)
         same = torch.cat([waves(moment, TIME_OCTAVES), self.learnt["embeddings"][:, instance]], 1)

@@ -85,12 +85,8 @@ class VibrationNode(StaticNode):
         return replace(rows, means=means, opacity=rows.opacity * factor * (factor > LEAST_FACTOR))
 
     def born_later(self, columns: Mapping[str, Tensor], noise: Tensor, late: bool) -> dict[str, Tensor]:
-        """Children of split rows: each at another time of its parent's life, where the parent would be then.
-
-        Args:
-            noise: standard normal ``[n]``.
-            late: whether the life span shrinks too (the second half of densification).
-        """
+        """Children of split rows: each at another time of its parent's life, where the parent would be then. ``noise``:
+        standard normal ``[n]``. ``late``: whether the life span shrinks too (the second half of densification)."""
         beta = columns["log_beta"].exp()
         later = beta * noise
         moved = columns["means"] + average_velocity(columns["velocity"], beta) * later[:, None]

@@ -53,14 +53,10 @@ SHORT_GAIN: Final = (sum(SPACE_START) / 2) ** -3
 class HexPlaneNode(StaticNode):
     """The whole world as Gaussians that a field moves.
 
-    Its table: ``planes`` [1, P], all planes one after the other, and ``plane_network`` [1, Q].
-
-    Args:
-        low, high: corners of the field's box: x, y, z in metres, t in seconds. gain: factor on the features (published:
-            1).
-        rests: the world without the field. view: the field is asked for Gaussians in and around its frustum only; None:
-            for all.
-    """
+    Its table: ``planes`` [1, P], all planes one after the other, and ``plane_network`` [1, Q]. ``low``, ``high``:
+    corners of the field's box: x, y, z in metres, t in seconds. ``gain``: factor on the features (published: 1). rests:
+    the world without the field. view: the field is asked for Gaussians in and around its frustum only; None: for
+    all."""
 
     kind = "hexplane"
 

@@ -57,18 +57,11 @@ def timed_points(
     ``gaussians/start.py``).
 
     Half of them are one per cube of space, half one per cube and every few frames, so that what moves has points all
-    along its way.
-
-    Raises:
-        InputError: no photograph shows any LiDAR point.
-    """
+    along its way. InputError: no photograph shows any LiDAR point."""
     xyz, rgb, semantics, time_s = _measured(scene, views, classes, colors)
     if len(xyz) == 0:
-        raise InputError(
-            "no LiDAR point is seen by a training photograph of its time",
-            where=scene.root,
-            remedy="check the LiDAR of the scene and --cameras",
-        )
+        what = "no LiDAR point is seen by a training photograph of its time"
+        raise InputError(what, where=scene.root, remedy="check the LiDAR of the scene and --cameras")
     centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
     half = replace(config, start=replace(config.start, gaussians=max(50, config.start.gaussians // 2)))
     parts = [thinned(xyz, centers, half), *_by_moment(xyz, time_s, scene, half)]

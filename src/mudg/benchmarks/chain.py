@@ -122,12 +122,8 @@ def refuse_foreign(
         except (InputError, KeyError, TypeError):
             foreign = [name for name in names if name in pages]
     if foreign:
-        raise UsageError(
-            "the output folder holds files that do not belong to this run",
-            where=str(out),
-            got=", ".join(sorted(foreign)[:8]),
-            remedy="choose an empty --out",
-        )
+        what = "the output folder holds files that do not belong to this run"
+        raise UsageError(what, where=str(out), got=", ".join(sorted(foreign)[:8]), remedy="choose an empty --out")
 
 
 def seconds_of(out: Path) -> dict[str, float]:

@@ -30,16 +30,10 @@ POSE: Final = "cameras"
 
 
 class Appearance:
-    """The corrections of a fit. A group that is off is absent from ``tables``.
-
-    Args:
-        names: per group, what has a correction of its own: cameras or images.
-        tables: per group, one row per name: ``affine`` [n, 3, 4] (difference from the identity), or ``shift`` [n, 3]
-            metres and ``turn`` [n, 3] radians; None = identity.
-
-    Raises:
-        InputError: a table does not fit its names.
-    """
+    """The corrections of a fit. A group that is off is absent from ``tables``. ``names``: per group, what has a
+    correction of its own: cameras or images. ``tables``: per group, one row per name: ``affine`` [n, 3, 4] (difference
+    from the identity), or ``shift`` [n, 3] metres and ``turn`` [n, 3] radians; None = identity. InputError: a table
+    does not fit its names."""
 
     def __init__(self, names: Mapping[str, Sequence[str]], tables: Mapping[str, Table] | None = None) -> None:
         self.names = {group: tuple(members) for group, members in names.items() if len(members)}

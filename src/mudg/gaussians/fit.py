@@ -93,11 +93,7 @@ class FitInputs:
 
 def write_fit(config: FitConfig, given: FitInputs, work: RunDir) -> dict[str, Any]:
     """Fit a scene and write the model to the work folder; returns a summary. An interrupted fit goes on from its newest
-    checkpoint.
-
-    Raises:
-        NumericsError: a loss or gradient is not finite. InputError: damaged inputs.
-    """
+    checkpoint. NumericsError: a loss or gradient is not finite. InputError: damaged inputs."""
     device = drawing_device(config.device, "fit", config.raster)
     config = recipe_of(config.method).used(config)
     if given.start is not None:

@@ -117,17 +117,12 @@ DEFORM_DECAY: Final = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeRows:
-    """The Gaussians of one node.
-
-    Args:
-        means: f32[n, 3] metres. quats: f32[n, 4] (w, x, y, z), any length. Both in the frame of the node (world for a
-            static one, box for a rigid one) before ``Node.at_time``, in the world after it.
-        opacity: f32[n] in [0, 1].
-        sh_dc: f32[n, 1, 3], the constant band of the colour.
-        own: raw columns of the table, f32[n, ...], that only some kind of node knows.
-        sh_rest: f32[n, K - 1, 3], the bands of the colour that depend on the direction of view, or None; directions are
-            those of the node's frame before ``Node.at_time``, of the world after it.
-    """
+    """The Gaussians of one node. ``means``: f32[n, 3] metres. ``quats``: f32[n, 4] (w, x, y, z), any length. Both in
+    the frame of the node (world for a static one, box for a rigid one) before ``Node.at_time``, in the world after it.
+    ``opacity``: f32[n] in [0, 1]. ``sh_dc``: f32[n, 1, 3], the constant band of the colour. ``own``: raw columns of the
+    table, f32[n, ...], that only some kind of node knows. ``sh_rest``: f32[n, K - 1, 3], the bands of the colour that
+    depend on the direction of view, or None; directions are those of the node's frame before ``Node.at_time``, of the
+    world after it."""
 
     means: Tensor
     quats: Tensor
@@ -568,11 +563,8 @@ class SkyNode:
 
     def fill(self, measured: Iterable[tuple[NDArray[np.float64], NDArray[np.float32]]]) -> None:
         """Start from measured sky colours: mean per texel; texels nobody saw take the nearest seen one's colour.
-
-        Args:
-            measured: portions of directions in the world ``[M, 3]`` and their colours f32[M, 3] in [0, 1]. How they are
-                divided makes no difference.
-        """
+        ``measured``: portions of directions in the world ``[M, 3]`` and their colours f32[M, 3] in [0, 1]. How they are
+        divided makes no difference."""
         rows, columns = self.rows, 2 * self.rows
         total, count = np.zeros((3, rows * columns)), np.zeros(rows * columns)
         for directions_world, rgb in measured:

@@ -21,11 +21,8 @@ render."""
 
 
 def perception_of(config: VirtualConfig, device: torch.device | None = None) -> Perception:
-    """The distance that ``config.perception`` names, of images on a device (None: the CPU).
-
-    Raises:
-        UsageError: LPIPS without a file of its weights. InputError: the file holds something else.
-    """
+    """The distance that ``config.perception`` names, of images on a device (None: the CPU). UsageError: LPIPS without a
+    file of its weights. InputError: the file holds something else."""
     if config.perception == "filters":
         return _compared(FilterBank().to(device), losses.feature_distance)
     if not config.lpips_weights:

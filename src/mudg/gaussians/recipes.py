@@ -34,11 +34,8 @@ LIDAR_DECAY_STEPS = 8000.0
 
 @dataclass(frozen=True, eq=False)
 class DrawnView:
-    """What a step drew of a recorded view, for the terms of a recipe.
-
-    Args:
-        model: as it was drawn (``Recipe.drawn_model``). step: from 1.
-    """
+    """What a step drew of a recorded view, for the terms of a recipe. ``model``: as it was drawn
+    (``Recipe.drawn_model``). ``step``: from 1."""
 
     model: SceneModel
     gaussians: Gaussians
@@ -78,11 +75,7 @@ class Recipe:
     """Share of the run after which it adds no more Gaussians by gradients."""
 
     def check(self, config: FitConfig, continues: bool) -> None:
-        """Refuse settings that the method cannot follow.
-
-        Raises:
-            UsageError: naming the setting.
-        """
+        """Refuse settings that the method cannot follow. UsageError: naming the setting."""
 
     def used(self, config: FitConfig) -> FitConfig:
         """The settings with those put in that the method fixes."""

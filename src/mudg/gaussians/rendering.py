@@ -21,7 +21,6 @@ from mudg.gaussians.settings import DrawingConfig
 
 # dynamic objects by themselves: their Gaussians alone, and where their boxes lie in a view --------
 
-
 BOX_GROWTH = 1.05
 NEAREST_CORNER_M = 0.3
 
@@ -79,7 +78,6 @@ def outline_mask(
 
 # rendering ----------------------------------------------------------------------------------------
 
-
 NEAR_M = 0.2
 DRAWING: Final = "drawing"
 """Fact of a fitted scene: settings of ``RasterConfig`` that it was fitted with and that change its pictures; not there:
@@ -92,16 +90,11 @@ _ROWS: Final = 128
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedCondition:
-    """One rendered view.
-
-    Args:
-        rgb: f32[3, H, W] in [0, 1], over the sky.
-        depth: f32[H, W], camera z in metres; NaN in the sky and where the scene is empty.
-        alpha: f32[H, W] in [0, 1], how much of the pixel Gaussians cover; the rest is sky.
-        semantics: u8[H, W] train ids, 255 = unknown.
-        certainty: f32[H, W] in [0, 1], how well photographs and LiDAR constrain what the pixel shows; at most alpha, so
-            0 in the sky. None: unknown, for a scene fitted by a version that did not measure it.
-    """
+    """One rendered view. ``rgb``: f32[3, H, W] in [0, 1], over the sky. ``depth``: f32[H, W], camera z in metres; NaN
+    in the sky and where the scene is empty. ``alpha``: f32[H, W] in [0, 1], how much of the pixel Gaussians cover; the
+    rest is sky. ``semantics``: u8[H, W] train ids, 255 = unknown. ``certainty``: f32[H, W] in [0, 1], how well
+    photographs and LiDAR constrain what the pixel shows; at most alpha, so 0 in the sky. None: unknown, for a scene
+    fitted by a version that did not measure it."""
 
     rgb: Tensor
     depth: Tensor
@@ -139,10 +132,7 @@ def render_condition(
     model: SceneModel, view: View, raster: RasterConfig | None = None, composed: Gaussians | None = None
 ) -> RenderedCondition:
     """Render one view of a fitted scene with the certainty of its pixels, on the CPU; see ``render_view``.
-
-    Args:
-        composed: what ``compose`` made of the model at the view's time, if it is at hand.
-    """
+    ``composed``: what ``compose`` made of the model at the view's time, if it is at hand."""
     gaussians, certainty = compose(model, view.time_s) if composed is None else composed, model.certainty
     if certainty is not None:
         known = certainty.float()[:, None]
@@ -190,7 +180,6 @@ def _observed(model: SceneModel, render: Render, view: View, source: str = "") -
 
 
 # renders of a fitted scene as the diffusion model's condition holds them --------------------------
-
 
 FAR_M = 1000.0
 """Depth of the sky and of what the scene does not cover."""
