@@ -89,7 +89,7 @@ def instrument(clock: Clock) -> None:
     for part, names in {
         "compose": ("compose",),
         "Adam": ("adam_step",),
-        "densify": ("_densify_if_due", "shorten_needles"),
+        "densify": ("densify_if_due", "shorten_needles"),
         "losses": ("recorded_terms", "virtual_terms", "regularisers"),
     }.items():
         for name in names:
@@ -137,23 +137,24 @@ def measure(options: argparse.Namespace) -> dict[str, Any]:
     )
     clock = Clock(time.process_time if options.threads == 1 else time.perf_counter)
     instrument(clock)
-    optimise, last_of_step, taken = fit.optimise, fit._densify_if_due, {}
+    optimise, last_of_step, taken = fit.optimise, fit.densify_if_due, {}
 
-    def count_steps(state: fit.FitState, settings: FitConfig, step: int) -> dict[str, Any]:
+    def count_steps(*given: Any) -> dict[str, Any]:
+        step = given[3]
         if step == FIRST_STEPS + 1:
             clock.seconds, clock.asking = dict.fromkeys(PARTS, 0.0), 0.0
             taken["began"] = clock.now()
         if step > FIRST_STEPS + options.steps > FIRST_STEPS:
             raise EnoughSteps
         taken["steps"] = step - FIRST_STEPS
-        return last_of_step(state, settings, step)
+        return last_of_step(*given)
 
     def timed_optimise(state: fit.FitState, settings: FitConfig, folder: Any) -> None:
         with contextlib.suppress(EnoughSteps):
             optimise(state, settings, folder)
         taken.update(seconds=clock.now() - taken.pop("began") - clock.asking, gaussians=len(state.model.table))
 
-    fit.optimise, fit._densify_if_due = timed_optimise, count_steps
+    fit.optimise, fit.densify_if_due = timed_optimise, count_steps
     with tempfile.TemporaryDirectory() as folder:
         Fit(scene=scene, fused=fused, out=Path(folder) / "fit", settings=config).run()
     clock.seconds["rest"] += taken["seconds"] - sum(clock.seconds.values())

@@ -161,7 +161,12 @@ def step_times(first: int, last: int) -> Iterator[dict[str, list[float]]]:
     """Clocks in the loop: waiting for views, reading them and making tensors (processor time of the thread), whole
     steps."""
     found: dict[str, list[float]] = {"waiting": [], "tensors": [], "reading": [], "step": []}
-    chosen_ahead, due, choose, tensors = fit.chosen_ahead, fit._densify_if_due, ViewSet.choose, StoredView.as_tensors
+    chosen_ahead, due, choose, tensors = (
+        fit.views.chosen_ahead,
+        fit.densify_if_due,
+        ViewSet.choose,
+        StoredView.as_tensors,
+    )
     began = [time.perf_counter()]
 
     @contextlib.contextmanager
@@ -170,20 +175,20 @@ def step_times(first: int, last: int) -> Iterator[dict[str, list[float]]]:
             ask = timed(lambda: next(upcoming), found["waiting"])
             yield iter(ask, None)
 
-    def count(state: fit.FitState, config: FitConfig, step: int) -> dict[str, Any]:
+    def count(*given: Any) -> dict[str, Any]:
         found["step"].append(time.perf_counter() - began[0])
         began[0] = time.perf_counter()
-        if step >= last:
+        if given[3] >= last:
             raise EnoughSteps
-        return due(state, config, step)
+        return due(*given)
 
-    fit.chosen_ahead, fit._densify_if_due = with_clock, count
+    fit.views.chosen_ahead, fit.densify_if_due = with_clock, count
     ViewSet.choose = timed(choose, found["reading"], time.thread_time)
     StoredView.as_tensors = timed(tensors, found["tensors"], time.thread_time)
     try:
         yield found
     finally:
-        fit.chosen_ahead, fit._densify_if_due = chosen_ahead, due
+        fit.views.chosen_ahead, fit.densify_if_due = chosen_ahead, due
         ViewSet.choose, StoredView.as_tensors = choose, tensors
     for name in found:
         found[name] = found[name][first:]

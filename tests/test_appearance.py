@@ -24,40 +24,36 @@ from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import StaticNode
 from mudg.gaussians.rendering import boxes_in_view, objects_only
 from mudg.gaussians.schedule import FiniteCheck
-from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.settings import AppearanceConfig, FitConfig
 from mudg.scene.read import read_scene
 
 SIZE = (60, 40)
 RECORDED = ("front/000000", "front/000001", "left/000000")
-VIRTUAL = ("front_shift+2.0/000000", "front_shift-2.0/000000", "front_shift+2.0/000001")
+VIRTUAL = "front_shift+2.0/000000"
 
 
 def everything(exposure="image") -> Appearance:
-    return Appearance.of_views(RECORDED, VIRTUAL, exposure, cameras=True, virtual_color=True)
+    return Appearance.of_views(RECORDED, AppearanceConfig(exposure=exposure, cameras=True))
 
 
 def test_the_start_is_the_identity():
     made = everything()
     rgb = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(0))
     view = view_at(0.3, camera())
-    for name, kind in ((RECORDED[0], "recorded"), (VIRTUAL[1], "virtual")):
-        assert torch.equal(made.colored(rgb, name, kind), rgb)
-        assert made.penalty(name, kind).item() == 0
+    assert torch.equal(made.colored(rgb, RECORDED[0], "recorded"), rgb)
+    assert made.penalty(RECORDED[0], "recorded").item() == 0
+    assert made.colored(rgb, VIRTUAL, "virtual") is rgb and made.penalty(VIRTUAL, "virtual") is None
     assert torch.allclose(made.world_from_cam(view, RECORDED[2]), torch.from_numpy(view.world_from_cam.copy()).float())
 
 
 def test_what_is_off_is_absent():
-    made = Appearance.of_views(RECORDED, VIRTUAL)
+    made = Appearance.of_views(RECORDED, AppearanceConfig())
     rgb = torch.rand(3, 2, 2, generator=torch.Generator().manual_seed(0))
     assert not made
     assert made.colored(rgb, RECORDED[0], "recorded") is rgb
-    assert made.penalty(VIRTUAL[0], "virtual") is None
+    assert made.penalty(RECORDED[0], "recorded") is None
     assert made.world_from_cam(view_at(0.0, camera()), RECORDED[0]) is None
-    assert everything("camera").names == {
-        "exposure": ("front", "left"),
-        "cameras": RECORDED,
-        "virtual": ("front_shift+2.0", "front_shift-2.0"),
-    }
+    assert everything("camera").names == {"exposure": ("front", "left"), "cameras": RECORDED}
 
 
 def test_a_view_without_a_map_is_refused():
@@ -67,17 +63,17 @@ def test_a_view_without_a_map_is_refused():
         Appearance({"exposure": ("a", "b")}, {"exposure": everything().tables["exposure"]})
 
 
-def test_recorded_maps_average_to_the_identity_and_virtual_ones_need_not():
+def test_maps_average_to_the_identity():
     made = everything("camera")
+    drawn = torch.randn(2, 3, 4, generator=torch.Generator().manual_seed(1))
     with torch.no_grad():
-        for group in ("exposure", "virtual"):
-            made.tables[group]["affine"].copy_(torch.randn(2, 3, 4, generator=torch.Generator().manual_seed(1)))
+        made.tables["exposure"]["affine"].copy_(drawn)
     rgb = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(0))
     mean = (made.colored(rgb, "front/7", "recorded") + made.colored(rgb, "left/7", "recorded")) / 2
     assert torch.allclose(mean, rgb, atol=1e-6)
-    affine = made.tables["virtual"]["affine"].detach()[0]
+    affine = drawn[1] - drawn.mean(0)
     expected = rgb + torch.einsum("ij,jhw->ihw", affine[:, :3], rgb) + affine[:, 3, None, None]
-    assert torch.allclose(made.colored(rgb, VIRTUAL[2], "virtual"), expected, atol=1e-6)
+    assert torch.allclose(made.colored(rgb, "left/7", "recorded"), expected, atol=1e-6)
 
 
 def test_rigid_motion_agrees_with_the_rotation_about_an_axis():
@@ -125,11 +121,11 @@ def test_only_the_image_of_a_step_moves(kernel):
 
 def test_a_non_finite_gradient_is_named():
     made = everything()
-    made.tables["virtual"]["affine"].grad = torch.full((2, 3, 4), float("nan"))
+    made.tables["exposure"]["affine"].grad = torch.full((3, 3, 4), float("nan"))
     scene = SceneModel(Table({"means": torch.zeros(1, 3)}), (StaticNode(),), None, (), 0)
-    with pytest.raises(NumericsError, match=r"virtual.affine, view v/1, step 3"):
+    with pytest.raises(NumericsError, match=r"exposure.affine, view v/1, step 3"):
         FiniteCheck(3, at_once=True).gradients("v/1", scene, made)
-    assert made.tables["virtual"]["affine"].grad is None
+    assert made.tables["exposure"]["affine"].grad is None
 
 
 def test_state_round_trip():

@@ -16,15 +16,14 @@ from mudg.core.raster.rasterize import RasterConfig
 from mudg.formats.settings import IngestConfig
 from mudg.gaussians import fit
 from mudg.gaussians.model import compose
-from mudg.gaussians.rendering import NEAR_M, check_drawing, raster_of, rasterize
-from mudg.gaussians.settings import AppearanceConfig, DensifyConfig, DrawingConfig, FitConfig, StartConfig
+from mudg.gaussians.rendering import NEAR_M, raster_of, rasterize
+from mudg.gaussians.settings import DrawingConfig, FitConfig, StartConfig
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps.fit import Fit
 from mudg.steps.ingest import Fuse, Ingest
 
 pytestmark = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
-CPU = torch.device("cpu")
 USUAL = FitConfig(
     method="street_gaussians", iterations=4, semantics=False, start=StartConfig(gaussians=800), checkpoint_every=100
 )
@@ -80,30 +79,3 @@ def test_a_finished_fit_goes_on_only_as_it_was_drawn(
     assert json.loads((out / "model.json").read_text())["facts"]["drawing"] == {"antialias": True}
     with pytest.raises(UsageError, match="drawn with other settings"):
         fitted(USUAL, prepared, tmp_path / "other", fits["smooth"])
-
-
-@pytest.mark.parametrize("drawing", [{"primitive": "disc"}, {"projection": "unscented"}, {"packed": True}])
-def test_what_only_gsplat_draws_is_refused_before_anything_is_written(
-    drawing: dict[str, str], prepared: tuple[Path, Path], tmp_path: Path
-) -> None:
-    config = replace(USUAL, drawing=DrawingConfig(**drawing), densify=DensifyConfig(kind="mcmc"))
-    with pytest.raises(UsageError, match="only gsplat on a CUDA device"):
-        fitted(config, prepared, tmp_path / "out")
-    assert not (tmp_path / "out").exists()
-
-
-def test_what_lacks_gradients_is_refused() -> None:
-    there = torch.device("cuda")
-    disc = replace(USUAL, drawing=DrawingConfig(primitive="disc"))
-    with pytest.raises(UsageError, match="gradients of projected means") as refused:
-        check_drawing(disc, there)
-    assert "--densify.kind mcmc" in str(refused.value)
-    check_drawing(replace(disc, densify=DensifyConfig(kind="mcmc")), there)
-    rays = replace(USUAL, drawing=DrawingConfig(projection="unscented"), densify=DensifyConfig(kind="none"))
-    check_drawing(rays, there)
-    with pytest.raises(UsageError, match="no gradients of camera poses"):
-        check_drawing(replace(rays, appearance=AppearanceConfig(cameras=True)), there)
-    with pytest.raises(UsageError, match="cannot combine"):
-        check_drawing(replace(USUAL, drawing=DrawingConfig(projection="unscented", primitive="disc")), there)
-    with pytest.raises(UsageError, match="only gsplat"):
-        check_drawing(replace(rays, raster="torch"), there)

@@ -25,6 +25,7 @@ from mudg.base import store
 from mudg.base.camera_colors import CameraColors, ColorMap
 from mudg.base.config import result_settings
 from mudg.base.errors import NumericsError, ResourceError, UsageError
+from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks import chain, rows
 from mudg.benchmarks import cities as bench_poses
 from mudg.benchmarks.settings import BenchConfig
@@ -49,7 +50,7 @@ from mudg.gaussians.nodes import SkyNode, StaticNode
 from mudg.gaussians.perception import perception_of
 from mudg.gaussians.rendering import render_planes
 from mudg.gaussians.schedule import FiniteCheck
-from mudg.gaussians.settings import FitConfig, VirtualConfig
+from mudg.gaussians.settings import VirtualConfig
 from mudg.scene.observations import read_observations
 from mudg.scoring import score
 from mudg.steps.fit import Fit
@@ -73,7 +74,7 @@ def world(tmp_path_factory) -> dict[str, Path]:
 def early_densification(monkeypatch):
     """Rounds of both kinds within a few steps."""
 
-    def schedule(config: FitConfig, *_given: float) -> DensifySettings | McmcSettings | None:
+    def schedule(config: MethodConfig, *_given: float) -> DensifySettings | McmcSettings | None:
         if config.densify.kind == "mcmc":
             return McmcSettings(2, 4, 2, max_rows=config.densify.max_gaussians)
         return DensifySettings(2, 4, 2, static_gradient=1e-4, max_rows=config.densify.max_gaussians, reset_every=3)
@@ -81,7 +82,7 @@ def early_densification(monkeypatch):
     monkeypatch.setattr(fit, "densify_schedule", schedule)
 
 
-def settings(method: str, device: str, **changes) -> FitConfig:
+def settings(method: str, device: str, **changes) -> MethodConfig:
     small = {
         "iterations": 6,
         "start__gaussians": 120,
@@ -124,7 +125,7 @@ def assert_same_fit(mine: Path, theirs: Path) -> None:
         )
 
 
-def fitted(world: dict[str, Path], out: Path, config: FitConfig, **more: Path) -> Path:
+def fitted(world: dict[str, Path], out: Path, config: MethodConfig, **more: Path) -> Path:
     return Fit(
         scene=world["scene"], fused=world["fuse"], observations=(world["virtual"],), out=out, settings=config, **more
     ).run()
@@ -202,19 +203,19 @@ class Steps:
 
     def watch(self, seen: list[Transfer], monkeypatch) -> None:
         """Cut the list of copies into steps."""
-        choose, due = fit.ViewSet.choose, fit._densify_if_due
+        choose, due = fit.ViewSet.choose, fit.densify_if_due
 
         def began(views, run_seed, step, *rest):
             seen.clear()
             return choose(views, run_seed, step, *rest)
 
-        def ended(state, config, step):
-            report = due(state, config, step)
-            self.of[step] = [copy for copy in seen if not copy.where.startswith("core/raster/")]
+        def ended(*given):
+            report = due(*given)
+            self.of[given[3]] = [copy for copy in seen if not copy.where.startswith("core/raster/")]
             return report
 
         monkeypatch.setattr(fit.ViewSet, "choose", began)
-        monkeypatch.setattr(fit, "_densify_if_due", ended)
+        monkeypatch.setattr(fit, "densify_if_due", ended)
 
 
 @pytest.mark.parametrize("method", [pytest.param("street_gaussians", marks=pytest.mark.slow), "mudg_s"])
@@ -398,7 +399,7 @@ def test_rows_are_put_in_the_order_of_their_place_with_ties_as_they_come():
     assert order_of_place(means).tolist() == [2, 4, 5, 3, 0, 1]
 
 
-@pytest.mark.parametrize("kind", ["filters", "codec", "lpips"])
+@pytest.mark.parametrize("kind", ["filters", "lpips"])
 def test_perceptual_distances_are_those_of_the_cpu(tmp_path, kind):
     store.write_safetensors(tmp_path / "lpips.safetensors", lpips_state())
     config = VirtualConfig(perception=kind, lpips_weights=str(tmp_path / "lpips.safetensors"))
@@ -442,7 +443,7 @@ def test_a_backend_that_does_not_draw_on_the_device_is_refused(world, tmp_path):
 
 
 def test_every_step_of_a_run_follows_its_device_unless_it_has_its_own():
-    made = with_device(RunConfig(device="cuda:1", fit=FitConfig(device="cpu")))
+    made = with_device(RunConfig(device="cuda:1", fit=MethodConfig(device="cpu")))
     assert (made.fit.device, made.render.device, made.score.device) == ("cpu", "cuda:1", "cuda:1")
     assert made.fuse == RunConfig().fuse
     assert with_device(RunConfig()) == RunConfig()

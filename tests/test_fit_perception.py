@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 import torch
 from test_score_metrics import lpips_state
@@ -10,10 +12,9 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.core.losses import lpips_distance, unit_features
 from mudg.core.metrics import Pair
-from mudg.diffusion import model_files
-from mudg.gaussians.perception import perception_of
+from mudg.gaussians.perception import lpips_network, perception_of
 from mudg.gaussians.settings import VirtualConfig
-from mudg.networks.featnets import CodecFeatures, PerceptualDistance
+from mudg.networks.featnets import PerceptualDistance
 
 
 def random(seed: int, *shape: int) -> torch.Tensor:
@@ -27,19 +28,21 @@ def test_gradient_of_the_loss():
     assert torch.autograd.gradcheck(lambda p: lpips_distance([p], units, weight, channels), (x,))
 
 
-def test_the_loss_is_the_scorers_distance_where_all_is_certain():
-    codec = CodecFeatures(model_files.load("embedded").codec)
-    render, truth = random(5, 3, 24, 32).float(), random(6, 3, 24, 32).float()
-    loss = perception_of(VirtualConfig(perception="codec"))(render, truth, torch.ones(1, 24, 32))
+def test_the_loss_is_the_scorers_distance_where_all_is_certain(tmp_path):
+    path = str(tmp_path / "lpips.safetensors")
+    store.write_safetensors(Path(path), {key: value.numpy() for key, value in lpips_state().items()})
+    network = lpips_network(path)
+    render, truth = random(5, 3, 48, 64).float(), random(6, 3, 48, 64).float()
+    loss = perception_of(VirtualConfig(perception="lpips", lpips_weights=path))(render, truth, torch.ones(1, 48, 64))
     pair = Pair(
         rgb=render,
         truth_rgb=truth,
         **dict.fromkeys(("depth", "semantics", "truth_depth", "truth_depth_valid", "truth_semantics")),
     )
-    assert loss.item() == pytest.approx(PerceptualDistance(codec)(pair), rel=1e-6)
+    assert loss.item() == pytest.approx(PerceptualDistance(network, network.channel_weights)(pair), rel=1e-6)
 
 
-@pytest.mark.parametrize("name", ["filters", "codec", "lpips"])
+@pytest.mark.parametrize("name", ["filters", "lpips"])
 def test_every_eye_sees_equality_differences_and_confidence(name, tmp_path):
     path = tmp_path / "lpips.safetensors"
     store.write_safetensors(path, {key: value.numpy() for key, value in lpips_state().items()})

@@ -606,7 +606,7 @@ def test_deformation_settles_between_its_neighbours_and_poses_stay():
     assert 0.2 < deform[2].mean().item() < 0.3
     assert 0.3 < deform[1].mean().item() < 0.4
     assert not node.offsets["shift"].any()
-    assert node.parameters() is node.offsets
+    assert node.learnt is node.offsets
 
 
 # ---- time ----------------------------------------------------------------------------------------

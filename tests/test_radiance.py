@@ -32,7 +32,6 @@ from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
 
 TINY = {"method": "emernerf", "iterations": 8, "preview_every": 100, "checkpoint_every": 4, **SMALL_RADIANCE}
-FEW_RAYS = {"radiance__rays": 8, "radiance__lidar_rays": 8}
 
 
 def drawn(*shape: int, name: str = "values", dtype: torch.dtype = torch.float64) -> torch.Tensor:
@@ -271,8 +270,9 @@ def started(world: Path, device: torch.device | str = "cpu", **changes: object) 
     return loop.prepare(config, read_scene(world / "scene"), Folder(), torch.device(device)), config
 
 
-def test_a_short_fit_lowers_its_losses(world):
-    state, config = started(world, iterations=80, radiance__rays=128, radiance__lidar_rays=128)
+def test_a_short_fit_lowers_its_losses(world, monkeypatch):
+    monkeypatch.setitem(loop.BATCHES, "tiny", (128, 128))
+    state, config = started(world, iterations=80)
     lines = [
         {name: float(value.detach()) for name, value in loop.take_step(state, config, step).items()}
         for step in range(1, 81)
@@ -282,14 +282,15 @@ def test_a_short_fit_lowers_its_losses(world):
 
 
 @pytest.mark.slow
-def test_a_step_on_another_device_is_the_same(world):
+def test_a_step_on_another_device_is_the_same(world, monkeypatch):
+    monkeypatch.setitem(loop.BATCHES, "tiny", (8, 8))
     with pretend_device() as there:
-        state, config = started(world, there, **FEW_RAYS)
+        state, config = started(world, there)
         elsewhere = [
             {name: float(value.detach().cpu()) for name, value in loop.take_step(state, config, step).items()}
             for step in (1, 2)
         ]
-    state, config = started(world, **FEW_RAYS)
+    state, config = started(world)
     for step, found in zip((1, 2), elsewhere):
         for name, value in loop.take_step(state, config, step).items():
             assert found[name] == pytest.approx(float(value.detach()), rel=1e-3, abs=1e-6), name
@@ -364,6 +365,7 @@ def test_published_sizes_are_a_row_of_the_same_table():
     config = fit_config(method="emernerf", radiance__size="published")
     assert SIZES[config.radiance.size].static == (10, 4, 16, 8192, 20)
     assert loop.BUDGETS[config.radiance.size].proposals == (128, 64)
+    assert loop.BATCHES[config.radiance.size] == (8192, 8192)
 
 
 # ---- rays ----------------------------------------------------------------------------------------

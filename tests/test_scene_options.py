@@ -37,7 +37,6 @@ EVERYTHING = {
     "objects__mirror_start": True,
     "appearance__exposure": "image",
     "appearance__cameras": True,
-    "appearance__virtual": True,
     "loss__object_weight": 0.1,
 }
 
@@ -147,36 +146,6 @@ def test_a_saved_scene_renders_as_the_fitted_one(world, tmp_path):
     view = view_at(0.45, camera(width=SIZE[0], height=SIZE[1]))
     for mine, theirs in ((fit.render_view(m, view, RasterConfig()) for m in (model, again)),):
         assert torch.equal(mine.rgb, theirs.rgb)
-
-
-@pytest.mark.slow
-def test_a_generator_that_paints_too_dark_does_not_darken_the_recorded_path(world, tmp_path):
-    path = trajectory.shifted(read_scene(world["scene"]), "front", 2.0)
-    with ObservationWriter(tmp_path / "dark" / path.name, path.name, "dark") as writer:
-        for view in path.views:
-            seen = truth(view.resized(30, 20))
-            seen.rgb.mul_(0.7)
-            writer.add(seen)
-    psnr = {}
-    for own in (False, True):
-        config = settings(
-            iterations=150,
-            appearance__exposure="none",
-            appearance__cameras=False,
-            poses__learn=False,
-            appearance__virtual=own,
-            virtual__beside=False,  # where the recorded path gives steps away, it suffers most
-        )
-        folder = Fit(
-            scene=world["scene"],
-            fused=world["fuse"],
-            observations=(tmp_path / "dark",),
-            out=tmp_path / str(own),
-            settings=config,
-        ).run()
-        view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
-        psnr[own] = metrics.psnr(fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb, truth(view).rgb)
-    assert psnr[True] > psnr[False] + 0.3, psnr
 
 
 # ---- odd scenes ----------------------------------------------------------------------------------

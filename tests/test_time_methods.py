@@ -7,6 +7,7 @@ import os
 import re
 import signal
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -37,13 +38,14 @@ from mudg.gaussians import densify, fit, nodes
 from mudg.gaussians import views as fit_views
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
-from mudg.gaussians.recipes import RECIPES, recipe_of
+from mudg.gaussians.recipes import RECIPES
 from mudg.gaussians.settings import METHODS, PUBLISHED
 from mudg.gaussians.start import columns_from_points
 from mudg.scene import fuse
 from mudg.scene.clouds import read_fused, write_fused
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
+from mudg.steps import command
 from mudg.steps.fit import Fit
 from mudg.steps.ingest import Fuse
 
@@ -130,7 +132,7 @@ def test_vibration_by_hand():
 
 
 def test_vibration_agrees_with_a_plain_loop_and_its_slopes_with_differences():
-    rows, node = vibrating(), VibrationNode("background", 1.0, 0.1).smoothed(0.013)
+    rows, node = vibrating(), VibrationNode("background", 1.0, 0.1, 0.013)
     seen = node.at_time(rows, 1.2)
     for i in range(len(rows.means)):
         beta, since = math.exp(rows.own["log_beta"][i]), 0.04 - 0.013 - float(rows.own["tau"][i])
@@ -270,7 +272,7 @@ def test_a_deformed_object_stays_one_through_everything_a_scene_does():
     assert torch.equal(compose(scene.with_object_moved("walker", np.eye(4)), 0.5).means, moved)
     assert scene.node_names() == ("walker",)
     assert scene.without_nodes(["walker"]).node_names() == ()
-    resting = scene.with_nodes((scene.nodes[0], scene.nodes[1].resting(), field))
+    resting = scene.with_nodes((scene.nodes[0], scene.nodes[1].with_values(rests=True), field))
     assert torch.equal(compose(resting, 0.5).means, rigid.at_time(rows, 0.5).means)
 
 
@@ -309,7 +311,11 @@ def test_the_field_moves_and_recolors_what_lies_in_its_box():
     node, g = field_in_float64(), torch.Generator().manual_seed(6)
     means = torch.cat([torch.rand(4, 3, generator=g).double(), torch.tensor([[9.0, 0, 0]]).double()])
     rows = NodeRows(means, torch.ones(5, 4).double(), torch.ones(5).double(), torch.zeros(5, 1, 3).double())
-    now, later, resting = node.at_time(rows, 1.2), node.at_time(rows, 1.9), node.resting().at_time(rows, 1.2)
+    now, later, resting = (
+        node.at_time(rows, 1.2),
+        node.at_time(rows, 1.9),
+        node.with_values(rests=True).at_time(rows, 1.2),
+    )
     assert bool((now.means[:4] != means[:4]).all()) and torch.equal(now.means[4], means[4])
     assert bool((now.sh_dc[:4] != 0).all()) and bool((now.sh_dc[4] == 0).all())
     assert not torch.equal(now.means, later.means)
@@ -325,7 +331,7 @@ def test_the_field_moves_and_recolors_what_lies_in_its_box():
         return found.means, found.sh_dc
 
     assert torch.autograd.gradcheck(at, [value.clone().requires_grad_() for value in (*columns, means)], fast_mode=True)
-    seen = node.seen_by(view_at(0.6, camera())).asked(torch.tensor([[1.0, 1, 0.5], [-2, 2, 0.5]]).double())
+    seen = node.with_values(view=view_at(0.6, camera())).asked(torch.tensor([[1.0, 1, 0.5], [-2, 2, 0.5]]).double())
     assert set(seen.tolist()) <= {0, 1}
 
 
@@ -345,7 +351,7 @@ def test_what_is_far_from_the_frustum_is_not_asked():
     center, look = view.world_from_cam[:3, 3], view.world_from_cam[:3, 2]
     means = torch.from_numpy(np.stack([center + 20 * look, center - 20 * look])).float()
     assert node.asked(means).tolist() == [0, 1]
-    assert node.seen_by(view).asked(means).tolist() == [0]
+    assert node.with_values(view=view).asked(means).tolist() == [0]
     assert hexplane_moving(torch.tensor([[0.0, 0, 0], [0.0, 3, 0]])).tolist() == [False, True]
 
 
@@ -606,31 +612,39 @@ def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_pat
 
 @pytest.mark.parametrize("method", RECIPES)
 def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
-    for weight in recipe_of(method).own_weights:
+    fit_to_world = partial(Fit, scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit")
+    for weight in METHODS[method].weights:
         with pytest.raises(UsageError, match="published weights of its own"):
-            Fit(
-                scene=world["scene"],
-                fused=world["fuse"],
-                out=tmp_path / "fit",
-                settings=settings(method, **{f"loss__{weight}": 0.33}),
-            ).run()
+            fit_to_world(settings=settings(method, **{f"loss__{weight}": 0.33})).run()
     with pytest.raises(UsageError, match="densifies by gradients"):
-        Fit(
-            scene=world["scene"],
-            fused=world["fuse"],
-            out=tmp_path / "fit",
-            settings=settings(method, densify__kind="mcmc"),
-        ).run()
+        fit_to_world(settings=settings(method, densify__kind="mcmc")).run()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "model.json").write_text("{}")
     with pytest.raises(UsageError, match="cannot go on"):
-        Fit(
-            scene=world["scene"],
-            fused=world["fuse"],
-            start_from=tmp_path / "other",
-            out=tmp_path / "fit",
-            settings=settings(method),
-        ).run()
+        fit_to_world(start_from=tmp_path / "other", settings=settings(method)).run()
+
+
+FOREIGN = {
+    "pvg": "--virtual.start",
+    "gs3d": "--poses.rounds",
+    "omnire": "--loss.lidar-weight",
+    "emernerf": "--sh-degree",
+    "difix": "--virtual.depth-weight",
+    "street_gaussians": "--radiance.size",
+}
+
+
+@pytest.mark.parametrize("method, flag", FOREIGN.items())
+def test_help_shows_the_settings_of_a_method_and_others_are_refused(method, flag):
+    page = command.help_page(Fit, everything=True, choice=method)
+    assert flag not in page.split() and "--iterations" in page
+    assert flag in command.help_page(Fit, everything=True).split()
+    assert command.chosen(Fit, ["--out", "x", f"--method={method}"]) == method
+    assert command.chosen(Fit, ["--method", method]) == method
+    value = {"--radiance.size": "tiny"}.get(flag, "1")
+    with pytest.raises(UsageError, match=f"does not apply to --method {method}") as refused:
+        command.parse(Fit, ["scene", "--out", "x", "--method", method, flag, value])
+    assert flag in str(refused.value)
 
 
 @pytest.mark.slow

@@ -159,7 +159,8 @@ def _help(verb: str, words: Sequence[str]) -> str | None:
         return None
     cls = steps.step_class(verb)
     part = next((word for word in words if not word.startswith("-")), "")
-    return command.help_page(cls, everything=everything, part=part if part in cls.parts else "")
+    part, choice = part if part in cls.parts else "", command.chosen(cls, words)
+    return command.help_page(cls, everything=everything, part=part, choice=choice)
 
 
 def _listed(names: Sequence[str]) -> list[str]:

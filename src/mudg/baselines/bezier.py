@@ -7,11 +7,9 @@ out: the velocity of the background, which here has no curves. Everything else i
 
 from __future__ import annotations
 
-import copy
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Final, Self
+from typing import Any, Final, Self
 
 import numpy as np
 import torch
@@ -26,15 +24,13 @@ from mudg.core.raster.rasterize import rasterize
 from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import NodeRows, RigidNode
-from mudg.gaussians.recipes import SCENE_UNIT_M, DrawnView, OwnRecipe
+from mudg.gaussians.recipes import DrawnView, OwnRecipe
 from mudg.gaussians.rendering import boxes_in_view, objects_only
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import start_model
 from mudg.gaussians.views import StoredView
 
-# bezier -------------------------------------------------------------------------------------------
-#
-# Tracked objects whose Gaussians follow Bezier curves (BezierGS, Ma et al. 2025).
+# curves -------------------------------------------------------------------------------------------
 #
 # The box track of an object becomes a cubic curve of its centre, whose four control points are learnt on; every
 # Gaussian has a curve of its own about it, given by four offsets. At a time, ``tau`` the parameter that belongs to it,
@@ -45,7 +41,6 @@ from mudg.gaussians.views import StoredView
 # the boxes make of the place. Gaussians themselves turn with the boxes.
 #
 # Column: ``curve`` [N, 4, 3] metres in the world, the deviations; 0 and unused for the background.
-
 
 ROUNDS: Final = 100
 """Rounds of fitting control points and moving every key to the nearest parameter of the curve."""
@@ -62,14 +57,10 @@ def bernstein(tau: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class BezierPath:
-    """A cubic curve and the parameter that belongs to a time.
-
-    Args:
-        control: f64[4, 3] metres. clock: coefficients of the cubic in time, highest power first. middle_s, span_s: time
-            that it is a polynomial in, ``(t - middle) / span``.
-        tau: parameters of the keys, f64[K]. error_m: root mean square distance of the curve from the keys at their
-            times.
-    """
+    """A cubic curve and the parameter that belongs to a time. ``control``: f64[4, 3] metres. ``clock``: coefficients of
+    the cubic in time, highest power first. ``middle_s``, ``span_s``: time that it is a polynomial in,
+    ``(t - middle) / span``. ``tau``: parameters of the keys, f64[K]. ``error_m``: root mean square distance of the
+    curve from the keys at their times."""
 
     control: Array
     clock: Array
@@ -89,10 +80,7 @@ class BezierPath:
 
 def fit_path(times_s: Array, positions: Array) -> BezierPath:
     """The curve of a track: from parameters along the chord, and from such in proportion to the time; the better one.
-
-    Args:
-        times_s: f64[K], rising. positions: f64[K, 3] metres.
-    """
+    ``times_s``: f64[K], rising. ``positions``: f64[K, 3] metres."""
     times = np.asarray(times_s, np.float64)
     span = max(float(times[-1] - times[0]), 1e-6)
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
@@ -164,20 +152,18 @@ class BezierNode(RigidNode):
         placement = self._placement(time_s)
         if placement is None:
             return None
-        means = self._center(time_s) + self.offsets_at(rows, float(self.path.tau_at(time_s)))
-        return replace(
-            rows, means=means, quats=rows.quats @ placement[2], sh_rest=self._colors_turned(rows.sh_rest, time_s)
-        )
+        tau = float(self.path.tau_at(time_s))
+        weights, _, center = self._at(tau)
+        center = center + (weights[:, None] * self.learnt["trajectory"][0]).sum(0)
+        means = center + self.offsets_at(rows, tau)
+        turned = self._colors_turned(rows.sh_rest, time_s)
+        return replace(rows, means=means, quats=rows.quats @ placement[2], sh_rest=turned)
 
     def offsets_at(self, rows: NodeRows, tau: float) -> Tensor:
         """Where Gaussians are beside the centre of the object at a parameter of the curve, ``[n, 3]`` metres in the
         world."""
         weights, turned, _ = self._at(tau)
         return rows.means.detach() @ turned + torch.einsum("j,njc->nc", weights, rows.own["curve"])
-
-    def _center(self, time_s: float) -> Tensor:
-        weights, _, center = self._at(float(self.path.tau_at(time_s)))
-        return center + (weights[:, None] * self.learnt["trajectory"][0]).sum(0)
 
     def _at(self, tau: float) -> tuple[Tensor, Tensor, Tensor]:
         """Weights of the control points [4], what turns places (transposed, [3, 3]) and the track's own centre [3],
@@ -190,15 +176,9 @@ class BezierNode(RigidNode):
             self._curves[tau] = tuple(torch.from_numpy(np.array(p)).float().to(device) for p in parts)
         return self._curves[tau]
 
-    def parameters(self) -> Table:
-        """See ``StaticNode``."""
-        return self.learnt
-
     def to(self, device: torch.device) -> Self:
-        """See ``StaticNode``."""
-        there = copy.copy(super().to(device))
-        there.learnt, there._curves = self.learnt.to(device), {}
-        return there
+        """See ``Node``."""
+        return super().to(device).with_values(learnt=self.learnt.to(device), _curves={})
 
     def moved(self, object_from_new: NDArray[np.float64]) -> Self:
         """See ``RigidNode``; what the curves learnt stays as it is in the world."""
@@ -215,9 +195,8 @@ class BezierNode(RigidNode):
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
         """Inverse of ``state``."""
         made = super().from_state(facts, tensors)
-        made.learnt = Table.from_state(
-            {key.removeprefix("learnt."): value for key, value in tensors.items() if key.startswith("learnt.")}
-        )
+        learnt = {key.removeprefix("learnt."): value for key, value in tensors.items() if key.startswith("learnt.")}
+        made.learnt = Table.from_state(learnt)
         return made
 
 
@@ -227,20 +206,14 @@ def distance_change(node: BezierNode, rows: NodeRows, taus: Sequence[float]) -> 
     return (first - second).abs().sum()
 
 
-# bezier -------------------------------------------------------------------------------------------
+# fit ----------------------------------------------------------------------------------------------
 
-
-LIDAR_WEIGHT, LIDAR_DECAY_STEPS = 1.0, 8000.0
-SMOOTH_WEIGHT, OBJECTS_WEIGHT, CONSISTENCY_WEIGHT = 0.1, 0.1, 0.01
+LIDAR_WEIGHT, SMOOTH_WEIGHT, OBJECTS_WEIGHT, CONSISTENCY_WEIGHT = 1.0, 0.1, 0.1, 0.01
 SSIM_SHARE: Final = 0.2
-SKY_M: Final = 900.0 * SCENE_UNIT_M
 
 
 class BezierRecipe(OwnRecipe):
     """See the module's text."""
-
-    own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight",)
-    unfit: ClassVar[tuple[str, ...]] = ("poses.learn", "objects.deformable", "loss.object_weight")
 
     def start(
         self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
@@ -254,14 +227,9 @@ class BezierRecipe(OwnRecipe):
 
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
         """See ``Recipe``."""
-        render, view = drawn.render, drawn.view
-        inverse = losses.inverse_depth(render.depth, render.alpha, SKY_M) * SCENE_UNIT_M
-        terms = {"smooth": SMOOTH_WEIGHT * losses.edge_aware(inverse, view.rgb)}
-        if view.lidar is not None and len(view.lidar.pixel):
-            weight = LIDAR_WEIGHT * math.exp(-drawn.published_step / LIDAR_DECAY_STEPS)
-            terms["lidar"] = weight * losses.sparse_inverse_depth(
-                inverse, view.lidar.pixel, view.lidar.depth_m / SCENE_UNIT_M
-            )
+        view = drawn.view
+        terms = {"smooth": SMOOTH_WEIGHT * losses.edge_aware(drawn.inverse_depth, view.rgb)}
+        terms |= drawn.lidar_term(LIDAR_WEIGHT)
         if len(drawn.model.nodes) > 1:
             if view.channels is not None:
                 terms["objects"] = OBJECTS_WEIGHT * objects_alone(drawn, view.channels)
@@ -286,17 +254,11 @@ def consistency(drawn: DrawnView) -> Tensor:
     model, time_s = drawn.model, drawn.view.view.time_s
     table, counts = model.table, model.counts()
     other = float(seeds.numpy_rng(drawn.config.seed, drawn.step, "other time").random())
-    total, rows = table["curve"].new_zeros(()), 0
-    starts = np.cumsum([0, *counts])
-    for node, start, count in zip(model.nodes, starts, counts):
-        if isinstance(node, BezierNode) and count and node.keys_around(time_s) is not None:
-            part = slice(int(start), int(start) + count)
-            given = NodeRows(
-                table["means"][part],
-                table["quats"][part],
-                table["logits"][part],
-                table["sh_dc"][part],
-                {"curve": table["curve"][part]},
-            )
-            total, rows = total + distance_change(node, given, (float(node.path.tau_at(time_s)), other)), rows + count
-    return total / max(1, rows)
+    total, count = table["curve"].new_zeros(()), 0
+    names = ("means", "quats", "logits", "sh_dc", "curve")
+    for node, *parts in zip(model.nodes, *(table[name].split(counts) for name in names)):
+        if isinstance(node, BezierNode) and len(parts[0]) and node.keys_around(time_s) is not None:
+            rows = NodeRows(*parts[:4], {"curve": parts[4]})
+            taus = float(node.path.tau_at(time_s)), other
+            total, count = total + distance_change(node, rows, taus), count + len(parts[0])
+    return total / max(1, count)

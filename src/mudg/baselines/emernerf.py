@@ -43,18 +43,14 @@ from mudg.baselines.emernerf_field import (
     pixel_terms,
     proposal_loss,
 )
+from mudg.baselines.settings import MethodConfig
 from mudg.core.pictures import depth_colors, gray, side_by_side, to_bytes
 from mudg.gaussians.rendering import COVERED
-from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.storage import RADIANCE, description_of, kind_of
 from mudg.gaussians.views import StoredView, load_recorded, training_frames
 from mudg.scene.read import read_points, read_scene
 
 # rays ---------------------------------------------------------------------------------------------
-#
-# What a radiance field learns from: pixels of recorded frames and LiDAR rays, as rays in the world. Tracked boxes are
-# not read.
-
 
 MOST_LIDAR_RAYS = 8_000_000
 NEAREST_RETURN_M = 0.5
@@ -89,16 +85,14 @@ def lidar_rays(scene: Scene) -> LidarRays | None:
     path, its own origin."""
     share = 1.0
     parts: list[tuple[np.ndarray, ...]] = []
+    along_path = lambda t: [np.interp(t, scene.ego.times_s, axis) for axis in scene.ego.world_from_ego[:, :3, 3].T]
     for sweep in log.progress(scene.sweeps, len(scene.sweeps), "reading LiDAR rays"):
         points = read_points(scene, sweep)
         share = min(share, MOST_LIDAR_RAYS / max(1, len(points.xyz) * len(scene.sweeps)))
         kept = slice(None, None, max(1, round(1 / share)))
         world = geometry.transform_points(sweep.world_from_lidar, points.xyz[kept]).astype(np.float64)
         time_s = sweep.time_s + points.dt_s[kept].astype(np.float64)
-        path, keys = scene.ego.world_from_ego[:, :3, 3], scene.ego.times_s
-        moved = [
-            np.interp(time_s, keys, path[:, axis]) - np.interp(sweep.time_s, keys, path[:, axis]) for axis in range(3)
-        ]
+        moved = [now - then for now, then in zip(along_path(time_s), along_path(sweep.time_s))]
         origins = sweep.world_from_lidar[:3, 3] + np.stack(moved, -1)
         along = world - origins
         far = np.linalg.norm(along, axis=1)
@@ -106,8 +100,7 @@ def lidar_rays(scene: Scene) -> LidarRays | None:
         parts.append((origins[good], along[good] / far[good, None], far[good], time_s[good]))
     if not sum(len(part[0]) for part in parts):
         return None
-    columns = (torch.from_numpy(np.concatenate(column)) for column in zip(*parts))
-    origins, directions, range_m, time_s = columns
+    origins, directions, range_m, time_s = (torch.from_numpy(np.concatenate(column)) for column in zip(*parts))
     return LidarRays(origins.float(), directions.float(), range_m.float(), time_s)
 
 
@@ -116,10 +109,8 @@ def extent_of(scene: Scene, lidar: LidarRays | None) -> Extent:
     if lidar is None:
         places = np.stack([frame.view.center_world for frame in scene.frames])
         low, high = places.min(0) - AROUND_CAMERAS_M, places.max(0) + AROUND_CAMERAS_M
-        log.warn(
-            f"no LiDAR: the inner box reaches {AROUND_CAMERAS_M:.0f} m around the cameras, and nothing measures"
-            " distance"
-        )
+        reach = f"the inner box reaches {AROUND_CAMERAS_M:.0f} m around the cameras"
+        log.warn(f"no LiDAR: {reach}, and nothing measures distance")
     else:
         points = (lidar.origins + lidar.range_m[:, None] * lidar.directions).numpy()
         low, high = np.percentile(points, BOX_PERCENTILES, axis=0)
@@ -135,15 +126,12 @@ def extent_of(scene: Scene, lidar: LidarRays | None) -> Extent:
 def view_rays(view: View, extent: Extent, camera: int, stride: int = 1) -> tuple[Rays, Tensor]:
     """A ray for every (``stride``-th) pixel, row by row, and the camera depth of each ray's unit length ``[R]``."""
     x, y = (torch.from_numpy(values[::stride].astype(np.float32)) for values in geometry.pixel_rays(view.camera))
-    plane = torch.stack([x.expand(len(y), -1), y[:, None].expand(-1, len(x)), torch.ones(len(y), len(x))], -1).reshape(
-        -1, 3
-    )
-    return _rays(
-        plane,
-        torch.tensor(view.world_from_cam, dtype=torch.float32).expand(len(plane), 4, 4),
-        torch.full((len(plane), 1), extent.normalised(view.time_s)),
-        torch.full((len(plane),), camera, dtype=torch.int64),
-    ), 1 / plane.norm(dim=1)
+    shape = len(y), len(x)
+    plane = torch.stack([x.expand(shape), y[:, None].expand(shape), torch.ones(shape)], -1).reshape(-1, 3)
+    poses = torch.tensor(view.world_from_cam, dtype=torch.float32).expand(len(plane), 4, 4)
+    times = torch.full((len(plane), 1), extent.normalised(view.time_s))
+    cameras = torch.full((len(plane),), camera, dtype=torch.int64)
+    return _rays(plane, poses, times, cameras), 1 / plane.norm(dim=1)
 
 
 def _rays(plane: Tensor, poses: Tensor, times: Tensor, cameras: Tensor) -> Rays:
@@ -164,39 +152,25 @@ class PixelBatch:
 
 
 class Pixels:
-    """All pixels of the recorded views, and how badly they are met so far.
-
-    Args:
-        views: recorded; each needs an image.
-        cameras: names; a ray carries the number of its camera.
-    """
+    """All pixels of recorded views, and how badly they are met so far. ``cameras``: names; a ray carries the number of
+    its camera."""
 
     def __init__(self, views: Sequence[StoredView], cameras: Sequence[str], extent: Extent) -> None:
         sizes = [view.rgb.shape[:2] for view in views]
         self._starts = torch.tensor([0, *np.cumsum([h * w for h, w in sizes])])
         self._sizes = torch.tensor(sizes)
-        cells = (self._sizes + ERROR_CELL_PX - 1) // ERROR_CELL_PX
-        self._cells = cells
-        self._cell_starts = torch.cat([torch.zeros(1, dtype=torch.int64), cells.prod(1).cumsum(0)])
+        self._cells = (self._sizes + ERROR_CELL_PX - 1) // ERROR_CELL_PX
+        self._cell_starts = torch.cat([torch.zeros(1, dtype=torch.int64), self._cells.prod(1).cumsum(0)])
         self.errors = torch.ones(int(self._cell_starts[-1]))
         self._rgb = torch.from_numpy(np.concatenate([view.rgb.reshape(-1, 3) for view in views]))
         masks = [np.ones(s, bool) if view.mask is None else view.mask for view, s in zip(views, sizes)]
         self._counts = torch.from_numpy(np.concatenate([mask.reshape(-1) for mask in masks]))
-        skies = [view.sky for view in views]
-        known = all(sky is not None for sky in skies)
-        self._sky = (
-            torch.from_numpy(np.concatenate([np.asarray(sky, bool).reshape(-1) for sky in skies])) if known else None
-        )
+        skies = [np.asarray(view.sky, bool).reshape(-1) for view in views if view.sky is not None]
+        self.sky = torch.from_numpy(np.concatenate(skies)) if len(skies) == len(views) else None  # known in all views
         self._poses = torch.from_numpy(np.stack([view.view.world_from_cam for view in views])).float()
-        lenses = [view.view.camera.intrinsics for view in views]
-        self._lenses = torch.tensor(lenses, dtype=torch.float32)
+        self._lenses = torch.tensor([view.view.camera.intrinsics for view in views], dtype=torch.float32)
         self._times = torch.tensor([[extent.normalised(view.view.time_s)] for view in views])
         self._cameras = torch.tensor([cameras.index(view.view.camera.name) for view in views])
-
-    @property
-    def sky_known(self) -> bool:
-        """Whether all views say where the sky is."""
-        return self._sky is not None
 
     def batch(self, count: int, error_share: float, generator: torch.Generator) -> PixelBatch:
         """``count`` pixels, a share of them drawn where the error was large."""
@@ -215,7 +189,7 @@ class Pixels:
         fx, fy, cx, cy = self._lenses[view].unbind(1)
         plane = torch.stack([(column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy, torch.ones_like(fx)], 1)
         rays = _rays(plane, self._poses[view], self._times[view], self._cameras[view])
-        sky = None if self._sky is None else self._sky[pixel]
+        sky = None if self.sky is None else self.sky[pixel]
         return PixelBatch(rays, self._rgb[pixel].float() / 255, self._counts[pixel].float(), sky, cell)
 
     def _badly_met(self, draws: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -243,13 +217,7 @@ def recorded_pixels(
     return Pixels(views, cameras, extent), views[len(views) // 2]
 
 
-def batch_generator(seed: int, step: int, purpose: str) -> torch.Generator:
-    """What a batch is drawn with: a function of seed, step and purpose alone."""
-    return seeds.torch_generator(seed, step, f"radiance {purpose}")
-
-
-# views of a radiance field: observations, and pictures of what it has learnt (depth, what moves, flow) ----------------
-
+# views of a field ---------------------------------------------------------------------------------
 
 RAYS_AT_ONCE = 2048
 PREVIEW_RAYS = 6000
@@ -274,9 +242,8 @@ def see(field: RadianceField, view: View, budget: Budget, stride: int = 1) -> Se
     """March all pixels of a view, or every ``stride``-th."""
     name = view.camera.name
     rays, z_per_m = view_rays(view, field.extent, field.cameras.index(name) if name in field.cameras else 0, stride)
-    parts = [
-        _part(field, rays.part(begin, begin + RAYS_AT_ONCE), budget) for begin in range(0, len(rays), RAYS_AT_ONCE)
-    ]
+    begins = range(0, len(rays), RAYS_AT_ONCE)
+    parts = [_part(field, rays.part(begin, begin + RAYS_AT_ONCE), budget) for begin in begins]
     width = -(-view.camera.width // stride)
     every = torch.cat(parts).view(-1, width, 9).permute(2, 0, 1)
     return Seen(every[:3], every[3] * z_per_m.view(-1, width), every[4], every[5], every[6:9])
@@ -297,11 +264,9 @@ def observe(field: RadianceField, view: View, budget: Budget, source: str = "") 
     seen = see(field, view, budget)
     covered = seen.opacity[None] >= COVERED
     opacity = seen.opacity[None].clamp(0, 1)
-    depth = torch.where(covered, seen.depth[None], torch.nan)
-    mask = torch.ones_like(covered)
-    return Observation(
-        view, seen.rgb.clamp(0, 1), depth, None, torch.where(covered, opacity, 1 - opacity), mask, "virtual", source
-    )
+    depth, sure = torch.where(covered, seen.depth[None], torch.nan), torch.where(covered, opacity, 1 - opacity)
+    rgb, mask = seen.rgb.clamp(0, 1), torch.ones_like(covered)
+    return Observation(view, rgb, depth, None, sure, mask, "virtual", source)
 
 
 def write_preview(field: RadianceField, stored: StoredView, budget: Budget, path: Path, whole: bool = False) -> None:
@@ -311,13 +276,8 @@ def write_preview(field: RadianceField, stored: StoredView, budget: Budget, path
     stride = 1 if whole else max(1, round((pixels / PREVIEW_RAYS) ** 0.5))
     seen = see(field, stored.view, budget, stride)
     depth = np.where(seen.opacity >= 0.5, seen.depth, np.nan)
-    panels = [
-        stored.rgb[::stride, ::stride],
-        to_bytes(seen.rgb),
-        depth_colors(depth),
-        gray(seen.moving.numpy()),
-        flow_colors(seen.flow.numpy()),
-    ]
+    moving = gray(seen.moving.numpy()), flow_colors(seen.flow.numpy())
+    panels = [stored.rgb[::stride, ::stride], to_bytes(seen.rgb), depth_colors(depth), *moving]
     store.write_image(path, side_by_side(panels))
 
 
@@ -330,30 +290,23 @@ def flow_colors(flow: NDArray[np.floating]) -> NDArray[np.uint8]:
     return (255 * np.stack(hues, -1) * strength[..., None]).round().astype(np.uint8)
 
 
-# a fitted radiance field on disk: ``model.json`` of kind radiance, and ``field.safetensors`` ------
+# on disk ------------------------------------------------------------------------------------------
 
 
 def save_field(field: RadianceField, budget: Budget, folder: Path) -> None:
     """Field and sampling, without optimiser moments."""
-    store.write_json(
-        folder / "model.json", {"schema": 1, "kind": RADIANCE, **field.description(), "budget": asdict(budget)}
-    )
-    store.write_safetensors(
-        folder / "field.safetensors", {name: value.cpu() for name, value in field.state_dict().items()}
-    )
+    description = {"schema": 1, "kind": RADIANCE, **field.description(), "budget": asdict(budget)}
+    store.write_json(folder / "model.json", description)
+    store.write_safetensors(folder / "field.safetensors", {k: value.cpu() for k, value in field.state_dict().items()})
 
 
 def load_field(folder: Path) -> tuple[RadianceField, Budget]:
-    """Inverse of ``save_field``.
-
-    Raises:
-        InputError: not the folder of a finished fit of a radiance field. IntegrityError: a file was altered.
-    """
+    """Inverse of ``save_field``. InputError: not the folder of a finished fit of a radiance field. IntegrityError: a
+    file was altered."""
     folder = Path(folder)
     if kind_of(folder) != RADIANCE:
-        raise InputError(
-            "this folder holds no radiance field", where=str(folder), expected="made by `mudg fit --method emernerf`"
-        )
+        expected = "made by `mudg fit --method emernerf`"
+        raise InputError("this folder holds no radiance field", where=str(folder), expected=expected)
     if (folder / store.MANIFEST).is_file():
         store.verify_manifest(folder)
     values, tensors = description_of(folder), store.read_tensors(folder / "field.safetensors")
@@ -362,8 +315,7 @@ def load_field(folder: Path) -> tuple[RadianceField, Budget]:
         return RadianceField.from_state(values, tensors), budget
 
 
-# loop ---------------------------------------------------------------------------------------------
-
+# fit ----------------------------------------------------------------------------------------------
 
 WARM_UP = 0.1
 FALLS_AT, FALL = (0.25, 0.5, 0.75, 0.9), 0.33
@@ -381,8 +333,8 @@ BUDGETS: Final[Mapping[str, Budget]] = {
     "tiny": Budget((16, 12), 8, NEAR_M, FAR_M),
 }
 """Samples of a ray, by setting."""
-"""Distances of the nearest and of the farthest sample."""
-"""Numbers that describe the appearance of a camera."""
+BATCHES: Final[Mapping[str, tuple[int, int]]] = {"small": (512, 256), "published": (8192, 8192), "tiny": (48, 24)}
+"""Pixels, and LiDAR rays, of a step, by setting."""
 WEIGHTS = Weights(sky=0.001, lidar=1.0, sight=0.1, dynamic=0.002, shadow=0.01, cycle=0.01)
 """Published, but for the dynamic density: 0.01, at once."""
 SIGHT_START, SIGHT_M, SIGHT_LEAST_M, SIGHT_HALVES = 0.08, 6.0, 0.6, 0.2
@@ -399,8 +351,7 @@ class RadianceState:
     """Everything that changes while fitting, and what it is fitted to."""
 
     field: RadianceField
-    optimisers: tuple[torch.optim.Adam, torch.optim.Adam]
-    """Of the fields, and of the proposal networks."""
+    optimisers: tuple[torch.optim.Adam, torch.optim.Adam]  # of the fields, and of the proposal networks
     pixels: Pixels
     lidar: LidarRays | None
     shown: StoredView
@@ -414,7 +365,7 @@ class RadianceState:
         return {"parameters": count, "steps": self.step, "seconds": round(self.seconds, 2), **(self.last or {})}
 
 
-def fit_radiance(config: FitConfig, scene: Path, device: torch.device, folder: RunDir) -> dict[str, Any]:
+def fit_radiance(config: MethodConfig, scene: Path, device: torch.device, folder: RunDir) -> dict[str, Any]:
     """Fit a field to a scene and write it to the folder; an interrupted fit goes on from its newest checkpoint. Returns
     a summary."""
     with one_torch_thread(), memory_of(device, "fit"):
@@ -427,14 +378,14 @@ def fit_radiance(config: FitConfig, scene: Path, device: torch.device, folder: R
     return state.summary()
 
 
-def prepare(config: FitConfig, scene: Scene, folder: RunDir, device: torch.device) -> RadianceState:
+def prepare(config: MethodConfig, scene: Scene, folder: RunDir, device: torch.device) -> RadianceState:
     """Read what is fitted to, and start from the newest checkpoint or from nothing."""
     frames = training_frames(scene, config.cameras)
     cameras = tuple(dict.fromkeys(frame.view.camera.name for frame in frames))
     lidar = lidar_rays(scene)
     extent = extent_of(scene, lidar)
     pixels, shown = recorded_pixels(scene, frames, config.width_px, cameras, extent)
-    if not pixels.sky_known:
+    if pixels.sky is None:
         log.info("the sky of this scene is not labelled: fitted without the sky term")
     facts = {"method": config.method, "scene": scene.id}
     field = RadianceField(SIZES[config.radiance.size], extent, cameras, facts, config.seed).to(device)
@@ -449,7 +400,7 @@ def prepare(config: FitConfig, scene: Scene, folder: RunDir, device: torch.devic
 # ---- the loop ------------------------------------------------------------------------------------
 
 
-def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
+def optimise(state: RadianceState, config: MethodConfig, folder: RunDir) -> None:
     """Fit up to step ``config.iterations``. Same inputs, same result, also across an interruption."""
     pace = checkpoint.Pace()
     with log.task(f"fit {config.method}", config.iterations, state.step) as bar, Interruption() as interruption:
@@ -462,9 +413,8 @@ def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
                 folder.log(step=step, seconds=round(state.seconds, 3), **state.last)
                 bar.update(f"psnr {state.last['psnr']:.1f}")
             if step % config.preview_every == 0 and step < config.iterations:
-                write_preview(
-                    state.field, state.shown, BUDGETS[config.radiance.size], folder.path / "preview" / f"{step:06d}.png"
-                )
+                picture = folder.path / "preview" / f"{step:06d}.png"
+                write_preview(state.field, state.shown, BUDGETS[config.radiance.size], picture)
             if interruption.requested or (step % config.checkpoint_every == 0 and pace.due()):
                 with pace.saving():
                     save_checkpoint(state, folder)
@@ -474,30 +424,28 @@ def optimise(state: RadianceState, config: FitConfig, folder: RunDir) -> None:
                 interruption.stop_now()
 
 
-def take_step(state: RadianceState, config: FitConfig, step: int) -> dict[str, Tensor]:
+def take_step(state: RadianceState, config: MethodConfig, step: int) -> dict[str, Tensor]:
     """A gradient step from pixels and one from LiDAR rays; the weighted loss terms of both."""
-    settings, field = config.radiance, state.field
-    device, budget = field.device, BUDGETS[settings.size]
+    field, device = state.field, state.field.device
+    budget, (pixels, lidar_rays) = BUDGETS[config.radiance.size], BATCHES[config.radiance.size]
     weights = replace(WEIGHTS, dynamic=WEIGHTS.dynamic * dynamic_share(step, config.iterations))
     learns = step <= WARM_UP * config.iterations or step % PROPOSALS_EVERY == 0
     for optimiser in state.optimisers:
         for group in optimiser.param_groups:
             group["lr"] = RATE * rate_share(step, config.iterations)
 
-    generator = batch_generator(config.seed, step, "pixels")
-    batch = state.pixels.batch(settings.rays, ERROR_SHARE, generator)
+    generator = seeds.torch_generator(config.seed, step, "radiance pixels")
+    batch = state.pixels.batch(pixels, ERROR_SHARE, generator)
     marched, draws, rays = _marched(field, batch.rays, budget, generator, learns)
-    sky = None if batch.sky is None else batch.sky.to(device)
-    terms, error = pixel_terms(
-        field, rays, marched, draws, (batch.rgb.to(device), batch.counts.to(device), sky), weights
-    )
+    truth = batch.rgb.to(device), batch.counts.to(device), None if batch.sky is None else batch.sky.to(device)
+    terms, error = pixel_terms(field, rays, marched, draws, truth, weights)
     _learn(state, terms, marched, learns, f"step {step}, pixels")
     state.pixels.note(batch.cells, error)
     if state.lidar is None:
         return terms
 
-    generator = batch_generator(config.seed, step, "lidar")
-    given, range_m = state.lidar.batch(settings.lidar_rays, field.extent, generator)
+    generator = seeds.torch_generator(config.seed, step, "radiance lidar")
+    given, range_m = state.lidar.batch(lidar_rays, field.extent, generator)
     marched, draws, _ = _marched(field, given, budget, generator, learns)
     sight_m = sight_width(step, config.iterations)
     measured = lidar_terms(field, marched, draws, range_m.to(device), weights, sight_m)
@@ -518,14 +466,10 @@ def _learn(state: RadianceState, terms: Mapping[str, Tensor], marched: Marched, 
     """One step of the optimisers down the sum of the terms; NumericsError before that if something is not finite."""
     total = torch.stack(list(terms.values())).sum()
     total = total + proposal_loss(marched) if learns else total
+    remedy = "the parameters are those of the step before; another --seed draws other rays"
     if not bool(torch.isfinite(total)):
         odd = [name for name, value in terms.items() if not bool(torch.isfinite(value))]
-        raise NumericsError(
-            "a loss term is not finite",
-            where=where,
-            got=", ".join(odd) or "proposals",
-            remedy="the parameters are those of the step before; another --seed draws other rays",
-        )
+        raise NumericsError("a loss term is not finite", where=where, got=", ".join(odd) or "proposals", remedy=remedy)
     for optimiser in state.optimisers:
         optimiser.zero_grad(set_to_none=True)
     total.backward()
@@ -534,12 +478,7 @@ def _learn(state: RadianceState, terms: Mapping[str, Tensor], marched: Marched, 
     if not bool(torch.isfinite(sums).all()):
         odd = [name for name, gradient in named if not bool(torch.isfinite(gradient).all())]
         if odd:
-            raise NumericsError(
-                "a gradient is not finite",
-                where=where,
-                got=", ".join(odd[:3]),
-                remedy="the parameters are those of the step before; another --seed draws other rays",
-            )
+            raise NumericsError("a gradient is not finite", where=where, got=", ".join(odd[:3]), remedy=remedy)
     for optimiser in state.optimisers[: 2 if learns else 1]:
         optimiser.step()
 
@@ -582,39 +521,27 @@ def _optimisers(field: RadianceField) -> tuple[torch.optim.Adam, torch.optim.Ada
     return first, second
 
 
-def _moments(state: RadianceState) -> dict[str, Tensor]:
-    made = {}
-    for name, value in state.field.named_parameters():
-        for optimiser in state.optimisers:
-            for kind, moment in optimiser.state.get(value, {}).items():
-                made[f"{kind}.{name}"] = moment.detach().cpu()
-    return made
-
-
 def save_checkpoint(state: RadianceState, folder: RunDir) -> None:
     """All that changes: parameters, moments, the error map, the step."""
-    groups = {
-        "field": {name: value.cpu() for name, value in state.field.state_dict().items()},
-        "moments": _moments(state),
-        "errors": {"errors": state.pixels.errors},
+    field = {name: value.cpu() for name, value in state.field.state_dict().items()}
+    moments = {
+        f"{kind}.{name}": moment.detach().cpu()
+        for name, value in state.field.named_parameters()
+        for optimiser in state.optimisers
+        for kind, moment in optimiser.state.get(value, {}).items()
     }
-    checkpoint.save(
-        folder.path / "steps", state.step, groups, {"seconds": state.seconds, "last": dict(state.last or {})}
-    )
+    groups = {"field": field, "moments": moments, "errors": {"errors": state.pixels.errors}}
+    facts = {"seconds": state.seconds, "last": dict(state.last or {})}
+    checkpoint.save(folder.path / "steps", state.step, groups, facts)
 
 
 def _restore(state: RadianceState, found: checkpoint.Checkpoint) -> None:
     state.field.load_state_dict(found.tensors("field"))
     moments = found.tensors("moments")
     for name, value in state.field.named_parameters():
+        own = {kind: moments.get(f"{kind}.{name}") for kind in ("step", "exp_avg", "exp_avg_sq")}
         for optimiser in state.optimisers:
-            if any(value is one for group in optimiser.param_groups for one in group["params"]):
-                kept = {
-                    kind: moments[f"{kind}.{name}"]
-                    for kind in ("step", "exp_avg", "exp_avg_sq")
-                    if f"{kind}.{name}" in moments
-                }
-                if kept:
-                    optimiser.state[value] = {kind: tensor.to(value.device) for kind, tensor in kept.items()}
+            if own["step"] is not None and any(value is one for one in optimiser.param_groups[0]["params"]):
+                optimiser.state[value] = {kind: tensor.to(value.device) for kind, tensor in own.items()}
     state.pixels.errors = found.tensors("errors")["errors"]
     state.step, state.seconds, state.last = found.step, float(found.state["seconds"]), found.state["last"]

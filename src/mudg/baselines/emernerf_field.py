@@ -24,20 +24,13 @@ from mudg.base.errors import InputError
 from mudg.core.grids import HashGrid, encode
 
 # sampling -----------------------------------------------------------------------------------------
-#
-# Where rays are sampled and what samples weigh: spacing, contraction of space, volume rendering weights, resampling,
-# and the loss that teaches proposal networks.
 
 
 def contract(xyz: Tensor, center: Tensor, half: Tensor) -> Tensor:
     """World places ``[..., 3]`` into the unit cube: a box fills its inner half evenly, everything outside the rest.
 
     With ``p = (xyz - center) / half`` and n the largest ``|p|``: p within the box, ``(2 - 1/n) p/n`` outside; [-2, 2]
-    becomes [0, 1].
-
-    Args:
-        center, half: f32[3], middle and half size of the box in metres.
-    """
+    becomes [0, 1]. ``center``, ``half``: f32[3], middle and half size of the box in metres."""
     inner = (xyz - center) / half
     norm = inner.abs().amax(-1, keepdim=True).clamp_min(1.0)
     return inner * ((2 - 1 / norm) / norm) / 4 + 0.5
@@ -61,25 +54,17 @@ def even_edges(rays: int, count: int, jitter: Tensor) -> Tensor:
 
 
 def rendering_weights(density: Tensor, edges_m: Tensor) -> Tensor:
-    """Share of the light of a ray that comes from each interval: ``T_i (1 - exp(-sigma_i delta_i))``.
-
-    Args:
-        density: ``[R, n]`` per metre.
-        edges_m: ``[R, n + 1]``, growing.
-    """
+    """Share of the light of a ray that comes from each interval: ``T_i (1 - exp(-sigma_i delta_i))``. ``density``:
+    ``[R, n]`` per metre. ``edges_m``: ``[R, n + 1]``, growing."""
     thickness = density * (edges_m[:, 1:] - edges_m[:, :-1])
     before = torch.cumsum(thickness, 1) - thickness
     return torch.exp(-before) * -torch.expm1(-thickness)
 
 
 def resampled_edges(edges: Tensor, weights: Tensor, count: int, jitter: Tensor, floor: float = 1e-3) -> Tensor:
-    """Edges ``[R, count + 1]`` of intervals with equal shares of the weights (data; no gradient).
-
-    Args:
-        edges: ``[R, n + 1]``. weights: ``[R, n]``.
-        jitter: f32[R, 1] in [0, 1].
-        floor: added to every weight, so that empty rays are sampled evenly.
-    """
+    """Edges ``[R, count + 1]`` of intervals with equal shares of the weights (data; no gradient). ``edges``:
+    ``[R, n + 1]``. ``weights``: ``[R, n]``. ``jitter``: f32[R, 1] in [0, 1]. ``floor``: added to every weight, so that
+    empty rays are sampled evenly."""
     mass = weights.detach() + floor
     cdf = torch.cumsum(mass / mass.sum(1, keepdim=True), 1)
     cdf = torch.cat([torch.zeros_like(cdf[:, :1]), cdf], 1).clamp(max=1.0)
@@ -96,13 +81,7 @@ def blurred_mass(edges: Tensor, weights: Tensor, wanted: Tensor, radius: float) 
     section 4).
 
     The blurred histogram is linear between the edges moved by +- radius; its integral is read off at the wanted edges.
-
-    Args:
-        edges: ``[R, n + 1]``. weights: ``[R, n]``. wanted: ``[R, m + 1]``.
-
-    Returns:
-        f64[R, m].
-    """
+    ``edges``: ``[R, n + 1]``. ``weights``: ``[R, n]``. ``wanted``: ``[R, m + 1]``. Returns f64[R, m]."""
     edges, weights, wanted = edges.double(), weights.double(), wanted.double()
     height = weights / (edges[:, 1:] - edges[:, :-1]).clamp_min(1e-9)
     radius = max(radius, 1e-6)
@@ -121,20 +100,15 @@ def blurred_mass(edges: Tensor, weights: Tensor, wanted: Tensor, radius: float) 
 
 
 def interlevel_loss(edges: Tensor, weights: Tensor, proposed: Tensor, proposal: Tensor, radius: float) -> Tensor:
-    """How far a proposal falls short of the (blurred) histogram that it should cover: sum of ``max(0, target - w)^2 /
-    w``, mean of rays.
-
-    Args:
-        edges, weights: of the final samples, ``[R, n + 1]`` and ``[R, n]``; data.
-        proposed, proposal: edges (data) and weights of the proposal, ``[R, m + 1]`` and ``[R, m]``.
-        radius: half width of the blur, in normalised distance.
-    """
+    """How far a proposal falls short of the (blurred) histogram that it should cover: sum of
+    ``max(0, target - w)^2 / w``, mean of rays. ``edges``, ``weights``: of the final samples, ``[R, n + 1]`` and
+    ``[R, n]``; data. ``proposed``, ``proposal``: edges (data) and weights of the proposal, ``[R, m + 1]`` and
+    ``[R, m]``. ``radius``: half width of the blur, in normalised distance."""
     target = blurred_mass(edges.detach(), weights.detach(), proposed.detach(), radius).to(proposal.dtype)
     return ((target - proposal).clamp_min(0).square() / (proposal + 1e-5)).sum(1).mean()
 
 
 # field --------------------------------------------------------------------------------------------
-
 
 OCTAVES = 5
 DIRECTION_WIDTH = 3 + 6 * OCTAVES
@@ -142,15 +116,18 @@ TABLE_START = 1e-4
 LARGEST_LOG_DENSITY = 12.0
 
 
+Grid = tuple[int, int, int, int, int]
+"""Levels, features per level, coarsest, finest, log2 of the entries of a level."""
+
+
 @dataclass(frozen=True)
 class FieldSizes:
-    """Sizes of all networks; a grid is (levels, features per level, coarsest, finest, log2 of the entries of a
-    level)."""
+    """Sizes of all networks."""
 
-    static: tuple[int, int, int, int, int]
-    dynamic: tuple[int, int, int, int, int]
-    flow: tuple[int, int, int, int, int]
-    proposals: tuple[tuple[int, int, int, int, int], ...]
+    static: Grid
+    dynamic: Grid
+    flow: Grid
+    proposals: tuple[Grid, ...]
     width: int
     proposal_width: int
     appearance: int = 16
@@ -158,28 +135,15 @@ class FieldSizes:
 
 SIZES: Final[Mapping[str, FieldSizes]] = {
     "small": FieldSizes(
-        static=(8, 2, 16, 1024, 17),
-        dynamic=(8, 2, 8, 256, 17),
-        flow=(8, 2, 8, 128, 15),
-        proposals=((5, 1, 16, 128, 16), (5, 1, 16, 512, 16)),
-        width=32,
-        proposal_width=16,
+        *((8, 2, 16, 1024, 17), (8, 2, 8, 256, 17), (8, 2, 8, 128, 15)),
+        *(((5, 1, 16, 128, 16), (5, 1, 16, 512, 16)), 32, 16),
     ),
     "published": FieldSizes(
-        static=(10, 4, 16, 8192, 20),
-        dynamic=(10, 4, 32, 8192, 18),
-        flow=(10, 4, 16, 4096, 18),
-        proposals=((8, 1, 16, 512, 20), (8, 1, 16, 2048, 20)),
-        width=64,
-        proposal_width=64,
+        *((10, 4, 16, 8192, 20), (10, 4, 32, 8192, 18), (10, 4, 16, 4096, 18)),
+        *(((8, 1, 16, 512, 20), (8, 1, 16, 2048, 20)), 64, 64),
     ),
     "tiny": FieldSizes(
-        static=(3, 2, 4, 16, 10),
-        dynamic=(3, 2, 4, 16, 10),
-        flow=(2, 2, 4, 8, 9),
-        proposals=((2, 1, 4, 8, 9), (2, 1, 4, 16, 9)),
-        width=8,
-        proposal_width=8,
+        *((3, 2, 4, 16, 10), (3, 2, 4, 16, 10), (2, 2, 4, 8, 9)), *(((2, 1, 4, 8, 9), (2, 1, 4, 16, 9)), 8, 8)
     ),
 }
 """By setting; tiny tries out the code. Grids of space and time with more places than entries share them."""
@@ -219,12 +183,8 @@ class FieldValues:
 
 
 class RadianceField(nn.Module):
-    """All fields with their parameters.
-
-    Args:
-        cameras: names; each has an appearance of its own.
-        facts: method, scene and so on, kept on disk.
-    """
+    """All fields with their parameters. ``cameras``: names; each has an appearance of its own. ``facts``: method, scene
+    and so on, kept on disk."""
 
     def __init__(
         self, sizes: FieldSizes, extent: Extent, cameras: Sequence[str], facts: Mapping[str, Any], seed: int = 0
@@ -262,11 +222,8 @@ class RadianceField(nn.Module):
         return self.flow(torch.cat([self.unit(xyz), time], 1))
 
     def values(self, xyz: Tensor, time: Tensor, share: Tensor | float = 1.0) -> FieldValues:
-        """Everything at places ``[N, 3]`` and normalised times ``[N, 1]``.
-
-        Args:
-            share: of the flow that aggregation follows, ``[N, 1]`` in [0, 1]: random while training, 1 else.
-        """
+        """Everything at places ``[N, 3]`` and normalised times ``[N, 1]``. ``share``: of the flow that aggregation
+        follows, ``[N, 1]`` in [0, 1]: random while training, 1 else."""
         static, flow = self.static(self.unit(xyz)), self.flow_at(xyz, time)
         dynamic = aggregated(self.dynamic_feature, xyz, time, flow, share, self.extent.step)
         return FieldValues(static, dynamic, _density(static[:, 0]), _density(dynamic[:, 0]), flow)
@@ -292,20 +249,13 @@ class RadianceField(nn.Module):
 
     def description(self) -> dict[str, Any]:
         """Everything but the parameters, as JSON values."""
-        return {
-            "sizes": asdict(self.sizes),
-            "extent": asdict(self.extent),
-            "cameras": list(self.cameras),
-            "facts": self.facts,
-        }
+        sizes, extent = asdict(self.sizes), asdict(self.extent)
+        return {"sizes": sizes, "extent": extent, "cameras": list(self.cameras), "facts": self.facts}
 
     @classmethod
     def from_state(cls, values: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> RadianceField:
-        """Inverse of ``description`` and ``state_dict``.
-
-        Raises:
-            InputError: tensors are missing, left over or of another shape.
-        """
+        """Inverse of ``description`` and ``state_dict``. InputError: tensors are missing, left over or of another
+        shape."""
         sizes = {
             k: v if isinstance(v, int) else tuple(tuple(r) if isinstance(r, list) else r for r in v)
             for k, v in values["sizes"].items()
@@ -316,22 +266,16 @@ class RadianceField(nn.Module):
         given = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
         if wanted != given:
             odd = sorted(name for name in wanted.keys() | given.keys() if wanted.get(name) != given.get(name))
-            raise InputError(
-                "the parameters do not fit the radiance field",
-                got=", ".join(odd[:4]),
-                expected=f"{len(wanted)} tensors",
-            )
+            what, expected = "the parameters do not fit the radiance field", f"{len(wanted)} tensors"
+            raise InputError(what, got=", ".join(odd[:4]), expected=expected)
         field.load_state_dict(dict(tensors))
         return field
 
 
 def aggregated(feature: Any, xyz: Tensor, time: Tensor, flow: Tensor, share: Tensor | float, step: float) -> Tensor:
     """A feature averaged along the flow: ``(f(x, t) + f(x + n v_f, t + n D) / 2 + f(x + n v_b, t - n D) / 2) / 2``.
-
-    Args:
-        feature: (places [N, 3], times [N, 1]) -> [N, C].
-        share: n, ``[N, 1]`` or a number. step: D, in normalised time.
-    """
+    ``feature``: (places [N, 3], times [N, 1]) -> [N, C]. ``share``: n, ``[N, 1]`` or a number. ``step``: D, in
+    normalised time."""
     here, count = feature(xyz, time), len(xyz)
     places = torch.cat([xyz + share * flow[:, :3], xyz + share * flow[:, 3:]])
     there = feature(places, torch.cat([time + share * step, time - share * step]))
@@ -368,9 +312,7 @@ class _Mlp(nn.Module):
 class _GridNet(nn.Module):
     """A hash grid and the network that reads it."""
 
-    def __init__(
-        self, dimensions: int, grid: tuple[int, int, int, int, int], layers: Sequence[int], draw: torch.Generator
-    ) -> None:
+    def __init__(self, dimensions: int, grid: Grid, layers: Sequence[int], draw: torch.Generator) -> None:
         super().__init__()
         self.grid = HashGrid(dimensions, *grid)
         self.table = nn.Parameter(TABLE_START * (2 * torch.rand(self.grid.table_shape, generator=draw) - 1))
@@ -411,8 +353,7 @@ def _drawn(inner: int, outer: int, draw: torch.Generator, columns: int = 0) -> n
     return nn.Parameter(limit * (2 * torch.rand(outer, columns or inner, generator=draw) - 1))
 
 
-# rays through the radiance field: samples, light, distance, and the loss terms of a batch of rays -
-
+# rays through the field ---------------------------------------------------------------------------
 
 MIDDLE_RANGE_M = 200.0
 PULSE_RADII = (0.03, 0.003)
@@ -435,13 +376,11 @@ class Rays:
 
     def to(self, device: torch.device) -> Rays:
         """The same rays on a device."""
-        return Rays(
-            *(t.to(device, non_blocking=True) for t in (self.origins, self.directions, self.times, self.cameras))
-        )
+        return Rays(*(t.to(device, non_blocking=True) for t in vars(self).values()))
 
     def part(self, begin: int, end: int) -> Rays:
         """Some of them."""
-        return Rays(*(t[begin:end] for t in (self.origins, self.directions, self.times, self.cameras)))
+        return Rays(*(t[begin:end] for t in vars(self).values()))
 
 
 @dataclass(frozen=True)
@@ -476,15 +415,10 @@ class RayDraws:
 
 @dataclass(frozen=True, eq=False)
 class Marched:
-    """Rays after marching, n samples each.
-
-    Args:
-        along: normalised edges ``[R, n + 1]``; edges_m: the same as distances; middles_m: distances ``[R, n]``; weights
-            ``[R, n]``.
-        xyz, times: of all samples, ``[R * n, 3]`` and ``[R * n, 1]``.
-        values: of the fields there.
-        proposals: edges and weights of every proposal round.
-    """
+    """Rays after marching, n samples each. ``along``: normalised edges ``[R, n + 1]``; ``edges_m``: the same as
+    distances; ``middles_m``: distances ``[R, n]``; weights ``[R, n]``. ``xyz``, ``times``: of all samples,
+    ``[R * n, 3]`` and ``[R * n, 1]``. ``values``: of the fields there. ``proposals``: edges and weights of every
+    proposal round."""
 
     along: Tensor
     edges_m: Tensor
@@ -525,12 +459,9 @@ class Marched:
 def march(
     field: RadianceField, rays: Rays, budget: Budget, draws: RayDraws | None = None, learn_proposals: bool = False
 ) -> Marched:
-    """Samples along rays, first where the proposal networks point, and the fields there.
-
-    Args:
-        draws: of a training batch; None: samples in the middle, the whole flow.
-        learn_proposals: keep the gradients of the proposal networks.
-    """
+    """Samples along rays, first where the proposal networks point, and the fields there. ``draws``: of a training
+    batch; None: samples in the middle, the whole flow. ``learn_proposals``: keep the gradients of the proposal
+    networks."""
     half = rays.times.new_full((len(rays), 1), 0.5)
 
     def jitter(turn: int) -> Tensor:
@@ -591,19 +522,13 @@ def pixel_terms(
     truth: tuple[Tensor, Tensor, Tensor | None],
     weights: Weights,
 ) -> tuple[dict[str, Tensor], Tensor]:
-    """Weighted loss terms of a batch of pixels, and the colour error of every ray ``[R]``.
-
-    Args:
-        truth: colours ``[R, 3]``, whether they count ``[R]`` (0 or 1), and whether they show sky (None: unknown).
-    """
+    """Weighted loss terms of a batch of pixels, and the colour error of every ray ``[R]``. ``truth``: colours
+    ``[R, 3]``, whether they count ``[R]`` (0 or 1), and whether they show sky (None: unknown)."""
     wanted, counts, sky = truth
     rgb, shadow = colors(field, rays, marched)
     error = (rgb - wanted).square().mean(1) * counts
-    terms = {
-        "color": error.mean(),
-        "shadow": weights.shadow * shadow.square().mean(),
-        **_of_motion(field, marched, draws, weights),
-    }
+    terms = {"color": error.mean(), "shadow": weights.shadow * shadow.square().mean()}
+    terms |= _of_motion(field, marched, draws, weights)
     if sky is not None and weights.sky:
         opacity = marched.opacity.clamp(1e-4, 1 - 1e-4)
         entropy = -torch.where(sky, torch.log1p(-opacity), opacity.log())
@@ -614,11 +539,8 @@ def pixel_terms(
 def lidar_terms(
     field: RadianceField, marched: Marched, draws: RayDraws, range_m: Tensor, weights: Weights, sight_m: float
 ) -> dict[str, Tensor]:
-    """Weighted loss terms of a batch of LiDAR rays that end at ``range_m`` f32[R].
-
-    Args:
-        sight_m: half width of the surface in the line-of-sight term; 0: without this term.
-    """
+    """Weighted loss terms of a batch of LiDAR rays that end at ``range_m`` f32[R]. ``sight_m``: half width of the
+    surface in the line-of-sight term; 0: without this term."""
     near = (range_m < LARGEST_RANGE_M).float()
     missed = ((marched.range_m - range_m) / LARGEST_RANGE_M).square()
     terms = {"lidar": weights.lidar * (missed * near).mean(), **_of_motion(field, marched, draws, weights)}
@@ -632,11 +554,8 @@ def line_of_sight(weights: Tensor, edges_m: Tensor, range_m: Tensor, sight_m: fl
     rays.
 
     The weight of an interval is compared with the mass of the bell N(z, sight_m / 3) in it, by the square of the
-    difference; what begins more than ``sight_m`` behind the range is free.
-
-    Args:
-        weights: ``[R, n]``. edges_m: ``[R, n + 1]``. range_m: ``[R]``.
-    """
+    difference; what begins more than ``sight_m`` behind the range is free. ``weights``: ``[R, n]``. ``edges_m``:
+    ``[R, n + 1]``. ``range_m``: ``[R]``."""
     off = edges_m - range_m[:, None]
     upto = 0.5 * (1 + torch.erf(off * (3 / (sight_m * 2**0.5))))
     missed = (weights - (upto[:, 1:] - upto[:, :-1])).square()
@@ -648,9 +567,8 @@ def _of_motion(field: RadianceField, marched: Marched, draws: RayDraws, weights:
     values, chosen = marched.values, draws.cycle
     terms: dict[str, Any] = {"dynamic": weights.dynamic * values.dynamic_density.mean()}
     if weights.cycle:
-        terms["cycle"] = weights.cycle * field.cycle_loss(
-            marched.xyz[chosen], marched.times[chosen], values.flow[chosen]
-        )
+        missed = field.cycle_loss(marched.xyz[chosen], marched.times[chosen], values.flow[chosen])
+        terms["cycle"] = weights.cycle * missed
     return terms
 
 

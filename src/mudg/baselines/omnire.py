@@ -8,7 +8,6 @@ small unless asked for.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any, ClassVar, Final, Self
@@ -30,12 +29,9 @@ from mudg.gaussians.views import StoredView, TrainView
 
 # deformed -----------------------------------------------------------------------------------------
 #
-# People and cyclists that one network deforms (the deformable nodes of OmniRe, Chen et al. 2024).
-#
 # Within its box every Gaussian of such an object moves by ``network(x, t, z)``: its place in the box, the time, and
 # what tells the object from others, an embedding that is learnt. One network serves all objects of a scene; it is a
 # node without Gaussians.
-
 
 EMBEDDING: Final = 16
 PLACE_OCTAVES, TIME_OCTAVES = 4, 4
@@ -45,11 +41,8 @@ INPUTS: Final = 3 * (1 + 2 * PLACE_OCTAVES) + (1 + 2 * TIME_OCTAVES) + EMBEDDING
 class DeformationField(StaticNode):
     """The network that deforms, and the embeddings of its objects.
 
-    Its table: ``network`` [1, P] (``FlatNetwork``) and ``embeddings`` [1, K, 16].
-
-    Args:
-        span_s: first and last time of the log, seconds. layers, width: of the network.
-    """
+    Its table: ``network`` [1, P] (``FlatNetwork``) and ``embeddings`` [1, K, 16]. ``span_s``: first and last time of
+    the log, seconds. ``layers``, ``width``: of the network."""
 
     kind = "deformation"
 
@@ -69,27 +62,14 @@ class DeformationField(StaticNode):
         return cls("deformation field", span_s, layers, width, Table({"network": network, "embeddings": embeddings}))
 
     def displacement(self, place: Tensor, time_s: float, instance: int) -> Tensor:
-        """How far Gaussians move at a time, ``[n, 3]`` metres in the frame of the box.
-
-        Args:
-            place: ``[n, 3]``, -1 to 1 within the box. instance: number of the object's embedding.
-        """
+        """How far Gaussians move at a time, ``[n, 3]`` metres in the frame of the box. ``place``: ``[n, 3]``, -1 to 1
+        within the box. ``instance``: number of the object's embedding."""
         first, last = self.span_s
         moment = place.new_full((1, 1), 2 * (time_s - first) / max(last - first, 1e-6) - 1)
         same = torch.cat([waves(moment, TIME_OCTAVES), self.learnt["embeddings"][:, instance]], 1)
         return self.network(
             self.learnt["network"], torch.cat([waves(place, PLACE_OCTAVES), same.expand(len(place), -1)], 1)
         )
-
-    def parameters(self) -> Table:
-        """See ``StaticNode``."""
-        return self.learnt
-
-    def to(self, device: torch.device) -> Self:
-        """See ``StaticNode``."""
-        there = copy.copy(self)
-        there.learnt = self.learnt.to(device)
-        return there
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """See ``StaticNode``."""
@@ -99,14 +79,9 @@ class DeformationField(StaticNode):
     @classmethod
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> DeformationField:
         """Inverse of ``state``."""
-        first, last = facts["span_s"]
-        return cls(
-            str(facts["name"]),
-            (float(first), float(last)),
-            int(facts["layers"]),
-            int(facts["width"]),
-            Table.from_state(tensors),
-        )
+        first, last = map(float, facts["span_s"])
+        sizes = int(facts["layers"]), int(facts["width"])
+        return cls(str(facts["name"]), (first, last), *sizes, Table.from_state(tensors))
 
 
 def network_of(layers: int, width: int) -> FlatNetwork:
@@ -117,8 +92,8 @@ def network_of(layers: int, width: int) -> FlatNetwork:
 class DeformedNode(RigidNode):
     """A tracked object whose Gaussians also move within its box as a ``DeformationField`` of the same scene says.
 
-    ``instance``: number of its embedding. Without a field (before the scene is put together, or ``resting``) it is
-    rigid.
+    ``instance``: number of its embedding. Without a field (before the scene is put together, or where it ``rests``) it
+    is rigid.
     """
 
     kind = "deformed"
@@ -135,35 +110,22 @@ class DeformedNode(RigidNode):
         return made
 
     def linked(self, nodes: Sequence[StaticNode | RigidNode]) -> Self:
-        """See ``RigidNode``."""
-        found = next((node for node in nodes if isinstance(node, DeformationField)), None)
-        if found is self.field:
-            return self
-        made = copy.copy(self)
-        made.field = found
-        return made
-
-    def resting(self) -> Self:
-        """The same object without its deformation."""
-        made = copy.copy(self)
-        made.rests = True
-        return made
+        """See ``Node``."""
+        field = next((node for node in nodes if isinstance(node, DeformationField)), None)
+        return self if field is self.field else self.with_values(field=field)
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``StaticNode``."""
+        """See ``Node``."""
         if self.field is None or self.rests or len(rows.means) == 0 or self.keys_around(time_s) is None:
             return super().at_time(rows, time_s)
-        place = (
-            2 * rows.means / torch.tensor(self.size_m, dtype=rows.means.dtype).to(rows.means.device, non_blocking=True)
-        )
+        size_m = torch.tensor(self.size_m, dtype=rows.means.dtype).to(rows.means.device, non_blocking=True)
+        place = 2 * rows.means / size_m
         moved = self.field.displacement(place, time_s, self.instance)
         return super().at_time(replace(rows, means=rows.means + moved), time_s)
 
     def moved(self, object_from_new: NDArray[Any]) -> Self:
         """See ``RigidNode``."""
-        made = super().moved(object_from_new)
-        made.instance, made.field = self.instance, self.field
-        return made
+        return super().moved(object_from_new).with_values(instance=self.instance, field=self.field)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """See ``StaticNode``."""
@@ -173,13 +135,10 @@ class DeformedNode(RigidNode):
     @classmethod
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Self:
         """Inverse of ``state``; the scene links the field."""
-        made = super().from_state(facts, tensors)
-        made.instance = int(facts["instance"])
-        return made
+        return super().from_state(facts, tensors).with_values(instance=int(facts["instance"]))
 
 
-# omnire -------------------------------------------------------------------------------------------
-
+# fit ----------------------------------------------------------------------------------------------
 
 RIGID_SHARE: Final = 0.1
 """Share of the run before the network joins (published: 3000 of 30,000 steps)."""
@@ -192,7 +151,6 @@ LIDAR_WEIGHT: Final = 0.01
 class OmniRecipe(OwnRecipe):
     """See the module's text."""
 
-    own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight",)
     last_densified: ClassVar[float] = 0.5
 
     def start(
@@ -215,13 +173,12 @@ class OmniRecipe(OwnRecipe):
         """See ``Recipe``: at first all objects are rigid."""
         if step > RIGID_SHARE * config.iterations:
             return model
-        return model.with_nodes(
-            tuple(node.resting() if isinstance(node, DeformedNode) else node for node in model.nodes)
-        )
+        resting = (node.with_values(rests=True) if isinstance(node, DeformedNode) else node for node in model.nodes)
+        return model.with_nodes(tuple(resting))
 
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
         """See ``Recipe``."""
-        lidar = drawn.view.lidar
-        if lidar is None or not len(lidar.pixel):
+        lidar = drawn.lidar
+        if lidar is None:
             return {}
         return {"lidar": LIDAR_WEIGHT * (drawn.render.depth.reshape(-1)[lidar.pixel] - lidar.depth_m).abs().mean()}

@@ -9,7 +9,6 @@ no limits on size that grow with the distance, no growing image sizes. Published
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -21,20 +20,16 @@ from torch import Tensor
 
 from mudg.base import log, seeds
 from mudg.base.types import FusedCloud, Scene
-from mudg.baselines.timed import timed_points
+from mudg.baselines.timed import timed_points, world_model
 from mudg.core import losses
-from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import NodeRows, StaticNode
-from mudg.gaussians.recipes import BOX_SETTINGS, SCENE_UNIT_M, DrawnView, OwnRecipe
+from mudg.gaussians.recipes import SCENE_UNIT_M, DrawnView, OwnRecipe
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import painted_sky
 from mudg.gaussians.views import StoredView, TrainView
 
 # vibration ----------------------------------------------------------------------------------------
-#
-# A world without boxes whose Gaussians swing about a point and show for a while (Periodic Vibration Gaussians, Chen et
-# al. 2023).
 #
 # Every Gaussian has a peak time ``tau``, a life span ``beta`` and a velocity ``v``. At the time t, with the cycle l,
 #
@@ -47,7 +42,6 @@ from mudg.gaussians.views import StoredView, TrainView
 #
 # Columns: ``tau`` [N], ``log_beta`` [N] (natural logarithm), ``velocity`` [N, 3] metres per unit of time.
 
-
 FRAME: Final = 0.02
 """A frame in units of time."""
 CYCLE: Final = 0.2
@@ -57,14 +51,9 @@ SHRINK: Final = 1.6
 
 
 class VibrationNode(StaticNode):
-    """The whole world as vibrating Gaussians.
-
-    Args:
-        name: of the node.
-        middle_s: seconds; time 0. frame_s: seconds between frames.
-        early: difference D between the time that is drawn and the time whose state is drawn, in units of time; the
-            state at t - D is carried by D times the average velocity (temporal smoothing, while fitting).
-    """
+    """The whole world as vibrating Gaussians. ``middle_s``: seconds; time 0. ``frame_s``: seconds between frames.
+    ``early``: difference D between the time that is drawn and the time whose state is drawn, in units of time; the
+    state at t - D is carried by D times the average velocity (temporal smoothing, while fitting)."""
 
     kind = "vibration"
     short_life = 0.01
@@ -80,18 +69,12 @@ class VibrationNode(StaticNode):
         span = times[-1] - times[0]
         return cls(name, (times[0] + times[-1]) / 2, span / (len(times) - 1) if span > 0 else 0.1)
 
-    def smoothed(self, early: float) -> VibrationNode:
-        """The same node drawing the state of ``early`` units of time before."""
-        other = copy.copy(self)
-        other.early = float(early)
-        return other
-
     def time_of(self, time_s: float) -> float:
         """Seconds to units of time."""
         return (time_s - self.middle_s) / self.frame_s * FRAME
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``StaticNode``."""
+        """See ``Node``."""
         tau, beta, velocity = rows.own["tau"], rows.own["log_beta"].exp(), rows.own["velocity"]
         since = self.time_of(time_s) - self.early - tau
         factor = torch.exp(-(since**2) / (2 * beta**2))
@@ -102,12 +85,8 @@ class VibrationNode(StaticNode):
         return replace(rows, means=means, opacity=rows.opacity * factor * (factor > LEAST_FACTOR))
 
     def born_later(self, columns: Mapping[str, Tensor], noise: Tensor, late: bool) -> dict[str, Tensor]:
-        """Children of split rows: each at another time of its parent's life, where the parent would be then.
-
-        Args:
-            noise: standard normal ``[n]``.
-            late: whether the life span shrinks too (the second half of densification).
-        """
+        """Children of split rows: each at another time of its parent's life, where the parent would be then. ``noise``:
+        standard normal ``[n]``. ``late``: whether the life span shrinks too (the second half of densification)."""
         beta = columns["log_beta"].exp()
         later = beta * noise
         moved = columns["means"] + average_velocity(columns["velocity"], beta) * later[:, None]
@@ -143,13 +122,10 @@ def moving_rows(columns: Mapping[str, Tensor], least_beta: float = 0.2) -> Tenso
 
 # pvg ----------------------------------------------------------------------------------------------
 
-
 SMOOTHING_PROBABILITY: Final = 0.5
 SMOOTHING_FRAMES: Final = 3.0
 """The width of the interval that the difference of times is drawn from, in frames."""
-LIDAR_WEIGHT, LIDAR_DECAY_STEPS = 0.1, 8000.0
-SKY_WEIGHT, ENTROPY_WEIGHT, SMOOTH_WEIGHT, VELOCITY_WEIGHT = 0.05, 0.05, 0.001, 0.01
-SKY_M: Final = 900.0 * SCENE_UNIT_M
+LIDAR_WEIGHT, SKY_WEIGHT, ENTROPY_WEIGHT, SMOOTH_WEIGHT, VELOCITY_WEIGHT = 0.1, 0.05, 0.05, 0.001, 0.01
 FILLED_SPAN: Final = 1.2
 """Points without a time of their own start at times spread over this many durations of the log."""
 
@@ -157,8 +133,6 @@ FILLED_SPAN: Final = 1.2
 class VibrationRecipe(OwnRecipe):
     """See the module's text."""
 
-    own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight", "sky_weight")
-    unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS
     last_densified: ClassVar[float] = 0.5
 
     def start(
@@ -168,16 +142,13 @@ class VibrationRecipe(OwnRecipe):
         node = VibrationNode.of_times([frame.view.time_s for frame in scene.frames])
         found = timed_points(scene, views, classes, config, fused.colors)
         duration = FRAME * (len({frame.view.time_s for frame in scene.frames}) - 1)
-        drawn = (
-            (seeds.numpy_rng(config.seed, 0, "start times").random(len(found.time_s)) - 0.5) * FILLED_SPAN * duration
-        )
+        random = seeds.numpy_rng(config.seed, 0, "start times").random(len(found.time_s))
+        drawn = (random - 0.5) * FILLED_SPAN * duration
         measured = (found.time_s - node.middle_s) / node.frame_s * FRAME
         tau = torch.from_numpy(np.where(np.isnan(found.time_s), drawn, measured))
         columns = found.points.columns(classes, config.sh_degree) | starting_columns(len(tau), tau, duration)
         log.info(f"start: {len(tau)} vibrating Gaussians")
-        owner = torch.zeros(len(tau), dtype=torch.int32)
-        sky = painted_sky(views, fused.colors)
-        return SceneModel(Table(columns, {"node": owner}), (node,), sky, classes, config.sh_degree, colors=fused.colors)
+        return world_model(node, columns, classes, config, fused.colors, painted_sky(views, fused.colors))
 
     def drawn_model(self, model: SceneModel, view: TrainView, step: int, config: FitConfig) -> SceneModel:
         """See ``Recipe``: at every second step or so, the state of another time, carried to the view's."""
@@ -185,28 +156,20 @@ class VibrationRecipe(OwnRecipe):
         if rng.random() >= SMOOTHING_PROBABILITY:
             return model
         early = SMOOTHING_FRAMES * (rng.random() - 0.5) * FRAME
-        return model.with_nodes(
-            tuple(node.smoothed(early) if isinstance(node, VibrationNode) else node for node in model.nodes)
-        )
+        return model.with_nodes(tuple(node.with_values(early=early) for node in model.nodes))
 
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
         """See ``Recipe``. The velocity is averaged over Gaussians by what they show of themselves at the time
         (published: over pixels)."""
-        render, view = drawn.render, drawn.view
-        inverse = losses.inverse_depth(render.depth, render.alpha, SKY_M) * SCENE_UNIT_M
+        view, alpha, inverse = drawn.view, drawn.render.alpha, drawn.inverse_depth
         terms = {
-            "entropy": ENTROPY_WEIGHT * losses.opacity_entropy(render.alpha),
+            "entropy": ENTROPY_WEIGHT * losses.opacity_entropy(alpha),
             "smooth": SMOOTH_WEIGHT * losses.edge_aware(inverse, view.rgb),
             "velocity": VELOCITY_WEIGHT * mean_velocity(drawn),
         }
         if view.sky is not None:
-            terms["sky"] = SKY_WEIGHT * losses.empty_sky(render.alpha, view.sky)
-        if view.lidar is not None and len(view.lidar.pixel):
-            weight = LIDAR_WEIGHT * math.exp(-drawn.published_step / LIDAR_DECAY_STEPS)
-            terms["lidar"] = weight * losses.sparse_inverse_depth(
-                inverse, view.lidar.pixel, view.lidar.depth_m / SCENE_UNIT_M
-            )
-        return terms
+            terms["sky"] = SKY_WEIGHT * losses.empty_sky(alpha, view.sky)
+        return terms | drawn.lidar_term(LIDAR_WEIGHT)
 
 
 def mean_velocity(drawn: DrawnView) -> Tensor:

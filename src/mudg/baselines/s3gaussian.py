@@ -9,10 +9,9 @@ are divided by 1.2, since the common colour term has weights of sum 1 and the pu
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
-from typing import Any, ClassVar, Final, Self
+from typing import Any, ClassVar, Final
 
 import numpy as np
 import torch
@@ -20,21 +19,18 @@ from torch import Tensor
 
 from mudg.base import log, seeds
 from mudg.base.types import FusedCloud, Scene, View
-from mudg.baselines.timed import FlatNetwork, timed_points
+from mudg.baselines.timed import FlatNetwork, timed_points, world_model
 from mudg.core import losses
 from mudg.core.grids import TIME, PlaneSizes, look_up
 from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import NodeRows, StaticNode
-from mudg.gaussians.recipes import BOX_SETTINGS, DrawnView, OwnRecipe
+from mudg.gaussians.recipes import DrawnView, OwnRecipe
 from mudg.gaussians.schedule import FIELD_STEPS
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.views import StoredView, TrainView
 
 # hexplane -----------------------------------------------------------------------------------------
-#
-# A world without boxes whose Gaussians are moved and recoloured by a field of place and time (S3Gaussian, Huang et al.
-# 2024).
 #
 # The field lies in six planes (xy, xz, yz and xt, yt, zt) of several sizes. A Gaussian at x, y, z and the time t takes
 # from each the bilinear value at its place; the six values are multiplied, those of the sizes joined. A linear layer
@@ -43,7 +39,6 @@ from mudg.gaussians.views import StoredView, TrainView
 #     mean(t) = mean + dx(x, y, z, t)        colour(t) = colour + dc(x, y, z, t)
 #
 # Rows outside the box of the field keep still.
-
 
 FRUSTUM_MARGIN: Final = 1.3
 """A Gaussian may be moved this much further than the edge of the image, as a share of half the image, plus
@@ -58,12 +53,10 @@ SHORT_GAIN: Final = (sum(SPACE_START) / 2) ** -3
 class HexPlaneNode(StaticNode):
     """The whole world as Gaussians that a field moves.
 
-    Its table: ``planes`` [1, P], all planes one after the other, and ``plane_network`` [1, Q].
-
-    Args:
-        low, high: corners of the field's box: x, y, z in metres, t in seconds.
-        gain: factor on the features (published: 1).
-    """
+    Its table: ``planes`` [1, P], all planes one after the other, and ``plane_network`` [1, Q]. ``low``, ``high``:
+    corners of the field's box: x, y, z in metres, t in seconds. ``gain``: factor on the features (published: 1). rests:
+    the world without the field. view: the field is asked for Gaussians in and around its frustum only; None: for
+    all."""
 
     kind = "hexplane"
 
@@ -79,13 +72,9 @@ class HexPlaneNode(StaticNode):
         super().__init__(name)
         self.low, self.high = tuple(map(float, low)), tuple(map(float, high))
         self.sizes, self.learnt, self.gain, self.rests = sizes, learnt, float(gain), False
-        self._view: View | None = None
-        inner = sizes.features * sizes.levels
-        self.networks = (
-            FlatNetwork((inner, sizes.width)),
-            FlatNetwork((sizes.width, sizes.width, 3), leading=True),
-            FlatNetwork((sizes.width, sizes.width, 3), leading=True),
-        )
+        self.view: View | None = None
+        head = FlatNetwork((sizes.width, sizes.width, 3), leading=True)
+        self.networks = FlatNetwork((sizes.features * sizes.levels, sizes.width)), head, head
 
     @classmethod
     def fresh(
@@ -94,31 +83,13 @@ class HexPlaneNode(StaticNode):
         """A field that moves nothing yet: planes of space between 0.1 and 0.5, planes of time 1."""
         least, most = SPACE_START
         generator = seeds.torch_generator(run_seed, 0, "hexplane")
-        planes = [
-            (
-                torch.ones(shape).flatten()
-                if TIME in axes
-                else torch.rand(shape, generator=generator).flatten() * (most - least) + least
-            )
-            for axes, shape in sizes.shapes
-        ]
+        drawn = lambda shape: torch.rand(shape, generator=generator).flatten() * (most - least) + least
+        planes = [torch.ones(shape).flatten() if TIME in axes else drawn(shape) for axes, shape in sizes.shapes]
         node = cls("background", low, high, sizes, Table({"planes": torch.zeros(1, 1)}), gain)
         trunk, *heads = node.networks
         network = [trunk.start(generator, silent=False), *(head.start(generator) for head in heads)]
         node.learnt = Table({"planes": torch.cat(planes)[None], "plane_network": torch.cat(network, 1)})
         return node
-
-    def resting(self) -> Self:
-        """The same world without the field."""
-        made = copy.copy(self)
-        made.rests = True
-        return made
-
-    def seen_by(self, view: View) -> Self:
-        """The same world for one view: the field is asked for Gaussians in and around its frustum only."""
-        made = copy.copy(self)
-        made._view = view
-        return made
 
     def planes(self) -> Iterator[tuple[tuple[int, int], Tensor]]:
         """Axes and numbers ``[second axis, first axis, features]`` of every plane, level by level."""
@@ -146,8 +117,8 @@ class HexPlaneNode(StaticNode):
         with torch.no_grad():
             low, high = (means.new_tensor(corner[:3]) for corner in (self.low, self.high))
             inside = ((means >= low) & (means <= high)).all(1)
-            if self._view is not None:
-                inside &= _near_frustum(self._view, means)
+            if self.view is not None:
+                inside &= _near_frustum(self.view, means)
             return inside.nonzero()[:, 0]
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
@@ -156,37 +127,20 @@ class HexPlaneNode(StaticNode):
             return rows
         asked = self.asked(rows.means)
         moved, colored = self.changes(rows.means[asked], time_s)
-        return replace(
-            rows, means=rows.means.index_add(0, asked, moved), sh_dc=rows.sh_dc.index_add(0, asked, colored[:, None])
-        )
-
-    def parameters(self) -> Table:
-        """See ``StaticNode``."""
-        return self.learnt
-
-    def to(self, device: torch.device) -> Self:
-        """See ``StaticNode``."""
-        there = copy.copy(self)
-        there.learnt = self.learnt.to(device)
-        return there
+        means, colors = rows.means.index_add(0, asked, moved), rows.sh_dc.index_add(0, asked, colored[:, None])
+        return replace(rows, means=means, sh_dc=colors)
 
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """See ``StaticNode``."""
-        return {
-            "name": self.name,
-            "low": list(self.low),
-            "high": list(self.high),
-            "gain": self.gain,
-            **asdict(self.sizes),
-        }, self.learnt.state()
+        facts = {"name": self.name, "low": list(self.low), "high": list(self.high), "gain": self.gain}
+        return {**facts, **asdict(self.sizes)}, self.learnt.state()
 
     @classmethod
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> HexPlaneNode:
         """Inverse of ``state``."""
         sizes = PlaneSizes(**{name: int(facts[name]) for name in PlaneSizes.__dataclass_fields__})
-        return cls(
-            str(facts["name"]), facts["low"], facts["high"], sizes, Table.from_state(tensors), float(facts["gain"])
-        )
+        learnt, gain = Table.from_state(tensors), float(facts["gain"])
+        return cls(str(facts["name"]), facts["low"], facts["high"], sizes, learnt, gain)
 
 
 def _near_frustum(view: View, means: Tensor) -> Tensor:
@@ -225,8 +179,7 @@ def _bending(plane: Tensor, dim: int) -> Tensor:
     return bent.square().mean() if bent.numel() else bent.sum()
 
 
-# s3gaussian ---------------------------------------------------------------------------------------
-
+# fit ----------------------------------------------------------------------------------------------
 
 STATIC_SHARE: Final = 5 / 55
 """Share of the run before the field joins (published: 5000 steps, then 50,000)."""
@@ -246,8 +199,6 @@ BOX_MARGIN: Final = 0.02
 class FieldRecipe(OwnRecipe):
     """See the module's text."""
 
-    own_weights: ClassVar[tuple[str, ...]] = ("lidar_weight", "ssim_weight")
-    unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS
     last_densified: ClassVar[float] = 0.5
 
     def common(self, config: FitConfig) -> FitConfig:
@@ -268,34 +219,22 @@ class FieldRecipe(OwnRecipe):
         gain = SHORT_GAIN if config.iterations < FIELD_STEPS else 1.0
         node = HexPlaneNode.fresh([*(low - margin), first], [*(high + margin), last], sizes, config.seed, gain)
         columns = found.points.columns(classes, config.sh_degree)
-        log.info(
-            f"start: {len(found.time_s)} Gaussians, {node.learnt['planes'].numel()} numbers in {sizes.levels} x 6"
-            " planes"
-        )
-        owner = torch.zeros(len(found.time_s), dtype=torch.int32)
-        return SceneModel(
-            Table(columns, {"node": owner}), (node,), None, classes, config.sh_degree, colors=fused.colors
-        )
+        numbers = node.learnt["planes"].numel()
+        log.info(f"start: {len(found.time_s)} Gaussians, {numbers} numbers in {sizes.levels} x 6 planes")
+        return world_model(node, columns, classes, config, fused.colors)
 
     def drawn_model(self, model: SceneModel, view: TrainView, step: int, config: FitConfig) -> SceneModel:
         """See ``Recipe``: at first nothing moves; then what is near the frustum."""
-        rests = step <= STATIC_SHARE * config.iterations
-        nodes = (
-            (node.resting() if rests else node.seen_by(view.view)) if isinstance(node, HexPlaneNode) else node
-            for node in model.nodes
-        )
-        return model.with_nodes(tuple(nodes))
+        changes = {"rests": True} if step <= STATIC_SHARE * config.iterations else {"view": view.view}
+        return model.with_nodes(tuple(node.with_values(**changes) for node in model.nodes))
 
     def terms(self, drawn: DrawnView) -> dict[str, Tensor]:
         """See ``Recipe``."""
         terms: dict[str, Tensor] = {}
-        lidar, whole = drawn.view.lidar, 1 + SSIM_SHARE
-        if lidar is not None and len(lidar.pixel):
-            terms["lidar"] = (
-                LIDAR_WEIGHT
-                / whole
-                * losses.sparse_squared_depth(drawn.render.depth, lidar.pixel, lidar.depth_m, LIDAR_SPAN_M)
-            )
+        lidar, whole = drawn.lidar, 1 + SSIM_SHARE
+        if lidar is not None:
+            error = losses.sparse_squared_depth(drawn.render.depth, lidar.pixel, lidar.depth_m, LIDAR_SPAN_M)
+            terms["lidar"] = LIDAR_WEIGHT / whole * error
         node = drawn.model.nodes[0]
         if isinstance(node, HexPlaneNode) and not node.rests:
             table, (space, time, flat) = drawn.model.table, plane_smoothness(node)

@@ -9,7 +9,7 @@ point has the colour of its own moment; points that none of these shows are left
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,6 +26,9 @@ from mudg.base.types import Scene
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.project import RULES as HIDING_RULES
 from mudg.core.project import visible_depth
+from mudg.core.table import Table
+from mudg.gaussians.model import SceneModel
+from mudg.gaussians.nodes import SkyNode, StaticNode
 from mudg.gaussians.settings import FitConfig
 from mudg.gaussians.start import StartPoints, fill_unreached, neighbour_scale, thinned, voxel_filter
 from mudg.gaussians.views import StoredView, heads_of
@@ -54,18 +57,11 @@ def timed_points(
     ``gaussians/start.py``).
 
     Half of them are one per cube of space, half one per cube and every few frames, so that what moves has points all
-    along its way.
-
-    Raises:
-        InputError: no photograph shows any LiDAR point.
-    """
+    along its way. InputError: no photograph shows any LiDAR point."""
     xyz, rgb, semantics, time_s = _measured(scene, views, classes, colors)
     if len(xyz) == 0:
-        raise InputError(
-            "no LiDAR point is seen by a training photograph of its time",
-            where=scene.root,
-            remedy="check the LiDAR of the scene and --cameras",
-        )
+        what = "no LiDAR point is seen by a training photograph of its time"
+        raise InputError(what, where=scene.root, remedy="check the LiDAR of the scene and --cameras")
     centers = np.stack([head.view.center_world for head in heads_of(views)]).astype(np.float32)
     half = replace(config, start=replace(config.start, gaussians=max(50, config.start.gaussians // 2)))
     parts = [thinned(xyz, centers, half), *_by_moment(xyz, time_s, scene, half)]
@@ -76,6 +72,19 @@ def timed_points(
     if filled is not None:
         chosen.append((filled, np.full(len(filled), np.nan)))
     return TimedPoints(StartPoints.joined([part for part, _ in chosen]), np.concatenate([times for _, times in chosen]))
+
+
+def world_model(
+    node: StaticNode,
+    columns: Mapping[str, Tensor],
+    classes: tuple[int, ...],
+    config: FitConfig,
+    colors: CameraColors,
+    sky: SkyNode | None = None,
+) -> SceneModel:
+    """A scene that is one node with these rows, and a sky."""
+    table = Table(columns, {"node": torch.zeros(len(columns["means"]), dtype=torch.int32)})
+    return SceneModel(table, (node,), sky, classes, config.sh_degree, colors=colors)
 
 
 def frame_seconds(scene: Scene) -> float:
@@ -119,14 +128,7 @@ def _seen(
     view, camera = stored.view, stored.view.camera
     uv, z = geometry.project(view, xyz)
     with np.errstate(invalid="ignore"):
-        inside = (
-            (z > 0.5)
-            & (z < LARGEST_M)
-            & (uv[:, 0] >= 0)
-            & (uv[:, 0] < camera.width)
-            & (uv[:, 1] >= 0)
-            & (uv[:, 1] < camera.height)
-        )
+        inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(1) & (z > 0.5) & (z < LARGEST_M)
     rows = np.flatnonzero(inside)
     column, row = uv[rows, 0].astype(int), uv[rows, 1].astype(int)
     nearest = visible_depth(view, xyz, HIDING_RULES["sweep"], gap_deg=gap_deg, far_m=LARGEST_M)[row, column]
@@ -151,28 +153,20 @@ def _by_moment(
         mine = np.flatnonzero(moment == number)
         parts.append(mine[voxel_filter(xyz[mine], 2 * config.start.voxel_m)])
     share = min(1.0, config.start.gaussians / max(1, sum(map(len, parts))))
-    return [
-        rows[
-            np.sort(
-                seeds.numpy_rng(config.seed, index, "moment").permutation(len(rows))[: max(4, int(share * len(rows)))]
-            )
-        ]
-        for index, rows in enumerate(parts)
-    ]
+    chosen = []
+    for index, rows in enumerate(parts):
+        order = seeds.numpy_rng(config.seed, index, "moment").permutation(len(rows))
+        chosen.append(rows[np.sort(order[: max(4, int(share * len(rows)))])])
+    return chosen
 
 
-# flat network -------------------------------------------------------------------------------------
-#
-# Small fully connected networks whose numbers lie in one row, so that they are a column ``[1, P]`` of a ``Table``.
+# ---- networks ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class FlatNetwork:
-    """Layers of these widths, from the input to the output, with ReLU between them.
-
-    Args:
-        widths: at least two. leading: also a ReLU before the first layer.
-    """
+    """A small network whose numbers lie in one row, a column ``[1, P]`` of a ``Table``: layers of these widths, with
+    ReLU between them. ``leading``: also a ReLU before the first layer."""
 
     widths: tuple[int, ...]
     leading: bool = False

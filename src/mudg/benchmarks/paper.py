@@ -372,13 +372,10 @@ def _refuse_other_counts(cells: dict[str, dict[str, Values]], place: str, column
     floor = counts.pop(TRUTH)
     wanted = {tuple(n) for n in counts.values() if n is not None}
     if len(wanted) > 1:
-        raise InputError(
-            "methods with different numbers of views cannot stand in one table",
-            where=f"{column.title} at {place}",
-            expected="the same n on every log",
-            got=", ".join(f"{name}: {sum(n)}" for name, n in counts.items() if n is not None),
-            remedy="make the table anew with --overwrite",
-        )
+        what, where = "methods with different numbers of views cannot stand in one table", f"{column.title} at {place}"
+        expected = "the same n on every log"
+        got = ", ".join(f"{name}: {sum(n)}" for name, n in counts.items() if n is not None)
+        raise InputError(what, where=where, expected=expected, got=got, remedy="make the table anew with --overwrite")
     if floor is not None and wanted and tuple(floor) not in wanted:
         cells[TRUTH][place][column.key] = {"reason": OTHER_N, "floor": cells[TRUTH][place][column.key]}
 

@@ -222,13 +222,9 @@ class ShownFrames(Output):
         if self.frames is not None and len(times) == last - first + 1:
             first, last = 0, len(times) - 1  # imported with these very frames
         if last >= len(times):
-            raise InputError(
-                "the log has fewer frames than the table asks for",
-                where=str(self.scene),
-                expected=f"frames {first} to {last}",
-                got=f"{len(times)} frames of camera {camera}",
-                remedy="give the whole log, or choose --frames",
-            )
+            what, got = "the log has fewer frames than the table asks for", f"{len(times)} frames of camera {camera}"
+            remedy = "give the whole log, or choose --frames"
+            raise InputError(what, where=str(self.scene), expected=f"frames {first} to {last}", got=got, remedy=remedy)
         moment = lambda time_s: int(np.argmin(np.abs(times - time_s)))
         chosen = [frame for frame in scene.frames if first <= moment(frame.view.time_s) <= last]
         if self.table.front_only:

@@ -16,12 +16,13 @@ from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.plain_yaml import parse_yaml
 from mudg.base.records import StrictRecord, checked_by, parse_record
+from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks.settings import BenchConfig, bench_preset
 from mudg.diffusion import model_files, views
 from mudg.diffusion.published import is_published
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.recipes import recipe_of
-from mudg.gaussians.settings import METHODS, PUBLISHED, FitConfig
+from mudg.gaussians.settings import METHODS, PUBLISHED
 from mudg.networks.inception import ResizeRule
 from mudg.scoring import score
 from mudg.scoring.tables import title_of
@@ -246,7 +247,7 @@ class Row:
     name: str
     title: str
     method: str = ""
-    fit: FitConfig | None = None
+    fit: MethodConfig | None = None
     changes: Mapping[str, Any] = field(default_factory=dict)
     sees: Sees = ""
     varied: bool = False
@@ -271,22 +272,22 @@ def generator_of(config: BenchConfig) -> SynthesizeConfig:
     return replace(config.synthesize, **own, processes=1)
 
 
-def usual_fit(config: BenchConfig) -> FitConfig:
+def usual_fit(config: BenchConfig) -> MethodConfig:
     """The settings of fits, as ``mudg run`` takes them for the whole chain."""
     return replace(config.fit, method=FULL, iterations=config.iterations, seed=config.seed, device=config.device)
 
 
-def method_fit(usual: FitConfig, method: str, preset: PresetName) -> FitConfig:
+def method_fit(usual: MethodConfig, method: str, preset: PresetName) -> MethodConfig:
     """The usual settings with a method. What a preset sets and a method for comparison does not know has its default
     there. UsageError: a setting beyond the preset that the method does not know."""
-    recipe, named, plain = recipe_of(method), bench_preset(preset).fit, FitConfig()
-    settings = configuration.load(FitConfig, usual, overrides={"method": method})
-    for name in (*recipe.unfit, *(f"loss.{weight}" for weight in recipe.own_weights)):
+    row, named, plain = METHODS[method], bench_preset(preset).fit, MethodConfig()
+    settings = configuration.load(MethodConfig, usual, overrides={"method": method})
+    for name in (*row.unfit, *(f"loss.{weight}" for weight in row.weights)):
         group, _, setting = name.partition(".")
         own, set_by_preset = getattr(settings, group), getattr(getattr(named, group), setting)
         if getattr(own, setting) == set_by_preset:
             settings = replace(settings, **{group: replace(own, **{setting: getattr(getattr(plain, group), setting)})})
-    recipe.check(settings, False)
+    recipe_of(method).check(settings, False)
     return settings
 
 
@@ -322,7 +323,7 @@ def refuse_unfit(
     preset), weights that are asked for and not given, or a method that the model cannot serve. InputError: there is no
     such model."""
     fits = [row.fit for row in rows if row.fit is not None]
-    virtual = [fit for fit in fits if {"virtual", "repaired"} & set(METHODS[fit.method].supervision)]
+    virtual = [fit for fit in fits if METHODS[fit.method].learns_virtual]
     renders = model_files.uses_renders(config.model)
     if any(fit.method == REPAIRED for fit in fits) and not renders:
         what, remedy = "repairs renders, and this diffusion model uses none", f"leave {REPAIRED} out, or choose"
@@ -342,7 +343,7 @@ def refuse_unfit(
                 what = "this setting would change nothing"
                 raise UsageError(what, where=flag_of(name), got=reason, remedy="leave it out")
     if generators or virtual:
-        refuse_missing(generator_of(config), virtual[0] if virtual else FitConfig(), "--model")
+        refuse_missing(generator_of(config), virtual[0] if virtual else MethodConfig(), "--model")
     for generator in dict.fromkeys((*generators, *((generator_of(config),) if virtual else ()))):
         views.check_config(generator, fitted=False)
 
@@ -358,7 +359,7 @@ def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row
     _refuse_unknown(wanted, known)
     rows = [_method_row(name, usual, preset) for name in known if name in wanted]
     for name, (description, weights) in ABLATION.items() if config.ablation else ():
-        ablated = configuration.load(FitConfig, usual, overrides={"virtual": weights})
+        ablated = configuration.load(MethodConfig, usual, overrides={"virtual": weights})
         rows.append(Row(name, f"with {description}", FULL, ablated))
     return _without_twins([*rows, *(variant_of(text, usual) for text in config.variant)])
 
@@ -421,21 +422,21 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
     for row in rows:
         if METHODS[row.method].made_by == "render" and not row.left_out:
             fit = method_fit(usual_fit(config), row.method, preset)
-            row = replace(row, fit=configuration.load(FitConfig, fit, overrides=dict(row.changes)))
+            row = replace(row, fit=configuration.load(MethodConfig, fit, overrides=dict(row.changes)))
         complete.append(row)
     return tuple(complete)
 
 
-def _method_row(name: str, usual: FitConfig, preset: PresetName) -> Row:
+def _method_row(name: str, usual: MethodConfig, preset: PresetName) -> Row:
     if name in (FILL, DIFFUSION):
         return Row(name, title_of(name), "" if name == FILL else name)
     method = BASE if name == LONGER else name
     return Row(name, LONGER_TITLE if name == LONGER else title_of(name), method, method_fit(usual, method, preset))
 
 
-def variant_of(text: str, usual: FitConfig) -> Row:
+def variant_of(text: str, usual: MethodConfig) -> Row:
     """A row of ``mudg_s`` from ``NAME=FIELD:VALUE,FIELD:VALUE``; values as in YAML, a dot between a group and its
-    field. UsageError if malformed or no field of ``FitConfig``."""
+    field. UsageError if malformed or no field of ``MethodConfig``."""
     name, separator, rest = text.partition("=")
     fields: dict[str, Any] = {}
     for part in rest.split(","):
@@ -446,7 +447,7 @@ def variant_of(text: str, usual: FitConfig) -> Row:
             fields[setting.strip()] = parse_yaml(value, setting)
         except InputError as error:
             raise UsageError("malformed value", where=f"--variant {name}: {setting}", got=value) from error
-    changed = configuration.load(FitConfig, usual, overrides=configuration.nested(fields))
+    changed = configuration.load(MethodConfig, usual, overrides=configuration.nested(fields))
     return Row(name, f"{name}: {rest}", FULL, changed, varied=True)
 
 

@@ -62,7 +62,6 @@ from mudg.scene.read import open_files, read_points, read_scene
 
 # a log over time: files of Foxglove and rerun, bags of ROS 2, recordings of NCore -----------------
 
-
 SUFFIXES: Final = {"mcap": ".mcap", "rerun": ".rrd", "ros2": "", "ncore": ""}
 """Formats, and the suffix of their file; none: a folder."""
 LOG_FOLDERS: Final = {"ros2": (1, (BAG_METADATA, BAG_FILE)), "ncore": (1, ncore.FILES)}
@@ -124,7 +123,6 @@ def write_messages(name: str, records: LogRecords, out: Path) -> dict[str, Any]:
 # A fitted scene as files hold it: plain arrays by object, its motion as keys, its sky as a picture; and a file's
 # Gaussians as a scene.
 
-
 SKY_COUNT: Final = 6000
 SKY_M: Final = 300.0
 CLASS_LOGIT: Final = 5.0
@@ -132,15 +130,8 @@ CLASS_LOGIT: Final = 5.0
 
 @torch.no_grad()
 def splat_scene(model: SceneModel, time_s: float, names: Sequence[str] = ()) -> SplatScene:
-    """A fitted scene in world axes.
-
-    Args:
-        time_s: at which a background that changes with time, which no file holds, is taken. names: of nodes to keep
-            (none: all).
-
-    Raises:
-        UsageError: a node that the scene does not have.
-    """
+    """A fitted scene in world axes. ``time_s``: at which a background that changes with time, which no file holds, is
+    taken. ``names``: of nodes to keep (none: all). UsageError: a node that the scene does not have."""
     there = [node.name for node in model.nodes]
     unknown = [name for name in names if name not in there]
     if unknown:
@@ -266,7 +257,6 @@ def model_of_cloud(cloud: SplatCloud, name: str) -> SceneModel:
 
 # export -------------------------------------------------------------------------------------------
 
-
 CAMERAS: Final[Mapping[str, Callable[[Scene, PointCloud | None], dict[str, bytes]]]] = {
     "nerfstudio": nerfstudio_files,
     "colmap": colmap_files,
@@ -282,13 +272,8 @@ FOLDERS: Final = {**dict.fromkeys(CAMERAS, (1, _CAMERA_FILES)), **LOG_FOLDERS}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Exported:
-    """What is exported.
-
-    Args:
-        parts: where it lies. model: the fit, edited; None if cameras alone are asked for. log: the recorded scene,
-            edited, or None.
-        edited: whether an edit script was carried out.
-    """
+    """What is exported. ``parts``: where it lies. ``model``: the fit, edited; None if cameras alone are asked for.
+    ``log``: the recorded scene, edited, or None. ``edited``: whether an edit script was carried out."""
 
     parts: RunParts
     model: SceneModel | None
@@ -498,7 +483,6 @@ def _points(given: Exported) -> PointCloud | None:
 #
 # asset import: a file of Gaussians from another program -> an asset that edit scripts can insert, or a scene in which
 # nothing moves.
-
 
 TRAIN_IDS: Final = {
     **dict.fromkeys(("pedestrian", "adult", "child"), ID["person"]),

@@ -1,13 +1,11 @@
 """Corrections of single images: exposure and colour, and small errors of camera poses, which vary although the scene
 does not.
 
-Three corrections, each optional, each the identity at the start, none of them used when a fitted scene is rendered:
+Two corrections, each optional, each the identity at the start, none of them used when a fitted scene is rendered:
 
     exposure   3x4 affine colour map per camera or per recorded image. The mean over all of them is held at the
                identity, so that the scene keeps the average colour of the log instead of drifting against the maps.
     cameras    6 numbers per recorded image: shift [m] and turn [rad] of the camera in its own frame.
-    virtual    3x4 affine colour map per set of virtual views. What a generator paints too dark or too blue everywhere
-               ends up here instead of in the Gaussians that recorded views share.
 
 The affine map is that of Street Gaussians (Yan et al. 2024): ``A rgb + b``, an L1 penalty on the distance from the
 identity.
@@ -16,7 +14,7 @@ identity.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import torch
 from torch import Tensor
@@ -25,24 +23,17 @@ from mudg.base.errors import InputError
 from mudg.base.types import View
 from mudg.core import losses
 from mudg.core.table import AdamKernel, Table
+from mudg.gaussians.settings import AppearanceConfig
 
-Exposure = Literal["none", "camera", "image"]
-RECORDED_COLOR: Final = "exposure"
-VIRTUAL_COLOR: Final = "virtual"
-CAMERA_POSE: Final = "cameras"
+COLOR: Final = "exposure"
+POSE: Final = "cameras"
 
 
 class Appearance:
-    """The corrections of a fit. A group that is off is absent from ``tables``.
-
-    Args:
-        names: per group, what has a correction of its own: cameras or images, sets of virtual views, images.
-        tables: per group, one row per name: ``affine`` [n, 3, 4] (difference from the identity), or ``shift`` [n, 3]
-            metres and ``turn`` [n, 3] radians; None = identity.
-
-    Raises:
-        InputError: a table does not fit its names.
-    """
+    """The corrections of a fit. A group that is off is absent from ``tables``. ``names``: per group, what has a
+    correction of its own: cameras or images. ``tables``: per group, one row per name: ``affine`` [n, 3, 4] (difference
+    from the identity), or ``shift`` [n, 3] metres and ``turn`` [n, 3] radians; None = identity. InputError: a table
+    does not fit its names."""
 
     def __init__(self, names: Mapping[str, Sequence[str]], tables: Mapping[str, Table] | None = None) -> None:
         self.names = {group: tuple(members) for group, members in names.items() if len(members)}
@@ -52,29 +43,15 @@ class Appearance:
         self.tables = dict(tables)
         for group, members in self.names.items():
             if group not in self.tables or len(self.tables[group]) != len(members):
-                raise InputError(
-                    "corrections of appearance do not fit their names", where=group, expected=f"{len(members)} rows"
-                )
+                what, expected = "corrections of appearance do not fit their names", f"{len(members)} rows"
+                raise InputError(what, where=group, expected=expected)
 
     @classmethod
-    def of_views(
-        cls,
-        recorded: Sequence[str],
-        virtual: Sequence[str],
-        exposure: Exposure = "none",
-        cameras: bool = False,
-        virtual_color: bool = False,
-    ) -> Appearance:
-        """Corrections for views named ``camera/number`` (recorded) and ``set/number`` (virtual), all the identity."""
+    def of_views(cls, recorded: Sequence[str], config: AppearanceConfig) -> Appearance:
+        """Corrections for recorded views named ``camera/number``, all the identity."""
         images = tuple(dict.fromkeys(recorded))
-        colored = {"none": (), "camera": tuple(dict.fromkeys(map(owner, recorded))), "image": images}[exposure]
-        return cls(
-            {
-                RECORDED_COLOR: colored,
-                CAMERA_POSE: images if cameras else (),
-                VIRTUAL_COLOR: tuple(dict.fromkeys(map(owner, virtual))) if virtual_color else (),
-            }
-        )
+        colored = {"none": (), "camera": tuple(dict.fromkeys(map(owner, recorded))), "image": images}[config.exposure]
+        return cls({COLOR: colored, POSE: images if config.cameras else ()})
 
     def __bool__(self) -> bool:
         return bool(self.tables)
@@ -86,39 +63,36 @@ class Appearance:
     # -- use ---------------------------------------------------------------------------------------
 
     def colored(self, rgb: Tensor, name: str, kind: str) -> Tensor:
-        """A rendered picture ``[3, H, W]`` as the camera (or generator) of view ``name`` would show it,
-        differentiable."""
-        found = self._affine(name, kind)
-        if found is None:
+        """A rendered picture ``[3, H, W]`` as the camera of view ``name`` would show it, differentiable."""
+        affine = self._affine(name, kind)
+        if affine is None:
             return rgb
-        flat = rgb.flatten(1)
-        return rgb + torch.addmm(found[:, 3:], found[:, :3], flat).view_as(rgb)
+        return rgb + torch.addmm(affine[:, 3:], affine[:, :3], rgb.flatten(1)).view_as(rgb)
 
     def penalty(self, name: str, kind: str) -> Tensor | None:
         """Mean distance of the view's colour map from the identity (scalar), or None where it has none."""
-        found = self._affine(name, kind)
-        return None if found is None else losses.identity_distance(found)
+        affine = self._affine(name, kind)
+        return None if affine is None else losses.identity_distance(affine)
 
     def world_from_cam(self, view: View, name: str) -> Tensor | None:
         """Corrected pose f32[4, 4] of a recorded view, differentiable; None where poses are not corrected."""
-        row = self._row.get(CAMERA_POSE, {}).get(name)
+        row = self._row.get(POSE, {}).get(name)
         if row is None:
             return None
-        shift, turn = (self.tables[CAMERA_POSE][name][row] for name in ("shift", "turn"))
+        shift, turn = (self.tables[POSE][column][row] for column in ("shift", "turn"))
         given = torch.from_numpy(view.world_from_cam.copy()).to(shift.dtype)
         return given.to(shift.device, non_blocking=True) @ rigid_motion(shift, turn)
 
     def _affine(self, name: str, kind: str) -> Tensor | None:
         """Difference ``[3, 4]`` of the view's colour map from the identity."""
-        group = RECORDED_COLOR if kind == "recorded" else VIRTUAL_COLOR
-        rows = self._row.get(group)
-        if rows is None:
+        rows = self._row.get(COLOR)
+        if rows is None or kind != "recorded":
             return None
         row = rows.get(name, rows.get(owner(name)))
         if row is None:
             raise InputError("a view has no colour map", where=name, expected=", ".join(list(rows)[:8]))
-        affine = self.tables[group]["affine"]
-        return affine[row] - affine.mean(0) if group == RECORDED_COLOR else affine[row]
+        affine = self.tables[COLOR]["affine"]
+        return affine[row] - affine.mean(0)
 
     # -- learning ----------------------------------------------------------------------------------
 
@@ -150,7 +124,7 @@ class Appearance:
 
 
 def owner(name: str) -> str:
-    """Camera of a recorded view, or set of a virtual one: what stands before the last slash of its name."""
+    """Camera of a recorded view: what stands before the last slash of its name."""
     return name.rpartition("/")[0]
 
 
@@ -165,6 +139,6 @@ def rigid_motion(shift_m: Tensor, turn_rad: Tensor) -> Tensor:
 
 
 def _identity(group: str, rows: int) -> Table:
-    if group == CAMERA_POSE:
+    if group == POSE:
         return Table({"shift": torch.zeros(rows, 3), "turn": torch.zeros(rows, 3)})
     return Table({"affine": torch.zeros(rows, 3, 4)})

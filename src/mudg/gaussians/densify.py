@@ -104,14 +104,10 @@ class DensifyStats:
         plain_from: int | None = None,
         time_gradient: Tensor | None = None,
     ) -> None:
-        """Add one backward pass (gradients in pixels; stored in units of half the image).
-
-        Args:
-            trace: of a render with absolute gradients, after backward.
-            plain_from: rows from here on (those of the objects) count with their plain gradient, where the
-                contributions of single pixels cancel; None = all rows with the absolute one.
-            time_gradient: f32[N], that of ``tau``, or None.
-        """
+        """Add one backward pass (gradients in pixels; stored in units of half the image). ``trace``: of a render with
+        absolute gradients, after backward. ``plain_from``: rows from here on (those of the objects) count with their
+        plain gradient, where the contributions of single pixels cancel; None = all rows with the absolute one.
+        ``time_gradient``: f32[N], that of ``tau``, or None."""
         if trace.abs_grad2d is None:
             raise ValueError("the render was made without absolute gradients")
         gradient = trace.abs_grad2d
@@ -147,14 +143,9 @@ def _half_size(width: int, height: int, device: torch.device) -> Tensor:
 def densify(
     model: SceneModel, stats: DensifyStats, step: int, settings: DensifySettings, run_seed: int
 ) -> dict[str, Any]:
-    """Clone, split and prune rows of the model's table in place; the caller starts new statistics.
-
-    Args:
-        step: finished steps; with ``run_seed`` it decides all random draws.
-
-    Returns:
-        Counts: ``cloned``, ``split``, ``pruned``, ``rows`` (after).
-    """
+    """Clone, split and prune rows of the model's table in place; the caller starts new statistics. ``step``: finished
+    steps; with ``run_seed`` it decides all random draws. Returns counts: ``cloned``, ``split``, ``pruned``, ``rows``
+    (after)."""
     grow = _rows_to_grow(model, stats, settings)
     large = model.table["log_scales"].detach().amax(1).exp() > settings.split_above_m
     if stats.time is not None:
@@ -279,7 +270,6 @@ def useless_rows(model: SceneModel, prune_opacity: float, prune_scale_m: float, 
 # rows. A stack never gets so many members that they would be dead at once. The random step is bounded by the Gaussian's
 # own size.
 
-
 LARGEST_STACK = 51
 """Most Gaussians that one may become in a round (published value)."""
 SURE_OPACITY = 1 - 1e-6
@@ -326,15 +316,8 @@ def stack_of(opacity: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
     Behind each other, N Gaussians of opacity ``o'`` let ``(1 - o' g)^N`` through, ``g`` their fall-off. ``o'`` makes
     that ``1 - o`` at the centre. The scale factor keeps the integral of the covered share along a line through the
     centre: ``o / sum_k binomial(N, k) (-1)^(k - 1) o'^k / sqrt(k)`` (Kheradmand et al. 2024, eq. 9, with the inner sum
-    carried out).
-
-    Args:
-        opacity: f64[M] of the one Gaussian, in (0, 1).
-        members: i64[M], N >= 1, at most ``LARGEST_STACK``.
-
-    Returns:
-        Opacity f64[M] of each member, and what its scales are multiplied with, f64[M].
-    """
+    carried out). ``opacity``: f64[M] of the one Gaussian, in (0, 1). ``members``: i64[M], N >= 1, at most
+    ``LARGEST_STACK``. Returns opacity f64[M] of each member, and what its scales are multiplied with, f64[M]."""
     opacity = opacity.double().clamp(max=SURE_OPACITY)
     count = members.double()
     each = -torch.expm1(torch.log1p(-opacity) / count)
@@ -348,15 +331,8 @@ def stack_of(opacity: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
 
 def systematic_counts(weights: Tensor, total: int, offset: float) -> Tensor:
     """How often each row is drawn: ``total`` draws in proportion to ``weights``, each row within 1 of its expectation.
-
-    Args:
-        weights: f64[N], none below 0, not all 0 if ``total`` > 0.
-        total: number of draws.
-        offset: in [0, 1), the one random number.
-
-    Returns:
-        i64[N] with sum ``total``.
-    """
+    ``weights``: f64[N], none below 0, not all 0 if ``total`` > 0. ``total``: number of draws. ``offset``: in [0, 1),
+    the one random number. Returns i64[N] with sum ``total``."""
     if total == 0:
         return torch.zeros(len(weights), dtype=torch.int64, device=weights.device)
     ends = torch.cumsum(weights.double(), 0)
@@ -376,14 +352,8 @@ def relocate_and_grow(model: SceneModel, step: int, settings: McmcSettings, run_
     """One round: relocate dead rows within their nodes and grow, on the model's table in place.
 
     Parameters, moments and labels move together; the moments of every Gaussian that became several start at zero. A
-    node whose rows are all dead keeps them.
-
-    Args:
-        step: finished steps; with ``run_seed`` it decides all random draws.
-
-    Returns:
-        Counts: ``relocated``, ``added``, ``dropped`` (dead rows that found no place), ``rows`` (after).
-    """
+    node whose rows are all dead keeps them. ``step``: finished steps; with ``run_seed`` it decides all random draws.
+    Returns counts: ``relocated``, ``added``, ``dropped`` (dead rows that found no place), ``rows`` (after)."""
     table, rows = model.table, len(model.table)
     owner = table.labels["node"].long()
     opacity = torch.sigmoid(table["logits"].detach().double())
@@ -442,10 +412,7 @@ def _correct(model: SceneModel, sources: Tensor, members: Tensor, opacity: Tenso
 
 def drift(model: SceneModel, step: int, rate: float, settings: McmcSettings, run_seed: int) -> None:
     """The random step of the centres after optimisation step ``step``, in place. Opaque Gaussians stay where they are.
-
-    Args:
-        rate: present learning rate of the centres, metres.
-    """
+    ``rate``: present learning rate of the centres, metres."""
     table = model.table
     opacity = torch.sigmoid(table.columns["logits"].detach())
     reach = settings.gate_opacity + 7.0 / settings.gate_sharpness  # beyond it the gate is below a thousandth
@@ -465,12 +432,31 @@ def random_step(
     scales_m: Tensor, quats: Tensor, opacity: Tensor, noise: Tensor, rate: float, settings: McmcSettings
 ) -> Tensor:
     """Displacements ``[n, 3]`` m: noise shaped by the covariance, faded by the opacity (published eq. 8), bounded by
-    the size.
-
-    Args:
-        scales_m: ``[n, 3]``. quats: ``[n, 4]`` (w, x, y, z), any length. opacity: ``[n]`` in (0, 1).
-        noise: ``[n, 3]``, standard normal, along the Gaussian's own axes. rate: metres.
-    """
+    the size. ``scales_m``: ``[n, 3]``. ``quats``: ``[n, 4]`` (w, x, y, z), any length. ``opacity``: ``[n]`` in (0, 1).
+    ``noise``: ``[n, 3]``, standard normal, along the Gaussian's own axes. ``rate``: metres."""
     gate = torch.sigmoid(settings.gate_sharpness * (settings.gate_opacity - opacity))[:, None]
     spread = torch.minimum(rate * settings.step_per_m2 * scales_m**2, scales_m)
     return rotate(quats, gate * spread * noise)
+
+
+def densify_if_due(
+    model: SceneModel,
+    stats: DensifyStats,
+    schedule: DensifySettings | McmcSettings | None,
+    step: int,
+    rate_m: float,
+    run_seed: int,
+) -> dict[str, Any]:
+    """What the schedule has for a step, after the optimiser's; a report if rows changed, as new statistics begin then.
+    ``rate_m``: present learning rate of the centres."""
+    report: dict[str, Any] = {}
+    if isinstance(schedule, McmcSettings):
+        if schedule.due(step):
+            report = relocate_and_grow(model, step, schedule, run_seed)
+        drift(model, step, rate_m, schedule, run_seed)
+    elif schedule is not None:
+        if schedule.due(step):
+            report = densify(model, stats, step, schedule, run_seed)
+        if schedule.reset_due(step):
+            reset_opacity(model, schedule)
+    return report

@@ -1,18 +1,12 @@
 """fit: recorded frames (and virtual observations) in, a dynamic Gaussian scene out.
 
-The loop is ``optimise`` and reads top to bottom. What it calls: ``gaussians/views.py`` (what a view is),
-``gaussians/start.py`` (where the Gaussians start), ``gaussians.model.compose`` (the scene at a time),
-``core.raster`` (the renderer), ``core.losses`` (every loss), ``gaussians.densify``. Nothing else touches the
-parameters.
+The loop is ``optimise`` and reads top to bottom. Nothing but what it calls touches the parameters. With ``start`` it
+goes on with a finished fit (``gaussians/storage.py``).
 
     OUT/model.json, gaussians.safetensors, nodes.safetensors    the fitted scene (``load_model``) and its certainty
     OUT/appearance.json, appearance.safetensors                 corrections of cameras and colours, where learnt
     OUT/log.jsonl, preview/*.png                                how it went
-    OUT/field.safetensors                                       instead of the Gaussians, for method emernerf
-                                                                (``baselines/emernerf.py``)
     OUT/steps/                                                  checkpoints, while it runs
-
-With ``start`` it goes on with a finished fit (``gaussians/storage.py``).
 """
 
 from __future__ import annotations
@@ -33,81 +27,37 @@ from torch import Tensor
 from mudg.base import checkpoint, log, palette, store
 from mudg.base.devices import memory_of
 from mudg.base.errors import UsageError
+from mudg.base.layout import MODEL_FILES
 from mudg.base.processes import Interruption, one_torch_thread
 from mudg.base.run_folder import RunDir, VerbOutput
 from mudg.base.types import FusedCloud, Gaussians, Render, Scene
 from mudg.core import losses, metrics, native_ops
 from mudg.core.pictures import panels_of
 from mudg.core.raster.rasterize import RasterConfig, drawing_device, rasterize
+from mudg.gaussians import storage, views
 from mudg.gaussians.appearance import Appearance
-from mudg.gaussians.densify import (
-    DensifySettings,
-    DensifyStats,
-    McmcSettings,
-    densify,
-    drift,
-    relocate_and_grow,
-    reset_opacity,
-    shorten_needles,
-)
+from mudg.gaussians.densify import DensifySettings, DensifyStats, McmcSettings, densify_if_due, shorten_needles
 from mudg.gaussians.model import CERTAINTY, SceneModel, compose, composite_sky, sky_lift
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.perception import Perception, perception_of
 from mudg.gaussians.poses import refine_poses
 from mudg.gaussians.recipes import DrawnView, recipe_of
 from mudg.gaussians.rendering import NEAR_M as NEAR_M
-from mudg.gaussians.rendering import boxes_in_view, check_drawing, drawing_facts, objects_only, raster_of
+from mudg.gaussians.rendering import boxes_in_view, drawing_facts, objects_only, raster_of
 from mudg.gaussians.rendering import render_view as render_view
 from mudg.gaussians.schedule import FiniteCheck, appearance_rates, densify_schedule, learning_rates, pose_round_due
 from mudg.gaussians.settings import METHODS, FitConfig
-from mudg.gaussians.storage import (
-    StartFit,
-    all_classes,
-    begun_at,
-    continued_appearance,
-    continued_model,
-    save_appearance,
-    save_model,
-    whole_run,
-)
 from mudg.gaussians.storage import load_model as load_model
+from mudg.gaussians.storage import save_model as save_model
 from mudg.gaussians.trust import certainty_of, unseen_maps, unseen_rows
-from mudg.gaussians.views import (
-    HalvedViews,
-    StoredView,
-    TrainView,
-    ViewSet,
-    chosen_ahead,
-    classes_of,
-    fused_lidar,
-    heads_of,
-    keep,
-    load_recorded,
-    load_virtual,
-    recorded_bytes,
-    scratch_folder,
-    training_frames,
-    virtual_bytes,
-)
+from mudg.gaussians.views import StoredView, TrainView, ViewSet, load_recorded
 from mudg.scene.clouds import read_fused
 from mudg.scene.fuse import fused_without_boxes
 from mudg.scene.observations import ObservationSet
 from mudg.scene.read import read_scene
 
-OUTPUT = VerbOutput(
-    "fit",
-    3,
-    (
-        "model.json",
-        "gaussians.safetensors",
-        "nodes.safetensors",
-        "appearance.json",
-        "appearance.safetensors",
-        "field.safetensors",
-        "preview/*.png",
-        "steps/",
-    ),
-)
+_FILES = (*MODEL_FILES, "appearance.json", "appearance.safetensors", "field.safetensors", "preview/*.png", "steps/")
+OUTPUT = VerbOutput("fit", 3, _FILES)
 FARTHEST_VIRTUAL_DEPTH_M = 100.0
 SHAPE_EVERY = 10
 EXPOSURE_WEIGHT = 0.01
@@ -115,13 +65,9 @@ EXPOSURE_WEIGHT = 0.01
 LEAST_WITNESSES, WITNESS_SHARE = 8, 0.015
 """Recorded views that the certainty is computed from, at most: this many, or this share of the steps (one costs about a
 step)."""
-MCMC_OPACITY_WEIGHT, MCMC_SCALE_WEIGHT = 0.01, 0.001
-"""Published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes of 10 m."""
-
-
-def learns_virtual(method: str) -> bool:
-    """Whether fits of a method learn from virtual views."""
-    return bool({"virtual", "repaired"} & set(METHODS[method].supervision))
+MCMC_WEIGHTS = 0.01, 0.001
+"""Of opacity and scale (published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes
+of 10 m)."""
 
 
 def check(config: FitConfig, *, fused: bool, virtual: bool, continued: bool) -> None:
@@ -129,20 +75,9 @@ def check(config: FitConfig, *, fused: bool, virtual: bool, continued: bool) -> 
     if not fused:
         raise UsageError(f"{config.method} needs fused clouds", remedy="run `mudg fuse` and give its folder as --fused")
     recipe_of(config.method).check(config, continued)
-    if learns_virtual(config.method) and not virtual:
+    if METHODS[config.method].learns_virtual and not virtual:
         remedy = "run `mudg synthesize` and give its folder as --observations, or choose --method street_gaussians"
         raise UsageError(f"{config.method} needs virtual observations", remedy=remedy)
-
-
-def check_device(config: FitConfig) -> torch.device:
-    """Where it is fitted.
-
-    Raises:
-        UsageError: the method or the drawing cannot be there. ResourceError: there is no such device.
-    """
-    device = drawing_device(config.device, "fit", config.raster)
-    check_drawing(config, device)
-    return device
 
 
 @dataclass(frozen=True)
@@ -153,27 +88,23 @@ class FitInputs:
     scene: Path
     fused: Path
     virtual: Mapping[str, ObservationSet] = field(default_factory=dict)
-    start: StartFit | None = None
+    start: storage.StartFit | None = None
 
 
 def write_fit(config: FitConfig, given: FitInputs, work: RunDir) -> dict[str, Any]:
     """Fit a scene and write the model to the work folder; returns a summary. An interrupted fit goes on from its newest
-    checkpoint.
-
-    Raises:
-        NumericsError: a loss or gradient is not finite. InputError: damaged inputs.
-    """
-    device = check_device(config)
+    checkpoint. NumericsError: a loss or gradient is not finite. InputError: damaged inputs."""
+    device = drawing_device(config.device, "fit", config.raster)
     config = recipe_of(config.method).used(config)
     if given.start is not None:
-        config = whole_run(config)
+        config = storage.whole_run(config)
     with one_torch_thread(), memory_of(device, "fit"):
         state = _prepare(config, given, work.path).to(device)
         with contextlib.closing(state.views):
             optimise(state, config, work)
             add_certainty(state, config)
-    save_model(state.model, work.path)
-    save_appearance(state.appearance, work.path)
+    storage.save_model(state.model, work.path)
+    storage.save_appearance(state.appearance, work.path)
     shutil.rmtree(work.path / "steps", ignore_errors=True)
     return state.summary()
 
@@ -214,99 +145,80 @@ def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
     scene, fused, start = read_scene(given.scene), read_fused(given.fused), given.start
     if not METHODS[config.method].boxes:
         scene, fused = replace(scene, tracks=()), fused_without_boxes(scene, given.fused)
-    frames, invented = training_frames(scene, config.cameras), sum(map(len, given.virtual.values()))
-    needed = recorded_bytes(frames, config.width_px) + virtual_bytes(given.virtual)
-    scratch = scratch_folder(len(frames) + invented, needed, out)
-    views, classes = recorded_views(config, scene, given.virtual, start, scratch)
+    frames, invented = views.training_frames(scene, config.cameras), sum(map(len, given.virtual.values()))
+    needed = views.recorded_bytes(frames, config.width_px) + views.virtual_bytes(given.virtual)
+    scratch = views.scratch_folder(len(frames) + invented, needed, out)
+    shown, classes = recorded_views(config, scene, given.virtual, start, scratch)
     if given.virtual:
-        measured = fused_lidar(fused, scene.tracks) if config.virtual.lidar_weight else None
-        views = replace(views, virtual=keep(load_virtual(given.virtual, classes, measured), invented, scratch))
+        measured = views.fused_lidar(fused, scene.tracks) if config.virtual.lidar_weight else None
+        loaded = views.load_virtual(given.virtual, classes, measured)
+        shown = replace(shown, virtual=views.keep(loaded, invented, scratch))
     found = checkpoint.latest(out / "steps")
+    if found is None and start is None:
+        return start_state(config, scene, fused, shown, classes)
     if found is None:
-        return (
-            start_state(config, scene, fused, views, classes)
-            if start is None
-            else continued_state(config, start, views, classes)
-        )
+        return continued_state(config, start, shown, classes)
     log.info(f"resuming at step {found.step} of {config.iterations}")
     model = SceneModel.from_state(found.state["model"], {name: found.tensors(name) for name in ("gaussians", "nodes")})
-    stats, appearance = (
-        found.tensors("stats"),
-        Appearance.from_state(found.state["appearance"], found.tensors("appearance")),
-    )
-    return FitState(
-        model,
-        views,
-        DensifyStats.from_state(stats),
-        _schedule_of(config),
-        found.step,
-        float(found.state["seconds"]),
-        found.state["last"],
-        appearance,
-        0 if start is None else begun_at(config.iterations),
-    )
+    stats, corrections = DensifyStats.from_state(found.tensors("stats")), found.tensors("appearance")
+    appearance = Appearance.from_state(found.state["appearance"], corrections)
+    seconds, last = float(found.state["seconds"]), found.state["last"]
+    begun_at = 0 if start is None else storage.begun_at(config.iterations)
+    return FitState(model, shown, stats, _schedule_of(config), found.step, seconds, last, appearance, begun_at)
 
 
 def recorded_views(
     config: FitConfig,
     scene: Scene,
     virtual: Mapping[str, ObservationSet] | None = None,
-    start: StartFit | None = None,
+    start: storage.StartFit | None = None,
     scratch: Path | None = None,
 ) -> tuple[ViewSet, tuple[int, ...]]:
     """The recorded views of a configuration, without virtual ones, and the train ids of the model's class channels
     (those that ``virtual`` shows and ``start`` knows included). ``scratch``: keep them in a file in this folder, not in
     memory."""
-    frames = training_frames(scene, config.cameras)
-    classes = classes_of(scene, frames, virtual or {}) if config.semantics else ()
-    classes = classes if start is None else all_classes(start, classes)
+    frames = views.training_frames(scene, config.cameras)
+    classes = views.classes_of(scene, frames, virtual or {}) if config.semantics else ()
+    classes = classes if start is None else storage.all_classes(start, classes)
     with_lidar = "lidar" in METHODS[config.method].supervision and config.loss.lidar_weight > 0
     loaded = load_recorded(scene, frames, classes, config.width_px, with_lidar)
-    return ViewSet(keep(loaded, len(frames), scratch), ()), classes
+    return ViewSet(views.keep(loaded, len(frames), scratch), ()), classes
 
 
 def start_state(
-    config: FitConfig, scene: Scene, cloud: FusedCloud, views: ViewSet, classes: tuple[int, ...]
+    config: FitConfig, scene: Scene, cloud: FusedCloud, shown: ViewSet, classes: tuple[int, ...]
 ) -> FitState:
     """The state that a fit starts from, on the CPU: a model built from the fused cloud, nothing corrected yet."""
-    model = recipe_of(config.method).start(scene, cloud, views.recorded, classes, config)
+    model = recipe_of(config.method).start(scene, cloud, shown.recorded, classes, config)
     model.facts |= {"method": config.method, "scene": scene.id, "classes": [palette.CLASSES[i] for i in classes]}
     model.facts |= drawing_facts(config.drawing)
     stats = DensifyStats.zeros(len(model.table))
-    return FitState(model, views, stats, _schedule_of(config), 0, appearance=_nothing_corrected(config, views))
+    return FitState(model, shown, stats, _schedule_of(config), 0, appearance=_nothing_corrected(config, shown))
 
 
 def _schedule_of(config: FitConfig) -> DensifySettings | McmcSettings | None:
     return densify_schedule(config, recipe_of(config.method).last_densified)
 
 
-def continued_state(config: FitConfig, start: StartFit, views: ViewSet, classes: tuple[int, ...]) -> FitState:
+def continued_state(config: FitConfig, start: storage.StartFit, shown: ViewSet, classes: tuple[int, ...]) -> FitState:
     """The state of a fit that goes on with a finished one; ``config`` is that of the whole run."""
-    model = continued_model(start, classes, config)
+    model = storage.continued_model(start, classes, config)
     model.facts |= {"method": config.method, "classes": [palette.CLASSES[i] for i in classes]}
-    appearance = continued_appearance(start, _nothing_corrected(config, views))
+    appearance = storage.continued_appearance(start, _nothing_corrected(config, shown))
     log.info(f"start: {len(model.table)} Gaussians of {start.folder}")
-    stats, step = DensifyStats.zeros(len(model.table)), begun_at(config.iterations)
-    return FitState(model, views, stats, _schedule_of(config), step, appearance=appearance, begun_at=step)
+    stats, step = DensifyStats.zeros(len(model.table)), storage.begun_at(config.iterations)
+    return FitState(model, shown, stats, _schedule_of(config), step, appearance=appearance, begun_at=step)
 
 
-def _nothing_corrected(config: FitConfig, views: ViewSet) -> Appearance:
-    wanted = config.appearance
-    return Appearance.of_views(
-        [head.name for head in heads_of(views.recorded)],
-        [head.name for head in heads_of(views.virtual)],
-        wanted.exposure,
-        wanted.cameras,
-        wanted.virtual,
-    )
+def _nothing_corrected(config: FitConfig, shown: ViewSet) -> Appearance:
+    return Appearance.of_views([head.name for head in views.heads_of(shown.recorded)], config.appearance)
 
 
 def add_certainty(state: FitState, config: FitConfig) -> None:
     """Note in the model how well the photographs constrain every Gaussian (``gaussians/trust.py``)."""
     raster, most = raster_of(state.model, config.raster), max(LEAST_WITNESSES, round(WITNESS_SHARE * config.iterations))
-    state.model.table.labels[CERTAINTY] = certainty_of(
-        state.model, state.views.recorded, raster, state.appearance, most
-    )
+    certainty = certainty_of(state.model, state.views.recorded, raster, state.appearance, most)
+    state.model.table.labels[CERTAINTY] = certainty
 
 
 # ---- the loop ------------------------------------------------------------------------------------
@@ -319,55 +231,50 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
     Same inputs, same result, also across an interruption: every draw comes from (seed, step), and checkpoints hold all
     that changes. Ctrl-C (or SIGTERM) is taken at the end of a step: checkpoint, then KeyboardInterrupt.
     """
-    raster, perception = (
-        raster_of(state.model, config.raster, config.drawing.packed),
-        perception_of(config.virtual, state.device),
-    )
+    raster, perception = raster_of(state.model, config.raster), perception_of(config.virtual, state.device)
     virtual_from, virtual_to = (share * config.iterations for share in (config.virtual.start, config.virtual.stop))
     virtual_from, pace = state.begun_at or virtual_from, checkpoint.Pace()
-    sizes = HalvedViews(config.virtual.half_size * config.iterations, keep=not state.views.filed)
+    sizes = views.HalvedViews(config.virtual.half_size * config.iterations, keep=not state.views.filed)
 
     def choose(step: int) -> tuple[StoredView, ...]:
         probability = config.virtual.probability if virtual_from < step <= virtual_to else 0.0
-        return tuple(
-            sizes.sized(view, step)
-            for view in state.views.choose(config.seed, step, probability, config.virtual.beside)
-        )
+        chosen = state.views.choose(config.seed, step, probability, config.virtual.beside)
+        return tuple(sizes.sized(view, step) for view in chosen)
 
     with (
         log.task(f"fit {config.method}", config.iterations, state.step) as bar,
         Interruption() as interruption,
         # The one way to the device; results come back in gaussians/rendering.py.
-        chosen_ahead(state.views, choose, range(state.step + 1, config.iterations + 1), state.device) as upcoming,
+        views.chosen_ahead(state.views, choose, range(state.step + 1, config.iterations + 1), state.device) as upcoming,
     ):
         while state.step < config.iterations:
             began = time.perf_counter()
             step = state.step + 1
             if step - 1 <= virtual_from < step and state.views.virtual and config.virtual.gaussians:
                 start_unseen_gaussians(state, config, raster)
-            views = next(upcoming)
+            seen = next(upcoming)
             check = FiniteCheck(step, at_once=state.device.type == "cpu")
-            learnt = [
-                _learn_from(state, view, LearnStep(config, raster, perception, check, step, view is views[0]))
-                for view in views
-            ]
+            how = [LearnStep(config, raster, perception, check, step, first=view is seen[0]) for view in seen]
+            learnt = [_learn_from(state, view, of_view) for view, of_view in zip(seen, how)]
             check.refuse()
             adam_step(state.model, step, config.iterations, state.begun_at)
-            state.appearance.adam_step(
-                step - state.begun_at, appearance_rates(step, config.iterations), native_ops.adam_columns
-            )
+            rates = appearance_rates(step, config.iterations)
+            state.appearance.adam_step(step - state.begun_at, rates, native_ops.adam_columns)
             if step % SHAPE_EVERY == 0:
                 shorten_needles(state.model.table, config.densify.longest_to_middle)
                 settle_nodes(state.model, config, step)
             if pose_round_due(config, step):
                 moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
                 folder.log(step=step, boxes_moved_m=round(moved_m, 5))
-            densified = _densify_if_due(state, config, step)
+            rate_m = learning_rates(step, config.iterations)["means"]
+            densified = densify_if_due(state.model, state.stats, state.schedule, step, rate_m, config.seed)
+            if densified:
+                state.stats = DensifyStats.zeros(len(state.model.table), state.device)
 
             state.step, state.seconds = step, state.seconds + time.perf_counter() - began
             if step % 20 == 0 or step == config.iterations or densified:
-                state.last = _progress(state, views[0], *learnt[0])
-                folder.log(step=step, view=views[0].name, seconds=round(state.seconds, 3), **state.last, **densified)
+                state.last = _progress(state, seen[0], *learnt[0])
+                folder.log(step=step, view=seen[0].name, seconds=round(state.seconds, 3), **state.last, **densified)
                 shown = f"psnr {state.last['psnr']:.1f}, " if "psnr" in state.last else ""
                 bar.update(f"{shown}{len(state.model.table)} Gaussians")
             if step % config.preview_every == 0 or step == config.iterations:
@@ -383,12 +290,8 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
 
 @dataclass(frozen=True)
 class LearnStep:
-    """What a step does with each of its views.
-
-    Args:
-        check: takes what must be finite.
-        first: whether it is the first view of this step; terms that do not depend on the view count with it.
-    """
+    """What a step does with one of its views. ``check``: takes what must be finite. ``first``: whether it is the first
+    view of this step; terms that do not depend on the view count with it."""
 
     config: FitConfig
     raster: RasterConfig
@@ -406,12 +309,8 @@ class LearntPicture(NamedTuple):
 
 
 def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[LearntPicture, dict[str, Tensor]]:
-    """Render a view and add the gradients of its loss to the parameters'.
-
-    Returns:
-        The picture (not all that was rendered: that would stay in memory while the next view is), and the weighted loss
-        terms.
-    """
+    """Render a view and add the gradients of its loss to the parameters'. Returns the picture (not all that was
+    rendered: that would stay in memory while the next view is), and the weighted loss terms."""
     config, step, raster, recipe = how.config, how.step, how.raster, recipe_of(how.config.method)
     recorded = view.kind == "recorded"
     model = recipe.drawn_model(state.model, view, step, config) if recorded else state.model
@@ -425,9 +324,8 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
         terms |= recipe.terms(DrawnView(model, gaussians, render, view, step, config, raster))
     else:
         terms = virtual_terms(state, render, view, config, how.perception)
-    terms |= (regularisers(gaussians, config) if how.first else {}) | correction_terms(
-        state, gaussians, view, config, raster, step
-    )
+    terms |= regularisers(gaussians, config) if how.first else {}
+    terms |= correction_terms(state, gaussians, view, config, raster, step)
     how.check.terms(view.name, terms)
     torch.stack(list(terms.values())).sum().backward()
     how.check.gradients(view.name, state.model, state.appearance)
@@ -435,17 +333,15 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
         camera = view.view.camera
         timed = state.model.table["tau"].grad if "tau" in state.model.table.columns else None
         state.stats.observe(render.trace, camera.width, camera.height, state.model.counts()[0], timed)
-    return LearntPicture(render.rgb.detach(), render.alpha.detach()), {
-        name: term.detach() for name, term in terms.items()
-    }
+    terms = {name: term.detach() for name, term in terms.items()}
+    return LearntPicture(render.rgb.detach(), render.alpha.detach()), terms
 
 
 def start_unseen_gaussians(state: FitState, config: FitConfig, raster: RasterConfig) -> None:
     """When virtual views join: start Gaussians at the surfaces that only they show (see ``gaussians/trust.py``)."""
     unseen = unseen_maps(state.model, state.views.recorded, state.views.virtual, raster)
     columns, labels, share = unseen_rows(state.model, unseen, config.virtual.gaussians, config.seed)
-    there = [{name: value.to(state.device) for name, value in of.items()} for of in (columns, labels)]
-    state.model.table.append(*there)
+    state.model.table.append(*({k: value.to(state.device) for k, value in of.items()} for of in (columns, labels)))
     state.model.sort_rows()
     state.stats = DensifyStats.zeros(len(state.model.table), state.device)
     log.info(f"virtual views: {share:.0%} of their pixels show what no recorded view saw")
@@ -472,10 +368,9 @@ def recorded_terms(state: FitState, render: Render, view: TrainView, config: Fit
     if view.sky is not None and weights.sky_weight and state.model.sky is not None:
         terms["sky"] = weights.sky_weight * losses.weighted_mean(losses.sky_map(render.alpha, view.sky), labels)
     if render.extra is not None and view.channels is not None and weights.semantic_weight:
-        total = labels.sum().double().clamp_min(1e-12) / weights.semantic_weight
-        terms["semantics"] = native_ops.class_loss(
-            render.extra, view.channels, labels[0], total, sky_lift(state.model, render.alpha)
-        )
+        total, lift = labels.sum().double().clamp_min(1e-12), sky_lift(state.model, render.alpha)
+        total = total / weights.semantic_weight
+        terms["semantics"] = native_ops.class_loss(render.extra, view.channels, labels[0], total, lift)
     return terms
 
 
@@ -489,9 +384,8 @@ def virtual_terms(
     rgb = _picture(state, render, view)
     terms: dict[str, Tensor] = {}
     if weights.color_weight:
-        terms["virtual_color"] = weights.color_weight * native_ops.photometric(
-            rgb, view.rgb, weights.ssim_weight, weight[0]
-        )
+        loss = native_ops.photometric(rgb, view.rgb, weights.ssim_weight, weight[0])
+        terms["virtual_color"] = weights.color_weight * loss
     if weights.perceptual_weight:
         terms["virtual_perceptual"] = weights.perceptual_weight * perception(rgb, view.rgb, weight)
     if view.depth is not None and weights.depth_weight:
@@ -502,9 +396,8 @@ def virtual_terms(
         loss = losses.sparse_depth(render.depth, view.lidar.pixel, view.lidar.depth_m)
         terms["virtual_lidar"] = weights.lidar_weight * loss
     if view.sky is not None and weights.sky_weight and state.model.sky is not None:
-        terms["virtual_sky"] = weights.sky_weight * losses.confident_mean(
-            losses.sky_map(render.alpha, view.sky), weight
-        )
+        loss = losses.confident_mean(losses.sky_map(render.alpha, view.sky), weight)
+        terms["virtual_sky"] = weights.sky_weight * loss
     if render.extra is not None and view.channels is not None and weights.semantic_weight:
         total, lift = weight[0].numel() / weights.semantic_weight, sky_lift(state.model, render.alpha)
         terms["virtual_semantics"] = native_ops.class_loss(render.extra, view.channels, weight[0], total, lift)
@@ -514,13 +407,10 @@ def virtual_terms(
 def regularisers(gaussians: Gaussians, config: FitConfig) -> dict[str, Tensor]:
     """Weighted mean opacity and mean scale of all Gaussians; unset weights are those published with ``mcmc``, else
     0."""
-    published = config.densify.kind == "mcmc"
-    opacity_weight, scale_weight = config.loss.opacity_weight, config.loss.scale_weight
-    if opacity_weight is None:
-        opacity_weight = MCMC_OPACITY_WEIGHT if published else 0.0
-    if scale_weight is None:
-        scale_weight = MCMC_SCALE_WEIGHT if published else 0.0
-    return losses.opacity_and_scale(gaussians.opacity, gaussians.scales, opacity_weight, scale_weight)
+    usual = MCMC_WEIGHTS if config.densify.kind == "mcmc" else (0.0, 0.0)
+    own = config.loss.opacity_weight, config.loss.scale_weight
+    weights = (other if weight is None else weight for weight, other in zip(own, usual))
+    return losses.opacity_and_scale(gaussians.opacity, gaussians.scales, *weights)
 
 
 def correction_terms(
@@ -532,21 +422,12 @@ def correction_terms(
     distance = state.appearance.penalty(view.name, view.kind)
     if distance is not None:
         terms["exposure"] = EXPOSURE_WEIGHT * distance
-    if (
-        config.loss.object_weight
-        and view.kind == "recorded"
-        and _settled(state.schedule, step)
-        and len(state.model.nodes) > 1
-    ):
+    settled = state.schedule is None or step > state.schedule.stop
+    if config.loss.object_weight and view.kind == "recorded" and settled and len(state.model.nodes) > 1:
         alpha = rasterize(objects_only(gaussians), view.view, raster).alpha
         inside = boxes_in_view(state.model, view.view).to(state.device, non_blocking=True)
         terms["objects"] = config.loss.object_weight * losses.object_map(alpha, inside).mean()
     return terms
-
-
-def _settled(schedule: DensifySettings | McmcSettings | None, step: int) -> bool:
-    """Whether the number of Gaussians does not change any more after a step."""
-    return schedule is None or step > schedule.stop
 
 
 def settle_nodes(model: SceneModel, config: FitConfig, step: int) -> None:
@@ -567,24 +448,6 @@ def adam_step(model: SceneModel, step: int, iterations: int, begun_at: int = 0) 
     for table in (model.table, *model.node_tables().values()):
         table.adam_step(step - begun_at, rates, native_ops.adam_columns)
         table.clear_gradients()
-
-
-def _densify_if_due(state: FitState, config: FitConfig, step: int) -> dict[str, Any]:
-    """What the schedule has for this step, after the optimiser's; a report if rows changed."""
-    model, schedule = state.model, state.schedule
-    report: dict[str, Any] = {}
-    if isinstance(schedule, McmcSettings):
-        if schedule.due(step):
-            report = relocate_and_grow(model, step, schedule, config.seed)
-        drift(model, step, learning_rates(step, config.iterations)["means"], schedule, config.seed)
-    elif schedule is not None:
-        if schedule.due(step):
-            report = densify(model, state.stats, step, schedule, config.seed)
-        if schedule.reset_due(step):
-            reset_opacity(model, schedule)
-    if report:
-        state.stats = DensifyStats.zeros(len(model.table), model.device)
-    return report
 
 
 # ---- on disk -------------------------------------------------------------------------------------

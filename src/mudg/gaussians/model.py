@@ -62,17 +62,11 @@ SKY_LOGIT: Final = 10.0
 
 @dataclass
 class SceneModel:
-    """A fitted, or to be fitted, scene.
-
-    Args:
-        table: all Gaussians, rows ordered by node; label column ``node`` i32 is the index into ``nodes``.
-        nodes: static node first.
-        sky: or None (background black).
-        classes: train ids of the semantic channels, in channel order; empty = no semantics.
-        sh_degree: of the colour columns.
-        facts: JSON values kept with the model (method, scene id, ...).
-        colors: how the cameras of the log show the Gaussians' colours, which are common ones.
-    """
+    """A fitted, or to be fitted, scene. ``table``: all Gaussians, rows ordered by node; label column ``node`` i32 is
+    the index into ``nodes``. ``nodes``: static node first. ``sky``: or None (background black). ``classes``: train ids
+    of the semantic channels, in channel order; empty = no semantics. ``sh_degree``: of the colour columns. ``facts``:
+    JSON values kept with the model (method, scene id, ...). ``colors``: how the cameras of the log show the Gaussians'
+    colours, which are common ones."""
 
     table: Table
     nodes: tuple[StaticNode | RigidNode, ...]
@@ -116,7 +110,7 @@ class SceneModel:
 
     def node_tables(self) -> dict[str, Table]:
         """The optimisable tables beside the shared one, by name (pose offsets; the sky's panorama)."""
-        tables = {f"node.{node.name}": own for node in self.nodes if (own := node.parameters()) is not None}
+        tables = {f"node.{node.name}": own for node in self.nodes if (own := node.learnt) is not None}
         return tables | ({"sky": self.sky.table} if self.sky is not None else {})
 
     def node_names(self) -> tuple[str, ...]:
@@ -124,26 +118,18 @@ class SceneModel:
         return tuple(node.name for node in self.nodes if isinstance(node, RigidNode))
 
     def dynamic_object(self, name: str) -> RigidNode:
-        """The node of a dynamic object.
-
-        Raises:
-            UsageError: an object that the scene has no node for (it may be parked, and so part of the background).
-        """
+        """The node of a dynamic object. UsageError: an object that the scene has no node for (it may be parked, and so
+        part of the background)."""
         for node in self.nodes:
             if isinstance(node, RigidNode) and node.name == name:
                 return node
         known = ", ".join(self.node_names())
-        raise UsageError(
-            f"the fitted scene has no dynamic object {name!r}",
-            expected=f"one of {known}" if known else "a scene with dynamic objects",
-        )
+        what = f"the fitted scene has no dynamic object {name!r}"
+        raise UsageError(what, expected=f"one of {known}" if known else "a scene with dynamic objects")
 
     def without_nodes(self, names: Sequence[str]) -> SceneModel:
-        """A copy without the named dynamic objects (the rest keeps its parameters, not its moments).
-
-        Raises:
-            UsageError: an object that the scene has no node for.
-        """
+        """A copy without the named dynamic objects (the rest keeps its parameters, not its moments). UsageError: an
+        object that the scene has no node for."""
         gone = {self.dynamic_object(name).name for name in names}
         kept = [
             index for index, node in enumerate(self.nodes) if node.name not in gone or not isinstance(node, RigidNode)
@@ -164,10 +150,7 @@ class SceneModel:
 
     def with_object_moved(self, name: str, object_from_new: NDArray[np.float64]) -> SceneModel:
         """A copy with one dynamic object displaced in its own frame by a rigid 4x4; it shares the table of Gaussians.
-
-        Raises:
-            UsageError: an object that the scene has no node for.
-        """
+        UsageError: an object that the scene has no node for."""
         moved = self.dynamic_object(name)
         nodes = tuple(moved.moved(object_from_new) if node is moved else node for node in self.nodes)
         return replace(self, nodes=nodes, facts=dict(self.facts))
@@ -192,11 +175,8 @@ class SceneModel:
 
     @classmethod
     def from_state(cls, values: Mapping[str, Any], groups: Mapping[str, Mapping[str, Tensor]]) -> SceneModel:
-        """Inverse of ``state``.
-
-        Raises:
-            InputError: an unknown node kind, a class that does not exist, or rows that belong to no node.
-        """
+        """Inverse of ``state``. InputError: an unknown node kind, a class that does not exist, or rows that belong to
+        no node."""
         nodes: list[StaticNode | RigidNode] = []
         sky: SkyNode | None = None
         for index, facts in enumerate(values["nodes"]):
@@ -220,21 +200,13 @@ class SceneModel:
         if any(not 0 <= value < len(CLASSES) for value in classes):
             raise InputError("a semantic class does not exist", expected=f"0..{len(CLASSES) - 1}", got=str(classes))
         if "semantics" in table.columns and table["semantics"].shape[1:] != (len(classes),):
-            raise InputError(
-                "the Gaussians have other classes than the scene",
-                expected=f"{len(classes)} channels",
-                got=str(tuple(table["semantics"].shape)),
-            )
+            what = "the Gaussians have other classes than the scene"
+            raise InputError(what, expected=f"{len(classes)} channels", got=str(tuple(table["semantics"].shape)))
         colors = CameraColors.of_record(values["camera_colors"]) if "camera_colors" in values else SAME_COLORS
         degree = int(values["sh_degree"])
         if degree > 0 and values.get("harmonics") != "node":
-            raise InputError(
-                "the scene's spherical harmonics are not in the frames of its objects",
-                where="harmonics",
-                expected="node",
-                got=str(values.get("harmonics")),
-                remedy="fit the scene again",
-            )
+            what, remedy = "the scene's spherical harmonics are not in the frames of its objects", "fit the scene again"
+            raise InputError(what, where="harmonics", expected="node", got=str(values.get("harmonics")), remedy=remedy)
         return cls(table, tuple(nodes), sky, classes, degree, dict(values["facts"]), colors)
 
 
@@ -242,10 +214,7 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
     """All Gaussians of the scene in the world at a time, activated, differentiable in every column.
 
     Objects that do not exist at that time stay in the rows with opacity 0, so that rows always match the table.
-
-    Args:
-        semantics: add the class logits as ``extra`` channels.
-    """
+    ``semantics``: add the class logits as ``extra`` channels."""
     table, counts = model.table, model.counts()
     all_rows = NodeRows(table["means"], table["quats"], torch.sigmoid(table["logits"]), table["sh_dc"])
     blocks = zip(

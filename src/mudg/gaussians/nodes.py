@@ -30,12 +30,9 @@ from mudg.core.table import Table
 
 # motion -------------------------------------------------------------------------------------------
 #
-# How tracked objects move: the noise of a track, and its smoothest likely version.
-#
 # A detector puts a box a little wrong at every key, each time anew; a car cannot follow such a path. Two sizes decide:
 # that of the noise, which the track itself betrays, and that of usual accelerations. The likeliest path between the two
 # minimises a sum of squares (the Whittaker smoother, on second differences), with a tail for sharp manoeuvres.
-
 
 ACCELERATION_M_S2: Final = 2.0
 """Usual acceleration of road users (standard deviation); hard braking is three to four times as much."""
@@ -104,23 +101,11 @@ def smoothed(
 
 # nodes --------------------------------------------------------------------------------------------
 
-
 LIMBED_LABELS: Final = frozenset(
-    {
-        "pedestrian",
-        "person",
-        "person_sitting",
-        "child",
-        "adult",
-        "cyclist",
-        "rider",
-        "bicyclist",
-        "motorcyclist",
-        "animal",
-    }
+    "pedestrian person person_sitting child adult cyclist rider bicyclist motorcyclist animal".split()
 )
 """Labels of tracks that change their shape while they move."""
-SYMMETRIC_LABELS: Final = frozenset({"car", "van", "truck", "bus", "tram", "train", "vehicle", "trailer", "motorcycle"})
+SYMMETRIC_LABELS: Final = frozenset("car van truck bus tram train vehicle trailer motorcycle".split())
 """Labels of tracks whose two sides are alike."""
 LEAST_NOISE_M: Final = 0.01
 LEAST_NOISE_RAD: Final = 0.002
@@ -132,18 +117,12 @@ DEFORM_DECAY: Final = 0.02
 
 @dataclass(frozen=True, slots=True, eq=False)
 class NodeRows:
-    """The Gaussians of one node.
-
-    Args:
-        means: f32[n, 3] metres. quats: f32[n, 4] (w, x, y, z), any length. Both in the frame of the node (world for a
-            static one, box for a rigid one) before ``Node.at_time``, in the world after it.
-        opacity: f32[n] in [0, 1].
-        sh_dc: f32[n, 1, 3], the constant band of the colour.
-        own: raw columns of the table, f32[n, ...], that only some kind of node knows (the moment at which a Gaussian
-            shows, say).
-        sh_rest: f32[n, K - 1, 3], the bands of the colour that depend on the direction of view, or None. Like the
-            places: directions are those of the node's frame before ``Node.at_time``, of the world after it.
-    """
+    """The Gaussians of one node. ``means``: f32[n, 3] metres. ``quats``: f32[n, 4] (w, x, y, z), any length. Both in
+    the frame of the node (world for a static one, box for a rigid one) before ``Node.at_time``, in the world after it.
+    ``opacity``: f32[n] in [0, 1]. ``sh_dc``: f32[n, 1, 3], the constant band of the colour. ``own``: raw columns of the
+    table, f32[n, ...], that only some kind of node knows. ``sh_rest``: f32[n, K - 1, 3], the bands of the colour that
+    depend on the direction of view, or None; directions are those of the node's frame before ``Node.at_time``, of the
+    world after it."""
 
     means: Tensor
     quats: Tensor
@@ -153,9 +132,33 @@ class NodeRows:
     sh_rest: Tensor | None = None
 
 
-class StaticNode:
-    """Rows already in the world. Other kinds of node have the same methods, and an optimisable table of their own if
-    they need one."""
+class Node:
+    """What all kinds of node share."""
+
+    learnt: Table | None = None
+    """The node's own optimisable table beside the shared one, or None."""
+
+    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
+        """The rows as they are at a time, differentiable in all they hold; None: the node does not exist then."""
+        return rows
+
+    def linked(self, nodes: Sequence[StaticNode | RigidNode]) -> Self:
+        """The same node as part of a scene of these nodes, for kinds that use what another node learns."""
+        return self
+
+    def to(self, device: torch.device) -> Self:
+        """The same node with what it learns on a device."""
+        return self if self.learnt is None else self.with_values(learnt=self.learnt.to(device))
+
+    def with_values(self, **values: Any) -> Self:
+        """The same node with other values of some attributes; it shares all else."""
+        other = copy.copy(self)
+        vars(other).update(values)
+        return other
+
+
+class StaticNode(Node):
+    """Rows already in the world."""
 
     kind = "static"
     short_life: ClassVar[float] = 0.0
@@ -164,29 +167,13 @@ class StaticNode:
     def __init__(self, name: str = "background") -> None:
         self.name = name
 
-    def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """The rows as they are at a time, differentiable in all they hold; None: the node does not exist then."""
-        return rows
-
     def born_later(self, columns: Mapping[str, Tensor], noise: Tensor, late: bool) -> dict[str, Tensor]:
         """Children of split rows in time; Gaussians without a life span are there at all times."""
         return dict(columns)
 
-    def parameters(self) -> Table | None:
-        """The node's own optimisable table beside the shared one, or None."""
-        return None
-
-    def linked(self, nodes: Sequence[StaticNode | RigidNode]) -> Self:
-        """The same node as part of a scene of these nodes, for kinds that use what another node learns."""
-        return self
-
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """What rebuilds the node: plain JSON values and tensors."""
         return {"name": self.name}, {}
-
-    def to(self, device: torch.device) -> Self:
-        """The same node with what it learns on a device."""
-        return self
 
     @classmethod
     def from_state(cls, facts: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> StaticNode:
@@ -194,18 +181,16 @@ class StaticNode:
         return cls(str(facts["name"]))
 
 
-class RigidNode:
+class RigidNode(Node):
     """A tracked dynamic object: rows in the frame of its box, carried by the box's pose.
 
     The pose at a time comes from the two neighbouring keys of the track. Each key may be corrected by offsets in the
     frame of the box, ``corrected = world_from_object @ (yaw about z, then dx dy dz)``; **both** neighbours' corrected
     positions and rotations are interpolated (straight line, slerp). Outside the track's span the object does not exist.
 
-    The offsets, one row per key: ``shift`` [K, 3] metres and ``yaw`` [K] radians. ``learn_pose``: whether a fit may
-    change them.
-
-    Poses are worked out on the CPU, also where the offsets are on another device: a copy of them is kept here, and what
-    moves the rows at a time goes to their device once.
+    The offsets, one row per key: ``shift`` [K, 3] metres and ``yaw`` [K] radians; ``learn_pose``: whether a fit may
+    change them, not by gradient steps but by ``gaussians/poses.py``. Poses are worked out on the CPU, also where the
+    offsets are on another device: a copy of them is kept here, and what moves the rows at a time goes there once.
     """
 
     kind = "rigid"
@@ -220,31 +205,26 @@ class RigidNode:
         offsets: Table | None = None,
         learn_pose: bool = False,
     ) -> None:
-        self.name = name
-        self.label = label
+        self.name, self.label, self.learn_pose = name, label, learn_pose
         self.size_m = tuple(float(value) for value in size_m)
         self.times_s = np.asarray(times_s, np.float64)
         self.world_from_object = np.asarray(world_from_object, np.float64)
-        self.learn_pose = learn_pose
-        count = len(self.times_s)
-        self.offsets = offsets or Table(
-            {"shift": torch.zeros(count, 3), "yaw": torch.zeros(count), **self._own_columns(count)}
-        )
+        keys = len(self.times_s)
+        columns = {"shift": torch.zeros(keys, 3), "yaw": torch.zeros(keys), **self._own_columns(keys)}
+        self.offsets = offsets or Table(columns)
         self._placements: dict[float, tuple[Tensor, Tensor, Tensor] | None] = {}
         self._mixings: dict[tuple[float, int], Tensor] = {}
         self._copied: tuple[Tensor, Tensor] | None = None
-        self._quats = torch.from_numpy(
-            np.stack([geometry.quaternion_from_matrix(m) for m in self.world_from_object])
-        ).float()
+        quats = np.stack([geometry.quaternion_from_matrix(pose) for pose in self.world_from_object])
+        self._quats = torch.from_numpy(quats).float()
         self._rotations = torch.from_numpy(self.world_from_object[:, :3, :3].copy()).float()
         self._positions = torch.from_numpy(self.world_from_object[:, :3, 3].copy()).float()
 
     @classmethod
     def from_track(cls, track: Track, learn_pose: bool = False) -> Self:
         """A node that follows ``track``."""
-        return cls(
-            track.id, track.label, track.size_m.tolist(), track.times_s, track.world_from_object, learn_pose=learn_pose
-        )
+        size_m, poses = track.size_m.tolist(), track.world_from_object
+        return cls(track.id, track.label, size_m, track.times_s, poses, learn_pose=learn_pose)
 
     @property
     def symmetric(self) -> bool:
@@ -310,9 +290,8 @@ class RigidNode:
     def corrected_keys(self, which: slice = slice(None)) -> NDArray[np.float64]:
         """The keys, or some of them, with their offsets: world_from_object f64[K, 4, 4]."""
         shift, yaw = (values[which].double().numpy() for values in self._offsets_here())
-        return self.world_from_object[which] @ np.stack(
-            [geometry.yaw_matrix(float(turn), move) for turn, move in zip(yaw, shift)]
-        )
+        moves = [geometry.yaw_matrix(float(turn), move) for turn, move in zip(yaw, shift)]
+        return self.world_from_object[which] @ np.stack(moves)
 
     def pose_matrix(self, time_s: float) -> NDArray[np.float64] | None:
         """Corrected world_from_object f64[4, 4] at a time; None outside the span."""
@@ -358,15 +337,14 @@ class RigidNode:
     # -- rows --------------------------------------------------------------------------------------
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``StaticNode``."""
+        """See ``Node``."""
         placement = self._placement(time_s)
         if placement is None:
             return None
         position, rotation_t, product_t = placement
         means = torch.addmm(position, rows.means, rotation_t)
-        return replace(
-            rows, means=means, quats=rows.quats @ product_t, sh_rest=self._colors_turned(rows.sh_rest, time_s)
-        )
+        turned = self._colors_turned(rows.sh_rest, time_s)
+        return replace(rows, means=means, quats=rows.quats @ product_t, sh_rest=turned)
 
     def _colors_turned(self, rest: Tensor | None, time_s: float) -> Tensor | None:
         """Bands of the colour that depend on the direction of view, from the directions of the box to those of the
@@ -392,26 +370,15 @@ class RigidNode:
             self._placements[time_s] = None if place is None else _sent(place, self.offsets.device)
         return self._placements[time_s]
 
-    def parameters(self) -> Table | None:
-        """None: offsets are not learnt by gradient steps but by ``gaussians/poses.py``, which weighs what each picture
-        can tell."""
-        return None
-
-    def linked(self, nodes: Sequence[StaticNode | RigidNode]) -> Self:
-        """See ``StaticNode``."""
-        return self
-
     def after_step(self, share: float) -> None:
         """Regularise, in place, what a node learns by gradient steps; ``share`` in [0, 1] falls with the learning
         rate."""
 
     def to(self, device: torch.device) -> Self:
-        """See ``StaticNode``. A copy, unless it is there already."""
+        """See ``Node``. A copy, unless it is there already."""
         if self.offsets.device == device:
             return self
-        there = copy.copy(self)
-        there.offsets, there._placements, there._mixings, there._copied = self.offsets.to(device), {}, {}, None
-        return there
+        return self.with_values(offsets=self.offsets.to(device), _placements={}, _mixings={}, _copied=None)
 
     def moved(self, object_from_new: NDArray[np.float64]) -> Self:
         """A node displaced in its own frame: key poses ``corrected @ object_from_new``; what its rows do inside the box
@@ -424,10 +391,7 @@ class RigidNode:
     def state(self) -> tuple[dict[str, Any], dict[str, Tensor]]:
         """See ``StaticNode``."""
         facts = {"name": self.name, "label": self.label, "size_m": list(self.size_m), "learn_pose": self.learn_pose}
-        tensors = {
-            "times_s": torch.from_numpy(self.times_s.copy()),
-            "world_from_object": torch.from_numpy(self.world_from_object.copy()),
-        }
+        tensors = {name: torch.from_numpy(getattr(self, name).copy()) for name in ("times_s", "world_from_object")}
         return facts, tensors | {f"offsets.{key}": value for key, value in self.offsets.state().items()}
 
     @classmethod
@@ -437,18 +401,14 @@ class RigidNode:
         name, table = str(facts["name"]), Table.from_state(offsets)
         times, poses = tensors["times_s"].numpy(), tensors["world_from_object"].numpy()
         if times.ndim != 1 or not len(times) or not np.isfinite(times).all() or (np.diff(times) < 0).any():
-            raise InputError(
-                "the times of an object are out of order", where=f"times_s of {name}", got=str(times.ravel()[:8])
-            )
+            what, where = "the times of an object are out of order", f"times_s of {name}"
+            raise InputError(what, where=where, got=str(times.ravel()[:8]))
         fits = poses.shape == (len(times), 4, 4)
         problem = next(filter(None, map(geometry.rigid_problem, poses)), "") if fits else f"shape {poses.shape}"
         if problem or table["shift"].shape != (len(times), 3) or table["yaw"].shape != (len(times),):
-            raise InputError(
-                "the poses of an object do not fit its times",
-                where=f"world_from_object of {name}",
-                got=problem,
-                expected=f"a rigid pose, a shift and a yaw for each of {len(times)} times",
-            )
+            what, where = "the poses of an object do not fit its times", f"world_from_object of {name}"
+            expected = f"a rigid pose, a shift and a yaw for each of {len(times)} times"
+            raise InputError(what, where=where, got=problem, expected=expected)
         return cls(name, str(facts["label"]), facts["size_m"], times, poses, table, bool(facts["learn_pose"]))
 
 
@@ -470,7 +430,7 @@ class DeformableNode(RigidNode):
         return {"deform": torch.zeros(keys, 3, up, across, along)}
 
     def at_time(self, rows: NodeRows, time_s: float) -> NodeRows | None:
-        """See ``StaticNode``."""
+        """See ``Node``."""
         if self.keys_around(time_s) is None:
             return None
         return super().at_time(replace(rows, means=rows.means + self.displacement(rows.means, time_s)), time_s)
@@ -491,7 +451,8 @@ class DeformableNode(RigidNode):
         )
         return moved[0, :, 0, 0].T
 
-    def parameters(self) -> Table:
+    @property
+    def learnt(self) -> Table:  # type: ignore[override]
         """The table that holds the displacements; the offsets in it never have a gradient, and so stay."""
         return self.offsets
 
@@ -532,8 +493,6 @@ def object_node(track: Track, learn_pose: bool = False, deformable: bool = False
 
 
 # sky ----------------------------------------------------------------------------------------------
-#
-# The sky of a scene: a panorama of all directions, visible where no Gaussian covers it.
 
 
 class SkyNode:
@@ -604,11 +563,8 @@ class SkyNode:
 
     def fill(self, measured: Iterable[tuple[NDArray[np.float64], NDArray[np.float32]]]) -> None:
         """Start from measured sky colours: mean per texel; texels nobody saw take the nearest seen one's colour.
-
-        Args:
-            measured: portions of directions in the world ``[M, 3]`` and their colours f32[M, 3] in [0, 1]. How they are
-                divided makes no difference.
-        """
+        ``measured``: portions of directions in the world ``[M, 3]`` and their colours f32[M, 3] in [0, 1]. How they are
+        divided makes no difference."""
         rows, columns = self.rows, 2 * self.rows
         total, count = np.zeros((3, rows * columns)), np.zeros(rows * columns)
         for directions_world, rgb in measured:

@@ -72,11 +72,7 @@ class PoseEvidence:
 def refine_poses(
     model: SceneModel, views: Sequence[StoredView], raster: RasterConfig, appearance: Appearance | None = None
 ) -> float:
-    """One round for every node that learns its pose, in place.
-
-    Returns:
-        Root mean square of the moves, metres.
-    """
+    """One round for every node that learns its pose, in place. Returns root mean square of the moves, metres."""
     learning = {
         index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode) and node.learn_pose
     }

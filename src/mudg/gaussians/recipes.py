@@ -6,33 +6,36 @@ A recipe is a class with the methods of ``Recipe``, which itself adds nothing, a
 
 from __future__ import annotations
 
+import math
 import pkgutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from operator import attrgetter
 from typing import ClassVar, Final
 
 from torch import Tensor
 
 from mudg.base.errors import UsageError
 from mudg.base.types import FusedCloud, Gaussians, Render, Scene
+from mudg.core import losses
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.schedule import LAST_DENSIFIED, PUBLISHED_STEPS
-from mudg.gaussians.settings import FitConfig
+from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.gaussians.start import start_model
-from mudg.gaussians.views import StoredView, TrainView
+from mudg.gaussians.views import LidarPixels, StoredView, TrainView
 
 SCENE_UNIT_M = 10.0
 """Published weights and rates belong to scenes whose unit is this long."""
+SKY_M = 900.0 * SCENE_UNIT_M
+LIDAR_DECAY_STEPS = 8000.0
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnView:
-    """What a step drew of a recorded view, for the terms of a recipe.
-
-    Args:
-        model: as it was drawn (``Recipe.drawn_model``). step: from 1.
-    """
+    """What a step drew of a recorded view, for the terms of a recipe. ``model``: as it was drawn
+    (``Recipe.drawn_model``). ``step``: from 1."""
 
     model: SceneModel
     gaussians: Gaussians
@@ -47,25 +50,32 @@ class DrawnView:
         """The step of the published length that this one stands for."""
         return self.step * PUBLISHED_STEPS / self.config.iterations
 
+    @property
+    def lidar(self) -> LidarPixels | None:
+        """LiDAR depths of the view, if there are any."""
+        return self.view.lidar if self.view.lidar is not None and len(self.view.lidar.pixel) else None
+
+    @cached_property
+    def inverse_depth(self) -> Tensor:
+        """Of the render, per scene unit; the sky at ``SKY_M``."""
+        return losses.inverse_depth(self.render.depth, self.render.alpha, SKY_M) * SCENE_UNIT_M
+
+    def lidar_term(self, weight: float) -> dict[str, Tensor]:
+        """The error of inverse depth at LiDAR points, whose weight decays; empty without points."""
+        if self.lidar is None:
+            return {}
+        error = losses.sparse_inverse_depth(self.inverse_depth, self.lidar.pixel, self.lidar.depth_m / SCENE_UNIT_M)
+        return {"lidar": weight * math.exp(-self.published_step / LIDAR_DECAY_STEPS) * error}
+
 
 class Recipe:
-    """A method that is the common loop and nothing else.
+    """A method that is the common loop and nothing else."""
 
-    ``own_weights``: settings of ``loss`` that are its own, published ones.
-    """
-
-    own_weights: ClassVar[tuple[str, ...]] = ()
-    unfit: ClassVar[tuple[str, ...]] = ()
-    """Settings, ``group.field``, that mean nothing to the method and must keep their defaults."""
     last_densified: ClassVar[float] = LAST_DENSIFIED
     """Share of the run after which it adds no more Gaussians by gradients."""
 
     def check(self, config: FitConfig, continues: bool) -> None:
-        """Refuse settings that the method cannot follow.
-
-        Raises:
-            UsageError: naming the setting.
-        """
+        """Refuse settings that the method cannot follow. UsageError: naming the setting."""
 
     def used(self, config: FitConfig) -> FitConfig:
         """The settings with those put in that the method fixes."""
@@ -73,9 +83,8 @@ class Recipe:
 
     def common(self, config: FitConfig) -> FitConfig:
         """The settings of the common loss terms: those that the method replaces weigh nothing."""
-        if not self.own_weights:
-            return config
-        return replace(config, loss=replace(config.loss, **dict.fromkeys(self.own_weights, 0.0)))
+        weights = METHODS[config.method].weights
+        return replace(config, loss=replace(config.loss, **dict.fromkeys(weights, 0.0))) if weights else config
 
     def start(
         self, scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
@@ -97,46 +106,22 @@ class OwnRecipe(Recipe):
 
     def check(self, config: FitConfig, continues: bool) -> None:
         """See ``Recipe``."""
-        default = FitConfig()
+        row, usual = METHODS[config.method], FitConfig()
         if continues:
             raise UsageError(f"{config.method} cannot go on with a finished fit", remedy="leave out --start-from")
-        for name in (*self.unfit, *(f"loss.{weight}" for weight in self.own_weights)):
-            group, _, field = name.partition(".")
-            given, usual = (getattr(getattr(of, group), field) for of in (config, default))
-            if given != usual:
-                reason = (
-                    "has published weights of its own"
-                    if group == "loss" and field in self.own_weights
-                    else "knows nothing of it"
-                )
-                raise UsageError(
-                    f"{config.method} {reason}",
-                    where=name,
-                    expected=str(usual),
-                    got=str(given),
-                    remedy="leave the setting out, or choose --method street_gaussians",
-                )
+        for name in (*row.unfit, *(f"loss.{weight}" for weight in row.weights)):
+            expected, got = (str(attrgetter(name)(one)) for one in (usual, config))
+            if got != expected:
+                reason = "knows nothing of it" if name in row.unfit else "has published weights of its own"
+                remedy = "leave the setting out, or choose --method street_gaussians"
+                raise UsageError(f"{config.method} {reason}", where=name, expected=expected, got=got, remedy=remedy)
         if config.densify.kind == "mcmc":
-            raise UsageError(
-                f"{config.method} densifies by gradients", where="densify.kind", expected="gradient or none", got="mcmc"
-            )
-
-
-BOX_SETTINGS = ("poses.learn", "objects.deformable", "objects.mirror_start", "loss.object_weight")
-"""Settings about dynamic objects, which methods without boxes do not know."""
-
-
-class StaticRecipe(OwnRecipe):
-    """``gs3d``: the common loop, without dynamic objects."""
-
-    unfit: ClassVar[tuple[str, ...]] = BOX_SETTINGS
-
-
-# the recipe of every method that is fitted --------------------------------------------------------
+            what, where = f"{config.method} densifies by gradients", "densify.kind"
+            raise UsageError(what, where=where, expected="gradient or none", got="mcmc")
 
 
 RECIPES: Final[Mapping[str, str]] = {
-    "gs3d": "mudg.gaussians.recipes:StaticRecipe",
+    "gs3d": "mudg.gaussians.recipes:OwnRecipe",
     "bezier": "mudg.baselines.bezier:BezierRecipe",
     "omnire": "mudg.baselines.omnire:OmniRecipe",
     "pvg": "mudg.baselines.pvg:VibrationRecipe",

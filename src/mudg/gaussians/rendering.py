@@ -13,15 +13,13 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from mudg.base import geometry, palette
-from mudg.base.errors import UsageError
 from mudg.base.types import Gaussians, Observation, Render, RenderPlanes, View
-from mudg.core.raster.rasterize import Backend, RasterConfig, rasterize, refuse_settings
+from mudg.core.raster.rasterize import Backend, RasterConfig, rasterize
 from mudg.gaussians.model import SceneModel, compose, composite_semantics, composite_sky
 from mudg.gaussians.nodes import RigidNode
-from mudg.gaussians.settings import DrawingConfig, FitConfig
+from mudg.gaussians.settings import DrawingConfig
 
 # dynamic objects by themselves: their Gaussians alone, and where their boxes lie in a view --------
-
 
 BOX_GROWTH = 1.05
 NEAREST_CORNER_M = 0.3
@@ -80,7 +78,6 @@ def outline_mask(
 
 # rendering ----------------------------------------------------------------------------------------
 
-
 NEAR_M = 0.2
 DRAWING: Final = "drawing"
 """Fact of a fitted scene: settings of ``RasterConfig`` that it was fitted with and that change its pictures; not there:
@@ -93,16 +90,11 @@ _ROWS: Final = 128
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RenderedCondition:
-    """One rendered view.
-
-    Args:
-        rgb: f32[3, H, W] in [0, 1], over the sky.
-        depth: f32[H, W], camera z in metres; NaN in the sky and where the scene is empty.
-        alpha: f32[H, W] in [0, 1], how much of the pixel Gaussians cover; the rest is sky.
-        semantics: u8[H, W] train ids, 255 = unknown.
-        certainty: f32[H, W] in [0, 1], how well photographs and LiDAR constrain what the pixel shows; at most alpha, so
-            0 in the sky. None: unknown, for a scene fitted by a version that did not measure it.
-    """
+    """One rendered view. ``rgb``: f32[3, H, W] in [0, 1], over the sky. ``depth``: f32[H, W], camera z in metres; NaN
+    in the sky and where the scene is empty. ``alpha``: f32[H, W] in [0, 1], how much of the pixel Gaussians cover; the
+    rest is sky. ``semantics``: u8[H, W] train ids, 255 = unknown. ``certainty``: f32[H, W] in [0, 1], how well
+    photographs and LiDAR constrain what the pixel shows; at most alpha, so 0 in the sky. None: unknown, for a scene
+    fitted by a version that did not measure it."""
 
     rgb: Tensor
     depth: Tensor
@@ -111,41 +103,14 @@ class RenderedCondition:
     certainty: Tensor | None
 
 
-def raster_of(model: SceneModel, backend: Backend = "auto", packed: bool = False) -> RasterConfig:
+def raster_of(model: SceneModel, backend: Backend = "auto") -> RasterConfig:
     """How a fitted scene is drawn: as it was while it was fitted."""
-    return RasterConfig(backend=backend, near_m=NEAR_M, packed=packed, **model.facts.get(DRAWING, {}))
+    return RasterConfig(backend=backend, near_m=NEAR_M, **model.facts.get(DRAWING, {}))
 
 
 def drawing_facts(config: DrawingConfig) -> dict[str, Any]:
     """What a model notes of these settings: nothing if they are the usual ones."""
-    chosen, usual = asdict(config), asdict(DrawingConfig())
-    changed = {name: value for name, value in chosen.items() if name != "packed" and value != usual[name]}
-    return {DRAWING: changed} if changed else {}
-
-
-def check_drawing(config: FitConfig, device: torch.device) -> None:
-    """Refuse before the work what no step could draw.
-
-    Raises:
-        UsageError: settings that exclude each other, that the backend of this device lacks, or that give no gradients
-            for what is to be learnt.
-    """
-    wanted = config.drawing
-    backend = config.raster if config.raster != "auto" else "gsplat" if device.type == "cuda" else "cpu"
-    refuse_settings(backend, RasterConfig(backend=config.raster, near_m=NEAR_M, **asdict(wanted)))
-    if (wanted.projection, wanted.primitive) != ("linear", "ellipsoid") and config.densify.kind == "gradient":
-        raise UsageError(
-            "this way of drawing has no gradients of projected means, by which Gaussians are added",
-            where="--drawing",
-            got=f"{wanted.projection}, {wanted.primitive}",
-            remedy="add --densify.kind mcmc",
-        )
-    if wanted.projection == "unscented" and config.appearance.cameras:
-        raise UsageError(
-            "unscented projection has no gradients of camera poses",
-            where="--appearance.cameras",
-            remedy="leave it out, or set --drawing.projection linear",
-        )
+    return {DRAWING: asdict(config)} if config != DrawingConfig() else {}
 
 
 COVERED = 0.5
@@ -167,10 +132,7 @@ def render_condition(
     model: SceneModel, view: View, raster: RasterConfig | None = None, composed: Gaussians | None = None
 ) -> RenderedCondition:
     """Render one view of a fitted scene with the certainty of its pixels, on the CPU; see ``render_view``.
-
-    Args:
-        composed: what ``compose`` made of the model at the view's time, if it is at hand.
-    """
+    ``composed``: what ``compose`` made of the model at the view's time, if it is at hand."""
     gaussians, certainty = compose(model, view.time_s) if composed is None else composed, model.certainty
     if certainty is not None:
         known = certainty.float()[:, None]
@@ -218,7 +180,6 @@ def _observed(model: SceneModel, render: Render, view: View, source: str = "") -
 
 
 # renders of a fitted scene as the diffusion model's condition holds them --------------------------
-
 
 FAR_M = 1000.0
 """Depth of the sky and of what the scene does not cover."""

@@ -29,18 +29,13 @@ from mudg.gaussians.settings import DensifyConfig, FitConfig, StartConfig
 # On the CPU each is looked at as soon as it is known. On another device looking means waiting for all that was sent
 # there, so the numbers of a whole step are gathered there and come back in one copy.
 
-
 Complaint = Callable[[float], None]
 """Raises for a number that is not finite; returns where it only overflowed."""
 
 
 class FiniteCheck:
-    """The numbers of one step that must be finite, in the order in which they were computed.
-
-    Args:
-        step: for messages.
-        at_once: look at every number when it is added, not in ``refuse``.
-    """
+    """The numbers of one step that must be finite, in the order in which they were computed. ``step``: for messages.
+    ``at_once``: look at every number when it is added, not in ``refuse``."""
 
     def __init__(self, step: int, at_once: bool) -> None:
         self._step = step
@@ -99,12 +94,8 @@ VIEW_REMEDY = "the parameters are those of the step before; leave this view out"
 
 
 def _refuse_term(name: str, where: str, number: float) -> None:
-    raise NumericsError(
-        f"the loss term {name!r} is not finite",
-        where=where,
-        got=str(number),
-        remedy="check this view's image and labels; the parameters are those of the step before",
-    )
+    remedy = "check this view's image and labels; the parameters are those of the step before"
+    raise NumericsError(f"the loss term {name!r} is not finite", where=where, got=str(number), remedy=remedy)
 
 
 def _refuse_gradient(table: Table, gradient: Tensor, where: str, remedy: str, number: float) -> None:
@@ -115,7 +106,6 @@ def _refuse_gradient(table: Table, gradient: Tensor, where: str, remedy: str, nu
 
 
 # settings of short fits: good enough to learn from what a fit gets wrong, in a few seconds --------
-
 
 MOST_GAUSSIANS, VOXEL_M = 40_000, 0.25
 """Gaussians at most, and the cubes of which each starts one, metres."""
@@ -138,7 +128,6 @@ def short_fit(iterations: int, clip_width_px: int, camera_width_px: int, seed: i
 
 
 # schedule -----------------------------------------------------------------------------------------
-
 
 PUBLISHED_STEPS = 30_000
 FIELD_STEPS = 55_000

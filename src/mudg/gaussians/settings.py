@@ -10,18 +10,6 @@ from mudg.base.devices import DeviceName
 
 
 @settings
-class RadianceConfig:
-    """Method emernerf."""
-
-    size: Literal["small", "published", "tiny"] = "small"
-    """Sizes of the networks and samples of a ray (docs/baselines.md)."""
-    rays: int = setting(default=512, ge=1)
-    """Pixels per step."""
-    lidar_rays: int = setting(default=256, ge=1)
-    """LiDAR rays per step."""
-
-
-@settings
 class StartConfig:
     """Initial Gaussians."""
 
@@ -77,9 +65,6 @@ class AppearanceConfig:
     the log."""
     cameras: bool = False
     """Correct the camera pose of every recorded image. Use it if calibration or vehicle poses are inaccurate."""
-    virtual: bool = False
-    """mudg_s: learn an affine colour map per set of virtual views, so that a colour cast of generated views does not
-    reach the recorded path."""
 
 
 @settings
@@ -89,13 +74,6 @@ class DrawingConfig:
     antialias: bool = False
     """Reduce the opacity of Gaussians smaller than a pixel by what the blur of the screen adds to them (Mip-Splatting).
     Use it if renders will be larger, smaller, nearer or further than the recorded images."""
-    packed: bool = False
-    """Working memory only for Gaussians that a view sees: less memory, slightly slower. Needs gsplat."""
-    projection: Literal["linear", "unscented"] = "linear"
-    """linear: as published for 3D Gaussian Splatting. unscented: evaluated along the ray of each pixel (3DGUT). Needs
-    gsplat and densify.kind mcmc or none."""
-    primitive: Literal["ellipsoid", "disc"] = "ellipsoid"
-    """ellipsoid, or disc: flat Gaussians (2DGS). Needs gsplat and densify.kind mcmc or none."""
 
 
 @settings
@@ -153,9 +131,9 @@ class VirtualConfig:
     """Share of structural similarity (SSIM) in the colour term, 0 to 1."""
     perceptual_weight: float = setting(default=0.3, ge=0)
     """Weight of the perceptual distance, measured by `perception`."""
-    perception: Literal["filters", "codec", "lpips"] = "filters"
-    """Features of the perceptual distance. filters: a fixed filter bank. codec: the shipped diffusion model's codec,
-    slower. lpips: the LPIPS network, which needs `lpips_weights`."""
+    perception: Literal["filters", "lpips"] = "filters"
+    """Features of the perceptual distance. filters: a fixed filter bank. lpips: the LPIPS network, which needs
+    `lpips_weights`."""
     lpips_weights: str = ""
     """Safetensors file with LPIPS weights (AlexNet, version 0.1, tensor names of the lpips package)."""
     depth_weight: float = setting(default=0.3, ge=0)
@@ -212,15 +190,13 @@ class FitConfig:
     drawing: DrawingConfig = setting(default_factory=DrawingConfig)
     loss: RecordedLossConfig = setting(default_factory=RecordedLossConfig)
     virtual: VirtualConfig = setting(default_factory=VirtualConfig)
-    radiance: RadianceConfig = setting(default_factory=RadianceConfig)
 
 
 # methods ------------------------------------------------------------------------------------------
 #
-# The methods that can be compared, as rows of plain values. Only what works is listed.
-#
-# Every method ends in the same thing, folders of observations on named trajectories, so that one scorer serves all: a
-# method either fits a scene (``mudg fit``) and renders it, or generates its views directly (``mudg synthesize``).
+# The methods that can be compared, as rows of plain values. Only what works is listed. Every method ends in folders of
+# observations on named trajectories, so that one scorer serves all: it either fits a scene (``mudg fit``) and renders
+# it, or generates its views directly (``mudg synthesize``).
 
 
 @dataclass(frozen=True)
@@ -236,6 +212,9 @@ class Method:
             path, repaired.
         scene: what its scene is made of: Gaussians, or a radiance field that is marched along rays.
         boxes: whether it knows the tracked boxes, those of the scene and those that fusing used.
+        weights: settings of ``loss`` in whose place it has published weights of its own.
+        unfit: other settings, ``group.field``, that mean nothing to it; both must keep their defaults.
+        chosen: settings that it fixes itself, whatever their values are.
     """
 
     title: str
@@ -244,22 +223,64 @@ class Method:
     supervision: tuple[Literal["color", "semantics", "lidar", "sky", "virtual", "repaired"], ...] = ()
     scene: Literal["gaussians", "radiance"] = "gaussians"
     boxes: bool = True
+    weights: tuple[str, ...] = ()
+    unfit: tuple[str, ...] = ()
+    chosen: tuple[str, ...] = ()
+
+    @property
+    def learns_virtual(self) -> bool:
+        """Whether its fit learns from views that no camera recorded."""
+        return bool({"virtual", "repaired"} & set(self.supervision))
+
+    def has(self, name: str) -> bool:
+        """Whether a setting of a fit, by its dotted name, applies to it."""
+        group = name.partition(".")[0]
+        if self.scene == "radiance":
+            return name in _OF_ALL or group == "radiance"
+        if group in ("poses", "objects") and not self.boxes:
+            return False
+        foreign = (*self.unfit, *self.chosen, *(f"loss.{weight}" for weight in self.weights))
+        return name not in foreign and group != "radiance" and (group != "virtual" or self.learns_virtual)
 
 
 _STREET: Final = ("color", "semantics", "lidar", "sky")
+_BOXES: Final = ("poses.learn", "objects.deformable", "objects.mirror_start", "loss.object_weight")
+"""Settings about dynamic objects."""
+_OF_ALL: Final = frozenset("method iterations seed cameras width_px device checkpoint_every preview_every".split())
+"""Settings that methods without Gaussians have, too."""
+_REPAIRS: Final = (
+    *("virtual.probability", "virtual.continued_probability", "virtual.gaussians", "virtual.color_weight"),
+    *("virtual.ssim_weight", "virtual.perceptual_weight", "virtual.perception", "virtual.lpips_weights"),
+    *("virtual.depth_weight", "virtual.lidar_weight", "virtual.semantic_weight"),
+)
+"""Settings of virtual views that ``difix`` chooses itself."""
 
 METHODS: Final[dict[str, Method]] = {
-    "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics"), boxes=False),
+    "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics"), boxes=False, unfit=_BOXES),
     "street_gaussians": Method("Gaussians without diffusion", "render", ("static", "objects", "sky"), _STREET),
-    "pvg": Method("PVG, our sky model", "render", ("static", "sky"), _STREET, boxes=False),
-    "s3gaussian": Method(
-        "S3Gaussian without features", "render", ("static",), ("color", "semantics", "lidar"), boxes=False
+    "pvg": Method(
+        *("PVG, our sky model", "render", ("static", "sky"), _STREET),
+        boxes=False,
+        weights=("lidar_weight", "sky_weight"),
+        unfit=_BOXES,
     ),
-    "bezier": Method("BezierGS", "render", ("static", "objects", "sky"), _STREET),
-    "omnire": Method("OmniRe without SMPL", "render", ("static", "objects", "sky"), _STREET),
+    "s3gaussian": Method(
+        *("S3Gaussian without features", "render", ("static",), ("color", "semantics", "lidar")),
+        boxes=False,
+        weights=("lidar_weight", "ssim_weight"),
+        unfit=_BOXES,
+    ),
+    "bezier": Method(
+        *("BezierGS", "render", ("static", "objects", "sky"), _STREET),
+        weights=("lidar_weight",),
+        unfit=("poses.learn", "objects.deformable", "loss.object_weight"),
+    ),
+    "omnire": Method("OmniRe without SMPL", "render", ("static", "objects", "sky"), _STREET, weights=("lidar_weight",)),
     "emernerf": Method("EmerNeRF, small", "render", (), ("color", "lidar", "sky"), "radiance", boxes=False),
     "difix": Method(
-        "Difix3D scheme, our network, no last repair", "render", ("static", "objects", "sky"), (*_STREET, "repaired")
+        *("Difix3D scheme, our network, no last repair", "render", ("static", "objects", "sky")),
+        (*_STREET, "repaired"),
+        chosen=_REPAIRS,
     ),
     "mudg_r": Method("Diffusion output", "synthesize"),
     "freevs": Method("FreeVS condition, our network", "synthesize"),

@@ -33,7 +33,6 @@ from mudg.gaussians.views import StoredView, heads_of
 
 # starting values of Gaussians: points, thinned and coloured, become rows of the table -------------
 
-
 SH_C0: Final = 0.28209479177387814
 START_OPACITY: Final = 0.1
 
@@ -69,12 +68,9 @@ def columns_from_points(
     sh_degree: int,
     scale_m: NDArray[np.float32] | None = None,
 ) -> dict[str, Tensor]:
-    """Starting columns for ``N`` coloured points: round, colour of the point, class of the point where known.
-
-    Args:
-        xyz: f32[N, 3] metres in the node's frame. rgb: u8[N, 3]. semantics: u8[N] train ids (255 = unknown) or None.
-        scale_m: f32[N]; default from the three nearest neighbours.
-    """
+    """Starting columns for ``N`` coloured points: round, colour of the point, class of the point where known. ``xyz``:
+    f32[N, 3] metres in the node's frame. ``rgb``: u8[N, 3]. ``semantics``: u8[N] train ids (255 = unknown) or None.
+    ``scale_m``: f32[N]; default from the three nearest neighbours."""
     count = len(xyz)
     scale = neighbour_scale(xyz) if scale_m is None else scale_m
     logits = np.zeros((count, len(classes)), np.float32)
@@ -107,7 +103,6 @@ def box_grid(size_m: Sequence[float], rgb: Sequence[float]) -> tuple[NDArray[np.
 
 
 # start --------------------------------------------------------------------------------------------
-
 
 UPRIGHT_IDS = tuple(ID[n] for n in ("building", "wall", "fence", "pole", "traffic light", "traffic sign", "vegetation"))
 GROUND_IDS = tuple(ID[n] for n in ("road", "sidewalk", "terrain"))
@@ -151,11 +146,7 @@ class StartPoints:
 def start_model(
     scene: Scene, fused: FusedCloud, views: Sequence[StoredView], classes: tuple[int, ...], config: FitConfig
 ) -> SceneModel:
-    """Build the scene model that the fit starts from.
-
-    Raises:
-        InputError: the fused cloud has no points at all.
-    """
+    """Build the scene model that the fit starts from. InputError: the fused cloud has no points at all."""
     if len(fused.static) == 0:
         raise InputError(
             "the fused cloud has no static points", where=scene.root, remedy="check the LiDAR of the scene"

@@ -18,7 +18,7 @@ from mudg.base.records import understood
 from mudg.base.run_folder import run_state
 from mudg.base.types import Camera, Scene, View
 from mudg.core.table import Table
-from mudg.gaussians.appearance import CAMERA_POSE, RECORDED_COLOR, Appearance
+from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.model import CERTAINTY, SceneModel
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.rendering import DRAWING, drawing_facts, raster_of, render_view
@@ -57,29 +57,17 @@ def load_appearance(folder: Path) -> Appearance:
 
 
 def model_of_scene(folder: Path, scene: Scene) -> SceneModel:
-    """Read a scene fitted to `scene`.
-
-    Raises:
-        InputError: it was fitted to another one. As `load_model`.
-    """
+    """Read a scene fitted to `scene`. InputError: it was fitted to another one. As `load_model`."""
     model = load_model(folder)
     if model.facts.get("scene", scene.id) != scene.id:
-        raise InputError(
-            "this scene was fitted to another log",
-            where=str(folder),
-            expected=scene.id,
-            got=str(model.facts["scene"]),
-            remedy="give the fit of this scene",
-        )
+        what, got = "this scene was fitted to another log", str(model.facts["scene"])
+        raise InputError(what, where=str(folder), expected=scene.id, got=got, remedy="give the fit of this scene")
     return model
 
 
 def kind_of(folder: Path) -> str:
-    """What a fit has written to this folder: ``gaussians`` or ``radiance``.
-
-    Raises:
-        InputError: not the folder of a finished fit.
-    """
+    """What a fit has written to this folder: ``gaussians`` or ``radiance``. InputError: not the folder of a finished
+    fit."""
     if not (Path(folder) / "model.json").is_file():
         raise InputError("this folder holds no fitted scene", where=str(folder), expected="a folder made by `mudg fit`")
     return str(description_of(folder).get("kind", GAUSSIANS))
@@ -91,30 +79,19 @@ def description_of(folder: Path) -> dict[str, Any]:
 
 
 def load_model(folder: Path) -> SceneModel:
-    """Read a fitted scene of Gaussians.
-
-    Raises:
-        InputError: not the folder of a finished fit, a radiance field, or of another schema. IntegrityError: a file was
-            altered.
-    """
+    """Read a fitted scene of Gaussians. InputError: not the folder of a finished fit, a radiance field, or of another
+    schema. IntegrityError: a file was altered."""
     folder = Path(folder)
     if kind_of(folder) != GAUSSIANS:
-        raise InputError(
-            "this fit is a radiance field, which has no Gaussians and no objects",
-            where=str(folder),
-            expected="a scene fitted by a method with Gaussians",
-            remedy="`mudg render` shows it; for everything else fit with --method street_gaussians",
-        )
+        what = "this fit is a radiance field, which has no Gaussians and no objects"
+        remedy = "`mudg render` shows it; for everything else fit with --method street_gaussians"
+        raise InputError(what, where=str(folder), expected="a scene fitted by a method with Gaussians", remedy=remedy)
     if (folder / store.MANIFEST).is_file():
         store.verify_manifest(folder)
     values = description_of(folder)
     if values.get("schema") != 1:
-        raise InputError(
-            "unknown schema of a fitted scene",
-            where=str(folder / "model.json"),
-            expected="1",
-            got=str(values.get("schema")),
-        )
+        what = "unknown schema of a fitted scene"
+        raise InputError(what, where=str(folder / "model.json"), expected="1", got=str(values.get("schema")))
     groups = {name: store.read_tensors(folder / f"{name}.safetensors") for name in ("gaussians", "nodes")}
     with understood("a fitted scene", str(folder)):
         model = SceneModel.from_state(values, groups)
@@ -142,7 +119,6 @@ def _try_out(model: SceneModel) -> None:
 # run of all steps together would be, at two thirds for 500 after 1000, was measured to learn less from virtual views:
 # the steps are too short by then.)
 
-
 START_METHOD = "street_gaussians"
 NEW_CLASS_LOGIT = -6.0
 """Logit of a class that the finished fit did not know: as unlikely as classes are that a Gaussian has learnt not to
@@ -158,14 +134,8 @@ class StartFit:
 
     @classmethod
     def of_folder(cls, folder: Path, inputs: Mapping[str, str]) -> StartFit:
-        """The finished fit in a folder.
-
-        Args:
-            inputs: digests of what the new fit reads; scene and fused cloud must be those of the finished one.
-
-        Raises:
-            InputError: no finished fit of street_gaussians, or one of another scene or cloud.
-        """
+        """The finished fit in a folder. ``inputs``: digests of what the new fit reads; scene and fused cloud must be
+        those of the finished one. InputError: no finished fit of street_gaussians, or one of another scene or cloud."""
         folder = Path(folder)
         state = _state_of_edited(folder) or _state_of(folder)
         remedy = "give the folder of a finished `mudg fit --method street_gaussians` as --start-from"
@@ -187,13 +157,8 @@ class StartFit:
         facts = description_of(folder).get("facts")
         method = facts.get("method") if isinstance(facts, dict) else None
         if method != START_METHOD:
-            raise InputError(
-                "a fit can only go on with one on recorded views",
-                where=f"{folder / 'model.json'}, facts.method",
-                expected=START_METHOD,
-                got=str(method),
-                remedy=remedy,
-            )
+            what, where = "a fit can only go on with one on recorded views", f"{folder / 'model.json'}, facts.method"
+            raise InputError(what, where=where, expected=START_METHOD, got=str(method), remedy=remedy)
         return cls(folder, store.digest(folder))
 
 
@@ -234,29 +199,18 @@ def whole_run(config: FitConfig) -> FitConfig:
 
 def continued_model(start: StartFit, classes: Sequence[int], config: FitConfig) -> SceneModel:
     """The model of a finished fit, on the CPU, with channels for all of ``classes`` (train ids) and no moments.
-
-    Raises:
-        UsageError: it was fitted with other degrees of spherical harmonics, or drawn with other settings.
-    """
+    UsageError: it was fitted with other degrees of spherical harmonics, or drawn with other settings."""
     model = load_model(start.folder)
     model.table.labels.pop(CERTAINTY, None)
     if model.sh_degree != config.sh_degree:
-        raise UsageError(
-            "the finished fit has another degree of spherical harmonics",
-            where=str(start.folder),
-            expected=str(config.sh_degree),
-            got=str(model.sh_degree),
-            remedy=f"add --sh-degree {model.sh_degree}",
-        )
+        what, where = "the finished fit has another degree of spherical harmonics", str(start.folder)
+        remedy = f"add --sh-degree {model.sh_degree}"
+        raise UsageError(what, where=where, expected=str(config.sh_degree), got=str(model.sh_degree), remedy=remedy)
     drawn, wanted = model.facts.get(DRAWING, {}), drawing_facts(config.drawing).get(DRAWING, {})
     if drawn != wanted:
-        raise UsageError(
-            "the finished fit was drawn with other settings",
-            where=str(start.folder),
-            expected=str(drawn or "the usual ones"),
-            got=str(wanted or "the usual ones"),
-            remedy="give the finished fit's --drawing settings",
-        )
+        what, got = "the finished fit was drawn with other settings", str(wanted or "the usual ones")
+        remedy = "give the finished fit's --drawing settings"
+        raise UsageError(what, where=str(start.folder), expected=str(drawn or "the usual ones"), got=got, remedy=remedy)
     for node in model.nodes:
         if isinstance(node, RigidNode) and config.poses.learn and not node.learn_pose:
             node.learn_pose = True
@@ -289,9 +243,5 @@ def continued_appearance(start: StartFit, fresh: Appearance) -> Appearance:
     """The corrections that a new fit starts from, with those that the finished one learnt about the same images and
     cameras."""
     learnt = load_appearance(start.folder)
-    kept = {
-        group: learnt.tables[group]
-        for group in (RECORDED_COLOR, CAMERA_POSE)
-        if group in fresh.names and learnt.names.get(group) == fresh.names[group]
-    }
+    kept = {group: learnt.tables[group] for group, names in fresh.names.items() if learnt.names.get(group) == names}
     return Appearance(fresh.names, {**fresh.tables, **kept})

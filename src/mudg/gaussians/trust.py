@@ -44,7 +44,6 @@ from mudg.gaussians.views import StoredView, TrainView, heads_of
 # The sums are exact: w is the derivative of a rendered feature by the Gaussian's feature, so that one backward pass per
 # view, with an image in place of the loss's gradient, sums over all pixels at once.
 
-
 COLOR_ERROR = 0.02
 """Mean difference of colour, of [0, 1], that halves the certainty."""
 DEPTH_ERROR = 0.1
@@ -55,13 +54,9 @@ ASSUMED_PIXELS = 0.1
 
 @dataclass(frozen=True, eq=False)
 class PhotoEvidence:
-    """Sums of blending weights per Gaussian, each f32[N], over views and pixels.
-
-    Args:
-        views: number of views that show it.
-        pixels: weight, in pixels. color: the same, each pixel times the mean difference of its three colours.
-        lidar: weight, in pixels with LiDAR. depth: the same, each times its relative difference of depth.
-    """
+    """Sums of blending weights per Gaussian, each f32[N], over views and pixels. ``views``: number of views that show
+    it. ``pixels``: weight, in pixels. ``color``: the same, each pixel times the mean difference of its three colours.
+    ``lidar``: weight, in pixels with LiDAR. ``depth``: the same, each times its relative difference of depth."""
 
     views: Tensor
     pixels: Tensor
@@ -141,7 +136,6 @@ def difference_images(model: SceneModel, render: Render, view: TrainView, appear
 
 
 # trust --------------------------------------------------------------------------------------------
-
 
 WITNESSES = 36
 """Number of recorded views that are compared, spread evenly over cameras and time."""

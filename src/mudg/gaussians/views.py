@@ -61,19 +61,12 @@ class LidarPixels:
 
 @dataclass(frozen=True)
 class TrainView:
-    """One view as tensors, ready for a step.
-
-    Args:
-        name: e.g. ``front/000012`` or ``front_shift+2.0/000003``, for messages.
-        kind: recorded or virtual.
-        rgb: f32[3, H, W] in [0, 1].
-        channels: i64[H, W], numbers of the model's class channels (255 = unlabelled), or None.
-        confidence: f32[1, H, W] in [0, 1]: of all that a virtual view shows, of the labels alone for a recorded one.
-        mask: bool[1, H, W], pixels that may be used at all.
-        sky: bool[1, H, W] or None if unknown.
-        depth: f32[1, H, W] metres of a virtual view (NaN = none), or None.
-        lidar: or None.
-    """
+    """One view as tensors, ready for a step. ``name``: e.g. ``front/000012`` or ``front_shift+2.0/000003``, for
+    messages. ``kind``: recorded or virtual. ``rgb``: f32[3, H, W] in [0, 1]. ``channels``: i64[H, W], numbers of the
+    model's class channels (255 = unlabelled), or None. ``confidence``: f32[1, H, W] in [0, 1]: of all that a virtual
+    view shows, of the labels alone for a recorded one. ``mask``: bool[1, H, W], pixels that may be used at all.
+    ``sky``: bool[1, H, W] or None if unknown. ``depth``: f32[1, H, W] metres of a virtual view (NaN = none), or None.
+    ``lidar``: or None."""
 
     name: str
     view: View
@@ -177,11 +170,8 @@ class ViewSet:
     ) -> tuple[StoredView, ...]:
         """The views of a step: a virtual one with the given probability (if there are any), else the next recorded one.
 
-        Recorded views come in a fresh random order per round, so that every one is seen equally often.
-
-        Args:
-            beside: the virtual view comes after the recorded one, not in its place.
-        """
+        Recorded views come in a fresh random order per round, so that every one is seen equally often. ``beside``: the
+        virtual view comes after the recorded one, not in its place."""
         generator = seeds.numpy_rng(run_seed, step, "view")
         if self.virtual and generator.random() < virtual_probability:
             drawn = self.virtual[int(generator.integers(len(self.virtual)))]
@@ -199,11 +189,8 @@ class ViewSet:
 
 
 def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
-    """Training frames of the named cameras (empty = all).
-
-    Raises:
-        UsageError: an unknown camera, or no training frame at all.
-    """
+    """Training frames of the named cameras (empty = all). UsageError: an unknown camera, or no training frame at
+    all."""
     for name in cameras:
         if name not in scene.cameras:
             raise UsageError(
@@ -290,11 +277,7 @@ def _read_by_threads(order: Sequence[int], read: Callable[[int], StoredView], do
 
 def virtual_sets(folders: Sequence[Path]) -> dict[str, ObservationSet]:
     """The sets of virtual observations in some folders, of all trajectories or of one, by name; only their indices are
-    read.
-
-    Raises:
-        InputError: a folder has none, two have sets of one name, or one of them holds recorded views.
-    """
+    read. InputError: a folder has none, two have sets of one name, or one of them holds recorded views."""
     sets: dict[str, ObservationSet] = {}
     for path in folders:
         found = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
@@ -303,22 +286,14 @@ def virtual_sets(folders: Sequence[Path]) -> dict[str, ObservationSet]:
                 "this folder holds no finished virtual views", where=str(path), remedy="run `mudg synthesize` first"
             )
         if twice := sorted(set(found) & set(sets)):
-            raise InputError(
-                "two folders hold virtual views of the same name",
-                where=str(path),
-                got=", ".join(twice[:4]),
-                remedy="give one of them",
-            )
+            what = "two folders hold virtual views of the same name"
+            raise InputError(what, where=str(path), got=", ".join(twice[:4]), remedy="give one of them")
         sets |= found
     for found in sets.values():
         if found.kind == "recorded":
-            raise InputError(
-                "recorded views among the virtual ones: held-out views must not be trained on",
-                where=str(found.path),
-                expected="views of kind virtual",
-                got=f"kind recorded, source {found.source}",
-                remedy="give the folder that `mudg synthesize` wrote",
-            )
+            what = "recorded views among the virtual ones: held-out views must not be trained on"
+            got, remedy = f"kind recorded, source {found.source}", "give the folder that `mudg synthesize` wrote"
+            raise InputError(what, where=str(found.path), expected="views of kind virtual", got=got, remedy=remedy)
     return sets
 
 
@@ -474,7 +449,6 @@ def lidar_pixels(view: View, xyz_world: NDArray[np.float32], gap_deg: float) -> 
 # gets is the same to the bit. The system keeps as much of the file in memory as it can spare. Which views a step gets
 # is a function of the step, so threads read those of the next steps beforehand.
 
-
 IN_MEMORY_BYTES = GIB
 """Decoded views of up to this size stay in memory."""
 AHEAD_THREADS = 2
@@ -516,22 +490,15 @@ def virtual_bytes(sets: Mapping[str, ObservationSet]) -> int:
 
 def scratch_folder(count: int, needed: int, folder: Path) -> Path | None:
     """Where ``count`` views of ``needed`` bytes are to be kept: in a file in this folder, or None: in memory. Says
-    which.
-
-    Raises:
-        ResourceError: the disk has less room than the file needs.
-    """
+    which. ResourceError: the disk has less room than the file needs."""
     if needed <= IN_MEMORY_BYTES:
         return None
     free = shutil.disk_usage(folder).free
     if free < needed:
-        raise ResourceError(
-            "the disk has too little room for the decoded views",
-            where=str(folder),
-            expected=f"{needed / GIB:.1f} GiB free for {count} views while the fit runs",
-            got=f"{free / GIB:.1f} GiB",
-            remedy="free disk space, choose --out on another disk, or lower --width-px",
-        )
+        what = "the disk has too little room for the decoded views"
+        expected = f"{needed / GIB:.1f} GiB free for {count} views while the fit runs"
+        remedy = "free disk space, choose --out on another disk, or lower --width-px"
+        raise ResourceError(what, where=str(folder), expected=expected, got=f"{free / GIB:.1f} GiB", remedy=remedy)
     log.info(
         f"views: {count}, {needed / GIB:.1f} GiB decoded: kept in a scratch file in {folder}, gone when the fit ends"
     )
@@ -661,19 +628,14 @@ def chosen_ahead(
 # Their finest structure is blurred by the diffusion model and teaches a scene little (docs/supervision.md), and a step
 # costs about as much per pixel as it costs per Gaussian.
 
-
 LEAST_PX: Final = 96
 """No side of a halved view is shorter: smaller views stay as they are."""
 
 
 class HalvedViews:
     """Gives the steps up to ``until`` virtual views at half their size; of views above ``WHOLE_PIXELS`` all steps, for
-    want of memory.
-
-    Args:
-        until: 0 leaves every view as it is.
-        keep: halved views stay in memory, a quarter of what the views themselves take.
-    """
+    want of memory. ``until``: 0 leaves every view as it is. ``keep``: halved views stay in memory, a quarter of what
+    the views themselves take."""
 
     def __init__(self, until: float, keep: bool) -> None:
         self._until = until

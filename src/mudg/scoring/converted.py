@@ -27,13 +27,9 @@ Names = Mapping[str, str]
 @dataclass(frozen=True)
 class ScoreNetwork:
     """A network of the scores: what its files are called when they are used, and how its tensors are found in a
-    published file.
-
-    Args:
-        flag: of ``mudg score``. check: tensors -> nothing, or an InputError. named: tensors of a file -> those of the
-            network under the names that are written.
-        published: SHA-256 of published files -> their names.
-    """
+    published file. ``flag``: of ``mudg score``. ``check``: tensors -> nothing, or an InputError. ``named``: tensors of
+    a file -> those of the network under the names that are written. ``published``: SHA-256 of published files -> their
+    names."""
 
     flag: str
     check: Callable[[Mapping[str, Tensor], str], object]

@@ -74,11 +74,7 @@ def read_detections(path: Path) -> dict[str, list[Detection]]:
 
     Understood are COCO's result form, a list whose boxes are in pixels of images resized to 480 x 320, as the published
     score does it; and a mapping with ``images`` (id, file_name, width, height) and ``annotations``, whose boxes are in
-    pixels of these images.
-
-    Raises:
-        InputError: anything else.
-    """
+    pixels of these images. InputError: anything else."""
     content = store.read_json(path)
     sizes: dict[Any, tuple[str, float, float]] = {}
     if isinstance(content, Mapping):

@@ -172,13 +172,10 @@ PairDistance = Callable[[metrics.Pair], float | None]
 
 @dataclass(frozen=True)
 class ScoredTrajectory:
-    """One trajectory to score.
-
-    Args:
-        name: trajectory name. camera: its camera. shift_m: 0 = the recorded path, None = neither it nor a plain shift.
-        views: at the common size. frames: the recorded frame of each view on the recorded path, else None.
-        sets, indices: the methods that have it, and which of their views stand beside ``views``.
-    """
+    """One trajectory to score. ``name``: trajectory name. ``camera``: its camera. ``shift_m``: 0 = the recorded path,
+    None = neither it nor a plain shift. ``views``: at the common size. ``frames``: the recorded frame of each view on
+    the recorded path, else None. ``sets``, ``indices``: the methods that have it, and which of their views stand beside
+    ``views``."""
 
     name: str
     camera: str
@@ -210,15 +207,10 @@ class ScoredTrajectory:
 
 @dataclass(frozen=True)
 class Reference:
-    """What every method is compared with, and how.
-
-    Args:
-        truth, baseline: of any view. held_out: ids of the recorded frames that count.
-        distances: what computes the rows of the table that need weights, at ``distance_views`` views of a trajectory (0
-            = all).
-        facts: makes what is known of views beside their true image. vehicles: numbers in instance maps, and their
-            tracks.
-    """
+    """What every method is compared with, and how. ``truth``, ``baseline``: of any view. ``held_out``: ids of the
+    recorded frames that count. ``distances``: what computes the rows of the table that need weights, at
+    ``distance_views`` views of a trajectory (0 = all). ``facts``: makes what is known of views beside their true image.
+    ``vehicles``: numbers in instance maps, and their tracks."""
 
     truth: Truth
     baseline: Baseline | None

@@ -74,17 +74,10 @@ def write_scores(
     fused: Path | None = None,
     truth: Path | None = None,
 ) -> dict[str, Any]:
-    """Score every trajectory of every method; returns a summary.
-
-    Args:
-        scene: the scene that was rendered. methods: name -> folder of observation folders (output of render or
-            synthesize).
-        fused: clouds made by fuse, for the baseline; without them there is none.
-        truth: folder of ``DrawTruth`` for this scene, to be read instead of drawing the truth again.
-
-    Raises:
-        InputError: nothing to score, or methods disagree about a trajectory's views.
-    """
+    """Score every trajectory of every method; returns a summary. ``scene``: the scene that was rendered. ``methods``:
+    name -> folder of observation folders (output of render or synthesize). ``fused``: clouds made by fuse, for the
+    baseline; without them there is none. ``truth``: folder of ``DrawTruth`` for this scene, to be read instead of
+    drawing the truth again. InputError: nothing to score, or methods disagree about a trajectory's views."""
     recorded, out = read_scene(scene), work.path
     trajectories = trajectories_of(config, recorded, methods)
     reference = Reference(

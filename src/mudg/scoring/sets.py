@@ -399,7 +399,6 @@ def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> VideoDistances:
 # give is read: ``METHOD/TRAJECTORY.safetensors`` and ``recorded/CAMERA.safetensors``, each with one tensor ``features``
 # [clips, values].
 
-
 RECORDED: Final = "recorded"
 TRUTH: Final = "truth"
 
@@ -477,15 +476,10 @@ Rows = NDArray[np.float32]
 
 class EmbeddingScores:
     """A distance of counted views from the recorded frames, with its floors, and what else an embedding tells of a
-    video, for every trajectory of a scene.
-
-    Args:
-        scene: whose recorded frames are the reference. files: makes embeddings. name: of the metric. distance: of two
-            sets.
-        further: other values by name, or why there is none, from the embeddings of all views and of the recorded
-            frames, and pairs of both at the same time.
-        made: how the numbers are made.
-    """
+    video, for every trajectory of a scene. ``scene``: whose recorded frames are the reference. ``files``: makes
+    embeddings. ``name``: of the metric. ``distance``: of two sets. ``further``: other values by name, or why there is
+    none, from the embeddings of all views and of the recorded frames, and pairs of both at the same time. ``made``: how
+    the numbers are made."""
 
     def __init__(
         self,

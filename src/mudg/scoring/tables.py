@@ -99,16 +99,11 @@ def document(
     rows: Mapping[str, Mapping[str, Any]],
     made: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Everything ``metrics.json`` holds.
-
-    Args:
-        scene: what was scored. exact: whether truth exists at any view.
-        trajectories: as JSON values. methods: in the order of the tables.
-        results: one entry per method and trajectory. rows: title, unit, better and needs of each metric.
-        made: how the numbers were made: ``depth_limit_m``, beyond which depths do not count; ``anchors``; and by the
-            entries of ``SET_METRICS``, ``detections`` and ``lpips`` what is known of their metrics; entries that are
-            missing were not computed.
-    """
+    """Everything ``metrics.json`` holds. ``scene``: what was scored. ``exact``: whether truth exists at any view.
+    ``trajectories``: as JSON values. ``methods``: in the order of the tables. ``results``: one entry per method and
+    trajectory. ``rows``: title, unit, better and needs of each metric. ``made``: how the numbers were made:
+    ``depth_limit_m``, beyond which depths do not count; ``anchors``; and by the entries of ``SET_METRICS``,
+    ``detections`` and ``lpips`` what is known of their metrics; entries that are missing were not computed."""
     depth_limit_m, distributions, videos = made["depth_limit_m"], made.get("distributions"), made.get("videos")
     held_out = len(scene.frames_in("test"))
     limit = f"{depth_limit_m:g} m"

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast, get_args
 
 from mudg.base.errors import UsageError
 from mudg.base.layout import MODEL_FILES
 from mudg.steps.engine import Make, Output, paths_of
-from mudg.steps.step import SCENE, Flag
+from mudg.steps.step import SCENE, Flag, flag_name, hint_of
 
 if TYPE_CHECKING:
     from mudg.base.run_folder import VerbOutput
-    from mudg.gaussians.settings import FitConfig
+    from mudg.baselines.settings import MethodConfig
+
+
+def _dotted(values: Mapping[str, Any], path: str = "") -> Iterator[str]:
+    """Names of nested values, with dots."""
+    for name, value in values.items():
+        yield from _dotted(value, f"{path}{name}.") if isinstance(value, Mapping) else (f"{path}{name}",)
 
 
 class Fit(Output):
@@ -31,6 +38,7 @@ class Fit(Output):
     )
     smaller = "smaller images (mudg ingest --resolution), fewer Gaussians (--start.gaussians, --densify.max-gaussians)"
     result = "model"
+    choice: ClassVar[str] = "method"
     version = 3
     files = (*MODEL_FILES, "appearance.json", "appearance.safetensors", "field.safetensors", "preview/*.png", "steps/")
     short = ("method", "iterations", "cameras", "width_px", "sh_degree", "seed", "device", "densify.max_gaussians")
@@ -44,11 +52,29 @@ class Fit(Output):
     start_from: Annotated[Path | None, Flag("FOLDER", "", "start_from")] = None
     """Finished fit of method street_gaussians to the same scene, to continue for `iterations` more steps. Virtual views
     are used from the first of them on."""
-    settings: FitConfig
+    settings: MethodConfig
 
     def required(self) -> tuple[str, ...]:
         alone = self.reads_scene_alone or (self.scene / "scene.json").exists()
         return () if alone else ("fused",)
+
+    @classmethod
+    def settings_from(cls, inputs: Mapping[str, Any], file: Path | None, given: Mapping[str, Any]) -> MethodConfig:
+        """UsageError for a setting that was given and does not apply to the method."""
+        settings = super().settings_from(inputs, file, given)
+        for name in _dotted(given):
+            if not cls.suits(settings.method, name):
+                own = [method for method in get_args(hint_of(type(settings), "method")) if cls.suits(method, name)]
+                what, remedy = f"this setting does not apply to --method {settings.method}", "leave it out"
+                raise UsageError(what, where=flag_name(name), expected=f"one of {', '.join(own)}", remedy=remedy)
+        return settings
+
+    @classmethod
+    def suits(cls, choice: str, name: str) -> bool:
+        """See ``Step``: settings of a method."""
+        from mudg.gaussians.settings import METHODS
+
+        return METHODS[choice].has(name)
 
     @property
     def reads_scene_alone(self) -> bool:
@@ -96,17 +122,19 @@ class Fit(Output):
             from mudg.baselines.emernerf import fit_radiance
 
             return partial(fit_radiance, self.settings, self.scene, choose_device(self.settings.device, "fit"))
+        from mudg.core.raster.rasterize import drawing_device
         from mudg.gaussians import fit
+        from mudg.gaussians.settings import METHODS
         from mudg.gaussians.storage import StartFit
         from mudg.gaussians.views import virtual_sets
 
         virtual, begun = {}, None if self.start_from is None else StartFit.of_folder(self.start_from, inputs)
         inputs |= {} if begun is None else {"start": begun.digest}
-        if fit.learns_virtual(self.settings.method):
+        if METHODS[self.settings.method].learns_virtual:
             virtual = virtual_sets(self.observations)
             named = {name: path for name, path in paths_of(self).items() if name.startswith("observations")}
             inputs |= self.digests(named)
         inputs |= self.digests({"lpips_weights": self.settings.virtual.lpips_weights})
-        fit.check_device(self.settings)
+        drawing_device(self.settings.device, "fit", self.settings.raster)  # refused before anything is written
         given = fit.FitInputs(self.scene, cast("Path", self.fused), virtual, begun)
         return partial(fit.write_fit, self.settings, given)

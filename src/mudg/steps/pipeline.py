@@ -19,8 +19,8 @@ from mudg.base.memory import Meter, Usage, folder_bytes, in_words
 from mudg.base.records import ForeignRecord, Number, parse_record
 from mudg.base.run_folder import is_temporary, locked, refuse_overlap
 from mudg.base.versions import environment, version
+from mudg.baselines.settings import MethodConfig
 from mudg.diffusion.settings import SynthesizeConfig
-from mudg.gaussians.settings import FitConfig
 from mudg.steps.engine import Output
 from mudg.steps.fit import Fit
 from mudg.steps.ingest import Annotate, Fuse, Ingest
@@ -37,7 +37,7 @@ CONTINUED_SHARE = 0.5
 """Further steps of the fit with diffusion, as a share of those of the fit that it continues."""
 
 
-def fits_of(config: FitConfig, continued: bool = True) -> tuple[FitConfig, FitConfig]:
+def fits_of(config: MethodConfig, continued: bool = True) -> tuple[MethodConfig, MethodConfig]:
     """Settings of the chain's two fits: the one on recorded views, and the one under virtual views, which goes on with
     it unless ``continued`` is off."""
     further = max(1, round(CONTINUED_SHARE * config.iterations)) if continued else config.iterations
@@ -122,7 +122,7 @@ def _write_viewer(out: Path) -> Path:
     return view.write_page(page, out / VIEWER, (out / VIEWER).with_name(f"{Path(VIEWER).stem}_page"))["page"]
 
 
-def refuse_missing(generator: SynthesizeConfig, fit: FitConfig, flag: str = "--synthesize.model") -> None:
+def refuse_missing(generator: SynthesizeConfig, fit: MethodConfig, flag: str = "--synthesize.model") -> None:
     """UsageError where weights that are not shipped are asked for and not given; InputError where there is no diffusion
     model. Before anything is written: the first of these is needed only after a fit. ``flag``: what names the diffusion
     model on this command line."""

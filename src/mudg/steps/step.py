@@ -79,6 +79,8 @@ class Step:
     """Inputs that come from the run at `scene` where they are not given."""
     parts: ClassVar[Mapping[str, str]] = {}
     """First words that choose what the verb does, each with a page of help of its own, and what each does."""
+    choice: ClassVar[str] = ""
+    """The setting whose value says which other settings apply (`suits`)."""
     if typing.TYPE_CHECKING:
         __dataclass_fields__: ClassVar[dict[str, dataclasses.Field[Any]]]
 
@@ -159,6 +161,11 @@ class Step:
         return True
 
     @classmethod
+    def suits(cls, choice: str, name: str) -> bool:
+        """Whether a setting, by its dotted name, applies where `choice` has this value."""
+        return True
+
+    @classmethod
     def build(
         cls, values: Mapping[str, Any], settings: Mapping[str, Any] | None = None, file: Path | None = None
     ) -> Self:
@@ -212,11 +219,11 @@ HOMES: Final[Mapping[str, str]] = {
     "BatchConfig": "mudg.fleet.settings",
     "ConvertConfig": "mudg.diffusion.settings",
     "DatasetConfig": "mudg.datasets.settings",
-    "FitConfig": "mudg.gaussians.settings",
     "FuseConfig": "mudg.scene.settings",
     "HarmonizeConfig": "mudg.diffusion.settings",
     "IngestConfig": "mudg.formats.settings",
     "LearnConfig": "mudg.diffusion.settings",
+    "MethodConfig": "mudg.baselines.settings",
     "ServeConfig": "mudg.sim.settings",
     "SynthesizeConfig": "mudg.diffusion.settings",
     **dict.fromkeys(("BenchConfig", "BenchOwn"), "mudg.benchmarks.settings"),

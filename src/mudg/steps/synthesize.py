@@ -132,10 +132,11 @@ def adapt_model(plan: PlannedAdaptation, work: RunDir) -> dict[str, Any]:
 
 def fit_scene(settings: FitConfig, scene: Path, fused: Path | None, out: Path) -> None:
     """Fuse a scene, unless it has clouds, and fit it."""
+    from mudg.baselines.settings import MethodConfig
     from mudg.scene.settings import FuseConfig
 
     fused = fused or Fuse(scene=scene, out=out / "fuse", settings=FuseConfig()).run()
-    Fit(scene=scene, fused=fused, out=out / "fit", settings=settings).run()
+    Fit(scene=scene, fused=fused, out=out / "fit", settings=MethodConfig(**vars(settings))).run()
 
 
 class Synthesize(Output):
