@@ -277,3 +277,37 @@ def overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
     width, height = min(a[2], b[2]) - max(a[0], b[0]), min(a[3], b[3]) - max(a[1], b[1])
     both = max(width, 0) * max(height, 0)
     return both / ((a[2] - a[0]) * (a[3] - a[1]) + (b[2] - b[0]) * (b[3] - b[1]) - both)
+
+
+def test_nuscenes_tables_refer_to_each_other_and_boxes_lie_where_they_are(
+    run: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out = write_set(run, "nuscenes", tmp_path / "nuscenes", cameras=("front",), shifts_m=(0.0, 0.5), least_pixels=1)
+    tables = {path.stem: json.loads(path.read_text()) for path in (out / "v1.0-mini").glob("*.json")}
+    known = {name: {row["token"]: row for row in rows} for name, rows in tables.items()}
+    assert all(len(known[name]) == len(rows) for name, rows in tables.items())
+    assert [scene["name"] for scene in tables["scene"]] == ["scene-recorded", "scene-shift+0.5"]
+    for name, rows in tables.items():
+        for row in rows:
+            for key, value in row.items():
+                target = key.removesuffix("_token")
+                if key.endswith("_token") and target in known:
+                    assert value in known[target], f"{name}.{key}"
+                if key in ("prev", "next") and value:
+                    assert known[name][value][{"prev": "next", "next": "prev"}[key]] == row["token"]
+    lines = {line["view"]: line for line in map(json.loads, (out / "provenance.jsonl").read_text().splitlines())}
+    matrix = lambda row: geometry.from_rotation_translation(
+        geometry.matrix_from_quaternion(row["rotation"]), row["translation"]
+    )
+    for row in tables["sample_data"]:
+        ego, mount = (
+            known["ego_pose"][row["ego_pose_token"]],
+            known["calibrated_sensor"][row["calibrated_sensor_token"]],
+        )
+        ending, _, index = row["filename"].removesuffix(".png").split("__")[1:]
+        line = lines[f"front_{ending}/{index}"]
+        assert np.abs(matrix(ego) @ matrix(mount) - np.array(line["world_from_camera"])).max() < 1e-9
+        assert (out / row["filename"]).is_file()
+        boxes = [one for one in tables["sample_annotation"] if one["sample_token"] == row["sample_token"]]
+        places = sorted(tuple(np.round(one["translation"], 6)) for one in boxes)
+        assert places == sorted(tuple(np.round(one["position_world_m"], 6)) for one in line["objects"])

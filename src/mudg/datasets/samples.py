@@ -71,7 +71,7 @@ class LabelledView:
     Args:
         name: of its trajectory and number, such as ``front_shift+2.0/000003``. layers: as in ``CameraReply``;
             ``instances`` u16[H, W] also marks parked objects. boxes: of all objects with at least part of their box in
-            the image. trust: see ``Trust``.
+            the image. trust: see ``Trust``. mount: vehicle-from-camera f64[4, 4]; None: the log does not tell.
     """
 
     name: str
@@ -79,6 +79,7 @@ class LabelledView:
     layers: Mapping[str, NDArray[Any]]
     boxes: tuple[ObjectBox, ...]
     trust: Trust
+    mount: NDArray[np.float64] | None = None
 
 
 class Labeller:
@@ -135,7 +136,16 @@ class Labeller:
         instances = self._instances(view, reply)
         drawn = {**reply.layers, "instances": instances}
         boxes = tuple(self._boxes(view, now, drawn))
-        return LabelledView(name, view, {layer: drawn[layer] for layer in layers}, boxes, reply.trust)
+        mount = self.mount(camera.name)
+        return LabelledView(name, view, {layer: drawn[layer] for layer in layers}, boxes, reply.trust, mount)
+
+    def mount(self, camera: str) -> NDArray[np.float64] | None:
+        """Vehicle-from-camera f64[4, 4] of a camera of the log, at its first frame with a vehicle pose."""
+        for frame in self.scene.frames_of(camera) if camera in self.scene.cameras else ():
+            ego = self.scene.ego.pose_at(frame.view.time_s)
+            if ego is not None:
+                return geometry.invert(ego) @ frame.view.world_from_cam
+        return None
 
     def _instances(self, view: View, reply: CameraReply) -> NDArray[np.uint16]:
         """Numbers of all objects, u16[H, W]: those drawn, and parked ones by their boxes."""

@@ -21,7 +21,7 @@ from mudg.base.errors import ResourceError, UsageError
 from mudg.base.memory import in_words
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Trajectory, View
-from mudg.datasets import coco, kitti
+from mudg.datasets import coco, kitti, nuscenes
 from mudg.datasets.samples import LabelledView, Labeller, ObjectBox
 from mudg.datasets.settings import DatasetConfig
 from mudg.sim.session import Layer, Session
@@ -51,6 +51,7 @@ class Format:
 FORMATS: Final[Mapping[str, Format]] = {
     "kitti": Format(("rgb",), kitti.FILES, kitti.write_view, kitti.write_whole),
     "coco": Format(("rgb", "classes", "instances"), coco.FILES, coco.write_view, coco.write_whole),
+    "nuscenes": Format(("rgb",), nuscenes.FILES, nuscenes.write_view, nuscenes.write_whole),
 }
 
 

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class Dataset(Output):
-    """Write labelled images of a reconstruction as a data set: kitti or coco."""
+    """Write labelled images of a reconstruction as a data set: kitti, coco or nuscenes."""
 
     section = "other programs"
     examples = (
@@ -27,7 +27,7 @@ class Dataset(Output):
     result = "dataset"
     format: Annotated[str, Flag("FORMAT", "first")]
     """kitti: images, calibration and 3D boxes as in KITTI's object benchmark. coco: instances with masks, and panoptic
-    segmentation."""
+    segmentation. nuscenes: all tables and images of a release, every path a scene."""
     run_folder: Annotated[Path, RUN]
     """Folder of a finished mudg run, or of a fit (with --scene)."""
     scene: Annotated[Path | None, Flag("FOLDER", "", "scene")] = None

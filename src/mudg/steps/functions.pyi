@@ -232,10 +232,10 @@ def dataset(
     farthest_seen_deg: float = 180.0,
     device: str = 'auto',
 ) -> Any:
-    """Write labelled images of a reconstruction as a data set: kitti or coco.
+    """Write labelled images of a reconstruction as a data set: kitti, coco or nuscenes.
 
     Args:
-        format: kitti: images, calibration and 3D boxes as in KITTI's object benchmark. coco: instances with masks, and panoptic segmentation.
+        format: kitti: images, calibration and 3D boxes as in KITTI's object benchmark. coco: instances with masks, and panoptic segmentation. nuscenes: all tables and images of a release, every path a scene.
         run_folder: Folder of a finished mudg run, or of a fit (with --scene).
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
