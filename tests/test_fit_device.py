@@ -257,8 +257,8 @@ def test_densification_brings_no_rows_back(plain_fit):
     """Rows are chosen, copied, moved and dropped there; counts come back, and the only large thing that goes there is
     noise."""
     draw = torch.Generator().manual_seed(0)
-    gradient = DensifySettings(1, 9, 1, max_rows=5000, prune_opacity=0.1)
-    chain_of_copies = McmcSettings(1, 9, 1, max_rows=5000, dead_opacity=0.2)
+    gradient = DensifySettings(1, 9, 1, max_rows=5000, least_opacity=0.1)
+    chain_of_copies = McmcSettings(1, 9, 1, max_rows=5000, least_opacity=0.2)
     model = fit.load_model(plain_fit)
     rows = len(model.table)
     seen_rows = DensifyStats(torch.rand(rows, generator=draw) * 4e-3, torch.ones(rows))

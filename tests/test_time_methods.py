@@ -39,7 +39,7 @@ from mudg.gaussians import views as fit_views
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
 from mudg.gaussians.recipes import RECIPES
-from mudg.gaussians.settings import METHODS, PUBLISHED
+from mudg.gaussians.settings import METHODS, PUBLISHED, WEIGHTS
 from mudg.gaussians.start import columns_from_points
 from mudg.scene import fuse
 from mudg.scene.clouds import read_fused, write_fused
@@ -613,9 +613,9 @@ def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_pat
 @pytest.mark.parametrize("method", RECIPES)
 def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
     fit_to_world = partial(Fit, scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit")
-    for weight in METHODS[method].weights:
+    for weight in WEIGHTS.get(method, ()):
         with pytest.raises(UsageError, match="published weights of its own"):
-            fit_to_world(settings=settings(method, **{f"loss__{weight}": 0.33})).run()
+            fit_to_world(settings=settings(method, **{weight.replace(".", "__"): 0.33})).run()
     with pytest.raises(UsageError, match="densifies by gradients"):
         fit_to_world(settings=settings(method, densify__kind="mcmc")).run()
     (tmp_path / "other").mkdir()
