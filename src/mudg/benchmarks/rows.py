@@ -304,6 +304,11 @@ def chain_settings(config: BenchConfig, preset: PresetName) -> dict[str, Any]:
     }
 
 
+def model_settings(config: BenchConfig) -> dict[str, Any]:
+    """Iterations, seed and model of a benchmark of complete methods, for ``bench.json``."""
+    return {"iterations": config.iterations, "seed": config.seed, "model": model_files.digest(config.model)}
+
+
 def changed_settings(config: BenchConfig, usual: BenchConfig) -> list[str]:
     """Dotted names of the settings in which a configuration differs from another."""
     lines = configuration.differences(configuration.to_dict(usual), configuration.to_dict(config))
