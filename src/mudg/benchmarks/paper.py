@@ -56,7 +56,7 @@ from mudg.core.metrics import METRICS
 from mudg.diffusion import model_files as mdm_files
 from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.settings import METHODS
-from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, compared, distances
+from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, distances, video_entry
 from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
 from mudg.steps.settings import PresetName
 
@@ -273,7 +273,7 @@ def pooled(logs: Sequence[Facts], out: Path) -> dict[str, dict[str, Values]]:
                     continue
                 cells = result.setdefault(row, {}).setdefault(place, {})
                 if entry == "videos":
-                    cells["fvd"] = {"mean": compared(made, reference)["fvd"], "standard_error": None}
+                    cells["fvd"] = {"mean": video_entry(made, reference)["values"]["fvd"], "standard_error": None}
                 else:
                     both = distances(made, reference)
                     cells["fid"] = {"mean": round(both.fid, 6), "standard_error": None}
