@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from mudg.base import config as configuration
 from mudg.baselines.settings import MethodConfig
+from mudg.gaussians.settings import FitConfig
+from mudg.steps.fit import Fit
 
 
 def fit_config(**changes: Any) -> MethodConfig:
@@ -17,3 +21,8 @@ def fit_config(**changes: Any) -> MethodConfig:
 
 SMALL_RADIANCE = {"radiance__size": "tiny"}
 """A radiance field of the smallest networks."""
+
+
+def fit_to(world: Mapping[str, Path], out: Path, settings: FitConfig, **more: Any) -> Fit:
+    """A fit to the scene and the clouds of a world."""
+    return Fit(scene=world["scene"], fused=world["fuse"], out=out, settings=settings, **more)

@@ -25,7 +25,7 @@ from mudg.baselines.emernerf import load_field, save_field
 from mudg.baselines.emernerf_field import Budget
 from mudg.core.table import Table
 from mudg.diffusion import model_files, published
-from mudg.gaussians.appearance import RECORDED_COLOR, Appearance
+from mudg.gaussians.appearance import COLOR, Appearance
 from mudg.gaussians.storage import StartFit, all_classes, kind_of, load_appearance, save_appearance, save_model
 from mudg.labels import street_net
 from mudg.steps.fitted import FittedScene
@@ -119,7 +119,7 @@ def test_damaged_tensors_of_a_fitted_scene_end_in_words(name: str, nth: int, fit
 
 
 def saved_appearance(folder: Path) -> Path:
-    made = Appearance({RECORDED_COLOR: ("front", "left")}, {RECORDED_COLOR: Table({"gain": torch.zeros(2, 3)})})
+    made = Appearance({COLOR: ("front", "left")}, {COLOR: Table({"gain": torch.zeros(2, 3)})})
     save_appearance(made, folder)
     load_appearance(folder)
     return folder / "appearance.json"

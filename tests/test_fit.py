@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
+from fit_settings import fit_config, fit_to
 from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg import native
@@ -83,20 +83,12 @@ def mean_psnr(folder: Path, left_m: float = 0.0) -> float:
 @pytest.fixture(scope="module")
 def learnt(world, tmp_path_factory) -> Path:
     """What 150 steps give."""
-    return Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
-        out=tmp_path_factory.mktemp("learnt") / "fit",
-        settings=settings(iterations=150),
-    ).run()
+    return fit_to(world, tmp_path_factory.mktemp("learnt") / "fit", settings(iterations=150)).run()
 
 
 def test_it_learns(world, learnt, tmp_path):
     """Some 150 steps from round grey blobs must clearly beat the start, in colour, depth and semantics."""
-    start, end = (
-        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "start", settings=settings(iterations=1)).run(),
-        learnt,
-    )
+    start, end = (fit_to(world, tmp_path / "start", settings(iterations=1)).run(), learnt)
     assert mean_psnr(end) > mean_psnr(start) + 5.0
     assert mean_psnr(end) > 21.0
     view = view_at(0.3, camera(width=SIZE[0], height=SIZE[1]))
@@ -122,12 +114,10 @@ def test_the_moving_car_is_where_its_track_says(learnt):
 
 
 def test_same_in_same_out(world, tmp_path):
-    first = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "a", settings=settings(iterations=12)).run()
-    second = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "b", settings=settings(iterations=12)).run()
+    first = fit_to(world, tmp_path / "a", settings(iterations=12)).run()
+    second = fit_to(world, tmp_path / "b", settings(iterations=12)).run()
     assert fitted_bytes(first) == fitted_bytes(second)
-    other = Fit(
-        scene=world["scene"], fused=world["fuse"], out=tmp_path / "c", settings=settings(iterations=12, seed=1)
-    ).run()
+    other = fit_to(world, tmp_path / "c", settings(iterations=12, seed=1)).run()
     assert fitted_bytes(other) != fitted_bytes(first)
 
 
@@ -143,13 +133,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
         assert [step for step in range(1, 27) if schedule.reset_due(step)] == [12]
     assert [step for step in range(1, 27) if schedule.due(step)] == ([10] if densify == "gradient" else [10, 20])
     assert config.virtual.start * config.iterations == pytest.approx(3.9)
-    step = Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
-        observations=(world["virtual"],),
-        out=tmp_path / "whole",
-        settings=config,
-    )
+    step = fit_to(world, tmp_path / "whole", config, observations=(world["virtual"],))
     whole = step.run()
 
     adam_step, parts = fit.adam_step, tmp_path / "parts"
@@ -172,7 +156,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
 def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_path, monkeypatch, densify):
     """Row counts kept between densifications, and any number of threads: the same bytes."""
     config = settings(iterations=22, densify__kind=densify)
-    first = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "a", settings=config).run()
+    first = fit_to(world, tmp_path / "a", config).run()
 
     def counted_again(model):
         return torch.bincount(model.table.labels["node"].long(), minlength=len(model.nodes)).tolist()
@@ -182,7 +166,7 @@ def test_results_depend_neither_on_threads_nor_on_what_is_remembered(world, tmp_
     native.set_threads(3) if native.library() is not None else None
     torch.set_num_threads(2)
     try:
-        second = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "b", settings=config).run()
+        second = fit_to(world, tmp_path / "b", config).run()
         assert torch.get_num_threads() == 2
     finally:
         native.set_threads(before) if native.library() is not None else None
@@ -194,18 +178,9 @@ def test_the_kinds_of_densification_differ_and_none_keeps_the_rows(world, tmp_pa
         kind: settings(iterations=44, densify__max_gaussians=1600, densify__kind=kind)
         for kind in ("gradient", "mcmc", "none")
     }
-    made = {
-        kind: Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / kind, settings=config).run()
-        for kind, config in configs.items()
-    }
+    made = {kind: fit_to(world, tmp_path / kind, config).run() for kind, config in configs.items()}
     rows = {kind: len(fit.load_model(folder).table) for kind, folder in made.items()}
-    start = len(
-        fit.load_model(
-            Fit(
-                scene=world["scene"], fused=world["fuse"], out=tmp_path / "start", settings=settings(iterations=1)
-            ).run()
-        ).table
-    )
+    start = len(fit.load_model(fit_to(world, tmp_path / "start", settings(iterations=1)).run()).table)
     assert rows["none"] == start
     assert start < rows["mcmc"] <= 1600
     assert start < rows["gradient"] <= 1600
@@ -239,12 +214,7 @@ def test_regularisers_are_means_of_opacity_and_scale():
 
 
 def test_densification_grows_within_its_cap(world, tmp_path):
-    folder = Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
-        out=tmp_path / "fit",
-        settings=settings(iterations=60, densify__max_gaussians=1600),
-    ).run()
+    folder = fit_to(world, tmp_path / "fit", settings(iterations=60, densify__max_gaussians=1600)).run()
     rows = [
         line["rows"]
         for line in map(store.parse_json, (folder / "log.jsonl").read_text().splitlines(), ["log"] * 99)
@@ -266,12 +236,11 @@ def test_virtual_views_do_not_feed_densification(world, monkeypatch, tmp_path):
 
     monkeypatch.setattr(fit, "rasterize", spy)
     monkeypatch.setattr(fit.DensifyStats, "observe", observe)
-    Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
+    fit_to(
+        world,
+        tmp_path / "fit",
+        settings("mudg_s", virtual__probability=0.5, virtual__start=0.0, checkpoint_every=999),
         observations=(world["virtual"],),
-        out=tmp_path / "fit",
-        settings=settings("mudg_s", virtual__probability=0.5, virtual__start=0.0, checkpoint_every=999),
     ).run()
     assert {absgrad for width, absgrad in kinds if width == 30} == {False}
     assert any(absgrad for width, absgrad in kinds if width == SIZE[0])
@@ -279,13 +248,7 @@ def test_virtual_views_do_not_feed_densification(world, monkeypatch, tmp_path):
 
 def test_perfect_virtual_views_help_off_the_path(world, learnt, tmp_path):
     config = settings("mudg_s", iterations=150, virtual__probability=0.4)
-    guided = Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
-        observations=(world["virtual"],),
-        out=tmp_path / "guided",
-        settings=config,
-    ).run()
+    guided = fit_to(world, tmp_path / "guided", config, observations=(world["virtual"],)).run()
     assert mean_psnr(guided, left_m=2.0) > mean_psnr(learnt, left_m=2.0) + 0.3
 
 
@@ -307,7 +270,7 @@ def test_a_non_finite_loss_is_named_and_changes_nothing(world, tmp_path, monkeyp
     )
     monkeypatch.setattr(fit.losses, "sky_map", poisoned)
     with pytest.raises(NumericsError, match=r"'sky' is not finite[\s\S]*front/00000\d, step 5"):
-        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings()).run()
+        fit_to(world, tmp_path / "fit", settings()).run()
     assert stepped == [1, 2, 3, 4]
 
 
@@ -334,16 +297,10 @@ def test_a_non_finite_gradient_is_named_and_never_reaches_the_parameters(world, 
 
 def test_mudg_s_without_virtual_views_is_a_usage_error(world, tmp_path):
     with pytest.raises(UsageError, match="virtual observations"):
-        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings("mudg_s")).run()
+        fit_to(world, tmp_path / "fit", settings("mudg_s")).run()
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="no finished virtual views"):
-        Fit(
-            scene=world["scene"],
-            fused=world["fuse"],
-            observations=(tmp_path / "empty",),
-            out=tmp_path / "fit",
-            settings=settings("mudg_s"),
-        ).run()
+        fit_to(world, tmp_path / "fit", settings("mudg_s"), observations=(tmp_path / "empty",)).run()
 
 
 def test_views_of_several_folders_are_those_of_one_folder_with_all(world, tmp_path):
@@ -351,12 +308,11 @@ def test_views_of_several_folders_are_those_of_one_folder_with_all(world, tmp_pa
     for name in names:
         shutil.copytree(world["virtual"] / name, tmp_path / f"of {name}" / name)
     several = [tmp_path / f"of {name}" if number else world["virtual"] / name for number, name in enumerate(names)]
-    step = Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
+    step = fit_to(
+        world,
+        tmp_path / "whole",
+        settings("mudg_s", iterations=4, virtual__start=0.0),
         observations=(world["virtual"],),
-        out=tmp_path / "whole",
-        settings=settings("mudg_s", iterations=4, virtual__start=0.0),
     )
     together = replace(step, out=tmp_path / "together").run()
     apart = replace(step, out=tmp_path / "apart", observations=tuple(several)).run()
@@ -381,13 +337,7 @@ def test_a_generated_view_of_which_no_pixel_counts_is_no_number(world, tmp_path)
         virtual__beside=False,
         virtual__gaussians=0,
     )
-    folder = Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
-        observations=(tmp_path / "virtual",),
-        out=tmp_path / "fit",
-        settings=config,
-    ).run()
+    folder = fit_to(world, tmp_path / "fit", config, observations=(tmp_path / "virtual",)).run()
     last = [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()][-1]
     assert last["view"].startswith("front_shift") and "psnr" not in last and "loss_virtual_color" in last
 
@@ -400,19 +350,13 @@ def test_recorded_observations_are_refused_as_virtual_views(world, tmp_path):
     with ObservationWriter(sets / "front_recorded", "front_recorded", "truth", "recorded") as writer:
         writer.add(replace(truth(view), kind="recorded"))
     with pytest.raises(InputError, match=r"recorded views[\s\S]*front_recorded[\s\S]*mudg synthesize"):
-        Fit(
-            scene=world["scene"],
-            fused=world["fuse"],
-            observations=(sets,),
-            out=tmp_path / "fit",
-            settings=settings("mudg_s"),
-        ).run()
+        fit_to(world, tmp_path / "fit", settings("mudg_s"), observations=(sets,)).run()
     assert not (tmp_path / "fit").exists()
 
 
 def test_unknown_camera_and_no_fit(world, tmp_path):
     with pytest.raises(UsageError, match="no camera named 'rear'"):
-        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(cameras=("rear",))).run()
+        fit_to(world, tmp_path / "fit", settings(cameras=("rear",))).run()
     with pytest.raises(InputError, match="no fitted scene"):
         fit.load_model(tmp_path)
 
@@ -475,12 +419,11 @@ def test_fused_points_give_depth_beside_the_path(world):
 def test_options_of_virtual_views_change_the_fit_and_stay_finite(world, tmp_path):
     usual = settings("mudg_s", iterations=30, densify__max_gaussians=2500, virtual__start=0.0, virtual__probability=0.6)
     folders = [
-        Fit(
-            scene=world["scene"],
-            fused=world["fuse"],
+        fit_to(
+            world,
+            tmp_path / str(n),
+            replace(usual, virtual=replace(usual.virtual, **changes)),
             observations=(world["virtual"],),
-            out=tmp_path / str(n),
-            settings=replace(usual, virtual=replace(usual.virtual, **changes)),
         ).run()
         for n, changes in enumerate(({}, {"lidar_weight": 0.0}, {"ssim_weight": 0.0}))
     ]
@@ -496,13 +439,7 @@ def test_virtual_views_of_the_published_fit_have_the_published_terms_alone(world
     paper = run_preset("paper").fit
     virtual = replace(paper.virtual, perception="filters", start=0.0, probability=0.5)
     config = replace(settings("mudg_s", iterations=12), loss=paper.loss, virtual=virtual)
-    Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
-        observations=(world["virtual"],),
-        out=tmp_path / "fit",
-        settings=config,
-    ).run()
+    fit_to(world, tmp_path / "fit", config, observations=(world["virtual"],)).run()
     assert seen[True] == {"virtual_perceptual", "virtual_depth", "virtual_semantics"}
     assert {"color", "lidar", "sky"} <= seen[False] and "semantics" not in seen[False]
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
+from fit_settings import fit_config, fit_to
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import store
@@ -157,7 +157,7 @@ def test_classes_that_only_virtual_views_show_are_added(world):
 def test_learnt_corrections_of_cameras_are_kept(world, tmp_path):
     changes = {"appearance__cameras": True, "appearance__exposure": "camera"}
     settled = settings("street_gaussians", iterations=12, **changes)
-    plain = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "plain", settings=settled).run()
+    plain = fit_to(world, tmp_path / "plain", settled).run()
     learnt = store.read_tensors(plain / "appearance.safetensors")
     start = continued.StartFit(plain, "")
     names = store.read_json(plain / "appearance.json")["names"]

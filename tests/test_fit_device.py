@@ -15,7 +15,7 @@ from pathlib import Path
 
 import pytest
 import torch
-from fit_settings import fit_config
+from fit_settings import fit_config, fit_to
 from pretend_device import Transfer, pretend_device, transfers
 from test_scene_options import EVERYTHING, written_world
 from test_score_metrics import lpips_state
@@ -190,9 +190,7 @@ def test_a_fit_goes_on_on_the_other_device(world, tmp_path, monkeypatch):
 def plain_fit(world, tmp_path_factory) -> Path:
     """A short fit on the CPU, with the native library."""
     config = fit_config(method="street_gaussians", iterations=30, start__gaussians=120, device="cpu")
-    return Fit(
-        scene=world["scene"], fused=world["fuse"], out=tmp_path_factory.mktemp("fit") / "out", settings=config
-    ).run()
+    return fit_to(world, tmp_path_factory.mktemp("fit") / "out", config).run()
 
 
 class Steps:
@@ -257,8 +255,8 @@ def test_densification_brings_no_rows_back(plain_fit):
     """Rows are chosen, copied, moved and dropped there; counts come back, and the only large thing that goes there is
     noise."""
     draw = torch.Generator().manual_seed(0)
-    gradient = DensifySettings(1, 9, 1, max_rows=5000, prune_opacity=0.1)
-    chain_of_copies = McmcSettings(1, 9, 1, max_rows=5000, dead_opacity=0.2)
+    gradient = DensifySettings(1, 9, 1, max_rows=5000, least_opacity=0.1)
+    chain_of_copies = McmcSettings(1, 9, 1, max_rows=5000, least_opacity=0.2)
     model = fit.load_model(plain_fit)
     rows = len(model.table)
     seen_rows = DensifyStats(torch.rand(rows, generator=draw) * 4e-3, torch.ones(rows))

@@ -121,13 +121,13 @@ def test_clips_floor_and_reasons(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     weights = tmp_path / "weights.safetensors"
     store.write_safetensors(weights, {"any": np.zeros(1, np.float32)})
     scene = read_scene(toy_views.write_scene(tmp_path / "scene"))
-    files = videos.ClipFiles(weights, "videogpt", tmp_path / "features", torch.device("cpu"))
-    found = videos.VideoDistances(scene, files)
+    found = videos.videos_of(ScoreConfig(fvd_weights=str(weights), device="cpu"), scene, tmp_path)
     same = distributions.ImageSet(40, toy_views.colors)
     backwards = distributions.ImageSet(40, lambda n: toy_views.colors(39 - n))
     sets = distributions.TrajectorySets("front_shift+2.0", "front", 48, 32, {"a": same, "b": backwards}, None)
     values = found.of(sets)
-    assert values["a"] == {"fvd": pytest.approx(0.0, abs=1e-5), "n": 4, "n_reference": 4} and values["b"]["fvd"] > 1e-3
+    assert values["a"] == {"values": {"fvd": pytest.approx(0.0, abs=1e-5)}, "n": 4, "n_reference": 4}
+    assert values["b"]["values"]["fvd"] > 1e-3
     (floor,) = found.record()["floors"]
     assert (floor["n"], floor["n_reference"]) == (2, 2)
     sets = {"a": distributions.ImageSet(20, toy_views.colors)}

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
+from fit_settings import fit_config, fit_to
 from pretend_device import pretend_device
 from scipy.spatial import cKDTree
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
@@ -306,13 +306,7 @@ def result_of(folder: Path) -> dict[str, bytes]:
 
 
 def test_a_fit_from_a_file_of_views_is_the_same_fit_also_when_resumed(world, tmp_path, monkeypatch):
-    step = Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
-        observations=(world["virtual"],),
-        out=tmp_path / "whole",
-        settings=settings(),
-    )
+    step = fit_to(world, tmp_path / "whole", settings(), observations=(world["virtual"],))
     usual = replace(step, out=tmp_path / "usual").run()
     monkeypatch.setattr(kept, "IN_MEMORY_BYTES", 0)
     before, adam_step, folder, asked = threads_at_work(), fit.adam_step, tmp_path / "filed", []

@@ -226,8 +226,8 @@ def test_a_stack_never_gets_so_many_members_that_they_are_dead() -> None:
         model.table["logits"][0] = math.log(0.04 / 0.96)
     report = relocate_and_grow(model, 10, SETTINGS, 0)
     alive = torch.sigmoid(model.table["logits"])
-    assert (alive >= SETTINGS.dead_opacity).all()
-    assert report["rows"] == int(math.log(1 - 0.04) / math.log(1 - SETTINGS.dead_opacity)) == len(model.table)
+    assert (alive >= SETTINGS.least_opacity).all()
+    assert report["rows"] == int(math.log(1 - 0.04) / math.log(1 - SETTINGS.least_opacity)) == len(model.table)
     assert report["dropped"] == 40 - report["rows"]
     opaque = scene(static=90, moving=0, dead=tuple(range(1, 90)), opacity=0.97)
     assert relocate_and_grow(opaque, 10, SETTINGS, 0)["rows"] == mcmc.LARGEST_STACK

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config
+from fit_settings import fit_config, fit_to
 from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg.base.errors import InputError, NumericsError
@@ -97,13 +97,7 @@ def fitted_bytes(folder: Path) -> dict[str, bytes]:
 
 def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, tmp_path, monkeypatch):
     config = settings()
-    step = Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
-        observations=(world["virtual"],),
-        out=tmp_path / "whole",
-        settings=config,
-    )
+    step = fit_to(world, tmp_path / "whole", config, observations=(world["virtual"],))
     whole = step.run()
     adam_step = fit.adam_step
 
@@ -133,13 +127,7 @@ def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, 
 
 
 def test_a_saved_scene_renders_as_the_fitted_one(world, tmp_path):
-    folder = Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
-        observations=(world["virtual"],),
-        out=tmp_path / "fit",
-        settings=settings(iterations=6),
-    ).run()
+    folder = fit_to(world, tmp_path / "fit", settings(iterations=6), observations=(world["virtual"],)).run()
     model = fit.load_model(folder)
     fit.save_model(model, tmp_path)
     again = fit.load_model(tmp_path)
@@ -220,9 +208,7 @@ def test_a_picture_that_is_not_finite_is_named(world, tmp_path, monkeypatch):
 
     monkeypatch.setattr(fit_views.StoredView, "as_tensors", poisoned)
     with pytest.raises(NumericsError, match=r"view front/000002, step \d"):
-        Fit(
-            scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings("street_gaussians")
-        ).run()
+        fit_to(world, tmp_path / "fit", settings("street_gaussians")).run()
 
 
 def test_a_virtual_picture_that_is_not_finite_is_refused_when_written(tmp_path):

@@ -22,7 +22,7 @@ from mudg.scene.read import read_scene
 from mudg.scoring import score
 from mudg.scoring import sets as distributions
 from mudg.scoring import tables as score_tables
-from mudg.scoring.sets import Distributions, FeatureFiles, ImageSet, TrajectorySets
+from mudg.scoring.sets import FeatureFiles, ImageSet, TrajectorySets
 from mudg.steps.render import Score
 from mudg.viewer import report as page
 
@@ -132,7 +132,7 @@ def test_features_are_kept_by_content_and_not_computed_twice(tmp_path: Path, qui
 
 def test_sets_of_different_size_are_refused_and_small_ones_have_no_number(tmp_path: Path, quick: Path) -> None:
     scene = read_scene(toy_views.write_scene(tmp_path / "scene"))
-    found = Distributions(scene, FeatureFiles(quick, "tf1", tmp_path / "features", CPU))
+    found = distributions.distributions(scene, FeatureFiles(quick, "tf1", tmp_path / "features", CPU))
     some = {n: ImageSet(n, toy_views.colors) for n in (1, 3, 4)}
     sets = TrajectorySets("front_shift+2.0", "front", 48, 32, {"a": some[4], "b": some[3]}, None)
     with pytest.raises(InputError, match="a: 4, b: 3"):

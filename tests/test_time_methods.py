@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_settings import SMALL_RADIANCE, fit_config
+from fit_settings import SMALL_RADIANCE, fit_config, fit_to
 from pretend_device import pretend_device
 from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
 
@@ -39,7 +39,7 @@ from mudg.gaussians import views as fit_views
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import NodeRows, RigidNode, StaticNode
 from mudg.gaussians.recipes import RECIPES
-from mudg.gaussians.settings import METHODS, PUBLISHED
+from mudg.gaussians.settings import METHODS, PUBLISHED, WEIGHTS
 from mudg.gaussians.start import columns_from_points
 from mudg.scene import fuse
 from mudg.scene.clouds import read_fused, write_fused
@@ -457,9 +457,7 @@ def test_a_fit_learns_reaches_every_column_and_is_read_back(world, tmp_path, mon
         adam_step(model, *rest)
 
     monkeypatch.setattr(fit, "adam_step", spy)
-    folder = Fit(
-        scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, iterations=60)
-    ).run()
+    folder = fit_to(world, tmp_path / "fit", settings(method, iterations=60)).run()
     assert OWN[method] <= reached
     model = fit.load_model(folder)
     view = view_at(0.6, camera(width=SIZE[0], height=SIZE[1]))
@@ -475,7 +473,7 @@ def test_a_fit_learns_reaches_every_column_and_is_read_back(world, tmp_path, mon
 @pytest.mark.parametrize("method", RECIPES)
 def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, method):
     config, stops = settings(method, iterations=14), [11]
-    whole = Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "whole", settings=config).run()
+    whole = fit_to(world, tmp_path / "whole", config).run()
     adam_step = fit.adam_step
 
     def stopped(model, step, *rest):
@@ -486,12 +484,10 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     monkeypatch.setattr(fit, "adam_step", stopped)
     while stops:
         with pytest.raises(KeyboardInterrupt):
-            Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "parts", settings=config).run()
+            fit_to(world, tmp_path / "parts", config).run()
         stops.pop(0)
     monkeypatch.setattr(fit, "adam_step", adam_step)
-    assert fitted_bytes(
-        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "parts", settings=config).run()
-    ) == fitted_bytes(whole)
+    assert fitted_bytes(fit_to(world, tmp_path / "parts", config).run()) == fitted_bytes(whole)
 
 
 @pytest.fixture(scope="module")
@@ -606,16 +602,16 @@ def test_a_cloud_without_boxes_has_the_settings_of_the_one_with_them(tracked_or_
 )
 def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_path, method, changes):
     with pytest.raises(UsageError, match="knows nothing of it"):
-        Fit(scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit", settings=settings(method, **changes)).run()
+        fit_to(world, tmp_path / "fit", settings(method, **changes)).run()
     assert not (tmp_path / "fit").exists()
 
 
 @pytest.mark.parametrize("method", RECIPES)
 def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
     fit_to_world = partial(Fit, scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit")
-    for weight in METHODS[method].weights:
+    for weight in WEIGHTS.get(method, ()):
         with pytest.raises(UsageError, match="published weights of its own"):
-            fit_to_world(settings=settings(method, **{f"loss__{weight}": 0.33})).run()
+            fit_to_world(settings=settings(method, **{weight.replace(".", "__"): 0.33})).run()
     with pytest.raises(UsageError, match="densifies by gradients"):
         fit_to_world(settings=settings(method, densify__kind="mcmc")).run()
     (tmp_path / "other").mkdir()
@@ -651,19 +647,9 @@ def test_help_shows_the_settings_of_a_method_and_others_are_refused(method, flag
 @pytest.mark.parametrize("method", MOVING)
 def test_a_fit_on_another_device_gives_the_same_numbers(world, tmp_path, method):
     small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch"}
-    here = Fit(
-        scene=world["scene"],
-        fused=world["fuse"],
-        out=tmp_path / "here",
-        settings=settings(method, device="cpu", **small),
-    ).run()
+    here = fit_to(world, tmp_path / "here", settings(method, device="cpu", **small)).run()
     with pretend_device():
-        there = Fit(
-            scene=world["scene"],
-            fused=world["fuse"],
-            out=tmp_path / "there",
-            settings=settings(method, device="pretend", **small),
-        ).run()
+        there = fit_to(world, tmp_path / "there", settings(method, device="pretend", **small)).run()
     view = view_at(0.6, camera(width=SIZE[0], height=SIZE[1]))
     pictures = [fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb for folder in (here, there)]
     assert metrics.psnr(*pictures) > 45.0

@@ -45,6 +45,7 @@ class DeformationField(StaticNode):
     the log, seconds. ``layers``, ``width``: of the network."""
 
     kind = "deformation"
+    learnt: Table
 
     def __init__(self, name: str, span_s: tuple[float, float], layers: int, width: int, learnt: Table) -> None:
         super().__init__(name)

@@ -59,6 +59,7 @@ class HexPlaneNode(StaticNode):
     all."""
 
     kind = "hexplane"
+    learnt: Table
 
     def __init__(
         self,

@@ -1,46 +1,9 @@
 """Measurements on generated cities, each one folder: ``mudg bench mdm``, ``poses`` and ``edit``.
 
-mdm: the diffusion model on held-out cities, 2, 3 and 4 m beside the recorded path, against exact truth: with and
-without given classes, at several numbers of steps; and the seam between windows of a longer video.
-
-poses: how much of the error of tracked boxes a fit takes out, of logs whose boxes were disturbed by known amounts.
-Three kinds of disturbance, in the frame of the box, all `NOISE_M` along each axis and `NOISE_RAD` of yaw: *noise*,
-drawn anew at every key, as a detector makes it; *drift*, the same noise passed through a Gaussian of `DRIFT_S`, as a
-tracking filter leaves it; an *offset*, drawn once per object, as a labeller makes it. Boxes stay disturbed for fusing
-too. An object is its Gaussians in the box frame and the poses of that frame. Any one rigid motion may be taken from the
-poses and given to the Gaussians without changing a single picture. So poses are compared after the best such motion
-(shift and yaw, one per object) is taken out, before and after fitting alike:
-
-    recovered = 1 - rms(after) / rms(before)
-
-over the keys of frames in which the object shows at least `SEEN_PX` pixels, held-out frames included. Of an offset,
-which is such a motion, nothing can be recovered; there, the test is that pictures do not suffer and boxes do not drift.
-Objects in generated cities move evenly, which flatters smoothing: of independent noise, the smooth path alone (poses
-"smoothed": no picture consulted) takes out most. Drift is the case in which only the pictures can help.
-
-edit: edits of fitted scenes against the city drawn again with the object elsewhere or gone. Of every city the vehicle
-that shows the most pixels is edited in a scene that was fitted to the city as it was. Truth is the same city with that
-vehicle on the edited path (``CityWorld.rearranged``), shadows included. Over frames of the recorded path:
-
-    inside     PSNR in the pixels that the edit changes in the truth (by more than 4/255), against the edited truth; and
-               of the unedited render in the same pixels, against the unedited truth: what the fit can do there at all
-    vehicle    PSNR in all pixels of the vehicle, with the edit and without
-    uncovered  PSNR in those of the changed pixels that show no vehicle any more: what stood behind it, and its shadow
-    outside    share of the other pixels that the edit changes in the render by more than 1/255
-    overlap    intersection over union of the vehicle's pixels in the truth and in the render, where its Gaussians make
-               more than half; and the same without the edit
-    perceptual  perceptual distance in the changed pixels (features of the shipped codec)
-
-With several cities the vehicle of each is also replaced by that of the next one, which knows nothing of this city but
-what `matched_light` tells. Truth is the city with a vehicle of that shape, size and paint on the path of its own, in
-its own light (``CityWorld.recast``). Beside it stands what the fit makes of its own vehicle, which was recorded there.
-light: true mean light of the vehicle over that of the render, in linear light: 1 = as bright as it should be.
-
-With a diffusion model (``--harmonize``) three edits are made in three ways: the fitted scene with the edits; its frames
-with the touched pixels repaired by the model (``editing/harmonised.py``); renders of a fit that goes on for as many
-steps again on an edited drive whose images are such frames. Besides a fit of the same city in which the object was
-never there: what a scene of this size can show at all. `insert` takes the object away and puts its own asset in 3 m
-ahead, so that the truth is that of the move."""
+mdm: the diffusion model on held-out cities beside the recorded path, against exact truth, and the seam between windows
+of a longer video. poses: how much of the error of disturbed boxes a fit takes out, ``1 - rms(after) / rms(before)``
+(docs/scene.md). edit: edits of fitted scenes against the city drawn again with the object elsewhere or gone, vehicles
+of other cities, and what a diffusion model adds (docs/edit.md)."""
 
 from __future__ import annotations
 

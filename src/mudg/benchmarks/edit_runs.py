@@ -1,27 +1,10 @@
 """``mudg bench edit RUN ...``: edits of recorded drives, of which no truth exists, by measures that need none.
 
-On every finished ``mudg run``, seen by its front camera on the recorded path, the moving vehicle ahead that shows the
-most pixels is taken away and moved, a vehicle of the next run is put in, and fog and dusk come. Every render is
-compared with that of the unedited fit:
+On every finished ``mudg run``, seen by its front camera, the moving vehicle ahead that shows the most pixels is taken
+away and moved, a vehicle of the next run is put in, and fog and dusk come. Every render is compared with that of the
+unedited fit; docs/edit.md explains the measures.
 
-    warp       mean absolute colour difference, [0, 1], of a surface between neighbouring frames, carried by the depth
-               and the poses of the rendered scene (the edited vehicle by its path); lower is steadier. Beside it that
-               of the unedited video
-    outside    share of the pixels away from the edit that change by more than 1/255, [0, 1]; lower is better (not for
-               weather and light)
-    structure  correlation of luminance gradients with the unedited render, [-1, 1]; higher is better (weather and light
-               alone)
-    lidar      AbsRel, 0 and up, of rendered depth at the LiDAR points of the moment away from the edit, with the edit
-               and without
-    uncovered  AbsRel in the pixels that showed the vehicle and do not any more, at static points of the sweeps around;
-               lower is better. PSNR, dB, of the render's colours there against those that recorded frames show at these
-               points when neither the vehicle nor its shadow is there; higher is better
-    overlap    intersection over union of the vehicle's pixels with the outline of its box, [0, 1], at the new place and
-               at the old one
-    collisions, warnings   numbers of what ``mudg edit`` reports
-
-OUT/bench.json  OUT/bench.md  OUT/page.html  OUT/rows/  OUT/pictures/  OUT/assets/ the vehicles that were put in
-"""
+    OUT/bench.json  bench.md  page.html  rows/  pictures/  assets/ the vehicles that were put in"""
 
 from __future__ import annotations
 

@@ -29,7 +29,16 @@ from mudg.base.run_folder import refuse_overlap
 from mudg.base.types import Camera, View
 from mudg.benchmarks.chain import Facts, compare, finished, refuse_foreign
 from mudg.benchmarks.places import Views, listed_cities, score_settings
-from mudg.benchmarks.rows import BASE, FULL, PaperPlace, PaperTable, chain_settings, refuse_unfit, shift_rows
+from mudg.benchmarks.rows import (
+    BASE,
+    FULL,
+    PaperPlace,
+    PaperTable,
+    chain_settings,
+    model_settings,
+    refuse_unfit,
+    shift_rows,
+)
 from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import standard_error
 from mudg.city import logs as city_logs
@@ -228,9 +237,7 @@ def run(
     jobs = {log.name: LoopLog(log, out / log.name, table, rows, *last, rules=rules).measure for log in logs}
     settings = {
         "list": config.list,
-        "iterations": config.iterations,
-        "seed": config.seed,
-        "model": model_files.digest(config.model),
+        **model_settings(config),
         "frames": rules.frames,
         "size_px": [rules.width, rules.height],
         "aims_m": AIMS_M,
@@ -257,33 +264,22 @@ def pooled(names: Sequence[str], logs: Sequence[Facts]) -> dict[str, Any]:
 
 def markdown(doc: Facts) -> str:
     """The tables for people."""
-    settings = doc["settings"]
-    frames = settings["frames"]
+    settings, names = doc["settings"], doc["rows"]
     aims = ", ".join(f"{aim:+g} m" for aim in settings["aims_m"].values())
     heads = ["row", *(title for title, _ in COLUMNS.values())]
-    rows = [[name, *_cells({c: of["mean"] for c, of in doc["pooled"][name].items()})] for name in doc["rows"]]
-    each = [
-        [str(entry["log"]), name, pilot, *_cells(drive)]
-        for entry in doc["logs"]
-        for name in doc["rows"]
-        for pilot, drive in entry["values"][name].items()
+    rows = [[name, *_cells({c: of["mean"] for c, of in doc["pooled"][name].items()})] for name in names]
+    drives = [
+        (e["log"], name, pilot, of) for e in doc["logs"] for name in names for pilot, of in e["values"][name].items()
     ]
-    return "\n".join(
-        [
-            f"# Closed loop: {len(doc['logs'])} logs of the {settings['list']} list",
-            "",
-            f"{frames} frames at 10 Hz; a pilot aims at {aims} from the recorded path and keeps its"
-            " distance to whoever it sees. Pictures are scored at the poses driven to; apart: from the drive of the"
-            " same pilot in the exact city.",
-            "",
-            *markdown_table(heads, rows),
-            "",
-            "## Each drive",
-            "",
-            *markdown_table(["log", "row", "aim", *heads[1:]], each),
-            "",
-        ]
+    each = [[str(log), name, pilot, *_cells(drive)] for log, name, pilot, drive in drives]
+    title = f"# Closed loop: {len(doc['logs'])} logs of the {settings['list']} list"
+    about = (
+        f"{settings['frames']} frames at 10 Hz; a pilot aims at {aims} from the recorded path and keeps its distance to"
+        " whoever it sees. Pictures are scored at the poses driven to; apart: from the drive of the same pilot in the"
+        " exact city."
     )
+    all_drives = markdown_table(["log", "row", "aim", *heads[1:]], each)
+    return "\n".join([title, "", about, "", *markdown_table(heads, rows), "", "## Each drive", "", *all_drives, ""])
 
 
 def _cells(values: Facts) -> list[str]:

@@ -1,17 +1,11 @@
-"""``mudg bench paper``: a table of a paper, filled with our numbers, on generated cities or recorded logs.
+"""``mudg bench paper``: a table of a paper (``papers.yaml``), filled with our numbers, on cities or recorded logs.
 
-A table (``papers.yaml``) says which frames, places and columns. Every log is prepared once; every method is fitted,
-rendered and scored on its own, by the ordinary verbs, so that whatever is finished is reused and an interrupted table
-goes on. In every table stand the truth (what it scores itself) and the fused points with holes filled.
-
-A cell is a number or the reason why there is none. A mean over logs is one over all of them: a method that lacks a
-number on one log has none in that cell, for means over other logs could not be compared. FID, KID and FVD compare the
-views of all logs at a place, as one set as in papers, with all recorded frames of their cameras; a mean of the
-distances of small sets is mostly bias.
+In every table stand the truth (what it scores itself) and the fused points with holes filled. A cell is a number or the
+reason why there is none: a method that lacks a number on one log has no mean. FID, KID and FVD compare the views of all
+logs at a place, as one set as in papers; a mean of the distances of small sets is mostly bias.
 
     OUT/<log>/...   see ``benchmarks/places.py``; views that fits learn from lie in OUT/<log>/virtual
-    OUT/bench.json   every number   OUT/bench.md bench.csv bench.tex   the table   OUT/page.html   table and pictures
-"""
+    OUT/bench.json   every number   OUT/bench.md bench.csv bench.tex   the table   OUT/page.html   table and pictures"""
 
 from __future__ import annotations
 
@@ -52,6 +46,7 @@ from mudg.benchmarks.rows import (
     Row,
     chain_settings,
     generator_of,
+    model_settings,
     paper_rows,
     refuse_unfit,
 )
@@ -61,7 +56,7 @@ from mudg.core.metrics import METRICS
 from mudg.diffusion import model_files as mdm_files
 from mudg.editing.settings import ScoreConfig
 from mudg.gaussians.settings import METHODS
-from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, compared, distances
+from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, distances, video_entry
 from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
 from mudg.steps.settings import PresetName
 
@@ -162,9 +157,7 @@ def run(
     settings = {
         "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "",
         "missing_scenes": missing_scenes(table, logs),
-        "iterations": config.iterations,
-        "seed": config.seed,
-        "model": mdm_files.digest(config.model),
+        **model_settings(config),
         "renders": renders,
         "videos": config.videos,
         "score": configuration.result_settings(measured),
@@ -280,7 +273,7 @@ def pooled(logs: Sequence[Facts], out: Path) -> dict[str, dict[str, Values]]:
                     continue
                 cells = result.setdefault(row, {}).setdefault(place, {})
                 if entry == "videos":
-                    cells["fvd"] = {"mean": compared(made, reference)["fvd"], "standard_error": None}
+                    cells["fvd"] = {"mean": video_entry(made, reference)["values"]["fvd"], "standard_error": None}
                 else:
                     both = distances(made, reference)
                     cells["fid"] = {"mean": round(both.fid, 6), "standard_error": None}

@@ -42,7 +42,17 @@ from mudg.benchmarks.places import (
     names_of,
     protocols_of,
 )
-from mudg.benchmarks.rows import BASE, FILL, Row, Sees, chain_settings, generator_of, real_rows, refuse_unfit
+from mudg.benchmarks.rows import (
+    BASE,
+    FILL,
+    Row,
+    Sees,
+    chain_settings,
+    generator_of,
+    model_settings,
+    real_rows,
+    refuse_unfit,
+)
 from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import virtual_fits_of
 from mudg.diffusion import model_files as mdm_files
@@ -115,9 +125,7 @@ def run(
     ]
     settings = {
         "protocols": list(config.protocols),
-        "iterations": config.iterations,
-        "seed": config.seed,
-        "model": mdm_files.digest(config.model),
+        **model_settings(config),
         "shown_cameras": list(config.shown),
         "resolution": config.resolution,
         "frames": config.frames,

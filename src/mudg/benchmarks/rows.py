@@ -22,7 +22,7 @@ from mudg.diffusion import model_files, views
 from mudg.diffusion.published import is_published
 from mudg.diffusion.settings import SynthesizeConfig
 from mudg.gaussians.recipes import recipe_of
-from mudg.gaussians.settings import METHODS, PUBLISHED
+from mudg.gaussians.settings import METHODS, PUBLISHED, UNFIT, WEIGHTS
 from mudg.networks.inception import ResizeRule
 from mudg.scoring import score
 from mudg.scoring.tables import title_of
@@ -280,9 +280,9 @@ def usual_fit(config: BenchConfig) -> MethodConfig:
 def method_fit(usual: MethodConfig, method: str, preset: PresetName) -> MethodConfig:
     """The usual settings with a method. What a preset sets and a method for comparison does not know has its default
     there. UsageError: a setting beyond the preset that the method does not know."""
-    row, named, plain = METHODS[method], bench_preset(preset).fit, MethodConfig()
+    named, plain = bench_preset(preset).fit, MethodConfig()
     settings = configuration.load(MethodConfig, usual, overrides={"method": method})
-    for name in (*row.unfit, *(f"loss.{weight}" for weight in row.weights)):
+    for name in (*UNFIT.get(method, ()), *WEIGHTS.get(method, ())):
         group, _, setting = name.partition(".")
         own, set_by_preset = getattr(settings, group), getattr(getattr(named, group), setting)
         if getattr(own, setting) == set_by_preset:
@@ -302,6 +302,11 @@ def chain_settings(config: BenchConfig, preset: PresetName) -> dict[str, Any]:
         "fit": configuration.result_settings(usual_fit(config)),
         "synthesize": {name: value for name, value in generator.items() if name not in PLACES},
     }
+
+
+def model_settings(config: BenchConfig) -> dict[str, Any]:
+    """Iterations, seed and model of a benchmark of complete methods, for ``bench.json``."""
+    return {"iterations": config.iterations, "seed": config.seed, "model": model_files.digest(config.model)}
 
 
 def changed_settings(config: BenchConfig, usual: BenchConfig) -> list[str]:

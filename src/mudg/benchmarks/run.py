@@ -1,20 +1,8 @@
 """``mudg bench``: measurements that print a table, each from one command.
 
-mdm            the diffusion model on held-out cities, against exact truth (``benchmarks/cities.py``)
-poses          how much of the error of tracked boxes a fit takes out (``benchmarks/cities.py``); needs no diffusion
-               model
-edit           edits of a fitted scene against the city regenerated with them (``benchmarks/cities.py``); needs no
-               diffusion model. Of finished runs that are given: edits of recorded drives by measures that need no truth
-               (``benchmarks/edit_runs.py``)
-shift          whole methods beside the recorded path, on lists of generated logs (``benchmarks/shift.py``)
-real           whole methods on real logs, against what the methods did not see of them (``benchmarks/real.py``)
-loop           a pilot drives in fitted scenes, against the exact city (``benchmarks/loop.py``)
-paper          a table of a paper, on generated cities or real logs (``benchmarks/paper.py``)
-
-The first three are one folder, with OUT/clips/ (or cities, fits, ...), OUT/bench.json, OUT/bench.md and pictures; the
-others compare rows (``benchmarks/rows.py``) on logs (``benchmarks/places.py``), worked on in one loop
-(``benchmarks/chain.py``), in folders of their steps.
-"""
+``mdm``, ``poses`` and ``edit`` are one folder, with OUT/clips/ (or cities, fits, ...), OUT/bench.json, OUT/bench.md and
+pictures. ``shift``, ``real``, ``paper`` and ``loop`` compare rows (``benchmarks/rows.py``) on logs
+(``benchmarks/places.py``), worked on in one loop (``benchmarks/chain.py``), in folders of their steps."""
 
 from __future__ import annotations
 
@@ -100,9 +88,8 @@ def run(
     if name == EDIT and sources:
         return edit_runs.run(config, sources, out, overwrite=overwrite)
     if sources:
-        raise UsageError(
-            "this benchmark makes its own logs", where=f"mudg bench {name}", got=", ".join(map(str, sources))
-        )
+        got = ", ".join(map(str, sources))
+        raise UsageError("this benchmark makes its own logs", where=f"mudg bench {name}", got=got)
     if name in (SHIFT, LOOP):
         return (shift if name == SHIFT else loop).run(config, out, preset=preset, overwrite=overwrite)
     inputs = {"model": model_files.digest(config.model)} if name == "mdm" else {}  # poses reads no diffusion model
@@ -129,12 +116,12 @@ def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
         users, group = USED[setting.split(".")[0]], f"synthesize.{setting}"
         if name not in users:
             elsewhere = name in CHAINS and setting in ("steps", "sampler", "eta")
-            raise UsageError(
+            what, expected = (
                 f"mudg bench {name} does not use this setting",
-                where=flag_of(setting),
-                expected=" or ".join(f"mudg bench {one}" for one in users),
-                remedy=f"give {flag_of(group)}" if elsewhere else "leave it out",
+                " or ".join(map("mudg bench {}".format, users)),
             )
+            remedy = f"give {flag_of(group)}" if elsewhere else "leave it out"
+            raise UsageError(what, where=flag_of(setting), expected=expected, remedy=remedy)
         if setting in OWN and (setting, name) != ("synthesize.shifts_m", REAL):
             raise UsageError("the benchmark chooses this itself", where=flag_of(setting), remedy=OWN[setting])
     if name == EDIT and config.model != BenchConfig().model and not config.harmonize:
@@ -143,10 +130,8 @@ def refuse_unused(name: str, config: BenchConfig, preset: PresetName) -> None:
     if name in CHAINS:
         refuse_missing(generator_of(config), MethodConfig(), "--model")
     if name == "mdm" and is_published(config.model):
-        what, remedy = (
-            "mudg bench mdm measures small models",
-            "mudg bench paper --table mudg2 measures published-type ones",
-        )
+        what = "mudg bench mdm measures small models"
+        remedy = "mudg bench paper --table mudg2 measures published-type ones"
         raise UsageError(what, where="--model", got=config.model, remedy=remedy)
 
 

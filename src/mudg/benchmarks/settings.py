@@ -12,6 +12,9 @@ from mudg.editing.settings import ScoreConfig
 from mudg.scene.settings import FuseConfig
 from mudg.steps.settings import PresetName, run_preset
 
+_Mudg = Literal["mudg1", "mudg2", "mudg3"]
+_Others = Literal["recam", "spvc", "panda", "dist"]
+
 
 @settings
 class BenchOwn:
@@ -73,19 +76,7 @@ class BenchOwn:
     thread each (0 = one per core). Results do not depend on it."""
     videos: bool = True
     """shift, paper: also write videos of all methods side by side."""
-    table: Literal[
-        "mudg1",
-        "mudg2",
-        "mudg3",
-        "recondreamer",
-        "drivedreamer4d",
-        "streetcrafter",
-        "freesim",
-        "recam",
-        "spvc",
-        "panda",
-        "dist",
-    ] = "mudg1"
+    table: Literal[_Mudg, "recondreamer", "drivedreamer4d", "streetcrafter", "freesim", _Others] = "mudg1"
     """paper: the table to fill (docs/paper_tables.md)."""
     freevs_model: str = ""
     """paper: diffusion model for the row freevs, learned with `--data.condition freevs` (empty = the row has no

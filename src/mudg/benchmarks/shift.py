@@ -33,6 +33,7 @@ from mudg.benchmarks.rows import (
     PaperTable,
     chain_settings,
     generator_of,
+    model_settings,
     refuse_unfit,
     shift_rows,
 )
@@ -136,9 +137,7 @@ def run(
     refuse_unfit(config, preset, rows, [generator_of(config)] * any(row.method == DIFFUSION for row in rows))
     settings = {
         "list": config.list,
-        "iterations": config.iterations,
-        "seed": config.seed,
-        "model": mdm_files.digest(config.model),
+        **model_settings(config),
         "renders": renders,
         "frames": rules.frames,
         "size_px": [rules.width, rules.height],

@@ -33,43 +33,50 @@ SPLIT_SHRINK = 1.6
 
 
 @dataclass(frozen=True)
-class DensifySettings:
-    """When and how to densify. Steps count from 1.
+class Rounds:
+    """When rows change, and what is never kept. Steps count from 1.
 
     Args:
-        start, stop, every: densify after step s when start <= s <= stop and s is a multiple of ``every``.
-        static_gradient, object_gradient: thresholds on the mean absolute screen gradient, in units of half the image
-            (published: 6e-4 for the background, 2e-4 for objects).
-        split_above_m: rows whose largest scale exceeds this are split, smaller ones cloned.
-        max_rows: growth stops here.
-        growth: at most this share of the present rows is added at a time.
-        prune_opacity: rows below are removed.
-        prune_scale_m: rows larger are removed (static rows only beyond ``start``).
-        box_margin: object rows outside this many half-sizes of their box are removed.
-        reset_every: steps between opacity resets, 0 = never. reset_opacity: the value opacities are pulled down to.
-        time_gradient: threshold on the mean gradient of ``tau``, for Gaussians that have one (``baselines/pvg.py``).
-        late: step from which their splits give three children with shorter lives, not two.
+        start, stop, every: rows change after step s when start <= s <= stop and s is a multiple of ``every``.
+        max_rows: growth stops here. growth: at most this share of the present rows is added at a time.
+        least_opacity: rows below are removed (mcmc: relocated). prune_scale_m: so are larger rows.
+        box_margin: and object rows outside this many half-sizes of their box.
     """
 
     start: int
     stop: int
     every: int
+    max_rows: int = 150_000
+    growth: float = 0.3
+    least_opacity: float = 0.005
+    prune_scale_m: float = 8.0
+    box_margin: float = 1.25
+
+    def due(self, step: int) -> bool:
+        """Whether rows change after step ``step`` (from 1)."""
+        return self.start <= step <= self.stop and step % self.every == 0
+
+
+@dataclass(frozen=True)
+class DensifySettings(Rounds):
+    """When and how to densify.
+
+    Args:
+        static_gradient, object_gradient: thresholds on the mean absolute screen gradient, in units of half the image
+            (published: 6e-4 for the background, 2e-4 for objects).
+        split_above_m: rows whose largest scale exceeds this are split, smaller ones cloned.
+        reset_every: steps between opacity resets, 0 = never. reset_opacity: the value opacities are pulled down to.
+        time_gradient: threshold on the mean gradient of ``tau``, for Gaussians that have one (``baselines/pvg.py``).
+        late: step from which their splits give three children with shorter lives, not two.
+    """
+
     static_gradient: float = 6e-4
     object_gradient: float = 2e-4
     split_above_m: float = 0.2
-    max_rows: int = 150_000
-    growth: float = 0.3
-    prune_opacity: float = 0.005
-    prune_scale_m: float = 8.0
-    box_margin: float = 1.25
     reset_every: int = 0
     reset_opacity: float = 0.01
     time_gradient: float = 2e-3
     late: int = 0
-
-    def due(self, step: int) -> bool:
-        """Whether to densify after step ``step`` (from 1)."""
-        return self.start <= step <= self.stop and step % self.every == 0
 
     def reset_due(self, step: int) -> bool:
         """Whether to pull opacities down after step ``step``."""
@@ -162,7 +169,7 @@ def densify(
     ):
         model.table.append(columns, labels)
     keep = torch.cat([keep, keep.new_ones(len(model.table) - len(keep))])
-    doomed = useless_rows(model, settings.prune_opacity, settings.prune_scale_m, settings.box_margin)
+    doomed = useless_rows(model, settings)
     pruned = int((doomed & keep).sum())
     model.table.take(keep & ~doomed)
     model.sort_rows()
@@ -235,18 +242,18 @@ def _halves(
     return halves
 
 
-def useless_rows(model: SceneModel, prune_opacity: float, prune_scale_m: float, box_margin: float) -> Tensor:
+def useless_rows(model: SceneModel, settings: Rounds) -> Tensor:
     """Bool[N]: transparent, oversized, not finite, or outside ``box_margin`` times the box it belongs to (plus 0.1
     m)."""
     table = model.table
     means = table["means"].detach()
-    doomed = torch.sigmoid(table["logits"].detach()) < prune_opacity
-    doomed |= table["log_scales"].detach().amax(1).exp() > prune_scale_m
+    doomed = torch.sigmoid(table["logits"].detach()) < settings.least_opacity
+    doomed |= table["log_scales"].detach().amax(1).exp() > settings.prune_scale_m
     doomed |= ~torch.isfinite(means).all(1)
     half_size = torch.full((len(model.nodes), 3), torch.inf)
     for index, node in enumerate(model.nodes):
         if isinstance(node, RigidNode):
-            half_size[index] = torch.tensor(node.size_m) / 2 * box_margin + 0.1
+            half_size[index] = torch.tensor(node.size_m) / 2 * settings.box_margin + 0.1
     return doomed | (means.abs() > half_size.to(model.device)[table.labels["node"].long()]).any(1)
 
 
@@ -277,37 +284,20 @@ SURE_OPACITY = 1 - 1e-6
 
 
 @dataclass(frozen=True)
-class McmcSettings:
-    """When and how. Steps count from 1.
+class McmcSettings(Rounds):
+    """When and how: dead rows are relocated, and the table grows to ``max_rows``.
 
     Args:
-        start, stop, every: relocate and grow after step s when start <= s <= stop and s is a multiple of ``every``.
-        max_rows: growth stops here; the table never has more rows.
-        growth: share of the present rows that is added at a time.
-        dead_opacity: rows below are relocated.
-        prune_scale_m: rows larger are relocated. box_margin: object rows outside this many half-sizes of their box,
-            too.
         step_per_m2: size of the random step: a Gaussian of scale s moves by ``rate * step_per_m2 * s^2`` along that
             axis, where ``rate`` is the learning rate of the centres in metres; never by more than s. The published 5e5
             belongs to scenes scaled to unit size; the learning rates here belong to scenes of 10 m.
         gate_sharpness, gate_opacity: the step fades with ``sigmoid(sharpness * (gate_opacity - opacity))``.
     """
 
-    start: int
-    stop: int
-    every: int
-    max_rows: int = 150_000
     growth: float = 0.05
-    dead_opacity: float = 0.005
-    prune_scale_m: float = 8.0
-    box_margin: float = 1.25
     step_per_m2: float = 5e3
     gate_sharpness: float = 100.0
     gate_opacity: float = 0.005
-
-    def due(self, step: int) -> bool:
-        """Whether to relocate and grow after step ``step`` (from 1)."""
-        return self.start <= step <= self.stop and step % self.every == 0
 
 
 def stack_of(opacity: Tensor, members: Tensor) -> tuple[Tensor, Tensor]:
@@ -357,12 +347,12 @@ def relocate_and_grow(model: SceneModel, step: int, settings: McmcSettings, run_
     table, rows = model.table, len(model.table)
     owner = table.labels["node"].long()
     opacity = torch.sigmoid(table["logits"].detach().double())
-    dead = useless_rows(model, settings.dead_opacity, settings.prune_scale_m, settings.box_margin)
+    dead = useless_rows(model, settings)
     alive_in = torch.bincount(owner[~dead], minlength=len(model.nodes))
     dead &= alive_in[owner] > 0
     weights = torch.where(dead, 0.0, opacity)
     copies = _draw_copies(model, weights, dead, step, settings, run_seed)
-    dead_transmittance = torch.log1p(torch.tensor(-settings.dead_opacity).double())
+    dead_transmittance = torch.log1p(torch.tensor(-settings.least_opacity).double())
     room = torch.floor(torch.log1p(-opacity.clamp(max=SURE_OPACITY)) / dead_transmittance)
     copies = torch.minimum(copies, (room.long() - 1).clamp(0, LARGEST_STACK - 1))
     sources = copies.nonzero()[:, 0]
@@ -440,12 +430,7 @@ def random_step(
 
 
 def densify_if_due(
-    model: SceneModel,
-    stats: DensifyStats,
-    schedule: DensifySettings | McmcSettings | None,
-    step: int,
-    rate_m: float,
-    run_seed: int,
+    model: SceneModel, stats: DensifyStats, schedule: Rounds | None, step: int, rate_m: float, run_seed: int
 ) -> dict[str, Any]:
     """What the schedule has for a step, after the optimiser's; a report if rows changed, as new statistics begin then.
     ``rate_m``: present learning rate of the centres."""
@@ -454,7 +439,7 @@ def densify_if_due(
         if schedule.due(step):
             report = relocate_and_grow(model, step, schedule, run_seed)
         drift(model, step, rate_m, schedule, run_seed)
-    elif schedule is not None:
+    elif isinstance(schedule, DensifySettings):
         if schedule.due(step):
             report = densify(model, stats, step, schedule, run_seed)
         if schedule.reset_due(step):

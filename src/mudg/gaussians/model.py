@@ -130,10 +130,8 @@ class SceneModel:
     def without_nodes(self, names: Sequence[str]) -> SceneModel:
         """A copy without the named dynamic objects (the rest keeps its parameters, not its moments). UsageError: an
         object that the scene has no node for."""
-        gone = {self.dynamic_object(name).name for name in names}
-        kept = [
-            index for index, node in enumerate(self.nodes) if node.name not in gone or not isinstance(node, RigidNode)
-        ]
+        gone = [self.dynamic_object(name) for name in names]
+        kept = [index for index, node in enumerate(self.nodes) if node not in gone]
         renumber = torch.full((len(self.nodes),), -1, dtype=torch.int32)
         renumber[kept] = torch.arange(len(kept), dtype=torch.int32)
         owner = renumber.to(self.device)[self.table.labels["node"].long()]
@@ -182,9 +180,8 @@ class SceneModel:
         for index, facts in enumerate(values["nodes"]):
             if facts["kind"] not in NODES:
                 raise InputError("unknown kind of scene node", expected=", ".join(NODES), got=str(facts["kind"]))
-            own = {
-                key.partition("/")[2]: value for key, value in groups["nodes"].items() if key.startswith(f"{index}/")
-            }
+            prefix = f"{index}/"
+            own = {k.removeprefix(prefix): value for k, value in groups["nodes"].items() if k.startswith(prefix)}
             node = pkgutil.resolve_name(NODES[facts["kind"]]).from_state(facts, own)
             if isinstance(node, SkyNode):
                 sky = node
@@ -217,9 +214,8 @@ def compose(model: SceneModel, time_s: float, semantics: bool = True) -> Gaussia
     ``semantics``: add the class logits as ``extra`` channels."""
     table, counts = model.table, model.counts()
     all_rows = NodeRows(table["means"], table["quats"], torch.sigmoid(table["logits"]), table["sh_dc"])
-    blocks = zip(
-        *(column.split(counts) for column in (all_rows.means, all_rows.quats, all_rows.opacity, all_rows.sh_dc))
-    )
+    common = (all_rows.means, all_rows.quats, all_rows.opacity, all_rows.sh_dc)
+    blocks = zip(*(column.split(counts) for column in common))
     own = {name: column.split(counts) for name, column in table.columns.items() if name not in COLUMNS}
     given = [NodeRows(*block, {name: parts[i] for name, parts in own.items()}) for i, block in enumerate(blocks)]
     if model.sh_degree > 0:

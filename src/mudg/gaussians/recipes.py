@@ -22,7 +22,7 @@ from mudg.core import losses
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.schedule import LAST_DENSIFIED, PUBLISHED_STEPS
-from mudg.gaussians.settings import METHODS, FitConfig
+from mudg.gaussians.settings import UNFIT, WEIGHTS, FitConfig
 from mudg.gaussians.start import start_model
 from mudg.gaussians.views import LidarPixels, StoredView, TrainView
 
@@ -83,7 +83,7 @@ class Recipe:
 
     def common(self, config: FitConfig) -> FitConfig:
         """The settings of the common loss terms: those that the method replaces weigh nothing."""
-        weights = METHODS[config.method].weights
+        weights = [name.removeprefix("loss.") for name in WEIGHTS.get(config.method, ())]
         return replace(config, loss=replace(config.loss, **dict.fromkeys(weights, 0.0))) if weights else config
 
     def start(
@@ -106,13 +106,13 @@ class OwnRecipe(Recipe):
 
     def check(self, config: FitConfig, continues: bool) -> None:
         """See ``Recipe``."""
-        row, usual = METHODS[config.method], FitConfig()
+        unfit, weights, usual = UNFIT.get(config.method, ()), WEIGHTS.get(config.method, ()), FitConfig()
         if continues:
             raise UsageError(f"{config.method} cannot go on with a finished fit", remedy="leave out --start-from")
-        for name in (*row.unfit, *(f"loss.{weight}" for weight in row.weights)):
+        for name in (*unfit, *weights):
             expected, got = (str(attrgetter(name)(one)) for one in (usual, config))
             if got != expected:
-                reason = "knows nothing of it" if name in row.unfit else "has published weights of its own"
+                reason = "knows nothing of it" if name in unfit else "has published weights of its own"
                 remedy = "leave the setting out, or choose --method street_gaussians"
                 raise UsageError(f"{config.method} {reason}", where=name, expected=expected, got=got, remedy=remedy)
         if config.densify.kind == "mcmc":

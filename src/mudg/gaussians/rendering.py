@@ -34,17 +34,9 @@ def objects_only(gaussians: Gaussians) -> Gaussians:
 
 def rows_of(gaussians: Gaussians, rows: Tensor) -> Gaussians:
     """Some rows bool[N], without class channels."""
-    return replace(
-        gaussians,
-        means=gaussians.means[rows],
-        quats=gaussians.quats[rows],
-        scales=gaussians.scales[rows],
-        opacity=gaussians.opacity[rows],
-        sh=gaussians.sh[rows],
-        sh_rest=None if gaussians.sh_rest is None else gaussians.sh_rest[rows],
-        extra=None,
-        node=gaussians.node[rows],
-    )
+    columns = {field.name: getattr(gaussians, field.name) for field in fields(gaussians)}
+    chosen = {name: None if value is None else value[rows] for name, value in columns.items() if name != "extra"}
+    return replace(gaussians, **chosen, extra=None)
 
 
 def boxes_in_view(model: SceneModel, view: View) -> Tensor:

@@ -6,9 +6,9 @@ Steps count from 1 to the length of the run; a fit that goes on with a finished 
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 
 import numpy as np
 import torch
@@ -24,10 +24,8 @@ from mudg.gaussians.settings import DensifyConfig, FitConfig, StartConfig
 # finite -------------------------------------------------------------------------------------------
 #
 # Nothing that is not finite reaches the parameters: loss terms and gradients are checked before every step of the
-# optimiser.
-#
-# On the CPU each is looked at as soon as it is known. On another device looking means waiting for all that was sent
-# there, so the numbers of a whole step are gathered there and come back in one copy.
+# optimiser. On the CPU each is looked at as soon as it is known. On another device looking means waiting for all that
+# was sent there, so the numbers of a whole step are gathered there and come back in one copy.
 
 Complaint = Callable[[float], None]
 """Raises for a number that is not finite; returns where it only overflowed."""
@@ -44,31 +42,21 @@ class FiniteCheck:
 
     def terms(self, view: str, terms: Mapping[str, Tensor]) -> None:
         """Add the loss terms of a view."""
-        self._add(
-            [
-                (value.detach(), functools.partial(_refuse_term, name, self._where(view)))
-                for name, value in terms.items()
-            ]
-        )
+        where = f"view {view}, step {self._step}"
+        self._add([(value.detach(), partial(_refuse_term, name, where)) for name, value in terms.items()])
 
     def gradients(self, view: str, model: SceneModel, appearance: Appearance) -> None:
         """Add the gradients after the backward pass of a view, by their sums: the cheapest pass over memory there
         is."""
-        learnt = {"gaussians": (model.table, SCENE_REMEDY)}
-        learnt |= {owner: (table, SCENE_REMEDY) for owner, table in model.node_tables().items()}
-        learnt |= {f"appearance {group}": (table, VIEW_REMEDY) for group, table in appearance.tables.items()}
-        self._add(
-            [
-                (
-                    gradient.sum(),
-                    functools.partial(
-                        _refuse_gradient, table, gradient, f"{owner}.{name}, {self._where(view)}", remedy
-                    ),
-                )
-                for owner, (table, remedy) in learnt.items()
-                for name, gradient in table.gradients().items()
-            ]
-        )
+        learnt = {"gaussians": model.table, **model.node_tables()}
+        learnt |= {f"appearance {group}": table for group, table in appearance.tables.items()}
+        numbers: list[tuple[Tensor, Complaint]] = []
+        for owner, table in learnt.items():
+            remedy = VIEW_REMEDY if owner.startswith("appearance ") else SCENE_REMEDY
+            for name, gradient in table.gradients().items():
+                where = f"{owner}.{name}, view {view}, step {self._step}"
+                numbers.append((gradient.sum(), partial(_refuse_gradient, table, gradient, where, remedy)))
+        self._add(numbers)
 
     def refuse(self) -> None:
         """NumericsError naming the first of the numbers that is not finite, if there is one; no parameter has been
@@ -79,9 +67,6 @@ class FiniteCheck:
             for number, (_, complain) in zip(numbers, added):
                 if not math.isfinite(number):
                     complain(number)
-
-    def _where(self, view: str) -> str:
-        return f"view {view}, step {self._step}"
 
     def _add(self, numbers: list[tuple[Tensor, Complaint]]) -> None:
         self._added += numbers
@@ -105,7 +90,7 @@ def _refuse_gradient(table: Table, gradient: Tensor, where: str, remedy: str, nu
         raise NumericsError("a gradient is not finite", where=where, got=f"{count} values", remedy=remedy)
 
 
-# settings of short fits: good enough to learn from what a fit gets wrong, in a few seconds --------
+# short fits: good enough to learn from what a fit gets wrong, in a few seconds --------------------
 
 MOST_GAUSSIANS, VOXEL_M = 40_000, 0.25
 """Gaussians at most, and the cubes of which each starts one, metres."""
@@ -115,16 +100,13 @@ WIDTHS = 2
 
 def short_fit(iterations: int, clip_width_px: int, camera_width_px: int, seed: int, device: str = "cpu") -> FitConfig:
     """A fit to recorded views alone, for renders in the conditions of clips `clip_width_px` wide."""
-    return FitConfig(
-        method="street_gaussians",
-        iterations=iterations,
-        width_px=min(WIDTHS * clip_width_px, camera_width_px),
-        seed=seed,
-        device=device,
-        preview_every=1_000_000,
-        densify=DensifyConfig(max_gaussians=MOST_GAUSSIANS),
-        start=StartConfig(gaussians=MOST_GAUSSIANS, voxel_m=VOXEL_M),
-    )
+    width_px = min(WIDTHS * clip_width_px, camera_width_px)
+    own = {"iterations": iterations, "width_px": width_px, "seed": seed, "device": device, "preview_every": 1_000_000}
+    few = {
+        "densify": DensifyConfig(max_gaussians=MOST_GAUSSIANS),
+        "start": StartConfig(gaussians=MOST_GAUSSIANS, voxel_m=VOXEL_M),
+    }
+    return FitConfig(method="street_gaussians", **own, **few)
 
 
 # schedule -----------------------------------------------------------------------------------------
@@ -181,21 +163,15 @@ def densify_schedule(config: FitConfig, last: float = LAST_DENSIFIED) -> Densify
 
     gradient: from 500, every 100, until ``last`` of the run, opacity reset every 3000. mcmc: the same rounds until 0.8.
     """
-    total = config.iterations
+    total, most = config.iterations, config.densify.max_gaussians
     every = max(10, min(100, total // 20))
     start = max(every, min(500, total // 10))
     if config.densify.kind == "mcmc":
-        return McmcSettings(start, int(0.8 * total), every, max_rows=config.densify.max_gaussians)
+        return McmcSettings(start, int(0.8 * total), every, most)
     if config.densify.kind == "none":
         return None
-    return DensifySettings(
-        start,
-        stop := int(last * total),
-        every,
-        max_rows=config.densify.max_gaussians,
-        reset_every=3000 if total >= 10_000 else 0,
-        late=stop // 2,
-    )
+    stop, reset_every = int(last * total), 3000 if total >= 10_000 else 0
+    return DensifySettings(start, stop, every, most, reset_every=reset_every, late=stop // 2)
 
 
 def pose_round_due(config: FitConfig, step: int) -> bool:

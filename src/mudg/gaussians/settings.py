@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -212,9 +213,6 @@ class Method:
             path, repaired.
         scene: what its scene is made of: Gaussians, or a radiance field that is marched along rays.
         boxes: whether it knows the tracked boxes, those of the scene and those that fusing used.
-        weights: settings of ``loss`` in whose place it has published weights of its own.
-        unfit: other settings, ``group.field``, that mean nothing to it; both must keep their defaults.
-        chosen: settings that it fixes itself, whatever their values are.
     """
 
     title: str
@@ -223,69 +221,63 @@ class Method:
     supervision: tuple[Literal["color", "semantics", "lidar", "sky", "virtual", "repaired"], ...] = ()
     scene: Literal["gaussians", "radiance"] = "gaussians"
     boxes: bool = True
-    weights: tuple[str, ...] = ()
-    unfit: tuple[str, ...] = ()
-    chosen: tuple[str, ...] = ()
 
     @property
     def learns_virtual(self) -> bool:
         """Whether its fit learns from views that no camera recorded."""
         return bool({"virtual", "repaired"} & set(self.supervision))
 
-    def has(self, name: str) -> bool:
-        """Whether a setting of a fit, by its dotted name, applies to it."""
-        group = name.partition(".")[0]
-        if self.scene == "radiance":
-            return name in _OF_ALL or group == "radiance"
-        if group in ("poses", "objects") and not self.boxes:
-            return False
-        foreign = (*self.unfit, *self.chosen, *(f"loss.{weight}" for weight in self.weights))
-        return name not in foreign and group != "radiance" and (group != "virtual" or self.learns_virtual)
-
 
 _STREET: Final = ("color", "semantics", "lidar", "sky")
-_BOXES: Final = ("poses.learn", "objects.deformable", "objects.mirror_start", "loss.object_weight")
-"""Settings about dynamic objects."""
-_OF_ALL: Final = frozenset("method iterations seed cameras width_px device checkpoint_every preview_every".split())
-"""Settings that methods without Gaussians have, too."""
-_REPAIRS: Final = (
-    *("virtual.probability", "virtual.continued_probability", "virtual.gaussians", "virtual.color_weight"),
-    *("virtual.ssim_weight", "virtual.perceptual_weight", "virtual.perception", "virtual.lpips_weights"),
-    *("virtual.depth_weight", "virtual.lidar_weight", "virtual.semantic_weight"),
-)
-"""Settings of virtual views that ``difix`` chooses itself."""
+_WHOLE: Final = ("static", "objects", "sky")
 
 METHODS: Final[dict[str, Method]] = {
-    "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics"), boxes=False, unfit=_BOXES),
-    "street_gaussians": Method("Gaussians without diffusion", "render", ("static", "objects", "sky"), _STREET),
-    "pvg": Method(
-        *("PVG, our sky model", "render", ("static", "sky"), _STREET),
-        boxes=False,
-        weights=("lidar_weight", "sky_weight"),
-        unfit=_BOXES,
-    ),
+    "gs3d": Method("3D Gaussians, static", "render", ("static",), ("color", "semantics"), boxes=False),
+    "street_gaussians": Method("Gaussians without diffusion", "render", _WHOLE, _STREET),
+    "pvg": Method("PVG, our sky model", "render", ("static", "sky"), _STREET, boxes=False),
     "s3gaussian": Method(
-        *("S3Gaussian without features", "render", ("static",), ("color", "semantics", "lidar")),
-        boxes=False,
-        weights=("lidar_weight", "ssim_weight"),
-        unfit=_BOXES,
+        "S3Gaussian without features", "render", ("static",), ("color", "semantics", "lidar"), boxes=False
     ),
-    "bezier": Method(
-        *("BezierGS", "render", ("static", "objects", "sky"), _STREET),
-        weights=("lidar_weight",),
-        unfit=("poses.learn", "objects.deformable", "loss.object_weight"),
-    ),
-    "omnire": Method("OmniRe without SMPL", "render", ("static", "objects", "sky"), _STREET, weights=("lidar_weight",)),
+    "bezier": Method("BezierGS", "render", _WHOLE, _STREET),
+    "omnire": Method("OmniRe without SMPL", "render", _WHOLE, _STREET),
     "emernerf": Method("EmerNeRF, small", "render", (), ("color", "lidar", "sky"), "radiance", boxes=False),
-    "difix": Method(
-        *("Difix3D scheme, our network, no last repair", "render", ("static", "objects", "sky")),
-        (*_STREET, "repaired"),
-        chosen=_REPAIRS,
-    ),
+    "difix": Method("Difix3D scheme, our network, no last repair", "render", _WHOLE, (*_STREET, "repaired")),
     "mudg_r": Method("Diffusion output", "synthesize"),
     "freevs": Method("FreeVS condition, our network", "synthesize"),
-    "mudg_s": Method("Gaussians with diffusion", "render", ("static", "objects", "sky"), (*_STREET, "virtual")),
+    "mudg_s": Method("Gaussians with diffusion", "render", _WHOLE, (*_STREET, "virtual")),
 }
 
 PUBLISHED: Final = ("pvg", "s3gaussian", "bezier", "omnire", "emernerf", "difix")
 """Published methods for comparison, fitted to recorded views alone; difix goes on under repaired renders."""
+
+WEIGHTS: Final[Mapping[str, tuple[str, ...]]] = {
+    "pvg": ("loss.lidar_weight", "loss.sky_weight"),
+    "s3gaussian": ("loss.lidar_weight", "loss.ssim_weight"),
+    "bezier": ("loss.lidar_weight",),
+    "omnire": ("loss.lidar_weight",),
+}
+"""Settings in whose place a method has published weights of its own; they must keep their defaults."""
+_OBJECTS: Final = ("poses.learn", "objects.deformable", "loss.object_weight")
+UNFIT: Final[Mapping[str, tuple[str, ...]]] = {
+    "bezier": _OBJECTS,
+    **dict.fromkeys(("gs3d", "pvg", "s3gaussian"), (*_OBJECTS, "objects.mirror_start")),
+}
+"""Other settings that mean nothing to a method and must keep their defaults."""
+_REPAIRS: Final = (
+    *("probability", "continued_probability", "gaussians", "color_weight", "ssim_weight", "perceptual_weight"),
+    *("perception", "lpips_weights", "depth_weight", "lidar_weight", "semantic_weight"),
+)
+"""Settings of virtual views that ``difix`` chooses itself."""
+_OF_ALL: Final = frozenset("method iterations seed cameras width_px device checkpoint_every preview_every".split())
+"""Settings that methods without Gaussians have, too."""
+
+
+def has_setting(method: str, name: str) -> bool:
+    """Whether a setting of a fit, by its dotted name, applies to a method."""
+    row, (group, _, field) = METHODS[method], name.partition(".")
+    if row.scene == "radiance":
+        return name in _OF_ALL or group == "radiance"
+    if group == "virtual":
+        return row.learns_virtual and (method != "difix" or field not in _REPAIRS)
+    foreign = name in (*WEIGHTS.get(method, ()), *UNFIT.get(method, ())) or group == "radiance"
+    return not foreign and (row.boxes or group not in ("poses", "objects"))

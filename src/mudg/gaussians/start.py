@@ -10,7 +10,7 @@ filled and the sky stands in.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from typing import Final
 
@@ -30,8 +30,6 @@ from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode, object_node
 from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.gaussians.views import StoredView, heads_of
-
-# starting values of Gaussians: points, thinned and coloured, become rows of the table -------------
 
 SH_C0: Final = 0.28209479177387814
 START_OPACITY: Final = 0.1
@@ -148,9 +146,8 @@ def start_model(
 ) -> SceneModel:
     """Build the scene model that the fit starts from. InputError: the fused cloud has no points at all."""
     if len(fused.static) == 0:
-        raise InputError(
-            "the fused cloud has no static points", where=scene.root, remedy="check the LiDAR of the scene"
-        )
+        what, remedy = "the fused cloud has no static points", "check the LiDAR of the scene"
+        raise InputError(what, where=scene.root, remedy=remedy)
     kinds = METHODS[config.method].nodes
     blocks = [_static_columns(fused, views, classes, config)]
     nodes: list[StaticNode | RigidNode] = [StaticNode()]
@@ -161,15 +158,12 @@ def start_model(
             blocks.append(_object_columns(node, cloud, classes, config, min(share, 8000)))
             nodes.append(node)
     columns = {name: torch.cat([block[name] for block in blocks]) for name in blocks[0]}
-    owner = torch.cat(
-        [torch.full((len(block["means"]),), index, dtype=torch.int32) for index, block in enumerate(blocks)]
-    )
-    sky = painted_sky(views, fused.colors) if "sky" in kinds else None
-    static = len(blocks[0]["means"])
+    counts = torch.tensor([len(block["means"]) for block in blocks])
+    owner = torch.arange(len(blocks), dtype=torch.int32).repeat_interleave(counts)
+    sky, static = painted_sky(views, fused.colors) if "sky" in kinds else None, int(counts[0])
     log.info(f"start: {static} static Gaussians, {len(owner) - static} on {len(nodes) - 1} dynamic objects")
-    return SceneModel(
-        Table(columns, {"node": owner}), tuple(nodes), sky, classes, config.sh_degree, colors=fused.colors
-    )
+    table = Table(columns, {"node": owner})
+    return SceneModel(table, tuple(nodes), sky, classes, config.sh_degree, colors=fused.colors)
 
 
 def _static_columns(
@@ -224,8 +218,7 @@ def _object_columns(
         xyz, rgb = np.concatenate([xyz, other]), np.concatenate([rgb, rgb[source]])
         semantics = np.concatenate([semantics, semantics[source]])
     if len(rows) < FEWEST_OBJECT_POINTS:
-        color = rgb.mean(0) if len(rgb) else np.array([127, 127, 127])
-        grid_xyz, grid_rgb = box_grid(node.size_m, color)
+        grid_xyz, grid_rgb = box_grid(node.size_m, rgb.mean(0) if len(rgb) else np.array([127, 127, 127]))
         commonest = np.bincount(semantics, minlength=256).argmax() if len(semantics) else UNLABELLED
         xyz, rgb = np.concatenate([xyz, grid_xyz]), np.concatenate([rgb, grid_rgb])
         semantics = np.concatenate([semantics, np.full(len(grid_xyz), commonest, np.uint8)])
@@ -283,13 +276,7 @@ def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns
     in its row counts as covered (LiDAR lines are sparse)."""
     uv, z = geometry.project(stored.view, xyz)
     with np.errstate(invalid="ignore"):
-        inside = (
-            (z > 1.0)
-            & (uv[:, 0] >= 0)
-            & (uv[:, 0] < columns * FILL_CELL_PX)
-            & (uv[:, 1] >= 0)
-            & (uv[:, 1] < rows * FILL_CELL_PX)
-        )
+        inside = ((uv >= 0) & (uv < (columns * FILL_CELL_PX, rows * FILL_CELL_PX))).all(1) & (z > 1.0)
     column, row = (uv[inside, 0] // FILL_CELL_PX).astype(int), (uv[inside, 1] // FILL_CELL_PX).astype(int)
     depth = np.full((rows, columns), np.inf)
     np.minimum.at(depth, (row, column), z[inside])
@@ -299,21 +286,14 @@ def _cell_depth(stored: StoredView, xyz: NDArray[np.float32], rows: int, columns
 
 def painted_sky(views: Sequence[StoredView], cameras: CameraColors) -> SkyNode:
     """A sky that starts with the mean recorded colour per direction, in common colours."""
-    sky = SkyNode.uniform(SKY_ROWS)
-    sky.fill(_sky_pixels(views, cameras))
-    return sky
 
-
-def _sky_pixels(
-    views: Sequence[StoredView], cameras: CameraColors
-) -> Iterator[tuple[NDArray[np.float64], NDArray[np.float32]]]:
-    """Directions and common colours of every second row and column of the sky, view by view."""
-    for stored in views:
-        if stored.sky is None:
-            continue
-        camera = stored.view.camera
-        row, column = stored.sky[::2, ::2].nonzero()
-        row, column = row * 2, column * 2
+    def pixels(stored: StoredView, shown: NDArray[np.bool_]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+        """Directions and common colours of every second row and column of the sky."""
+        camera, (row, column) = stored.view.camera, (2 * index for index in shown[::2, ::2].nonzero())
         rays = np.stack([*geometry.pinhole_ray(camera.intrinsics, column + 0.5, row + 0.5), np.ones(len(row))], 1)
         rgb = cameras.bytes_to_common(camera.name, stored.rgb[row, column])
-        yield rays @ stored.view.world_from_cam[:3, :3].T, rgb.astype(np.float32) / 255
+        return rays @ stored.view.world_from_cam[:3, :3].T, rgb.astype(np.float32) / 255
+
+    sky = SkyNode.uniform(SKY_ROWS)
+    sky.fill(pixels(stored, stored.sky) for stored in views if stored.sky is not None)
+    return sky

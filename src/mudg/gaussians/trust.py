@@ -1,4 +1,5 @@
-"""Which part of a virtual view no recorded camera ever saw, and Gaussians to start there.
+"""How well photographs constrain every Gaussian; which part of a virtual view no recorded camera ever saw, and
+Gaussians to start there.
 
 Behind a parked bus a generated view is the best there is; nothing was measured there, so no Gaussian could start there.
 For every pixel of a virtual view, its point (at the depth of the virtual view itself) is carried to a number of
@@ -80,18 +81,7 @@ def certainty_of(
     most: int = 0,
 ) -> Tensor:
     """Certainty of every Gaussian of a model, f16[N], from recorded views, evenly chosen if there are more than
-    ``most`` (0 = all)."""
-    return evidence_of(model, views, raster, appearance, most).certainty().half()
-
-
-def evidence_of(
-    model: SceneModel,
-    views: Sequence[StoredView],
-    raster: RasterConfig,
-    appearance: Appearance | None = None,
-    most: int = 0,
-) -> PhotoEvidence:
-    """What recorded views tell about every Gaussian, those that are left out like the others; see ``certainty_of``."""
+    ``most`` (0 = all); those that are left out count like the others."""
     count = min(most or len(views), len(views))
     chosen = np.unique(np.linspace(0, len(views) - 1, count).round().astype(int))
     total = torch.zeros(5, len(model.table), device=model.device)
@@ -99,7 +89,7 @@ def evidence_of(
         sums = weight_sums(model, views[int(index)].as_tensors(model.device), raster, appearance)
         total += torch.cat([(sums[:1] / (sums[:1] + 1)), sums])
     total *= len(views) / len(chosen)
-    return PhotoEvidence(*total)
+    return PhotoEvidence(*total).certainty().half()
 
 
 def weight_sums(
@@ -262,14 +252,10 @@ def unseen_rows(
         kept = _spread(points, share, seeds.numpy_rng(run_seed, index, "unseen rows"))
         columns.append(kept.columns(model.classes, model.sh_degree))
         owners.append(torch.full((len(kept),), index, dtype=torch.int32))
+    share, none = float(np.mean(shares)), torch.zeros(0, dtype=torch.int32)
     if not columns:
-        none = {name: value.detach()[:0].cpu() for name, value in model.table.columns.items()}
-        return none, {"node": torch.zeros(0, dtype=torch.int32)}, float(np.mean(shares))
-    return (
-        {name: torch.cat([c[name] for c in columns]) for name in columns[0]},
-        {"node": torch.cat(owners)},
-        float(np.mean(shares)),
-    )
+        return {name: value.detach()[:0].cpu() for name, value in model.table.columns.items()}, {"node": none}, share
+    return {name: torch.cat([c[name] for c in columns]) for name in columns[0]}, {"node": torch.cat(owners)}, share
 
 
 def _spread(points: StartPoints, most: int, rng: np.random.Generator) -> StartPoints:
@@ -306,9 +292,8 @@ def _seeds_of(
     row, column, z = row[kept], column[kept], z[kept].astype(np.float64)
     points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), z)
     channel = np.full(len(row), UNLABELLED, np.uint8) if stored.channels is None else stored.channels[row, column]
-    train_id = np.append(np.array(model.classes, np.uint8), np.uint8(UNLABELLED))[
-        np.minimum(channel, len(model.classes))
-    ]
+    train_ids = np.append(np.array(model.classes, np.uint8), np.uint8(UNLABELLED))
+    train_id = train_ids[np.minimum(channel, len(model.classes))]
     scale = (0.6 * SEED_STRIDE_PX * z / stored.view.camera.fx).astype(np.float32)
     rgb = model.colors.bytes_to_common(stored.view.camera.name, stored.rgb[row, column])
     owner = np.zeros(len(row), np.int64)
@@ -317,18 +302,15 @@ def _seeds_of(
         inside = _in_box(node, points, stored.view.time_s)
         if inside is not None:
             owner[inside[0]], local[inside[0]] = index, inside[1]
-    return [
-        (int(index), StartPoints(local[mine].astype(np.float32), rgb[mine], train_id[mine], scale[mine]))
-        for index in np.unique(owner)
-        for mine in [owner == index]
-    ]
+    every = StartPoints(local.astype(np.float32), rgb, train_id, scale)
+    return [(int(index), every[np.flatnonzero(owner == index)]) for index in np.unique(owner)]
 
 
 def _sees_or_sees_past(witness: _Witness, points: NDArray[np.float64]) -> NDArray[np.bool_]:
     camera = witness.view.camera
     uv, z = geometry.project(witness.view, points)
     with np.errstate(invalid="ignore"):
-        inside = (z > 0.2) & (uv[:, 0] >= 0) & (uv[:, 0] < camera.width) & (uv[:, 1] >= 0) & (uv[:, 1] < camera.height)
+        inside = ((uv >= 0) & (uv < (camera.width, camera.height))).all(1) & (z > 0.2)
     column = np.where(inside, np.nan_to_num(uv[:, 0]), 0).astype(int).clip(0, camera.width - 1)
     row = np.where(inside, np.nan_to_num(uv[:, 1]), 0).astype(int).clip(0, camera.height - 1)
     return inside & (witness.depth[row, column] >= z * (1 - TOLERANCE))

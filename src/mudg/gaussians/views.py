@@ -11,7 +11,6 @@ import contextlib
 import math
 import shutil
 import threading
-from abc import abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -132,19 +131,9 @@ class StoredView:
         )
 
 
-class FiledViews(Sequence[StoredView]):
-    """Views that do not lie in memory: asking for one reads it."""
-
-    heads: Sequence[ViewHead]
-
-    @abstractmethod
-    def close(self) -> None:
-        """Give the space back; nothing can be read any more."""
-
-
 def heads_of(views: Sequence[StoredView]) -> Sequence[ViewHead]:
     """All views without their pixels; nothing is read."""
-    return views.heads if isinstance(views, FiledViews) else [view.head for view in views]
+    return views.heads if isinstance(views, ViewFile) else [view.head for view in views]
 
 
 @dataclass(frozen=True)
@@ -157,12 +146,12 @@ class ViewSet:
     @property
     def filed(self) -> bool:
         """Whether some views do not lie in memory."""
-        return any(isinstance(views, FiledViews) for views in (self.recorded, self.virtual))
+        return any(isinstance(views, ViewFile) for views in (self.recorded, self.virtual))
 
     def close(self) -> None:
         """Give back the space of views that do not lie in memory."""
         for views in (self.recorded, self.virtual):
-            if isinstance(views, FiledViews):
+            if isinstance(views, ViewFile):
                 views.close()
 
     def choose(
@@ -193,14 +182,12 @@ def training_frames(scene: Scene, cameras: Sequence[str]) -> tuple[Frame, ...]:
     all."""
     for name in cameras:
         if name not in scene.cameras:
-            raise UsageError(
-                f"the scene has no camera named {name!r}", where=scene.root, expected=", ".join(scene.cameras)
-            )
+            what, known = f"the scene has no camera named {name!r}", ", ".join(scene.cameras)
+            raise UsageError(what, where=scene.root, expected=known)
     frames = tuple(f for f in scene.frames_in("train") if not cameras or f.view.camera.name in cameras)
     if not frames:
-        raise UsageError(
-            "the scene has no training frames", where=scene.root, remedy="ingest with a larger --test-every, or 0"
-        )
+        remedy = "ingest with a larger --test-every, or 0"
+        raise UsageError("the scene has no training frames", where=scene.root, remedy=remedy)
     return frames
 
 
@@ -241,20 +228,13 @@ def load_recorded(
             name: resize_nearest(read_label(scene, frame, name), *size) if name in frame.labels else None
             for name in ("semantics", "sky", "ego", "semantics_confidence")
         }
-        confidence = labels["semantics_confidence"]
-        semantics = labels["semantics"]
-        sky = labels["sky"] if labels["sky"] is not None else (None if semantics is None else semantics == ID["sky"])
-        return StoredView(
-            frame.id,
-            view,
-            "recorded",
-            resize_area(read_image(scene, frame), *size[::-1]),
-            None if semantics is None or not classes else to_channels(semantics, classes),
-            sky,
-            None if labels["ego"] is None else ~labels["ego"].astype(bool),
-            points.pixels_of(view) if with_lidar else None,
-            confidence=None if confidence is None else (confidence * 255).round().astype(np.uint8),
-        )
+        semantics, sky, ego, confidence = labels.values()
+        rgb, lidar = resize_area(read_image(scene, frame), *size[::-1]), points.pixels_of(view) if with_lidar else None
+        channels = None if semantics is None or not classes else to_channels(semantics, classes)
+        sky = semantics == ID["sky"] if sky is None and semantics is not None else sky
+        mask = None if ego is None else ~ego.astype(bool)
+        sure = None if confidence is None else (confidence * 255).round().astype(np.uint8)
+        return StoredView(frame.id, view, "recorded", rgb, channels, sky, mask, lidar, confidence=sure)
 
     order = sorted(range(len(frames)), key=lambda index: frames[index].view.time_s)
     without_lidar = 0
@@ -262,9 +242,8 @@ def load_recorded(
         without_lidar += stored.lidar is None
         yield index, stored
     if with_lidar and without_lidar:
-        log.warn(
-            f"{without_lidar} of {len(frames)} frames have no LiDAR sweep within {NEAREST_SWEEP_S} s: no depth there"
-        )
+        count = f"{without_lidar} of {len(frames)}"
+        log.warn(f"{count} frames have no LiDAR sweep within {NEAREST_SWEEP_S} s: no depth there")
 
 
 def _read_by_threads(order: Sequence[int], read: Callable[[int], StoredView], doing: str) -> LoadedViews:
@@ -282,9 +261,8 @@ def virtual_sets(folders: Sequence[Path]) -> dict[str, ObservationSet]:
     for path in folders:
         found = {name: read_observations(folder) for name, folder in list_observation_sets(path).items()}
         if not found:
-            raise InputError(
-                "this folder holds no finished virtual views", where=str(path), remedy="run `mudg synthesize` first"
-            )
+            what = "this folder holds no finished virtual views"
+            raise InputError(what, where=str(path), remedy="run `mudg synthesize` first")
         if twice := sorted(set(found) & set(sets)):
             what = "two folders hold virtual views of the same name"
             raise InputError(what, where=str(path), got=", ".join(twice[:4]), remedy="give one of them")
@@ -307,18 +285,12 @@ def load_virtual(
         name, observations, index = every[place]
         view, arrays = observations.views[index], observations.arrays(index)
         semantics, confidence = arrays.get("semantics"), arrays["confidence"].astype(np.float32).clip(0, 1)
-        return StoredView(
-            f"{name}/{index:06d}",
-            view,
-            "virtual",
-            observations.rgb_u8(index).copy(),
-            None if semantics is None or not classes else to_channels(semantics, classes),
-            None if semantics is None else semantics == ID["sky"],
-            arrays["mask"].astype(bool),
-            None if measured is None else measured(view),
-            arrays["depth"].copy() if "depth" in arrays else None,
-            (confidence * 255).round().astype(np.uint8),
-        )
+        channels = None if semantics is None or not classes else to_channels(semantics, classes)
+        sky, mask = None if semantics is None else semantics == ID["sky"], arrays["mask"].astype(bool)
+        lidar = None if measured is None else measured(view)
+        depth = arrays["depth"].copy() if "depth" in arrays else None
+        head, rgb = (f"{name}/{index:06d}", view, "virtual"), observations.rgb_u8(index).copy()
+        return StoredView(*head, rgb, channels, sky, mask, lidar, depth, (confidence * 255).round().astype(np.uint8))
 
     yield from _read_by_threads(range(len(every)), read, "reading virtual views")
 
@@ -438,16 +410,14 @@ def lidar_pixels(view: View, xyz_world: NDArray[np.float32], gap_deg: float) -> 
     return LidarPixels(torch.from_numpy(pixel), torch.from_numpy(depth[pixel]))
 
 
-# kept ---------------------------------------------------------------------------------------------
+# ---- where views lie -----------------------------------------------------------------------------
 #
-# Where the views of a fit lie: small sets in memory, large ones in a scratch file, read ahead of the steps that need
-# them.
-#
-# Decoded views of a long log at full size need more memory than the fit itself: 1,000 of 1600 x 1066 pixels 8 to 11
-# GiB, 1,000 virtual ones with dense depth 18. Above ``IN_MEMORY_BYTES`` they go to a file without a name in the folder
-# of the fit, plane by plane as they are (masks in bits), so that a view costs one read and no decoding, and what a step
-# gets is the same to the bit. The system keeps as much of the file in memory as it can spare. Which views a step gets
-# is a function of the step, so threads read those of the next steps beforehand.
+# Small sets lie in memory, large ones in a scratch file, read ahead of the steps that need them. Decoded views of a
+# long log at full size need more memory than the fit itself: 1,000 of 1600 x 1066 pixels 8 to 11 GiB, 1,000 virtual
+# ones with dense depth 18. Above ``IN_MEMORY_BYTES`` they go to a file without a name in the folder of the fit, plane
+# by plane as they are (masks in bits), so that a view costs one read and no decoding, and what a step gets is the same
+# to the bit. The system keeps as much of the file in memory as it can spare. Which views a step gets is a function of
+# the step, so threads read those of the next steps beforehand.
 
 IN_MEMORY_BYTES = GIB
 """Decoded views of up to this size stay in memory."""
@@ -459,22 +429,14 @@ _PLANES = ("depth", "rgb", "channels", "confidence", "sky", "mask")
 """Depth first, so that it lies at a multiple of its element's size."""
 
 
-# ---- how much there is ---------------------------------------------------------------------------
-
-
 def recorded_bytes(frames: Sequence[Frame], width_px: int) -> int:
     """Bytes that the frames need when they are decoded, about."""
     total = 0.0
     for frame in frames:
         camera = resized_view(frame.view, width_px).camera
         has = frame.labels
-        planes = (
-            3
-            + ("semantics" in has)
-            + ("sky" in has or "semantics" in has)
-            + ("ego" in has)
-            + ("semantics_confidence" in has)
-        )
+        planes = 3 + sum(label in has for label in ("semantics", "ego", "semantics_confidence"))
+        planes += "sky" in has or "semantics" in has
         total += camera.width * camera.height * (planes + 12 * LIDAR_SHARE)
     return int(total)
 
@@ -499,19 +461,15 @@ def scratch_folder(count: int, needed: int, folder: Path) -> Path | None:
         expected = f"{needed / GIB:.1f} GiB free for {count} views while the fit runs"
         remedy = "free disk space, choose --out on another disk, or lower --width-px"
         raise ResourceError(what, where=str(folder), expected=expected, got=f"{free / GIB:.1f} GiB", remedy=remedy)
-    log.info(
-        f"views: {count}, {needed / GIB:.1f} GiB decoded: kept in a scratch file in {folder}, gone when the fit ends"
-    )
+    place = f"kept in a scratch file in {folder}, gone when the fit ends"
+    log.info(f"views: {count}, {needed / GIB:.1f} GiB decoded: {place}")
     return folder
-
-
-# ---- a file of views -----------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class _Slot:
-    """Where a view lies: its head, the first byte, its planes (name, type, shape) in order, the number of LiDAR pixels
-    (None: none)."""
+    """Where a view lies: its first byte, its planes (name, type, shape) in order, the number of LiDAR pixels (None:
+    none)."""
 
     head: ViewHead
     begins: int
@@ -520,8 +478,8 @@ class _Slot:
     lidar: int | None
 
 
-class ViewFile(FiledViews):
-    """Views in a scratch file. Filled once; then any thread may read."""
+class ViewFile(Sequence[StoredView]):
+    """Views in a scratch file: asking for one reads it. Filled once; then any thread may read."""
 
     def __init__(self, folder: Path, count: int) -> None:
         self._file = ScratchFile(folder)
@@ -599,9 +557,6 @@ def keep(loaded: LoadedViews, count: int, folder: Path | None) -> Sequence[Store
         return filed
 
 
-# ---- views of later steps ------------------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def chosen_ahead(
     views: ViewSet, choose: Callable[[int], tuple[StoredView, ...]], steps: range, device: torch.device = CPU
@@ -612,21 +567,17 @@ def chosen_ahead(
     a thread is raised at its step. Tensors are made by the caller's thread: in another one, every large allocation
     costs its page faults anew.
     """
-    chosen: Generator[tuple[StoredView, ...], None, None]
-    if views.filed:
-        chosen = computed_ahead(lambda turn: choose(steps[turn]), len(steps), AHEAD_THREADS)
-    else:
-        chosen = (choose(step) for step in steps)
+    ahead = computed_ahead(lambda turn: choose(steps[turn]), len(steps), AHEAD_THREADS) if views.filed else None
+    chosen = ahead or (choose(step) for step in steps)
     with contextlib.closing(chosen):
         yield (tuple(view.as_tensors(device) for view in found) for found in chosen)
 
 
-# halved -------------------------------------------------------------------------------------------
+# ---- halved --------------------------------------------------------------------------------------
 #
-# Virtual views at half their size, for the steps of a fit that need no more.
-#
-# Their finest structure is blurred by the diffusion model and teaches a scene little (docs/supervision.md), and a step
-# costs about as much per pixel as it costs per Gaussian.
+# Virtual views at half their size, for the steps of a fit that need no more: their finest structure is blurred by the
+# diffusion model and teaches a scene little (docs/supervision.md), and a step costs about as much per pixel as it costs
+# per Gaussian.
 
 LEAST_PX: Final = 96
 """No side of a halved view is shorter: smaller views stay as they are."""
@@ -657,28 +608,20 @@ class HalvedViews:
 def halved(view: StoredView) -> StoredView:
     """The view at half its size: colours and confidence are means, labels and depth those of the nearest pixel. A pixel
     is masked where any of those that it is made of is."""
-    height, width = (side // 2 for side in view.rgb.shape[:2])
+    tall, wide = view.rgb.shape[:2]
+    height, width = tall // 2, wide // 2
     if min(height, width) < LEAST_PX:
         return view
-    nearest = {name: getattr(view, name) for name in ("channels", "sky", "depth")}
-    return replace(
-        view,
-        view=view.view.resized(width, height),
-        rgb=resize_area(view.rgb, width, height),
-        lidar=_lidar(view, width, height),
-        mask=None if view.mask is None else resize_area(view.mask.astype(np.uint8) * 255, width, height) == 255,
-        confidence=None if view.confidence is None else resize_area(view.confidence, width, height),
-        **{name: None if plane is None else resize_nearest(plane, height, width) for name, plane in nearest.items()},
-    )
-
-
-def _lidar(view: StoredView, width: int, height: int) -> LidarPixels | None:
-    """Every measurement, in the pixel that it falls into."""
-    if view.lidar is None:
-        return None
-    tall, wide = view.rgb.shape[:2]
-    row, column = view.lidar.pixel // wide, view.lidar.pixel % wide
-    row, column = (
-        (2 * place + 1) * new // (2 * old) for place, new, old in ((row, height, tall), (column, width, wide))
-    )
-    return LidarPixels(row * width + column, view.lidar.depth_m)
+    planes: dict[str, Any] = {"rgb": resize_area(view.rgb, width, height), "view": view.view.resized(width, height)}
+    for name in ("channels", "sky", "depth"):
+        plane = getattr(view, name)
+        planes[name] = None if plane is None else resize_nearest(plane, height, width)
+    if view.mask is not None:
+        planes["mask"] = resize_area(view.mask.astype(np.uint8) * 255, width, height) == 255
+    if view.confidence is not None:
+        planes["confidence"] = resize_area(view.confidence, width, height)
+    if view.lidar is not None:  # every measurement, in the pixel that it falls into
+        row, column = view.lidar.pixel // wide, view.lidar.pixel % wide
+        row, column = (2 * row + 1) * height // (2 * tall), (2 * column + 1) * width // (2 * wide)
+        planes["lidar"] = LidarPixels(row * width + column, view.lidar.depth_m)
+    return replace(view, **planes)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import functools
 import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
@@ -44,6 +44,11 @@ BLOCK_FRAMES: Final = 8
 FEWEST_BLOCKS: Final = 4
 FEWEST_TO_EXTRAPOLATE: Final = 1000
 _BATCH: Final = 8
+
+
+Rows = NDArray[np.float32]
+Entry = dict[str, Any]
+"""``values`` by metric, and what stands beside them in metrics.json: sizes of the sets."""
 
 
 @dataclass(frozen=True)
@@ -82,7 +87,7 @@ class TrajectorySets:
 
 @dataclass(frozen=True)
 class SetDistances:
-    """FID and KID of ``n`` images against ``n_reference``, and what stands beside them in metrics.json."""
+    """FID and KID of ``n`` images against ``n_reference``, and what stands beside them."""
 
     n: int
     n_reference: int
@@ -92,18 +97,18 @@ class SetDistances:
     mind: float
     fid_at_infinity: float | None
 
-    def record(self) -> dict[str, Any]:
+    def entry(self) -> Entry:
         """As JSON values, rounded to 6 digits after the point."""
-        values = {name: getattr(self, name) for name in ("kid_standard_error", "mind", "fid_at_infinity")}
-        rounded = {name: None if value is None else round(value, 6) for name, value in values.items()}
-        return {"n": self.n, "n_reference": self.n_reference, **rounded}
+        rounded = {name: None if value is None else round(value, 6) for name, value in vars(self).items()}
+        return {"values": {name: rounded.pop(name) for name in ("fid", "kid")}, **rounded}
 
 
 @dataclass
 class EmbeddingFiles:
-    """Embeddings of sets of images by a network, kept in a folder. ``network``: images ``[n, 3, h, w]`` -> ``[n,
-    width]``. ``prepare``: an image u8[H, W, 3] as the network wants it. ``width``: of the embedding. ``key``: weights
-    and rules, by which kept files are found. ``folder``: where they lie. ``device``: of the network."""
+    """Features of sets of images by a network, kept in a folder: what went through the same network before is read.
+    ``network``: images ``[n, 3, h, w]`` -> ``[n, width]``. ``prepare``: an image u8[H, W, 3] as the network wants it.
+    ``width``: of the features. ``key``: weights and rules, by which kept files are found. ``folder``: where they lie.
+    ``device``: of the network."""
 
     network: Callable[[Tensor], Tensor]
     prepare: Callable[[NDArray[np.uint8]], Tensor]
@@ -113,22 +118,38 @@ class EmbeddingFiles:
     device: torch.device
 
     def of(self, images: ImageSet) -> NDArray[np.float32]:
-        """Embeddings f32[n, width], read from the folder if these very pixels were seen before."""
+        """Features f32[n, width], read from the folder if these very pixels were seen before."""
         return self.named(images)[1]
 
     def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
-        """The name of the file that holds the embeddings ("" of an empty set), and the embeddings f32[n, width]."""
-        if not images.count:
-            return "", np.zeros((0, self.width), np.float32)
-        return kept_features(self.folder, self.key, images, (images.count, self.width), lambda: self._computed(images))
+        """The name of the file that holds the features ("" where there are none), and the features f32[n, width]."""
+        shape = self.rows(images.count), self.width
+        if not shape[0]:
+            return "", np.zeros(shape, np.float32)
+        content = hashlib.sha256(f"{self.key} {images.count}".encode())
+        for number in range(images.count):
+            picture = images.image(number)
+            content.update(str(picture.shape).encode() + np.ascontiguousarray(picture).tobytes())
+        path = self.folder / f"{content.hexdigest()}.safetensors"
+        if path.is_file():
+            kept = store.read_safetensors(path).get("features")
+            if kept is not None and kept.shape == shape:
+                return path.name, kept
+        with torch.no_grad():
+            batches = [self.network(batch.to(self.device)).cpu().numpy() for batch in self.batches(images)]
+        features = np.concatenate(batches)
+        store.write_safetensors(path, {"features": features})
+        return path.name, features
 
-    def _computed(self, images: ImageSet) -> NDArray[np.float32]:
-        batches = []
+    def rows(self, images: int) -> int:
+        """How many features so many images have."""
+        return images
+
+    def batches(self, images: ImageSet) -> Iterator[Tensor]:
+        """What goes through the network, a part at a time."""
         for start in range(0, images.count, _BATCH):
-            batch = [self.prepare(images.image(n)) for n in range(start, min(start + _BATCH, images.count))]
-            with torch.no_grad():
-                batches.append(self.network(torch.stack(batch).to(self.device)).cpu().numpy())
-        return np.concatenate(batches)
+            numbers = range(start, min(start + _BATCH, images.count))
+            yield torch.stack([self.prepare(images.image(n)) for n in numbers])
 
 
 class FeatureFiles(EmbeddingFiles):
@@ -146,26 +167,6 @@ class FeatureFiles(EmbeddingFiles):
         self.sha256, self.source_sha256 = sha256, source_sha256(weights)
 
 
-def kept_features(
-    folder: Path, key: str, images: ImageSet, shape: tuple[int, int], compute: Callable[[], NDArray[np.float32]]
-) -> tuple[str, NDArray[np.float32]]:
-    """The name of the file with the features of a set, and the features: from a folder if these very pixels went
-    through the same network before, else computed and kept there. ``folder``: where files lie. ``key``: weights and
-    rules. ``images``: what is described. ``shape``: of the features. ``compute``: makes them."""
-    content = hashlib.sha256(f"{key} {images.count}".encode())
-    for number in range(images.count):
-        picture = images.image(number)
-        content.update(str(picture.shape).encode() + np.ascontiguousarray(picture).tobytes())
-    path = folder / f"{content.hexdigest()}.safetensors"
-    if path.is_file():
-        found = store.read_safetensors(path).get("features")
-        if found is not None and found.shape == shape:
-            return path.name, found
-    features = compute()
-    store.write_safetensors(path, {"features": features})
-    return path.name, features
-
-
 def recorded_images(scene: Scene, sets: TrajectorySets) -> ImageSet:
     """The recorded frames of a trajectory's camera at the common size, in order of time; none if the scene lacks the
     camera."""
@@ -173,91 +174,103 @@ def recorded_images(scene: Scene, sets: TrajectorySets) -> ImageSet:
     return ImageSet(len(frames), lambda number: read_image(scene, frames[number])).resized(sets.width, sets.height)
 
 
+@dataclass
 class SetNotes:
     """Which files of features were compared, so that sets of several logs can be pooled, one record per method and
-    trajectory; and the floors."""
+    trajectory; and the floors: what the truth itself scores."""
 
-    def __init__(self) -> None:
-        self.sets: list[dict[str, str]] = []
-        self.floors: list[dict[str, Any]] = []
+    sets: list[dict[str, str]] = field(default_factory=list)
+    floors: list[dict[str, Any]] = field(default_factory=list)
 
     def note(self, trajectory: str, method: str, made: str, reference: str) -> None:
         """Note the names of two files in the folder of features."""
         self.sets.append({"trajectory": trajectory, "method": method, "made": made, "reference": reference})
 
-    def note_floor(self, trajectory: str, how: str, values: Mapping[str, Any]) -> None:
+    def note_floor(self, trajectory: str, how: str, entry: Entry) -> None:
         """Note what the truth itself scores."""
-        self.floors.append({"trajectory": trajectory, "how": how, **values})
+        sizes = {name: value for name, value in entry.items() if name != "values"}
+        self.floors.append({"trajectory": trajectory, "how": how, **entry["values"], **sizes})
 
     def record(self) -> dict[str, Any]:
         """For metrics.json."""
         return {"floors": self.floors, "sets": self.sets}
 
 
-class Distributions:
-    """FID and KID of every trajectory of a scene. ``scene``: whose recorded frames are the reference. ``features``: how
-    images become features."""
+class SetComparison:
+    """A distance of sets of images for every trajectory of a scene, whose recorded frames are the reference.
 
-    def __init__(self, scene: Scene, features: FeatureFiles) -> None:
-        self._scene, self._features = scene, features
-        self._recorded: dict[tuple[str, int, int], tuple[str, NDArray[np.float32]]] = {}
+    Args:
+        files: how images become features. compare: two sets of features to their numbers.
+        halves: two parts of the reference, whose distance is the floor where no truth is known, and what they are.
+        made: how the numbers are made.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        files: EmbeddingFiles,
+        compare: Callable[[Rows, Rows], Entry],
+        halves: tuple[Callable[[Rows], tuple[Rows, Rows]], str],
+        made: Mapping[str, Any],
+    ) -> None:
+        self._scene, self._files, self._compare, self._halves, self._made = scene, files, compare, halves, made
+        self._recorded: dict[tuple[str, int, int], tuple[str, Rows]] = {}
         self._notes = SetNotes()
 
-    def of(self, sets: TrajectorySets) -> dict[str, SetDistances | str]:
-        """Distances by method, or why there are none; the floor of the trajectory is noted for ``record``. InputError:
+    def of(self, sets: TrajectorySets) -> dict[str, Entry | str]:
+        """Numbers by method, or why there are none; the floor of the trajectory is noted for ``record``. InputError:
         methods have different numbers of images."""
         counts = {method: images.count for method, images in sets.methods.items()}
         if len(set(counts.values())) > 1:
             what, expected = "FID of sets of different size cannot be compared", "the same views for all methods"
             got = ", ".join(f"{method}: {count}" for method, count in counts.items())
             raise InputError(what, where=sets.name, expected=expected, got=got)
-        name, reference = self._reference(sets)
-        if not len(reference):
+        key, recorded = (sets.camera, sets.width, sets.height), recorded_images(self._scene, sets)
+        if not recorded.count:
             return dict.fromkeys(counts, score_tables.NO_TRUTH)
-        if min(*counts.values(), len(reference)) < FEWEST:
+        if min(map(self._files.rows, (*counts.values(), recorded.count))) < FEWEST:
             return dict.fromkeys(counts, score_tables.TOO_FEW)
-        found: dict[str, SetDistances | str] = {}
+        if key not in self._recorded:
+            self._recorded[key] = self._files.named(recorded)
+        (name, reference), found = self._recorded[key], dict[str, Entry | str]()
         for method, images in sets.methods.items():
-            own, made = self._features.named(images.resized(sets.width, sets.height))
+            own, made = self._files.named(images.resized(sets.width, sets.height))
             self._notes.note(sets.name, method, own, name)
-            found[method] = distances(made, reference)
-        self._note_floor(sets, reference)
+            found[method] = self._compare(made, reference)
+        split, how = self._halves
+        pair = split(reference)
+        if sets.truth is not None:
+            pair = self._files.of(sets.truth.resized(sets.width, sets.height)), reference
+            how = "true images of the same views"
+        if min(map(len, pair)) >= FEWEST:
+            self._notes.note_floor(sets.name, how, self._compare(*pair))
         return found
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors, for metrics.json."""
-        return {
-            "network": "Inception-v3 of 2015, global average, 2048 values",
-            "weights_sha256": self._features.sha256,
-            "published_weights": self._features.source_sha256 == inception.KNOWN_SHA256,
-            "resize": self._features.rule,
-            "reference": "recorded frames of the same camera",
-            "covariance": "n - 1",
-            **self._notes.record(),
-        }
-
-    def _reference(self, sets: TrajectorySets) -> tuple[str, NDArray[np.float32]]:
-        key = (sets.camera, sets.width, sets.height)
-        if key not in self._recorded:
-            self._recorded[key] = self._features.named(recorded_images(self._scene, sets))
-        return self._recorded[key]
-
-    def _note_floor(self, sets: TrajectorySets, reference: NDArray[np.float32]) -> None:
-        if sets.truth is not None:
-            how = "true images of the same views"
-            found = distances(self._features.of(sets.truth.resized(sets.width, sets.height)), reference)
-        elif len(reference) >= 2 * FEWEST:
-            how, found = "every second recorded frame against the others", distances(reference[::2], reference[1::2])
-        else:
-            return
-        values = {"fid": round(found.fid, 6), "kid": round(found.kid, 6), **found.record()}
-        self._notes.note_floor(sets.name, how, values)
+        return {**self._made, **self._notes.record()}
 
 
-def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> Distributions:
+EVERY_SECOND: Final = (lambda rows: (rows[::2], rows[1::2]), "every second recorded frame against the others")
+
+
+def distributions(scene: Scene, files: FeatureFiles) -> SetComparison:
+    """FID and KID."""
+    made = {
+        "network": "Inception-v3 of 2015, global average, 2048 values",
+        "weights_sha256": files.sha256,
+        "published_weights": files.source_sha256 == inception.KNOWN_SHA256,
+        "resize": files.rule,
+        "reference": "recorded frames of the same camera",
+        "covariance": "n - 1",
+    }
+    return SetComparison(scene, files, lambda *pair: distances(*pair).entry(), EVERY_SECOND, made)
+
+
+def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
     """What computes FID and KID."""
     device, folder = choose_device(config.device, "networks of the scores"), out / FEATURES_FOLDER
-    return Distributions(scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, folder, device))
+    return distributions(scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, folder, device))
 
 
 def distances(made: NDArray[np.float32], reference: NDArray[np.float32]) -> SetDistances:
@@ -268,15 +281,10 @@ def distances(made: NDArray[np.float32], reference: NDArray[np.float32]) -> SetD
         error = feature_distances.kernel_distance_error(made, reference, blocks, rng("blocks of KID"))
     if min(len(made), len(reference)) >= FEWEST_TO_EXTRAPOLATE:
         at_infinity = feature_distances.frechet_at_infinity(made, reference, rng("sizes of FID"))
-    return SetDistances(
-        n=len(made),
-        n_reference=len(reference),
-        fid=feature_distances.frechet_distance(made, reference),
-        kid=feature_distances.kernel_distance(made, reference),
-        kid_standard_error=error,
-        mind=feature_distances.mind_distance(made, reference, rng("directions of MIND")),
-        fid_at_infinity=at_infinity,
-    )
+    measures = feature_distances.frechet_distance, feature_distances.kernel_distance
+    fid, kid = (measure(made, reference) for measure in measures)
+    mind = feature_distances.mind_distance(made, reference, rng("directions of MIND"))
+    return SetDistances(len(made), len(reference), fid, kid, error, mind, at_infinity)
 
 
 # -- videos ----------------------------------------------------------------------------------------
@@ -289,45 +297,31 @@ CLIP_FRAMES: Final = 16
 HOP_FRAMES: Final = 8
 
 
-class ClipFiles:
-    """Features of the clips of a video by FVD's network, kept in a folder. ``weights``: file with the network's
-    weights. ``rule``: how frames get its size. ``folder``: where features are kept. ``device``: of the network.
-    InputError: the file is missing, damaged, or holds another network."""
+class ClipFiles(EmbeddingFiles):
+    """Features f32[clips, 400] of the clips of a video by FVD's network, kept in a folder. ``weights``: file with the
+    network's weights. ``rule``: how frames get its size. ``folder``: where features are kept. ``device``: of the
+    network. InputError: the file is missing, damaged, or holds another network."""
 
     def __init__(self, weights: Path, rule: i3d.VideoRule, folder: Path, device: torch.device) -> None:
+        state, self.sha256 = read_checkpoint(weights), store.sha256_file(weights)
         self.rule: i3d.VideoRule = rule
-        state = read_checkpoint(weights)
-        self.sha256 = store.sha256_file(weights)
-        self._folder, self._device = folder, device
-        self._network = i3d.I3DFeatures(state, str(weights)).to(device)
+        network = i3d.I3DFeatures(state, str(weights)).to(device)
+        key = f"I3D {self.sha256} {rule} {CLIP_FRAMES} {HOP_FRAMES}"
+        prepare = functools.partial(i3d.prepared_frame, rule=rule)
+        super().__init__(network, prepare, i3d.WIDTH, key, folder, device)
 
-    def of(self, images: ImageSet) -> NDArray[np.float32]:
-        """Features f32[clips, 400]; no row if the video is shorter than a clip."""
-        return self.named(images)[1]
+    def rows(self, images: int) -> int:
+        """See ``EmbeddingFiles``: one per clip."""
+        return clip_count(images)
 
-    def named(self, images: ImageSet) -> tuple[str, NDArray[np.float32]]:
-        """The name of the file that holds the features ("" if there is no clip), and the features."""
-        count = clip_count(images.count)
-        if not count:
-            return "", np.zeros((0, i3d.WIDTH), np.float32)
-        key = f"I3D {self.sha256} {self.rule} {CLIP_FRAMES} {HOP_FRAMES}"
-        return kept_features(self._folder, key, images, (count, i3d.WIDTH), lambda: self._computed(images))
-
-    def _computed(self, images: ImageSet) -> NDArray[np.float32]:
-        rows = []
-        for clip in self._clips(images):
-            with torch.no_grad():
-                rows.append(self._network(clip[None].to(self._device)).cpu().numpy())
-        return np.concatenate(rows)
-
-    def _clips(self, images: ImageSet) -> Iterator[Tensor]:
-        """Clips f32[3, 16, 224, 224] in order of time."""
+    def batches(self, images: ImageSet) -> Iterator[Tensor]:
+        """Clips f32[1, 3, 16, 224, 224] in order of time."""
         window: list[Tensor] = []
         for number in range(images.count):
-            window = [*window[-CLIP_FRAMES + 1 :], i3d.prepared_frame(images.image(number), self.rule)]
+            window = [*window[-CLIP_FRAMES + 1 :], self.prepare(images.image(number))]
             begin = number + 1 - CLIP_FRAMES
             if begin >= 0 and begin % HOP_FRAMES == 0:
-                yield torch.stack(window, 1)
+                yield torch.stack(window, 1)[None]
 
 
 def clip_count(frames: int) -> int:
@@ -335,61 +329,29 @@ def clip_count(frames: int) -> int:
     return 0 if frames < CLIP_FRAMES else (frames - CLIP_FRAMES) // HOP_FRAMES + 1
 
 
-class VideoDistances:
-    """FVD of every trajectory of a scene. ``scene``: whose recorded video is the reference. ``clips``: how videos
-    become features."""
-
-    def __init__(self, scene: Scene, clips: ClipFiles) -> None:
-        self._scene, self._clips = scene, clips
-        self._notes = SetNotes()
-
-    def of(self, sets: TrajectorySets) -> dict[str, dict[str, Any] | str]:
-        """By method ``{"fvd", "n", "n_reference"}``, or why there is none; the floor of the trajectory is noted for
-        ``record``. ``sets``: with all views of every method, in order of time."""
-        recorded = recorded_images(self._scene, sets)
-        if not recorded.count:
-            return dict.fromkeys(sets.methods, score_tables.NO_TRUTH)
-        if min(clip_count(v.count) for v in (*sets.methods.values(), recorded)) < FEWEST:
-            return dict.fromkeys(sets.methods, score_tables.TOO_FEW)
-        name, reference = self._clips.named(recorded)
-        found: dict[str, dict[str, Any] | str] = {}
-        for method, images in sets.methods.items():
-            own, made = self._clips.named(images.resized(sets.width, sets.height))
-            self._notes.note(sets.name, method, own, name)
-            found[method] = compared(made, reference)
-        half = len(reference) // 2
-        if sets.truth is not None:
-            floor = compared(self._clips.of(sets.truth.resized(sets.width, sets.height)), reference)
-            self._notes.note_floor(sets.name, "true images of the same views", floor)
-        elif half >= FEWEST:
-            floor = compared(reference[:half], reference[half:])
-            self._notes.note_floor(sets.name, "first half of the recorded video against the second", floor)
-        return found
-
-    def record(self) -> dict[str, Any]:
-        """How the numbers were made, and the floors, for metrics.json."""
-        return {
-            "network": "I3D, Kinetics-400, scores before the softmax, 400 values",
-            "weights_sha256": self._clips.sha256,
-            "norm_epsilon": i3d.NORM_EPSILON,
-            "resize": self._clips.rule,
-            "clip_frames": CLIP_FRAMES,
-            "hop_frames": HOP_FRAMES,
-            "reference": "recorded video of the same camera",
-            "covariance": "n - 1",
-            **self._notes.record(),
-        }
+def video_entry(made: Rows, reference: Rows) -> Entry:
+    """FVD of two sets of features ``[n, d]``."""
+    value = round(frechet_distance(made, reference), 6)
+    return {"values": {"fvd": value}, "n": len(made), "n_reference": len(reference)}
 
 
-def compared(made: NDArray[np.float32], reference: NDArray[np.float32]) -> dict[str, Any]:
-    """FVD of two sets of features ``[n, d]`` with their sizes."""
-    return {"fvd": round(frechet_distance(made, reference), 6), "n": len(made), "n_reference": len(reference)}
-
-
-def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> VideoDistances:
-    """What computes FVD."""
+def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
+    """What computes FVD; a trajectory's sets hold all views of every method, in order of time."""
     device = choose_device(config.device, "networks of the scores")
-    return VideoDistances(scene, ClipFiles(Path(config.fvd_weights), config.fvd_resize, out / FEATURES_FOLDER, device))
+    files = ClipFiles(Path(config.fvd_weights), config.fvd_resize, out / FEATURES_FOLDER, device)
+    made = {
+        "network": "I3D, Kinetics-400, scores before the softmax, 400 values",
+        "weights_sha256": files.sha256,
+        "norm_epsilon": i3d.NORM_EPSILON,
+        "resize": files.rule,
+        "clip_frames": CLIP_FRAMES,
+        "hop_frames": HOP_FRAMES,
+        "reference": "recorded video of the same camera",
+        "covariance": "n - 1",
+    }
+    halves = lambda rows: (rows[: len(rows) // 2], rows[len(rows) // 2 :])
+    how = "first half of the recorded video against the second"
+    return SetComparison(scene, files, video_entry, (halves, how), made)
 
 
 # -- video features --------------------------------------------------------------------------------
@@ -413,8 +375,7 @@ class VideoFeatures:
             expected = f"{tables}, each with a tensor features [clips, values]"
             remedy = "run the extractor yourself and save what it gives; programs (TorchScript) are not read"
             raise InputError("no such folder of features", where=str(folder), expected=expected, remedy=remedy)
-        self._folder = folder
-        self._floors: list[dict[str, Any]] = []
+        self._folder, self._notes = folder, SetNotes()
         self._width: int | None = None
 
     def of(self, trajectory: str, camera: str, methods: Sequence[str]) -> dict[str, dict[str, Any] | str]:
@@ -429,8 +390,7 @@ class VideoFeatures:
             found[method] = score_tables.NO_FEATURES if made is None else _compared(made, reference)
         true = self._read(f"{TRUTH}/{trajectory}")
         if true is not None and not isinstance(floor := _compared(true, reference), str):
-            sizes = {"n": floor["n"], "n_reference": floor["n_reference"]}
-            self._floors.append({"trajectory": trajectory, "how": "true clips", **floor["values"], **sizes})
+            self._notes.note_floor(trajectory, "true clips", floor)
         return found
 
     def record(self) -> dict[str, Any]:
@@ -442,7 +402,7 @@ class VideoFeatures:
             "covariance": "n - 1",
             "kernel": "(x.y / d)^2, biased, times 100",
             "reference": "clips of the recorded video of the same camera",
-            "floors": self._floors,
+            "floors": self._notes.floors,
         }
 
     def _read(self, name: str) -> NDArray[np.float64] | None:
@@ -471,8 +431,6 @@ def _compared(made: NDArray[np.float64], reference: NDArray[np.float64]) -> dict
 # Distances of sets compare the counted views of a trajectory with the recorded frames of the same camera, as FID does.
 # CLIP-F and consistency follow the video, so all views count.
 
-Rows = NDArray[np.float32]
-
 
 class EmbeddingScores:
     """A distance of counted views from the recorded frames, with its floors, and what else an embedding tells of a
@@ -491,7 +449,7 @@ class EmbeddingScores:
         made: dict[str, Any],
     ) -> None:
         self._scene, self._files, self._name, self._distance = scene, files, name, distance
-        self._further, self._made, self._floors = further, made, list[dict[str, Any]]()
+        self._further, self._made, self._notes = further, made, SetNotes()
 
     def of(
         self, sets: TrajectorySets, counted: Sequence[int], views: Sequence[View]
@@ -515,14 +473,11 @@ class EmbeddingScores:
             }
         if sets.truth is not None:
             floor = self._compared(embedded(sets.truth)[list(counted)], reference, fewest=0)
-            self._note_floor(sets.name, "true images of the same views", floor)
+            self._notes.note_floor(sets.name, "true images of the same views", floor)
         elif len(reference) >= 2 * FEWEST:
-            floor = self._compared(reference[::2], reference[1::2])
-            self._note_floor(sets.name, "every second recorded frame against the others", floor)
+            split, how = EVERY_SECOND
+            self._notes.note_floor(sets.name, how, self._compared(*split(reference)))
         return found
-
-    def _note_floor(self, trajectory: str, how: str, floor: dict[str, Any]) -> None:
-        self._floors.append({"trajectory": trajectory, "how": how, **floor.pop("values"), **floor})
 
     def _compared(self, made: Rows, reference: Rows, fewest: int = FEWEST) -> dict[str, Any]:
         """The distance and the sizes of both sets; or why there is none."""
@@ -535,7 +490,7 @@ class EmbeddingScores:
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors."""
-        return {**self._made, "floors": self._floors}
+        return {**self._made, "floors": self._notes.floors}
 
 
 def _units(rows: Rows) -> NDArray[np.float64]:

@@ -25,6 +25,8 @@ from mudg.scoring.sets import ImageSet, TrajectorySets
 BASELINE: Final = "nearest_fill"
 Rows = Sequence[dict[str, Any]]
 OF_ENTRY: Final[Mapping[str, tuple[str, ...]]] = {
+    "distribution": ("fid", "kid"),
+    "video": ("fvd",),
     "dinov2": ("fd_dinov2", "subject_consistency"),
     "clip": ("cmmd", "clip_f", "clip_v"),
     "video_features": ("video_frechet", "video_mmd"),
@@ -36,8 +38,8 @@ OF_ENTRY: Final[Mapping[str, tuple[str, ...]]] = {
 class SetScores:
     """What is computed of whole sets; None where its weights or files were not given."""
 
-    distributions: sets.Distributions | None
-    videos: sets.VideoDistances | None
+    distributions: sets.SetComparison | None
+    videos: sets.SetComparison | None
     dinov2: sets.EmbeddingScores | None
     clip: sets.EmbeddingScores | None
     video_features: sets.VideoFeatures | None
@@ -57,22 +59,10 @@ class SetScores:
     def _add(self, trajectory: ScoredTrajectory, rows: Rows, reference: Reference, out: Path) -> None:
         counted = trajectory.counted(reference.held_out)
         if self.distributions is not None:
-            distances = self.distributions.of(_sets_of(trajectory, reference, out, counted))
-            for row in rows:
-                value = distances[row["method"]]
-                if isinstance(value, str):
-                    row["values"] |= {"fid": value, "kid": value}
-                else:
-                    row["values"] |= {"fid": round(value.fid, 6), "kid": round(value.kid, 6)}
-                    row["distribution"] = value.record()
+            _add_named(rows, "distribution", self.distributions.of(_sets_of(trajectory, reference, out, counted)))
         every = _sets_of(trajectory, reference, out, range(len(trajectory.views)))
         if self.videos is not None:
-            distances = self.videos.of(every)
-            for row in rows:
-                value = distances[row["method"]]
-                row["values"]["fvd"] = value if isinstance(value, str) else value["fvd"]
-                if not isinstance(value, str):
-                    row["video"] = {"n": value["n"], "n_reference": value["n_reference"]}
+            _add_named(rows, "video", self.videos.of(every))
         for name, embedded in (("dinov2", self.dinov2), ("clip", self.clip)):
             if embedded is not None:
                 _add_named(rows, name, embedded.of(every, counted, trajectory.views))
@@ -159,7 +149,7 @@ def _add_named(rows: Rows, entry: str, found: Mapping[str, dict[str, Any] | str]
         of = found[row["method"]]
         row["values"] |= dict(of["values"]) if not isinstance(of, str) else dict.fromkeys(OF_ENTRY[entry], of)
         if not isinstance(of, str) and "n" in of:
-            row[entry] = {"n": of["n"], "n_reference": of["n_reference"]}
+            row[entry] = {name: value for name, value in of.items() if name != "values"}
 
 
 def _add_detections(

@@ -72,9 +72,9 @@ class Fit(Output):
     @classmethod
     def suits(cls, choice: str, name: str) -> bool:
         """See ``Step``: settings of a method."""
-        from mudg.gaussians.settings import METHODS
+        from mudg.gaussians.settings import has_setting
 
-        return METHODS[choice].has(name)
+        return has_setting(choice, name)
 
     @property
     def reads_scene_alone(self) -> bool:
