@@ -75,7 +75,7 @@ def test_normal_equations_solve_a_linear_problem_and_bound_outliers():
 
 
 def test_without_evidence_a_clean_track_stays_and_wrong_offsets_go_back(node):
-    nothing = fit_poses.PoseEvidence.none(FRAMES)
+    nothing = fit_poses.PoseEvidence(FRAMES)
     assert np.abs(fit_poses._move(node, nothing)).max() < 0.02
     node.add_offsets(np.tile([0.1, 0.05, 0.0], (FRAMES, 1)), np.full(FRAMES, 0.02))
     fit_poses._move(node, nothing)
@@ -83,12 +83,12 @@ def test_without_evidence_a_clean_track_stays_and_wrong_offsets_go_back(node):
 
 
 def test_evidence_between_two_keys_is_shared(node):
-    evidence = fit_poses.PoseEvidence.none(FRAMES)
-    fit_poses._add_to_keys(node, 0.375, np.eye(4), np.ones(4), evidence)
+    evidence = fit_poses.PoseEvidence(FRAMES)
+    evidence.add(node.keys_around(0.375), np.eye(4), np.ones(4))
     assert evidence.matrix[1, 0, 0] == pytest.approx(0.75**2)
     assert evidence.matrix[2, 0, 0] == pytest.approx(0.25**2)
     assert evidence.vector[:, 0] == pytest.approx([0, 0.75, 0.25, 0, 0, 0])
-    fit_poses._add_to_keys(node, 99.0, np.eye(4), np.ones(4), evidence)
+    evidence.add(node.keys_around(99.0), np.eye(4), np.ones(4))
     assert evidence.views == 1
 
 

@@ -28,21 +28,7 @@ from mudg.base.processes import Interruption, one_torch_thread
 from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Frame, Observation, Scene, View
-from mudg.baselines.emernerf_field import (
-    SIZES,
-    Budget,
-    Extent,
-    Marched,
-    RadianceField,
-    RayDraws,
-    Rays,
-    Weights,
-    colors,
-    lidar_terms,
-    march,
-    pixel_terms,
-    proposal_loss,
-)
+from mudg.baselines import emernerf_field as fields
 from mudg.baselines.settings import MethodConfig
 from mudg.core.pictures import depth_colors, gray, side_by_side, to_bytes
 from mudg.gaussians.rendering import COVERED
@@ -72,11 +58,13 @@ class LidarRays:
     def __len__(self) -> int:
         return len(self.origins)
 
-    def batch(self, count: int, extent: Extent, generator: torch.Generator) -> tuple[Rays, Tensor]:
+    def batch(self, count: int, extent: fields.Extent, generator: torch.Generator) -> tuple[fields.Rays, Tensor]:
         """``count`` of them, drawn with replacement, and their ranges."""
         chosen = torch.randint(0, len(self), (count,), generator=generator)
         times = ((self.time_s[chosen] - extent.start_s) / extent.span_s).clamp(0, 1)[:, None]
-        rays = Rays(self.origins[chosen], self.directions[chosen], times.float(), torch.zeros(count, dtype=torch.int64))
+        rays = fields.Rays(
+            self.origins[chosen], self.directions[chosen], times.float(), torch.zeros(count, dtype=torch.int64)
+        )
         return rays, self.range_m[chosen]
 
 
@@ -104,7 +92,7 @@ def lidar_rays(scene: Scene) -> LidarRays | None:
     return LidarRays(origins.float(), directions.float(), range_m.float(), time_s)
 
 
-def extent_of(scene: Scene, lidar: LidarRays | None) -> Extent:
+def extent_of(scene: Scene, lidar: LidarRays | None) -> fields.Extent:
     """The box of the LiDAR points (without the outermost 2 % along every axis), and the time of the log."""
     if lidar is None:
         places = np.stack([frame.view.center_world for frame in scene.frames])
@@ -120,10 +108,12 @@ def extent_of(scene: Scene, lidar: LidarRays | None) -> Extent:
     gaps = np.diff(np.sort(own))
     start, end = times.min(), times.max()
     step = float(np.median(gaps)) if len(gaps) else 0.1
-    return Extent(tuple(center.tolist()), tuple(half.tolist()), float(start), float(max(end - start, step)), step)
+    return fields.Extent(
+        tuple(center.tolist()), tuple(half.tolist()), float(start), float(max(end - start, step)), step
+    )
 
 
-def view_rays(view: View, extent: Extent, camera: int, stride: int = 1) -> tuple[Rays, Tensor]:
+def view_rays(view: View, extent: fields.Extent, camera: int, stride: int = 1) -> tuple[fields.Rays, Tensor]:
     """A ray for every (``stride``-th) pixel, row by row, and the camera depth of each ray's unit length ``[R]``."""
     x, y = (torch.from_numpy(values[::stride].astype(np.float32)) for values in geometry.pixel_rays(view.camera))
     shape = len(y), len(x)
@@ -134,9 +124,9 @@ def view_rays(view: View, extent: Extent, camera: int, stride: int = 1) -> tuple
     return _rays(plane, poses, times, cameras), 1 / plane.norm(dim=1)
 
 
-def _rays(plane: Tensor, poses: Tensor, times: Tensor, cameras: Tensor) -> Rays:
+def _rays(plane: Tensor, poses: Tensor, times: Tensor, cameras: Tensor) -> fields.Rays:
     along = (poses[:, :3, :3] * plane[:, None, :]).sum(2)
-    return Rays(poses[:, :3, 3], along / along.norm(dim=1, keepdim=True), times, cameras)
+    return fields.Rays(poses[:, :3, 3], along / along.norm(dim=1, keepdim=True), times, cameras)
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +134,7 @@ class PixelBatch:
     """Rays of pixels with what they show: colours f32[R, 3], whether they count f32[R], sky bool[R] or None; cells of
     the error map."""
 
-    rays: Rays
+    rays: fields.Rays
     rgb: Tensor
     counts: Tensor
     sky: Tensor | None
@@ -155,7 +145,7 @@ class Pixels:
     """All pixels of recorded views, and how badly they are met so far. ``cameras``: names; a ray carries the number of
     its camera."""
 
-    def __init__(self, views: Sequence[StoredView], cameras: Sequence[str], extent: Extent) -> None:
+    def __init__(self, views: Sequence[StoredView], cameras: Sequence[str], extent: fields.Extent) -> None:
         sizes = [view.rgb.shape[:2] for view in views]
         self._starts = torch.tensor([0, *np.cumsum([h * w for h, w in sizes])])
         self._sizes = torch.tensor(sizes)
@@ -209,7 +199,7 @@ class Pixels:
 
 
 def recorded_pixels(
-    scene: Scene, frames: Sequence[Frame], width_px: int, cameras: Sequence[str], extent: Extent
+    scene: Scene, frames: Sequence[Frame], width_px: int, cameras: Sequence[str], extent: fields.Extent
 ) -> tuple[Pixels, StoredView]:
     """The pixels of these frames, and the middle view."""
     places = dict(load_recorded(scene, frames, (), width_px, False))
@@ -238,7 +228,7 @@ class Seen:
 
 
 @torch.no_grad()
-def see(field: RadianceField, view: View, budget: Budget, stride: int = 1) -> Seen:
+def see(field: fields.RadianceField, view: View, budget: fields.Budget, stride: int = 1) -> Seen:
     """March all pixels of a view, or every ``stride``-th."""
     name = view.camera.name
     rays, z_per_m = view_rays(view, field.extent, field.cameras.index(name) if name in field.cameras else 0, stride)
@@ -249,16 +239,16 @@ def see(field: RadianceField, view: View, budget: Budget, stride: int = 1) -> Se
     return Seen(every[:3], every[3] * z_per_m.view(-1, width), every[4], every[5], every[6:9])
 
 
-def _part(field: RadianceField, rays: Rays, budget: Budget) -> Tensor:
+def _part(field: fields.RadianceField, rays: fields.Rays, budget: fields.Budget) -> Tensor:
     rays = rays.to(field.device)
-    marched = march(field, rays, budget)
+    marched = fields.march(field, rays, budget)
     moving = marched.dynamic_weights()
     flow = (moving[..., None] * marched.values.flow[:, :3].view(*moving.shape, 3)).sum(1)
     rest = torch.stack([marched.median_m, marched.opacity, moving.sum(1)], 1)
-    return torch.cat([colors(field, rays, marched)[0], rest, flow], 1).cpu()
+    return torch.cat([fields.colors(field, rays, marched)[0], rest, flow], 1).cpu()
 
 
-def observe(field: RadianceField, view: View, budget: Budget, source: str = "") -> Observation:
+def observe(field: fields.RadianceField, view: View, budget: fields.Budget, source: str = "") -> Observation:
     """One view as an observation of kind "virtual", without classes; where opacity is below ``COVERED`` there is no
     depth."""
     seen = see(field, view, budget)
@@ -269,7 +259,9 @@ def observe(field: RadianceField, view: View, budget: Budget, source: str = "") 
     return Observation(view, rgb, depth, None, sure, mask, "virtual", source)
 
 
-def write_preview(field: RadianceField, stored: StoredView, budget: Budget, path: Path, whole: bool = False) -> None:
+def write_preview(
+    field: fields.RadianceField, stored: StoredView, budget: fields.Budget, path: Path, whole: bool = False
+) -> None:
     """A picture of five panels: truth, colour, depth, opacity of what moves, its flow. Coarser than the view unless
     ``whole``."""
     pixels = stored.view.camera.width * stored.view.camera.height
@@ -293,14 +285,14 @@ def flow_colors(flow: NDArray[np.floating]) -> NDArray[np.uint8]:
 # on disk ------------------------------------------------------------------------------------------
 
 
-def save_field(field: RadianceField, budget: Budget, folder: Path) -> None:
+def save_field(field: fields.RadianceField, budget: fields.Budget, folder: Path) -> None:
     """Field and sampling, without optimiser moments."""
     description = {"schema": 1, "kind": RADIANCE, **field.description(), "budget": asdict(budget)}
     store.write_json(folder / "model.json", description)
     store.write_safetensors(folder / "field.safetensors", {k: value.cpu() for k, value in field.state_dict().items()})
 
 
-def load_field(folder: Path) -> tuple[RadianceField, Budget]:
+def load_field(folder: Path) -> tuple[fields.RadianceField, fields.Budget]:
     """Inverse of ``save_field``. InputError: not the folder of a finished fit of a radiance field. IntegrityError: a
     file was altered."""
     folder = Path(folder)
@@ -311,8 +303,8 @@ def load_field(folder: Path) -> tuple[RadianceField, Budget]:
         store.verify_manifest(folder)
     values, tensors = description_of(folder), store.read_tensors(folder / "field.safetensors")
     with understood("a radiance field", str(folder)):
-        budget = Budget(**{**values["budget"], "proposals": tuple(values["budget"]["proposals"])})
-        return RadianceField.from_state(values, tensors), budget
+        budget = fields.Budget(**{**values["budget"], "proposals": tuple(values["budget"]["proposals"])})
+        return fields.RadianceField.from_state(values, tensors), budget
 
 
 # fit ----------------------------------------------------------------------------------------------
@@ -327,15 +319,15 @@ PROPOSALS_EVERY = 5
 ERROR_SHARE = 0.25
 """Share of the pixels that are drawn where the colour error was large."""
 NEAR_M, FAR_M = 0.1, 1000.0
-BUDGETS: Final[Mapping[str, Budget]] = {
-    "small": Budget((64, 32), 32, NEAR_M, FAR_M),
-    "published": Budget((128, 64), 64, NEAR_M, FAR_M),
-    "tiny": Budget((16, 12), 8, NEAR_M, FAR_M),
+BUDGETS: Final[Mapping[str, fields.Budget]] = {
+    "small": fields.Budget((64, 32), 32, NEAR_M, FAR_M),
+    "published": fields.Budget((128, 64), 64, NEAR_M, FAR_M),
+    "tiny": fields.Budget((16, 12), 8, NEAR_M, FAR_M),
 }
 """Samples of a ray, by setting."""
 BATCHES: Final[Mapping[str, tuple[int, int]]] = {"small": (512, 256), "published": (8192, 8192), "tiny": (48, 24)}
 """Pixels, and LiDAR rays, of a step, by setting."""
-WEIGHTS = Weights(sky=0.001, lidar=1.0, sight=0.1, dynamic=0.002, shadow=0.01, cycle=0.01)
+WEIGHTS = fields.Weights(sky=0.001, lidar=1.0, sight=0.1, dynamic=0.002, shadow=0.01, cycle=0.01)
 """Published, but for the dynamic density: 0.01, at once."""
 SIGHT_START, SIGHT_M, SIGHT_LEAST_M, SIGHT_HALVES = 0.08, 6.0, 0.6, 0.2
 """Share of the run before the line of sight counts; half width of its surface then, and at the end (published: 2.5 m);
@@ -350,7 +342,7 @@ LOG_EVERY = 20
 class RadianceState:
     """Everything that changes while fitting, and what it is fitted to."""
 
-    field: RadianceField
+    field: fields.RadianceField
     optimisers: tuple[torch.optim.Adam, torch.optim.Adam]  # of the fields, and of the proposal networks
     pixels: Pixels
     lidar: LidarRays | None
@@ -388,7 +380,7 @@ def prepare(config: MethodConfig, scene: Scene, folder: RunDir, device: torch.de
     if pixels.sky is None:
         log.info("the sky of this scene is not labelled: fitted without the sky term")
     facts = {"method": config.method, "scene": scene.id}
-    field = RadianceField(SIZES[config.radiance.size], extent, cameras, facts, config.seed).to(device)
+    field = fields.RadianceField(fields.SIZES[config.radiance.size], extent, cameras, facts, config.seed).to(device)
     state = RadianceState(field, _optimisers(field), pixels, lidar, shown)
     found = checkpoint.latest(folder.path / "steps")
     if found is not None:
@@ -438,7 +430,7 @@ def take_step(state: RadianceState, config: MethodConfig, step: int) -> dict[str
     batch = state.pixels.batch(pixels, ERROR_SHARE, generator)
     marched, draws, rays = _marched(field, batch.rays, budget, generator, learns)
     truth = batch.rgb.to(device), batch.counts.to(device), None if batch.sky is None else batch.sky.to(device)
-    terms, error = pixel_terms(field, rays, marched, draws, truth, weights)
+    terms, error = fields.pixel_terms(field, rays, marched, draws, truth, weights)
     _learn(state, terms, marched, learns, f"step {step}, pixels")
     state.pixels.note(batch.cells, error)
     if state.lidar is None:
@@ -448,24 +440,26 @@ def take_step(state: RadianceState, config: MethodConfig, step: int) -> dict[str
     given, range_m = state.lidar.batch(lidar_rays, field.extent, generator)
     marched, draws, _ = _marched(field, given, budget, generator, learns)
     sight_m = sight_width(step, config.iterations)
-    measured = lidar_terms(field, marched, draws, range_m.to(device), weights, sight_m)
+    measured = fields.lidar_terms(field, marched, draws, range_m.to(device), weights, sight_m)
     _learn(state, measured, marched, learns, f"step {step}, LiDAR")
     return terms | {name if name not in terms else f"{name}_lidar": value for name, value in measured.items()}
 
 
 def _marched(
-    field: RadianceField, rays: Rays, budget: Budget, generator: torch.Generator, learns: bool
-) -> tuple[Marched, RayDraws, Rays]:
+    field: fields.RadianceField, rays: fields.Rays, budget: fields.Budget, generator: torch.Generator, learns: bool
+) -> tuple[fields.Marched, fields.RayDraws, fields.Rays]:
     """A training batch on the device: marched, with what was drawn for it. The one way there."""
     there = rays.to(field.device)
-    draws = RayDraws.of(len(rays), budget, generator, field.device)
-    return march(field, there, budget, draws, learns), draws, there
+    draws = fields.RayDraws.of(len(rays), budget, generator, field.device)
+    return fields.march(field, there, budget, draws, learns), draws, there
 
 
-def _learn(state: RadianceState, terms: Mapping[str, Tensor], marched: Marched, learns: bool, where: str) -> None:
+def _learn(
+    state: RadianceState, terms: Mapping[str, Tensor], marched: fields.Marched, learns: bool, where: str
+) -> None:
     """One step of the optimisers down the sum of the terms; NumericsError before that if something is not finite."""
     total = torch.stack(list(terms.values())).sum()
-    total = total + proposal_loss(marched) if learns else total
+    total = total + fields.proposal_loss(marched) if learns else total
     remedy = "the parameters are those of the step before; another --seed draws other rays"
     if not bool(torch.isfinite(total)):
         odd = [name for name, value in terms.items() if not bool(torch.isfinite(value))]
@@ -510,7 +504,7 @@ def _progress(terms: Mapping[str, Tensor]) -> dict[str, float]:
 # ---- the optimisers, and checkpoints -------------------------------------------------------------
 
 
-def _optimisers(field: RadianceField) -> tuple[torch.optim.Adam, torch.optim.Adam]:
+def _optimisers(field: fields.RadianceField) -> tuple[torch.optim.Adam, torch.optim.Adam]:
     proposals = list(field.proposals.parameters())
     own = {id(value) for value in proposals}
     fused = field.device.type in ("cpu", "cuda")

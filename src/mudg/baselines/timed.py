@@ -21,7 +21,6 @@ from torch import Tensor
 from mudg.base import geometry, seeds
 from mudg.base.camera_colors import CameraColors
 from mudg.base.errors import InputError
-from mudg.base.palette import UNLABELLED
 from mudg.base.types import Scene
 from mudg.core.fusion import largest_beam_gap
 from mudg.core.project import RULES as HIDING_RULES
@@ -137,10 +136,8 @@ def _seen(
     if stored.mask is not None:
         seen &= stored.mask[row, column]
     rows, row, column = rows[seen], row[seen], column[seen]
-    train_ids = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))
-    unknown = np.full(len(rows), UNLABELLED, np.uint8)
-    labels = unknown if stored.channels is None else train_ids[np.minimum(stored.channels[row, column], len(classes))]
-    return rows, colors.bytes_to_common(camera.name, stored.rgb[row, column]), labels
+    common = colors.bytes_to_common(camera.name, stored.rgb[row, column])
+    return rows, common, stored.train_ids(row, column, classes)
 
 
 def _by_moment(

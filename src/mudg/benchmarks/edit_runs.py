@@ -34,18 +34,7 @@ from mudg.core.edit import Motion
 from mudg.core.fusion import STATIC
 from mudg.core.lidar import DEPTH_LIMIT_M, OwnedPoints
 from mudg.core.raster.rasterize import drawing_device
-from mudg.editing.apply import (
-    Drawer,
-    EditedDrive,
-    asset_from,
-    background_of,
-    carry_out,
-    ground_of,
-    in_weather,
-    read_asset,
-    weather_of,
-    write_asset,
-)
+from mudg.editing import apply
 from mudg.editing.plan import EditPlan, EditSources, EditWorld, collisions, plan_edits
 from mudg.editing.recorded import boxes_mask, ground_mask, outlines, touched_boxes
 from mudg.editing.runs import RunParts, find_run
@@ -87,7 +76,7 @@ class Video:
     of the vehicle whose path is followed, or empty. ``motion``: its path. ``size_m``: of its box."""
 
     model: SceneModel
-    draw: Drawer
+    draw: apply.Drawer
     actor: str = ""
     motion: Motion | None = None
     size_m: tuple[float, float, float] = (1.0, 1.0, 1.0)
@@ -173,7 +162,7 @@ class Sums:
 def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> dict[str, Any]:
     """The numbers of one edit. ``shown``: gets the number of each frame, and its renders without and with the edit.
     InputError: the script cannot be carried out on this drive."""
-    drive = carry_out(script, case.model, case.scene, case.cloud)
+    drive = apply.carry_out(script, case.model, case.scene, case.cloud)
     usual, edited, weather = _videos(case, drive)
     sums = Sums()
     for number, frame in enumerate(case.frames):
@@ -206,13 +195,13 @@ def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> d
     }
 
 
-def _videos(case: RunCase, drive: EditedDrive) -> tuple[Video, Video, bool]:
+def _videos(case: RunCase, drive: apply.EditedDrive) -> tuple[Video, Video, bool]:
     """The unedited and the edited video, and whether weather or light changes."""
     conditions = conditions_of(drive.script.canonical())
     made = drive.model(case.model)
     plain, draw = drawer(case.model), drawer(made)
     if conditions is not None:
-        draw = in_weather(draw, weather_of(draw, conditions, case.scene))
+        draw = apply.in_weather(draw, apply.weather_of(draw, conditions, case.scene))
     new = next(iter(drive.plan.inserted), case.lead)
     usual, edited = Video(case.model, plain), Video(made, draw)
     for video, world, name in ((usual, drive.plan.before, case.lead), (edited, drive.plan.after, new)):
@@ -378,7 +367,7 @@ def _document(runs: Mapping[str, RunParts], device: torch.device, out: Path) -> 
 
     def lead_found(name: str) -> dict[str, str]:
         lead = case(name).lead
-        write_asset(out / "assets" / f"{name}.safetensors", asset_from(runs[name], lead))
+        apply.write_asset(out / "assets" / f"{name}.safetensors", apply.asset_from(runs[name], lead))
         return {"lead": lead}
 
     lead_files = {name: finished(out / "rows" / f"{name}_lead.json", partial(lead_found, name)) for name in names}
@@ -466,8 +455,8 @@ def script_of(case: RunCase, edit: str, asset: Path) -> EditScript:
     made = [parse_edits(text.replace("AHEAD", str(a)).replace("LEFT", str(b)), edit, Path()) for a, b in INSERT_AT_M]
     if edit != "insert":
         return made[0]
-    world, given = EditWorld.of_scene(case.scene, ground_of(case.cloud, case.model)), read_asset(asset)
-    sources = EditSources(lambda _: given, lambda path: background_of(find_run(Path(path)), path))
+    world, given = EditWorld.of_scene(case.scene, apply.ground_of(case.cloud, case.model)), apply.read_asset(asset)
+    sources = EditSources(lambda _: given, lambda path: apply.background_of(find_run(Path(path)), path))
     return next((script for script in made if not collisions(plan_edits(script, world, sources))), made[0])
 
 

@@ -36,18 +36,8 @@ from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import EditScript
 from mudg.exporting.settings import ExportConfig, ImportConfig
 from mudg.formats import ncore as ncore_package
-from mudg.formats.exporters import ncore
+from mudg.formats.exporters import messages, ncore
 from mudg.formats.exporters.cameras import colmap_files, nerfstudio_files, picture_names, pictures
-from mudg.formats.exporters.messages import (
-    BAG_FILE,
-    BAG_METADATA,
-    FoxgloveMessages,
-    LogRecords,
-    Ros2Messages,
-    bag_metadata,
-    mcap_writer,
-    write_mcap,
-)
 from mudg.formats.exporters.rerun_file import package, write_rerun
 from mudg.formats.splats.binary import MAX_BYTES
 from mudg.formats.splats.cloud import SplatCloud, SplatNode, SplatScene, logit, spacing_m, turned, unit
@@ -64,14 +54,16 @@ from mudg.scene.read import open_files, read_points, read_scene
 
 SUFFIXES: Final = {"mcap": ".mcap", "rerun": ".rrd", "ros2": "", "ncore": ""}
 """Formats, and the suffix of their file; none: a folder."""
-LOG_FOLDERS: Final = {"ros2": (1, (BAG_METADATA, BAG_FILE)), "ncore": (1, ncore.FILES)}
+LOG_FOLDERS: Final = {"ros2": (1, (messages.BAG_METADATA, messages.BAG_FILE)), "ncore": (1, ncore.FILES)}
 """Formats that are folders: version and files of each."""
 
 
-def records_of(scene: Scene, fused: Any = None) -> LogRecords:
+def records_of(scene: Scene, fused: Any = None) -> messages.LogRecords:
     """The records of a scene on disk; pictures and points are read when they are asked for."""
     files = open_files(scene.root)
-    return LogRecords(scene, lambda frame: files.read(frame.image.path), lambda sweep: read_points(scene, sweep), fused)
+    return messages.LogRecords(
+        scene, lambda frame: files.read(frame.image.path), lambda sweep: read_points(scene, sweep), fused
+    )
 
 
 def refuse_missing(name: str) -> None:
@@ -81,15 +73,15 @@ def refuse_missing(name: str) -> None:
     elif name == "ncore":
         ncore_package.package()
     elif name in ("mcap", "ros2"):
-        mcap_writer()
+        messages.mcap_writer()
 
 
-def write_log(name: str, records: LogRecords | None, splats: SplatScene | None, out: Path) -> dict[str, int]:
+def write_log(name: str, records: messages.LogRecords | None, splats: SplatScene | None, out: Path) -> dict[str, int]:
     """Write a log as one file: ``mcap`` the records, ``rerun`` records and Gaussians; returns its size."""
     if name == "rerun":
         write_rerun(out, records, splats, records.scene.id if records is not None else "scene")
     elif records is not None:
-        write_mcap(out, FoxgloveMessages(records))
+        messages.write_mcap(out, messages.FoxgloveMessages(records))
     contents = [] if records is None else [_counts(records)]
     if splats is not None:
         contents.append(f"{_count(splats)} Gaussians")
@@ -98,16 +90,16 @@ def write_log(name: str, records: LogRecords | None, splats: SplatScene | None, 
     return {"bytes": size}
 
 
-def _counts(records: LogRecords) -> str:
+def _counts(records: messages.LogRecords) -> str:
     return f"{len(records.scene.frames)} pictures, {len(records.scene.sweeps)} sweeps"
 
 
-def write_messages(name: str, records: LogRecords, out: Path) -> dict[str, Any]:
+def write_messages(name: str, records: messages.LogRecords, out: Path) -> dict[str, Any]:
     """Write a log as a folder, ``ros2`` or ``ncore``; returns a summary."""
     if name == "ros2":
-        topics, span = write_mcap(out / BAG_FILE, Ros2Messages(records))
-        store.atomic_write(out / BAG_METADATA, bag_metadata(topics, span))
-        largest, what, count = out / BAG_FILE, "messages", sum(number for _, number in topics.values())
+        topics, span = messages.write_mcap(out / messages.BAG_FILE, messages.Ros2Messages(records))
+        store.atomic_write(out / messages.BAG_METADATA, messages.bag_metadata(topics, span))
+        largest, what, count = out / messages.BAG_FILE, "messages", sum(number for _, number in topics.values())
     else:
         rolling = ", ".join(name for name, camera in records.scene.cameras.items() if camera.readout_s > 0)
         if rolling:

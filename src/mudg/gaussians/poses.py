@@ -21,7 +21,7 @@ not that of the pixel.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -53,19 +53,24 @@ COLOR_SHARE = 1 / 120
 """What one channel of one pixel counts for: neighbours are blurred together, and the model errs where they do."""
 
 
-@dataclass
 class PoseEvidence:
-    """Sums of the pictures' normal equations: ``matrix`` f64[K, 4, 4] and ``vector`` f64[K, 4] per key of one
-    object."""
+    """Sums of the pictures' normal equations: ``matrix`` f64[K, 4, 4] and ``vector`` f64[K, 4] per key of one object;
+    ``views``: number of pictures."""
 
-    matrix: NDArray[np.float64]
-    vector: NDArray[np.float64]
-    views: int = field(default=0)
+    def __init__(self, keys: int) -> None:
+        self.matrix, self.vector, self.views = np.zeros((keys, 4, 4)), np.zeros((keys, 4)), 0
 
-    @classmethod
-    def none(cls, keys: int) -> PoseEvidence:
-        """Nothing seen yet."""
-        return cls(np.zeros((keys, 4, 4)), np.zeros((keys, 4)))
+    def add(
+        self, around: tuple[int, int, float] | None, matrix: NDArray[np.float64], vector: NDArray[np.float64]
+    ) -> None:
+        """Add that of a moment to the two keys around it, by their share in the pose; None: the object is not there."""
+        if around is None:
+            return
+        before, after, u = around
+        for key, share in ((before, 1.0 - u), (after, u)):
+            self.matrix[key] += share**2 * matrix
+            self.vector[key] += share * vector
+        self.views += 1
 
 
 @torch.no_grad()
@@ -73,14 +78,12 @@ def refine_poses(
     model: SceneModel, views: Sequence[StoredView], raster: RasterConfig, appearance: Appearance | None = None
 ) -> float:
     """One round for every node that learns its pose, in place. Returns root mean square of the moves, metres."""
-    learning = {
-        index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode) and node.learn_pose
-    }
-    evidence = {index: PoseEvidence.none(len(node.times_s)) for index, node in learning.items()}
+    rigid = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
+    learning = {index: node for index, node in rigid.items() if node.learn_pose}
+    evidence = {index: PoseEvidence(len(node.times_s)) for index, node in learning.items()}
     for stored in views:
-        outlines = {
-            index: mask.to(model.device, non_blocking=True) for index, mask in _outlines(learning, stored).items()
-        }
+        shown = _outlines(learning, stored)
+        outlines = {index: mask.to(model.device, non_blocking=True) for index, mask in shown.items()}
         if outlines:
             _add_evidence(model, stored, outlines, evidence, raster, appearance)
     moves = [_move(node, evidence[index]) for index, node in learning.items() if evidence[index].views]
@@ -126,21 +129,7 @@ def _add_evidence(
     for index, outline in outlines.items():
         jacobian = torch.stack([change[:, outline].flatten() for change in changes], 1).double()
         matrix, vector = _normal_equations(jacobian, missing[:, outline].flatten().double())
-        _add_to_keys(model.nodes[index], time_s, matrix, vector, evidence[index])
-
-
-def _add_to_keys(
-    node: RigidNode, time_s: float, matrix: NDArray[np.float64], vector: NDArray[np.float64], into: PoseEvidence
-) -> None:
-    """Add the evidence of a moment to the two keys around it, by their share in the pose."""
-    found = node.keys_around(time_s)
-    if found is None:
-        return
-    before, after, u = found
-    for key, share in ((before, 1.0 - u), (after, u)):
-        into.matrix[key] += share**2 * matrix
-        into.vector[key] += share * vector
-    into.views += 1
+        evidence[index].add(model.nodes[index].keys_around(time_s), matrix, vector)
 
 
 def _picture(

@@ -247,9 +247,7 @@ def _fill_view(
     rows, columns = view.camera.height // cell, view.camera.width // cell
     center_row = (np.arange(rows) * cell + cell // 2)[:, None]
     center_column = (np.arange(columns) * cell + cell // 2)[None, :]
-    train_ids = np.append(np.array(classes, np.uint8), np.uint8(UNLABELLED))
-    channel = stored.channels[center_row, center_column]
-    label = train_ids[np.minimum(channel, len(classes))]
+    label = stored.train_ids(center_row, center_column, classes)
     depth = _cell_depth(stored, xyz, rows, columns)
     covered = np.isfinite(depth)
     wanted = ~covered & np.isin(label, [i for i in range(19) if i not in (*DYNAMIC_IDS, *GROUND_IDS, ID["sky"])])

@@ -10,8 +10,10 @@ recorded view, or outside all their images, are *unseen*: ``unseen_rows`` makes 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,7 +21,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mudg.base import geometry, log, seeds
-from mudg.base.palette import UNLABELLED
 from mudg.base.types import Render, View
 from mudg.core.raster.rasterize import RasterConfig, rasterize
 from mudg.gaussians.appearance import Appearance
@@ -142,8 +143,7 @@ MOST_SEEDS = 8_000_000
 """Points held at once; thinning them takes about 150 bytes each."""
 
 
-@dataclass(frozen=True)
-class _Witness:
+class _Witness(NamedTuple):
     """A recorded view and what it sees: depth f32[H, W], infinite in the sky."""
 
     view: View
@@ -161,7 +161,7 @@ def unseen_maps(
     heads = heads_of(recorded)
     chosen = np.unique(np.linspace(0, len(heads) - 1, min(WITNESSES, len(heads))).round().astype(int))
     witnesses = [_witness(model, heads[i].view, raster) for i in chosen]
-    objects = [_Placed(node) for node in model.nodes if isinstance(node, RigidNode)]
+    objects = [(node.size_m, cache(node.pose_matrix)) for node in model.nodes if isinstance(node, RigidNode)]
     for stored in log.progress(virtual, len(virtual), "finding unseen surfaces"):
         yield stored, _unseen(stored, witnesses, objects)
 
@@ -180,40 +180,29 @@ def block_centres(size_px: int) -> NDArray[np.intp]:
     return np.minimum(np.arange(0, size_px, STRIDE_PX) + STRIDE_PX // 2, size_px - 1)
 
 
-class _Placed:
-    """An object whose poses do not change meanwhile: each is worked out once, for every view asks for those of all
-    witnesses."""
-
-    def __init__(self, node: RigidNode) -> None:
-        self.size_m = node.size_m
-        self._node = node
-        self._known: dict[float, NDArray[np.float64] | None] = {}
-
-    def pose_matrix(self, time_s: float) -> NDArray[np.float64] | None:
-        """``RigidNode.pose_matrix``."""
-        if time_s not in self._known:
-            self._known[time_s] = self._node.pose_matrix(time_s)
-        return self._known[time_s]
+_Placed = tuple[tuple[float, ...], Callable[[float], NDArray[np.float64] | None]]
+"""Size of an object's box, and its poses, which do not change meanwhile: each is worked out once."""
 
 
 def _unseen(stored: StoredView, witnesses: Sequence[_Witness], objects: Sequence[_Placed]) -> NDArray[np.bool_]:
-    height, width = stored.rgb.shape[:2]
+    (height, width), time_s = stored.rgb.shape[:2], stored.view.time_s
     row, column = np.meshgrid(block_centres(height), block_centres(width), indexing="ij")
     shape = row.shape
     row, column = row.ravel(), column.ravel()
     depth = np.full(len(row), SKY_AT_M) if stored.depth is None else stored.depth[row, column].astype(np.float64)
     depth = np.where(np.isfinite(depth) & (depth > 0), depth, SKY_AT_M)
     points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), depth)
-    carried = [(node, found) for node in objects if (found := _in_box(node, points, stored.view.time_s)) is not None]
+    inside_of = [(pose_at, _in_box(size_m, pose_at(time_s), points)) for size_m, pose_at in objects]
+    carried = [(pose_at, found) for pose_at, found in inside_of if found is not None]
     seen = np.zeros(len(points), bool)
     # who sees most comes first
-    for witness in sorted(witnesses, key=lambda one: abs(one.view.time_s - stored.view.time_s)):
+    for witness in sorted(witnesses, key=lambda one: abs(one.view.time_s - time_s)):
         left = np.flatnonzero(~seen)
         place = np.full(len(points), -1)
         place[left] = np.arange(len(left))
         moved, exists = points[left], np.ones(len(left), bool)
-        for node, (inside, local) in carried:
-            pose, waiting = node.pose_matrix(witness.view.time_s), place[inside] >= 0
+        for pose_at, (inside, local) in carried:
+            pose, waiting = pose_at(witness.view.time_s), place[inside] >= 0
             here = place[inside][waiting]
             exists[here] = pose is not None
             if pose is not None:
@@ -232,7 +221,8 @@ def unseen_rows(
     A point in the box of a dynamic object belongs to that object. Above ``MOST_SEEDS`` points, every second one goes
     on.
     """
-    objects = {index: _Placed(node) for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
+    rigid = {index: node for index, node in enumerate(model.nodes) if isinstance(node, RigidNode)}
+    objects = {index: (node.size_m, cache(node.pose_matrix)) for index, node in rigid.items()}
     found: dict[int, list[StartPoints]] = {index: [] for index in range(len(model.nodes))}
     shares, stride, total = [], 1, 0
     for stored, unseen_here in unseen:
@@ -291,15 +281,13 @@ def _seeds_of(
         kept &= stored.confidence[row, column] >= SEED_CONFIDENCE * 255
     row, column, z = row[kept], column[kept], z[kept].astype(np.float64)
     points = geometry.unproject(stored.view, np.stack([column + 0.5, row + 0.5], 1), z)
-    channel = np.full(len(row), UNLABELLED, np.uint8) if stored.channels is None else stored.channels[row, column]
-    train_ids = np.append(np.array(model.classes, np.uint8), np.uint8(UNLABELLED))
-    train_id = train_ids[np.minimum(channel, len(model.classes))]
+    train_id = stored.train_ids(row, column, model.classes)
     scale = (0.6 * SEED_STRIDE_PX * z / stored.view.camera.fx).astype(np.float32)
     rgb = model.colors.bytes_to_common(stored.view.camera.name, stored.rgb[row, column])
     owner = np.zeros(len(row), np.int64)
     local = points.copy()
-    for index, node in objects.items():
-        inside = _in_box(node, points, stored.view.time_s)
+    for index, (size_m, pose_at) in objects.items():
+        inside = _in_box(size_m, pose_at(stored.view.time_s), points)
         if inside is not None:
             owner[inside[0]], local[inside[0]] = index, inside[1]
     every = StartPoints(local.astype(np.float32), rgb, train_id, scale)
@@ -317,12 +305,11 @@ def _sees_or_sees_past(witness: _Witness, points: NDArray[np.float64]) -> NDArra
 
 
 def _in_box(
-    node: _Placed, points: NDArray[np.float64], time_s: float
+    size_m: Sequence[float], pose: NDArray[np.float64] | None, points: NDArray[np.float64]
 ) -> tuple[NDArray[np.int64], NDArray[np.float64]] | None:
-    """Indices of points in the node's box (grown by a tenth) and their coordinates in it; None if there are none."""
-    pose = node.pose_matrix(time_s)
+    """Indices of points in a box at a pose (grown by a tenth) and their coordinates in it; None if there are none."""
     if pose is None:
         return None
     local = geometry.transform_points(geometry.invert(pose), points)
-    inside = np.flatnonzero((np.abs(local) < np.array(node.size_m) * 0.55 + 0.1).all(1))
+    inside = np.flatnonzero((np.abs(local) < np.array(size_m) * 0.55 + 0.1).all(1))
     return (inside, local[inside]) if len(inside) else None

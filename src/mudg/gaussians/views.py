@@ -110,6 +110,14 @@ class StoredView:
         """The view without its pixels."""
         return ViewHead(self.name, self.view, self.kind, self.channels is not None)
 
+    def train_ids(
+        self, row: NDArray[np.integer], column: NDArray[np.integer], classes: Sequence[int]
+    ) -> NDArray[np.uint8]:
+        """Train ids at pixels, by those of the channels; 255 where there is none."""
+        if self.channels is None:
+            return np.full(np.broadcast(row, column).shape, UNLABELLED, np.uint8)
+        return np.array([*classes, UNLABELLED], np.uint8)[np.minimum(self.channels[row, column], len(classes))]
+
     def as_tensors(self, device: torch.device = CPU) -> TrainView:
         """The view for a step, on a device. The bytes travel and grow there: a fifth of what the tensors take."""
 

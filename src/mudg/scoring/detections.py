@@ -25,14 +25,6 @@ from mudg.base.types import Scene, Track, View
 from mudg.city.world import CityWorld
 from mudg.core import street_scores
 from mudg.core.fusion import points_in_box
-from mudg.core.street_scores import (
-    NTA_CONFIDENCE,
-    NTA_FEWEST_POINTS,
-    NTA_HEIGHT_PX,
-    NTA_WIDTH_PX,
-    VEHICLE_LABELS,
-    ImageBox,
-)
 from mudg.editing.settings import ScoreConfig
 from mudg.scene.read import read_points
 from mudg.scoring import tables as score_tables
@@ -50,7 +42,7 @@ _BOXES: Final = "a list of records with image_id, category_id, bbox [x, y, width
 class Detection:
     """A detector's box in pixels of 480 x 320, its class and confidence in [0, 1]."""
 
-    box: ImageBox
+    box: street_scores.ImageBox
     category: int
     score: float
 
@@ -80,7 +72,10 @@ def read_detections(path: Path) -> dict[str, list[Detection]]:
     if isinstance(content, Mapping):
         try:
             for image in content["images"]:
-                scale = NTA_WIDTH_PX / float(image["width"]), NTA_HEIGHT_PX / float(image["height"])
+                scale = (
+                    street_scores.NTA_WIDTH_PX / float(image["width"]),
+                    street_scores.NTA_HEIGHT_PX / float(image["height"]),
+                )
                 sizes[image["id"]] = (str(image["file_name"]), *scale)
             content = content["annotations"]
         except (KeyError, TypeError, ValueError, ZeroDivisionError) as error:
@@ -94,7 +89,7 @@ def read_detections(path: Path) -> dict[str, list[Detection]]:
     for number, record in enumerate(content):
         name, detection = _parsed(record, sizes, f"{path}: record {number}")
         kept = found.setdefault(name, [])
-        if detection.score > NTA_CONFIDENCE:
+        if detection.score > street_scores.NTA_CONFIDENCE:
             kept.append(detection)
     return found
 
@@ -151,12 +146,12 @@ class BoxDetections:
         counted = "counted in the sweeps taken with the view"
         return {
             "file_sha256": self.sha256,
-            "confidence_above": NTA_CONFIDENCE,
+            "confidence_above": street_scores.NTA_CONFIDENCE,
             "reach_px": street_scores.NTA_REACH_PX,
-            "size": [NTA_WIDTH_PX, NTA_HEIGHT_PX],
+            "size": [street_scores.NTA_WIDTH_PX, street_scores.NTA_HEIGHT_PX],
             "classes": "all; beside it COCO's car and bus alone (2 and 5)",
             "boxes": published if self._as_published else "cut at the near plane",
-            "fewest_points": NTA_FEWEST_POINTS if sweeps else None,
+            "fewest_points": street_scores.NTA_FEWEST_POINTS if sweeps else None,
             "points": counted if sweeps else "no sweeps: boxes of any number count",
         }
 
@@ -165,7 +160,7 @@ class BoxDetections:
         sweeps = [s for s in self._scene.sweeps if abs(s.time_s - view.time_s) <= SAME_SWEEP_S]
         if not sweeps:
             return self._scene.tracks
-        vehicles = [track for track in self._scene.tracks if track.label in VEHICLE_LABELS]
+        vehicles = [track for track in self._scene.tracks if track.label in street_scores.VEHICLE_LABELS]
         totals = dict.fromkeys((track.id for track in vehicles), 0)
         for sweep in sweeps:
             if sweep.id not in self._counts:
@@ -178,7 +173,7 @@ class BoxDetections:
                         self._counts[sweep.id][track.id] = int(points_in_box(local, track.size_m, 0.0, 0.0).sum())
             for name, count in self._counts[sweep.id].items():
                 totals[name] += count
-        return [track for track in vehicles if totals[track.id] >= NTA_FEWEST_POINTS]
+        return [track for track in vehicles if totals[track.id] >= street_scores.NTA_FEWEST_POINTS]
 
 
 class LaneDetections:
