@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
 import shutil
-import signal
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config, fit_to
+from fit_settings import fit_to, fitted_bytes, interrupted, small_fit, written_street
 from toy_world import camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg import native
@@ -21,7 +19,7 @@ from mudg.base import geometry, store
 from mudg.base.errors import InputError, NumericsError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Gaussians, View
-from mudg.core import metrics, trajectory
+from mudg.core import metrics
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.gaussians import fit
 from mudg.gaussians import start as fit_start
@@ -45,30 +43,11 @@ FRAMES = 6
 @pytest.fixture(scope="module")
 def world(tmp_path_factory) -> dict[str, Path]:
     """A scene, its fused cloud, and perfect virtual views 2 m to either side."""
-    root = tmp_path_factory.mktemp("world")
-    scene = write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1])
-    write_fused(root / "fuse", fused_cloud(FRAMES), {})
-    for shift_m in (2.0, -2.0):
-        path = trajectory.shifted(scene, "front", shift_m)
-        with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
-            for view in path.views:
-                writer.add(truth(view.resized(30, 20)))
-    return {"scene": root / "scene", "fuse": root / "fuse", "virtual": root / "virtual"}
+    return written_street(tmp_path_factory.mktemp("world"), SIZE, FRAMES, (2.0, -2.0))
 
 
 def settings(method: str = "street_gaussians", **changes) -> FitConfig:
-    small = {
-        "iterations": 24,
-        "start__gaussians": 900,
-        "densify__max_gaussians": 1500,
-        "checkpoint_every": 1000,
-        "preview_every": 1000,
-    }
-    return fit_config(method=method, **{**small, **changes})
-
-
-def fitted_bytes(folder: Path) -> dict[str, bytes]:
-    return {name: (folder / name).read_bytes() for name in ("gaussians.safetensors", "nodes.safetensors", "model.json")}
+    return small_fit(method, **changes)
 
 
 def mean_psnr(folder: Path, left_m: float = 0.0) -> float:
@@ -126,7 +105,7 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     """Ctrl-C and SIGTERM before and after virtual views join, a densification and an opacity reset; learnt poses and
     all. Bit for bit."""
     config = settings("mudg_s", iterations=26, poses__learn=True, densify__kind=densify)
-    schedule, stops = fit.densify_schedule(config), [4, 9, 10, 12]
+    schedule = fit.densify_schedule(config)
     if densify == "gradient":
         schedule = dataclasses.replace(schedule, reset_every=12)
         monkeypatch.setattr(fit, "densify_schedule", lambda *_given: schedule)
@@ -136,19 +115,11 @@ def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypat
     step = fit_to(world, tmp_path / "whole", config, observations=(world["virtual"],))
     whole = step.run()
 
-    adam_step, parts = fit.adam_step, tmp_path / "parts"
-
-    def ctrl_c(model, step, *rest):
-        adam_step(model, step, *rest)
-        if step == stops[0]:
-            os.kill(os.getpid(), signal.SIGTERM if step % 2 else signal.SIGINT)
-
-    monkeypatch.setattr(fit, "adam_step", ctrl_c)
-    while stops:
-        with pytest.raises(KeyboardInterrupt):
+    parts = tmp_path / "parts"
+    for stop in (4, 9, 10, 12):
+        with interrupted(stop):
             replace(step, out=parts).run()
-        assert (parts / "steps" / f"step_{stops.pop(0):08d}").is_dir()
-    monkeypatch.setattr(fit, "adam_step", adam_step)
+        assert (parts / "steps" / f"step_{stop:08d}").is_dir()
     assert fitted_bytes(replace(step, out=parts).run()) == fitted_bytes(whole)
 
 
@@ -500,7 +471,7 @@ def test_what_a_moving_object_shows_is_asked_where_the_object_was():
     shown = fit_views.StoredView("v", now, "virtual", black, depth=depth)
     witness = fit_trust._Witness(late, np.full(shape, 5.2, np.float32))
     middle = (cam.height // 2, cam.width // 2)
-    assert not fit_trust._unseen(shown, [witness], [node])[middle]
+    assert not fit_trust._unseen(shown, [witness], [(node.size_m, node.pose_matrix)])[middle]
     assert fit_trust._unseen(shown, [witness], [])[middle]  # without the box the point stays 40 m to the side
 
 

@@ -2,70 +2,45 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config, fit_to
+from fit_settings import fit_to, fitted_bytes, interrupted, small_fit, written_street
 from toy_world import camera, fused_cloud, truth, view_at, write_scene
 
 from mudg.base import store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
-from mudg.core import metrics, trajectory
+from mudg.core import metrics
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.gaussians import fit
 from mudg.gaussians import storage as continued
 from mudg.gaussians.appearance import Appearance
 from mudg.gaussians.settings import FitConfig
 from mudg.scene.clouds import write_fused
-from mudg.scene.observations import ObservationWriter
-from mudg.steps.fit import Fit
 
 SIZE = (60, 40)
 FRAMES = 6
-FILES = ("gaussians.safetensors", "nodes.safetensors", "model.json")
 
 
 def settings(method: str = "mudg_s", **changes) -> FitConfig:
-    small = {
-        "iterations": 16,
-        "start__gaussians": 900,
-        "densify__max_gaussians": 1500,
-        "checkpoint_every": 1000,
-        "preview_every": 1000,
-    }
-    return fit_config(method=method, **{**small, **changes})
+    return small_fit(method, **{"iterations": 16, **changes})
 
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory) -> dict[str, Path]:
     """A scene, its fused cloud, perfect virtual views 2 m to the left, and a finished fit on recorded views."""
     root = tmp_path_factory.mktemp("world")
-    scene = write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1])
-    write_fused(root / "fuse", fused_cloud(FRAMES), {})
-    path = trajectory.shifted(scene, "front", 2.0)
-    with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
-        for view in path.views:
-            writer.add(truth(view.resized(30, 20)))
-    Fit(
-        scene=root / "scene",
-        fused=root / "fuse",
-        out=root / "plain",
-        settings=settings("street_gaussians", iterations=80),
-    ).run()
-    return {name: root / name for name in ("scene", "fuse", "virtual", "plain")}
+    world = written_street(root, SIZE, FRAMES)
+    return world | {"plain": fit_to(world, root / "plain", settings("street_gaussians", iterations=80)).run()}
 
 
 def go_on(world: dict[str, Path], out: Path, config: FitConfig | None = None, **changes) -> Path:
     named = {"observations": (world["virtual"],), "start_from": world["plain"], **changes}
-    return Fit(
-        **{"scene": world["scene"], "fused": world["fuse"], "out": out, "settings": config or settings(), **named}
-    ).run()
+    return fit_to(world, out, config or settings(), **named).run()
 
 
 def psnr_beside(folder: Path) -> float:
@@ -108,22 +83,13 @@ def test_the_steps_are_the_second_half_of_a_run(monkeypatch):
     assert schedule.due(600) and not schedule.due(601 + schedule.every)
 
 
-def test_a_resumed_run_equals_an_uninterrupted_one(world, tmp_path, monkeypatch):
-    whole, parts, adam_step = go_on(world, tmp_path / "whole"), tmp_path / "parts", fit.adam_step
-    stops = [17, 18, 20, 25]  # of the steps 17 to 32; densification after 20
-
-    def ctrl_c(model, step, *rest):
-        adam_step(model, step, *rest)
-        if stops and step == stops[0]:
-            os.kill(os.getpid(), signal.SIGTERM if step % 2 else signal.SIGINT)
-
-    monkeypatch.setattr(fit, "adam_step", ctrl_c)
-    while stops:
-        with pytest.raises(KeyboardInterrupt):
+def test_a_resumed_run_equals_an_uninterrupted_one(world, tmp_path):
+    whole, parts = go_on(world, tmp_path / "whole"), tmp_path / "parts"
+    for stop in (17, 18, 20, 25):  # of the steps 17 to 32; densification after 20
+        with interrupted(stop):
             go_on(world, parts)
-        assert (parts / "steps" / f"step_{stops.pop(0):08d}").is_dir()
-    go_on(world, parts)
-    assert [(parts / name).read_bytes() for name in FILES] == [(whole / name).read_bytes() for name in FILES]
+        assert (parts / "steps" / f"step_{stop:08d}").is_dir()
+    assert fitted_bytes(go_on(world, parts)) == fitted_bytes(whole)
 
 
 def test_another_start_is_another_fit(world, tmp_path):

@@ -9,13 +9,12 @@ from __future__ import annotations
 import contextlib
 import json
 import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
-from fit_settings import fit_config, fit_to
+from fit_settings import fit_config, fit_to, interrupted, small_fit
 from pretend_device import Transfer, pretend_device, transfers
 from test_scene_options import EVERYTHING, written_world
 from test_score_metrics import lpips_state
@@ -83,18 +82,9 @@ def early_densification(monkeypatch):
 
 
 def settings(method: str, device: str, **changes) -> MethodConfig:
-    small = {
-        "iterations": 6,
-        "start__gaussians": 120,
-        "densify__max_gaussians": 400,
-        "checkpoint_every": 1000,
-        "preview_every": 1000,
-        "raster": "torch",
-        "loss__semantic_every": 2,
-        "virtual__probability": 0.5,
-        "virtual__gaussians": 50,
-    }
-    return fit_config(method=method, device=device, **{**small, **changes})
+    few = {"iterations": 6, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch"}
+    virtual = {"loss__semantic_every": 2, "virtual__probability": 0.5, "virtual__gaussians": 50}
+    return small_fit(method, device=device, **{**few, **virtual, **changes})
 
 
 @contextlib.contextmanager
@@ -159,21 +149,12 @@ def test_a_fit_has_the_numbers_of_the_cpu(world, tmp_path, case):
 
 
 @pytest.mark.slow
-def test_a_fit_goes_on_on_the_other_device(world, tmp_path, monkeypatch):
+def test_a_fit_goes_on_on_the_other_device(world, tmp_path):
     """Begun there, interrupted, finished here; then another fit goes on there with what was made here."""
     with twins():
         whole = fitted(world, tmp_path / "whole", settings("street_gaussians", "cpu"))
-    adam_step = fit.adam_step
-
-    def stop(model, step, *rest):
-        adam_step(model, step, *rest)
-        if step == 3:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(fit, "adam_step", stop)
-    with pretend_device(), pytest.raises(KeyboardInterrupt):
+    with pretend_device(), interrupted(3):
         fitted(world, tmp_path / "parts", settings("street_gaussians", "pretend"))
-    monkeypatch.setattr(fit, "adam_step", adam_step)
     with twins():
         parts = fitted(world, tmp_path / "parts", settings("street_gaussians", "cpu"))
         assert_same_fit(parts, whole)

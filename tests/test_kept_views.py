@@ -7,7 +7,6 @@ import errno
 import itertools
 import os
 import shutil
-import signal
 import sys
 import threading
 from dataclasses import fields, replace
@@ -16,22 +15,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config, fit_to
+from fit_settings import fit_to, interrupted, small_fit, written_street
 from pretend_device import pretend_device
 from scipy.spatial import cKDTree
-from toy_world import camera, fused_cloud, truth, view_at, write_scene
+from toy_world import camera, fused_cloud, view_at
 
 from mudg.base import scratch
 from mudg.base.errors import ResourceError
-from mudg.core import trajectory
 from mudg.gaussians import fit, trust
 from mudg.gaussians import views as fit_views
 from mudg.gaussians import views as kept
 from mudg.gaussians.nodes import SkyNode
 from mudg.gaussians.start import StartPoints
 from mudg.gaussians.views import LidarPixels, StoredView, TrainView, ViewSet
-from mudg.scene.clouds import write_fused
-from mudg.scene.observations import ObservationWriter
 from mudg.scene.read import read_scene
 from mudg.steps.fit import Fit
 
@@ -278,26 +274,12 @@ def test_a_mapped_array_that_the_disk_has_no_room_for_is_an_error_in_words(tmp_p
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory) -> dict[str, Path]:
-    root = tmp_path_factory.mktemp("world")
-    scene = write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1])
-    write_fused(root / "fuse", fused_cloud(FRAMES), {})
-    path = trajectory.shifted(scene, "front", 2.0)
-    with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
-        for view in path.views:
-            writer.add(truth(view.resized(30, 20)))
-    return {"scene": root / "scene", "fuse": root / "fuse", "virtual": root / "virtual"}
+    return written_street(tmp_path_factory.mktemp("world"), SIZE, FRAMES)
 
 
 def settings():
-    return fit_config(
-        method="mudg_s",
-        iterations=24,
-        start__gaussians=600,
-        densify__max_gaussians=1000,
-        checkpoint_every=1000,
-        preview_every=12,
-        poses__learn=True,
-    )
+    few = {"start__gaussians": 600, "densify__max_gaussians": 1000, "preview_every": 12}
+    return small_fit("mudg_s", **few, poses__learn=True)
 
 
 def result_of(folder: Path) -> dict[str, bytes]:
@@ -309,20 +291,11 @@ def test_a_fit_from_a_file_of_views_is_the_same_fit_also_when_resumed(world, tmp
     step = fit_to(world, tmp_path / "whole", settings(), observations=(world["virtual"],))
     usual = replace(step, out=tmp_path / "usual").run()
     monkeypatch.setattr(kept, "IN_MEMORY_BYTES", 0)
-    before, adam_step, folder, asked = threads_at_work(), fit.adam_step, tmp_path / "filed", []
-
-    def ctrl_c(model, step, *rest):
-        adam_step(model, step, *rest)
-        if step == 9:
-            asked.append(len(open_in(folder)))
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(fit, "adam_step", ctrl_c)
-    with pytest.raises(KeyboardInterrupt):
+    before, folder, asked = threads_at_work(), tmp_path / "filed", []
+    with interrupted(9, lambda: asked.append(len(open_in(folder)))):
         replace(step, out=folder).run()
     assert asked == [2]  # recorded and virtual views
     assert threads_at_work() == before and open_in(folder) == []
-    monkeypatch.setattr(fit, "adam_step", adam_step)
     replace(step, out=folder).run()
     assert result_of(folder) == result_of(usual)
     names = {path.relative_to(folder).as_posix() for path in folder.rglob("*")}

@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
-from fit_settings import fit_config, fit_to
+from fit_settings import fit_to, fitted_bytes, interrupted, small_fit, written_clouds_and_views
 from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
 
 from mudg.base.errors import InputError, NumericsError
 from mudg.base.types import FusedCloud, PointCloud, Scene, Track
-from mudg.core import metrics, trajectory
+from mudg.core import metrics
 from mudg.core.raster.rasterize import RasterConfig
 from mudg.gaussians import fit
 from mudg.gaussians import views as fit_views
@@ -66,12 +64,8 @@ def written_world(root: Path, size: tuple[int, int], frames: int) -> dict[str, P
     plain = write_scene(root / "plain", frames=frames, width=size[0], height=size[1])
     scene = with_tracks(plain, (*plain.tracks, walker_track(plain.tracks[0].times_s)), root / "scene")
     cloud = fused_cloud(frames)
-    write_fused(root / "fuse", FusedCloud(cloud.static, {**cloud.objects, "walker": walker_cloud()}), {})
-    path = trajectory.shifted(scene, "front", 2.0)
-    with ObservationWriter(root / "virtual" / path.name, path.name, "truth") as writer:
-        for view in path.views:
-            writer.add(truth(view.resized(30, 20)))
-    return {"scene": root / "scene", "fuse": root / "fuse", "virtual": root / "virtual"}
+    both = FusedCloud(cloud.static, {**cloud.objects, "walker": walker_cloud()})
+    return written_clouds_and_views(root, scene, both)
 
 
 @pytest.fixture(scope="module")
@@ -80,36 +74,16 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 
 def settings(method: str = "mudg_s", **changes) -> FitConfig:
-    small = {
-        "iterations": 30,
-        "start__gaussians": 700,
-        "densify__max_gaussians": 1200,
-        "checkpoint_every": 1000,
-        "preview_every": 1000,
-        "virtual__probability": 0.4,
-    }
-    return fit_config(method=method, **{**small, **EVERYTHING, **changes})
+    few = {"iterations": 30, "start__gaussians": 700, "densify__max_gaussians": 1200, "virtual__probability": 0.4}
+    return small_fit(method, **{**few, **EVERYTHING, **changes})
 
 
-def fitted_bytes(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.safetensors")) + [folder / "model.json"]}
-
-
-def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, tmp_path, monkeypatch):
+def test_interrupted_and_resumed_equals_uninterrupted_with_everything_on(world, tmp_path):
     config = settings()
     step = fit_to(world, tmp_path / "whole", config, observations=(world["virtual"],))
     whole = step.run()
-    adam_step = fit.adam_step
-
-    def ctrl_c(model, step, *rest):
-        adam_step(model, step, *rest)
-        if step == 17:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(fit, "adam_step", ctrl_c)
-    with pytest.raises(KeyboardInterrupt):
+    with interrupted(17):
         replace(step, out=tmp_path / "parts").run()
-    monkeypatch.setattr(fit, "adam_step", adam_step)
     parts = replace(step, out=tmp_path / "parts").run()
     assert fitted_bytes(parts) == fitted_bytes(whole)
     assert set(fitted_bytes(whole)) == {

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-import os
 import re
-import signal
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -13,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from fit_settings import SMALL_RADIANCE, fit_config, fit_to
+from fit_settings import SMALL_RADIANCE, fit_to, fitted_bytes, interrupted, small_fit, written_street
 from pretend_device import pretend_device
-from toy_world import CAR_SIZE, camera, car_pose, fused_cloud, truth, view_at, write_scene
+from toy_world import CAR_SIZE, camera, car_pose, truth, view_at, write_scene
 
 from mudg.base import geometry
 from mudg.base.errors import UsageError
@@ -42,7 +40,7 @@ from mudg.gaussians.recipes import RECIPES
 from mudg.gaussians.settings import METHODS, PUBLISHED, WEIGHTS
 from mudg.gaussians.start import columns_from_points
 from mudg.scene import fuse
-from mudg.scene.clouds import read_fused, write_fused
+from mudg.scene.clouds import read_fused
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.steps import command
@@ -70,31 +68,13 @@ FITTED = {"gaussians", "nodes", "model", "field"}
 @pytest.fixture(scope="module")
 def world(tmp_path_factory) -> dict[str, Path]:
     """A scene with a moving car, and what fusing gives."""
-    root = tmp_path_factory.mktemp("world")
-    write_scene(root / "scene", frames=FRAMES, width=SIZE[0], height=SIZE[1])
-    write_fused(root / "fuse", fused_cloud(FRAMES), {})
-    return {name: root / name for name in ("scene", "fuse")}
+    return written_street(tmp_path_factory.mktemp("world"), SIZE, FRAMES, ())
 
 
 @pytest.fixture(autouse=True)
 def cars_that_walk(monkeypatch):
     """The one object of the toy street may deform, too."""
     monkeypatch.setattr(nodes, "LIMBED_LABELS", nodes.LIMBED_LABELS | {"car"})
-
-
-def settings(method: str, **changes):
-    small = {
-        "iterations": 24,
-        "start__gaussians": 900,
-        "densify__max_gaussians": 1500,
-        "checkpoint_every": 1000,
-        "preview_every": 1000,
-    }
-    return fit_config(method=method, **{**small, **changes})
-
-
-def fitted_bytes(folder: Path) -> dict[str, bytes]:
-    return {name: (folder / name).read_bytes() for name in ("gaussians.safetensors", "nodes.safetensors", "model.json")}
 
 
 # ---- vibration -----------------------------------------------------------------------------------
@@ -215,7 +195,7 @@ def test_half_of_the_steps_draw_the_state_of_another_time():
     table = Table({"means": torch.zeros(1, 3)}, {"node": torch.zeros(1, dtype=torch.int32)})
     model = SceneModel(table, (VibrationNode("b", 0, 0.1),), None, (), 0)
     drawn = [
-        pvg.VibrationRecipe().drawn_model(model, None, step, settings("pvg")).nodes[0].early for step in range(400)
+        pvg.VibrationRecipe().drawn_model(model, None, step, small_fit("pvg")).nodes[0].early for step in range(400)
     ]
     moved = [early for early in drawn if early]
     assert 160 < len(moved) < 240
@@ -457,7 +437,7 @@ def test_a_fit_learns_reaches_every_column_and_is_read_back(world, tmp_path, mon
         adam_step(model, *rest)
 
     monkeypatch.setattr(fit, "adam_step", spy)
-    folder = fit_to(world, tmp_path / "fit", settings(method, iterations=60)).run()
+    folder = fit_to(world, tmp_path / "fit", small_fit(method, iterations=60)).run()
     assert OWN[method] <= reached
     model = fit.load_model(folder)
     view = view_at(0.6, camera(width=SIZE[0], height=SIZE[1]))
@@ -471,22 +451,11 @@ def test_a_fit_learns_reaches_every_column_and_is_read_back(world, tmp_path, mon
 
 
 @pytest.mark.parametrize("method", RECIPES)
-def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, monkeypatch, method):
-    config, stops = settings(method, iterations=14), [11]
+def test_interrupted_and_resumed_equals_uninterrupted(world, tmp_path, method):
+    config = small_fit(method, iterations=14)
     whole = fit_to(world, tmp_path / "whole", config).run()
-    adam_step = fit.adam_step
-
-    def stopped(model, step, *rest):
-        adam_step(model, step, *rest)
-        if step == stops[0]:
-            os.kill(os.getpid(), signal.SIGINT)
-
-    monkeypatch.setattr(fit, "adam_step", stopped)
-    while stops:
-        with pytest.raises(KeyboardInterrupt):
-            fit_to(world, tmp_path / "parts", config).run()
-        stops.pop(0)
-    monkeypatch.setattr(fit, "adam_step", adam_step)
+    with interrupted(11):
+        fit_to(world, tmp_path / "parts", config).run()
     assert fitted_bytes(fit_to(world, tmp_path / "parts", config).run()) == fitted_bytes(whole)
 
 
@@ -508,7 +477,7 @@ def fitted_to(worlds: dict[str, Path], name: str, out: Path, method: str, iterat
         scene=worlds[name],
         fused=worlds[f"{name}-fuse"],
         out=out / name,
-        settings=settings(method, iterations=iterations, **small),
+        settings=small_fit(method, iterations=iterations, **small),
     ).run()
 
 
@@ -602,7 +571,7 @@ def test_a_cloud_without_boxes_has_the_settings_of_the_one_with_them(tracked_or_
 )
 def test_settings_about_boxes_are_refused_by_methods_without_them(world, tmp_path, method, changes):
     with pytest.raises(UsageError, match="knows nothing of it"):
-        fit_to(world, tmp_path / "fit", settings(method, **changes)).run()
+        fit_to(world, tmp_path / "fit", small_fit(method, **changes)).run()
     assert not (tmp_path / "fit").exists()
 
 
@@ -611,13 +580,13 @@ def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
     fit_to_world = partial(Fit, scene=world["scene"], fused=world["fuse"], out=tmp_path / "fit")
     for weight in WEIGHTS.get(method, ()):
         with pytest.raises(UsageError, match="published weights of its own"):
-            fit_to_world(settings=settings(method, **{weight.replace(".", "__"): 0.33})).run()
+            fit_to_world(settings=small_fit(method, **{weight.replace(".", "__"): 0.33})).run()
     with pytest.raises(UsageError, match="densifies by gradients"):
-        fit_to_world(settings=settings(method, densify__kind="mcmc")).run()
+        fit_to_world(settings=small_fit(method, densify__kind="mcmc")).run()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "model.json").write_text("{}")
     with pytest.raises(UsageError, match="cannot go on"):
-        fit_to_world(start_from=tmp_path / "other", settings=settings(method)).run()
+        fit_to_world(start_from=tmp_path / "other", settings=small_fit(method)).run()
 
 
 FOREIGN = {
@@ -647,9 +616,9 @@ def test_help_shows_the_settings_of_a_method_and_others_are_refused(method, flag
 @pytest.mark.parametrize("method", MOVING)
 def test_a_fit_on_another_device_gives_the_same_numbers(world, tmp_path, method):
     small = {"iterations": 5, "start__gaussians": 120, "densify__max_gaussians": 400, "raster": "torch"}
-    here = fit_to(world, tmp_path / "here", settings(method, device="cpu", **small)).run()
+    here = fit_to(world, tmp_path / "here", small_fit(method, device="cpu", **small)).run()
     with pretend_device():
-        there = fit_to(world, tmp_path / "there", settings(method, device="pretend", **small)).run()
+        there = fit_to(world, tmp_path / "there", small_fit(method, device="pretend", **small)).run()
     view = view_at(0.6, camera(width=SIZE[0], height=SIZE[1]))
     pictures = [fit.render_view(fit.load_model(folder), view, RasterConfig()).rgb for folder in (here, there)]
     assert metrics.psnr(*pictures) > 45.0

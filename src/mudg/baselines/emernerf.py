@@ -12,7 +12,7 @@ import math
 import shutil
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -327,8 +327,8 @@ BUDGETS: Final[Mapping[str, fields.Budget]] = {
 """Samples of a ray, by setting."""
 BATCHES: Final[Mapping[str, tuple[int, int]]] = {"small": (512, 256), "published": (8192, 8192), "tiny": (48, 24)}
 """Pixels, and LiDAR rays, of a step, by setting."""
-WEIGHTS = fields.Weights(sky=0.001, lidar=1.0, sight=0.1, dynamic=0.002, shadow=0.01, cycle=0.01)
-"""Published, but for the dynamic density: 0.01, at once."""
+DYNAMIC_WEIGHT = 0.002
+"""Of the dynamic density (published: 0.01, at once)."""
 SIGHT_START, SIGHT_M, SIGHT_LEAST_M, SIGHT_HALVES = 0.08, 6.0, 0.6, 0.2
 """Share of the run before the line of sight counts; half width of its surface then, and at the end (published: 2.5 m);
 share of the run in which it halves."""
@@ -420,7 +420,7 @@ def take_step(state: RadianceState, config: MethodConfig, step: int) -> dict[str
     """A gradient step from pixels and one from LiDAR rays; the weighted loss terms of both."""
     field, device = state.field, state.field.device
     budget, (pixels, lidar_rays) = BUDGETS[config.radiance.size], BATCHES[config.radiance.size]
-    weights = replace(WEIGHTS, dynamic=WEIGHTS.dynamic * dynamic_share(step, config.iterations))
+    dynamic = DYNAMIC_WEIGHT * dynamic_share(step, config.iterations)
     learns = step <= WARM_UP * config.iterations or step % PROPOSALS_EVERY == 0
     for optimiser in state.optimisers:
         for group in optimiser.param_groups:
@@ -430,7 +430,7 @@ def take_step(state: RadianceState, config: MethodConfig, step: int) -> dict[str
     batch = state.pixels.batch(pixels, ERROR_SHARE, generator)
     marched, draws, rays = _marched(field, batch.rays, budget, generator, learns)
     truth = batch.rgb.to(device), batch.counts.to(device), None if batch.sky is None else batch.sky.to(device)
-    terms, error = fields.pixel_terms(field, rays, marched, draws, truth, weights)
+    terms, error = fields.pixel_terms(field, rays, marched, draws, truth, dynamic)
     _learn(state, terms, marched, learns, f"step {step}, pixels")
     state.pixels.note(batch.cells, error)
     if state.lidar is None:
@@ -440,7 +440,7 @@ def take_step(state: RadianceState, config: MethodConfig, step: int) -> dict[str
     given, range_m = state.lidar.batch(lidar_rays, field.extent, generator)
     marched, draws, _ = _marched(field, given, budget, generator, learns)
     sight_m = sight_width(step, config.iterations)
-    measured = fields.lidar_terms(field, marched, draws, range_m.to(device), weights, sight_m)
+    measured = fields.lidar_terms(field, marched, draws, range_m.to(device), dynamic, sight_m)
     _learn(state, measured, marched, learns, f"step {step}, LiDAR")
     return terms | {name if name not in terms else f"{name}_lidar": value for name, value in measured.items()}
 

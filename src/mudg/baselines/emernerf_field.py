@@ -502,16 +502,8 @@ def colors(field: RadianceField, rays: Rays, marched: Marched) -> tuple[Tensor, 
 # ---- losses --------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Weights:
-    """Weights of the loss terms, as published."""
-
-    sky: float
-    lidar: float
-    sight: float
-    dynamic: float
-    shadow: float
-    cycle: float
+SKY_WEIGHT, LIDAR_WEIGHT, SIGHT_WEIGHT, SHADOW_WEIGHT, CYCLE_WEIGHT = 0.001, 1.0, 0.1, 0.01, 0.01
+"""As published."""
 
 
 def pixel_terms(
@@ -520,32 +512,33 @@ def pixel_terms(
     marched: Marched,
     draws: RayDraws,
     truth: tuple[Tensor, Tensor, Tensor | None],
-    weights: Weights,
+    dynamic: float,
 ) -> tuple[dict[str, Tensor], Tensor]:
     """Weighted loss terms of a batch of pixels, and the colour error of every ray ``[R]``. ``truth``: colours
-    ``[R, 3]``, whether they count ``[R]`` (0 or 1), and whether they show sky (None: unknown)."""
+    ``[R, 3]``, whether they count ``[R]`` (0 or 1), and whether they show sky (None: unknown). ``dynamic``: weight of
+    the dynamic density."""
     wanted, counts, sky = truth
     rgb, shadow = colors(field, rays, marched)
     error = (rgb - wanted).square().mean(1) * counts
-    terms = {"color": error.mean(), "shadow": weights.shadow * shadow.square().mean()}
-    terms |= _of_motion(field, marched, draws, weights)
-    if sky is not None and weights.sky:
+    terms = {"color": error.mean(), "shadow": SHADOW_WEIGHT * shadow.square().mean()}
+    terms |= _of_motion(field, marched, draws, dynamic)
+    if sky is not None:
         opacity = marched.opacity.clamp(1e-4, 1 - 1e-4)
         entropy = -torch.where(sky, torch.log1p(-opacity), opacity.log())
-        terms["sky"] = weights.sky * (entropy * counts).mean()
+        terms["sky"] = SKY_WEIGHT * (entropy * counts).mean()
     return terms, error.detach()
 
 
 def lidar_terms(
-    field: RadianceField, marched: Marched, draws: RayDraws, range_m: Tensor, weights: Weights, sight_m: float
+    field: RadianceField, marched: Marched, draws: RayDraws, range_m: Tensor, dynamic: float, sight_m: float
 ) -> dict[str, Tensor]:
     """Weighted loss terms of a batch of LiDAR rays that end at ``range_m`` f32[R]. ``sight_m``: half width of the
     surface in the line-of-sight term; 0: without this term."""
     near = (range_m < LARGEST_RANGE_M).float()
     missed = ((marched.range_m - range_m) / LARGEST_RANGE_M).square()
-    terms = {"lidar": weights.lidar * (missed * near).mean(), **_of_motion(field, marched, draws, weights)}
-    if sight_m > 0 and weights.sight:
-        terms["sight"] = weights.sight * line_of_sight(marched.weights, marched.edges_m, range_m, sight_m)
+    terms = {"lidar": LIDAR_WEIGHT * (missed * near).mean(), **_of_motion(field, marched, draws, dynamic)}
+    if sight_m > 0:
+        terms["sight"] = SIGHT_WEIGHT * line_of_sight(marched.weights, marched.edges_m, range_m, sight_m)
     return terms
 
 
@@ -562,14 +555,11 @@ def line_of_sight(weights: Tensor, edges_m: Tensor, range_m: Tensor, sight_m: fl
     return torch.where(off[:, :-1] < sight_m, missed, 0.0).sum(1).mean()
 
 
-def _of_motion(field: RadianceField, marched: Marched, draws: RayDraws, weights: Weights) -> dict[str, Tensor]:
+def _of_motion(field: RadianceField, marched: Marched, draws: RayDraws, dynamic: float) -> dict[str, Tensor]:
     """What every batch has: little may move, and flow there and back ends where it began."""
     values, chosen = marched.values, draws.cycle
-    terms: dict[str, Any] = {"dynamic": weights.dynamic * values.dynamic_density.mean()}
-    if weights.cycle:
-        missed = field.cycle_loss(marched.xyz[chosen], marched.times[chosen], values.flow[chosen])
-        terms["cycle"] = weights.cycle * missed
-    return terms
+    missed = field.cycle_loss(marched.xyz[chosen], marched.times[chosen], values.flow[chosen])
+    return {"dynamic": dynamic * values.dynamic_density.mean(), "cycle": CYCLE_WEIGHT * missed}
 
 
 def proposal_loss(marched: Marched) -> Tensor:

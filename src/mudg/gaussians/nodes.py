@@ -226,11 +226,6 @@ class RigidNode(Node):
         size_m, poses = track.size_m.tolist(), track.world_from_object
         return cls(track.id, track.label, size_m, track.times_s, poses, learn_pose=learn_pose)
 
-    @property
-    def symmetric(self) -> bool:
-        """Whether its left side is like its right one."""
-        return self.label.lower() in SYMMETRIC_LABELS
-
     def _own_columns(self, keys: int) -> dict[str, Tensor]:
         """Starting values of what a kind of node has per key besides the offsets."""
         return {}
@@ -322,17 +317,14 @@ class RigidNode(Node):
 
         The size of the noise is what the track itself betrays, at least `LEAST_NOISE_M` and `LEAST_NOISE_RAD`.
         """
-        positions, heading = self.world_from_object[:, :3, 3], self.headings()
+        positions = self.world_from_object[:, :3, 3]
+        heading = np.unwrap([geometry.yaw_of(pose) for pose in self.world_from_object])
         noise = key_noise(self.times_s, np.column_stack([positions, heading]))
         noise_m = max(float(np.sqrt((noise[:3] ** 2).mean())), LEAST_NOISE_M)
         noise_rad = max(float(noise[3]), LEAST_NOISE_RAD)
         path = smoothed(self.times_s, positions, noise_m, ACCELERATION_M_S2) - positions
         turn = smoothed(self.times_s, heading[:, None], noise_rad, YAW_ACCELERATION_RAD_S2)[:, 0] - heading
         return (self.world_from_object[:, :3, :3].transpose(0, 2, 1) @ path[..., None])[..., 0], turn
-
-    def headings(self) -> NDArray[np.float64]:
-        """Yaw of the given keys f64[K], radians, without jumps of 2 pi."""
-        return np.unwrap([geometry.yaw_of(pose) for pose in self.world_from_object])
 
     # -- rows --------------------------------------------------------------------------------------
 

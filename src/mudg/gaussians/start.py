@@ -27,7 +27,7 @@ from mudg.base.palette import DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.types import FusedCloud, PointCloud, Scene
 from mudg.core.table import Table
 from mudg.gaussians.model import SceneModel
-from mudg.gaussians.nodes import RigidNode, SkyNode, StaticNode, object_node
+from mudg.gaussians.nodes import SYMMETRIC_LABELS, RigidNode, SkyNode, StaticNode, object_node
 from mudg.gaussians.settings import METHODS, FitConfig
 from mudg.gaussians.views import StoredView, heads_of
 
@@ -213,7 +213,7 @@ def _object_columns(
     rows = voxel_filter(cloud.xyz, 0.06)
     rows = rows[np.sort(seeds.numpy_rng(config.seed, 0, f"object {node.name}").permutation(len(rows))[:most])]
     xyz, rgb, semantics = cloud.xyz[rows], cloud.rgb[rows], _labels(cloud)[rows]
-    if config.objects.mirror_start and node.symmetric:
+    if config.objects.mirror_start and node.label.lower() in SYMMETRIC_LABELS:
         other, source = mirrored_points(xyz)
         xyz, rgb = np.concatenate([xyz, other]), np.concatenate([rgb, rgb[source]])
         semantics = np.concatenate([semantics, semantics[source]])
