@@ -142,14 +142,8 @@ def seam(model: MDM, config: BenchConfig, request: SampleRequest) -> dict[str, A
     mean = lambda kept: sum(kept) / len(kept) if kept else math.nan
     across = mean([r for i, r in enumerate(ratios) if i in seams])
     within = mean([r for i, r in enumerate(ratios) if i not in seams])
-    return {
-        "city": city,
-        "across": round(across, 4),
-        "inside": round(within, 4),
-        "steps": usual.steps,
-        "seams": sorted(seams),
-        "pairs": [round(r, 4) for r in ratios],
-    }
+    change = {"city": city, "across": round(across, 4), "inside": round(within, 4), "steps": usual.steps}
+    return {**change, "seams": sorted(seams), "pairs": [round(r, 4) for r in ratios]}
 
 
 LISTS: dict[str, tuple[int, ...]] = {

@@ -119,13 +119,9 @@ class MakeTargets(Output):
         by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
         records, left_out, color_maps = _written(maker, by_camera, work.path)
         pictures = _write_pictures(maker, records, work.path)
-        document = {
-            "views": records,
-            "color_maps": {name: asdict(found) for name, found in color_maps.items()},
-            "pictures": pictures,
-            "left_out": left_out,
-            "reason": "" if records else (next(iter(left_out.values()), "no frame to score")),
-        }
+        reason = "" if records else next(iter(left_out.values()), "no frame to score")
+        document = {"views": records, "color_maps": {name: asdict(found) for name, found in color_maps.items()}}
+        document |= {"pictures": pictures, "left_out": left_out, "reason": reason}
         store.write_json(work.path / "targets.json", document)
         return {"views": len(records)}
 
@@ -139,13 +135,10 @@ def read_targets(folder: Path) -> Targets:
     seen = {place: [r["seen_px"] for r in own if "seen_px" in r] for place, own in by_place.items()}
     all_seen = sum(map(sum, seen.values()))
     shares = {place: np.mean([r["seen_share"] for r in own]) for place, own in by_place.items() if seen[place]}
-    facts = {
-        "views": {place: len(own) for place, own in by_place.items()},
-        "left_out": found["left_out"],
-        "color_maps": found["color_maps"],
-        "seen_share": {place: round(float(share), 4) for place, share in shares.items()},
-        "weight": {place: round(sum(counts) / all_seen, 4) for place, counts in seen.items() if counts and all_seen},
-    }
+    weight = {place: round(sum(counts) / all_seen, 4) for place, counts in seen.items() if counts and all_seen}
+    facts = {"views": {place: len(own) for place, own in by_place.items()}}
+    facts |= {name: found[name] for name in ("left_out", "color_maps")}
+    facts |= {"seen_share": {place: round(float(share), 4) for place, share in shares.items()}, "weight": weight}
     return Targets(folder, tuple(found["views"]), maps, tuple(found["pictures"]), facts, found["reason"])
 
 

@@ -178,21 +178,15 @@ def measured(case: RunCase, script: EditScript, shown: Shown | None = None) -> d
         if shown is not None:
             shown(number, old, new)
     kinds = [note["kind"] for note in drive.notes]
-    return {
-        "warp": edited.warp,
-        "warp_before": usual.warp,
-        "outside": sums.changed / sums.away if sums.away else None,
-        "structure": float(np.mean(sums.structure)) if sums.structure else None,
-        "lidar": sums.depth_of("after"),
-        "lidar_before": sums.depth_of("before"),
-        "uncovered": sums.depth_of("uncovered"),
-        "uncovered_psnr": sums.uncovered_psnr,
-        "overlap": edited.overlap,
-        "overlap_before": usual.overlap,
-        "collisions": kinds.count("collision"),
-        "warnings": len(kinds),
-        "notes": [note["text"] for note in drive.notes],
-    }
+    outside = sums.changed / sums.away if sums.away else None
+    structure = float(np.mean(sums.structure)) if sums.structure else None
+    images = {"warp": edited.warp, "warp_before": usual.warp, "outside": outside, "structure": structure}
+    depths = {name: sums.depth_of(key) for name, key in (("lidar", "after"), ("lidar_before", "before"))}
+    uncovered = {"uncovered": sums.depth_of("uncovered"), "uncovered_psnr": sums.uncovered_psnr}
+    overlaps = {"overlap": edited.overlap, "overlap_before": usual.overlap}
+    counts = {"collisions": kinds.count("collision"), "warnings": len(kinds)}
+    notes = [note["text"] for note in drive.notes]
+    return {**images, **depths, **uncovered, **overlaps, **counts, "notes": notes}
 
 
 def _videos(case: RunCase, drive: apply.EditedDrive) -> tuple[Video, Video, bool]:
@@ -296,12 +290,9 @@ FORMS: Final = {
     **dict.fromkeys(("warp", "warp_before"), "{:.4f}"),
     "outside": "{:.2%}",
     "structure": "{:.3f}",
-    "lidar": "{:.4f}",
-    "lidar_before": "{:.4f}",
+    **dict.fromkeys(("lidar", "lidar_before"), "{:.4f}"),
     "uncovered": "{:.3f}",
-    "uncovered_psnr": "{:.2f}",
-    "overlap": "{:.2f}",
-    "overlap_before": "{:.2f}",
+    **dict.fromkeys(("uncovered_psnr", "overlap", "overlap_before"), "{:.2f}"),
     **dict.fromkeys(("collisions", "warnings"), "{}"),
 }
 KINDS: Final = ("unedited", "edited", "difference")

@@ -156,14 +156,8 @@ class Course:
         motion = drive.motion
         station, shift = drive.road.locate((motion.x_m, motion.y_m))
         beyond_m = self.world.beyond_kerb_m(drive.car.box(drive.pose).footprint())
-        return {
-            "xy": [motion.x_m, motion.y_m],
-            "speed_mps": motion.speed_mps,
-            "station_m": station,
-            "shift_m": shift,
-            "hit": drive.collision(),
-            "off_road": bool((beyond_m > 0).any()),
-        }
+        place = {"xy": [motion.x_m, motion.y_m], "speed_mps": motion.speed_mps, "station_m": station, "shift_m": shift}
+        return {**place, "hit": drive.collision(), "off_road": bool((beyond_m > 0).any())}
 
 
 def measure_drive(
@@ -196,14 +190,10 @@ def parting(path: Sequence[Facts], exact: Sequence[Facts]) -> dict[str, float]:
     """How far a drive is from that in the exact city, time by time, and what befell it."""
     apart = [math.dist(a["xy"], b["xy"]) for a, b in zip(path, exact, strict=True)]
     speeds = [abs(a["speed_mps"] - b["speed_mps"]) for a, b in zip(path, exact, strict=True)]
-    return {
-        "shift_m": max(abs(at["shift_m"]) for at in path),
-        "parting_m": float(np.mean(apart)),
-        "parted_m": apart[-1],
-        "speed_off_mps": float(np.mean(speeds)),
-        "collisions": float(any(at["hit"] for at in path)),
-        "departures": float(any(at["off_road"] for at in path)),
-    }
+    away = {"shift_m": max(abs(at["shift_m"]) for at in path), "parting_m": float(np.mean(apart))}
+    speed_off, befell = float(np.mean(speeds)), {"collisions": "hit", "departures": "off_road"}
+    any_of = {name: float(any(at[key] for at in path)) for name, key in befell.items()}
+    return {**away, "parted_m": apart[-1], "speed_off_mps": speed_off, **any_of}
 
 
 # ---- numbers ----

@@ -109,23 +109,13 @@ class PaperLog(Views):
             }
         films, scene = self.film(shown), self.loaded
         sizes = dict.fromkeys(f"{camera.width}x{camera.height}" for camera in scene.cameras.values())
-        return {
-            "log": self.log.name,
-            "dataset": scene.source.dataset,
-            "cameras": list(scene.cameras),
-            "frames": len(scene.frames_of(first_camera(scene, ()))),
-            "size": ", ".join(sizes),
-            "held_out": len(scene.frames_in("test")),
-            "tracks": len(scene.tracks),
-            "note": self.log.note,
-            "exact": truth is not None,
-            "values": values,
-            "features": features,
-            "made": _made_of(fill),
-            "films": films,
-            "columns": list(shown),
-            "seconds": seconds_of(self.out),
-        }
+        names = {"log": self.log.name, "dataset": scene.source.dataset, "cameras": list(scene.cameras)}
+        counts = {"frames": len(scene.frames_of(first_camera(scene, ()))), "size": ", ".join(sizes)}
+        counts |= {"held_out": len(scene.frames_in("test")), "tracks": len(scene.tracks)}
+        about = {"note": self.log.note, "exact": truth is not None}
+        scores = {"values": values, "features": features, "made": _made_of(fill)}
+        pictures = {"films": films, "columns": list(shown)}
+        return {**names, **counts, **about, **scores, **pictures, "seconds": seconds_of(self.out)}
 
 
 def run(
@@ -326,21 +316,11 @@ def document(
         numbers = {row: round(of["mean"], column.digits) for row, of in results.items() if "mean" in of}
         best.setdefault(place, {})[column.key] = best_of(column.better, numbers)
     published = [{"title": r.title, "source": r.source, "values": list(map(list, r.values))} for r in table.published]
-    return {
-        "schema": 1,
-        "bench": "paper",
-        "table": table.values(),
-        "exact": exact,
-        "settings": dict(settings),
-        "rows": every,
-        "cells": cells,
-        "best": best,
-        "further": [column.values() for column in columns],
-        "further_title": "Exact truth" if exact else "Measured at LiDAR points and in recorded frames",
-        "published": published,
-        "made": logs[0]["made"],
-        "logs": [dict(entry) for entry in logs],
-    }
+    head = {"schema": 1, "bench": "paper", "table": table.values(), "exact": exact, "settings": dict(settings)}
+    numbers = {"rows": every, "cells": cells, "best": best, "further": [column.values() for column in columns]}
+    title = "Exact truth" if exact else "Measured at LiDAR points and in recorded frames"
+    whence = {"further_title": title, "published": published, "made": logs[0]["made"]}
+    return {**head, **numbers, **whence, "logs": [dict(entry) for entry in logs]}
 
 
 def _cell(logs: Sequence[Facts], row: str, place: str, column: PaperColumn, pooled: Facts | None) -> dict[str, Any]:

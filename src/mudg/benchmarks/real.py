@@ -118,11 +118,8 @@ def run(
     last, own = (rows, config, on_device(training, config.device), overwrite), {}
     for protocol in protocols:
         own.setdefault(protocol.split, []).append(protocol)
-    jobs = [
-        SplitJob(out / name, scene, SPLITS[split], tuple(of_split), *last)
-        for name, scene in scenes.items()
-        for split, of_split in own.items()
-    ]
+    every = [(name, scene, split) for name, scene in scenes.items() for split in own]
+    jobs = [SplitJob(out / name, scene, SPLITS[split], tuple(own[split]), *last) for name, scene, split in every]
     settings = {
         "protocols": list(config.protocols),
         **model_settings(config),
@@ -303,18 +300,11 @@ def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str
     loaded = read_scene(scene)
     sizes = {name: [camera.width, camera.height] for name, camera in loaded.cameras.items()}
     cameras = {camera: {"size_px": of, "frames": len(loaded.frames_of(camera))} for camera, of in sizes.items()}
-    return {
-        "log": name,
-        "id": loaded.id,
-        "dataset": loaded.source.dataset,
-        "digest": store.digest(scene),
-        "cameras": cameras,
-        "sweeps": len(loaded.sweeps),
-        "tracks": len(loaded.tracks),
-        "held_out": {s["split"]: s["held_out"] for s in splits},
-        "diffusion": {s["split"]: s["diffusion"] for s in splits},
-        "protocols": {protocol: result for s in splits for protocol, result in s["protocols"].items()},
-    }
+    names = {"log": name, "id": loaded.id, "dataset": loaded.source.dataset, "digest": store.digest(scene)}
+    counts = {"cameras": cameras, "sweeps": len(loaded.sweeps), "tracks": len(loaded.tracks)}
+    of_split = {part: {s["split"]: s[part] for s in splits} for part in ("held_out", "diffusion")}
+    protocols = {protocol: result for s in splits for protocol, result in s["protocols"].items()}
+    return {**names, **counts, **of_split, "protocols": protocols}
 
 
 def document(
@@ -332,13 +322,9 @@ def document(
             if name != BASE:
                 of, base = pooled[name], pooled[BASE]
                 against[name] = {c: COLUMNS[c].compared(of[c], base[c]) for c in protocol.columns}
-        result[protocol.name] = {
-            "row": asdict(protocol),
-            "logs": entries,
-            "pooled": pooled,
-            "left_out": {log: entry["left_out"] for log, entry in entries.items() if "left_out" in entry},
-            "against": against,
-        }
+        left_out = {log: entry["left_out"] for log, entry in entries.items() if "left_out" in entry}
+        row = {"row": asdict(protocol), "logs": entries, "pooled": pooled}
+        result[protocol.name] = {**row, "left_out": left_out, "against": against}
     facts = [{key: value for key, value in entry.items() if key != "protocols"} for entry in logs]
     head = {"schema": 1, "bench": "real", "settings": dict(settings), "methods": list(rows)}
     return {**head, "logs": facts, "protocols": result}

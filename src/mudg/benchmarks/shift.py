@@ -97,17 +97,9 @@ class ShiftLog(Views):
         if self.config.videos:
             films = self.film({"truth": self.truth, **{name: of[0] for name, of in views.items() if name in SHOWN}})
         facts = city_logs.facts(self.log.seed, self.log.rules)
-        return {
-            "log": self.log.seed,
-            "turn_deg": round(facts.turn_deg, 2),
-            "length_m": round(facts.length_m, 1),
-            "movers": facts.moving,
-            "mover_share": round(facts.moving_share, 4),
-            "words": facts.description,
-            "films": films,
-            "values": values,
-            "seconds": seconds_of(self.out),
-        }
+        path = {"log": self.log.seed, "turn_deg": round(facts.turn_deg, 2), "length_m": round(facts.length_m, 1)}
+        movers = {"movers": facts.moving, "mover_share": round(facts.moving_share, 4), "words": facts.description}
+        return {**path, **movers, "films": films, "values": values, "seconds": seconds_of(self.out)}
 
 
 def run(
@@ -171,17 +163,11 @@ def document(
     fitted = [row["name"] for row in rows if row["fit"] is not None and row["name"] not in ("gs3d", BASE, FULL)]
     held = lambda a, b, place, metrics: against(full, a, b, place, metrics) if {a, b} <= {*names} else []
     of_variant = lambda name: [c for p in (SHIFTED, RECORDED) for c in held(name, FULL, p, VARIANT)]
-    return {
-        "schema": 1,
-        "settings": dict(settings),
-        "distances_m": list(distances_m),
-        "methods": [dict(r) for r in rows],
-        "metrics": list(COLUMNS),
-        "logs": full,
-        "pooled": pooled,
-        "comparisons": [comparison for comparison_of in COMPARISONS for comparison in held(*comparison_of)],
-        "variants": [{"name": name, "against_mudg_s": of_variant(name)} for name in fitted if FULL in names],
-    }
+    head = {"schema": 1, "settings": dict(settings), "distances_m": list(distances_m)}
+    head |= {"methods": [dict(r) for r in rows], "metrics": list(COLUMNS)}
+    comparisons = [comparison for comparison_of in COMPARISONS for comparison in held(*comparison_of)]
+    variants = [{"name": name, "against_mudg_s": of_variant(name)} for name in fitted if FULL in names]
+    return {**head, "logs": full, "pooled": pooled, "comparisons": comparisons, "variants": variants}
 
 
 def with_mean(of: Mapping[str, Facts], shifted: Sequence[str]) -> dict[str, dict[str, Any]]:
@@ -213,20 +199,11 @@ def against(logs: Sequence[Facts], a: str, b: str, place: str, metrics: str) -> 
         both, of = [pair for pair in known if pair is not None], partial(_compared_means, ratio=metric in RATIOS)
         per_log = [None if pair is None else of([pair]) for pair in known]
         where = "recorded path" if place == RECORDED else "off the recorded path"
-        comparisons.append(
-            {
-                "title": f"{a} against {b}, {where}: {COLUMNS[metric][0]}",
-                "a": a,
-                "b": b,
-                "place": place,
-                "metric": metric,
-                "kind": "ratio" if metric in RATIOS else "difference",
-                "value": of(both) if both else None,
-                "standard_error": standard_error(of, both),
-                "logs": len(both),
-                "per_log": [None if value is None else round(value, 5) for value in per_log],
-            }
-        )
+        kind, title = "ratio" if metric in RATIOS else "difference", f"{a} against {b}, {where}: {COLUMNS[metric][0]}"
+        what = {"title": title, "a": a, "b": b, "place": place, "metric": metric, "kind": kind}
+        value = {"value": of(both) if both else None, "standard_error": standard_error(of, both), "logs": len(both)}
+        each = [None if value is None else round(value, 5) for value in per_log]
+        comparisons.append({**what, **value, "per_log": each})
     return comparisons
 
 

@@ -192,17 +192,10 @@ class ScoredTrajectory:
 
     def record(self) -> dict[str, Any]:
         """The trajectory as JSON values."""
-        camera = self.views[0].camera
-        return {
-            "name": self.name,
-            "camera": self.camera,
-            "shift_m": self.shift_m,
-            "views": len(self.views),
-            "width": camera.width,
-            "height": camera.height,
-            "methods": list(self.sets),
-            "indices": {m: list(i) for m, i in self.indices.items()},
-        }
+        camera, indices = self.views[0].camera, {m: list(i) for m, i in self.indices.items()}
+        names = {"name": self.name, "camera": self.camera, "shift_m": self.shift_m}
+        sizes = {"views": len(self.views), "width": camera.width, "height": camera.height}
+        return {**names, **sizes, "methods": list(self.sets), "indices": indices}
 
 
 @dataclass(frozen=True)

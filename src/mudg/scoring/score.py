@@ -174,17 +174,10 @@ def nearest_fill(cloud: FusedCloud, world_from_object: Mapping[str, NDArray[np.f
         known = np.concatenate([layer.semantics for layer in layers if layer.semantics is not None])
         ids = np.append(known, palette.UNLABELLED)[index]  # index -1 = nothing = the appended entry
         semantics = torch.from_numpy(ids[row, column].astype(np.int64))
-    depth = drawn.depth.numpy()[:, row, column]
-    return Observation(
-        view=view,
-        rgb=torch.from_numpy(drawn.color.numpy()[:, row, column]),
-        depth=torch.from_numpy(np.where(depth > 0, depth, np.nan).astype(np.float32)),
-        semantics=semantics,
-        confidence=drawn.valid.float(),
-        mask=torch.ones(1, height, width, dtype=torch.bool),
-        kind="virtual",
-        source=BASELINE,
-    )
+    rgb, depth = (torch.from_numpy(plane.numpy()[:, row, column]) for plane in (drawn.color, drawn.depth))
+    depth = torch.where(depth > 0, depth, torch.nan).float()
+    mask = torch.ones(1, height, width, dtype=torch.bool)
+    return Observation(view, rgb, depth, semantics, drawn.valid.float(), mask, "virtual", BASELINE)
 
 
 # ---- one trajectory ----
@@ -247,19 +240,13 @@ def _score(
                     sums[name][metric].add(value)
             del made
             advance()
-    anchors = _values(sums.pop(TRUTH), truth_has)
-    return [
-        {
-            "method": name,
-            "trajectory": trajectory.name,
-            "views": scored,
-            "values": _values(of, truth_has),
-            "iou": _iou(of),
-            "details": view_metrics.details(of),
-            "truth": {k: v for k, v in anchors.items() if not isinstance(v, str)},
-        }
-        for name, of in sums.items()
-    ]
+    anchors = {k: v for k, v in _values(sums.pop(TRUTH), truth_has).items() if not isinstance(v, str)}
+    results = []
+    for name, of in sums.items():
+        numbers = {"values": _values(of, truth_has), "iou": _iou(of), "details": view_metrics.details(of)}
+        where = {"method": name, "trajectory": trajectory.name, "views": scored}
+        results.append({**where, **numbers, "truth": dict(anchors)})
+    return results
 
 
 def _in_order(
@@ -388,19 +375,8 @@ def pair_of(
     valid = None
     if true.depth is not None:
         valid = torch.isfinite(true.depth) & (true.depth > 0) & (true.depth <= DEPTH_LIMIT_M)
-    return metrics.Pair(
-        rgb=rgb,
-        depth=depth,
-        semantics=semantics,
-        truth_rgb=true.rgb,
-        truth_depth=true.depth,
-        truth_depth_valid=valid,
-        truth_semantics=true.semantics,
-        mask=true.mask,
-        moving=truth.moving,
-        view=true.view,
-        facts=facts,
-    )
+    made, truths = (rgb, depth, semantics), (true.rgb, true.depth, valid, true.semantics)
+    return metrics.Pair(*made, *truths, mask=true.mask, moving=truth.moving, view=true.view, facts=facts)
 
 
 def _write_error_picture(path: Path, seen: Mapping[str, Observation], true: Observation) -> None:

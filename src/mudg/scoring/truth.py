@@ -154,17 +154,13 @@ def _recorded(scene: Scene, frame: Frame, view: View) -> Observation:
             return None
         return resize_nearest(read_label(scene, frame, name), height, width)
 
-    semantics, depth, ego = label("semantics"), label("depth"), label("ego")
-    return Observation(
-        view=view,
-        rgb=resize_rgb(torch.from_numpy(read_image(scene, frame).copy()).permute(2, 0, 1).float() / 255, height, width),
-        depth=_lidar_depth(scene, view) if depth is None else torch.from_numpy(depth.copy())[None],
-        semantics=None if semantics is None else torch.from_numpy(semantics.astype(np.int64)),
-        confidence=torch.ones(1, height, width),
-        mask=torch.ones(1, height, width, dtype=torch.bool) if ego is None else torch.from_numpy(ego == 0)[None],
-        kind="recorded",
-        source="camera",
-    )
+    ids, dense, ego = label("semantics"), label("depth"), label("ego")
+    rgb = resize_rgb(torch.from_numpy(read_image(scene, frame).copy()).permute(2, 0, 1).float() / 255, height, width)
+    depth = _lidar_depth(scene, view) if dense is None else torch.from_numpy(dense.copy())[None]
+    semantics = None if ids is None else torch.from_numpy(ids.astype(np.int64))
+    everywhere = torch.ones(1, height, width)
+    mask = everywhere.bool() if ego is None else torch.from_numpy(ego == 0)[None]
+    return Observation(view, rgb, depth, semantics, everywhere, mask, "recorded", "camera")
 
 
 def _lidar_depth(scene: Scene, view: View) -> Tensor | None:
