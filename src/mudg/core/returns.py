@@ -168,7 +168,7 @@ def first_surface(beams: Floats, xyz: Floats) -> Met:
     part = Met(
         1 / at,
         at / np.hypot(at, slope),
-        gaps[own, 0],
+        np.asarray(gaps[own, 0], np.float64),
         spacing,
         one_sided,
         rows,
