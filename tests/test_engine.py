@@ -34,6 +34,7 @@ LINES = {
     "export": "export colmap TOY/fit --scene TOY/scene --edits TOY/edits.yaml",
     "asset export": "asset export TOY/fit car-001 --scene TOY/scene",
     "asset import": "asset import TOY/edits.yaml --kind scene",
+    "dataset": "dataset coco TOY/fit --scene TOY/scene",
     "ingest": "ingest TOY/scene",
 }
 """A command line of every verb whose result has inputs."""

@@ -156,4 +156,4 @@ def test_parts_of_verbs_have_pages_of_their_own(
 
 def test_every_part_that_a_verb_takes_has_a_page() -> None:
     assert set(steps.step_class("ingest").parts) == {"city", *FORMATS}
-    assert set(steps.step_class("bench").parts) == {*bench.BENCHES, bench.SHIFT, bench.REAL, bench.PAPER}
+    assert set(steps.step_class("bench").parts) == {*bench.BENCHES, bench.SHIFT, bench.REAL, bench.PAPER, bench.LOOP}

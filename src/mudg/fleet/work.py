@@ -107,6 +107,8 @@ class InputStore:
                         lock(handle, False, stop)
                         break
                     continue
+                if mark.is_file() and store.read_text(mark) == self.token:
+                    continue  # fetched by another while this one waited: the lock is let go of before it is had alone
                 store.remove(mark)
                 source.fetch(content, mirror=True)
                 store.write_in_tree(mark, self.token.encode())
