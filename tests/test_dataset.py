@@ -15,12 +15,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 from roundtrip import needs_native
+from scipy.spatial import KDTree
 from toy_fitted import write_toy_run
 
 import mudg
 from mudg.base import geometry
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.types import Camera, View
+from mudg.core import trajectory
 from mudg.datasets import coco, kitti, write
 from mudg.datasets.samples import LabelledView, Labeller, ObjectBox, around, outside
 from mudg.datasets.settings import DatasetConfig
@@ -37,9 +39,10 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     return scene, fit
 
 
-def write_set(run: tuple[Path, Path], name: str, out: Path, **settings: object) -> Path:
+def write_set(run: tuple[Path, Path], name: str, out: Path, path: Path | None = None, **settings: object) -> Path:
     scene, fit = run
-    return Dataset(format=name, run_folder=fit, scene=scene, out=out, settings=DatasetConfig(**settings)).run()
+    chosen = DatasetConfig(**settings)
+    return Dataset(format=name, runs=(fit,), scene=scene, path=path, out=out, settings=chosen).run()
 
 
 # -- formats ---------------------------------------------------------------------------------------
@@ -64,13 +67,14 @@ def test_a_label_of_kitti_is_the_box_by_its_own_formula(x: float, y: float, yaw:
     """The development kit's corners, turned about the camera's y axis, fall on the projected corners of our box."""
     world_from_cam = geometry.yaw_matrix(0.0, (1.0, 0.2, 1.5)) @ geometry.invert(geometry.CAM_FROM_EGO_AXES)
     view, box = View(CAMERA, world_from_cam, 0.0), box_at(x, y, yaw)
-    line = kitti.label_line(box, LabelledView("x", view, {}, (box,), Trust(1.0, 0.0, 0.0)))
+    labelled = LabelledView("x", view, {}, (box,), Trust(1.0, 0.0, 0.0))
+    line = kitti.label_line(box, labelled, "0.00")
     kind, *words = line.split()
     truncated, hidden, alpha, _, _, _, _, h, w, length, cx, cy, cz, turn = map(float, words)
     c, s = math.cos(turn), math.sin(turn)
     corners = [(dx * length / 2, dy, dz * w / 2) for dx in (-1, 1) for dy in (0, -h) for dz in (-1, 1)]
     theirs = np.array([(c * a + s * b + cx, up + cy, -s * a + c * b + cz) for a, up, b in corners])
-    calib = {line.split(":")[0]: line.split(":")[1] for line in kitti.calibration(CAMERA).splitlines()}
+    calib = {line.split(":")[0]: line.split(":")[1] for line in kitti.calibration(labelled, {}).splitlines()}
     p2 = np.array(calib["P2"].split(), float).reshape(3, 4)
     uvw = np.column_stack([theirs, np.ones(8)]) @ p2.T
     ours, _ = geometry.project(view, geometry.transform_points(box.world_from_box, geometry.box_corners(box.size_m)))
@@ -138,6 +142,137 @@ def test_coco_agrees_with_its_panoptic_images(run: tuple[Path, Path], tmp_path: 
             assert segment["bbox"] == [xs.min(), ys.min(), np.ptp(xs) + 1, np.ptp(ys) + 1]
 
 
+def test_a_sequence_of_kitti_is_read_again_with_its_poses_tracks_and_scans(
+    run: tuple[Path, Path], tmp_path: Path
+) -> None:
+    out = write_set(
+        run,
+        "kitti-tracking",
+        tmp_path / "kitti",
+        cameras=("front",),
+        shifts_m=(0.0, 0.5),
+        least_pixels=1,
+        lidar="vlp16",
+    )
+    assert (out / "ImageSets/train.txt").read_text().split() == ["0000", "0001"]
+    mudg.ingest(str(out), out=tmp_path / "back", sequence="0001", test_every=0)
+    back = mudg.read_scene(tmp_path / "back")
+    lines = [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
+    lines = [line for line in lines if line["view"].startswith("front_shift")]
+    theirs = [frame.view.world_from_cam for frame in back.frames_of(next(iter(back.cameras)))]
+    mine = [np.array(line["world_from_camera"]) for line in lines]
+    assert len(theirs) == len(mine) == len(back.sweeps)
+    for a, b in zip(theirs, mine, strict=True):
+        assert np.abs(geometry.invert(theirs[0]) @ a - geometry.invert(mine[0]) @ b).max() < 1e-3
+    ids = {track.label.lower(): track for track in back.tracks}
+    for index, line in enumerate(lines):
+        for box in (one for one in line["objects"] if one["label"] == "car"):
+            pose = ids["car"].pose_at(back.frames[index].view.time_s)
+            there = geometry.invert(mine[index])[:3] @ np.array([*box["position_world_m"], 1.0])
+            assert np.abs(there - (geometry.invert(theirs[index]) @ pose)[:3, 3]).max() < 1e-3
+    labeller = Labeller(Session(run[1], scene=run[0]), "vlp16")
+    again = labeller.label("x", labelled_view(run, lines[0]), ("rgb",)).sweep
+    points = mudg.read_points(back, back.sweeps[0])
+    assert again is not None and len(points.xyz) == len(again.reply.xyz) > 50
+    ours = geometry.invert(mine[0]) @ again.world_from_lidar
+    read = geometry.invert(theirs[0]) @ back.sweeps[0].world_from_lidar
+    assert np.abs(ours - read).max() < 1e-3
+    assert np.abs(points.xyz - again.reply.xyz).max() < 1e-3
+
+
+def test_returns_lie_on_what_the_log_measured_and_are_counted_by_box(run: tuple[Path, Path]) -> None:
+    labeller = Labeller(Session(run[1], scene=run[0]), "hdl64")
+    scene, view = labeller.scene, labeller.scene.frames_of("front")[2].view
+    labelled = labeller.label("x", view, ("rgb",))
+    assert labelled.sweep is not None
+    world = geometry.transform_points(labelled.sweep.world_from_lidar, labelled.sweep.reply.xyz.astype(float))
+    (recorded,) = (sweep for sweep in scene.sweeps if abs(sweep.time_s - view.time_s) < 1e-6)
+    measured = geometry.transform_points(recorded.world_from_lidar, mudg.read_points(scene, recorded).xyz.astype(float))
+    apart, _ = KDTree(world).query(measured)
+    assert np.median(apart) < 0.15
+    for box in labelled.boxes:
+        local = geometry.transform_points(geometry.invert(box.world_from_box), world)
+        assert abs(box.returns - (np.abs(local) <= np.array(box.size_m) / 2).all(1).sum()) <= 1
+    assert max(box.returns for box in labelled.boxes) > 10
+
+
+def test_drives_of_one_split_share_no_list_with_those_of_the_other(tmp_path: Path) -> None:
+    runs = [write_toy_run(tmp_path / name) for name in ("a", "b")]
+    drives = [
+        write.Drive(name, fit, scene, split=split)
+        for (scene, fit, _, _), name, split in zip(runs, ("a", "b"), ("train", "val"), strict=True)
+    ]
+    for name in ("kitti", "coco", "nuscenes"):
+        work = FakeWork(tmp_path / name)
+        summary = write.write_dataset(name, DatasetConfig(cameras=("front",)), drives, work)
+        assert summary["images"] == 10
+    lists = {split: (tmp_path / f"kitti/ImageSets/{split}.txt").read_text().split() for split in ("train", "val")}
+    assert (lists["train"], lists["val"]) == ([f"{n:06d}" for n in range(5)], [f"{n:06d}" for n in range(5, 10)])
+    for number, split in enumerate(("train", "val")):
+        images = json.loads((tmp_path / f"coco/annotations/instances_{split}.json").read_text())["images"]
+        assert [image["id"] for image in images] == list(range(5 * number, 5 * number + 5))
+    splits = json.loads((tmp_path / "nuscenes/splits.json").read_text())
+    assert splits == {"train": ["scene-a-recorded"], "val": ["scene-b-recorded"]}
+
+
+class FakeWork:
+    """The folder of a result."""
+
+    def __init__(self, path: Path) -> None:
+        path.mkdir()
+        self.path = path
+
+
+def test_a_path_of_your_own_stands_for_the_shifts(run: tuple[Path, Path], tmp_path: Path) -> None:
+    scene = mudg.read_scene(run[0])
+    poses = [frame.view.world_from_cam.copy() for frame in scene.frames_of("front")[1:3]]
+    for pose in poses:
+        pose[:3, 3] += [0.0, 0.7, 0.4]
+    file = tmp_path / "drone.txt"
+    file.write_text("".join(" ".join(map(repr, pose[:3].ravel().tolist())) + "\n" for pose in poses))
+    out = write_set(run, "coco", tmp_path / "coco", file, cameras=("front",), fov_deg=70.0)
+    lines = [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
+    assert [line["view"] for line in lines] == ["drone/000000", "drone/000001"]
+    assert np.abs(np.array([line["world_from_camera"] for line in lines]) - poses).max() < 1e-9
+    views = as_dataset(run[1], run[0], path=file, cameras="front", fov_deg=70.0, lidar="vlp16")
+    focal = views[1]["intrinsics"][0, 0].item()
+    assert 2 * math.degrees(math.atan(views[1]["rgb"].shape[2] / 2 / focal)) == pytest.approx(70.0, abs=1e-3)
+    batch = collate([views[0], views[1]])
+    assert [len(points) for points in batch["points"]] == [len(views[n]["points"]) for n in (0, 1)]
+    assert batch["points"][0].shape[1] == 4 and batch["world_from_lidar"].shape == (2, 4, 4)
+
+
+def test_its_own_reader_loads_123d(run: tuple[Path, Path], tmp_path: Path) -> None:
+    pytest.importorskip("py123d", reason="py123d is not installed")
+    from py123d.api.scene.arrow.arrow_scene_builder import ArrowSceneBuilder
+    from py123d.api.scene.scene_filter import SceneFilter
+    from py123d.common.execution.sequential_executor import SequentialExecutor
+    from py123d.datatypes.sensors import CameraID, LidarID
+
+    out = write_set(run, "py123d", tmp_path / "d", cameras=("front",), shifts_m=(0.5,), least_pixels=1, lidar="vlp16")
+    assert {path.name for path in out.iterdir()} >= {"logs", "provenance.jsonl"} and not (out / "samples").exists()
+    builder = ArrowSceneBuilder(out / "logs", tmp_path)
+    (scene,) = builder.get_scenes(SceneFilter(iteration_threshold=100), SequentialExecutor())
+    lines = [json.loads(line) for line in (out / "provenance.jsonl").read_text().splitlines()]
+    labeller = Labeller(Session(run[1], scene=run[0]), "vlp16")
+    assert scene.number_of_iterations == len(lines)
+    for index, line in enumerate(lines):
+        labelled = labeller.label("x", labelled_view(run, line), ("rgb",))
+        camera = scene.get_camera_at_iteration(index, CameraID.PCAM_F0)
+        assert np.array_equal(camera.image, labelled.layers["rgb"])
+        assert np.abs(camera.camera_to_global_se3.transformation_matrix - labelled.view.world_from_cam).max() < 1e-6
+        boxes = {box.attributes.track_token: box for box in scene.get_box_detections_se3_at_iteration(index)}
+        assert boxes.keys() == {one["id"] for one in line["objects"]}
+        for one in line["objects"]:
+            center = boxes[one["id"]].bounding_box_se3.center_se3
+            assert np.abs(np.array([center.x, center.y, center.z]) - one["position_world_m"]).max() < 1e-6
+        lidar = scene.get_lidar_at_iteration(index, LidarID.LIDAR_TOP)
+        assert labelled.sweep is not None and labelled.mount is not None
+        vehicle = labelled.view.world_from_cam @ geometry.invert(labelled.mount)
+        ours = geometry.transform_points(labelled.sweep.world_from_lidar, labelled.sweep.reply.xyz.astype(float))
+        assert np.abs(geometry.transform_points(vehicle, lidar.xyz.astype(float)) - ours).max() < 1e-3
+
+
 @pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 def test_pycocotools_reads_the_masks(run: tuple[Path, Path], tmp_path: Path) -> None:
     tools = pytest.importorskip("pycocotools.coco", reason="pycocotools is not installed")
@@ -153,11 +288,11 @@ def test_an_interrupted_data_set_equals_an_uninterrupted_one(
     whole = write_set(run, "coco", tmp_path / "whole", cameras=("front",))
     label, calls = Labeller.label, []
 
-    def interrupted(self: Labeller, *args: object) -> LabelledView:
+    def interrupted(self: Labeller, *args: object, **more: object) -> LabelledView:
         calls.append(1)
         if len(calls) == 3:
             raise KeyboardInterrupt
-        return label(self, *args)
+        return label(self, *args, **more)
 
     monkeypatch.setattr(Labeller, "label", interrupted)
     with pytest.raises(KeyboardInterrupt):
@@ -199,9 +334,13 @@ def test_objects_seen_from_unknown_sides_and_tiny_ones_are_left_out(run: tuple[P
 def test_words_for_what_cannot_be(run: tuple[Path, Path], tmp_path: Path) -> None:
     scene, fit = run
     with pytest.raises(UsageError, match="no such data set format"):
-        Dataset(format="voc", run_folder=fit, scene=scene, out=tmp_path / "a", settings=DatasetConfig()).run()
+        Dataset(format="voc", runs=(fit,), scene=scene, out=tmp_path / "a", settings=DatasetConfig()).run()
     with pytest.raises(UsageError, match="need the log"):
-        Dataset(format="coco", run_folder=fit, out=tmp_path / "a", settings=DatasetConfig()).run()
+        Dataset(format="coco", runs=(fit,), out=tmp_path / "a", settings=DatasetConfig()).run()
+    with pytest.raises(UsageError, match="belongs to one drive"):
+        Dataset(format="coco", runs=(fit, fit), scene=scene, out=tmp_path / "a", settings=DatasetConfig()).run()
+    with pytest.raises(UsageError, match="no such LiDAR"):
+        write_set(run, "coco", tmp_path / "a", lidar="hdl65")
     with pytest.raises(UsageError, match="camera"):
         write_set(run, "coco", tmp_path / "a", cameras=("rear",))
     assert not (tmp_path / "a").exists() or not any((tmp_path / "a").rglob("*.png"))
@@ -249,7 +388,7 @@ def test_masks_and_boxes_beside_the_path_are_those_of_the_city(tmp_path: Path) -
     labeller = Labeller(Session(tmp_path / "fit", scene=tmp_path / "scene"))
     world = CityWorld.from_source(labeller.scene.source)
     masks, boxes, hidden = [], [], []
-    for path in labeller.paths(("front",), (2.0, -2.0)):
+    for path in (trajectory.shifted(labeller.scene, "front", shift) for shift in (2.0, -2.0)):
         for view in path.views[::6]:
             labelled, truth = labeller.label("x", view, ("instances",)), world.render(view)
             for box in labelled.boxes:
@@ -282,11 +421,15 @@ def overlap(a: tuple[float, ...], b: tuple[float, ...]) -> float:
 def test_nuscenes_tables_refer_to_each_other_and_boxes_lie_where_they_are(
     run: tuple[Path, Path], tmp_path: Path
 ) -> None:
-    out = write_set(run, "nuscenes", tmp_path / "nuscenes", cameras=("front",), shifts_m=(0.0, 0.5), least_pixels=1)
+    chosen = {"cameras": ("front",), "shifts_m": (0.0, 0.5), "least_pixels": 1, "lidar": "vlp16"}
+    out = write_set(run, "nuscenes", tmp_path / "nuscenes", **chosen)
     tables = {path.stem: json.loads(path.read_text()) for path in (out / "v1.0-mini").glob("*.json")}
     known = {name: {row["token"]: row for row in rows} for name, rows in tables.items()}
     assert all(len(known[name]) == len(rows) for name, rows in tables.items())
-    assert [scene["name"] for scene in tables["scene"]] == ["scene-recorded", "scene-shift+0.5"]
+    drive = run[1].name
+    scenes = [f"scene-{drive}-recorded", f"scene-{drive}-shift+0.5"]
+    assert [scene["name"] for scene in tables["scene"]] == scenes
+    assert json.loads((out / "splits.json").read_text()) == {"train": scenes}
     for name, rows in tables.items():
         for row in rows:
             for key, value in row.items():
@@ -304,10 +447,15 @@ def test_nuscenes_tables_refer_to_each_other_and_boxes_lie_where_they_are(
             known["ego_pose"][row["ego_pose_token"]],
             known["calibrated_sensor"][row["calibrated_sensor_token"]],
         )
+        lidar = row["fileformat"] == "pcd"
+        assert (out / row["filename"]).is_file() and lidar == ("LIDAR_TOP" in row["filename"])
+        if lidar:
+            rows = np.fromfile(out / row["filename"], "<f4").reshape(-1, 5)
+            assert len(rows) > 50 and 0 <= rows[:, 3].min() <= rows[:, 3].max() <= 255
+            continue
         ending, _, index = row["filename"].removesuffix(".png").split("__")[1:]
-        line = lines[f"front_{ending}/{index}"]
+        line = lines[f"front_{ending.removeprefix(drive + '-')}/{index}"]
         assert np.abs(matrix(ego) @ matrix(mount) - np.array(line["world_from_camera"])).max() < 1e-9
-        assert (out / row["filename"]).is_file()
         boxes = [one for one in tables["sample_annotation"] if one["sample_token"] == row["sample_token"]]
         places = sorted(tuple(np.round(one["translation"], 6)) for one in boxes)
         assert places == sorted(tuple(np.round(one["position_world_m"], 6)) for one in line["objects"])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mudg.base import store
 from mudg.base.palette import CLASSES, DISPLAY_COLORS, DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.versions import version
-from mudg.datasets.samples import LabelledView, ObjectBox, around
+from mudg.datasets.samples import LabelledView, ObjectBox, Place, around
 
 FILES: Final = ("images/*.png", "panoptic/*.png", "annotations/*.json", "provenance.jsonl")
 CATEGORY_OF: Final = {
@@ -28,8 +28,9 @@ CATEGORY_OF: Final = {
 """Label -> class, where they differ."""
 
 
-def write_view(folder: Path, number: int, view: LabelledView) -> dict[str, Any]:
+def write_view(folder: Path, place: Place, view: LabelledView) -> dict[str, Any]:
     """The image, its panoptic image, and its annotations."""
+    number = place.number
     classes, instances = view.layers["classes"], view.layers["instances"]
     height, width = classes.shape
     store.write_image(folder / "images" / f"{number:06d}.png", view.layers["rgb"])
@@ -61,7 +62,15 @@ def write_view(folder: Path, number: int, view: LabelledView) -> dict[str, Any]:
 
 
 def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
-    """``annotations/instances.json`` and ``annotations/panoptic.json``."""
+    """``annotations/instances.json`` and ``annotations/panoptic.json``; ``instances_train.json`` and so on of several
+    splits."""
+    splits = list(dict.fromkeys(record["split"] for record in records))
+    for split in splits:
+        own = [record for record in records if record["split"] == split]
+        _write_split(folder / "annotations", own, f"_{split}" if len(splits) > 1 else "")
+
+
+def _write_split(folder: Path, records: Sequence[Mapping[str, Any]], ending: str) -> None:
     things = set(DYNAMIC_IDS)
     categories = [
         {"id": index + 1, "name": name, "isthing": int(index in things), "color": DISPLAY_COLORS[index].tolist()}
@@ -72,7 +81,7 @@ def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
     each = ({**one, "image_id": record["entry"]["id"]} for record in records for one in record["annotations"])
     annotations = [{**one, "id": number + 1} for number, one in enumerate(each)]
     whole = {"info": info, "licenses": [], "images": images, "categories": categories}
-    store.write_json(folder / "annotations" / "instances.json", {**whole, "annotations": annotations})
+    store.write_json(folder / f"instances{ending}.json", {**whole, "annotations": annotations})
     panoptic = [
         {
             "image_id": record["entry"]["id"],
@@ -81,7 +90,7 @@ def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
         }
         for record in records
     ]
-    store.write_json(folder / "annotations" / "panoptic.json", {**whole, "annotations": panoptic})
+    store.write_json(folder / f"panoptic{ending}.json", {**whole, "annotations": panoptic})
 
 
 def class_of(box: ObjectBox, seen: NDArray[np.uint8]) -> int:

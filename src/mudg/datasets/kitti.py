@@ -1,7 +1,9 @@
-"""KITTI's object benchmark: ``image_2``, ``calib``, ``label_2`` and the list of frames.
+"""KITTI: the object benchmark (``image_2``, ``velodyne``, ``calib``, ``label_2``, lists of frames) and the tracking
+benchmark (the same by sequence, with track ids and packets of a GPS/IMU unit).
 
 Camera axes: x right, y down, z forward, which are ours. A view has one camera, so ``P0`` to ``P3`` are equal and
-``R0_rect`` is the identity. Source: the development kit's readme (Geiger, Lenz, Urtasun 2012).
+rectification is the identity. The GPS/IMU unit is the vehicle. Sources: the readme files of the development kits
+(Geiger, Lenz, Urtasun 2012; Geiger, Lenz, Stiller, Urtasun 2013).
 """
 
 from __future__ import annotations
@@ -12,12 +14,28 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from mudg.base import geometry, store
-from mudg.base.types import Camera
-from mudg.datasets.samples import LabelledView, ObjectBox, clipped
+from mudg.datasets.samples import LabelledView, ObjectBox, Place, ViewSweep, clipped
 
-FILES: Final = ("image_2/*.png", "calib/*.txt", "label_2/*.txt", "ImageSets/*.txt", "provenance.jsonl")
+FILES: Final = (
+    "image_2/*.png",
+    "velodyne/*.bin",
+    "calib/*.txt",
+    "label_2/*.txt",
+    "ImageSets/*.txt",
+    "provenance.jsonl",
+)
+TRACKING_FILES: Final = (
+    "image_02/*/*.png",
+    "velodyne/*/*.bin",
+    "calib/*.txt",
+    "label_02/*.txt",
+    "oxts/*.txt",
+    "ImageSets/*.txt",
+    "provenance.jsonl",
+)
 TYPES: Final = {
     **dict.fromkeys(("car", "vehicle"), "Car"),
     "van": "Van",
@@ -28,37 +46,91 @@ TYPES: Final = {
     **dict.fromkeys(("cyclist", "rider", "bicyclist"), "Cyclist"),
 }
 """Label -> KITTI's type; all others are ``Misc``."""
-OCCLUSION: Final = (0.1, 0.5)
-"""Shares from which on an object is partly, and largely, occluded."""
-VELO_TO_CAM: Final = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
+LEVELS: Final = (0.1, 0.5)
+"""Shares from which on an object is partly, and largely, occluded, or cut by the image."""
+VELO_TO_CAM: Final = geometry.from_rotation_translation(
+    np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]]), (0.0, 0.0, 0.0)
+)
 """Without a LiDAR its frame has the camera's origin, x forward, y left, z up."""
+EARTH_RADIUS_M: Final = 6378137.0
+Matrix = NDArray[np.float64]
 
 
-def write_view(folder: Path, number: int, view: LabelledView) -> dict[str, Any]:
-    """The files of a frame."""
-    name = f"{number:06d}"
+def write_view(folder: Path, place: Place, view: LabelledView) -> dict[str, Any]:
+    """The files of a frame of the object benchmark."""
+    name = f"{place.number:06d}"
     store.write_image(folder / "image_2" / f"{name}.png", view.layers["rgb"])
-    store.write_text(folder / "calib" / f"{name}.txt", calibration(view.view.camera))
-    lines = [label_line(box, view) for box in view.boxes]
-    store.write_text(folder / "label_2" / f"{name}.txt", "".join(f"{line}\n" for line in lines))
+    _write_scan(folder / "velodyne" / f"{name}.bin", view.sweep)
+    cam_from_velo, velo_from_imu = frames_of(view)
+    named = {"R0_rect": np.eye(3), "Tr_velo_to_cam": cam_from_velo[:3], "Tr_imu_to_velo": velo_from_imu[:3]}
+    store.write_text(folder / "calib" / f"{name}.txt", calibration(view, named))
+    lines = [label_line(box, view, f"{box.truncation:.2f}") for box in view.boxes]
+    store.write_text(folder / "label_2" / f"{name}.txt", _text(lines))
     return {"name": name}
 
 
 def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
-    """The list of frames: all are of one drive, so they belong to one split."""
-    store.write_text(folder / "ImageSets" / "train.txt", "".join(f"{record['name']}\n" for record in records))
+    """Lists of frames by split."""
+    for split in dict.fromkeys(record["split"] for record in records):
+        names = [record["name"] for record in records if record["split"] == split]
+        store.write_text(folder / "ImageSets" / f"{split}.txt", _text(dict.fromkeys(names)))
 
 
-def calibration(camera: Camera) -> str:
-    """``calib/*.txt``; KITTI's pixel centres are whole numbers, ours halves."""
+def write_tracked(folder: Path, place: Place, view: LabelledView) -> dict[str, Any]:
+    """The files of a frame of the tracking benchmark; every path is a sequence."""
+    sequence, name = f"{place.sequence:04d}", f"{place.frame:06d}"
+    store.write_image(folder / "image_02" / sequence / f"{name}.png", view.layers["rgb"])
+    _write_scan(folder / "velodyne" / sequence / f"{name}.bin", view.sweep)
+    cam_from_velo, velo_from_imu = frames_of(view)
+    named = {"R_rect": np.eye(3), "Tr_velo_cam": cam_from_velo[:3], "Tr_imu_velo": velo_from_imu[:3]}
+    lines = [
+        f"{place.frame} {box.number} " + label_line(box, view, str(sum(box.truncation >= share for share in LEVELS)))
+        for box in view.boxes
+    ]
+    packet = packet_line(view.view.world_from_cam @ cam_from_velo @ velo_from_imu)
+    return {"name": sequence, "calib": calibration(view, named), "lines": lines, "packet": packet}
+
+
+def write_sequences(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
+    """``calib``, ``label_02`` and ``oxts`` of every sequence, and lists of sequences by split."""
+    for sequence in dict.fromkeys(record["name"] for record in records):
+        own = [record for record in records if record["name"] == sequence]
+        store.write_text(folder / "calib" / f"{sequence}.txt", own[0]["calib"])
+        lines = [line for record in own for line in record["lines"]]
+        store.write_text(folder / "label_02" / f"{sequence}.txt", _text(lines))
+        store.write_text(folder / "oxts" / f"{sequence}.txt", _text(record["packet"] for record in own))
+    write_whole(folder, records)
+
+
+def _text(lines: Any) -> str:
+    return "".join(f"{line}\n" for line in lines)
+
+
+def _write_scan(file: Path, sweep: ViewSweep | None) -> None:
+    """x, y, z in metres and the intensity of every return, float32."""
+    if sweep is not None:
+        rows = np.column_stack([sweep.reply.xyz, sweep.reply.intensity]).astype("<f4")
+        store.write_blocks(file, [rows.tobytes()])
+
+
+def frames_of(view: LabelledView) -> tuple[Matrix, Matrix]:
+    """Camera-from-velodyne and velodyne-from-IMU f64[4, 4]."""
+    mount, sweep = view.mount, view.sweep
+    if mount is None:
+        return VELO_TO_CAM, np.eye(4)
+    cam_from_velo = VELO_TO_CAM if sweep is None else geometry.invert(mount) @ sweep.vehicle_from_lidar
+    return cam_from_velo, geometry.invert(mount @ cam_from_velo)
+
+
+def calibration(view: LabelledView, named: Mapping[str, ArrayLike]) -> str:
+    """A file of ``calib``; KITTI's pixel centres are whole numbers, ours halves."""
+    camera = view.view.camera
     projection = [camera.fx, 0, camera.cx - 0.5, 0, 0, camera.fy, camera.cy - 0.5, 0, 0, 0, 1, 0]
-    text = lambda values: " ".join(f"{float(value):.12e}" for value in np.ravel(values))
-    lines = [f"P{index}: {text(projection)}" for index in range(4)]
-    lines += [f"R0_rect: {text(np.eye(3))}", f"Tr_velo_to_cam: {text(VELO_TO_CAM)}"]
-    return "\n".join([*lines, f"Tr_imu_to_velo: {text(np.eye(4)[:3])}"]) + "\n"
+    rows = {**{f"P{index}": projection for index in range(4)}, **named}
+    return _text(f"{name}: " + " ".join(f"{value:.12e}" for value in np.ravel(row)) for name, row in rows.items())
 
 
-def label_line(box: ObjectBox, view: LabelledView) -> str:
+def label_line(box: ObjectBox, view: LabelledView, truncation: str) -> str:
     """A line of ``label_2``: type, truncation, occlusion, observation angle, rectangle, height, width, length, place of
     the middle of the lower face and turn about the camera's y axis."""
     pose, (length, width, height) = view.view.cam_from_world @ box.world_from_box, box.size_m
@@ -66,7 +138,19 @@ def label_line(box: ObjectBox, view: LabelledView) -> str:
     turn = math.atan2(-pose[2, 0], pose[0, 0])
     alpha = (turn - math.atan2(x, z) + math.pi) % (2 * math.pi) - math.pi
     left, top, right, bottom = clipped(box.amodal_px, view.view.camera)
-    hidden = 3 if math.isnan(box.occlusion) else sum(box.occlusion >= share for share in OCCLUSION)
+    hidden = 3 if math.isnan(box.occlusion) else sum(box.occlusion >= share for share in LEVELS)
     numbers = [alpha, left, top, right - 1, bottom - 1, height, width, length, x, y, z, turn]
-    words = [TYPES.get(box.label, "Misc"), f"{box.truncation:.2f}", str(hidden)]
+    words = [TYPES.get(box.label, "Misc"), truncation, str(hidden)]
     return " ".join([*words, *(f"{value:.2f}" for value in numbers[:5]), *(f"{value:.4f}" for value in numbers[5:])])
+
+
+def packet_line(world_from_imu: Matrix) -> str:
+    """A packet of 30 numbers: latitude, longitude (degrees; the world's origin is at 0, 0, Mercator), altitude, roll,
+    pitch, yaw; velocities, accelerations and what remains are 0."""
+    east, north, up = world_from_imu[:3, 3]
+    latitude = 2 * math.atan(math.exp(north / EARTH_RADIUS_M)) - math.pi / 2
+    turn = world_from_imu[:3, :3]
+    angles = (math.atan2(turn[2, 1], turn[2, 2]), -math.asin(min(max(turn[2, 0], -1.0), 1.0)))
+    place = (math.degrees(latitude), math.degrees(east / EARTH_RADIUS_M), up)
+    values = (*place, *angles, geometry.yaw_of(world_from_imu), *(0.0,) * 24)
+    return " ".join(f"{value:.15g}" for value in values)

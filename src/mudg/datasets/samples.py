@@ -17,13 +17,14 @@ from numpy.typing import NDArray
 from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.base.palette import DYNAMIC_IDS
-from mudg.base.types import Camera, Track, Trajectory, View
-from mudg.core import trajectory
+from mudg.base.types import Camera, Scene, Track, View
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.rendering import outline_mask
-from mudg.gaussians.views import resized_view
+from mudg.scene.beams import beams_of
+from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest
 from mudg.sim.optics import Pinhole
 from mudg.sim.session import CameraReply, CameraRequest, Instant, Layer, Session, Trust
+from mudg.sim.sweeps import WantedSweeps, own_table, wanted_sweeps
 
 SLACK_M: Final = (0.5, 1.5)
 """How far before and behind its box a surface may be that belongs to a parked object (windows let depth through)."""
@@ -49,6 +50,7 @@ class ObjectBox:
             NaN for parked objects, which cannot be drawn alone. truncation: share of ``amodal_px`` outside the image.
         seen_from_deg: angle between this view of it and the nearest from which it was recorded: a side that no camera
             saw is guesswork.
+        returns: how many returns of the view's sweep lie in the box; 0 without one.
     """
 
     track_id: str
@@ -62,6 +64,37 @@ class ObjectBox:
     occlusion: float
     truncation: float
     seen_from_deg: float
+    returns: int = 0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ViewSweep:
+    """What a LiDAR on the vehicle measures at the moment of a view, all beams at once.
+
+    Args:
+        reply: the returns, in the sensor's frame. vehicle_from_lidar, world_from_lidar: f64[4, 4]. name: of the sensor.
+    """
+
+    reply: LidarReply
+    vehicle_from_lidar: NDArray[np.float64]
+    world_from_lidar: NDArray[np.float64]
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a view stands in a data set.
+
+    Args:
+        number: among all views. drive: its name. split: train or val. sequence: number of its path, counted over all
+            drives. frame: number within the path, without gaps.
+    """
+
+    number: int
+    drive: str
+    split: str
+    sequence: int
+    frame: int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -72,6 +105,7 @@ class LabelledView:
         name: of its trajectory and number, such as ``front_shift+2.0/000003``. layers: as in ``CameraReply``;
             ``instances`` u16[H, W] also marks parked objects. boxes: of all objects with at least part of their box in
             the image. trust: see ``Trust``. mount: vehicle-from-camera f64[4, 4]; None: the log does not tell.
+        sweep: of the LiDAR that was asked for, or None.
     """
 
     name: str
@@ -80,19 +114,20 @@ class LabelledView:
     boxes: tuple[ObjectBox, ...]
     trust: Trust
     mount: NDArray[np.float64] | None = None
+    sweep: ViewSweep | None = None
 
 
 class Labeller:
     """Makes labelled views of a session.
 
     Args:
-        session: of a run, with its log.
+        session: of a run, with its log. lidar: as the setting of ``mudg dataset``; empty: none.
 
     Raises:
-        UsageError: a fit without its log.
+        UsageError: a fit without its log, or one that tells nothing of such a LiDAR.
     """
 
-    def __init__(self, session: Session) -> None:
+    def __init__(self, session: Session, lidar: str = "") -> None:
         if session.scene is None:
             what, remedy = "labels need the log that a fit belongs to", "give the folder of a run, or scene="
             raise UsageError(what, remedy=remedy)
@@ -106,23 +141,10 @@ class Labeller:
         self.labels = {name: labels.get(name) or nodes.get(name, "") for name in self.names}
         self._tracks = {track.id: track for track in session.scene.tracks}
         self._directions: dict[str, NDArray[np.float64]] = {}
+        self._lidar = mounted(self.scene, lidar) if lidar else None
 
-    def paths(self, cameras: Sequence[str], shifts_m: Sequence[float], width_px: int = 0) -> list[Trajectory]:
-        """The recorded path (0) and shifted ones of cameras.
-
-        Raises:
-            UsageError: no such camera.
-        """
-        made = []
-        for camera in [cameras] if isinstance(cameras, str) else cameras or tuple(self.scene.cameras)[:1]:
-            for shift in shifts_m:
-                on = trajectory.shifted(self.scene, camera, shift) if shift else trajectory.recorded(self.scene, camera)
-                views = tuple(resized_view(view, width_px) for view in on.views)
-                made.append(Trajectory(on.name, views, on.origin))
-        return made
-
-    def label(self, name: str, view: View, layers: Sequence[Layer]) -> LabelledView:
-        """A view with its layers and boxes."""
+    def label(self, name: str, view: View, layers: Sequence[Layer], *, swept: bool = True) -> LabelledView:
+        """A view with its layers and boxes; ``swept``: and with its sweep, if there is a LiDAR."""
         now = Instant(view.time_s, view.world_from_cam)
         needed: tuple[Layer, ...] = tuple(dict.fromkeys((*layers, "depth", "classes", "instances")))
         camera = view.camera
@@ -135,9 +157,21 @@ class Labeller:
         (reply,) = self.session.render([request])
         instances = self._instances(view, reply)
         drawn = {**reply.layers, "instances": instances}
-        boxes = tuple(self._boxes(view, now, drawn))
         mount = self.mount(camera.name)
-        return LabelledView(name, view, {layer: drawn[layer] for layer in layers}, boxes, reply.trust, mount)
+        sweep = self._sweep(view, mount) if swept else None
+        boxes = tuple(self._boxes(view, now, drawn, sweep))
+        return LabelledView(name, view, {layer: drawn[layer] for layer in layers}, boxes, reply.trust, mount, sweep)
+
+    def _sweep(self, view: View, mount: NDArray[np.float64] | None) -> ViewSweep | None:
+        if self._lidar is None:
+            return None
+        if mount is None:
+            what = "a LiDAR needs the poses of the vehicle at the camera's frames"
+            raise UsageError(what, where="--lidar", got=f"none for {view.camera.name}", remedy="leave --lidar out")
+        wanted, beams, vehicle_from_lidar = self._lidar
+        pose = view.world_from_cam @ geometry.invert(mount) @ vehicle_from_lidar
+        request = LidarRequest(beams=beams, start=Instant(view.time_s, pose), like=wanted.sensor)
+        return ViewSweep(self.session.render([request])[0], vehicle_from_lidar, pose, wanted.name)
 
     def mount(self, camera: str) -> NDArray[np.float64] | None:
         """Vehicle-from-camera f64[4, 4] of a camera of the log, at its first frame with a vehicle pose."""
@@ -175,7 +209,9 @@ class Labeller:
         sizes, track = self.session.sizes_m(), self._tracks.get(name)
         return sizes.get(name) or (None if track is None else tuple(track.size_m.tolist()))
 
-    def _boxes(self, view: View, now: Instant, drawn: Mapping[str, NDArray[Any]]) -> Iterator[ObjectBox]:
+    def _boxes(
+        self, view: View, now: Instant, drawn: Mapping[str, NDArray[Any]], sweep: ViewSweep | None
+    ) -> Iterator[ObjectBox]:
         poses, sizes, instances = self.session.poses(now), self.session.sizes_m(), drawn["instances"]
         for index, name in enumerate(self.names):
             track, size = self._tracks.get(name), self._size(name)
@@ -207,6 +243,7 @@ class Labeller:
                 occlusion=occlusion,
                 truncation=outside(amodal, view.camera),
                 seen_from_deg=self._seen_from_deg(name, track, pose, view),
+                returns=0 if sweep is None else _returns_in(sweep, pose, size),
             )
 
     def _seen_from_deg(self, name: str, track: Track | None, pose: NDArray[np.float64], view: View) -> float:
@@ -224,6 +261,31 @@ class Labeller:
         if not len(known):
             return 180.0
         return float(np.degrees(np.arccos(np.clip(known @ _direction(pose, view), -1, 1).max())))
+
+
+def _returns_in(sweep: ViewSweep, world_from_box: NDArray[np.float64], size_m: Sequence[float]) -> int:
+    """Returns of a sweep within a box."""
+    box_from_lidar = geometry.invert(world_from_box) @ sweep.world_from_lidar
+    xyz = sweep.reply.xyz.astype(np.float64)
+    inside = np.abs(geometry.transform_points(box_from_lidar, xyz)) <= np.asarray(size_m) / 2
+    return int(inside.all(1).sum())
+
+
+def mounted(scene: Scene, lidar: str) -> tuple[WantedSweeps, BeamTable, NDArray[np.float64]]:
+    """A LiDAR by name: what is wanted, its beams, and vehicle-from-LiDAR f64[4, 4], of the first sweep of the sensor
+    for which the log has a pose of the vehicle.
+
+    Raises:
+        UsageError: no such LiDAR, or no pose of the vehicle.
+    """
+    wanted = wanted_sweeps(lidar, scene)
+    for sweep in (one for one in scene.sweeps if one.sensor == wanted.sensor):
+        ego = scene.ego.pose_at(sweep.time_s)
+        if ego is not None:
+            beams = own_table(beams_of(scene, sweep)) if wanted.beams is None else wanted.beams
+            return wanted, beams, geometry.invert(ego) @ sweep.world_from_lidar
+    what = "a LiDAR needs the poses of the vehicle at its sweeps"
+    raise UsageError(what, where="--lidar", got=f"none for {wanted.sensor}", remedy="leave --lidar out")
 
 
 def _direction(world_from_box: NDArray[np.float64], view: View) -> NDArray[np.float64]:

@@ -14,8 +14,8 @@ from torch.utils.data import Dataset, default_collate
 from mudg.base import config as configuration
 from mudg.datasets.samples import LabelledView, Labeller
 from mudg.datasets.settings import DatasetConfig
-from mudg.datasets.write import views_of, wanted
-from mudg.sim.session import Layer, Session
+from mudg.datasets.write import Drive, wanted
+from mudg.sim.session import Layer
 
 LAYERS: Final[tuple[Layer, ...]] = ("rgb", "depth", "classes", "instances", "confidence")
 RAGGED: Final = (
@@ -28,8 +28,9 @@ RAGGED: Final = (
     "truncation",
     "labels",
     "ids",
+    "points",
 )
-"""Entries that have as many rows as a view has objects."""
+"""Entries that have as many rows as a view has objects, or a sweep has returns."""
 
 
 class LabelledViews(Dataset[dict[str, Any]]):
@@ -40,11 +41,13 @@ class LabelledViews(Dataset[dict[str, Any]]):
     pixels; ``world_from_cam`` f64[4, 4]; ``time_s`` f64; ``trust`` f32, the determined share; of N objects ``boxes_2d``
     and ``boxes_amodal`` f32[N, 4] (left, top, right, bottom in pixels), ``cam_from_box`` f32[N, 4, 4], ``sizes_m``
     f32[N, 3], ``numbers`` i64[N] (values in ``instances``), ``occlusion`` f32[N] (NaN: not known), ``truncation``
-    f32[N], ``labels`` and ``ids`` lists of text; and ``name``. Nothing is drawn at random: the same index gives the
-    same bytes in any process.
+    f32[N], ``labels`` and ``ids`` lists of text; and ``name``. With ``lidar`` in the settings also ``points``
+    f32[P, 4]: x, y, z in metres in the frame of the sensor, intensity in [0, 1]; and ``world_from_lidar`` f64[4, 4].
+    Nothing is drawn at random: the same index gives the same bytes in any process.
 
     Args:
         run, scene: as for ``mudg.sim.Session``, as paths, so that every worker opens its own. settings: which views.
+        path: file of a camera path that stands for the shifts, as of ``mudg render --path``.
 
     Raises:
         InputError, UsageError: as ``Session`` and ``Labeller``.
@@ -56,14 +59,16 @@ class LabelledViews(Dataset[dict[str, Any]]):
         scene: str | Path | None = None,
         edits: str | Path | None = None,
         settings: DatasetConfig | None = None,
+        path: str | Path | None = None,
     ) -> None:
-        self.run, self.scene, self.edits, self.settings = run, scene, edits, settings or DatasetConfig()
-        self._labeller: Labeller | None = None
-        self.views = views_of(self._opened(), self.settings)
+        scene, edits, path = (None if one is None else Path(one) for one in (scene, edits, path))
+        self.drive = Drive(Path(run).name, Path(run), scene, edits, path=path)
+        self.settings = settings or DatasetConfig()
+        self.views = self.drive.views(self.settings)
+        self._labeller: Labeller | None = self.drive.labeller(self.settings)
 
     def _opened(self) -> Labeller:
-        if self._labeller is None:
-            self._labeller = Labeller(Session(self.run, self.edits, self.scene, self.settings.device))
+        self._labeller = self._labeller or self.drive.labeller(self.settings)
         return self._labeller
 
     def __getstate__(self) -> dict[str, Any]:
@@ -84,7 +89,13 @@ def entry(view: LabelledView) -> dict[str, Any]:
     camera, boxes, layers = view.view.camera, view.boxes, view.layers
     depth = np.nan_to_num(layers["depth"], nan=0.0)
     rows = lambda values, shape: torch.tensor(np.array(list(values), np.float32).reshape(len(boxes), *shape))
+    swept: dict[str, Tensor] = {}
+    if view.sweep is not None:
+        reply = view.sweep.reply
+        swept["points"] = torch.from_numpy(np.column_stack([reply.xyz, reply.intensity]).astype(np.float32))
+        swept["world_from_lidar"] = torch.from_numpy(view.sweep.world_from_lidar.copy())
     return {
+        **swept,
         "name": view.name,
         "rgb": torch.from_numpy(layers["rgb"]).permute(2, 0, 1).float() / 255,
         "depth": torch.from_numpy(depth)[None],
@@ -111,17 +122,23 @@ def collate(entries: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """A batch: what all views have is stacked, what belongs to objects stays a list per view."""
     shared = [{name: value for name, value in one.items() if name not in RAGGED} for one in entries]
     batch: dict[str, Any] = default_collate(shared)
-    ragged: dict[str, list[Tensor | list[str]]] = {name: [one[name] for one in entries] for name in RAGGED}
+    there = [name for name in RAGGED if name in entries[0]]
+    ragged: dict[str, list[Tensor | list[str]]] = {name: [one[name] for one in entries] for name in there}
     return {**batch, **ragged}
 
 
 def as_dataset(
-    run: str | Path, scene: str | Path | None = None, edits: str | Path | None = None, **settings: Any
+    run: str | Path,
+    scene: str | Path | None = None,
+    edits: str | Path | None = None,
+    path: str | Path | None = None,
+    **settings: Any,
 ) -> LabelledViews:
     """Labelled views of a reconstruction for a ``DataLoader`` (see ``LabelledViews``; batches need ``mudg.collate``).
 
     Args:
         run: folder of a run, or of a fit with its ``scene``. edits: an edit script to carry out before.
+        path: file of a camera path that stands for the shifts.
         settings: those of ``mudg dataset``, such as ``cameras="front"``, ``shifts_m=(0, 2)``, ``width_px=480``.
 
     Raises:
@@ -129,4 +146,4 @@ def as_dataset(
     """
     if isinstance(settings.get("cameras"), str):
         settings["cameras"] = (settings["cameras"],)
-    return LabelledViews(run, scene, edits, configuration.load(DatasetConfig, overrides=settings))
+    return LabelledViews(run, scene, edits, configuration.load(DatasetConfig, overrides=settings), path)

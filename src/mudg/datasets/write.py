@@ -1,15 +1,15 @@
-"""``mudg dataset``: labelled views of a reconstruction in the format of a data set.
+"""``mudg dataset``: labelled views of reconstructions in the format of a data set.
 
 Every view becomes its files and a record, so that an interrupted run goes on with the next view; what a format keeps
 in one file (COCO's annotations, lists of splits) is made of the records at the end. ``OUT/provenance.jsonl`` has a line
-per image: run, edits, trajectory, pose, trust and objects.
+per image: run, edits, split, trajectory, pose, trust and objects.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -20,15 +20,21 @@ from mudg.base import geometry, log, store
 from mudg.base.errors import ResourceError, UsageError
 from mudg.base.memory import in_words
 from mudg.base.run_folder import RunDir
-from mudg.base.types import Trajectory, View
-from mudg.datasets import coco, kitti, nuscenes
-from mudg.datasets.samples import LabelledView, Labeller, ObjectBox
+from mudg.base.types import Scene, View
+from mudg.datasets import coco, kitti, nuscenes, py123d
+from mudg.datasets.samples import LabelledView, Labeller, ObjectBox, Place, mounted
 from mudg.datasets.settings import DatasetConfig
+from mudg.editing.render import trajectories
+from mudg.editing.runs import find_run, scene_at
+from mudg.editing.settings import RenderConfig
+from mudg.scene.read import read_scene
 from mudg.sim.session import Layer, Session
 
 Record = Mapping[str, Any]
 PNG_BYTES: Final = 2.2
 """Bytes per pixel of a rendered PNG with its labels, measured on generated cities (1.6 to 2.0)."""
+SWEEP_BYTES: Final = 2_000_000
+"""Bytes of a sweep of about 100,000 returns."""
 RECORDS: Final = "records"
 
 
@@ -39,64 +45,126 @@ class Format:
     Args:
         layers: that it needs. files: patterns of what it writes. view: writes the files of a view below the work folder
             and returns what the whole needs to know of it. whole: writes the files of the whole from the records, in
-            the order of the views.
+            the order of the views. one_sweep: a sweep belongs to all cameras of a moment, not to each.
+        check: refuses what cannot be written on this machine. scratch: folders that the finished one does not have.
     """
 
     layers: tuple[Layer, ...]
     files: tuple[str, ...]
-    view: Callable[[Path, int, LabelledView], dict[str, Any]]
+    view: Callable[[Path, Place, LabelledView], dict[str, Any]]
     whole: Callable[[Path, Sequence[Record]], None]
+    one_sweep: bool = False
+    check: Callable[[], object] = lambda: None
+    scratch: tuple[str, ...] = ()
 
 
 FORMATS: Final[Mapping[str, Format]] = {
     "kitti": Format(("rgb",), kitti.FILES, kitti.write_view, kitti.write_whole),
+    "kitti-tracking": Format(("rgb",), kitti.TRACKING_FILES, kitti.write_tracked, kitti.write_sequences),
     "coco": Format(("rgb", "classes", "instances"), coco.FILES, coco.write_view, coco.write_whole),
-    "nuscenes": Format(("rgb",), nuscenes.FILES, nuscenes.write_view, nuscenes.write_whole),
+    "nuscenes": Format(("rgb",), nuscenes.FILES, nuscenes.write_view, nuscenes.write_whole, True),
+    "py123d": Format(("rgb",), py123d.FILES, py123d.write_view, py123d.write_whole, True, py123d.library, ("samples",)),
 }
 
 
-def write_dataset(
-    name: str, config: DatasetConfig, session: Session, provenance: Record, work: RunDir
-) -> dict[str, Any]:
-    """Fill a folder. ``provenance``: where the views come from, kept with every image."""
-    chosen, labeller = FORMATS[name], Labeller(session)
-    views = views_of(labeller, config)
-    require_disk(views, work.path)
-    counts: dict[str, int] = {}
-    records = []
-    with log.task(f"dataset {name}", len(views)) as bar:
-        for number, (title, view) in enumerate(views):
-            path = work.path / RECORDS / f"{number:06d}.json"
-            if not path.is_file():
-                labelled = wanted(labeller.label(title, view, chosen.layers), config)
-                made = chosen.view(work.path, number, labelled)
-                store.write_json(path, {**made, "about": about(number, labelled, provenance)})
-            records.append(store.read_json(path))
-            for label in records[-1]["about"]["labels"]:
+@dataclass(frozen=True, slots=True)
+class Drive:
+    """A reconstruction whose views are wanted.
+
+    Args:
+        name: unlike that of other drives of the data set. run, scene, edits: as for ``Session``. split: train or val.
+        path: file of a camera path that stands for the shifts. provenance: kept with every image.
+    """
+
+    name: str
+    run: Path
+    scene: Path | None = None
+    edits: Path | None = None
+    split: str = "train"
+    path: Path | None = None
+    provenance: Record = dataclasses.field(default_factory=dict)
+
+    def views(self, config: DatasetConfig) -> list[tuple[str, View]]:
+        """Names and views, trajectory by trajectory.
+
+        Raises:
+            UsageError: a camera, LiDAR or path that its log does not have, or a fit without its log.
+        """
+        scene = self.log()
+        if config.lidar:
+            mounted(scene, config.lidar)
+        named = {name: getattr(config, name) for name in ("shifts_m", "paths", "width_px", "fov_deg")}
+        chosen = RenderConfig(cameras=config.cameras or tuple(scene.cameras), **named)
+        return [
+            (f"{path.name}/{index:06d}", view)
+            for path in trajectories(scene, chosen, self.path)
+            for index, view in enumerate(path.views)
+            if index % config.every == 0
+        ]
+
+    def log(self) -> Scene:
+        """Its log."""
+        scene = self.scene or find_run(self.run).scene
+        if scene is None:
+            what, remedy = "labels need the log that a fit belongs to", "give the folder of a run, or --scene"
+            raise UsageError(what, where=str(self.run), remedy=remedy)
+        return read_scene(scene_at(scene))
+
+    def labeller(self, config: DatasetConfig) -> Labeller:
+        """What makes its labelled views."""
+        return Labeller(Session(self.run, self.edits, self.scene, config.device), config.lidar)
+
+
+def write_dataset(name: str, config: DatasetConfig, drives: Sequence[Drive], work: RunDir) -> dict[str, Any]:
+    """Fill a folder with the views of drives."""
+    views = {drive.name: drive.views(config) for drive in drives}
+    require_disk([view for rows in views.values() for _, view in rows], config, work.path)
+    records, counts = [], dict[str, int]()
+    with log.task(f"dataset {name}", sum(map(len, views.values()))) as bar:
+        for record in _written(FORMATS[name], config, drives, views, work.path):
+            records.append(record)
+            for label in record["about"]["labels"]:
                 counts[label] = counts.get(label, 0) + 1
             bar.advance()
-    chosen.whole(work.path, records)
+    FORMATS[name].whole(work.path, records)
     lines = [store.json_text(record["about"], None) for record in records]
     store.write_text(work.path / "provenance.jsonl", "\n".join(lines) + "\n")
-    shutil.rmtree(work.path / RECORDS)
+    for scratch in (RECORDS, *FORMATS[name].scratch):
+        shutil.rmtree(work.path / scratch)
     return {"format": name, "images": len(records), "objects": dict(sorted(counts.items()))}
 
 
-def views_of(labeller: Labeller, config: DatasetConfig) -> list[tuple[str, View]]:
-    """Names and views, trajectory by trajectory."""
-    cameras = config.cameras or tuple(labeller.scene.cameras)
-    paths: list[Trajectory] = labeller.paths(cameras, config.shifts_m, config.width_px)
-    return [
-        (f"{path.name}/{index:06d}", view)
-        for path in paths
-        for index, view in enumerate(path.views)
-        if index % config.every == 0
-    ]
+def _written(
+    chosen: Format,
+    config: DatasetConfig,
+    drives: Sequence[Drive],
+    views: Mapping[str, Sequence[tuple[str, View]]],
+    folder: Path,
+) -> Iterator[Record]:
+    """Records of all views in order; those that are missing are made."""
+    number, sequences = -1, dict[tuple[str, str], int]()
+    for drive in drives:
+        labeller: Labeller | None = None
+        cameras = list(dict.fromkeys(view.camera.name for _, view in views[drive.name]))
+        for title, view in views[drive.name]:
+            number += 1
+            sequence = (drive.name, title.partition("/")[0])
+            sequences[sequence] = sequences.get(sequence, -1) + 1
+            place = Place(number, drive.name, drive.split, list(sequences).index(sequence), sequences[sequence])
+            path = folder / RECORDS / f"{number:06d}.json"
+            if not path.is_file():
+                labeller = labeller or drive.labeller(config)
+                swept = not chosen.one_sweep or view.camera.name == cameras[0]
+                labelled = wanted(labeller.label(title, view, chosen.layers, swept=swept), config)
+                made = chosen.view(folder, place, labelled)
+                store.write_json(path, {**made, "split": drive.split, "about": about(place, labelled, drive)})
+            yield store.read_json(path)
 
 
-def require_disk(views: Sequence[tuple[str, View]], folder: Path) -> None:
+def require_disk(views: Sequence[View], config: DatasetConfig, folder: Path) -> None:
     """Say what will be written; ResourceError where the disk does not hold it."""
-    size = int(sum(view.camera.width * view.camera.height for _, view in views) * PNG_BYTES)
+    size = int(sum(view.camera.width * view.camera.height for view in views) * PNG_BYTES)
+    size += SWEEP_BYTES * len(views) if config.lidar else 0
     free = shutil.disk_usage(folder).free
     log.info(f"dataset: {len(views)} images, about {in_words(size)}; {in_words(free)} are free")
     if not views:
@@ -112,19 +180,22 @@ def wanted(view: LabelledView, config: DatasetConfig) -> LabelledView:
     return dataclasses.replace(view, boxes=tuple(box for box in view.boxes if box.pixels and keep(box)))
 
 
-def about(number: int, view: LabelledView, provenance: Record) -> dict[str, Any]:
+def about(place: Place, view: LabelledView, drive: Drive) -> dict[str, Any]:
     """Where an image comes from, and how far it can be trusted."""
     trust = {
         name: None if np.isnan(value) else round(value, 4) for name, value in dataclasses.asdict(view.trust).items()
     }
     return {
-        "image": f"{number:06d}",
-        **provenance,
+        "image": f"{place.number:06d}",
+        **drive.provenance,
+        "drive": drive.name,
+        "split": drive.split,
         "view": view.name,
         "camera": view.view.camera.name,
         "time_s": view.view.time_s,
         "world_from_camera": view.view.world_from_cam.tolist(),
         "trust": trust,
+        "lidar": None if view.sweep is None else view.sweep.name,
         "labels": [box.label for box in view.boxes],
         "objects": [object_record(box) for box in view.boxes],
     }
@@ -142,4 +213,5 @@ def object_record(box: ObjectBox) -> dict[str, Any]:
         "occlusion": None if np.isnan(box.occlusion) else round(box.occlusion, 4),
         "truncation": round(box.truncation, 4),
         "seen_from_deg": round(box.seen_from_deg, 2),
+        "returns": box.returns,
     }

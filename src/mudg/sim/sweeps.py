@@ -17,7 +17,7 @@ from mudg.base.types import Scene, Sweep
 from mudg.core.trajectory import ego_left_world, trajectory_name
 from mudg.editing.script import EditScript
 from mudg.editing.settings import RenderConfig
-from mudg.scene.beams import beams_of, with_silent
+from mudg.scene.beams import Beams, beams_of, with_silent
 from mudg.scene.read import read_scene
 from mudg.scene.sweep_sets import INDEX, SimulatedSweep, SweepSet, write_index
 from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest
@@ -107,12 +107,14 @@ def _place(scene: Scene, sweep: Sweep, shift_m: float, table: BeamTable | None) 
     poses = [pose.copy() for pose in (own.start, own.end)]
     for pose in poses:
         pose[:3, 3] += moved
-    if table is None:
-        full = with_silent(own)
-        reach = float(own.range_m.max(initial=100.0))
-        ring = np.zeros(len(full), np.uint16)
-        table = BeamTable(full.directions, ring, full.share, (0.0, 1.05 * reach))
+    table = own_table(own) if table is None else table
     return table, Instant(own.start_s, poses[0]), Instant(own.end_s, poses[1])
+
+
+def own_table(beams: Beams) -> BeamTable:
+    """The beams of a recorded sweep, those that returned nothing included."""
+    full, reach = with_silent(beams), float(beams.range_m.max(initial=100.0))
+    return BeamTable(full.directions, np.zeros(len(full), np.uint16), full.share, (0.0, 1.05 * reach))
 
 
 def _arrays(beams: BeamTable, reply: LidarReply) -> dict[str, Any]:
