@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 from roundtrip import needs_native
+from safetensors.numpy import load_file
 from scipy.spatial import KDTree
 from toy_fitted import write_toy_run
 
@@ -199,7 +200,7 @@ def test_returns_lie_on_what_the_log_measured_and_are_counted_by_box(run: tuple[
 def test_drives_of_one_split_share_no_list_with_those_of_the_other(tmp_path: Path) -> None:
     runs = [write_toy_run(tmp_path / name) for name in ("a", "b")]
     drives = [
-        write.Drive(name, fit, scene, split=split)
+        write.LabelledDrive(name, fit, scene, split=split)
         for (scene, fit, _, _), name, split in zip(runs, ("a", "b"), ("train", "val"), strict=True)
     ]
     for name in ("kitti", "coco", "nuscenes"):
@@ -459,3 +460,79 @@ def test_nuscenes_tables_refer_to_each_other_and_boxes_lie_where_they_are(
         boxes = [one for one in tables["sample_annotation"] if one["sample_token"] == row["sample_token"]]
         places = sorted(tuple(np.round(one["translation"], 6)) for one in boxes)
         assert places == sorted(tuple(np.round(one["position_world_m"], 6)) for one in line["objects"])
+
+
+# -- layers and paths ------------------------------------------------------------------------------
+
+
+def test_layers_of_render_are_those_of_the_views_and_say_how_far_to_trust_them(
+    run: tuple[Path, Path], tmp_path: Path
+) -> None:
+    scene, fit = run
+    names = ("instances", "normals", "motion", "distance", "confidence")
+    out = mudg.render(scene, fit, out=tmp_path / "r", shifts_m=(0.0, 0.5), layers=names, video=False)
+    labeller = Labeller(Session(fit, scene=scene))
+    for folder in ("front_recorded", "front_shift+0.5"):
+        index = json.loads((out / "layers" / folder / "layers.json").read_text())
+        assert list(index["objects"].values()) == list(labeller.names)
+        depths = mudg.read_observations(out / folder)
+        for number, view in enumerate(index["views"]):
+            arrays = load_file(out / "layers" / folder / view["file"])
+            assert set(arrays) == set(names) - ({"motion"} if number == len(depths) - 1 else set())
+            picture = np.asarray(Image.open(out / "layers" / folder / f"{number:06d}_instances.png"))
+            assert picture.dtype == np.uint16 and np.array_equal(picture, arrays["instances"])
+            length = np.linalg.norm(arrays["normals"], axis=2)
+            assert np.nanmax(np.abs(length - 1)) < 1e-4
+            pixels = {box["number"]: box["pixels"] for box in view["boxes"]}
+            assert all((arrays["instances"] == number).sum() == count for number, count in pixels.items())
+            depth = depths[number].depth[0].numpy()
+            seen = np.isfinite(depth) & np.isfinite(arrays["distance"])
+            assert (arrays["distance"][seen] >= depth[seen] - 1e-3).all()
+            assert 0 <= view["trust"]["determined"] <= 1
+    with pytest.raises(UsageError, match="edit script"):
+        mudg.render(scene, fit, out=tmp_path / "x", layers=("normals",), remove_tracks=("car-1",))
+
+
+def test_motion_leads_to_where_a_surface_is_in_the_next_view(run: tuple[Path, Path], tmp_path: Path) -> None:
+    """Of the world that stands still: its surface at this view's distance, projected into the next view. A few pixels
+    belong to objects beyond the outline of their box."""
+    scene, fit = run
+    out = mudg.render(scene, fit, out=tmp_path / "r", shifts_m=(0.0,), layers=("motion", "distance", "instances"))
+    folder = out / "layers" / "front_recorded"
+    rows = json.loads((folder / "layers.json").read_text())["views"]
+    arrays = load_file(folder / rows[0]["file"])
+    camera = Camera(**rows[0]["camera"])
+    now, later = (View(camera, np.array(row["world_from_camera"]), row["time_s"]) for row in rows[:2])
+    v, u = np.nonzero(np.isfinite(arrays["motion"][..., 0]) & (arrays["instances"] == 0))
+    rays = np.stack([(u + 0.5 - camera.cx) / camera.fx, (v + 0.5 - camera.cy) / camera.fy, np.ones(len(u))], 1)
+    rays *= (arrays["distance"][v, u] / np.linalg.norm(rays, axis=1))[:, None]
+    there, _ = geometry.project(later, geometry.transform_points(now.world_from_cam, rays))
+    assert len(u) > 500
+    apart = np.abs(arrays["motion"][v, u] - (there - np.stack([u + 0.5, v + 0.5], 1))).max(1)
+    assert np.quantile(apart, 0.97) < 0.01
+
+
+def test_a_scene_in_memory_is_filmed_saved_and_exported_with_its_edits(run: tuple[Path, Path], tmp_path: Path) -> None:
+    scene, fitted = mudg.read_scene(run[0]), mudg.FittedScene.read(run[1])
+    path = mudg.camera_path(scene, mudg.Camera.from_fov("mine", 64, 48, 80.0), shift_m=0.5)
+    pictures = list(fitted.render_path(path))
+    assert [picture.rgb.shape for picture in pictures] == [(48, 64, 3)] * len(path)
+    assert fitted.film(path, tmp_path / "film.mp4").stat().st_size > 1000
+    (car,) = (name for name in fitted.object_ids if name.startswith("car"))
+    empty = fitted.without(car)
+    now = path.views[1]
+    assert len(empty.gaussians(now.time_s).means) < len(fitted.gaussians(now.time_s).means) == len(fitted)
+    saved = mudg.FittedScene.read(empty.save(tmp_path / "saved"))
+    again, before = (one.render(now.camera, now.world_from_cam, now.time_s) for one in (saved, empty))
+    assert np.array_equal(again.rgb, before.rgb) and car not in saved.object_ids
+    with pytest.raises(UsageError, match="there already"):
+        empty.save(tmp_path / "saved")
+    sizes = [
+        one.export("ply", tmp_path / f"{len(one)}.ply", time_s=now.time_s).stat().st_size for one in (fitted, empty)
+    ]
+    assert sizes[0] > sizes[1]
+    with pytest.raises(UsageError, match="no export format"):
+        fitted.export("obj", tmp_path / "x.obj")
+    assert mudg.camera_path(scene, name="up+1.0").views[0].center_world[2] == pytest.approx(
+        scene.frames_of("front")[0].view.center_world[2] + 1.0
+    )

@@ -20,13 +20,14 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from mudg.base.errors import MudgError
+    from mudg.base.log import set_quiet
     from mudg.base.types import Camera, Gaussians, Observation, PointCloud, Render, Scene, Track, Trajectory, View
     from mudg.core.raster.rasterize import rasterize
     from mudg.datasets.tensors import as_dataset, collate
     from mudg.scene.labels import read_label
     from mudg.scene.observations import read_observations
     from mudg.scene.read import read_image, read_points
-    from mudg.steps.fitted import FittedScene, Picture, read_scene
+    from mudg.steps.fitted import FittedScene, Picture, camera_path, read_scene
     from mudg.steps.functions import (
         adapt,
         annotate,
@@ -68,6 +69,7 @@ _HOMES = {
     "Trajectory": "mudg.base.types",
     "View": "mudg.base.types",
     "as_dataset": "mudg.datasets.tensors",
+    "camera_path": "mudg.steps.fitted",
     "collate": "mudg.datasets.tensors",
     "rasterize": "mudg.core.raster.rasterize",
     "read_image": "mudg.scene.read",
@@ -91,6 +93,7 @@ _HOMES = {
     "ingest": _FUNCTIONS,
     "learn": _FUNCTIONS,
     "page": _FUNCTIONS,
+    "set_quiet": "mudg.base.log",
     "render": _FUNCTIONS,
     "report": _FUNCTIONS,
     "run": _FUNCTIONS,
@@ -116,6 +119,7 @@ __all__ = [
     "annotate",
     "as_dataset",
     "bench",
+    "camera_path",
     "collate",
     "convert",
     "dataset",
@@ -140,6 +144,7 @@ __all__ = [
     "report",
     "run",
     "score",
+    "set_quiet",
     "synthesize",
 ]
 

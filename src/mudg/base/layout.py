@@ -8,6 +8,7 @@ from typing import Final
 SCENE_FILES: Final = ("scene.json", "tracks.json", "images/*/*", "lidar/*/*.safetensors", "labels/*/*/*")
 OBSERVATION_FILES: Final = ("observations.json", "rgb/*.png", "data/*.safetensors")
 SWEEP_FILES: Final = ("sweeps.json", "*.safetensors")
+LAYER_FILES: Final = ("layers.json", "*.safetensors", "*.png")
 MODEL_FILES: Final = ("model.json", "gaussians.safetensors", "nodes.safetensors")
 
 

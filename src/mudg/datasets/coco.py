@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mudg.base import store
 from mudg.base.palette import CLASSES, DISPLAY_COLORS, DYNAMIC_IDS, ID, UNLABELLED
 from mudg.base.versions import version
-from mudg.datasets.samples import LabelledView, ObjectBox, Place, around
+from mudg.datasets.samples import DatasetPlace, LabelledView, ObjectBox, around
 
 FILES: Final = ("images/*.png", "panoptic/*.png", "annotations/*.json", "provenance.jsonl")
 CATEGORY_OF: Final = {
@@ -28,7 +28,7 @@ CATEGORY_OF: Final = {
 """Label -> class, where they differ."""
 
 
-def write_view(folder: Path, place: Place, view: LabelledView) -> dict[str, Any]:
+def write_view(folder: Path, place: DatasetPlace, view: LabelledView) -> dict[str, Any]:
     """The image, its panoptic image, and its annotations."""
     number = place.number
     classes, instances = view.layers["classes"], view.layers["instances"]

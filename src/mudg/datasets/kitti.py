@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mudg.base import geometry, store
-from mudg.datasets.samples import LabelledView, ObjectBox, Place, ViewSweep, clipped
+from mudg.datasets.samples import DatasetPlace, LabelledView, ObjectBox, ViewSweep, clipped
 
 FILES: Final = (
     "image_2/*.png",
@@ -56,7 +56,7 @@ EARTH_RADIUS_M: Final = 6378137.0
 Matrix = NDArray[np.float64]
 
 
-def write_view(folder: Path, place: Place, view: LabelledView) -> dict[str, Any]:
+def write_view(folder: Path, place: DatasetPlace, view: LabelledView) -> dict[str, Any]:
     """The files of a frame of the object benchmark."""
     name = f"{place.number:06d}"
     store.write_image(folder / "image_2" / f"{name}.png", view.layers["rgb"])
@@ -76,7 +76,7 @@ def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
         store.write_text(folder / "ImageSets" / f"{split}.txt", _text(dict.fromkeys(names)))
 
 
-def write_tracked(folder: Path, place: Place, view: LabelledView) -> dict[str, Any]:
+def write_tracked(folder: Path, place: DatasetPlace, view: LabelledView) -> dict[str, Any]:
     """The files of a frame of the tracking benchmark; every path is a sequence."""
     sequence, name = f"{place.sequence:04d}", f"{place.frame:06d}"
     store.write_image(folder / "image_02" / sequence / f"{name}.png", view.layers["rgb"])

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mudg.base import geometry, store
-from mudg.datasets.samples import LabelledView, Place
+from mudg.datasets.samples import DatasetPlace, LabelledView
 from mudg.formats.importers.nuscenes import CAMERAS
 
 RELEASE: Final = "v1.0-mini"
@@ -55,7 +55,7 @@ def token(*words: object) -> str:
     return hashlib.sha256(" ".join(map(str, words)).encode()).hexdigest()[:32]
 
 
-def write_view(folder: Path, place: Place, view: LabelledView) -> Row:
+def write_view(folder: Path, place: DatasetPlace, view: LabelledView) -> Row:
     """The image of a sample and, if it has one, its sweep, and what the tables need to know of them."""
     camera = view.view.camera
     channel = CHANNELS.get(camera.name, f"CAM_{camera.name.upper()}")

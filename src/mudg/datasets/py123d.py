@@ -12,10 +12,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base import geometry
+from mudg.base import geometry, store
 from mudg.base.errors import ResourceError
 from mudg.datasets import nuscenes
-from mudg.datasets.samples import LabelledView, Place
+from mudg.datasets.samples import DatasetPlace, LabelledView
 
 FILES: Final = ("logs/*/*/*.arrow", "provenance.jsonl")
 CAMERAS: Final = {
@@ -54,7 +54,7 @@ def library() -> Any:
     return py123d
 
 
-def write_view(folder: Path, place: Place, view: LabelledView) -> dict[str, Any]:
+def write_view(folder: Path, place: DatasetPlace, view: LabelledView) -> dict[str, Any]:
     """Image, sweep and facts of a view as of nuScenes, until ``write_whole`` takes them into the log."""
     camera = nuscenes.pose_row(view.view.world_from_cam)
     return {**nuscenes.write_view(folder, place, view), "camera": camera}
@@ -105,7 +105,7 @@ def _modalities(folder: Path, views: Sequence[Row]) -> Iterator[Any]:
             camera_to_imu_se3=_pose(view["mount"]),
             is_undistorted=True,
         )
-        image = (folder / view["filename"]).read_bytes()
+        image = store.read_bytes(folder / view["filename"])
         yield ParsedCamera(camera, _time(view), _pose(view["camera"]), byte_string=image)
         if "sweep" in view:
             yield _lidar(folder, view, now)
@@ -116,7 +116,7 @@ def _lidar(folder: Path, view: Row, now: Any) -> Any:
     from py123d.datatypes.sensors.lidar import LidarFeature
 
     about = sensors.LidarMetadata("LIDAR_TOP", sensors.LidarID.LIDAR_TOP, _pose(view["lidar"]))
-    rows = np.frombuffer((folder / view["sweep"]).read_bytes(), "<f4").reshape(-1, 5)
+    rows = np.frombuffer(store.read_bytes(folder / view["sweep"]), "<f4").reshape(-1, 5)
     points = geometry.transform_points(_matrix(view["lidar"]), rows[:, :3]).astype(np.float32)
     columns = {LidarFeature.INTENSITY: rows[:, 3], LidarFeature.CHANNEL: rows[:, 4].clip(0, 255)}
     features = {name.serialize(): column.round().astype(np.uint8) for name, column in columns.items()}

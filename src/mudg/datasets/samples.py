@@ -82,7 +82,7 @@ class ViewSweep:
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class DatasetPlace:
     """Where a view stands in a data set.
 
     Args:
@@ -143,8 +143,11 @@ class Labeller:
         self._directions: dict[str, NDArray[np.float64]] = {}
         self._lidar = mounted(self.scene, lidar) if lidar else None
 
-    def label(self, name: str, view: View, layers: Sequence[Layer], *, swept: bool = True) -> LabelledView:
-        """A view with its layers and boxes; ``swept``: and with its sweep, if there is a LiDAR."""
+    def label(
+        self, name: str, view: View, layers: Sequence[Layer], *, swept: bool = True, motion_to: Instant | None = None
+    ) -> LabelledView:
+        """A view with its layers and boxes; ``swept``: and with its sweep, if there is a LiDAR. ``motion_to``: as in
+        ``CameraRequest``, of the layer ``motion``."""
         now = Instant(view.time_s, view.world_from_cam)
         needed: tuple[Layer, ...] = tuple(dict.fromkeys((*layers, "depth", "classes", "instances")))
         camera = view.camera
@@ -153,6 +156,7 @@ class Labeller:
             start=now,
             layers=needed,
             colors_of=camera.name,
+            motion_to=motion_to if "motion" in layers else None,
         )
         (reply,) = self.session.render([request])
         instances = self._instances(view, reply)

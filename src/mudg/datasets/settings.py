@@ -15,8 +15,6 @@ class DatasetConfig:
     shifts_m: tuple[float, ...] = (0.0,)
     """Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path. Several make
     one data set."""
-    paths: tuple[str, ...] = ()
-    """Further paths, as those of mudg render: up+0.5 (a camera 0.5 m higher), lane+3.0 (a lane change), speed+5.0."""
     every: int = setting(default=1, ge=1)
     """Take every n-th frame."""
     width_px: int = setting(default=0, ge=0)

@@ -14,7 +14,7 @@ from torch.utils.data import Dataset, default_collate
 from mudg.base import config as configuration
 from mudg.datasets.samples import LabelledView, Labeller
 from mudg.datasets.settings import DatasetConfig
-from mudg.datasets.write import Drive, wanted
+from mudg.datasets.write import LabelledDrive, wanted
 from mudg.sim.session import Layer
 
 LAYERS: Final[tuple[Layer, ...]] = ("rgb", "depth", "classes", "instances", "confidence")
@@ -62,7 +62,7 @@ class LabelledViews(Dataset[dict[str, Any]]):
         path: str | Path | None = None,
     ) -> None:
         scene, edits, path = (None if one is None else Path(one) for one in (scene, edits, path))
-        self.drive = Drive(Path(run).name, Path(run), scene, edits, path=path)
+        self.drive = LabelledDrive(Path(run).name, Path(run), scene, edits, path=path)
         self.settings = settings or DatasetConfig()
         self.views = self.drive.views(self.settings)
         self._labeller: Labeller | None = self.drive.labeller(self.settings)

@@ -22,13 +22,13 @@ from mudg.base.memory import in_words
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Scene, View
 from mudg.datasets import coco, kitti, nuscenes, py123d
-from mudg.datasets.samples import LabelledView, Labeller, ObjectBox, Place, mounted
+from mudg.datasets.samples import DatasetPlace, LabelledView, Labeller, ObjectBox, mounted
 from mudg.datasets.settings import DatasetConfig
 from mudg.editing.render import trajectories
 from mudg.editing.runs import find_run, scene_at
 from mudg.editing.settings import RenderConfig
 from mudg.scene.read import read_scene
-from mudg.sim.session import Layer, Session
+from mudg.sim.session import Layer, Session, Trust
 
 Record = Mapping[str, Any]
 PNG_BYTES: Final = 2.2
@@ -51,7 +51,7 @@ class Format:
 
     layers: tuple[Layer, ...]
     files: tuple[str, ...]
-    view: Callable[[Path, Place, LabelledView], dict[str, Any]]
+    view: Callable[[Path, DatasetPlace, LabelledView], dict[str, Any]]
     whole: Callable[[Path, Sequence[Record]], None]
     one_sweep: bool = False
     check: Callable[[], object] = lambda: None
@@ -68,7 +68,7 @@ FORMATS: Final[Mapping[str, Format]] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Drive:
+class LabelledDrive:
     """A reconstruction whose views are wanted.
 
     Args:
@@ -93,7 +93,7 @@ class Drive:
         scene = self.log()
         if config.lidar:
             mounted(scene, config.lidar)
-        named = {name: getattr(config, name) for name in ("shifts_m", "paths", "width_px", "fov_deg")}
+        named = {name: getattr(config, name) for name in ("shifts_m", "width_px", "fov_deg")}
         chosen = RenderConfig(cameras=config.cameras or tuple(scene.cameras), **named)
         return [
             (f"{path.name}/{index:06d}", view)
@@ -115,7 +115,7 @@ class Drive:
         return Labeller(Session(self.run, self.edits, self.scene, config.device), config.lidar)
 
 
-def write_dataset(name: str, config: DatasetConfig, drives: Sequence[Drive], work: RunDir) -> dict[str, Any]:
+def write_dataset(name: str, config: DatasetConfig, drives: Sequence[LabelledDrive], work: RunDir) -> dict[str, Any]:
     """Fill a folder with the views of drives."""
     views = {drive.name: drive.views(config) for drive in drives}
     require_disk([view for rows in views.values() for _, view in rows], config, work.path)
@@ -137,7 +137,7 @@ def write_dataset(name: str, config: DatasetConfig, drives: Sequence[Drive], wor
 def _written(
     chosen: Format,
     config: DatasetConfig,
-    drives: Sequence[Drive],
+    drives: Sequence[LabelledDrive],
     views: Mapping[str, Sequence[tuple[str, View]]],
     folder: Path,
 ) -> Iterator[Record]:
@@ -150,7 +150,7 @@ def _written(
             number += 1
             sequence = (drive.name, title.partition("/")[0])
             sequences[sequence] = sequences.get(sequence, -1) + 1
-            place = Place(number, drive.name, drive.split, list(sequences).index(sequence), sequences[sequence])
+            place = DatasetPlace(number, drive.name, drive.split, list(sequences).index(sequence), sequences[sequence])
             path = folder / RECORDS / f"{number:06d}.json"
             if not path.is_file():
                 labeller = labeller or drive.labeller(config)
@@ -180,11 +180,8 @@ def wanted(view: LabelledView, config: DatasetConfig) -> LabelledView:
     return dataclasses.replace(view, boxes=tuple(box for box in view.boxes if box.pixels and keep(box)))
 
 
-def about(place: Place, view: LabelledView, drive: Drive) -> dict[str, Any]:
+def about(place: DatasetPlace, view: LabelledView, drive: LabelledDrive) -> dict[str, Any]:
     """Where an image comes from, and how far it can be trusted."""
-    trust = {
-        name: None if np.isnan(value) else round(value, 4) for name, value in dataclasses.asdict(view.trust).items()
-    }
     return {
         "image": f"{place.number:06d}",
         **drive.provenance,
@@ -194,11 +191,16 @@ def about(place: Place, view: LabelledView, drive: Drive) -> dict[str, Any]:
         "camera": view.view.camera.name,
         "time_s": view.view.time_s,
         "world_from_camera": view.view.world_from_cam.tolist(),
-        "trust": trust,
+        "trust": trust_record(view.trust),
         "lidar": None if view.sweep is None else view.sweep.name,
         "labels": [box.label for box in view.boxes],
         "objects": [object_record(box) for box in view.boxes],
     }
+
+
+def trust_record(trust: Trust) -> dict[str, float | None]:
+    """How far a view can be trusted, as JSON values."""
+    return {name: None if np.isnan(value) else round(value, 4) for name, value in dataclasses.asdict(trust).items()}
 
 
 def object_record(box: ObjectBox) -> dict[str, Any]:

@@ -41,6 +41,9 @@ class RenderConfig:
     lidar: str = ""
     """Also simulate the log's LiDAR sweeps at every shift: a sensor of the scene, pandar128, at128, hdl64, vlp16, or a
     JSON file of beams (docs/simulator.md). Empty = none."""
+    layers: tuple[Literal["instances", "normals", "motion", "distance", "confidence"], ...] = ()
+    """Also write these layers of every view, with its boxes and its trust: ids of objects, normals of surfaces, optical
+    flow to the next view in pixels, distance along the ray in metres, and how certain a pixel is (docs/datasets.md)."""
     video: bool = True
     """Also write one MP4 video per trajectory."""
     harmonize: HarmonizeConfig = setting(default_factory=HarmonizeConfig)

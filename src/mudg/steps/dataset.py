@@ -13,7 +13,7 @@ from mudg.steps.step import FILE_YAML, Flag
 if TYPE_CHECKING:
     from mudg.base.run_folder import VerbOutput
     from mudg.datasets.settings import DatasetConfig
-    from mudg.datasets.write import Drive
+    from mudg.datasets.write import LabelledDrive
 
 
 class Dataset(Output):
@@ -64,16 +64,16 @@ class Dataset(Output):
 
         return partial(write.write_dataset, self.format, self.settings, self._drives(inputs))
 
-    def _drives(self, inputs: dict[str, str]) -> list[Drive]:
+    def _drives(self, inputs: dict[str, str]) -> list[LabelledDrive]:
         """Drives by split. Of folders of one name the later ones are numbered."""
-        from mudg.datasets.write import Drive
+        from mudg.datasets.write import LabelledDrive
 
-        made: dict[str, Drive] = {}
+        made: dict[str, LabelledDrive] = {}
         for split, runs in (("train", self.runs), ("val", self.val)):
             for number, run in enumerate(runs):
                 same = sum(one.run.name == run.name for one in made.values())
                 name = f"{run.name}-{same}" if same else run.name
                 key = "runs" if split == "train" else "val"
                 provenance = {"run": inputs[f"{key} {number}" if number else key], "edits": inputs.get("edits", "")}
-                made[name] = Drive(name, run, self.scene, self.edits, split, self.path, provenance)
+                made[name] = LabelledDrive(name, run, self.scene, self.edits, split, self.path, provenance)
         return list(made.values())

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import rigid_problem
-from mudg.base.types import Camera, Scene, View
+from mudg.base.types import Camera, Gaussians, Scene, Trajectory, View
 
 if TYPE_CHECKING:
     from mudg.gaussians.model import SceneModel
@@ -44,6 +47,32 @@ def read_scene(folder: str | Path) -> Scene:
     from mudg.scene.read import read_scene
 
     return read_scene(scene_at(Path(folder)))
+
+
+def camera_path(
+    scene: Scene, camera: str | Camera = "", *, shift_m: float = 0.0, name: str = "", file: str | Path | None = None
+) -> Trajectory:
+    """A path of views through a log: the recorded one, one beside it, or that of a file.
+
+    Args:
+        camera: of the log (empty: its first), or a camera of your own, which then takes the place of its first one.
+        shift_m: to the left of the direction of travel, metres. name: of a named path, as ``up+1.0`` or ``lane+0.1``.
+        file: TUM or KITTI poses (.txt) or nerfstudio's transforms.json, as of ``mudg render --path``.
+
+    Raises:
+        UsageError: no such camera or path. InputError: the file holds no path.
+    """
+    from mudg.core import trajectory
+    from mudg.formats.paths import read_path
+
+    recorded = camera if isinstance(camera, str) and camera else next(iter(scene.cameras))
+    if file is not None:
+        optics = camera if isinstance(camera, Camera) else scene.frames_of(recorded)[0].view.camera
+        return read_path(Path(file), scene, optics)
+    path = trajectory.named(scene, recorded, name) if name else trajectory.at_shift(scene, recorded, shift_m)
+    if not isinstance(camera, Camera):
+        return path
+    return replace(path, views=tuple(replace(view, camera=camera) for view in path.views))
 
 
 class FittedScene:
@@ -147,6 +176,69 @@ class FittedScene:
         with ResultFile.open(Path(out), "asset export", {"id": track_id}, {}, overwrite=True) as file:
             write_asset(file.staged(), asset)
             return file.finish({"id": track_id})
+
+    def gaussians(self, time_s: float) -> Gaussians:
+        """All Gaussians in the world at a time, activated, on the CPU (see ``mudg.Gaussians``). Objects that are not
+        there then have opacity 0; the sky is not among them."""
+        import torch
+
+        from mudg.gaussians.model import compose
+
+        with torch.no_grad():
+            return compose(self._model.to(torch.device("cpu")), time_s)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the scene, with its edits, as a folder that every command takes where it takes a fit.
+
+        Raises:
+            UsageError: something is there already.
+        """
+        from mudg.base import store
+        from mudg.gaussians.storage import save_model
+
+        folder = Path(folder)
+        if folder.exists():
+            raise UsageError("something is there already", where=str(folder), expected="a new folder")
+        part = store.staging_path(folder)
+        shutil.rmtree(part, ignore_errors=True)
+        save_model(self._model, part)
+        store.write_manifest(part)
+        part.rename(folder)
+        return folder
+
+    def export(self, format: str, out: str | Path, **settings: Any) -> Path:
+        """Write the scene, with its edits, for another program, as ``mudg.export`` does.
+
+        Args:
+            format: ``ply``, ``spz``, ``glb``, ``usdz``, ``sog`` and so on. settings: of ``mudg export``, such as
+                ``time_s=1.5``.
+
+        Raises:
+            UsageError: no such format, or a setting that it does not have.
+        """
+        from mudg.steps import functions
+
+        with tempfile.TemporaryDirectory() as scratch:
+            return functions.export(format, self.save(Path(scratch) / "fit"), out=Path(out), **settings)
+
+    def render_path(self, path: Trajectory | Iterable[View]) -> Iterator[Picture]:
+        """Pictures along a path (``mudg.camera_path``), drawn one by one as they are asked for.
+
+        Raises:
+            As ``render``.
+        """
+        for view in path.views if isinstance(path, Trajectory) else path:
+            yield self.render(view.camera, view.world_from_cam, view.time_s)
+
+    def film(self, path: Trajectory | Iterable[View], out: str | Path, fps: float = 10.0) -> Path:
+        """Write an MP4 video of the colours along a path. A file that is there is replaced when the new one is whole.
+
+        Raises:
+            InputError: no views. ResourceError: no usable encoder, or the disk is full.
+        """
+        from mudg.formats.exporters.video import write_mp4
+
+        return write_mp4(Path(out), (picture.rgb for picture in self.render_path(path)), fps)
 
     def render(self, camera: Camera, world_from_cam: ArrayLike, time_s: float, *, backend: str = "auto") -> Picture:
         """Render a camera at a pose and time.

@@ -217,35 +217,43 @@ def convert(
 
 def dataset(
     format: str,
-    run_folder: str | Path,
+    runs: tuple[str | Path, ...],
     *,
     out: str | Path,
     overwrite: bool = False,
+    val: tuple[str | Path, ...] = (),
     scene: str | Path | None = None,
     edits: str | Path | None = None,
+    path: str | Path | None = None,
     config: str | Path | None = None,
     cameras: tuple[str, ...] = (),
     shifts_m: tuple[float, ...] = (0.0,),
     every: int = 1,
     width_px: int = 0,
+    fov_deg: float = 0.0,
+    lidar: str = '',
     least_pixels: int = 25,
     farthest_seen_deg: float = 180.0,
     device: str = 'auto',
 ) -> Any:
-    """Write labelled images of a reconstruction as a data set: kitti, coco or nuscenes.
+    """Write labelled images of reconstructions as a data set: kitti, kitti-tracking, coco, nuscenes or py123d.
 
     Args:
-        format: kitti: images, calibration and 3D boxes as in KITTI's object benchmark. coco: instances with masks, and panoptic segmentation. nuscenes: all tables and images of a release, every path a scene.
-        run_folder: Folder of a finished mudg run, or of a fit (with --scene).
+        format: kitti: images, calibration and 3D boxes as in KITTI's object benchmark. kitti-tracking: the same by sequence, with track ids and poses. coco: instances with masks, and panoptic segmentation. nuscenes: all tables and images of a release, every path a scene. py123d: Arrow logs of 123D.
+        runs: Folders of finished mudg runs, or of a fit (with --scene). They form the split train.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        val: More of them, which form the split val.
         scene: Scene directory that a fit belongs to. A run has its own.
-        edits: Edit script (docs/edit.md) to carry out before.
+        edits: Edit script (docs/edit.md) to carry out before; with one RUN.
+        path: Camera path that stands for the shifts, as of mudg render --path; with one RUN.
         config: YAML file of settings, read before those given here.
         cameras: Cameras of the log (empty = all).
         shifts_m: Lateral shifts in metres, positive to the left of the direction of travel; 0 = the recorded path. Several make one data set.
         every: Take every n-th frame.
         width_px: Image width in pixels (0 = as recorded); the height follows.
+        fov_deg: Horizontal field of view in degrees (0 = as recorded).
+        lidar: Give every view a sweep of this LiDAR, taken at the moment of its image: a sensor of the scene, pandar128, at128, hdl64, vlp16, or a JSON file of beams (docs/simulator.md). Empty: none.
         least_pixels: Leave out objects of which fewer pixels are visible.
         farthest_seen_deg: Leave out objects that are seen from this many degrees or more beside every direction from which the log recorded them: that side of them is guesswork. 60 is strict.
         device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
@@ -657,6 +665,7 @@ def render(
     fov_deg: float = 0.0,
     remove_tracks: tuple[str, ...] = (),
     lidar: str = '',
+    layers: tuple[Literal['instances', 'normals', 'motion', 'distance', 'confidence'], ...] = (),
     video: bool = True,
     harmonize: Mapping[str, Any] = ...,
     raster: Literal['auto', 'cpu', 'torch', 'gsplat'] = 'auto',
@@ -680,6 +689,7 @@ def render(
         fov_deg: Horizontal field of view in degrees (0 = the camera's own).
         remove_tracks: Ids of tracked objects to leave out, as listed in the scene.
         lidar: Also simulate the log's LiDAR sweeps at every shift: a sensor of the scene, pandar128, at128, hdl64, vlp16, or a JSON file of beams (docs/simulator.md). Empty = none.
+        layers: Also write these layers of every view, with its boxes and its trust: ids of objects, normals of surfaces, optical flow to the next view in pixels, distance along the ray in metres, and how certain a pixel is (docs/datasets.md).
         video: Also write one MP4 video per trajectory.
         harmonize: With an edit script: let the diffusion model repair what the edits touch.
         raster: Rasteriser backend. auto picks the fastest one available and prints its name.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
 from mudg.base.errors import UsageError
-from mudg.base.layout import OBSERVATION_FILES, SWEEP_FILES, below
+from mudg.base.layout import LAYER_FILES, OBSERVATION_FILES, SWEEP_FILES, below
 from mudg.steps.engine import Make, Output, script_of
 from mudg.steps.step import FILE_YAML, SCENE, Flag
 
@@ -29,9 +29,12 @@ class RenderViews(Output):
     smaller = "smaller views (--width-px), fewer --cameras"
     result = "views"
     from_run = ("model",)
-    version, files = 2, ("*.mp4", *below("*", OBSERVATION_FILES), *below("lidar/*", SWEEP_FILES))
+    version, files = (
+        2,
+        ("*.mp4", *below("*", OBSERVATION_FILES), *below("lidar/*", SWEEP_FILES), *below("layers/*", LAYER_FILES)),
+    )
     short = (
-        *("cameras", "shifts_m", "paths", "width_px", "fov_deg", "lidar", "video", "remove_tracks", "device"),
+        *("cameras", "shifts_m", "paths", "width_px", "fov_deg", "lidar", "layers", "video", "remove_tracks", "device"),
         *("harmonize.on", "harmonize.model"),
     )
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
@@ -54,6 +57,9 @@ class RenderViews(Output):
             got = f"no --{'edits' if self.edits is None else 'fused'}"
             remedy = "give --edits and --fused, or leave it out"
             raise UsageError(what, where="--harmonize.on", got=got, remedy=remedy)
+        if self.settings.layers and (self.settings.harmonize.on or self.settings.remove_tracks):
+            what, remedy = "layers are drawn of what an edit script makes", "take objects out with --edits"
+            raise UsageError(what, where="--layers", got="--harmonize.on or --remove-tracks", remedy=remedy)
         if self.path is not None and (self.settings.harmonize.on or self.settings.lidar):
             what, remedy = "a path of your own is drawn without repairs and sweeps", "leave one of them out"
             raise UsageError(what, where="--path", got="--harmonize.on or --lidar", remedy=remedy)
@@ -75,16 +81,22 @@ class RenderViews(Output):
         model, script = cast("Path", self.model), script_of(self.edits)
         edited = render.prepare(self.settings, self.scene, model, script, self.fused, self.path)
         views = partial(render.write_views, self.settings, self.scene, model, edited, path=self.path)
-        if not self.settings.lidar:
+        if not self.settings.lidar and not self.settings.layers:
             return views
+        from mudg.datasets import layers
         from mudg.scene.read import read_scene
         from mudg.sim import sweeps
 
-        sweeps.wanted_sweeps(self.settings.lidar, read_scene(self.scene))
+        if self.settings.lidar:
+            sweeps.wanted_sweeps(self.settings.lidar, read_scene(self.scene))
 
         def make(work: RunDir) -> dict[str, Any]:
-            summary = views(work)
-            return summary | {"lidar": sweeps.simulate_log(self.settings, self.scene, model, script, work.path)}
+            summary, drawn = views(work), (self.settings, self.scene, model, script)
+            if self.settings.layers:
+                summary["layers"] = layers.write_layers(*drawn, self.path, work.path)
+            if self.settings.lidar:
+                summary["lidar"] = sweeps.simulate_log(*drawn, work.path)
+            return summary
 
         return make
 
