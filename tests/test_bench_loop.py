@@ -5,18 +5,22 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from roundtrip import needs_native
 
+from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.benchmarks import loop
 from mudg.benchmarks.settings import BenchConfig
 from mudg.city.logs import LISTS, LogRules, log_config
 from mudg.city.world import CityWorld
+from mudg.sim.lidar import BeamTable
 
 pytestmark = needs_native
+
 RULES = LogRules(frames=8, width=96, height=64, cameras=("front",))
 
 
@@ -79,6 +83,31 @@ def test_a_vehicle_on_the_sidewalk_and_in_another_is_judged(course: loop.Course)
         aside.motion.x_m + left[0], aside.motion.y_m + left[1], aside.motion.heading_rad, 0.0
     )
     assert course.judge(aside)["off_road"]
+
+
+def test_a_sweep_is_judged_by_what_the_city_returns_there(course: loop.Course) -> None:
+    beams = BeamTable.spinning(np.linspace(-20, 5, 8), 2.0)
+    mount = geometry.from_rotation_translation(np.eye(3), (0, 0, 1.8))
+
+    class Echo:
+        """Answers with the city's own ranges, farther by an offset, without every third return."""
+
+        def __init__(self, off_m: float, third: bool) -> None:
+            self.off_m, self.third = off_m, third
+
+        def render(self, requests: list) -> list:
+            pose = requests[0].start.world_from_sensor
+            away = np.tile(pose[:3, 3], (len(beams.share), 1)), beams.directions @ pose[:3, :3].T
+            found, _ = course.world.ranges(*away, np.full(len(beams.share), requests[0].start.time_s))
+            rows = np.flatnonzero(np.isfinite(found))
+            rows = rows[np.arange(len(rows)) % 3 > 0] if self.third else rows
+            return [SimpleNamespace(beam=rows, range_m=found[rows] + self.off_m)]
+
+    lidar = (SimpleNamespace(sensor="lidar"), beams, mount)
+    assert loop.sweep_errors(course, Echo(0.0, False), lidar, course.begin()) == {"range_m": 0.0, "beams_f1": 1.0}
+    worse = loop.sweep_errors(course, Echo(0.25, True), lidar, course.begin())
+    assert worse["range_m"] == pytest.approx(0.25)
+    assert worse["beams_f1"] == pytest.approx(0.8, abs=0.01)
 
 
 def test_the_benchmark_fits_drives_and_is_reused(tmp_path: Path) -> None:

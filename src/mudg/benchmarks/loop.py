@@ -46,11 +46,14 @@ from mudg.city.logs import STANDARD, LogRules
 from mudg.city.world import CityWorld
 from mudg.core import metrics
 from mudg.diffusion import model_files
+from mudg.scene.read import read_scene
 from mudg.scene.road import Road
 from mudg.sim.cockpit import Cockpit
 from mudg.sim.drive import Drive, Following, RoadUser, beginning
+from mudg.sim.lidar import LidarRequest
 from mudg.sim.pilots import DriverView, RoutePilot
-from mudg.sim.session import Session
+from mudg.sim.session import Instant, Session
+from mudg.sim.sweeps import MountedLidar, mounted
 from mudg.steps.settings import PresetName
 
 EXACT: Final = "exact city"
@@ -60,10 +63,14 @@ AIMS_M: Final = {"left": 3.0, "right": -3.0}
 SEEN: Final = ("rgb", "depth", "classes")
 FAR_M: Final = 80.0
 """Depth counts up to here."""
+SWEPT: Final = 5
+"""Every so many steps the LiDAR is judged, too."""
 COLUMNS: Final[Mapping[str, tuple[str, int]]] = {
     "psnr": ("PSNR dB", 2),
     "abs_rel": ("AbsRel", 4),
     "miou": ("mIoU", 3),
+    "range_m": ("LiDAR, m", 3),
+    "beams_f1": ("beams F1", 3),
     "shift_m": ("largest shift, m", 2),
     "parting_m": ("apart, mean, m", 3),
     "parted_m": ("apart at the end, m", 3),
@@ -89,17 +96,20 @@ class LoopLog(Views):
             pilot: finished(drives / f"exact-{pilot}.json", partial(measure_drive, course, aim))
             for pilot, aim in AIMS_M.items()
         }
+        scene = read_scene(self.scene)
+        lidar = mounted(scene, scene.sweeps[0].sensor)
         values = {EXACT: {pilot: parting(of["path"], of["path"]) for pilot, of in exact.items()}}
         for row in self.rows:
             virtual: tuple[Path, ...] = ()
             if row.learns_virtual:
                 virtual = (self.chain.generated(self.off_path, self.out / self.virtual, renders=self.renders),)
             cockpit = Cockpit(Session(self.chain.fitted(row, virtual), scene=self.scene), (), 0, SEEN)
+            sweep = partial(sweep_errors, course, cockpit.session, lidar)
             values[row.name] = {}
             for pilot, aim in AIMS_M.items():
                 name = f"{row.name}-{pilot}"
                 eyes = lambda drive, cockpit=cockpit: next(iter(cockpit.see(drive).values())).layers
-                go = partial(measure_drive, course, aim, eyes, drives / f"{name}.jpg")
+                go = partial(measure_drive, course, aim, eyes, drives / f"{name}.jpg", sweep)
                 drive = finished(drives / f"{name}.json", go)
                 scores = {key: value for key, value in drive.items() if key != "path"}
                 values[row.name][pilot] = {**scores, **parting(drive["path"], exact[pilot]["path"])}
@@ -161,16 +171,22 @@ class Course:
 
 
 def measure_drive(
-    course: Course, aim_m: float, eyes: Eyes | None = None, picture: Path | None = None
+    course: Course,
+    aim_m: float,
+    eyes: Eyes | None = None,
+    picture: Path | None = None,
+    sweep: Callable[[Drive], dict[str, float]] | None = None,
 ) -> dict[str, Any]:
     """One drive: where it led, and how right its pictures were. ``eyes``: None: the exact city, whose pictures need no
-    score. ``picture``: where one of them is written beside the exact one."""
-    path, errors, shown = [], [], []
+    score. ``picture``: where one of them is written beside the exact one. ``sweep``: judges the LiDAR at a moment."""
+    path, errors, shown, swept = [], [], [], []
     counts = torch.zeros((), dtype=torch.int64)
     for drive, seen in course.go(aim_m, eyes or course.exact):
         path.append(course.judge(drive))
         if eyes is None:
             continue
+        if sweep is not None and len(path) % SWEPT == 1:
+            swept.append(sweep(drive))
         truth = course.exact(drive)
         shown.append((truth["rgb"], seen["rgb"]))
         both = np.isfinite(truth["depth"]) & np.isfinite(seen["depth"]) & (truth["depth"] < FAR_M)
@@ -180,10 +196,28 @@ def measure_drive(
         counts = counts + metrics.confusion(*(torch.from_numpy(of["classes"].astype(np.int64)) for of in (seen, truth)))
     if picture is not None and shown:
         store.write_image(picture, np.concatenate(shown[3 * len(shown) // 4], 1), quality=90)
-    means = {name: float(np.mean([one[name] for one in errors])) for name in (errors[0] if errors else {})}
+    mean = lambda rows: {name: float(np.mean([one[name] for one in rows])) for name in (rows[0] if rows else {})}
+    means = mean(errors) | mean(swept)
     if errors:
         means["miou"] = float(np.mean(list(metrics.iou_of(counts).values())))
     return {"path": path, **means}
+
+
+def sweep_errors(course: Course, session: Session, lidar: MountedLidar, drive: Drive) -> dict[str, float]:
+    """A sweep of the log's LiDAR where the vehicle is, against the exact city's: median error of the range in metres of
+    beams that return in both, and F1 of whether beams return."""
+    wanted, beams, mount = lidar
+    pose = drive.pose @ mount
+    (reply,) = session.render([LidarRequest(beams=beams, start=Instant(drive.time_s, pose), like=wanted.sensor)])
+    count = len(beams.share)
+    found = np.full(count, np.nan)
+    found[reply.beam] = reply.range_m
+    places, directions = np.tile(pose[:3, 3], (count, 1)), beams.directions @ pose[:3, :3].T
+    true, _ = course.world.ranges(places, directions, np.full(count, drive.time_s))
+    both = np.isfinite(found) & np.isfinite(true)
+    either = int(np.isfinite(found).sum() + np.isfinite(true).sum())
+    off = float(np.median(np.abs(found[both] - true[both]))) if both.any() else float("nan")
+    return {"range_m": off, "beams_f1": 2 * int(both.sum()) / max(either, 1)}
 
 
 def parting(path: Sequence[Facts], exact: Sequence[Facts]) -> dict[str, float]:

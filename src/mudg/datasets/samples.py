@@ -17,14 +17,13 @@ from numpy.typing import NDArray
 from mudg.base import geometry
 from mudg.base.errors import UsageError
 from mudg.base.palette import DYNAMIC_IDS
-from mudg.base.types import Camera, Scene, Track, View
+from mudg.base.types import Camera, Track, View
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.rendering import outline_mask
-from mudg.scene.beams import beams_of
-from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest
+from mudg.sim.lidar import LidarReply, LidarRequest
 from mudg.sim.optics import Pinhole
 from mudg.sim.session import CameraReply, CameraRequest, Instant, Layer, Session, Trust
-from mudg.sim.sweeps import WantedSweeps, own_table, wanted_sweeps
+from mudg.sim.sweeps import mounted
 
 SLACK_M: Final = (0.5, 1.5)
 """How far before and behind its box a surface may be that belongs to a parked object (windows let depth through)."""
@@ -273,23 +272,6 @@ def _returns_in(sweep: ViewSweep, world_from_box: NDArray[np.float64], size_m: S
     xyz = sweep.reply.xyz.astype(np.float64)
     inside = np.abs(geometry.transform_points(box_from_lidar, xyz)) <= np.asarray(size_m) / 2
     return int(inside.all(1).sum())
-
-
-def mounted(scene: Scene, lidar: str) -> tuple[WantedSweeps, BeamTable, NDArray[np.float64]]:
-    """A LiDAR by name: what is wanted, its beams, and vehicle-from-LiDAR f64[4, 4], of the first sweep of the sensor
-    for which the log has a pose of the vehicle.
-
-    Raises:
-        UsageError: no such LiDAR, or no pose of the vehicle.
-    """
-    wanted = wanted_sweeps(lidar, scene)
-    for sweep in (one for one in scene.sweeps if one.sensor == wanted.sensor):
-        ego = scene.ego.pose_at(sweep.time_s)
-        if ego is not None:
-            beams = own_table(beams_of(scene, sweep)) if wanted.beams is None else wanted.beams
-            return wanted, beams, geometry.invert(ego) @ sweep.world_from_lidar
-    what = "a LiDAR needs the poses of the vehicle at its sweeps"
-    raise UsageError(what, where="--lidar", got=f"none for {wanted.sensor}", remedy="leave --lidar out")
 
 
 def _direction(world_from_box: NDArray[np.float64], view: View) -> NDArray[np.float64]:

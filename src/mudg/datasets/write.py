@@ -22,13 +22,14 @@ from mudg.base.memory import in_words
 from mudg.base.run_folder import RunDir
 from mudg.base.types import Scene, View
 from mudg.datasets import coco, kitti, nuscenes, py123d
-from mudg.datasets.samples import DatasetPlace, LabelledView, Labeller, ObjectBox, mounted
+from mudg.datasets.samples import DatasetPlace, LabelledView, Labeller, ObjectBox
 from mudg.datasets.settings import DatasetConfig
 from mudg.editing.render import trajectories
 from mudg.editing.runs import find_run, scene_at
 from mudg.editing.settings import RenderConfig
 from mudg.scene.read import read_scene
 from mudg.sim.session import Layer, Session, Trust
+from mudg.sim.sweeps import mounted
 
 Record = Mapping[str, Any]
 PNG_BYTES: Final = 2.2

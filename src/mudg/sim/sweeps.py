@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mudg.base import log, store
+from mudg.base import geometry, log, store
 from mudg.base.errors import UsageError
 from mudg.base.types import Scene, Sweep
 from mudg.core.trajectory import ego_left_world, trajectory_name
@@ -54,6 +55,26 @@ def wanted_sweeps(name: str, scene: Scene) -> WantedSweeps:
         return WantedSweeps(sensors[0], read_table(Path(name)), Path(name).stem)
     expected = f"a sensor of the scene ({', '.join(sensors)}), {', '.join(TABLES)}, or a JSON file of beams"
     raise UsageError("no such LiDAR", where="--lidar", expected=expected, got=name)
+
+
+MountedLidar = tuple[WantedSweeps, BeamTable, NDArray[np.float64]]
+
+
+def mounted(scene: Scene, lidar: str) -> MountedLidar:
+    """A LiDAR by name: what is wanted, its beams, and vehicle-from-LiDAR f64[4, 4], of the first sweep of the sensor
+    for which the log has a pose of the vehicle.
+
+    Raises:
+        UsageError: no such LiDAR, or no pose of the vehicle.
+    """
+    wanted = wanted_sweeps(lidar, scene)
+    for sweep in (one for one in scene.sweeps if one.sensor == wanted.sensor):
+        ego = scene.ego.pose_at(sweep.time_s)
+        if ego is not None:
+            beams = own_table(beams_of(scene, sweep)) if wanted.beams is None else wanted.beams
+            return wanted, beams, geometry.invert(ego) @ sweep.world_from_lidar
+    what = "a LiDAR needs the poses of the vehicle at its sweeps"
+    raise UsageError(what, where="--lidar", got=f"none for {wanted.sensor}", remedy="leave --lidar out")
 
 
 def simulate_log(config: RenderConfig, scene: Path, model: Path, script: EditScript | None, out: Path) -> list[str]:
