@@ -2,7 +2,7 @@
 
     python bench/published_memory.py
 
-Prints the table of docs/published.md. Gigabytes are 10^9 bytes; see `mudg/diffusion/memory_plan.py` for what
+Prints the table of docs/research/published.md. Gigabytes are 10^9 bytes; see `mudg/diffusion/memory_plan.py` for what
 is counted.
 """
 

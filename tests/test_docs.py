@@ -53,7 +53,7 @@ FOREIGN_NAMES = (
     "PromptDepthAnything DepthLab DynamiCrafter DeepSpeed SegFormer MergedPointCloud RayCluster RayJob"
 ).split()
 SLOW = ("docs/bench_shift.md", "docs/paper_tables.md", "docs/results.md", "docs/training.md")
-"""Pages whose examples take longer: a benchmark, the whole chain, a training. So do those of the formats."""
+"""Pages whose examples take longer: a benchmark, the whole chain, a training. So do those of the formats and of training."""
 
 
 class Block(NamedTuple):
@@ -70,7 +70,7 @@ def name_of(page: Path) -> str:
 
 
 def takes_long(page: Path) -> bool:
-    return page.parent.name == "formats" or name_of(page) in SLOW
+    return page.parent.name in ("formats", "training") or name_of(page) in SLOW
 
 
 def blocks(text: str) -> Iterator[Block]:

@@ -157,7 +157,7 @@ def test_the_recipes_of_the_shipped_models_are_settings_files(name, tmp_path):
 
 
 def test_the_recipe_in_the_manual_is_a_settings_file(tmp_path):
-    text = (Path(__file__).parents[1] / "docs" / "training.md").read_text()
+    text = (Path(__file__).parents[1] / "docs" / "training" / "published.md").read_text()
     (tmp_path / "stage1.yaml").write_text(text.partition("`stage1.yaml`:")[2].split("```yaml\n")[1].split("```")[0])
     config = load(LearnConfig, None, tmp_path / "stage1.yaml")
     assert config.optimizer.betas == (0.9, 0.999) and config.compute.parallel == "fsdp" and not config.data.augment

@@ -540,7 +540,7 @@ def test_short_trajectories_are_refused_in_words(street, tmp_path):
 
 @pytest.mark.slow
 def test_full_size_fits_ten_gigabytes():
-    """Counted, not run: see docs/published.md for the table."""
+    """Counted, not run: see docs/research/published.md for the table."""
     needs = memory_plan.needs_of(PublishedConfig(), 2)
     assert needs.parameters == pytest.approx(4.41e9, rel=0.01)
     plan, peak_bytes = memory_plan.choose(needs, 10_000_000_000)

@@ -36,8 +36,8 @@ def same(one, other):
 @pytest.mark.parametrize("steps", [50, 20, 8])
 @pytest.mark.parametrize("guidance", [None, 1.0])
 def test_passes_for_a_clip(model, monkeypatch, steps, guidance):
-    """The numbers of docs/published.md: the denoising network once per step, with everything in one batch; the rest
-    once per clip."""
+    """The numbers of docs/research/published.md: the denoising network once per step, with everything in one batch; the
+    rest once per clip."""
     rows: dict[str, list[int]] = {}
 
     def watch(owner, name="forward", answer=None):

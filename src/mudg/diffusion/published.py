@@ -6,7 +6,7 @@
     latents    -> pixels           autoencoder
 
 `encode_condition`, `loss` and `sample` mean what they mean in `diffusion/model.py`. Where model and paper differ from
-each other the defaults follow the released weights; docs/published.md lists the differences.
+each other the defaults follow the released weights; docs/research/published.md lists the differences.
 """
 
 from __future__ import annotations

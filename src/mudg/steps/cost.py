@@ -44,7 +44,7 @@ recorded pixels."""
 PROGRAM_BYTES, NETWORK_BYTES, NETWORK_PIXEL_BYTES = 600_000_000, 680_000_000, 1_600
 """The program after a fit; each process in which a network runs, and a pixel of its view."""
 PUBLISHED_BYTES: Final = {"cpu": 19_000_000_000, "cuda": 9_000_000_000}
-"""A published-type model (counted, not measured: docs/published.md)."""
+"""A published-type model (counted, not measured: docs/research/published.md)."""
 PARAMETER_BYTES, GAUSSIAN_BYTES = 20, 300
 """A number of a Gaussian in memory, with moments and gradient; a Gaussian on disk, in both fits and the viewer."""
 VIEW_PIXEL_BYTES, SCORED_PIXEL_BYTES, VIEWS_BYTES = 10, 25, 2**30
