@@ -48,11 +48,11 @@ FOLDERS = (
     " networks core native base bench docs tests tools build_backend src"
 ).split()
 GROUPS = "virtual loss densify poses objects appearance start optimizer compute network codec city".split()
-FILE_ENDINGS = tuple(".py .json .jsonl .yaml .txt .md .png .jpg .mp4 .html .pt .ckpt .safetensors".split())
+FILE_ENDINGS = tuple(".py .json .jsonl .yaml .csv .txt .md .png .jpg .mp4 .html .pt .ckpt .safetensors".split())
 FOREIGN_NAMES = (
     "PromptDepthAnything DepthLab DynamiCrafter DeepSpeed SegFormer MergedPointCloud RayCluster RayJob"
 ).split()
-SLOW = ("docs/bench_shift.md", "docs/paper_tables.md", "docs/results.md", "docs/training.md")
+SLOW = ("docs/bench_shift.md", "docs/paper_tables.md", "docs/results.md", "docs/start/demo.md", "docs/training.md")
 """Pages whose examples take longer: a benchmark, the whole chain, a training. So do those of the formats."""
 
 
