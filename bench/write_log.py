@@ -5,8 +5,8 @@
     python bench/ingest_cost.py FORMAT FOLDER
 
 FORMAT is one of kitti360, pandaset, nuplan, custom, recording (what docs/examples/convert_my_log.py reads) and, with
-``--small`` only, waymo, nuscenes, argoverse2, dgp (argoverse2 needs pyarrow). The logs are written by the writers of ``tests/``; cameras that the city's car lacks show
-another camera's images.
+``--small`` only, waymo, nuscenes, argoverse2, dgp (argoverse2 needs pyarrow). The logs are written by the writers of
+``tests/``; cameras that the city's car lacks show another camera's images.
 """
 
 from __future__ import annotations
