@@ -4,9 +4,9 @@
     python bench/write_log.py FORMAT FOLDER [--frames 6]         the sensors and image sizes of the data set
     python bench/ingest_cost.py FORMAT FOLDER
 
-FORMAT is one of kitti360, pandaset, nuplan, custom and, with ``--small`` only, waymo, nuscenes, argoverse2, dgp
-(argoverse2 needs pyarrow). The logs are written by the writers of ``tests/``; cameras that the city's car lacks show
-another camera's images.
+FORMAT is one of kitti360, pandaset, nuplan, custom, recording (what docs/examples/convert_my_log.py reads) and, with
+``--small`` only, waymo, nuscenes, argoverse2, dgp (argoverse2 needs pyarrow). The logs are written by the writers of
+``tests/``; cameras that the city's car lacks show another camera's images.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 import roundtrip
-from write_custom import write_log
+from write_custom import write_log, write_recording
 from write_dgp import write_dgp
 from write_kitti360 import write_kitti360
 from write_nuplan import write_nuplan
@@ -62,6 +62,11 @@ def write_waymo(truth: Scene, folder: Path) -> None:
     write_waymo.write_tfrecord(made, folder / f"segment-{made.name}_with_camera_labels.tfrecord")
 
 
+def write_raw(truth: Scene, folder: Path) -> None:
+    """A recording as a vehicle may store it: folders of images and clouds, tables of poses and boxes."""
+    write_recording(truth, folder / "drive")
+
+
 SMALL_WRITERS: dict[str, Callable[[Scene, Path], object]] = {
     "kitti360": write_kitti360,
     "pandaset": write_pandaset,
@@ -71,6 +76,7 @@ SMALL_WRITERS: dict[str, Callable[[Scene, Path], object]] = {
     "nuscenes": write_nuscenes,
     "argoverse2": write_av2,
     "dgp": write_dgp,
+    "recording": write_raw,
 }
 
 
@@ -91,6 +97,8 @@ def write_full(name: str, folder: Path, frames: int) -> int:
         config = replace(config, width=1408, height=376, lidar_azimuth_step_deg=0.18)
     if name == "custom":
         config = replace(config, width=960, height=640)
+    if name == "recording":
+        config = replace(config, width=384, height=256, lidar_azimuth_step_deg=0.2)
     with tempfile.TemporaryDirectory() as city:
         truth = write_city(config, Path(city) / "city")
         times = np.array([sweep.time_s for sweep in truth.sweeps])
@@ -107,6 +115,8 @@ def write_full(name: str, folder: Path, frames: int) -> int:
             write_pandaset(truth, folder, cameras=PANDASET, suffix=".jpg", point_times=True)
         elif name == "custom":
             write_log(truth, folder, ".pcd")
+        elif name == "recording":
+            write_raw(truth, folder)
         else:
             write_nuplan(truth, folder, cameras=NUPLAN, distortion=DISTORTION, jpeg=True)
     return len(tracks)
@@ -120,7 +130,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=6)
     parser.add_argument("--small", action="store_true")
     options = parser.parse_args()
-    if not options.small and options.format not in ("kitti360", "pandaset", "nuplan", "custom"):
+    if not options.small and options.format not in ("kitti360", "pandaset", "nuplan", "custom", "recording"):
         parser.error(f"{options.format} is written with --small only (bench/sensor_logs.py, bench/waymo.py measure it)")
     log.set_quiet(True)
     options.folder.mkdir(parents=True, exist_ok=True)

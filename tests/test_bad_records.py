@@ -1,7 +1,7 @@
 """Clouds, boxes, poses, times, classes and file names that contradict a data set's rules, format by format.
 
-Cases that a format's own test has are not repeated; docs/ingest.md lists them all. What is refused leaves nothing
-behind.
+Cases that a format's own test has are not repeated; docs/reference/damaged_logs.md lists them all. What is refused
+leaves nothing behind.
 """
 
 from __future__ import annotations

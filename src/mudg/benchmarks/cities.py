@@ -2,8 +2,8 @@
 
 mdm: the diffusion model on held-out cities beside the recorded path, against exact truth, and the seam between windows
 of a longer video. poses: how much of the error of disturbed boxes a fit takes out, ``1 - rms(after) / rms(before)``
-(docs/scene.md). edit: edits of fitted scenes against the city drawn again with the object elsewhere or gone, vehicles
-of other cities, and what a diffusion model adds (docs/edit.md)."""
+(docs/research/scene.md). edit: edits of fitted scenes against the city drawn again with the object elsewhere or gone,
+vehicles of other cities, and what a diffusion model adds (docs/edit.md)."""
 
 from __future__ import annotations
 

@@ -584,8 +584,8 @@ def chosen_ahead(
 # ---- halved --------------------------------------------------------------------------------------
 #
 # Virtual views at half their size, for the steps of a fit that need no more: their finest structure is blurred by the
-# diffusion model and teaches a scene little (docs/supervision.md), and a step costs about as much per pixel as it costs
-# per Gaussian.
+# diffusion model and teaches a scene little (docs/research/supervision.md), and a step costs about as much per pixel as
+# it costs per Gaussian.
 
 LEAST_PX: Final = 96
 """No side of a halved view is shorter: smaller views stay as they are."""

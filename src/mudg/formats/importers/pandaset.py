@@ -17,7 +17,7 @@ lies where it was at its own time ``t``; ``dt_s`` keeps that time. The two LiDAR
 recorded poses and the published static calibration. A cloud is filed under the end of its turn, 0.05 s after its middle
 and after the front camera's image; a sweep here stands at the middle.
 
-Images. Measured on sequence 002 (see docs/formats/pandaset.md), images show what moves as it was ``EXPOSURE_S`` from
+Images. Measured on sequence 002 (see docs/research/formats.md), images show what moves as it was ``EXPOSURE_S`` from
 their time stamp, and fit standing points when the camera is taken ``POSE_S`` along the vehicle's path. Both are applied
 to all cameras.
 
