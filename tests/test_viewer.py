@@ -29,6 +29,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.base.palette import ID
 from mudg.base.types import Camera
 from mudg.core.trajectory import at_shift
+from mudg.formats.paths import read_path
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.scene.read import read_scene
@@ -400,6 +401,56 @@ def test_a_link_shows_the_same(opened: Browser) -> None:
     )
     shown = opened.run(f"(() => {{ {middle} return Math.max(...p.filter((_, i) => i % 4 < 3)); }})()")
     assert shown == 0
+
+
+@pytest.mark.slow
+def test_a_camera_path_is_played_and_saved_for_render(opened: Browser, toy: Toy, tmp_path: Path) -> None:
+    scene, begin = read_scene(toy[0] / "scene"), 0.1
+    opened.run("mudg.change({keys: [], mode: 'recorded', camera: 'front', shift: 0, up: 0}), 1")
+    assert opened.run("[...document.querySelectorAll('#key-play, #key-save')].every((button) => button.disabled)")
+    axes = lambda: np.array(opened.run("mudg.last.view.axes"))
+    places = {begin: [0, 0.5, 2.0], 0.3: [1.0, 1.5, 2.5], 0.65: [3.0, 0.0, 1.5]}
+    turns = {}
+    for index, (time_s, eye) in enumerate(places.items()):
+        state = {"mode": "fly", "t": time_s, "eye": eye, "yaw": 0.2 * index, "pitch": -0.1 * index}
+        opened.run(f"mudg.settled({json.dumps(state)}).then(() => document.getElementById('key-add').click())")
+        turns[time_s] = axes()
+    keys = opened.run("JSON.stringify(mudg.state.keys)")
+    opened.run("mudg.draw(1, true), 1")
+    linked = opened.run(
+        "import('mudg/state').then((m) => m.fromHash(location.hash, m.initialState(mudg.facts), mudg.facts).keys)"
+    )
+    for key, known in zip(linked, json.loads(keys), strict=True):
+        assert [key["t"], *key["eye"], *key["turn"]] == pytest.approx(
+            [known["t"], *known["eye"], *known["turn"]], abs=1e-3
+        )
+    text = opened.run("import('mudg/path').then((m) => m.pathText(mudg.state.keys, mudg.facts.begin_s))")
+    (tmp_path / "path.json").write_text(text, encoding="utf-8")
+    read = read_path(tmp_path / "path.json", scene, scene.cameras["front"])
+    start = opened.run("mudg.facts.begin_s")
+    assert [v.time_s - start for v in read.views] == pytest.approx([0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.65])
+    for index, time_s in ((0, begin), (2, 0.3), (6, 0.65)):
+        assert read.views[index].center_world == pytest.approx(places[time_s], abs=1e-6)
+        assert read.views[index].world_from_cam[:3, :3].T == pytest.approx(turns[time_s], abs=1e-6)
+    for view_ in read.views:  # the page shows what is saved
+        opened.run(f"mudg.settled({{mode: 'path', t: {view_.time_s - start}}}).then(() => 1)")
+        assert opened.run("mudg.last.view.eye") == pytest.approx(view_.center_world, abs=1e-6)
+        assert axes() == pytest.approx(view_.world_from_cam[:3, :3].T, abs=1e-6)
+    near = opened.run(
+        "import('mudg/path').then((m) => [0.299, 0.3, 0.301].map((t) => m.along(mudg.state.keys, t).eye))"
+    )
+    before, after = np.diff(near, axis=0)
+    assert before == pytest.approx(after, abs=1e-3), "no corner at the key in the middle"
+    assert np.abs(before).max() > 3e-3
+    opened.run("document.getElementById('key-play').click(), 1")
+    assert opened.run("[mudg.state.mode, mudg.state.playing, mudg.state.t >= 0.1 && mudg.state.t < 0.65]") == [
+        "path",
+        True,
+        True,
+    ]
+    opened.run("document.getElementById('key-clear').click(), mudg.change({playing: false}), 1")
+    assert opened.run("[mudg.state.mode, mudg.state.keys.length]") == ["recorded", 0]
+    assert opened.errors == []
 
 
 @pytest.mark.slow

@@ -579,10 +579,6 @@ TEXELS: Final = (2, 3, 4, 5)
 """Texels per Gaussian by degree of the harmonics; as `assets/viewer/data.js` lays them out."""
 SORT_BYTES: Final = 38
 """Per Gaussian in the sorter of a page (`assets/viewer/sorter.js`)."""
-MODULES: Final = (
-    *("math", "data", "sorter", "shaders", "edits", "particles", "weather", "renderer", "cameras", "state", "overlay"),
-    *("arrival", "app", "zip", "share", "gizmo", "editor", "ui", "input", "exact", "main"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -708,8 +704,10 @@ def asset(name: str) -> str:
 def import_map() -> str:
     """The viewer's modules as an import map of data addresses: a page opened by double click may not load files beside
     it."""
+    folder = files("mudg") / "assets" / "viewer"
+    modules = sorted(file.name.removesuffix(".js") for file in folder.iterdir() if file.name.endswith(".js"))
     coded = lambda name: base64.b64encode(asset(f"{name}.js").encode()).decode()
-    addresses = {f"mudg/{name}": "data:text/javascript;base64," + coded(name) for name in MODULES}
+    addresses = {f"mudg/{name}": "data:text/javascript;base64," + coded(name) for name in modules}
     return script_json({"imports": addresses})
 
 

@@ -116,12 +116,18 @@ export class App {
     return { left: this.loaded[scene], right, mode: mode === "none" ? "one" : mode };
   }
 
+  /** The time that is played, seconds: that of the path, or of the drive. */
+  span() {
+    const { mode, keys } = this.state;
+    return mode === "path" ? [keys[0].t, keys[keys.length - 1].t] : [0, this.facts.end_s];
+  }
+
   frame(now) {
     const s = this.state;
     if (s.playing) {
-      const t = s.t + Math.min(0.25, (now - (this.before ?? now)) / 1000) * s.speed, end = this.facts.end_s;
+      const t = s.t + Math.min(0.25, (now - (this.before ?? now)) / 1000) * s.speed, [begin, end] = this.span();
       if (t > end && !s.loop) this.change({ t: end, playing: false });
-      else this.change({ t: t > end ? 0 : Math.max(0, t) });
+      else this.change({ t: t > end ? begin : Math.max(begin, t) });
     }
     this.move?.(Math.min(0.25, (now - (this.before ?? now)) / 1000));
     this.before = now;

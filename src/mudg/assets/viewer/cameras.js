@@ -3,9 +3,10 @@
 // A view is {width, height, fx, fy, cx, cy, eye, axes: [right, down, ahead], gain, offset}: a pinhole camera in the world.
 
 import { PoseKeys, add, clamp, cross, dot, keysAround, quaternionOf, rotationOf, slerp, sub, unit } from "mudg/math";
+import { along } from "mudg/path";
 
 /** Ways to look, with their names for people. */
-export const MODES = { recorded: "Recorded camera", chase: "Behind the vehicle", top: "From above", orbit: "Round a point", fly: "Free" };
+export const MODES = { recorded: "Recorded camera", chase: "Behind the vehicle", top: "From above", orbit: "Round a point", fly: "Free", path: "Along your path" };
 const UP = [0, 0, 1], SAME = { gain: [1, 1, 1], offset: [0, 0, 0] };
 const MIDDLE = [0.3, 0.4, 0.5, 0.6, 0.7]; // places in a view, across and down, that tell whether a recorded camera looked there
 const HEIGHT_OF_VIEW = 0.9; // radians, of cameras that are not recorded ones
@@ -97,6 +98,7 @@ export class Cameras {
 
   free() {
     const s = this.state, { position, rotation } = this.drive.ego.nearest(s.t);
+    if (s.mode === "path") return along(s.keys, s.t);
     const heading = Math.atan2(rotation[3], rotation[0]);
     if (s.mode === "fly") return { eye: s.eye, axes: level(direction(s.yaw, s.pitch)) };
     if (s.mode === "orbit") return { eye: add(s.target, direction(s.yaw, s.pitch), -s.distance), axes: level(direction(s.yaw, s.pitch)) };
@@ -126,7 +128,7 @@ export class Cameras {
   /** Turns by a drag of pixels. */
   drag(dx, dy, height) {
     const s = this.state, per = HEIGHT_OF_VIEW / height;
-    if (s.mode === "recorded") this.letGo();
+    if (s.mode === "recorded" || s.mode === "path") this.letGo();
     if (s.mode === "chase" || s.mode === "top") {
       s.turn -= dx * per * 2;
       s.tilt = clamp(s.tilt - dy * per * 2, -1.2, 1.2);
@@ -140,7 +142,7 @@ export class Cameras {
   /** Nearer or farther, by a factor. */
   zoom(factor) {
     const s = this.state;
-    if (s.mode === "recorded") this.letGo();
+    if (s.mode === "recorded" || s.mode === "path") this.letGo();
     if (s.mode === "chase") s.behind = clamp(s.behind * factor, 2, 80);
     else if (s.mode === "top") s.height = clamp(s.height * factor, 8, 300);
     else if (s.mode === "orbit") s.distance = clamp(s.distance * factor, 0.5, 300);

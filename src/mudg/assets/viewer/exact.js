@@ -3,7 +3,8 @@
 
 import { Cameras } from "mudg/cameras";
 import { scriptText } from "mudg/edits";
-import { FRAMES_PER_S, framesOf, nameOf, save } from "mudg/share";
+import { FRAMES_PER_S } from "mudg/path";
+import { framesOf, nameOf, save } from "mudg/share";
 
 /** Asks the server something. */
 function ask(app, name, body, signal) {

@@ -121,6 +121,7 @@ function keyboard(app, controls) {
     else if (event.key === "t") app.change({ mode: "top" });
     else if (event.key === "f") controls.mode("fly");
     else if (event.key === "o") controls.mode("orbit");
+    else if (event.key === "k") document.getElementById("key-add").click();
     else if (event.key === "b") app.change({ boxes: !s.boxes });
     else if (event.key === "l") app.change({ lidar: !s.lidar });
     else if (event.key === "[") app.change({ mode: "recorded", shift: clamp(s.shift + 0.5, -4, 4) });

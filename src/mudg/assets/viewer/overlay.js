@@ -1,9 +1,11 @@
 // Boxes, paths, LiDAR points and recorded cameras, drawn over the picture. They are not hidden by what stands before them.
 
 import { add, dot, project, sub, turn } from "mudg/math";
+import { along } from "mudg/path";
 
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const NEAREST = 0.25;
+const PATH_COLOR = "#ffd54a", PATH_STEPS = 100; // of the camera path
 const LABELS_WITHIN_M = 35; // names farther away would cover one another
 
 /** A colour that belongs to a track, the same on every page. */
@@ -36,7 +38,8 @@ export class Overlay {
     c.setTransform(1, 0, 0, 1, 0, 0);
     c.clearRect(0, 0, this.canvas.width, this.canvas.height);
     this.thumbnails = [];
-    const empty = !(state.boxes || state.paths || state.lidar || state.cameras || state.selected);
+    const flown = state.mode !== "path" && state.keys.length > 0;
+    const empty = !(flown || state.boxes || state.paths || state.lidar || state.cameras || state.selected);
     this.canvas.style.visibility = empty ? "hidden" : "visible"; // a canvas that is only cleared may keep its old picture on the screen
     if (empty) return;
     c.save();
@@ -54,6 +57,7 @@ export class Overlay {
       if (state.boxes || chosen) this.box(view, track, state.t, chosen);
     }
     if (state.paths) this.line(view, this.drive.ego.positions, "rgb(255 255 255 / .8)", 2);
+    if (flown) this.flown(view, state.keys);
     if (state.selected) this.gizmo?.draw(c, view, ratio);
     c.restore();
   }
@@ -75,6 +79,14 @@ export class Overlay {
     }
     c.stroke();
     c.setLineDash([]);
+  }
+
+  /** The camera path, a mark at each key. */
+  flown(view, keys) {
+    const begin = keys[0].t, step = (keys[keys.length - 1].t - begin) / PATH_STEPS, c = this.context;
+    this.line(view, Array.from({ length: PATH_STEPS + 1 }, (_, k) => along(keys, begin + k * step).eye), PATH_COLOR, 2);
+    c.fillStyle = PATH_COLOR;
+    for (const [x, y, z] of keys.map((key) => project(view, key.eye))) if (z >= NEAREST) c.fillRect(x - 4 * this.ratio, y - 4 * this.ratio, 8 * this.ratio, 8 * this.ratio);
   }
 
   path(view, track, t) {

@@ -2,12 +2,11 @@
 
 import { scaled } from "mudg/app";
 import { scriptText } from "mudg/edits";
+import { FRAMES_PER_S, pathText } from "mudg/path";
 import { toHash } from "mudg/state";
 import { zipOf } from "mudg/zip";
 
 const MOST_SIDE = 8192;
-/** Of videos and of the pictures of a drive. */
-export const FRAMES_PER_S = 10;
 
 export function save(blob, name) {
   const link = document.createElement("a");
@@ -96,6 +95,12 @@ export async function saveEdits(app) {
   if (app.facts.live) return app.editor.saveThere();
   save(new Blob([text], { type: "application/yaml" }), "edits.yaml");
   return "Saved edits.yaml for mudg edit.";
+}
+
+/** Saves the camera path for `mudg render`. */
+export function savePath({ state, facts }) {
+  save(new Blob([pathText(state.keys, facts.begin_s)], { type: "application/json" }), "path.json");
+  return "Saved path.json for mudg render --path.";
 }
 
 /** Puts a link to what is shown into the clipboard. */

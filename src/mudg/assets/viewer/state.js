@@ -3,13 +3,14 @@
 import { LAYERS } from "mudg/shaders";
 import { MODES } from "mudg/cameras";
 import { clamp } from "mudg/math";
+import { keysOf, keysText } from "mudg/path";
 
 /** State at the beginning. */
 export function initialState(facts) {
   return {
     mode: "recorded", camera: Object.keys(facts.cameras)[0], t: 0, shift: 0, up: 0, layer: "color", playing: false, speed: 1, loop: true,
     compare: "none", divider: 0.5, scene: 0, boxes: false, paths: false, lidar: false, cameras: false, hidden: new Set(), selected: null, edits: [], edition: 0,
-    eye: [0, 0, 2], yaw: 0, pitch: 0, target: [0, 0, 0], distance: 12, behind: 12, height: 45, turn: 0, tilt: 0,
+    eye: [0, 0, 2], yaw: 0, pitch: 0, target: [0, 0, 0], distance: 12, behind: 12, height: 45, turn: 0, tilt: 0, keys: [],
   };
 }
 
@@ -28,6 +29,7 @@ export function toHash(s) {
   if (s.hidden.size) parts.h = [...s.hidden].join(",");
   if (s.mode === "fly") parts.p = [...s.eye, s.yaw, s.pitch].map(round).join(",");
   if (s.mode === "orbit") parts.p = [...s.target, s.yaw, s.pitch, s.distance].map(round).join(",");
+  if (s.keys.length) parts.k = keysText(s.keys);
   return "#" + new URLSearchParams(Object.entries(parts).map(([k, v]) => [k, String(v)])).toString();
 }
 
@@ -49,10 +51,11 @@ export function fromHash(hash, s, facts) {
   for (const name of FLAGS) s[name] = (given.get("o") ?? "").split(",").includes(name);
   const known = new Set(facts.scenes.flatMap((scene) => scene.nodes.map((node) => node.name)));
   s.hidden = new Set((given.get("h") ?? "").split(",").filter((name) => known.has(name)));
+  s.keys = (given.has("k") && keysOf(given.get("k"), facts.end_s)) || [];
   const p = (given.get("p") ?? "").split(",").map(Number);
   const mode = given.get("m");
   if (mode === "fly" && p.length === 5 && p.every(Number.isFinite)) Object.assign(s, { mode, eye: p.slice(0, 3), yaw: p[3], pitch: p[4] });
   else if (mode === "orbit" && p.length === 6 && p.every(Number.isFinite)) Object.assign(s, { mode, target: p.slice(0, 3), yaw: p[3], pitch: p[4], distance: p[5] });
-  else if (mode !== "fly" && mode !== "orbit" && Object.hasOwn(MODES, mode ?? "")) s.mode = mode;
+  else if (mode !== "fly" && mode !== "orbit" && Object.hasOwn(MODES, mode ?? "") && (mode !== "path" || s.keys.length)) s.mode = mode;
   return s;
 }

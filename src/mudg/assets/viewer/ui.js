@@ -5,7 +5,8 @@ import { LAYERS } from "mudg/shaders";
 import { clamp, project } from "mudg/math";
 import { trackColor } from "mudg/overlay";
 import { exactVideos } from "mudg/exact";
-import { recordVideo, saveEdits, saveFrames, saveLink, savePicture } from "mudg/share";
+import { withKey } from "mudg/path";
+import { recordVideo, saveEdits, saveFrames, saveLink, savePath, savePicture } from "mudg/share";
 
 const LAYER_NAMES = { color: "Color", depth: "Depth", class: "Classes", instance: "Objects", normal: "Normals", confidence: "Confidence", recorded: "Recorded" };
 const OVERLAYS = { boxes: "Boxes", paths: "Trajectories", lidar: "LiDAR", cameras: "Recorded cameras" };
@@ -61,6 +62,7 @@ export class Controls {
     facts.depth_colors.forEach(([r, g, b], x) => { scale.fillStyle = `rgb(${r} ${g} ${b})`; scale.fillRect(x, 0, 1, 1); });
     this.timeline();
     this.shift();
+    this.path();
     this.objects();
     this.buttons();
     app.listeners.add(() => this.show());
@@ -96,7 +98,8 @@ export class Controls {
 
   mode(mode) {
     const { app } = this;
-    if (mode === "fly") app.cameras.letGo();
+    if (mode === "path" && !app.state.keys.length) this.say("Add a key first.");
+    else if (mode === "fly") app.cameras.letGo();
     else if (mode === "orbit") {
       const { view } = app.last, chosen = app.tracks.find((track) => track.id === app.state.selected)?.pose.at(app.state.t);
       app.cameras.orbit(chosen?.position ?? [0, 1, 2].map((k) => view.eye[k] + 12 * view.axes[2][k]));
@@ -115,8 +118,8 @@ export class Controls {
   }
 
   play() {
-    const { app } = this, { t, playing } = app.state;
-    app.change({ playing: !playing, t: !playing && t >= app.facts.end_s ? 0 : t });
+    const { app } = this, { t, playing } = app.state, [begin, end] = app.span();
+    app.change({ playing: !playing, t: !playing && t >= end ? begin : t });
   }
 
   /** To the next recorded frame of the camera. */
@@ -131,6 +134,22 @@ export class Controls {
     $("shift").oninput = set;
     $("up").oninput = set;
     $("center").onclick = () => app.change({ shift: 0, up: 0, mode: "recorded" });
+  }
+
+  /** A camera path: keys at moments of the drive, from the views that the page has there. */
+  path() {
+    const { app } = this, keys = (made) => app.change({ keys: made, ...(!made.length && app.state.mode === "path" ? { mode: "recorded" } : {}) });
+    $("key-add").onclick = () => { if (app.last.view) keys(withKey(app.state.keys, app.state.t, app.last.view)); };
+    $("key-play").onclick = () => app.change({ mode: "path", t: app.state.keys[0].t, playing: true });
+    $("key-save").onclick = () => this.say(savePath(app));
+    $("key-clear").onclick = () => keys([]);
+    app.listeners.add(({ keys: now }) => {
+      for (const [id, least] of [["play", 2], ["save", 1], ["clear", 1]]) $(`key-${id}`).disabled = now.length < least;
+      if (this.keysShown === now) return;
+      this.keysShown = now;
+      $("key-list").replaceChildren(...now.map((key) => make("li", {}, make("button", { type: "button", onclick: () => app.change({ mode: "path", t: key.t, playing: false }) }, `${key.t.toFixed(2)} s`),
+        make("button", { type: "button", "aria-label": `Remove the key at ${key.t.toFixed(2)} s`, onclick: () => keys(app.state.keys.filter((one) => one !== key)) }, "\u00d7"))));
+    });
   }
 
   /** Says what the recording saw of this view. */
