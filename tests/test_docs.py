@@ -52,15 +52,10 @@ FILE_ENDINGS = tuple(".py .json .jsonl .yaml .csv .txt .md .png .jpg .mp4 .html 
 FOREIGN_NAMES = (
     "PromptDepthAnything DepthLab DynamiCrafter DeepSpeed SegFormer MergedPointCloud RayCluster RayJob"
 ).split()
-<<<<<<< HEAD
-SLOW = ("docs/bench_shift.md", "docs/paper_tables.md", "docs/results.md", "docs/training.md")
-"""Pages whose examples take longer: a benchmark, the whole chain, a training. So do those of the formats and of training."""
-=======
 SLOW = tuple(
     f"docs/{page}.md" for page in "bench_shift paper_tables results start/demo training tutorials/my_own_log".split()
 )
-"""Pages whose examples take longer: a benchmark, the whole chain, a training. So do those of the formats."""
->>>>>>> docsc
+"""Pages whose examples take longer: a benchmark, the whole chain. So do those of the formats and of training."""
 
 
 class Block(NamedTuple):

@@ -22,7 +22,7 @@ from mudg.base import store
 READERS = {
     "coco": ("pycocotools==2.0.11", "numpy"),
     "nuscenes": ("nuscenes-devkit==1.2.0",),
-    "kitti-tracking": ("pykitti==0.3.1",),
+    "kitti-tracking": ("pykitti==0.3.1", "opencv-python-headless"),
     "py123d": ("py123d==0.7.0",),
 }
 """Format -> packages of its reader."""
@@ -61,12 +61,17 @@ OF_TRACKING = """
 import sys
 import numpy as np
 import pykitti
-read = pykitti.tracking(sys.argv[1], "0000")
-images = list(read.cam2)
-poses = [packet.T_w_imu for packet in read.oxts]
-assert len(images) == len(poses) and np.isfinite(poses).all()
-assert all(np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < 1e-9 for pose in poses)
-print(len(images), "images of sequence 0000,", round(float(np.linalg.norm(poses[-1][:3, 3] - poses[0][:3, 3])), 2), "m")
+from pykitti.utils import load_oxts_packets_and_poses, load_velo_scan, read_calib_file
+folder = sys.argv[1]
+read = pykitti.tracking(folder, "0000")
+images, poses = list(read.cam2), [one.T_w_imu for one in load_oxts_packets_and_poses([folder + "/oxts/0000.txt"])]
+off = max(np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() for pose in poses)
+assert len(images) == len(poses) and off < 1e-9
+calibration = read_calib_file(folder + "/calib/0000.txt")
+points = sum(len(load_velo_scan(file)) for file in read.velo_files)
+assert calibration["P2"].size == calibration["Tr_velo_cam"].size == 12
+way = np.linalg.norm(poses[-1][:3, 3] - poses[0][:3, 3])
+print(len(images), "images of sequence 0000,", round(float(way), 2), "m,", points, "returns")
 """
 OF_123D = """
 import sys
@@ -117,7 +122,7 @@ def main() -> int:
 def environment(folder: Path, packages: tuple[str, ...]) -> str:
     """The interpreter of an environment with packages; it is made if it is not there."""
     python, done = folder / "bin" / "python", folder / "packages.json"
-    if not done.is_file():
+    if not done.is_file() or store.read_json(done) != list(packages):
         venv.create(folder, with_pip=True, clear=True)
         subprocess.run([python, "-m", "pip", "install", "-q", *packages], check=True, stderr=subprocess.DEVNULL)
         store.write_json(done, list(packages))
