@@ -51,8 +51,9 @@ def city(work: Path, seed: int) -> Path:
 
 def reconstruction(work: Path, seed: int) -> Path:
     """The log as a run makes it, with virtual views."""
-    scene = city(work, seed)
-    return mudg.run(str(scene), out=work / f"run{seed}", fast=True, shifts_m=SHIFTS_M)
+    out = work / f"run{seed}"
+    mudg.run(str(city(work, seed)), out=out, fast=True, shifts_m=SHIFTS_M)
+    return out
 
 
 def beside(work: Path, seed: int, shifts_m: Sequence[float]) -> list[View]:

@@ -20,7 +20,7 @@ from mudg.base.geometry import yaw_matrix
 def notebook(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """Names that the page's code leaves behind, run from top to bottom in an empty folder."""
     blocks = re.findall(r"```python\n(.*?)```", (repository / "docs" / "python.md").read_text(), re.DOTALL)
-    assert len(blocks) == 5
+    assert len(blocks) == 6
     names: dict[str, Any] = {}
     folder = tmp_path_factory.mktemp("notebook")
     with pytest.MonkeyPatch.context() as patch:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,6 +25,7 @@ from mudg.gaussians.rendering import render_view
 from mudg.sim.lidar import BeamTable, LidarReply, LidarRequest
 from mudg.sim.optics import Fisheye, FTheta, Pinhole, faces_of
 from mudg.sim.session import LAYERS, CameraRequest, Instant, Session
+from mudg.sim.tables import read_table
 
 LOOK = geometry.invert(geometry.CAM_FROM_EGO_AXES)
 PLAIN = Pinhole(64, 48, 50.0, 50.0, 32.0, 24.0)
@@ -321,3 +324,20 @@ def test_a_car_that_the_caller_places_is_met_by_beams() -> None:
     own = reply.instances == 1 + reply.objects.index("car-1")
     inside = geometry.transform_points(geometry.invert(car) @ at, reply.xyz[own].astype(float))
     assert own.sum() > 10 and (np.median(np.abs(inside), 0) <= np.array(SIZE) / 2).all()
+
+
+@pytest.mark.parametrize(
+    ("changed", "words"),
+    [
+        ({"field_deg": -90}, "field_deg"),
+        ({"field_deg": 0.001}, "narrower than a step"),
+        ({"azimuth_step_deg": 0.01, "elevations_deg": list(range(-60, 60))}, "too many beams"),
+    ],
+)
+def test_beam_tables_that_no_sensor_has_are_refused_before_they_are_made(
+    tmp_path: Path, changed: dict, words: str
+) -> None:
+    table = {"elevations_deg": [-10, 0], "azimuth_step_deg": 1, "range_m": [1, 50], "field_deg": 90, **changed}
+    (tmp_path / "beams.json").write_text(json.dumps(table))
+    with pytest.raises(MudgError, match=words):
+        read_table(tmp_path / "beams.json")

@@ -82,6 +82,9 @@ class BeamTable:
             expected = "0.01 to 90 degrees"
             raise UsageError("no such step", where="azimuth_step_deg", expected=expected, got=str(azimuth_step_deg))
         columns = round(360 / azimuth_step_deg)
+        if columns * len(elevations) > MOST_BEAMS:
+            got = f"{columns} columns of {len(elevations)} rows"
+            raise UsageError("too many beams", where="azimuth_step_deg", expected=f"at most {MOST_BEAMS}", got=got)
         share = (np.arange(columns) + 0.5) / columns
         azimuth = np.pi * (1 - 2 * share) * (1 if clockwise else -1)
         level = np.cos(elevations)[None]

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from mudg.base import store
+from mudg.base.errors import UsageError
 from mudg.base.records import Number, StrictRecord, parse_record
 from mudg.sim.lidar import BeamTable
 
@@ -21,6 +22,9 @@ def forward(
     """A LiDAR that sweeps a field ahead of it from left to right."""
     turn = BeamTable.spinning(elevations_deg, step_deg, range_m)
     inside = np.abs(np.degrees(np.arctan2(turn.directions[:, 1], turn.directions[:, 0]))) <= field_deg / 2
+    if not inside.any():
+        what, expected = "the field of view is narrower than a step", f"at least {step_deg:g} degrees"
+        raise UsageError(what, where="field_deg", expected=expected, got=f"{field_deg:g}")
     share = turn.share[inside]
     share = (share - share.min()) / max(float(np.ptp(share)), 1e-9)
     return BeamTable(turn.directions[inside], turn.ring[inside], share, range_m)
@@ -42,7 +46,7 @@ class TableFile(StrictRecord):
     elevations_deg: Annotated[list[Number], Field(min_length=1, max_length=512)]
     azimuth_step_deg: Number
     range_m: Annotated[list[Number], Field(min_length=2, max_length=2)] = [0.5, 120.0]
-    field_deg: Number = 360.0
+    field_deg: Annotated[Number, Field(gt=0)] = 360.0
     direction: Literal["clockwise", "anticlockwise"] = "clockwise"
 
 
