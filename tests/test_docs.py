@@ -146,9 +146,9 @@ def test_examples_run(page: Path, shared: tuple[Path, set[str]], monkeypatch: py
     run_page(page.read_text(encoding="utf-8"), finished)
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES[1:] if p.parent.name != "research"], ids=name_of)
+@pytest.mark.parametrize("page", [p for p in PAGES[1:] if p.parent.name not in ("research", "reference")], ids=name_of)
 def test_every_page_has_an_example(page: Path) -> None:
-    """README's are its two lines, which `.ci/run` runs; pages of research belong to one that has some."""
+    """README's are its two lines, which `.ci/run` runs; pages of research and reference belong to one that has some."""
     text = page.read_text(encoding="utf-8")
     assert has_example(text), f"{name_of(page)} has no example that runs: a block marked console or python"
     fences = re.findall(r"^```.*$", text, re.MULTILINE)
