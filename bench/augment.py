@@ -5,8 +5,8 @@ python bench/augment.py --work /tmp/augment --cities 4 --tests 4 --steps 500
 
 Rows: recorded images; the same and our views at 2 and 4 m to both sides; the same, without pixels that the recording
 does not determine; the same and exact views at those places. All have exact labels but ours, which are rendered with
-the image. The network is the labeller's (``StreetNet``) without LiDAR, from nothing, always for as many steps. Cities
-and scenes are kept in ``--work``.
+the image. The network is the labeller's (``StreetNet``), half as wide and without LiDAR, from nothing, always for as
+many steps, on one thread. Cities and scenes are kept in ``--work``.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ SIZE = (256, 160)
 SHIFTS_M = (2.0, -2.0, 4.0, -4.0)
 TESTED_M = (0.0, 2.0, 4.0)
 BATCH = 4
+WIDTHS = (16, 32, 48, 64, 64)
 LR = 2e-3
 FIRST_TRAINED, FIRST_TESTED = 5100, 5200
 Labelled = tuple[NDArray[np.uint8], NDArray[np.uint8]]
@@ -92,7 +93,7 @@ def rendered(work: Path, seed: int, determined: bool) -> list[Labelled]:
 def network(images: Sequence[Labelled], steps: int, seed: int) -> StreetNet:
     """A segmenter trained on images."""
     torch.manual_seed(seeds.key(seed, 0, "segmenter") % 2**31)
-    net = StreetNet(StreetNetConfig()).train()
+    net = StreetNet(StreetNetConfig(widths=WIDTHS, blocks=(1, 1, 1, 1, 1))).train()
     optimizer = torch.optim.AdamW(net.parameters(), LR, weight_decay=1e-4)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, LR, steps, pct_start=0.1)
     for step in range(steps):
@@ -147,7 +148,8 @@ def main() -> None:
     }
     held = range(FIRST_TESTED, FIRST_TESTED + options.tests)
     tests = {m: [one for k in held for one in exact(work, k, (m, -m) if m else (0.0,), 4)] for m in TESTED_M}
-    native.set_threads(2)
+    native.set_threads(1)
+    torch.set_num_threads(1)
     sys.stdout.write(f"{'mIoU %, exact views of other cities':36s}" + "".join(f"{m:6.0f} m" for m in TESTED_M) + "\n")
     for name, images in rows.items():
         found = []

@@ -52,10 +52,8 @@ FILE_ENDINGS = tuple(".py .json .jsonl .yaml .csv .txt .md .png .jpg .mp4 .html 
 FOREIGN_NAMES = (
     "PromptDepthAnything DepthLab DynamiCrafter DeepSpeed SegFormer MergedPointCloud RayCluster RayJob"
 ).split()
-SLOW = tuple(
-    f"docs/{page}.md" for page in "bench_shift paper_tables results start/demo training tutorials/my_own_log".split()
-)
-"""Pages whose examples take longer: a benchmark, the whole chain. So do those of the formats and of training."""
+SLOW = tuple(f"docs/{page}.md" for page in "bench_shift paper_tables results start/demo training".split())
+"""Pages whose examples take longer: a benchmark, the whole chain. So do those of formats, training and tutorials."""
 
 
 class Block(NamedTuple):
@@ -72,7 +70,7 @@ def name_of(page: Path) -> str:
 
 
 def takes_long(page: Path) -> bool:
-    return page.parent.name in ("formats", "training") or name_of(page) in SLOW
+    return page.parent.name in ("formats", "training", "tutorials") or name_of(page) in SLOW
 
 
 def blocks(text: str) -> Iterator[Block]:
