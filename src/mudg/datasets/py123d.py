@@ -50,7 +50,7 @@ def library() -> Any:
         import py123d
     except ImportError as error:
         what = "the format py123d needs the package of that name"
-        raise ResourceError(what, expected="py123d 0.7", got=str(error), remedy="pip install py123d") from error
+        raise ResourceError(what, expected="py123d 0.7", got=str(error), remedy="pip install 'mudg[py123d]'") from error
     return py123d
 
 
