@@ -2,7 +2,7 @@
 
     python bench/fit.py                               # 40 frames of 3 cameras, 480x320, 3000 iterations
     python bench/fit.py --steps 60 --threads 1        # a quick look: the first 60 of them
-    python bench/fit.py --densify mcmc --json fit.json
+    python bench/fit.py --densify none --json fit.json
 
 The scene is a generated city, made once and kept in --work. The loop is `gaussians/fit.py` as it is: its functions are
 wrapped with a clock, nothing is left out. With one thread processor time is measured, else wall time. "rasteriser" is
@@ -199,7 +199,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=40)
     parser.add_argument("--cameras", type=int, default=3, choices=(1, 2, 3))
     parser.add_argument("--size", default="480x320")
-    parser.add_argument("--densify", default="gradient", choices=("gradient", "mcmc", "none"))
+    parser.add_argument("--densify", default="gradient", choices=("gradient", "none"))
     parser.add_argument(
         "--work", default=str(Path(tempfile.gettempdir()) / "mudg_bench_fit"), help="where the generated scene is kept"
     )

@@ -35,15 +35,7 @@ from mudg.core.table import Table
 from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.gaussians import fit
 from mudg.gaussians.appearance import Appearance
-from mudg.gaussians.densify import (
-    DensifySettings,
-    DensifyStats,
-    McmcSettings,
-    densify,
-    drift,
-    order_of_place,
-    relocate_and_grow,
-)
+from mudg.gaussians.densify import DensifySettings, DensifyStats, densify
 from mudg.gaussians.model import SceneModel, compose
 from mudg.gaussians.nodes import SkyNode, StaticNode
 from mudg.gaussians.perception import perception_of
@@ -71,11 +63,9 @@ def world(tmp_path_factory) -> dict[str, Path]:
 
 @pytest.fixture(autouse=True)
 def early_densification(monkeypatch):
-    """Rounds of both kinds within a few steps."""
+    """Rounds within a few steps."""
 
-    def schedule(config: MethodConfig, *_given: float) -> DensifySettings | McmcSettings | None:
-        if config.densify.kind == "mcmc":
-            return McmcSettings(2, 4, 2, max_rows=config.densify.max_gaussians)
+    def schedule(config: MethodConfig, *_given: float) -> DensifySettings | None:
         return DensifySettings(2, 4, 2, static_gradient=1e-4, max_rows=config.densify.max_gaussians, reset_every=3)
 
     monkeypatch.setattr(fit, "densify_schedule", schedule)
@@ -124,7 +114,6 @@ def fitted(world: dict[str, Path], out: Path, config: MethodConfig, **more: Path
 CASES = {
     "gradient": ("street_gaussians", {"sh_degree": 1, "poses__learn": True, "poses__start": 0.3, "poses__rounds": 2}),
     "everything": ("mudg_s", {**EVERYTHING, "densify__kind": "gradient"}),
-    "mcmc": ("mudg_s", {"densify__kind": "mcmc", "appearance__exposure": "camera"}),
 }
 
 
@@ -139,7 +128,7 @@ def test_a_fit_has_the_numbers_of_the_cpu(world, tmp_path, case):
     assert_same_fit(there, here)
     lines = [[json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()] for folder in (here, there)]
     did = set().union(*lines[0])
-    assert did >= ({"relocated"} if changes.get("densify__kind") == "mcmc" else {"cloned", "split", "pruned"})
+    assert did >= {"cloned", "split", "pruned"}
     assert ("boxes_moved_m" in did) == bool(changes.get("poses__learn"))
     for mine, theirs in zip(*lines, strict=True):
         assert mine.keys() == theirs.keys()
@@ -237,32 +226,20 @@ def test_densification_brings_no_rows_back(plain_fit):
     noise."""
     draw = torch.Generator().manual_seed(0)
     gradient = DensifySettings(1, 9, 1, max_rows=5000, least_opacity=0.1)
-    chain_of_copies = McmcSettings(1, 9, 1, max_rows=5000, least_opacity=0.2)
     model = fit.load_model(plain_fit)
     rows = len(model.table)
     seen_rows = DensifyStats(torch.rand(rows, generator=draw) * 4e-3, torch.ones(rows))
     with pretend_device() as there:
-        far, noted = model.to(there), {}
-        stats = seen_rows.to(there)
-        for name, change in {
-            "densify": lambda m, s: densify(m, s, 4, gradient, 0),
-            "relocate": lambda m, s: relocate_and_grow(m, 5, chain_of_copies, 0),
-            "drift": lambda m, s: drift(m, 6, 1e-3, replace(chain_of_copies, gate_opacity=0.9), 0),
-        }.items():
-            with transfers() as seen:
-                found = change(far, stats)
-            assert found == change(model, seen_rows), name
-            noted[name] = [copy for copy in seen if copy.values > NUMBERS]
-            assert all(copy.way == "there" for copy in noted[name]), noted[name]
-            torch.testing.assert_close(
-                far.table["means"].detach().cpu(), model.table["means"].detach(), atol=1e-6, rtol=1e-6
-            )
-            if found:
-                assert sum(found.values()) > found["rows"], found
-        assert {copy.where for copy in noted["densify"]} == {"gaussians/densify.py:_halves"}
-        assert not noted["relocate"]
-        assert [copy.where for copy in seen if copy.way == "wait"] == ["gaussians/densify.py:drift"]
-        assert {copy.where for copy in noted["drift"]} == {"gaussians/densify.py:drift"}
+        far, stats = model.to(there), seen_rows.to(there)
+        with transfers() as seen:
+            found = densify(far, stats, 4, gradient, 0)
+        assert found == densify(model, seen_rows, 4, gradient, 0)
+        noted = [copy for copy in seen if copy.values > NUMBERS]
+        assert all(copy.way == "there" for copy in noted), noted
+        assert {copy.where for copy in noted} == {"gaussians/densify.py:_halves"}
+        means = far.table["means"].detach().cpu()
+        torch.testing.assert_close(means, model.table["means"].detach(), atol=1e-6, rtol=1e-6)
+        assert sum(found.values()) > found["rows"], found
 
 
 def test_what_is_not_finite_is_found_in_one_look(world):
@@ -371,11 +348,6 @@ def test_colors_of_cameras_are_mapped_there():
         with transfers() as seen:
             colors.image_of("rear", moved)
         assert not seen
-
-
-def test_rows_are_put_in_the_order_of_their_place_with_ties_as_they_come():
-    means = torch.tensor([[1.0, 2, 3], [1, 2, 3], [0, 5, 5], [1, 2, 1], [-0.0, 5, 5], [1, 0, 9]])
-    assert order_of_place(means).tolist() == [2, 4, 5, 3, 0, 1]
 
 
 @pytest.mark.parametrize("kind", ["filters", "lpips"])

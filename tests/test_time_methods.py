@@ -581,8 +581,6 @@ def test_what_a_method_cannot_follow_is_refused(world, tmp_path, method):
     for weight in WEIGHTS.get(method, ()):
         with pytest.raises(UsageError, match="published weights of its own"):
             fit_to_world(settings=small_fit(method, **{weight.replace(".", "__"): 0.33})).run()
-    with pytest.raises(UsageError, match="densifies by gradients"):
-        fit_to_world(settings=small_fit(method, densify__kind="mcmc")).run()
     (tmp_path / "other").mkdir()
     (tmp_path / "other" / "model.json").write_text("{}")
     with pytest.raises(UsageError, match="cannot go on"):

@@ -342,23 +342,6 @@ def object_map(object_alpha: Tensor, inside_boxes: Tensor, floor: float = 1e-3) 
 # ---- regularisers --------------------------------------------------------------------------------
 
 
-def opacity_and_scale(
-    opacity: Tensor, scales_m: Tensor, opacity_weight: float, scale_weight: float
-) -> dict[str, Tensor]:
-    """Weighted mean opacity and mean scale of all Gaussians (Kheradmand et al. 2024), scalars by name; a weight of 0
-    leaves a term out.
-
-    Args:
-        opacity: ``[N]`` in [0, 1]. scales_m: ``[N, 3]`` metres.
-    """
-    terms = {}
-    if opacity_weight:
-        terms["opacity"] = opacity_weight * opacity.mean()
-    if scale_weight:
-        terms["scale"] = scale_weight * scales_m.mean()
-    return terms
-
-
 def identity_distance(difference: Tensor) -> Tensor:
     """Mean absolute entry (scalar) of what a colour map differs from the identity by, ``[3, 4]`` (Street Gaussians)."""
     return difference.abs().mean()

@@ -36,7 +36,7 @@ from mudg.core.pictures import panels_of
 from mudg.core.raster.rasterize import RasterConfig, drawing_device, rasterize
 from mudg.gaussians import storage, views
 from mudg.gaussians.appearance import Appearance
-from mudg.gaussians.densify import DensifySettings, DensifyStats, McmcSettings, densify_if_due, shorten_needles
+from mudg.gaussians.densify import DensifySettings, DensifyStats, densify_if_due, shorten_needles
 from mudg.gaussians.model import CERTAINTY, SceneModel, compose, composite_sky, sky_lift
 from mudg.gaussians.nodes import RigidNode
 from mudg.gaussians.perception import Perception, perception_of
@@ -65,9 +65,6 @@ EXPOSURE_WEIGHT = 0.01
 LEAST_WITNESSES, WITNESS_SHARE = 8, 0.015
 """Recorded views that the certainty is computed from, at most: this many, or this share of the steps (one costs about a
 step)."""
-MCMC_WEIGHTS = 0.01, 0.001
-"""Of opacity and scale (published: 0.01 each, the scale in a scene of unit size; learning rates here belong to scenes
-of 10 m)."""
 
 
 def check(config: FitConfig, *, fused: bool, virtual: bool, continued: bool) -> None:
@@ -116,7 +113,7 @@ class FitState:
     model: SceneModel
     views: ViewSet
     stats: DensifyStats
-    schedule: DensifySettings | McmcSettings | None
+    schedule: DensifySettings | None
     step: int
     seconds: float = 0.0
     last: Mapping[str, float] | None = None
@@ -196,7 +193,7 @@ def start_state(
     return FitState(model, shown, stats, _schedule_of(config), 0, appearance=_nothing_corrected(config, shown))
 
 
-def _schedule_of(config: FitConfig) -> DensifySettings | McmcSettings | None:
+def _schedule_of(config: FitConfig) -> DensifySettings | None:
     return densify_schedule(config, recipe_of(config.method).last_densified)
 
 
@@ -266,8 +263,7 @@ def optimise(state: FitState, config: FitConfig, folder: RunDir) -> None:
             if pose_round_due(config, step):
                 moved_m = refine_poses(state.model, state.views.recorded, raster, state.appearance)
                 folder.log(step=step, boxes_moved_m=round(moved_m, 5))
-            rate_m = learning_rates(step, config.iterations)["means"]
-            densified = densify_if_due(state.model, state.stats, state.schedule, step, rate_m, config.seed)
+            densified = densify_if_due(state.model, state.stats, state.schedule, step, config.seed)
             if densified:
                 state.stats = DensifyStats.zeros(len(state.model.table), state.device)
 
@@ -324,7 +320,8 @@ def _learn_from(state: FitState, view: TrainView, how: LearnStep) -> tuple[Learn
         terms |= recipe.terms(DrawnView(model, gaussians, render, view, step, config, raster))
     else:
         terms = virtual_terms(state, render, view, config, how.perception)
-    terms |= regularisers(gaussians, config) if how.first else {}
+    if how.first and config.loss.opacity_weight:
+        terms["opacity"] = config.loss.opacity_weight * gaussians.opacity.mean()
     terms |= correction_terms(state, gaussians, view, config, raster, step)
     how.check.terms(view.name, terms)
     torch.stack(list(terms.values())).sum().backward()
@@ -402,15 +399,6 @@ def virtual_terms(
         total, lift = weight[0].numel() / weights.semantic_weight, sky_lift(state.model, render.alpha)
         terms["virtual_semantics"] = native_ops.class_loss(render.extra, view.channels, weight[0], total, lift)
     return terms
-
-
-def regularisers(gaussians: Gaussians, config: FitConfig) -> dict[str, Tensor]:
-    """Weighted mean opacity and mean scale of all Gaussians; unset weights are those published with ``mcmc``, else
-    0."""
-    usual = MCMC_WEIGHTS if config.densify.kind == "mcmc" else (0.0, 0.0)
-    own = config.loss.opacity_weight, config.loss.scale_weight
-    weights = (other if weight is None else weight for weight, other in zip(own, usual))
-    return losses.opacity_and_scale(gaussians.opacity, gaussians.scales, *weights)
 
 
 def correction_terms(

@@ -115,9 +115,6 @@ class OwnRecipe(Recipe):
                 reason = "knows nothing of it" if name in unfit else "has published weights of its own"
                 remedy = "leave the setting out, or choose --method street_gaussians"
                 raise UsageError(f"{config.method} {reason}", where=name, expected=expected, got=got, remedy=remedy)
-        if config.densify.kind == "mcmc":
-            what, where = f"{config.method} densifies by gradients", "densify.kind"
-            raise UsageError(what, where=where, expected="gradient or none", got="mcmc")
 
 
 RECIPES: Final[Mapping[str, str]] = {

@@ -17,7 +17,7 @@ from torch import Tensor
 from mudg.base.errors import NumericsError
 from mudg.core.table import Table
 from mudg.gaussians.appearance import Appearance
-from mudg.gaussians.densify import DensifySettings, McmcSettings
+from mudg.gaussians.densify import DensifySettings
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.settings import DensifyConfig, FitConfig, StartConfig
 
@@ -158,16 +158,12 @@ def appearance_rates(step: int, iterations: int) -> dict[str, float]:
     return {"affine": 2e-3 * gentle, "shift": 1e-3 * gentle, "turn": 1e-4 * gentle}
 
 
-def densify_schedule(config: FitConfig, last: float = LAST_DENSIFIED) -> DensifySettings | McmcSettings | None:
-    """The published schedules, scaled to the iterations; None without densification.
-
-    gradient: from 500, every 100, until ``last`` of the run, opacity reset every 3000. mcmc: the same rounds until 0.8.
-    """
+def densify_schedule(config: FitConfig, last: float = LAST_DENSIFIED) -> DensifySettings | None:
+    """The published schedule, scaled to the iterations: from 500, every 100, until ``last`` of the run, opacity reset
+    every 3000; None without densification."""
     total, most = config.iterations, config.densify.max_gaussians
     every = max(10, min(100, total // 20))
     start = max(every, min(500, total // 10))
-    if config.densify.kind == "mcmc":
-        return McmcSettings(start, int(0.8 * total), every, most)
     if config.densify.kind == "none":
         return None
     stop, reset_every = int(last * total), 3000 if total >= 10_000 else 0

@@ -25,9 +25,8 @@ class StartConfig:
 class DensifyConfig:
     """Adding, removing and shaping Gaussians during the fit."""
 
-    kind: Literal["gradient", "mcmc", "none"] = "gradient"
-    """gradient: clone, split and prune by image gradients. mcmc: move unused Gaussians and grow to max_gaussians. none:
-    keep the initial number."""
+    kind: Literal["gradient", "none"] = "gradient"
+    """gradient: clone, split and prune by image gradients. none: keep the initial number."""
     max_gaussians: int = setting(default=120_000, ge=100)
     """Largest number of Gaussians. More give finer detail and take more time and memory."""
     longest_to_middle: float = setting(default=10.0, ge=1)
@@ -94,11 +93,9 @@ class RecordedLossConfig:
     object_weight: float = setting(default=0.0, ge=0)
     """Weight of the term that makes dynamic objects opaque or empty inside their boxes and removes haze outside
     (published: 0.1)."""
-    opacity_weight: float | None = setting(default=None, ge=0)
-    """Weight that lowers all opacities, so that Gaussians that no view needs fade (not given: 0.01 with mcmc, else
-    0)."""
-    scale_weight: float | None = setting(default=None, ge=0)
-    """Weight per metre that shrinks all Gaussians (not given: 0.001 with mcmc, else 0)."""
+    opacity_weight: float = setting(default=0.0, ge=0)
+    """Weight that lowers all opacities, so that Gaussians that no view needs fade. 0.01 helps shifted views of fits
+    without generated ones."""
 
 
 @settings

@@ -187,7 +187,7 @@ def _refuse(request: Request) -> None:
         raise UsageError(
             "gsplat gives absolute gradients of projected means only of linearly projected ellipsoids",
             got=f"projection={config.projection!r}, primitive={config.primitive!r}",
-            remedy="densify without them (mcmc), or draw linearly projected ellipsoids",
+            remedy="draw linearly projected ellipsoids",
         )
     if config.projection == "unscented" and any(pose is not None and pose.requires_grad for pose in request.poses):
         raise UsageError(
