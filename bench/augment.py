@@ -67,7 +67,7 @@ def exact(work: Path, seed: int, shifts_m: Sequence[float], every: int = 1) -> l
     """What a camera would see in the city itself."""
     world = CityWorld.from_source(mudg.read_scene(city(work, seed)).source)
     found = (world.render(view, supersample=2) for view in beside(work, seed, shifts_m)[::every])
-    return [(truth.rgb, truth.semantics) for truth in found]
+    return [(truth.rgb_u8, truth.semantics) for truth in found]
 
 
 def recorded(work: Path, seed: int) -> list[Labelled]:
