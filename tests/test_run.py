@@ -46,7 +46,9 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 
     monkeypatch.setattr(Step, "run", stand_in)
     monkeypatch.setattr(pipeline, "_has_semantics", lambda _scene: seen["labelled"])
-    monkeypatch.setattr(pipeline, "_forecast", lambda _config, scene: f"forecast of {scene.name}")
+    monkeypatch.setattr(
+        pipeline, "_forecast", lambda _config, scene: (f"forecast of {scene.name}", {"fuse": 200, "score": 100})
+    )
     monkeypatch.setattr(pipeline, "_teaches", lambda _config, _scene: seen["teaches"])
     monkeypatch.setattr(score, "summary_table", lambda _out: "table")
 
@@ -110,6 +112,8 @@ def test_a_forecast_is_said_before_the_first_long_step(
     chain(tmp_path, run_preset("fast"))
     said = capsys.readouterr().err
     assert said.index("== ingest") < said.index("forecast of scene") < said.index("== fuse")
+    assert "== fuse (step 1 of 9, about 5 min left)" in said
+    assert "== report (step 9 of 9)" in said
     assert verbs["ingest"].settings.resolution == "", "a city has a size of its own"
     chain(tmp_path, run_preset("fast"))
     assert "forecast" not in capsys.readouterr().err

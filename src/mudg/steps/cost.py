@@ -167,7 +167,7 @@ def in_words(
         lines.append(f"  memory and disk of this machine suffice for: {names}")
     lines.append(f"  {'time per step':<30}" + "".join(f"{name:>12}" for name in found))
     for step in max((one.seconds for one in found.values()), key=len):
-        cells = ["not taken" if step not in one.seconds else _duration(one.seconds[step]) for one in found.values()]
+        cells = ["not taken" if step not in one.seconds else duration(one.seconds[step]) for one in found.values()]
         lines.append(f"    {step:<28}" + "".join(f"{cell:>12}" for cell in cells))
     return lines
 
@@ -176,8 +176,8 @@ def in_a_line(idle: Estimate, now: Estimate) -> str:
     """What a run is about to take, on this machine undisturbed and as busy as it is now."""
     total_s, now_s = (sum(value or 0.0 for value in one.seconds.values()) for one in (idle, now))
     longest = sorted(idle.seconds, key=lambda name: -(idle.seconds[name] or 0.0))[:3]
-    busy = f", about {_duration(now_s)} if it stays as busy as it is now" if now_s > FACTOR * total_s else ""
-    parts = f" ({', '.join(f'{name} {_duration(idle.seconds[name])}' for name in longest)})" if total_s else ""
+    busy = f", about {duration(now_s)} if it stays as busy as it is now" if now_s > FACTOR * total_s else ""
+    parts = f" ({', '.join(f'{name} {duration(idle.seconds[name])}' for name in longest)})" if total_s else ""
     space = f"{memory.in_words(idle.memory_bytes)} of memory, {memory.in_words(idle.written_bytes)} on disk"
     return f"forecast: {_time(idle)} on this machine{busy}{parts}; {space}"
 
@@ -187,10 +187,11 @@ def _time(one: Estimate) -> str:
     if len(unknown) == len(one.seconds):
         return "time not measured"
     more = f" and {', '.join(unknown)} (not measured)" if unknown else ""
-    return f"about {_duration(sum(value or 0.0 for value in one.seconds.values()))}{more}"
+    return f"about {duration(sum(value or 0.0 for value in one.seconds.values()))}{more}"
 
 
-def _duration(seconds: float | None) -> str:
+def duration(seconds: float | None) -> str:
+    """Seconds, minutes or hours in words."""
     if seconds is None:
         return "-"
     if seconds < 90:

@@ -88,7 +88,9 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
     config = with_device(config)
     try:
         scene = _prepare_scene(config, source, out, ledger, overwrite)
-        for name, step in steps_of(config, scene, out, overwrite).items():
+        steps = steps_of(config, scene, out, overwrite)
+        ledger.ahead = [*steps, "viewer", "report"]
+        for name, step in steps.items():
             ledger.timed(name, step.out, step.run)
         key = _report_key(out)
         if not ledger.has_report(key):
@@ -181,15 +183,16 @@ def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Le
         ingest = Ingest(log=str(source), out=out / "scene", overwrite=overwrite, settings=settings)
         scene = ledger.timed("ingest", ingest.out, ingest.run)
     if not ledger.has_done("fuse"):
-        log.info(_forecast(config, scene))
+        said, ledger.expected_s = _forecast(config, scene)
+        log.info(said)
     if not _has_semantics(scene):
         step = Annotate(scene=scene, out=out / "annotate", overwrite=overwrite, settings=config.annotate)
         return ledger.timed("annotate", step.out, step.run)
     return scene
 
 
-def _forecast(config: RunConfig, scene: Path) -> str:
-    """A line on what the steps from here on will take."""
+def _forecast(config: RunConfig, scene: Path) -> tuple[str, Mapping[str, float | None]]:
+    """A line on what the steps from here on will take, and the seconds of each on the machine as it is now."""
     from mudg import native
     from mudg.base import devices
     from mudg.core.raster import rasterize as probe
@@ -200,7 +203,7 @@ def _forecast(config: RunConfig, scene: Path) -> str:
     size, cores, speed = scene_size(read_scene(scene), config), native.default_threads(), probe.speed()
     kind = "cpu" if config.device == "cpu" or devices.usual_device() == "cpu" else "cuda"
     idle, now = (cost.estimate(config, size, cores, one, kind) for one in (speed.idle, speed.now))
-    return cost.in_a_line(idle, now)
+    return cost.in_a_line(idle, now), now.seconds
 
 
 def _has_semantics(scene: Path) -> bool:
@@ -328,6 +331,10 @@ class _Ledger:
         self._steps: dict[str, dict[str, Any]] = dict(before.get("steps", {}))
         self._report = dict(before.get("report", {}))
         self.digests: dict[str, str] = {}
+        self.ahead: list[str] = []
+        """Names of the steps on a labelled scene, once they are known."""
+        self.expected_s: Mapping[str, float | None] = {}
+        """Forecast of steps by name."""
 
     @classmethod
     def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
@@ -397,6 +404,22 @@ class _Ledger:
         """Whether a step has ended before."""
         return self._steps.get(step, {}).get("state") == "complete"
 
+    def _standing(self, name: str) -> str:
+        """Which step of how many this is, and what is left: the forecast, corrected by what finished steps took."""
+        from mudg.steps import cost
+
+        if name not in self.ahead:
+            return ""
+        at, known = self.ahead.index(name), {key: value for key, value in self.expected_s.items() if value}
+        done = [one for one in self.ahead[:at] if one in known]
+        place = f" (step {at + 1} of {len(self.ahead)}"
+        if not set(self.ahead[at:]) & known.keys():
+            return f"{place})"
+        taken = sum(self._steps[one]["seconds"] for one in done)
+        pace = taken / sum(known[one] for one in done) if done and taken else 1.0
+        left_s = pace * sum(known.get(one, 0.0) for one in self.ahead[at:])
+        return f"{place}, about {cost.duration(left_s)} left)"
+
     def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
         """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result
         adds none. The next step begins with the memory that this one took given back."""
@@ -404,7 +427,7 @@ class _Ledger:
 
         finished = self.has_done(name) and result.exists()
         meter, state = Meter(), "interrupted"
-        log.info(f"== {name}")
+        log.info(f"== {name}{self._standing(name)}")
         try:
             made = run()
             release_memory()
