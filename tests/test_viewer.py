@@ -35,6 +35,7 @@ from mudg.gaussians.rendering import raster_of, render_view
 from mudg.scene.read import read_scene
 from mudg.viewer import page as viewer_page
 from mudg.viewer import view
+from mudg.viewer.live import GROUND
 from mudg.viewer.page import (
     BLOCK,
     blob_of,
@@ -454,6 +455,55 @@ def test_a_camera_path_is_played_and_saved_for_render(opened: Browser, toy: Toy,
 
 
 @pytest.mark.slow
+def test_views_have_a_field_of_view_ground_and_a_vehicle(opened: Browser) -> None:
+    angle = "(view) => 360 / Math.PI * Math.atan(view.width / 2 / view.fx)"
+    change = lambda **state: opened.run(f"mudg.settled({json.dumps(state)}).then(() => (mudg.draw(1, true), 1))")
+    recorded = opened.run("mudg.facts.cameras.front")
+    change(mode="recorded", camera="front", t=0.4, shift=0, up=0, fov=0, boxes=False)
+    assert opened.run("mudg.last.view.fx / mudg.last.view.width") == pytest.approx(recorded["fx"] / recorded["width"])
+    for mode in ("recorded", "chase"):
+        change(mode=mode, fov=100)
+        assert opened.run(f"({angle})(mudg.last.view)") == pytest.approx(100)
+    assert "w=100" in opened.run("location.hash")
+    assert opened.run("document.getElementById('fov-text').textContent") == "100\u00b0"
+    opened.run("document.getElementById('center').click(), 1")
+    assert opened.run("[mudg.state.mode, mudg.state.fov]") == ["recorded", 0]
+    # grey ground below the horizon of a free view, sky above it
+    change(mode="fly", eye=[0, 0, 30], yaw=3.14, pitch=0)
+    colors = opened.run("Array.from(mudg.renderer.bytes(mudg.pictureOf('left', mudg.used().left, mudg.last.view)))")
+    seen = np.array(colors).reshape(*opened.run("[mudg.last.view.height, mudg.last.view.width, 4]"))[..., :3] / 255
+    rows = len(seen) // 4
+    assert np.abs(seen[-rows:] - GROUND).max() < 0.01
+    assert np.abs(seen[:rows] - GROUND).max(-1).min() > 0.03
+    # the recording vehicle has a box where it is seen from outside, and no name covers another
+    change(mode="chase", t=0.4, boxes=True, fov=0)
+    names = opened.run("mudg.overlayDrawer.labels.map((label) => label.text)")
+    assert any(name.startswith("recording vehicle") for name in names)
+    opened.run(
+        "mudg.overlayDrawer.labels.push({...mudg.overlayDrawer.labels[0], far: 1e3}), mudg.overlayDrawer.names(), 1"
+    )
+    assert opened.run("mudg.overlayDrawer.named <= mudg.overlayDrawer.labels.length - 1")
+    change(mode="recorded", boxes=True)
+    assert not any("recording" in name for name in opened.run("mudg.overlayDrawer.labels.map((label) => label.text)"))
+    change(boxes=False)
+    assert opened.errors == []
+
+
+@pytest.mark.slow
+def test_who_is_here_for_the_first_time_gets_a_hint(toy: Toy, tmp_path: Path) -> None:
+    note = "document.getElementById('note').textContent"
+    with Browser(tmp_path / "profile", size=(900, 500)) as one:
+        one.open(f"file://{toy[0] / 'page.html'}")
+        assert one.run(note).startswith("Drag to look around")
+        assert one.run("!document.getElementById('full').hidden")
+        one.run("dispatchEvent(new KeyboardEvent('keydown', {key: 'b', code: 'KeyB'})), 1")
+        assert one.run(note) == ""
+        one.open("about:blank", "true")
+        one.open(f"file://{toy[0] / 'page.html'}")
+        assert one.run(note) == ""
+
+
+@pytest.mark.slow
 def test_hidden_objects_are_gone(opened: Browser, toy: Toy) -> None:
     with_car = opened.measure(["class"], camera="front", t=0.4)["class"]
     without = opened.measure(["class"], camera="front", t=0.4, hidden=["car-1"])["class"]
@@ -629,6 +679,24 @@ def test_the_server_draws_exact_frames(served: tuple[int, str], toy: Toy) -> Non
     assert status == 200
     true = render_view(toy[2], wanted, raster_of(toy[2])).rgb.permute(1, 2, 0).numpy()
     assert np.abs(np.asarray(Image.open(io.BytesIO(content))) / 255.0 - true).max() < 0.003
+
+
+def test_a_free_exact_frame_shows_ground_below_the_horizon(served: tuple[int, str], toy: Toy) -> None:
+    port, token = served
+    lens = {"width": 64, "height": 48, "fx": 40, "fy": 40, "cx": 32, "cy": 24}
+    at = {"eye": [-60, 0, 20], "axes": [[0, 1, 0], [0, 0, -1], [-1, 0, 0]], "time_s": 0.4}
+    here = {"Origin": f"http://localhost:{port}", "Host": f"localhost:{port}"}
+
+    def drawn(camera: str) -> np.ndarray:
+        body = {"scene": 0, "layer": "color", "hidden": [], "camera": camera, **lens, **at}
+        status, content = ask(port, "POST", "/frame", body, X_Mudg_Token=token, **here)
+        assert status == 200
+        return np.asarray(Image.open(io.BytesIO(content))) / 255.0
+
+    free, recorded = drawn(""), drawn("front")
+    assert np.abs(free[36:] - GROUND).max() < 0.01  # a sky of few rows is blurred at the horizon
+    assert np.abs(recorded[36:] - GROUND).max() > 0.03
+    assert np.abs(free[:12] - recorded[:12]).max() < 0.01
 
 
 def test_other_machines_need_a_token() -> None:

@@ -6,7 +6,7 @@ import functools
 import io
 import threading
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -23,6 +23,7 @@ from mudg.base.records import Number, StrictRecord
 from mudg.base.types import Camera, FusedCloud, Observation, Scene, View
 from mudg.core.edit import Motion
 from mudg.core.pictures import class_colors, depth_colors, to_bytes
+from mudg.core.table import Table
 from mudg.diffusion.inputs import InWeather
 from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, left_behind, street_left, weather_of
 from mudg.editing.model import motion_of
@@ -31,7 +32,7 @@ from mudg.editing.runs import find_run
 from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edits
 from mudg.formats.exporters.video import mp4_bytes
 from mudg.gaussians.model import SceneModel
-from mudg.gaussians.nodes import RigidNode
+from mudg.gaussians.nodes import RigidNode, SkyNode
 from mudg.gaussians.rendering import raster_of, render_view
 from mudg.viewer.page import begin_of, key_rows
 from mudg.viewer.report import FAR_M, NEAR_M
@@ -229,6 +230,8 @@ def _sealed(path: Path) -> bool:
 
 
 # -- frames ----------------------------------------------------------------------------------------
+GROUND: Final = (0.43, 0.43, 0.42)
+"""What free views show of uncovered ground; as in `assets/viewer/shaders.js`."""
 LAYERS: Final = ("color", "depth", "class")
 VIDEO_CRF: Final = 18
 """x264's quality of videos; lower is better."""
@@ -281,6 +284,16 @@ class _Shown:
     edits: str
     models: list[SceneModel]
     weather: dict[int, InWeather]
+
+
+def over_ground(model: SceneModel) -> SceneModel:
+    """The scene with grey ground where nothing covers it below the horizon. Its sky reaches there, too, but is right
+    from the recorded path only."""
+    if model.sky is None:
+        return model
+    panorama = model.sky.table["panorama"].detach().clone()
+    panorama[..., model.sky.rows // 2 :, :] = panorama.new_tensor(GROUND)[:, None, None]
+    return replace(model, sky=SkyNode(Table({"panorama": panorama})))
 
 
 def _drawer_of(model: SceneModel) -> Drawer:
@@ -343,7 +356,8 @@ class FrameSource:
             index = min(asked.scene, len(self._shown.models) - 1)
             model = self._shown.models[index]
             gone = [name for name in asked.hidden if name in model.node_names()]
-            draw = _drawer_of(model.without_nodes(gone) if gone else model)
+            seen = model if asked.camera else over_ground(model)
+            draw = _drawer_of(seen.without_nodes(gone) if gone else seen)
             conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
             if conditions is None or asked.layer != "color":
                 return draw

@@ -1,13 +1,16 @@
 // Where the page looks from: along the recorded drive, behind or above the vehicle, round a point, or freely.
 //
-// A view is {width, height, fx, fy, cx, cy, eye, axes: [right, down, ahead], gain, offset}: a pinhole camera in the world.
+// A view is {width, height, fx, fy, cx, cy, eye, axes: [right, down, ahead], gain, offset, ground}: a pinhole camera in the world; `ground`:
+// what nothing covers below the horizon is drawn as ground. The recorded sky reaches below the horizon, too, but is right from the path only.
 
 import { PoseKeys, add, clamp, cross, dot, keysAround, quaternionOf, rotationOf, slerp, sub, unit } from "mudg/math";
 import { along } from "mudg/path";
 
 /** Ways to look, with their names for people. */
 export const MODES = { recorded: "Recorded camera", chase: "Behind the vehicle", top: "From above", orbit: "Round a point", fly: "Free", path: "Along your path" };
-const UP = [0, 0, 1], SAME = { gain: [1, 1, 1], offset: [0, 0, 0] };
+/** The recorded path, as it was recorded. */
+export const HOME = { mode: "recorded", shift: 0, up: 0, fov: 0 };
+const UP = [0, 0, 1], SAME = { gain: [1, 1, 1], offset: [0, 0, 0], ground: true };
 const MIDDLE = [0.3, 0.4, 0.5, 0.6, 0.7]; // places in a view, across and down, that tell whether a recorded camera looked there
 const HEIGHT_OF_VIEW = 0.9; // radians, of cameras that are not recorded ones
 
@@ -72,14 +75,14 @@ export class Cameras {
 
   /** The view in pixels of a picture of at most width x height, and whether it keeps the proportions of a recorded camera. */
   view(width, height) {
-    const { mode, camera, t, shift, up } = this.state, recorded = this.drive.facts.cameras[camera];
+    const { mode, camera, t, shift, up, fov } = this.state, recorded = this.drive.facts.cameras[camera];
     const colors = { gain: recorded.gain, offset: recorded.offset };
     if (mode === "recorded") {
       const scale = Math.min(width / recorded.width, height / recorded.height);
       const w = Math.max(1, Math.round(recorded.width * scale)), h = Math.max(1, Math.round(recorded.height * scale));
-      return { ...this.shifted(camera, t, shift, up), ...resized(recorded, w, h), ...colors };
+      return { ...this.shifted(camera, t, shift, up), ...lens(recorded, w, h, fov), ...colors };
     }
-    const f = 0.5 * height / Math.tan(HEIGHT_OF_VIEW / 2);
+    const f = fov ? focal(width, fov) : 0.5 * height / Math.tan(HEIGHT_OF_VIEW / 2);
     return { ...this.free(), width, height, fx: f, fy: f, cx: width / 2, cy: height / 2, ...SAME };
   }
 
@@ -89,11 +92,11 @@ export class Cameras {
     return { eye: add(add(eye, this.drive.left(t), shift), UP, up), axes };
   }
 
-  /** The recorded camera of a frame with its exact intrinsics, optionally at another width. */
-  exact(camera, t, shift = 0, up = 0, width = 0) {
+  /** The recorded camera of a frame with its exact intrinsics, optionally at another width and with another field of view. */
+  exact(camera, t, shift = 0, up = 0, width = 0, fov = 0) {
     const recorded = this.drive.facts.cameras[camera], w = width || recorded.width;
     const h = Math.max(1, Math.round(recorded.height * w / recorded.width));
-    return { ...this.shifted(camera, t, shift, up), ...resized(recorded, w, h), gain: recorded.gain, offset: recorded.offset };
+    return { ...this.shifted(camera, t, shift, up), ...lens(recorded, w, h, fov), gain: recorded.gain, offset: recorded.offset };
   }
 
   free() {
@@ -184,8 +187,12 @@ export function rayOf({ axes: [right, down, ahead], fx, fy, cx, cy }, x, y) {
   return unit(add(add(ahead, right, (x + 0.5 - cx) / fx), down, (y + 0.5 - cy) / fy));
 }
 
-/** Intrinsics for another size of the same picture. */
-function resized(camera, width, height) {
-  const sx = width / camera.width, sy = height / camera.height;
-  return { width, height, fx: camera.fx * sx, fy: camera.fy * sy, cx: camera.cx * sx, cy: camera.cy * sy };
+/** Focal length of a field of view, degrees from left to right; and back. */
+const focal = (width, fov) => 0.5 * width / Math.tan(fov * Math.PI / 360);
+export const fovOf = ({ width, fx }) => 360 / Math.PI * Math.atan(0.5 * width / fx);
+
+/** Intrinsics for another size of the same picture, and another field of view as of `mudg render --fov-deg` (0: as recorded). */
+function lens(camera, width, height, fov) {
+  const sx = fov ? focal(width, fov) / camera.fx : width / camera.width, sy = fov ? sx : height / camera.height;
+  return { width, height, fx: camera.fx * sx, fy: camera.fy * sy, cx: camera.cx * width / camera.width, cy: camera.cy * height / camera.height };
 }

@@ -56,7 +56,7 @@ export function videoOf(app) {
   let view = null;
   for (let k = 0; k < framesOf(app); k++) {
     const t = k / FRAMES_PER_S, cameras = new Cameras(app.drive, { ...s, t });
-    view = s.mode === "recorded" ? cameras.exact(s.camera, t, s.shift, s.up) : cameras.view(canvas.width, canvas.height);
+    view = s.mode === "recorded" ? cameras.exact(s.camera, t, s.shift, s.up, 0, s.fov) : cameras.view(canvas.width, canvas.height);
     moments.push({ time_s: t + facts.begin_s, eye: view.eye, axes: view.axes });
   }
   return { ...wanted(app, view), fps: FRAMES_PER_S, moments };

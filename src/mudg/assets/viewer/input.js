@@ -1,5 +1,6 @@
 // Mouse, touch and keyboard on the picture.
 
+import { HOME } from "mudg/cameras";
 import { clamp } from "mudg/math";
 import { objectAt } from "mudg/gizmo";
 import { LAYERS } from "mudg/shaders";
@@ -79,7 +80,7 @@ function click(app, event) {
   if (!frame) app.change({ selected: view ? objectAt(view, ...placeOf(app, event), app.tracks, app.state.t) : null });
   else {
     document.getElementById("thumb").hidden = true;
-    app.change({ mode: "recorded", camera: frame.camera, t: frame.t, shift: 0, up: 0 });
+    app.change({ ...HOME, camera: frame.camera, t: frame.t });
   }
 }
 
@@ -116,7 +117,7 @@ function keyboard(app, controls) {
     else if (event.key === "ArrowLeft" && event.target.type !== "range") controls.step(-1);
     else if (event.key === "ArrowRight" && event.target.type !== "range") controls.step(1);
     else if (number >= 1 && number <= LAYERS.length && controls.has(LAYERS[number - 1])) app.change({ layer: LAYERS[number - 1] });
-    else if (event.key === "r") app.change({ mode: "recorded", shift: 0, up: 0 });
+    else if (event.key === "r") app.change(HOME);
     else if (event.key === "c") app.change({ mode: "chase" });
     else if (event.key === "t") app.change({ mode: "top" });
     else if (event.key === "f") controls.mode("fly");

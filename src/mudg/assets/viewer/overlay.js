@@ -5,8 +5,9 @@ import { along } from "mudg/path";
 
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
 const NEAREST = 0.25;
-const PATH_COLOR = "#ffd54a", PATH_STEPS = 100; // of the camera path
-const LABELS_WITHIN_M = 35; // names farther away would cover one another
+const EGO_COLOR = "hsl(0 0% 100%)", PATH_COLOR = "#ffd54a", PATH_STEPS = 100; // of the camera path
+const LABELS_WITHIN_M = 60; // names farther away would be of specks
+const EGO = { id: "", label: "recording vehicle", size_m: [4.6, 1.9, 1.5], ahead_m: 1.35 }; // a usual car, from its rear axle: logs do not know
 
 /** A colour that belongs to a track, the same on every page. */
 export function trackColor(id) {
@@ -38,6 +39,7 @@ export class Overlay {
     c.setTransform(1, 0, 0, 1, 0, 0);
     c.clearRect(0, 0, this.canvas.width, this.canvas.height);
     this.thumbnails = [];
+    this.labels = [];
     const flown = state.mode !== "path" && state.keys.length > 0;
     const empty = !(flown || state.boxes || state.paths || state.lidar || state.cameras || state.selected);
     this.canvas.style.visibility = empty ? "hidden" : "visible"; // a canvas that is only cleared may keep its old picture on the screen
@@ -56,6 +58,8 @@ export class Overlay {
       if (state.paths || chosen) this.path(view, track, state.t);
       if (state.boxes || chosen) this.box(view, track, state.t, chosen);
     }
+    if (state.boxes && state.mode !== "recorded") this.box(view, { ...EGO, pose: this.egoKeys() }, state.t, false, EGO_COLOR);
+    this.names();
     if (state.paths) this.line(view, this.drive.ego.positions, "rgb(255 255 255 / .8)", 2);
     if (flown) this.flown(view, state.keys);
     if (state.selected) this.gizmo?.draw(c, view, ratio);
@@ -96,10 +100,36 @@ export class Overlay {
     this.line(view, here ? [here, ...future] : future, color, 1.5, [5, 4]);
   }
 
-  box(view, track, t, chosen) {
+  /** The recording vehicle's path, of the middle of its box: on the ground where that is known. */
+  egoKeys() {
+    const { ego } = this.drive, up = [0, 0, EGO.size_m[2] / 2];
+    const middle = ({ position: [x, y, z], rotation }) => add(add([x, y, this.gizmo?.editor.ground?.height(x, y) || z], turn(rotation, [EGO.ahead_m, 0, 0])), up);
+    const at = (pose) => pose && { ...pose, position: middle(pose) };
+    return { at: (t) => at(ego.at(t)), speed: (t) => ego.speed(t) };
+  }
+
+  /** Names of boxes: the chosen one, then the nearest; one that would cover another is left out. */
+  names() {
+    const c = this.context, unit = this.ratio, placed = [];
+    c.font = `${12 * unit}px system-ui, sans-serif`;
+    for (const { text, color, place: [x, y] } of this.labels.sort((a, b) => a.far - b.far)) {
+      const wide = c.measureText(text).width, box = [x - wide / 2 - 7 * unit, y - 19 * unit, x + wide / 2 + 4 * unit, y - 3 * unit];
+      if (placed.some((other) => box[0] < other[2] && box[2] > other[0] && box[1] < other[3] && box[3] > other[1])) continue;
+      placed.push(box);
+      c.fillStyle = "rgb(12 14 18 / .78)";
+      c.fillRect(box[0] + 3 * unit, box[1], wide + 8 * unit, 16 * unit);
+      c.fillStyle = color;
+      c.fillRect(box[0], box[1], 3 * unit, 16 * unit);
+      c.fillStyle = "#f2f4f8"; // some colours of boxes are hard to read
+      c.fillText(text, x - wide / 2, y - 7 * unit);
+    }
+    this.named = placed.length;
+  }
+
+  box(view, track, t, chosen, color = trackColor(track.id)) {
     const pose = track.pose.at(t);
     if (!pose) return;
-    const half = track.size_m.map((v) => v / 2), c = this.context, color = trackColor(track.id);
+    const half = track.size_m.map((v) => v / 2), c = this.context;
     const places = Array.from({ length: 8 }, (_, k) => add(pose.position,
       turn(pose.rotation, [(k & 4 ? 1 : -1) * half[0], (k & 2 ? 1 : -1) * half[1], (k & 1 ? 1 : -1) * half[2]])));
     const corners = places.map((place) => project(view, place)).filter(([, , z]) => z >= NEAREST);
@@ -118,15 +148,8 @@ export class Overlay {
     c.fill();
     if (!chosen && corners[0][2] > LABELS_WITHIN_M) return;
     const top = corners.reduce((best, corner) => (corner[1] < best[1] ? corner : best));
-    const speed = track.pose.speed(t), text = `${track.id} ${track.label}${speed > 0.2 ? ` ${(speed * 3.6).toFixed(0)} km/h` : ""}`;
-    c.font = `${12 * this.ratio}px system-ui, sans-serif`;
-    const wide = c.measureText(text).width;
-    c.fillStyle = "rgb(12 14 18 / .78)";
-    c.fillRect(top[0] - wide / 2 - 4 * this.ratio, top[1] - 19 * this.ratio, wide + 8 * this.ratio, 16 * this.ratio);
-    c.fillStyle = color;
-    c.fillRect(top[0] - wide / 2 - 7 * this.ratio, top[1] - 19 * this.ratio, 3 * this.ratio, 16 * this.ratio);
-    c.fillStyle = "#f2f4f8"; // some colours of boxes are hard to read
-    c.fillText(text, top[0] - wide / 2, top[1] - 7 * this.ratio);
+    const speed = track.pose.speed(t), text = `${track.id} ${track.label}${speed > 0.2 ? ` ${(speed * 3.6).toFixed(0)} km/h` : ""}`.trim();
+    this.labels.push({ text, color, place: top, far: chosen ? 0 : corners[0][2] });
   }
 
   points(view, t) {

@@ -266,6 +266,7 @@ export class Renderer {
       gl.uniform1i(places.scales, 2);
       gl.uniform1i(places.layer, number);
       gl.uniform1i(places.hasSky, loaded.sky ? 1 : 0);
+      gl.uniform1i(places.ground, view.ground ? 1 : 0);
       this.camera(places, view, false);
       gl.uniform2f(places.depthRange, ...this.facts.depth_range_m);
       gl.uniform3fv(places.gain, view.gain);

@@ -142,9 +142,11 @@ export const screenVertex = HEAD + `
 void main() { gl_Position = vec4(gl_VertexID == 1 ? 3.0 : -1.0, gl_VertexID == 2 ? 3.0 : -1.0, 0.0, 1.0); }`;
 
 /** Sums of one layer to a picture: sky behind colours, depth and confidence through their colour scales. */
+const GROUND = "0.43, 0.43, 0.42"; // as `live.GROUND`
+
 export const resolveFragment = HEAD + `
 uniform sampler2D sums, sky, scales; uniform int layer; uniform bool hasSky;
-uniform mat3 worldFromCamera; uniform vec4 intrinsics; uniform vec2 size, depthRange; uniform vec3 gain, offset; uniform vec4 fog, light, veil;
+uniform mat3 worldFromCamera; uniform vec4 intrinsics; uniform vec2 size, depthRange; uniform bool ground; uniform vec3 gain, offset; uniform vec4 fog, light, veil;
 out vec4 color;
 void main() {
   vec4 sum = texelFetch(sums, ivec2(gl_FragCoord.xy), 0);
@@ -154,7 +156,7 @@ void main() {
       vec2 pixel = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y);
       vec3 ray = worldFromCamera * vec3((pixel - intrinsics.zw) / intrinsics.xy, 1.0);
       vec2 at = vec2(atan(ray.y, ray.x) / 6.2831853 + 0.5, 0.5 - atan(ray.z, length(ray.xy)) / 3.14159265);
-      vec3 behind = texture(sky, at).rgb;
+      vec3 behind = ground && ray.z < 0.0 ? vec3(${GROUND}) : texture(sky, at).rgb;
       float thin = 300.0 * fog.a + 1000.0 * (veil.x + veil.z); // fog is 300 m high, clouds are 1000 m up
       behind = mix(fog.rgb, behind, exp(-thin / max(ray.z / length(ray), 0.01)));
       rgb += (1.0 - sum.a) * behind;

@@ -2,6 +2,7 @@
 
 import { scaled } from "mudg/app";
 import { scriptText } from "mudg/edits";
+import { fovOf } from "mudg/cameras";
 import { FRAMES_PER_S, pathText } from "mudg/path";
 import { toHash } from "mudg/state";
 import { zipOf } from "mudg/zip";
@@ -98,9 +99,9 @@ export async function saveEdits(app) {
 }
 
 /** Saves the camera path for `mudg render`. */
-export function savePath({ state, facts }) {
+export function savePath({ state, facts, last }) {
   save(new Blob([pathText(state.keys, facts.begin_s)], { type: "application/json" }), "path.json");
-  return "Saved path.json for mudg render --path.";
+  return `Saved path.json: mudg render --path path.json --fov-deg ${Math.round(fovOf(last.view))}`;
 }
 
 /** Puts a link to what is shown into the clipboard. */

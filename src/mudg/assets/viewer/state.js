@@ -1,14 +1,17 @@
 // What the page shows, as plain values, and as the part of its address behind "#", so that a link shows the same.
 
 import { LAYERS } from "mudg/shaders";
-import { MODES } from "mudg/cameras";
+import { HOME, MODES } from "mudg/cameras";
 import { clamp } from "mudg/math";
 import { keysOf, keysText } from "mudg/path";
+
+/** Fields of view to choose from, degrees from left to right. */
+export const FOV_DEG = [20, 130];
 
 /** State at the beginning. */
 export function initialState(facts) {
   return {
-    mode: "recorded", camera: Object.keys(facts.cameras)[0], t: 0, shift: 0, up: 0, layer: "color", playing: false, speed: 1, loop: true,
+    ...HOME, camera: Object.keys(facts.cameras)[0], t: 0, layer: "color", playing: false, speed: 1, loop: true,
     compare: "none", divider: 0.5, scene: 0, boxes: false, paths: false, lidar: false, cameras: false, hidden: new Set(), selected: null, edits: [], edition: 0,
     eye: [0, 0, 2], yaw: 0, pitch: 0, target: [0, 0, 0], distance: 12, behind: 12, height: 45, turn: 0, tilt: 0, keys: [],
   };
@@ -22,6 +25,7 @@ export function toHash(s) {
   const parts = { m: s.mode, c: s.camera, t: round(s.t), l: s.layer };
   if (s.shift) parts.s = round(s.shift);
   if (s.up) parts.u = round(s.up);
+  if (s.fov) parts.w = round(s.fov);
   if (s.compare !== "none") Object.assign(parts, { v: s.compare, d: round(s.divider) });
   if (s.scene) parts.f = s.scene;
   const flags = FLAGS.filter((name) => s[name]);
@@ -45,6 +49,7 @@ export function fromHash(hash, s, facts) {
   s.t = number("t", 0, facts.end_s, s.t);
   s.shift = number("s", -8, 8, s.shift);
   s.up = number("u", -2, 8, s.up);
+  s.fov = number("w", FOV_DEG[0], FOV_DEG[1], s.fov);
   s.divider = number("d", 0, 1, s.divider);
   s.scene = Math.round(number("f", 0, facts.scenes.length - 1, s.scene));
   if (["none", "divider", "difference"].includes((given.get("v") ?? "").split("-")[0])) s.compare = given.get("v");

@@ -1,9 +1,10 @@
 // The controls: each changes the state through App.change, and shows what the state says.
 
-import { MODES } from "mudg/cameras";
+import { HOME, MODES, fovOf } from "mudg/cameras";
 import { LAYERS } from "mudg/shaders";
 import { clamp, project } from "mudg/math";
 import { trackColor } from "mudg/overlay";
+import { FOV_DEG } from "mudg/state";
 import { exactVideos } from "mudg/exact";
 import { withKey } from "mudg/path";
 import { recordVideo, saveEdits, saveFrames, saveLink, savePath, savePicture } from "mudg/share";
@@ -51,7 +52,7 @@ export class Controls {
     const compare = { none: "Nothing" };
     if (facts.scenes.length > 1) Object.assign(compare, { "divider-scene": `${facts.scenes[1].name}, divider`, "difference-scene": `${facts.scenes[1].name}, difference` });
     if (facts.images.count) Object.assign(compare, { "divider-recorded": "Recorded image, divider", "difference-recorded": "Recorded image, difference" });
-    options($("compare"), compare, (value) => change({ compare: value, ...(value.endsWith("recorded") ? { mode: "recorded", shift: 0, up: 0 } : {}) }));
+    options($("compare"), compare, (value) => change({ compare: value, ...(value.endsWith("recorded") ? HOME : {}) }));
     $("compare").disabled = !others;
     for (const [name, title] of Object.entries(OVERLAYS)) {
       if (name === "lidar" && !facts.lidar.length) continue;
@@ -133,7 +134,8 @@ export class Controls {
     const { app } = this, set = () => app.change({ shift: Number($("shift").value), up: Number($("up").value), mode: "recorded" });
     $("shift").oninput = set;
     $("up").oninput = set;
-    $("center").onclick = () => app.change({ shift: 0, up: 0, mode: "recorded" });
+    Object.assign($("fov"), { min: FOV_DEG[0], max: FOV_DEG[1], oninput: ({ target }) => app.change({ fov: Number(target.value) }) });
+    $("center").onclick = () => app.change(HOME);
   }
 
   /** A camera path: keys at moments of the drive, from the views that the page has there. */
@@ -225,9 +227,25 @@ export class Controls {
     exactVideos(app, (text) => this.say(text));
     $("link").onclick = async () => this.say(await saveLink(app));
     $("help").onclick = () => $("keys").showModal();
+    $("full").hidden = !document.fullscreenEnabled;
+    $("full").onclick = () => (document.fullscreenElement ? document.exitFullscreen() : document.documentElement.requestFullscreen());
+    this.hint();
     $("open").onclick = () => { const shown = document.body.classList.toggle("with-panel"); $("open").setAttribute("aria-expanded", String(shown)); app.change(); };
     if (matchMedia("(min-width: 800px)").matches) document.body.classList.add("with-panel");
     $("open").setAttribute("aria-expanded", String(document.body.classList.contains("with-panel")));
+  }
+
+  /** A line for those who are here for the first time, until they do something. */
+  hint() {
+    try {
+      if (localStorage.getItem("mudg-hint")) return;
+      localStorage.setItem("mudg-hint", "shown");
+    } catch { /* this browser keeps nothing for a page from the disk: it is shown again */ }
+    const touch = matchMedia("(pointer: coarse)").matches, done = new AbortController();
+    $("note").textContent = touch ? "Drag to look around, pinch to move." : "Drag to look around, scroll to move, W A S D to fly, ? for all keys.";
+    for (const event of ["pointerdown", "keydown", "wheel"]) {
+      addEventListener(event, () => { done.abort(); $("note").textContent = ""; }, { signal: done.signal, capture: true, passive: true });
+    }
   }
 
   /** A short message, also for screen readers. */
@@ -255,6 +273,9 @@ export class Controls {
     $("shift").value = String(s.shift);
     $("up").value = String(s.up);
     $("shift-text").textContent = s.shift ? `${Math.abs(s.shift).toFixed(1)} m ${s.shift > 0 ? "left" : "right"}` : "recorded path";
+    const degrees = Math.round(s.fov || fovOf(app.cameras.view(...app.size())));
+    $("fov").value = String(degrees);
+    $("fov-text").textContent = `${degrees}\u00b0${s.fov || s.mode !== "recorded" ? "" : ", as recorded"}`;
     $("up-text").textContent = `${s.up > 0 ? "+" : ""}${s.up.toFixed(1)} m`;
     for (const name of Object.keys(OVERLAYS)) if ($(`overlay-${name}`)) $(`overlay-${name}`).checked = s[name];
     for (const input of document.querySelectorAll("input[name=layer]")) input.checked = input.value === s.layer;
