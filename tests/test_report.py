@@ -310,3 +310,42 @@ def test_a_chart_names_the_sides_that_it_shows(shifts_m: tuple[float, ...], left
     drawn = template.render(figure=figure)
     words = re.findall(r"<text [^>]*>(left|right, m|m)</text>", drawn)
     assert words == [word for word in (left, right) if word]
+
+
+def test_every_section_link_leads_to_a_section(page: str) -> None:
+    found = outline(page)
+    targets = {attributes.get("id") for _, attributes in found.tags}
+    links = [
+        attributes["href"]
+        for tag, attributes in found.tags
+        if tag == "a" and str(attributes.get("href")).startswith("#")
+    ]
+    assert len(links) >= 4
+    assert all(str(link)[1:] in targets for link in links)
+
+
+@pytest.mark.parametrize(("shifts_m", "first"), [((0.0, 4.0, 2.0, -2.0), 2.0), ((0.0, 3.0, 5.0), 3.0), ((0.0,), 0.0)])
+def test_the_page_begins_two_metres_to_the_left_or_near_there(shifts_m: tuple[float, ...], first: float) -> None:
+    videos = [report.TrajectoryVideo(f"front_{shift}", "front", shift, 1, 1, 1, {}, "", "") for shift in shifts_m]
+    chosen = [one for one in report._player_values({"truth": "exact"}, videos, [])["shift_choices"] if one["checked"]]
+    assert [one["name"] for one in chosen] == [f"front_{first}"]
+
+
+def test_curves_are_those_of_the_logs_of_both_fits(tmp_path: Path) -> None:
+    assert report.fit_charts(tmp_path) == []
+    logs = {"street_gaussians": [(10, 20.0), (20, 24.0)], "mudg_s": [(20, 25.0), (40, 30.0)]}
+    for method, rows in logs.items():
+        (tmp_path / "fit" / method).mkdir(parents=True)
+        lines = [{"step": step, "psnr": psnr, "loss_color": 0.1} for step, psnr in rows]
+        text = "".join(json.dumps(line) + "\n" for line in [*lines, {"step": 15, "boxes_moved_m": 0.1}])
+        (tmp_path / "fit" / method / "log.jsonl").write_text(text)
+    psnr, loss = report.fit_charts(tmp_path)
+    assert [line["method"] for line in psnr["lines"]] == list(logs)
+    assert loss["title"].startswith("Loss")
+    scale = {tick["at"]: float(tick["text"]) for tick in psnr["y_ticks"]}
+    (a, va), *_, (b, vb) = scale.items()
+    steps = [(tick["at"], float(tick["text"])) for tick in psnr["x_ticks"]]
+    for line in psnr["lines"]:
+        for (x, y), (step, value) in zip(line["points"], logs[line["method"]], strict=True):
+            assert va + (y - a) * (vb - va) / (b - a) == pytest.approx(value, abs=0.05)
+            assert np.interp(x, *zip(*steps, strict=True)) == pytest.approx(step, abs=0.2)

@@ -10,7 +10,7 @@ import base64
 import json
 import math
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -144,9 +144,11 @@ GROUPS: Final = (
 )
 OPTIONAL: Final = frozenset({"At LiDAR points", "Vehicles and lanes", "Steadiness"})
 """Groups that are left out, and distances of them, where no method has a number."""
-ABSENT: Final = ("lpips", "fid", "kid", "fvd")
-"""Metrics whose columns are shown although they were not computed; the others are named below the tables."""
 CHARTED: Final = ("psnr", "abs_rel", "miou")
+CURVES: Final = (("psnr", "PSNR, dB", SENSES["higher"]), ("loss_color", "Loss of colour", SENSES["lower"]))
+"""Columns of the logs of fits that are drawn: title, and which way is better."""
+FIRST_M: Final = 2.0
+"""The page begins beside the recorded path, as near to here as there are views."""
 NEAR_M: Final = 2.0
 FAR_M: Final = 80.0
 WITH: Final = "mudg_s"
@@ -195,6 +197,7 @@ def page(
     adaptation: Adaptation | None = None,
     viewer: str = "",
     out: Path = Path(),
+    curves: Sequence[Mapping[str, Any]] = (),
 ) -> str:
     """The text of the page.
 
@@ -203,7 +206,7 @@ def page(
         columns: panel columns in the order in which they stand in the videos. adaptation: of the diffusion model, if
             there was one.
         viewer: relative address of the page that shows the fitted scene, or empty. out: folder of the run, for
-            commands.
+            commands. curves: as of ``fit_charts``.
     """
     scene = scores["scene"]
     heading, lead = headline(scores)
@@ -216,6 +219,7 @@ def page(
         lead=lead,
         scene=scene,
         viewer=viewer,
+        curves=curves,
         facts=_facts(scores, ledger),
         rules=scores["rules"],
         methods=scores["methods"],
@@ -299,7 +303,8 @@ def _player_values(
     """What ``player.html.j2`` shows; ``player`` goes to ``player.js``."""
     exact = scores["truth"] == "exact"
     ordered = sorted(videos, key=lambda v: (v.camera, -(v.shift_m if v.shift_m is not None else -1e9)))
-    first = max((v for v in videos if v.shift_m), key=lambda v: v.shift_m or 0.0, default=next(iter(videos), None))
+    beside = [v for v in videos if v.shift_m]
+    first = min(beside, key=lambda v: abs((v.shift_m or 0.0) - FIRST_M), default=next(iter(videos), None))
     steps = np.geomspace(NEAR_M, FAR_M, 8).astype(np.float32)[None]
     stops = ", ".join("#{:02x}{:02x}{:02x}".format(*c) for c in depth_colors(steps, NEAR_M, FAR_M)[0])
     choice = lambda v: {"camera": v.camera, "name": v.name, "title": v.place, "checked": v is first}
@@ -349,11 +354,6 @@ def _score_values(scores: Mapping[str, Any]) -> dict[str, Any]:
     made_of_sets = [metrics[name] for name, entry in SET_METRICS.items() if entry in scores]
     if made_of_sets:
         groups.append(_with_floor(scores, _score_group(scores, "Distribution", made_of_sets, distances), distances))
-    shown = [m for m in absent if m["name"] in ABSENT]
-    if shown:
-        cells = [{"text": number_text(m["name"], NOT_COMPUTED), "classes": "absent"} for m in shown]
-        rows = [{"method": m["name"], "title": m["title"], "cells": cells} for m in scores["methods"]]
-        groups.append({"title": "Perceptual", "distances": [], "metrics": shown, "rows": rows})
     has_number = lambda name: any(isinstance(r["values"].get(name), float) for r in scores["results"])
     numeric = [metric for metric in metrics.values() if has_number(metric["name"])]
     results = []
@@ -433,34 +433,62 @@ def axis_ticks(low: float, high: float) -> list[float]:
 
 
 def _chart(scores: Mapping[str, Any], metric: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Values of the macro ``chart``: one line per method over the lateral shift; None with fewer than two shifts."""
+    """Values of the macro ``chart``: one line per method over the lateral shift, left of the road on the left; None
+    with fewer than two shifts."""
     points = chart_points(scores, metric["name"])
-    shifts = sorted({s for p in points.values() for s, _ in p})
+    shifts = {s for line in points.values() for s, _ in line}
     if len(shifts) < 2:
         return None
-    numbers = [v for p in points.values() for _, v in p]
-    ticks = axis_ticks(min(numbers), max(numbers))
-    left, right, top, bottom = 40.0, 330.0, 8.0, 150.0
-
-    def x(shift: float) -> float:  # left of the road is left on the chart
-        return round(left + (shifts[-1] - shift) / (shifts[-1] - shifts[0]) * (right - left), 1)
-
-    def y(value: float) -> float:
-        return round(bottom - (value - ticks[0]) / (ticks[-1] - ticks[0]) * (bottom - top), 1)
-
+    lines = {method: [(-shift, value) for shift, value in line] for method, line in points.items()}
     better = SENSES[metric["better"]]
+    figure = _figure(lines, sorted(-shift for shift in shifts), lambda value: number_text(metric["name"], value))
     return {
+        **figure,
         "title": metric["title"] + (f", {metric['unit']}" if metric["unit"] else ""),
         "better": better,
         "label": f"{metric['title']} over the lateral shift, {better}",
+        "begin": "left" if max(shifts) > 0 else "",
+        "end": "right, m" if min(shifts) < 0 else "m",
+    }
+
+
+def fit_charts(out: Path) -> list[dict[str, Any]]:
+    """Values of the macro ``chart``: what the fits of a run logged of recorded views, over their steps; empty where
+    there is no log."""
+    rows: dict[str, list[dict[str, Any]]] = {}
+    for method in (WITHOUT, WITH):
+        path = out / "fit" / method / "log.jsonl"
+        if path.is_file():
+            found = (store.parse_json(line, str(path)) for line in store.read_text(path).splitlines())
+            rows[method] = [row for row in found if "step" in row]
+    made = []
+    for key, title, better in CURVES:
+        lines = {method: [(row["step"], row[key]) for row in own if key in row] for method, own in rows.items()}
+        lines = {method: line for method, line in lines.items() if len(line) > 1}
+        if lines:
+            steps = axis_ticks(0, max(x for line in lines.values() for x, _ in line))
+            figure = _figure(lines, steps, "{:g}".format)
+            words = {"title": title, "better": better, "label": f"{title} over the steps of the fits, {better}"}
+            made.append({**figure, **words, "begin": "", "end": "steps"})
+    return made
+
+
+def _figure(
+    lines: Mapping[str, Sequence[tuple[float, float]]], marks: Sequence[float], text: Callable[[float], str]
+) -> dict[str, Any]:
+    """Places of lines and axes in a chart; ``marks``: of the axis below, increasing."""
+    numbers = [value for line in lines.values() for _, value in line]
+    ticks = axis_ticks(min(numbers), max(numbers))
+    left, right, top, bottom = 40.0, 330.0, 8.0, 150.0
+    x = lambda value: round(left + (value - marks[0]) / (marks[-1] - marks[0]) * (right - left), 1)
+    y = lambda value: round(bottom - (value - ticks[0]) / (ticks[-1] - ticks[0]) * (bottom - top), 1)
+    return {
         "left": left,
         "right": right,
         "bottom": bottom,
-        "y_ticks": [{"at": y(value), "text": number_text(metric["name"], value)} for value in ticks],
-        "x_ticks": [{"at": x(shift), "text": f"{abs(shift):g}"} for shift in shifts],
-        "to_left": shifts[-1] > 0,
-        "to_right": shifts[0] < 0,
-        "lines": [{"method": m, "points": [(x(s), y(v)) for s, v in line]} for m, line in points.items()],
+        "y_ticks": [{"at": y(value), "text": text(value)} for value in ticks],
+        "x_ticks": [{"at": x(value), "text": f"{abs(value):g}"} for value in marks],
+        "lines": [{"method": m, "points": [(x(a), y(b)) for a, b in line]} for m, line in lines.items()],
     }
 
 
@@ -601,7 +629,7 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     with understood("a scored run", str(out)):
         scores, ledger = store.read_json(out / "score" / "metrics.json"), store.read_json(out / "run.json")
         columns, adaptation = list(_folders(out, scores)), _adaptation(out / "adapt")
-        content = page(scores, ledger, text, videos, columns, adaptation, viewer_address(out), out)
+        content = page(scores, ledger, text, videos, columns, adaptation, viewer_address(out), out, fit_charts(out))
     store.write_text(out / "report.html", content)
     return out / "report.html"
 

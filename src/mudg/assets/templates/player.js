@@ -68,7 +68,10 @@
     if (!video || video.readyState < 2) { return; }
     panels.forEach(function (p) { crop(p.canvas, p.x, p.y, 0, 1); });
     var cut = wipe.value / 100, y = +modality.value;
-    if (stage.width !== current.width) { stage.width = current.width; }
+    if (stage.width !== current.width) {
+      stage.width = current.width;
+      stage.parentElement.style.maxWidth = "min(70rem, " + (2 * current.width) + "px)"; // not stretched beyond twice its pixels
+    }
     if (stage.height !== current.height) { stage.height = current.height; }
     crop(stage, data.columns.indexOf(left.value), y, 0, cut);
     crop(stage, data.columns.indexOf(right.value), y, cut, 1);
