@@ -52,7 +52,7 @@ if TYPE_CHECKING:
         synthesize,
     )
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 
 _FUNCTIONS = "mudg.steps.functions"
 _HOMES = {
