@@ -5,14 +5,20 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Iterable, Iterator
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from mudg.base.errors import plain, plain_lines
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.progress import Progress, TaskID
 
 Item = TypeVar("Item")
 
 _quiet = False
 _said: set[str] = set()
+_bars: list[Progress] = []
+"""What draws all bars of a terminal, while there are some. Messages go through its console, and break none."""
 
 
 def set_quiet(quiet: bool) -> None:
@@ -26,10 +32,11 @@ def is_quiet() -> bool:
     return _quiet
 
 
-def _console():
+def _console() -> Console:
+    """That of the bars, or a new one: stderr may be another stream by now."""
     from rich.console import Console
 
-    return Console(stderr=True, highlight=False, soft_wrap=True)
+    return _bars[0].console if _bars else Console(stderr=True, highlight=False, soft_wrap=True)
 
 
 def _say(lines: Iterable[str], style: str | None = None) -> None:
@@ -65,27 +72,25 @@ class ProgressTask:
         self._total = total
         self._done = start
         self._text = ""
-        self._progress = None
-        self._id = None
+        self._id: TaskID | None = None
         self._last_line_s = time.monotonic()
-        if _quiet:
+        if _quiet or not _console().is_terminal:
             return
-        console = _console()
-        if console.is_terminal:
+        if not _bars:
             from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
             before, after = (TextColumn(f"{{task.{of}}}", markup=False) for of in ("description", "fields[text]"))
             columns = (before, BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(), after)
-            self._progress = Progress(*columns, console=console, transient=False)
-            self._progress.start()
-            self._id = self._progress.add_task(self._description, total=total, completed=start, text="")
+            _bars.append(Progress(*columns, console=_console()))
+            _bars[0].start()
+        self._id = _bars[0].add_task(self._description, total=total, completed=start, text="")
 
     def advance(self, count: int = 1) -> None:
         """Count ``count`` more items as done."""
         self._done += count
-        if self._progress is not None and self._id is not None:
+        if self._id is not None:
             with contextlib.suppress(OSError, ValueError):
-                self._progress.update(self._id, completed=self._done, text=self._text)
+                _bars[0].update(self._id, completed=self._done, text=self._text)
         elif not _quiet and (time.monotonic() - self._last_line_s > 10.0):
             self._last_line_s = time.monotonic()
             info(f"{self._description}: {self._done}/{self._total} {self._text}")
@@ -95,11 +100,15 @@ class ProgressTask:
         self._text = plain(text)
 
     def close(self) -> None:
-        """Stop drawing."""
-        if self._progress is not None:
-            with contextlib.suppress(OSError, ValueError):
-                self._progress.stop()
-            self._progress = None
+        """Stop drawing. A bar within another goes away; the outer one stays on the screen."""
+        if self._id is None:
+            return
+        with contextlib.suppress(OSError, ValueError):
+            if len(_bars[0].tasks) > 1:
+                _bars[0].remove_task(self._id)
+            else:
+                _bars.pop().stop()
+        self._id = None
 
 
 @contextlib.contextmanager
