@@ -24,7 +24,12 @@ from mudg import app, native
 
 REPOSITORY = Path(__file__).resolve().parents[1]
 PAGES = [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
-TEXTS = [*PAGES, REPOSITORY / "CONTRIBUTING.md"]
+PRINTED = ("docs/reference/commands.md", "docs/reference/names.md")
+"""Pages that the program prints (tools/reference.py)."""
+TEXTS = [
+    *(page for page in PAGES if page.relative_to(REPOSITORY).as_posix() not in PRINTED),
+    REPOSITORY / "CONTRIBUTING.md",
+]
 FLAGS: dict[str, list[str]] = {
     verb: [*flags, *(re.sub(r"([^.-]+(?:-[^.]+)*)$", r"no-\1", flag) for flag in flags)]
     for verb, flags in json.loads((REPOSITORY / "tests" / "house" / "cli.json").read_text(encoding="utf-8")).items()

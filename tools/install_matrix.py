@@ -51,13 +51,16 @@ def cases(given: argparse.Namespace) -> Iterator[tuple[str, Sequence[str], Path,
     work = given.work.resolve()
     found: list[Path] = []
     for name in given.python:
-        program = shutil.which(name)
-        venv = work / name
+        program, venv = shutil.which(name), work / name.strip("/").replace("/", "-")
+        works = (
+            program is not None
+            and not subprocess.run((program, "--version"), capture_output=True, check=False).returncode
+        )
         install = f"{program} -m venv {venv} && {venv}/bin/pip install -q {given.pip_options} {given.wheel.resolve()}"
-        yield f"{name}: install", ("bash", "-c", install) if program else (), work, lambda _folder: ""
+        yield f"{name}: install", ("bash", "-c", install) if works else (), work, lambda _folder: ""
         if (venv / "bin" / "mudg").is_file():
             found.append(venv)
-            yield f"{name}: demo", (str(venv / "bin" / "mudg"), *DEMO, "demo"), work / f"run {name}", report_of
+            yield f"{name}: demo", (str(venv / "bin" / "mudg"), *DEMO, "demo"), work / f"run {venv.name}", report_of
     if not found:
         return
     mudg, root = str(found[0] / "bin" / "mudg"), os.geteuid() == 0

@@ -11,6 +11,7 @@ import inspect
 import json
 import os
 import re
+import runpy
 import types
 from pathlib import Path
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -184,3 +185,13 @@ def test_the_overview_lists_every_verb() -> None:
     for verb in steps.VERBS:
         assert f"\n  {verb} " in overview
     assert [verb for _, verbs in steps.sections() for verb in verbs if verbs] != []
+
+
+@pytest.mark.parametrize("name", ["commands.md", "names.md"])
+def test_the_reference_is_what_the_program_says(repository: Path, name: str) -> None:
+    """``python tools/reference.py`` writes the pages; so does the variable that renews all frozen files."""
+    said = runpy.run_path(str(repository / "tools" / "reference.py"))["PAGES"][name]()
+    page = repository / "docs" / "reference" / name
+    if os.environ.get("MUDG_UPDATE_FROZEN"):
+        page.write_text(said, encoding="utf-8")
+    assert page.read_text(encoding="utf-8") == said
