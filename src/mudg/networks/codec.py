@@ -15,7 +15,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from mudg.base import checkpoint, palette, records, store
+from mudg.base import palette
 from mudg.base.errors import UsageError
 
 Modality = Literal["rgb", "depth", "semantics"]
@@ -226,12 +226,3 @@ def semantic_shares(ids: Tensor, factor: int = 2) -> Tensor:
         counts.scatter_add_(1, cells[:, place : place + 1], torch.ones_like(counts[:, :1]))
     share = counts[:, :CLASSES]
     return (share / share.sum(1, keepdim=True).clamp(min=1.0)).reshape(*lead, CLASSES, *cells.shape[-2:])
-
-
-def shipped_codec() -> PatchCodec:
-    """The codec of the shipped diffusion model."""
-    content, prefix = store.read_json(SHIPPED / "model.json"), "codec."
-    codec = PatchCodec(records.parse_dataclass(CodecConfig, content["config"]["codec"], "codec: "))
-    state = checkpoint.read_shards(SHIPPED, content["files"])
-    codec.load_state_dict({n.removeprefix(prefix): value for n, value in state.items() if n.startswith(prefix)})
-    return codec.eval()
