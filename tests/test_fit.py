@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import json
 import shutil
+import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -161,6 +164,36 @@ def test_the_opacity_weight_makes_gaussians_fainter_and_is_logged(world, tmp_pat
         line = store.parse_json((folder / "log.jsonl").read_text().splitlines()[0], "log")
         assert ("loss_opacity" in line) == (weight > 0)
     assert means[0.5] < means[0.0]
+
+
+def test_tensorboard_shows_the_log_and_changes_nothing(world, tmp_path, monkeypatch):
+    """What the package is told are the numbers of log.jsonl, and the result stays the same."""
+    told: list[tuple[str, float, int]] = []
+
+    class Writer:
+        def __init__(self, folder: str) -> None:
+            Path(folder).mkdir()
+            (Path(folder) / "events").write_bytes(b"")
+
+        def add_scalar(self, *entry) -> None:
+            told.append(entry)
+
+        def flush(self) -> None: ...
+        def close(self) -> None: ...
+
+    find = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name, *rest: name == "tensorboard" or find(name, *rest))
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", SimpleNamespace(SummaryWriter=Writer))
+    plain = fit_to(world, tmp_path / "plain", settings(iterations=12)).run()
+    step = replace(fit_to(world, tmp_path / "watched", settings(iterations=12)), tensorboard=True)
+    watched = step.run()
+    assert fitted_bytes(watched) == fitted_bytes(plain)
+    assert store.read_json(watched / store.MANIFEST) == store.read_json(plain / store.MANIFEST)
+    lines = [store.parse_json(line, "log") for line in (watched / "log.jsonl").read_text().splitlines()]
+    numbers = [(f"fit/{k}", v, line["step"]) for line in lines for k, v in line.items() if k not in ("step", "view")]
+    assert told == numbers and len(numbers) > 3
+    assert replace(step, overwrite=True, settings=settings(iterations=13)).run() == watched
+    assert len(list((watched / "tensorboard").iterdir())) == 1, "the folder of the result that was replaced is gone"
 
 
 def test_densification_grows_within_its_cap(world, tmp_path):

@@ -121,7 +121,8 @@ def test_tensorboard_is_asked_for_in_words(clips, tmp_path, monkeypatch):
         importlib.util, "find_spec", lambda name, *rest: None if name == "tensorboard" else find(name, *rest)
     )
     with pytest.raises(ResourceError, match=r"pip install 'mudg\[track\]'"):
-        Learn(out=tmp_path / "run", settings=tiny(clips, tensorboard=True)).run()
+        Learn(out=tmp_path / "run", tensorboard=True, settings=tiny(clips)).run()
+    assert not (tmp_path / "run").exists()
 
 
 def test_moments_of_another_model_are_refused(clips, stage_one, tmp_path):

@@ -173,7 +173,7 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-_STATE, _SETTINGS, _LOCK, _LOG = store.RUN_STATE, "run.yaml", "lock", store.RUN_LOG
+_STATE, _SETTINGS, _LOCK, _LOG, _BOARD = store.RUN_STATE, "run.yaml", "lock", store.RUN_LOG, "tensorboard/"
 _BEGUN = frozenset({_STATE, _SETTINGS, _LOCK})
 """What a run folder holds before anything is made."""
 _BOOKKEEPING = _BEGUN | {_LOG, store.MANIFEST}
@@ -372,7 +372,7 @@ def own_names(output: VerbOutput, folder: Path) -> list[str]:
     finished = state.get("state") == "complete" and listed
 
     def is_own(name: str) -> bool:
-        if name in _BOOKKEEPING or name in listed or is_temporary(name):
+        if name in _BOOKKEEPING or name.startswith(_BOARD) or name in listed or is_temporary(name):
             return True
         return (not finished or ".part" in name) and _matches(name, patterns)  # no manifest lists temporary folders
 
@@ -419,6 +419,7 @@ class RunDir:
         self._ended = complete
         self._seen: Mapping[str, Any] = {}
         """What the folder's record said when it was opened."""
+        self._board: Any = None
 
     @classmethod
     def open(
@@ -516,8 +517,20 @@ class RunDir:
         return self._earlier
 
     def log(self, **fields: Any) -> None:
-        """Append one JSON line to log.jsonl."""
+        """Append one JSON line to log.jsonl; its numbers go to TensorBoard, too, if it is watched."""
         store.append_line(self.path / _LOG, store.json_text(fields, indent=None))
+        if self._board is not None:
+            for name, value in fields.items():
+                if name != "step" and isinstance(value, int | float):
+                    self._board.add_scalar(f"{self._output.verb}/{name}", value, fields.get("step"))
+            self._board.flush()
+
+    def watch(self) -> None:
+        """Write what is logged from now on to ``tensorboard/`` as well. No result depends on it, and no manifest lists
+        it."""
+        from torch.utils.tensorboard import SummaryWriter
+
+        self._board = SummaryWriter(str(self.path / _BOARD))
 
     def pause(self, summary: Mapping[str, Any] | None = None) -> None:
         """Record an interruption, once: the time spent is kept, the lock released; the same command continues."""
@@ -539,7 +552,9 @@ class RunDir:
         """Mark the folder complete: hash every file of the verb, write the manifest, release the lock, and take the
         place of the result that is to be replaced."""
         remove_files(self.path, list(filter(is_temporary, all_names(self.path))))  # of runs that were killed
-        names = [name for name in store.list_files(self.path) if name not in (_LOG, _STATE)]
+        if self._board is not None:
+            self._board.close()
+        names = [n for n in store.list_files(self.path) if n not in (_LOG, _STATE) and not n.startswith(_BOARD)]
         own = [name for name in names if name == _SETTINGS or _matches(name, self._output.files)]
         if others := sorted(set(names) - set(own)):
             log.warn(f"{self.path} holds files that {self.verb} did not make: {', '.join(others[:8])}")

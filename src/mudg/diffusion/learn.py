@@ -12,7 +12,6 @@ OUT/codec/    checkpoints of the codec         OUT/steps/   checkpoints of the n
 OUT/samples/  picture grids during training    OUT/loss.png, OUT/log.jsonl, OUT/metrics.json
 OUT/model/    the exported model: fp16 weights, model.json, MODEL_CARD.md
 OUT/cache/    clips that were fetched or made when they were drawn; removed at the end
-OUT/tensorboard/  with `compute.tensorboard`
 """
 
 from __future__ import annotations
@@ -20,7 +19,6 @@ from __future__ import annotations
 import concurrent.futures
 import contextlib
 import hashlib
-import importlib.util
 import os
 import shutil
 import time
@@ -57,15 +55,8 @@ def check(config: LearnConfig) -> LearnConfig:
     """The configuration; without renders where the condition has none.
 
     Raises:
-        UsageError: settings that do not go together, or a condition that cannot be made. ResourceError: a package is
-            missing.
+        UsageError: settings that do not go together, or a condition that cannot be made.
     """
-    if config.compute.tensorboard and importlib.util.find_spec("tensorboard") is None:
-        raise ResourceError(
-            "TensorBoard is not installed",
-            where="--compute.tensorboard",
-            remedy="pip install 'mudg[track]', or leave the flag out: log.jsonl holds the same",
-        )
     if config.data.condition != "full":
         if config.data.scenes:
             raise UsageError(
@@ -471,11 +462,6 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
     state, spread = _begin(model, config, out, ranks)
     weights = class_weights(source.shards, source.weighed(), config.loss.class_balance).to(ranks.device)
     settings = loss_settings(config, weights)
-    board: Any = None
-    if config.compute.tensorboard and ranks.leads:
-        from torch.utils.tensorboard import SummaryWriter
-
-        board = SummaryWriter(str(run_dir.path / "tensorboard"))
 
     def bring(step: int) -> None:
         frames, count, parts = _batch(config, ranks, step)
@@ -537,8 +523,6 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
                     values = {"frames": frames, "rate": round(rate, 3), **mean_of(recent)}
                     run_dir.log(step=done, **values)
                     score.plot_losses(run_dir.path / "log.jsonl", run_dir.path / "loss.png")
-                    for name, value in values.items() if board is not None else ():
-                        board.add_scalar(f"learn/{name}", value, done)
                 recent = []
             if done % config.compute.checkpoint_every == 0 or last or stop:
                 took_s = state.save(out, ranks, facts, config.compute.checkpoints_kept)
@@ -550,8 +534,6 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
             if stop and not last:
                 log.info(f"learn: stopped after step {saved_at}, which is saved")
                 interruption.stop_now()
-    if board is not None:
-        board.close()
     return state.export_weights(ranks)
 
 

@@ -391,8 +391,6 @@ class LearnCompute:
     """Steps ahead for which training clips are fetched or made (0 = none)."""
     log_every: int = setting(default=50, ge=1)
     """Steps between lines of log.jsonl."""
-    tensorboard: bool = False
-    """Also write the losses for TensorBoard (needs `pip install 'mudg[track]'`)."""
 
 
 @settings

@@ -4,12 +4,13 @@ replacement; and the fields that many of them share."""
 from __future__ import annotations
 
 import dataclasses
+import importlib.util
 import typing
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
-from mudg.base.errors import UsageError
+from mudg.base.errors import ResourceError, UsageError
 from mudg.steps.step import Flag, Step, flag_of, hint_of, hints, positions
 
 if typing.TYPE_CHECKING:
@@ -136,6 +137,8 @@ def ready(step: Result) -> tuple[Result, dict[str, str], Make]:
     from mudg.base.run_folder import refuse_overlap
 
     refuse_overlap(step.out, step.reads())
+    if isinstance(step, Watched):
+        step.refuse_unwatchable()
     step = step.checked()
     inputs = step.inputs()
     return step, inputs, step.prepare(inputs)
@@ -150,6 +153,8 @@ def opened(step: Result) -> tuple[Result, RunDir, Make]:
     folder = RunDir.open(step.out, step.output(), step.key_settings(), inputs, step.overwrite, step.places())
     if folder.complete:
         folder.reused()
+    elif isinstance(step, Watched) and step.tensorboard:
+        folder.watch()
     return step, folder, make
 
 
@@ -193,6 +198,19 @@ class Output(Result):
     overwrite: bool = False
     """Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one
     is finished, so the disk must hold both. Files that do not belong to the old result are kept."""
+
+
+class Watched(Output):
+    """A step that trains, and whose numbers can be watched."""
+
+    tensorboard: bool = False
+    """Also write the numbers of log.jsonl to OUT/tensorboard, for TensorBoard (needs `pip install 'mudg[track]'`)."""
+
+    def refuse_unwatchable(self) -> None:
+        """ResourceError without the package."""
+        if self.tensorboard and importlib.util.find_spec("tensorboard") is None:
+            what, remedy = "TensorBoard is not installed", "pip install 'mudg[track]', or leave the flag out"
+            raise ResourceError(what, where="--tensorboard", remedy=f"{remedy}: log.jsonl holds the same")
 
 
 class Listed(Output):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Self, cast, get_args
 
 from mudg.base.errors import UsageError
 from mudg.base.layout import MODEL_FILES
-from mudg.steps.engine import Make, Output, paths_of
+from mudg.steps.engine import Make, Watched, paths_of
 from mudg.steps.step import SCENE, Flag, flag_name, hint_of
 
 if TYPE_CHECKING:
@@ -24,7 +24,7 @@ def _dotted(values: Mapping[str, Any], path: str = "") -> Iterator[str]:
         yield from _dotted(value, f"{path}{name}.") if isinstance(value, Mapping) else (f"{path}{name}",)
 
 
-class Fit(Output):
+class Fit(Watched):
     """Fit a dynamic 3D Gaussian scene to recorded (and virtual) views."""
 
     section = "single steps, in the order of use"

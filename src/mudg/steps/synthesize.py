@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, cast
 
 from mudg.base.layout import OBSERVATION_FILES, below
-from mudg.steps.engine import Make, Output, opened, script_of
+from mudg.steps.engine import Make, Output, Watched, opened, script_of
 from mudg.steps.fit import Fit
 from mudg.steps.ingest import Fuse
 from mudg.steps.step import FILE_YAML, SCENE, Flag
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mudg.gaussians.settings import FitConfig
 
 
-class Learn(Output):
+class Learn(Watched):
     """Train a diffusion model on generated cities, or fine-tune one on your own logs."""
 
     section = "single steps, in the order of use"
@@ -36,7 +36,7 @@ class Learn(Output):
     version, idle = 1, ("compute",)
     files = (
         *("clips/*.safetensors", "clips/log_clips.json", "codec/", "steps/", "cache/", "samples/*.png"),
-        *("tensorboard/", "loss.png", "metrics.json", "model/*", "model.part/"),
+        *("loss.png", "metrics.json", "model/*", "model.part/"),
     )
     short = (
         *("start", "steps", "seed", "precision", "data.scenes", "data.clips", "data.cities", "data.width"),
