@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import socket
 import subprocess
 import sys
@@ -26,8 +27,9 @@ from mudg.viewer import report
 
 @pytest.fixture
 def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """Stand-ins that note their calls and write a folder; ``trouble[verb]`` is raised once by that verb."""
-    seen: dict[str, Any] = {"calls": [], "trouble": {}, "labelled": True, "teaches": (True, "")}
+    """Stand-ins that note their calls and write a folder; ``trouble[verb]`` is raised once by that verb,
+    ``during[verb]`` called while it runs."""
+    seen: dict[str, Any] = {"calls": [], "trouble": {}, "during": {}, "labelled": True, "teaches": (True, "")}
 
     def stand_in(step: Step) -> Any:
         if isinstance(step, Run | Demo):
@@ -38,6 +40,7 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
             raise trouble
         label = f"{verb}:{step.out.name}" if verb in ("fit", "render") else verb
         seen["calls"].append(label)
+        seen["during"].get(verb, lambda: None)()
         seen[label] = step
         step.out.mkdir(parents=True, exist_ok=True)
         (step.out / "scene.json").write_text("{}") if verb in ("ingest", "annotate") else None
@@ -112,11 +115,11 @@ def test_a_forecast_is_said_before_the_first_long_step(
     chain(tmp_path, run_preset("fast"))
     said = capsys.readouterr().err
     assert said.index("== ingest") < said.index("forecast of scene") < said.index("== fuse")
-    assert "== fuse (step 1 of 9, about 5 min left)" in said
-    assert "== report (step 9 of 9)" in said
+    assert "== fuse, step 1 of 9, about 5 min left" in said
+    assert "== report, step 9 of 9" in said
     assert verbs["ingest"].settings.resolution == "", "a city has a size of its own"
     chain(tmp_path, run_preset("fast"))
-    assert "forecast" not in capsys.readouterr().err
+    assert "forecast of" not in capsys.readouterr().err
     (tmp_path / "log").mkdir()
     Run(source=tmp_path / "log", out=tmp_path / "other", settings=run_preset("fast")).run()
     assert verbs["ingest"].settings.resolution == "480"
@@ -220,8 +223,29 @@ def test_an_interruption_is_recorded_and_the_repeat_continues(tmp_path: Path, ve
     assert ledger["state"] == "interrupted"
     assert ledger["steps"]["synthesize"]["state"] == "interrupted"
     assert "score" not in ledger["steps"]
+    page = tmp_path / "out" / "report.html"
+    assert "Repeat the same command to go on" in page.read_text(), "the report of a run grows with it"
+    assert 'http-equiv="refresh"' not in page.read_text()
     chain(tmp_path)
     assert store.read_json(tmp_path / "out" / "run.json")["state"] == "complete"
+    assert "Repeat the same command" not in page.read_text()
+
+
+def test_the_page_of_a_run_shows_its_steps_while_it_goes_on(tmp_path: Path, verbs: dict[str, Any]) -> None:
+    """It names what is done and what runs, renews itself, and never takes the place of a report."""
+    page, texts = tmp_path / "out" / "report.html", []
+    verbs["during"]["synthesize"] = lambda: texts.append(page.read_text())
+    chain(tmp_path)
+    (text,) = texts
+    assert 'http-equiv="refresh"' in text and "Synthesize, step 3 of 9" in text
+    done = ("ingest", "fuse", "fit without diffusion")
+    states = re.findall(r'<th scope="row">([a-z ]+)</th><td>([a-z]*)</td>', text)
+    assert states[:4] == [*((name, "done") for name in done), ("synthesize", "running")]
+    assert len(states) == 10 and all(state == "" for _, state in states[4:])
+    report = page.read_text()
+    chain(tmp_path)
+    assert page.read_text() == report
+    assert len(texts) == 1 or texts[1] == report
 
 
 def test_seconds_add_up_over_continuations_and_reuse_adds_none(

@@ -85,6 +85,7 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
     from mudg.viewer import report as run_report
 
     ledger, page = _Ledger.open(out, config, str(source), overwrite), out / "report.html"
+    log.info(f"report: {page} (open it now: it grows while the run goes on)")
     config = with_device(config)
     try:
         scene = _prepare_scene(config, source, out, ledger, overwrite)
@@ -330,6 +331,8 @@ class _Ledger:
         self._asked = dict(asked)
         self._steps: dict[str, dict[str, Any]] = dict(before.get("steps", {}))
         self._report = dict(before.get("report", {}))
+        self._now = ""
+        """The step that runs."""
         self.digests: dict[str, str] = {}
         self.ahead: list[str] = []
         """Names of the steps on a labelled scene, once they are known."""
@@ -406,19 +409,31 @@ class _Ledger:
 
     def _standing(self, name: str) -> str:
         """Which step of how many this is, and what is left: the forecast, corrected by what finished steps took."""
+        if name not in self.ahead:
+            return name
         from mudg.steps import cost
 
-        if name not in self.ahead:
-            return ""
         at, known = self.ahead.index(name), {key: value for key, value in self.expected_s.items() if value}
         done = [one for one in self.ahead[:at] if one in known]
-        place = f" (step {at + 1} of {len(self.ahead)}"
+        place = f"{name}, step {at + 1} of {len(self.ahead)}"
         if not set(self.ahead[at:]) & known.keys():
-            return f"{place})"
+            return place
         taken = sum(self._steps[one]["seconds"] for one in done)
         pace = taken / sum(known[one] for one in done) if done and taken else 1.0
-        left_s = pace * sum(known.get(one, 0.0) for one in self.ahead[at:])
-        return f"{place}, about {cost.duration(left_s)} left)"
+        return f"{place}, about {cost.duration(pace * sum(known.get(one, 0.0) for one in self.ahead[at:]))} left"
+
+    def _show(self, state: str) -> None:
+        """Write the page of the unfinished run, but not over a report."""
+        from mudg.viewer.report import progress_page
+
+        page = self._out / "report.html"
+        if page.is_file() and self._report.get("progress") != store.sha256_file(page):
+            return
+        names, spent = dict.fromkeys((*self._steps, self._now, *self.ahead)), self.seconds()
+        of = lambda name: "done" if self.has_done(name) else state if name == self._now else ""
+        steps = [(name, of(name), spent.get(name, 0.0)) for name in names if name]
+        store.write_text(page, progress_page(self._out, steps, state, self._standing(self._now).capitalize()))
+        self._report = {"progress": store.sha256_file(page)}
 
     def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
         """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result
@@ -427,7 +442,9 @@ class _Ledger:
 
         finished = self.has_done(name) and result.exists()
         meter, state = Meter(), "interrupted"
-        log.info(f"== {name}{self._standing(name)}")
+        log.info(f"== {self._standing(name)}")
+        self._now = name
+        self.save("running")
         try:
             made = run()
             release_memory()
@@ -454,7 +471,9 @@ class _Ledger:
         }
 
     def save(self, state: str) -> None:
-        """Write OUT/run.json."""
+        """Write OUT/run.json, and before the end the page of the unfinished run."""
+        if state != "complete":
+            self._show(state)
         record = {
             "schema": 1,
             "state": state,
