@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from mudg.base import store
 from mudg.base.errors import InputError
 from mudg.base.types import Camera, Observation, View
 from mudg.scene.observations import ObservationWriter, list_observation_sets, read_observations
@@ -93,6 +93,38 @@ def test_damaged_files_are_named(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"000000\.png"):
         read_observations(tmp_path / "t")[0]
     png.write_bytes(content)
-    store.write_safetensors(tmp_path / "t" / "data" / "000000.safetensors", {"depth": np.zeros((2, 2), np.float32)})
-    with pytest.raises(InputError, match=r"000000\.safetensors"):
+
+
+BAD_ARRAYS = {
+    "cut off": (lambda arrays, content: content[: len(content) // 2], "not a valid .npz file"),
+    "empty": (lambda arrays, content: b"", "not a valid .npz file"),
+    "altered": (lambda arrays, content: content[:200] + b"XXXX" + content[204:], "not a valid .npz file"),
+    "objects": (lambda arrays, content: _npz(arrays | {"depth": np.array([{}])}), "not a valid .npz file"),
+    "another size": (
+        lambda arrays, content: _npz(arrays | {"depth": np.zeros((2, 2), np.float32)}),
+        r"float32\[2, 2\]",
+    ),
+    "another type": (lambda arrays, content: _npz(arrays | {"mask": arrays["mask"] + 0.0}), r"float64"),
+    "none": (lambda arrays, content: _npz({"depth": arrays["depth"]}), "missing"),
+    "a bomb": (lambda arrays, content: _npz(arrays | {"depth": np.zeros(2**24, np.float32)}), "too large"),
+}
+
+
+def _npz(arrays) -> bytes:
+    out = io.BytesIO()
+    np.savez_compressed(out, **arrays)
+    return out.getvalue()
+
+
+@pytest.mark.parametrize("name", BAD_ARRAYS)
+def test_damaged_arrays_are_named(name: str, tmp_path: Path) -> None:
+    damaged, words = BAD_ARRAYS[name]
+    with ObservationWriter(tmp_path / "t", "t", "x") as writer:
+        writer.add(_observation(0))
+    path = tmp_path / "t" / "data" / "000000.npz"
+    with np.load(path, allow_pickle=False) as arrays:  # numpy itself reads what was written
+        kept = dict(arrays)
+    path.write_bytes(damaged(kept, path.read_bytes()))
+    with pytest.raises(InputError, match=words) as raised:
         read_observations(tmp_path / "t")[0]
+    assert "000000.npz" in str(raised.value)

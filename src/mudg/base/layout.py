@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from typing import Final
 
 SCENE_FILES: Final = ("scene.json", "tracks.json", "images/*/*", "lidar/*/*.safetensors", "labels/*/*/*")
-OBSERVATION_FILES: Final = ("observations.json", "rgb/*.png", "data/*.safetensors")
+OBSERVATION_FILES: Final = ("observations.json", "rgb/*.png", "data/*.npz")
 SWEEP_FILES: Final = ("sweeps.json", "*.safetensors")
 LAYER_FILES: Final = ("layers.json", "*.safetensors", "*.png")
 MODEL_FILES: Final = ("model.json", "gaussians.safetensors", "nodes.safetensors")

@@ -236,7 +236,7 @@ class FillViews(Output):
     """The scorer's baseline on some trajectories as folders of views, so that it is a method like the others."""
 
     verb_name = FILL
-    version, files = 1, below("*", OBSERVATION_FILES)
+    version, files = 2, below("*", OBSERVATION_FILES)
     scene: Path
     fused: Path
     paths: tuple[Trajectory, ...]
@@ -259,7 +259,7 @@ class ExactViews(Output):
     """The truth of the shifted trajectories as if the diffusion model had painted it; nothing of the recorded path."""
 
     verb_name = EXACT
-    version, files = 1, below("*", OBSERVATION_FILES)
+    version, files = 2, below("*", OBSERVATION_FILES)
     truth: Path
     paths: tuple[Trajectory, ...]
 

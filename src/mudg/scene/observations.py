@@ -2,12 +2,16 @@
 
 observations.json    schema, trajectory, source, kind; one record per view (camera, pose, time, file names)
 rgb/000000.png       8-bit colour, for people and programs
-data/000000.safetensors   depth f32 (NaN = none), semantics u8 (255 = unlabelled), confidence f16, mask u8
+data/000000.npz      depth f32 (NaN = none), semantics u8 (255 = unlabelled), confidence f16, mask u8: compressed to
+                     a third or half, without loss
 """
 
 from __future__ import annotations
 
 import io
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,7 +28,15 @@ from mudg.core.pictures import to_bytes
 from mudg.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
-_SCHEMA = 1
+_SCHEMA = 2
+_TYPES = {
+    "confidence": np.dtype(np.float16),
+    "mask": np.dtype(np.uint8),
+    "depth": np.dtype(np.float32),
+    "semantics": np.dtype(np.uint8),
+}
+_HEADER_BYTES = 4096
+"""More than the header of an array takes."""
 
 
 class ObservationWriter:
@@ -38,7 +50,7 @@ class ObservationWriter:
         self._out, self._trajectory, self._source, self._kind = Path(out), trajectory, source, kind
         self._records: list[dict[str, Any]] = []
         self.done = 0
-        while (self._out / "data" / f"{self.done:06d}.safetensors").is_file():
+        while data_path(self._out, self.done).is_file():
             self.done += 1
 
     def __enter__(self) -> ObservationWriter:
@@ -46,7 +58,8 @@ class ObservationWriter:
 
     def skip(self, view: View) -> None:
         """Record a view whose files an earlier run has written."""
-        arrays = store.read_safetensors(self._out / "data" / f"{len(self._records):06d}.safetensors")
+        path, camera = data_path(self._out, len(self._records)), view.camera
+        arrays = _unpacked(store.read_bytes(path), path, (camera.height, camera.width), ())
         self._record(view, "depth" in arrays, "semantics" in arrays)
 
     def add(self, observation: Observation) -> None:
@@ -65,7 +78,7 @@ class ObservationWriter:
             arrays["depth"] = _numpy(observation.depth[0], np.float32)
         if observation.semantics is not None:
             arrays["semantics"] = _numpy(observation.semantics, np.uint8)
-        store.write_safetensors(self._out / "data" / f"{name}.safetensors", arrays)
+        store.atomic_write(data_path(self._out, len(self._records)), _packed(arrays))
         self._record(observation.view, observation.depth is not None, observation.semantics is not None)
 
     def _record(self, view: View, has_depth: bool, has_semantics: bool) -> None:
@@ -83,6 +96,44 @@ class ObservationWriter:
         if kind is None:
             head = {"schema": _SCHEMA, "trajectory": self._trajectory, "source": self._source, "kind": self._kind}
             store.write_json(self._out / _INDEX, {**head, "observations": self._records})
+
+
+def data_path(folder: Path, index: int) -> Path:
+    """Where the arrays of one observation lie."""
+    return folder / "data" / f"{index:06d}.npz"
+
+
+def _packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """Arrays as a compressed .npz file; equal arrays give equal bytes."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as archive:
+        for name, array in arrays.items():
+            content = io.BytesIO()
+            np.lib.format.write_array(content, array, allow_pickle=False)
+            archive.writestr(zipfile.ZipInfo(f"{name}.npy"), content.getvalue(), zipfile.ZIP_DEFLATED, compresslevel=1)
+    return out.getvalue()
+
+
+def _unpacked(content: bytes, path: Path, shape: tuple[int, int], wanted: Sequence[str]) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz file that are known here; InputError where one is missing, of another type or size, or
+    larger than its view."""
+    arrays = {}
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            there = {info.filename: info for info in archive.infolist()}
+            for name, kind in _TYPES.items():
+                info = there.get(f"{name}.npy")
+                if info is not None and info.file_size <= kind.itemsize * shape[0] * shape[1] + _HEADER_BYTES:
+                    arrays[name] = np.lib.format.read_array(io.BytesIO(archive.read(info)), allow_pickle=False)
+    except (zipfile.BadZipFile, zlib.error, ValueError, EOFError, NotImplementedError, RuntimeError) as error:
+        raise InputError("not a valid .npz file", where=str(path), got=str(error)) from error
+    for name in (*wanted, *arrays):
+        array = arrays.get(name)
+        if array is None or array.shape != shape or array.dtype != _TYPES[name]:
+            what, got = "an observation file does not fit its view", "missing, or too large"
+            got = got if array is None else f"{array.dtype}{list(array.shape)}"
+            raise InputError(what, where=f"{path}: {name}", expected=f"{_TYPES[name]}{list(shape)}", got=got)
+    return arrays
 
 
 def _numpy(tensor: torch.Tensor, dtype: type[np.generic]) -> NDArray[Any]:
@@ -114,15 +165,9 @@ class ObservationSet:
         if not 0 <= index < len(self):
             raise IndexError(index)
         camera = self.views[index].camera
-        path = self.path / "data" / f"{index:06d}.safetensors"
-        arrays = store.read_safetensors(path)
-        shape = (camera.height, camera.width)
+        path, shape = data_path(self.path, index), (camera.height, camera.width)
         wanted = ["confidence", "mask"] + ["depth"] * self.has_depth[index] + ["semantics"] * self.has_semantics[index]
-        for name in wanted:
-            if name not in arrays or arrays[name].shape != shape:
-                got = "missing" if name not in arrays else str(arrays[name].shape)
-                what = "an observation file does not fit its view"
-                raise InputError(what, where=f"{path}: {name}", expected=str(shape), got=got)
+        arrays = _unpacked(store.read_bytes(path), path, shape, wanted)
         return {name: arrays[name] for name in wanted}
 
     def __getitem__(self, index: int) -> Observation:

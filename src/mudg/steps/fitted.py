@@ -112,6 +112,9 @@ class FittedScene:
         """Number of Gaussians."""
         return len(self._model.table)
 
+    def __repr__(self) -> str:
+        return f"FittedScene({self.method!r}, {len(self)} Gaussians, {len(self.object_ids)} objects)"
+
     def object_pose(self, track_id: str, time_s: float) -> NDArray[np.float64] | None:
         """World pose f64[4, 4] of an object's box at a time; None where the object is not there.
 

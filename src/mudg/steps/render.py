@@ -30,7 +30,7 @@ class RenderViews(Output):
     result = "views"
     from_run = ("model",)
     version, files = (
-        2,
+        3,
         ("*.mp4", *below("*", OBSERVATION_FILES), *below("lidar/*", SWEEP_FILES), *below("layers/*", LAYER_FILES)),
     )
     short = (
@@ -114,7 +114,7 @@ class Score(Output):
     section = "single steps, in the order of use"
     examples = ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",)
     smaller = "smaller views (--width-px), fewer --views"
-    version = 6
+    version = 7
     files = (
         *("metrics.json", "metrics.md", "errors/*.png", "features/*.safetensors"),
         *below("truth/*", OBSERVATION_FILES),
@@ -162,7 +162,7 @@ class DrawTruth(Output):
     """Draw the truth of a generated city on some trajectories once, for many scores."""
 
     verb_name = "truth"
-    version, files = 2, below("*", (*OBSERVATION_FILES, "moving.safetensors"))
+    version, files = 3, below("*", (*OBSERVATION_FILES, "moving.safetensors"))
     scene: Path
     trajectories: tuple[Any, ...]
     """Each a `Trajectory`."""

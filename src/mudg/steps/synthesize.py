@@ -147,7 +147,7 @@ class Synthesize(Output):
     smaller = "one process (--processes 1), smaller views (--width-px), fewer --cameras and --shifts-m"
     result = "views"
     from_run = ("fused",)
-    version, files = 2, below("*", (*OBSERVATION_FILES, "overview.png", "depth_fits.json", "state/"))
+    version, files = 3, below("*", (*OBSERVATION_FILES, "overview.png", "depth_fits.json", "state/"))
     idle = ("offload", "compiled")
     short = (
         *("model", "cameras", "shifts_m", "paths", "steps", "width_px", "condition", "align_depth", "precision"),
