@@ -404,6 +404,7 @@ def fit(
     *,
     out: str | Path,
     overwrite: bool = False,
+    tensorboard: bool = False,
     observations: tuple[str | Path, ...] = (),
     start_from: str | Path | None = None,
     config: str | Path | None = None,
@@ -435,6 +436,7 @@ def fit(
         fused: Point clouds written by fuse; required by every method but emernerf. The folder may also stand after SCENE without the flag.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        tensorboard: Also write the numbers of log.jsonl to OUT/tensorboard, for TensorBoard (needs `pip install 'mudg[track]'`).
         observations: Virtual views written by synthesize, in one folder or several; required by method mudg_s.
         start_from: Finished fit of method street_gaussians to the same scene, to continue for `iterations` more steps. Virtual views are used from the first of them on.
         config: YAML file of settings, read before those given here.
@@ -582,6 +584,7 @@ def learn(
     *,
     out: str | Path,
     overwrite: bool = False,
+    tensorboard: bool = False,
     config: str | Path | None = None,
     seed: int = 0,
     start: str = '',
@@ -602,6 +605,7 @@ def learn(
     Args:
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
+        tensorboard: Also write the numbers of log.jsonl to OUT/tensorboard, for TensorBoard (needs `pip install 'mudg[track]'`).
         config: YAML file of settings, read before those given here.
         seed: Seed of the cities, the initial weights and all other random numbers.
         start: Model to continue from: a folder written by learn or convert, or "embedded" for the shipped model (empty = train from scratch).
