@@ -56,18 +56,18 @@ WHOLE, SHORT = replace(LOG, width=1242, height=375), settings("default", 60, (2.
 MEASURED = {
     # run: settings, scene, cores, speed; seconds by the clock, processor seconds, most memory in MB, results in MB,
     # from its run.json
-    "demo on two cores": (settings("default"), DEMO, 2, 1.0, 341.6, None, None, 832.8),
+    "demo on two cores": (settings("default"), DEMO, 2, 1.0, 341.6, None, None, 448.0),
     "demo on two cores, another day": (settings("default"), DEMO, 2, 1.0, 297.4, None, None, None),
-    "demo --fast with six trajectories": (settings("fast", 250, SIX), FAST, 1, 1.0, None, 115.4, 1641, 203.3),
-    "demo --fast, slower machine": (settings("fast"), FAST, 2, SLOWER, None, 153.0, 1859, 105.5),
-    "run --fast on a KITTI drive, slower machine": (settings("fast"), LOG, 2, SLOWER, None, 231.5, 1948, 187.6),
+    "demo --fast with six trajectories": (settings("fast", 250, SIX), FAST, 1, 1.0, None, 115.4, 1641, None),
+    "demo --fast, slower machine": (settings("fast"), FAST, 2, SLOWER, None, 153.0, 1859, 75.0),
+    "run --fast on a KITTI drive, slower machine": (settings("fast"), LOG, 2, SLOWER, None, 231.5, 1948, 122.6),
     "run on that drive at full size": (settings("default"), WHOLE, 2, 1.0, 653.0, None, 3221, None),
-    "16 frames of it, adapted": (SHORT, drive(16, 320, 97, True), 1, 1.0, None, 270.8, 2139, 105.4),
-    "10 frames of it": (settings("default", 100, (2.0, -2.0), 2), drive(10, 480, 145), 1, 1.0, None, 67.9, None, 120.0),
-    "6 frames of it": (settings("default", 60, (2.0,)), drive(6, 320, 97), 1, 1.0, None, 17.5, None, 36.8),
-    "two cameras": (settings("default", 100, (2.0, -2.0), 2), city(16, 8, 320, 208), 1, 1.0, None, 73.2, None, 103.5),
-    "ten frames": (settings("default", 150, (3.0,)), city(10, 10, 192, 128), 1, 1.0, None, 30.2, 965, 53.3),
-    "small": (settings("default", 200, (2.0, -2.0)), city(6, 6, 120, 80), 1, 1.0, None, 33.8, None, 32.2),
+    "16 frames of it, adapted": (SHORT, drive(16, 320, 97, True), 1, 1.0, None, 270.8, 2139, None),
+    "10 frames of it": (settings("default", 100, (2.0, -2.0), 2), drive(10, 480, 145), 1, 1.0, None, 67.9, None, None),
+    "6 frames of it": (settings("default", 60, (2.0,)), drive(6, 320, 97), 1, 1.0, None, 17.5, None, None),
+    "two cameras": (settings("default", 100, (2.0, -2.0), 2), city(16, 8, 320, 208), 1, 1.0, None, 73.2, None, None),
+    "ten frames": (settings("default", 150, (3.0,)), city(10, 10, 192, 128), 1, 1.0, None, 30.2, 965, None),
+    "small": (settings("default", 200, (2.0, -2.0)), city(6, 6, 120, 80), 1, 1.0, None, 33.8, None, None),
 }
 
 

@@ -47,8 +47,10 @@ PUBLISHED_BYTES: Final = {"cpu": 19_000_000_000, "cuda": 9_000_000_000}
 """A published-type model (counted, not measured: docs/research/published.md)."""
 PARAMETER_BYTES, GAUSSIAN_BYTES = 20, 300
 """A number of a Gaussian in memory, with moments and gradient; a Gaussian on disk, in both fits and the viewer."""
-VIEW_PIXEL_BYTES, SCORED_PIXEL_BYTES, VIEWS_BYTES = 10, 25, 2**30
-"""A pixel of a view, in memory (all of them at most VIEWS_BYTES) and as written; one that is labelled or scored."""
+VIEW_PIXEL_BYTES, VIEWS_BYTES = 10, 2**30
+"""A pixel of a view in memory, where all of them take at most VIEWS_BYTES."""
+WRITTEN_PIXEL_BYTES, SCORED_PIXEL_BYTES = 6, 10
+"""A pixel of a view as written, compressed; one that is labelled or scored."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +141,7 @@ def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0,
     held = PUBLISHED_BYTES[device] if published else networks
     memory_bytes = max(PARAMETER_BYTES * columns * gaussians + views, held)
     judged = (rendered if size.exact else size.path_images) + (0 if size.labelled else size.images)
-    shown = VIEW_PIXEL_BYTES * (made + 2 * rendered) + SCORED_PIXEL_BYTES * judged
+    shown = WRITTEN_PIXEL_BYTES * (made + 2 * rendered) + SCORED_PIXEL_BYTES * judged
     written = pixels * shown + GAUSSIAN_BYTES * gaussians
     return Estimate(seconds, processor_s, round(PROGRAM_BYTES + memory_bytes), round(written))
 
