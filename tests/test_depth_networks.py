@@ -25,7 +25,7 @@ from mudg.labels.depth.networks import (
     residual_confidence,
 )
 from mudg.labels.inputs import DepthInput, DepthOptions, Prediction
-from mudg.networks.folders import Place
+from mudg.networks.folders import Compute
 
 RULES = CompletionRules()
 real_packages = pytest.mark.filterwarnings("ignore")
@@ -228,16 +228,16 @@ def test_bfloat16_gives_nearly_the_same(tmp_path: Path) -> None:
     tiny_networks.marigold(tmp_path / "b", longest_px=24)
     given, _ = street(16, 24)
     for folder, options in (("a", DepthOptions()), ("b", DepthOptions(guided=True, steps=2))):
-        exact = load_depth_network(tmp_path / folder, Place("cpu"), options)(given).values
-        rounded = load_depth_network(tmp_path / folder, Place("cpu", bf16=True), options)(given).values
+        exact = load_depth_network(tmp_path / folder, Compute("cpu"), options)(given).values
+        rounded = load_depth_network(tmp_path / folder, Compute("cpu", bf16=True), options)(given).values
         assert rounded.dtype == np.float32 and 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
 
 
 def test_a_missing_device_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ResourceError, match="device cannot be used"):
-        Place("cuda").ready()
-    assert Place().ready() == torch.device("cpu")
+        Compute("cuda").ready()
+    assert Compute().ready() == torch.device("cpu")
 
 
 @real_packages

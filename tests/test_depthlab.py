@@ -31,7 +31,7 @@ from mudg.labels.depth.depthlab import DepthLab, DepthLabSampling, clip_crop, kn
 from mudg.labels.depth.networks import kind_of, load_depth_network
 from mudg.labels.inputs import DepthInput, DepthOptions
 from mudg.labels.settings import AnnotateConfig
-from mudg.networks.folders import Place
+from mudg.networks.folders import Compute
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_scene
 from mudg.steps.convert import Convert
@@ -467,8 +467,8 @@ def test_answers_are_of_the_images_size_and_always_the_same(converted: Path) -> 
 def test_bfloat16_gives_nearly_the_same(converted: Path) -> None:
     given, _ = street(24, 32)
     options = DepthOptions(steps=3)
-    exact = load_depth_network(converted, Place("cpu"), options)(given).values
-    rounded = load_depth_network(converted, Place("cpu", bf16=True), options)(given).values
+    exact = load_depth_network(converted, Compute("cpu"), options)(given).values
+    rounded = load_depth_network(converted, Compute("cpu", bf16=True), options)(given).values
     assert 0 < float(np.abs(rounded - exact).mean()) < 0.05 * float(np.ptp(exact))
 
 

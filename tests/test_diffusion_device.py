@@ -33,7 +33,7 @@ from mudg.labels.depth.networks import Preparation, TransformersDepth
 from mudg.labels.inputs import DepthInput
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.settings import AnnotateConfig
-from mudg.networks.folders import Place
+from mudg.networks.folders import Compute
 from mudg.scene.labels import read_label
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_scene
@@ -311,15 +311,15 @@ def test_pretrained_networks_compute_on_the_device_and_answer_on_the_cpu():
     )
     preparation = Preparation(20, 30, 1, True, (0.5,) * 3, (0.5,) * 3)
 
-    def answers(place: Place):
+    def answers(place: Compute):
         net = Plain(3).to(place.ready()).eval()
-        segmenter = Segmenter(net, "segformer", np.array([0, 2, 10]), (0.5,) * 3, (0.2,) * 3, place=place)
-        depth = TransformersDepth(net, preparation, "depth", with_lidar=False, place=place)
+        segmenter = Segmenter(net, "segformer", np.array([0, 2, 10]), (0.5,) * 3, (0.2,) * 3, compute=place)
+        depth = TransformersDepth(net, preparation, "depth", with_lidar=False, compute=place)
         return [*segmenter.classes(rgb), depth(asked).values]
 
-    here = answers(Place("cpu"))
+    here = answers(Compute("cpu"))
     with pretend_device(), copies() as crossed:
-        there = answers(Place("pretend"))
+        there = answers(Compute("pretend"))
     for a, b in zip(here, there, strict=True):
         assert isinstance(b, np.ndarray) and np.allclose(a, b, atol=1e-5)
     assert crossed.to_host == [3 * 600, 600]  # probabilities, depth

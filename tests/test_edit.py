@@ -268,6 +268,24 @@ def test_removing_an_object_leaves_the_picture_without_it() -> None:
     assert made.node_names() == ()
 
 
+def test_parts_of_the_street_are_erased_and_objects_stay() -> None:
+    """Counted by plain arithmetic: balls take what lies in them, a box turned by 90 degrees what lies outside of it."""
+    model = toy()
+    means, street = model.table["means"].detach().double().numpy(), model.table.labels["node"].numpy() == 0
+    near = [np.linalg.norm(means - place, axis=1) <= radius for place, radius in (((12, -4, 0.8), 1.0), ((3, 0, 0), 2))]
+    made = carried(model, "- erase: {balls: [[12, -4, 0.8, 1.0], [3, 0, 0, 2]]}")
+    assert len(made.table) == len(model.table) - int((street & (near[0] | near[1])).sum()) < len(model.table) - 40
+    assert int((made.table.labels["node"] == 1).sum()) == 50, "the moving car is no part of the street"
+    box = "- erase: {keep: {center: [5, 2, 0], size_m: [6, 20, 4], yaw_deg: 90}}"
+    inside = (np.abs(means[:, 0] - 5) <= 10) & (np.abs(means[:, 1] - 2) <= 3) & (np.abs(means[:, 2]) <= 2)
+    made = carried(model, box)
+    assert len(made.table) == int((~street | inside).sum()) < len(model.table)
+    xyz = means[street].astype(np.float32)
+    cloud = FusedCloud(PointCloud(xyz, np.zeros((len(xyz), 3), np.uint8), "world"), {}, "images")
+    left = edited_cloud(cloud, planned(box, world_of(model))).static
+    assert np.array_equal(left.xyz, xyz[inside[street]])
+
+
 def test_objects_are_chosen_by_kind() -> None:
     model = toy()
     assert carried(model, "- remove: {class: car, moving: true}").node_names() == ()
@@ -532,6 +550,10 @@ def test_edits_on_another_device_are_the_same() -> None:
         ("- stop: {id: car-1, at_s: 9}", "outside its path"),
         ("- remove: {ids: [car-1]}\n- stop: {id: car-1, at_s: 1}", "line 2: stop.id"),
         ("- background: {run: other}", "belongs is not known"),
+        ("- erase: {}", "nothing says what to erase"),
+        ("- erase: {balls: [[1, 2, 3]]}", "a ball is not described"),
+        ("- erase: {balls: [[1, 2, 3, 0]]}", "a ball is not described"),
+        ("- erase: {keep: {center: [0, 0], size_m: [1, 1, 1]}}", "center"),
     ],
 )
 def test_what_cannot_be_done_is_told_with_line_and_verb(text: str, said: str) -> None:

@@ -343,6 +343,55 @@ def test_an_object_is_picked_moved_and_turned_with_its_handles(opened: Browser, 
 
 
 @pytest.mark.slow
+def test_the_brush_and_the_crop_box_take_parts_of_the_street_as_the_program_does(opened: Browser, toy: Toy) -> None:
+    """A stroke marks surfaces under the pointer, and the page then shows what the program renders of the script."""
+    model, scene = toy[2], read_scene(toy[0] / "scene")
+    wanted = next(v for v in at_shift(scene, "front", 0.0).views if abs(v.time_s - 0.6) < 1e-6)
+
+    def compare() -> tuple[float, float]:
+        """PSNR of the page to the render of its script, and to the render without edits."""
+        text = opened.run("import('mudg/edits').then((edits) => edits.scriptText(mudg.state.edits))")
+        edited = carry_out(parse_edits(text, "edits.yaml"), model).model(model)
+        seen = opened.measure(["color"], camera="front", t=0.6)["color"][..., :3] / 255.0
+        true, plain = (render_view(m, wanted, raster_of(m)).rgb.permute(1, 2, 0).numpy() for m in (edited, model))
+        return tuple(float(-10 * np.log10(np.square(seen - of).mean())) for of in (true, plain))
+
+    opened.run("document.getElementById('stage').setPointerCapture = () => {}; mudg.editor.set([]); 1")
+    opened.run("mudg.change({mode: 'recorded', camera: 'front', t: 0.6, shift: 0}); 1")
+    opened.wait("mudg.sharp")
+    change = "(() => {{ const e = document.getElementById('{}'); e.value = {}; e.onchange({{target: e}}); }})(); 1"
+    opened.run(change.format("brush-radius", 1.25))
+    opened.run("document.getElementById('brush').click(); 1")
+    assert opened.run("document.getElementById('brush').getAttribute('aria-pressed')") == "true"
+    box = opened.run(
+        "(() => { const b = mudg.stage.getBoundingClientRect(); return [b.left, b.top, b.width, b.height]; })()"
+    )
+    places = [(box[0] + box[2] * u, box[1] + box[3] * 0.8) for u in (0.35, 0.5, 0.65)]
+    for kind, (x, y) in zip(("pointerdown", "pointermove", "pointermove"), places, strict=True):
+        opened.run(f"(({PRESS})('{kind}', {x}, {y}), 1)")
+    opened.run(f"(({PRESS})('pointerup', {places[-1][0]}, {places[-1][1]}), 1)")
+    (entry,) = opened.run("mudg.state.edits")
+    balls = np.array(entry["erase"]["balls"])
+    assert balls.shape[1] == 4 and len(balls) >= 2 and (balls[:, 3] == 1.25).all()
+    apart = np.linalg.norm(model.table["means"].detach().numpy()[:, None] - balls[None, :, :3], axis=2)
+    assert (apart.min(0) < 1).all(), "each mark lies at a surface"
+    same, other = compare()
+    assert same >= 38 and other < same - 5
+    opened.run("document.getElementById('brush').click(); mudg.editor.undo(); 1")
+    assert opened.run("mudg.state.edits.length") == 0
+    opened.run("document.getElementById('crop').click(); 1")
+    for field, value in (("box-length", 14), ("box-width", 5), ("box-yaw", 20)):
+        opened.run(change.format(field, value))
+    (entry,) = opened.run("mudg.state.edits")
+    assert entry["erase"]["keep"]["size_m"][:2] == [14, 5] and entry["erase"]["keep"]["yaw_deg"] == 20
+    same, other = compare()
+    assert same >= 38 and other < same - 5
+    opened.run("document.getElementById('crop').click(); 1")
+    assert opened.run("mudg.state.edits.length") == 0
+    assert opened.errors == []
+
+
+@pytest.mark.slow
 def test_a_page_with_a_server_checks_and_saves(toy: Toy, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("- speed: {id: car-1, factor: 0.5}\n")
     files = EditFiles(tmp_path / "mine.yaml", tmp_path / "edits.yaml")

@@ -214,29 +214,29 @@ def _make_private(folder: Path) -> None:
 # there and back -----------------------------------------------------------------------------------
 
 
-def _fetch_earlier(given: Location, at: Path) -> None:
+def _fetch_earlier(location: Location, at: Path) -> None:
     """What the output holds already: the verb reuses or refuses it. What an interrupted command left goes first."""
     store.make_folder(at.parent)
-    if at.exists() or not given.exists():
+    if at.exists() or not location.exists():
         return
-    record = given.uploaded()
+    record = location.uploaded()
     if record is not None and not record.complete:
         return  # an upload that was stopped; this one takes its place
-    if record is None and store.MANIFEST not in (names := given.names()) and names:
+    if record is None and store.MANIFEST not in (names := location.names()) and names:
         remedy = "choose an address at which nothing is"
-        raise UsageError("the output address holds files of something else", where=str(given), remedy=remedy)
-    log.info(f"fetching what {given} holds")
+        raise UsageError("the output address holds files of something else", where=str(location), remedy=remedy)
+    log.info(f"fetching what {location} holds")
     partial = at.parent / f".{at.name}.earliers.part"
-    given.fetch(partial, mirror=True)
+    location.fetch(partial, mirror=True)
     store.take_place(partial, at)
 
 
-def _upload(given: Location, at: Path) -> None:
+def _upload(location: Location, at: Path) -> None:
     """Everything that the verb made, also what lies beside the file that it was to write."""
     made = [path for path in sorted(at.parent.iterdir()) if ".part" not in path.name]
     if at not in made:
-        raise InputError("the command made nothing", where=str(given))
-    above = str(given).rpartition("/")[0]
+        raise InputError("the command made nothing", where=str(location))
+    above = str(location).rpartition("/")[0]
     for path in sorted(made, key=lambda one: one == at):
         target = Location.of(f"{above}/{path.name}")
         log.info(f"uploading {target}")

@@ -113,8 +113,8 @@ def _leaves(value: Any, name: str, depth: int) -> Iterator[tuple[str, PickledObj
         yield from _leaves(entry, f"{name}.{key}" if name else str(key), depth + 1)
 
 
-def _read(archive: zipfile.ZipFile, folder: str, found: PickledObject, where: str) -> Tensor:
-    storage, offset, size, stride = found.arguments
+def _read(archive: zipfile.ZipFile, folder: str, value: PickledObject, where: str) -> Tensor:
+    storage, offset, size, stride = value.arguments
     ((mark, kind, key, _place, count),) = storage.arguments
     known = mark == "storage" and isinstance(kind, Name) and kind.text in _STORAGES
     if not (known and isinstance(key, str) and key.isalnum()):
@@ -440,11 +440,11 @@ def _without_prefix(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return dict(tensors)
 
 
-def with_towers(found: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> dict[str, Tensor]:
+def with_towers(state: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """A checkpoint completed by an OpenCLIP file (names without prefix) where it lacks the text or the image tower."""
-    result = dict(found)
+    result = dict(state)
     for prefix in (_TEXT, _IMAGE):
-        if not any(name.startswith(prefix) for name in found):
+        if not any(name.startswith(prefix) for name in state):
             image = prefix == _IMAGE
             result |= {prefix + name: value for name, value in towers.items() if name.startswith("visual.") == image}
     return result
@@ -453,11 +453,11 @@ def with_towers(found: Mapping[str, Tensor], towers: Mapping[str, Tensor]) -> di
 # matching -----------------------------------------------------------------------------------------
 
 
-def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str) -> dict[str, Tensor]:
+def match(state: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str) -> dict[str, Tensor]:
     """The tensors of a checkpoint under our names, strictly.
 
     Args:
-        found: published name -> tensor.
+        state: published name -> tensor.
         wanted: our name -> shape, all that the model needs and nothing else.
 
     Raises:
@@ -466,9 +466,9 @@ def match(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], wher
     """
     published = published_names(wanted)
     known = set(published.values())
-    read = {name: value for name, value in found.items() if name in known or name not in UNUSED}
+    read = {name: value for name, value in state.items() if name in known or name not in UNUSED}
     match_exactly(read, {published[ours]: shape for ours, shape in wanted.items()}, where, "the published model")
-    return {ours: found[theirs] for ours, theirs in published.items()}
+    return {ours: state[theirs] for ours, theirs in published.items()}
 
 
 def refuse_bad_values(tensors: Mapping[str, Tensor], where: str) -> None:
@@ -481,19 +481,19 @@ def refuse_bad_values(tensors: Mapping[str, Tensor], where: str) -> None:
             raise InputError("a tensor holds values that are not finite", where=f"{where}: {name}")
 
 
-def match_exactly(found: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str, network: str) -> None:
+def match_exactly(state: Mapping[str, Tensor], wanted: Mapping[str, Sequence[int]], where: str, network: str) -> None:
     """Names and shapes of a checkpoint against what its network needs, strictly; ``network``: what to call it.
 
     Raises:
         InputError: names are missing, unknown, or have another shape; the first ones of each kind are listed with the
             counts.
     """
-    missing = [name for name in wanted if name not in found]
-    unexpected = [name for name in found if name not in wanted]
+    missing = [name for name in wanted if name not in state]
+    unexpected = [name for name in state if name not in wanted]
     misshaped = [
-        f"{name} {tuple(found[name].shape)} instead of {tuple(shape)}"
+        f"{name} {tuple(state[name].shape)} instead of {tuple(shape)}"
         for name, shape in wanted.items()
-        if name in found and tuple(found[name].shape) != tuple(shape)
+        if name in state and tuple(state[name].shape) != tuple(shape)
     ]
     if missing or unexpected or misshaped:
         lines = [

@@ -537,10 +537,10 @@ def psnr_in(errors: Sequence[NDArray[np.float32]]) -> float | None:
     return metrics.psnr_of_errors(every) if len(every) else None
 
 
-def distance_in(made: NDArray[np.float32], true: NDArray[np.float32], mask: NDArray[np.bool_]) -> float:
+def distance_in(generated: NDArray[np.float32], true: NDArray[np.float32], mask: NDArray[np.bool_]) -> float:
     """Perceptual distance of two images f32[H, W, 3], weighted by the pixels of a mask."""
     features = shipped_features()
-    pair = [torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))) for image in (made, true)]
+    pair = [torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))) for image in (generated, true)]
     with torch.no_grad():
         weight = torch.from_numpy(mask).float()[None]
         return float(lpips_distance(features(pair[0]), unit_features(features(pair[1])), weight, over_weight=True))

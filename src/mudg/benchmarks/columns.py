@@ -471,12 +471,12 @@ def _confusion(sight: Sight) -> Sum | None:
     return metrics.confusion(sight.semantics, true).double().numpy()
 
 
-def _relative(made: Tensor, true: Tensor) -> Tensor:
-    return (made - true).abs() / true
+def _relative(generated: Tensor, true: Tensor) -> Tensor:
+    return (generated - true).abs() / true
 
 
-def _within(made: Tensor, true: Tensor) -> Tensor:
-    return (torch.maximum(made.clamp_min(1e-6) / true, true / made.clamp_min(1e-6)) < 1.25).double()
+def _within(generated: Tensor, true: Tensor) -> Tensor:
+    return (torch.maximum(generated.clamp_min(1e-6) / true, true / generated.clamp_min(1e-6)) < 1.25).double()
 
 
 def _part_columns(part: str) -> dict[str, Column]:

@@ -33,7 +33,7 @@ JEDI_DEGREE: Final = 2
 JEDI_FACTOR: Final = 100.0
 
 
-def frechet_distance(made: ArrayLike, real: ArrayLike) -> float:
+def frechet_distance(generated: ArrayLike, real: ArrayLike) -> float:
     """Squared Frechet distance of the Gaussians with the sets' means and covariances (divisor n - 1).
 
     ``|m1 - m2|^2 + tr S1 + tr S2 - 2 tr (S1 S2)^(1/2)``. The last trace is the nuclear norm of ``A B^T``, where A and B
@@ -41,7 +41,7 @@ def frechet_distance(made: ArrayLike, real: ArrayLike) -> float:
     added to any diagonal.
 
     Args:
-        made, real: ``[n, d]`` and ``[m, d]``, n, m >= 2.
+        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 2.
 
     Returns:
         In squared units of the features, [0, inf). 0 for equal means and covariances, up to rounding. Symmetric;
@@ -50,7 +50,7 @@ def frechet_distance(made: ArrayLike, real: ArrayLike) -> float:
     Raises:
         InputError: sets of other widths, too few rows, or values that are not finite.
     """
-    a, b = _pair(made, real, 2)
+    a, b = _pair(generated, real, 2)
     apart = a.mean(0) - b.mean(0)
     root_a, root_b = _covariance_root(a), _covariance_root(b)
     common = np.linalg.svd(root_a @ root_b.T, compute_uv=False).sum()
@@ -64,7 +64,7 @@ def _covariance_root(features: Features) -> Features:
 
 
 def frechet_at_infinity(
-    made: ArrayLike, real: ArrayLike, rng: np.random.Generator, sizes: int = INFINITY_SIZES
+    generated: ArrayLike, real: ArrayLike, rng: np.random.Generator, sizes: int = INFINITY_SIZES
 ) -> float:
     """The Frechet distance extrapolated to endless sets: its bias is nearly linear in 1/N.
 
@@ -73,7 +73,7 @@ def frechet_at_infinity(
     about 1000 rows on.
 
     Args:
-        made, real: ``[n, d]`` and ``[m, d]``, at least twice ``sizes`` rows each.
+        generated, real: ``[n, d]`` and ``[m, d]``, at least twice ``sizes`` rows each.
         rng: chooses the rows. sizes: number of sizes, >= 2.
 
     Returns:
@@ -82,7 +82,7 @@ def frechet_at_infinity(
     Raises:
         InputError: as ``frechet_distance``.
     """
-    a, b = _pair(made, real, max(4, 2 * sizes))
+    a, b = _pair(generated, real, max(4, 2 * sizes))
     most = min(len(a), len(b))
     counts = np.unique(np.linspace(most / 2, most, sizes).round().astype(int))
     found = []
@@ -93,12 +93,12 @@ def frechet_at_infinity(
     return float(slope_and_start[0])
 
 
-def kernel_distance(made: ArrayLike, real: ArrayLike) -> float:
+def kernel_distance(generated: ArrayLike, real: ArrayLike) -> float:
     """Unbiased squared maximum mean discrepancy with the kernel ``(x.y / d + 1)^3`` over all rows; KID on FID's
     features.
 
     Args:
-        made, real: ``[n, d]`` and ``[m, d]``, n, m >= 2; n and m may differ.
+        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 2; n and m may differ.
 
     Returns:
         (-inf, inf), raw (not times 100 or 1000). Its mean over samples of one law is 0, so a single value may be
@@ -107,12 +107,12 @@ def kernel_distance(made: ArrayLike, real: ArrayLike) -> float:
     Raises:
         InputError: as ``frechet_distance``.
     """
-    a, b = _pair(made, real, 2)
+    a, b = _pair(generated, real, 2)
     return _unbiased(_cubic(a, a), _cubic(b, b), _cubic(a, b), np.ones(len(a)), np.ones(len(b)))
 
 
 def kernel_distance_error(
-    made: ArrayLike, real: ArrayLike, blocks: Sequence[ArrayLike], rng: np.random.Generator, draws: int = 200
+    generated: ArrayLike, real: ArrayLike, blocks: Sequence[ArrayLike], rng: np.random.Generator, draws: int = 200
 ) -> float:
     """Standard error of ``kernel_distance`` by a block bootstrap: rows of a block, such as frames of one log, depend on
     each other and are drawn together.
@@ -120,7 +120,7 @@ def kernel_distance_error(
     A row that is drawn twice is never compared with itself: pairs of one row are left out, as in the distance itself.
 
     Args:
-        made, real: ``[n, d]`` and ``[m, d]``.
+        generated, real: ``[n, d]`` and ``[m, d]``.
         blocks: block number of every row of either set; at least two blocks each.
         rng: draws the blocks. draws: number of resamples, >= 2.
 
@@ -130,7 +130,7 @@ def kernel_distance_error(
     Raises:
         InputError: as ``frechet_distance``, or block numbers that do not fit the rows.
     """
-    a, b = _pair(made, real, 2)
+    a, b = _pair(generated, real, 2)
     groups = []
     for rows, numbers in zip((a, b), blocks, strict=True):
         given = np.asarray(numbers, np.int64)
@@ -169,7 +169,7 @@ def _unbiased(own_a: Features, own_b: Features, across: Features, a: Features, b
 
 
 def mind_distance(
-    made: ArrayLike, real: ArrayLike, rng: np.random.Generator, directions: int = MIND_DIRECTIONS
+    generated: ArrayLike, real: ArrayLike, rng: np.random.Generator, directions: int = MIND_DIRECTIONS
 ) -> float:
     """MIND: squared 2-Wasserstein distance along random directions, times 3 d (sliced Wasserstein distance).
 
@@ -177,7 +177,7 @@ def mind_distance(
     multiplied by 3 d. A larger set is first reduced to the size of the smaller one, to random rows.
 
     Args:
-        made, real: ``[n, d]`` and ``[m, d]``, n, m >= 1.
+        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 1.
         rng: draws rows and directions: the same state and sizes give the same directions. directions: how many.
 
     Returns:
@@ -187,7 +187,7 @@ def mind_distance(
     Raises:
         InputError: as ``frechet_distance``.
     """
-    a, b = _pair(made, real, 1)
+    a, b = _pair(generated, real, 1)
     width, count = a.shape[1], min(len(a), len(b))
     lines = rng.standard_normal((width, directions))
     lines /= np.linalg.norm(lines, axis=0)
@@ -196,14 +196,14 @@ def mind_distance(
     return float(MIND_FACTOR * width * (apart**2).mean())
 
 
-def cmmd_distance(made: ArrayLike, real: ArrayLike) -> float:
+def cmmd_distance(generated: ArrayLike, real: ArrayLike) -> float:
     """CMMD: squared maximum mean discrepancy of directions under a Gaussian kernel of sigma 10, times 1000.
 
     Rows are brought to length 1 first. Biased: means over full kernel matrices, with their diagonals. Published values
     are of image embeddings of CLIP ViT-L/14 at 336 pixels.
 
     Args:
-        made, real: ``[n, d]`` and ``[m, d]``, n, m >= 1, no row of length 0.
+        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 1, no row of length 0.
 
     Returns:
         [0, 1000 * 2 * (1 - exp(-4 / 200))], that is at most 39.6; 0 for equal sets. Symmetric; unchanged by common
@@ -213,7 +213,7 @@ def cmmd_distance(made: ArrayLike, real: ArrayLike) -> float:
         InputError: as ``frechet_distance``, or a row of length 0.
     """
     units = []
-    for name, features in zip(("generated", "real"), _pair(made, real, 1), strict=True):
+    for name, features in zip(("generated", "real"), _pair(generated, real, 1), strict=True):
         lengths = np.linalg.norm(features, axis=1, keepdims=True)
         if not lengths.all():
             raise InputError(
@@ -229,14 +229,14 @@ def cmmd_distance(made: ArrayLike, real: ArrayLike) -> float:
     return max(0.0, CMMD_FACTOR * (mean_kernel(a, a) + mean_kernel(b, b) - 2.0 * mean_kernel(a, b)))
 
 
-def polynomial_distance(made: ArrayLike, real: ArrayLike) -> float:
+def polynomial_distance(generated: ArrayLike, real: ArrayLike) -> float:
     """Squared maximum mean discrepancy with the kernel ``(x.y / d)^2``, times 100, as JEDi has it on features of
     videos.
 
     Biased: means over full kernel matrices, with their diagonals.
 
     Args:
-        made, real: ``[n, d]`` and ``[m, d]``, n, m >= 1.
+        generated, real: ``[n, d]`` and ``[m, d]``, n, m >= 1.
 
     Returns:
         [0, inf); 0 for equal sets, and for sets with equal second moments. Symmetric; multiplied by c^4 when all
@@ -245,7 +245,7 @@ def polynomial_distance(made: ArrayLike, real: ArrayLike) -> float:
     Raises:
         InputError: as ``frechet_distance``.
     """
-    a, b = _pair(made, real, 1)
+    a, b = _pair(generated, real, 1)
 
     def mean_kernel(x: Features, y: Features) -> float:
         return float(((x @ y.T / x.shape[1]) ** JEDI_DEGREE).mean())
@@ -253,8 +253,8 @@ def polynomial_distance(made: ArrayLike, real: ArrayLike) -> float:
     return max(0.0, JEDI_FACTOR * (mean_kernel(a, a) + mean_kernel(b, b) - 2.0 * mean_kernel(a, b)))
 
 
-def _pair(made: ArrayLike, real: ArrayLike, fewest: int) -> tuple[Features, Features]:
-    a, b = (_checked(features, name, fewest) for features, name in ((made, "generated"), (real, "real")))
+def _pair(generated: ArrayLike, real: ArrayLike, fewest: int) -> tuple[Features, Features]:
+    a, b = (_checked(features, name, fewest) for features, name in ((generated, "generated"), (real, "real")))
     if a.shape[1] != b.shape[1]:
         raise InputError(
             "two sets of features differ in width",

@@ -413,16 +413,16 @@ def image_error(error: Tensor, square: float, gradient: float) -> Tensor:
     return error.abs().mean() + square * error.square().mean() + gradient * (across.abs().mean() + down.abs().mean())
 
 
-def depth_code_error(made: Tensor, truth: Tensor, weight: Tensor, log_per_code: float) -> Tensor:
+def depth_code_error(generated: Tensor, truth: Tensor, weight: Tensor, log_per_code: float) -> Tensor:
     """5 x smooth L1 (beta 0.005) of made / true depth - 1, weighted; a plain mean over pixels.
 
     A surface painted too far away costs more than one too near, as in the measure it is scored by.
 
     Args:
-        made, truth: codes ``[N, 1, H, W]``, taken for logarithms of depth in steps of ``log_per_code``.
+        generated, truth: codes ``[N, 1, H, W]``, taken for logarithms of depth in steps of ``log_per_code``.
         weight: ``[N, 1, H, W]``; 0 where the truth is not known.
     """
-    ratio = torch.expm1(((made - truth) * log_per_code).clamp(max=MAX_LOG_RATIO))
+    ratio = torch.expm1(((generated - truth) * log_per_code).clamp(max=MAX_LOG_RATIO))
     off = F.smooth_l1_loss(ratio, torch.zeros_like(ratio), beta=0.005, reduction="none")
     return 5.0 * (off * weight).mean()
 

@@ -74,20 +74,20 @@ BAND_PIXELS: Final = 600_000
 MOVABLE = tuple(palette.ID[n] for n in ("person", "rider", "car", "truck", "bus", "train", "motorcycle", "bicycle"))
 
 
-def flicker(made: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> float:
-    """Change of static surfaces from one frame to the next in `made`, over that in `truth` (1 = as steady as the
+def flicker(generated: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> float:
+    """Change of static surfaces from one frame to the next in `generated`, over that in `truth` (1 = as steady as the
     truth).
 
     Arguments as for `changes`. NaN for one frame or without such pixels.
     """
-    pairs = changes(made, truth, frames)
+    pairs = changes(generated, truth, frames)
     true_change = sum(t for _, t in pairs)
     return sum(m for m, _ in pairs) / true_change if true_change > 0 else math.nan
 
 
-def changes(made: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> list[tuple[float, float]]:
-    """Summed absolute change of static surfaces between each frame and the next, in `made` and in `truth`, f32[T,3,H,W]
-    each.
+def changes(generated: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> list[tuple[float, float]]:
+    """Summed absolute change of static surfaces between each frame and the next, in `generated` and in `truth`, both
+    f32[T,3,H,W].
 
     Every pixel of a class that cannot move is carried by its true depth into the next frame and compared with what is
     there (bilinear), if the same surface is seen there (depths within 3 %).
@@ -95,7 +95,7 @@ def changes(made: Tensor, truth: Tensor, frames: Sequence[TrueFrame]) -> list[tu
     pairs = []
     for t in range(len(truth) - 1):
         where = pixel_motion(frames[t], frames[t + 1])
-        pairs.append((change(made[t], made[t + 1], where), change(truth[t], truth[t + 1], where)))
+        pairs.append((change(generated[t], generated[t + 1], where), change(truth[t], truth[t + 1], where)))
     return pairs
 
 

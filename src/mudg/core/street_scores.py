@@ -133,13 +133,13 @@ def at_lane_size(mask: NDArray[np.generic]) -> Mask:
     return np.asarray(mask)[rows][:, columns] != 0
 
 
-def ntl_iou(found: Mask, true: Mask) -> float:
+def ntl_iou(detected: Mask, true: Mask) -> float:
     """(IoU of the background + IoU of lanes) / 2 of one frame, times 100; a class that neither has counts as 0.
 
     An image without any lane found scores 47 to 50, because nearly everything is background: read differences of single
     points.
     """
-    return 50.0 * (_iou(~found, ~true) + _iou(found, true))
+    return 50.0 * (_iou(~detected, ~true) + _iou(detected, true))
 
 
 def _iou(a: Mask, b: Mask) -> float:
@@ -182,16 +182,16 @@ def bright_stripes(rgb: NDArray[np.floating], road: Mask) -> Mask:
     return found & (np.bincount(regions.ravel(), minlength=count + 1) >= FEWEST_PX)[regions]
 
 
-def tolerant_iou(found: Mask, true: Mask, tolerance_px: int = TOLERANCE_PX) -> tuple[float, float]:
+def tolerant_iou(detected: Mask, true: Mask, tolerance_px: int = TOLERANCE_PX) -> tuple[float, float]:
     """(Hits, hits + misses + false alarms) of thin structures: pixels count as hit if the other mask has one within
     ``tolerance_px``.
 
     Hits are the mean of those of either mask. Both numbers add up over frames; their ratio is the IoU.
     """
-    near_true, near_found = _grown(true, tolerance_px), _grown(found, tolerance_px)
-    right, covered = int((found & near_true).sum()), int((true & near_found).sum())
+    near_true, near_found = _grown(true, tolerance_px), _grown(detected, tolerance_px)
+    right, covered = int((detected & near_true).sum()), int((true & near_found).sum())
     hits = (right + covered) / 2
-    return hits, hits + (int(found.sum()) - right) + (int(true.sum()) - covered)
+    return hits, hits + (int(detected.sum()) - right) + (int(true.sum()) - covered)
 
 
 def rows_of(mask: Mask, margin: int) -> slice:
@@ -341,13 +341,13 @@ def nta_iou(truths: Sequence[ImageBox], detections: Sequence[ImageBox]) -> list[
     return [_matched(true, detections, NTA_REACH_PX) for true in truths]
 
 
-def _matched(true: ImageBox, found: Sequence[ImageBox], reach_px: float) -> float:
-    if not len(found):
+def _matched(true: ImageBox, detected: Sequence[ImageBox], reach_px: float) -> float:
+    if not len(detected):
         return 0.0
-    centres = [(box[:2] + box[2:]) / 2 for box in found]
+    centres = [(box[:2] + box[2:]) / 2 for box in detected]
     away = [float(np.linalg.norm(centre - (true[:2] + true[2:]) / 2)) for centre in centres]
     nearest = int(np.argmin(away))
-    return iou(true, found[nearest]) if away[nearest] <= reach_px else 0.0
+    return iou(true, detected[nearest]) if away[nearest] <= reach_px else 0.0
 
 
 # ---- what is really visible ----------------------------------------------------------------------

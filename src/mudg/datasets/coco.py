@@ -28,9 +28,9 @@ CATEGORY_OF: Final = {
 """Label -> class, where they differ."""
 
 
-def write_view(folder: Path, place: DatasetPlace, view: LabelledView) -> dict[str, Any]:
+def write_view(folder: Path, target: DatasetPlace, view: LabelledView) -> dict[str, Any]:
     """The image, its panoptic image, and its annotations."""
-    number = place.number
+    number = target.number
     classes, instances = view.layers["classes"], view.layers["instances"]
     height, width = classes.shape
     store.write_image(folder / "images" / f"{number:06d}.png", view.layers["rgb"])

@@ -56,9 +56,9 @@ EARTH_RADIUS_M: Final = 6378137.0
 Matrix = NDArray[np.float64]
 
 
-def write_view(folder: Path, place: DatasetPlace, view: LabelledView) -> dict[str, Any]:
+def write_view(folder: Path, target: DatasetPlace, view: LabelledView) -> dict[str, Any]:
     """The files of a frame of the object benchmark."""
-    name = f"{place.number:06d}"
+    name = f"{target.number:06d}"
     store.write_image(folder / "image_2" / f"{name}.png", view.layers["rgb"])
     _write_scan(folder / "velodyne" / f"{name}.bin", view.sweep)
     cam_from_velo, velo_from_imu = frames_of(view)
@@ -76,15 +76,15 @@ def write_whole(folder: Path, records: Sequence[Mapping[str, Any]]) -> None:
         store.write_text(folder / "ImageSets" / f"{split}.txt", _text(dict.fromkeys(names)))
 
 
-def write_tracked(folder: Path, place: DatasetPlace, view: LabelledView) -> dict[str, Any]:
+def write_tracked(folder: Path, target: DatasetPlace, view: LabelledView) -> dict[str, Any]:
     """The files of a frame of the tracking benchmark; every path is a sequence."""
-    sequence, name = f"{place.sequence:04d}", f"{place.frame:06d}"
+    sequence, name = f"{target.sequence:04d}", f"{target.frame:06d}"
     store.write_image(folder / "image_02" / sequence / f"{name}.png", view.layers["rgb"])
     _write_scan(folder / "velodyne" / sequence / f"{name}.bin", view.sweep)
     cam_from_velo, velo_from_imu = frames_of(view)
     named = {"R_rect": np.eye(3), "Tr_velo_cam": cam_from_velo[:3], "Tr_imu_velo": velo_from_imu[:3]}
     lines = [
-        f"{place.frame} {box.number} " + label_line(box, view, str(sum(box.truncation >= share for share in LEVELS)))
+        f"{target.frame} {box.number} " + label_line(box, view, str(sum(box.truncation >= share for share in LEVELS)))
         for box in view.boxes
     ]
     packet = packet_line(view.view.world_from_cam @ cam_from_velo @ velo_from_imu)

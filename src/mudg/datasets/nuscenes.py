@@ -55,12 +55,12 @@ def token(*words: object) -> str:
     return hashlib.sha256(" ".join(map(str, words)).encode()).hexdigest()[:32]
 
 
-def write_view(folder: Path, place: DatasetPlace, view: LabelledView) -> Row:
+def write_view(folder: Path, target: DatasetPlace, view: LabelledView) -> Row:
     """The image of a sample and, if it has one, its sweep, and what the tables need to know of them."""
     camera = view.view.camera
     channel = CHANNELS.get(camera.name, f"CAM_{camera.name.upper()}")
     ending, index = view.name.removeprefix(f"{camera.name}_").split("/")
-    ending = f"{place.drive}-{ending}"
+    ending = f"{target.drive}-{ending}"
     name = f"samples/{channel}/mudg__{ending}__{channel}__{index}.png"
     store.write_image(folder / name, view.layers["rgb"])
     intrinsics = [[camera.fx, 0, camera.cx - 0.5], [0, camera.fy, camera.cy - 0.5], [0, 0, 1]]
@@ -84,7 +84,7 @@ def write_view(folder: Path, place: DatasetPlace, view: LabelledView) -> Row:
     pose = view.view.world_from_cam if view.mount is None else view.view.world_from_cam @ geometry.invert(view.mount)
     size = {"width": camera.width, "height": camera.height}
     facts = {
-        "drive": place.drive,
+        "drive": target.drive,
         "scene": ending,
         "index": index,
         "channel": channel,

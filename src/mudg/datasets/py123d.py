@@ -54,10 +54,10 @@ def library() -> Any:
     return py123d
 
 
-def write_view(folder: Path, place: DatasetPlace, view: LabelledView) -> dict[str, Any]:
+def write_view(folder: Path, target: DatasetPlace, view: LabelledView) -> dict[str, Any]:
     """Image, sweep and facts of a view as of nuScenes, until ``write_whole`` takes them into the log."""
     camera = nuscenes.pose_row(view.view.world_from_cam)
-    return {**nuscenes.write_view(folder, place, view), "camera": camera}
+    return {**nuscenes.write_view(folder, target, view), "camera": camera}
 
 
 def write_whole(folder: Path, records: Sequence[Row]) -> None:

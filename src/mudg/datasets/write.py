@@ -181,10 +181,10 @@ def wanted(view: LabelledView, config: DatasetConfig) -> LabelledView:
     return dataclasses.replace(view, boxes=tuple(box for box in view.boxes if box.pixels and keep(box)))
 
 
-def about(place: DatasetPlace, view: LabelledView, drive: LabelledDrive) -> dict[str, Any]:
+def about(target: DatasetPlace, view: LabelledView, drive: LabelledDrive) -> dict[str, Any]:
     """Where an image comes from, and how far it can be trusted."""
     return {
-        "image": f"{place.number:06d}",
+        "image": f"{target.number:06d}",
         **drive.provenance,
         "drive": drive.name,
         "split": drive.split,

@@ -289,13 +289,13 @@ class ClipMaker:
             clip = replace(clip, fine=cut_patch(self._clip(fine, images, finished), self._log.scale, PATCH_PX, rng))
         return replace(clip, shift_m=self._lesson.shift_m)
 
-    def _clip(self, condition: Condition, images: list, made: GeneratedClip) -> Clip:
+    def _clip(self, condition: Condition, images: list, clip: GeneratedClip) -> Clip:
         rgb = torch.stack(
             [image_tensor(resize_area(i, v.camera.width, v.camera.height)) for i, v in zip(images, condition.views)]
         )
         depth, known = zip(*(measured_depth(self._scene, view) for view in condition.views))
         depth, known = torch.from_numpy(np.stack(depth))[:, None], torch.from_numpy(np.stack(known))[:, None]
-        return Clip(condition, rgb, torch.where(known, depth, made.depth), torch.ones_like(known), made.semantics)
+        return Clip(condition, rgb, torch.where(known, depth, clip.depth), torch.ones_like(known), clip.semantics)
 
 
 # adapt --------------------------------------------------------------------------------------------

@@ -173,9 +173,9 @@ def convert_file(config: ConvertConfig, checkpoint: Path, to: Path, network: Pub
     published.save(to, network, tensors, facts, _card(network, facts), dtype=dtype, shard_bytes=SHARD_BYTES)
 
 
-def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:
+def refuse_relatives(state: Mapping[str, Tensor], where: Path) -> None:
     """InputError for DynamiCrafter-256, which looks alike and is another model."""
-    marks = [name for name in found if ".framestride_embed." in name or name.endswith(".attn2.alpha")]
+    marks = [name for name in state if ".framestride_embed." in name or name.endswith(".attn2.alpha")]
     if marks:
         raise InputError(
             "this is the 256-pixel DynamiCrafter, which cannot be converted",
@@ -190,7 +190,7 @@ def refuse_relatives(found: Mapping[str, Tensor], where: Path) -> None:
         )
 
 
-def widen(found: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
+def widen(state: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
     """A checkpoint with 8 input channels made one with 12 and a modality label; others unchanged. Also says what was
     done.
 
@@ -198,7 +198,7 @@ def widen(found: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], str]:
     included, is halved; the label's embedding starts as a copy of that of the noise step. Both as in the published
     training.
     """
-    tensors = dict(found)
+    tensors = dict(state)
     kernel = tensors.get(_ENTER)
     if kernel is None or kernel.ndim != 4 or kernel.shape[1] % 2 or any(".class_embed." in name for name in tensors):
         return tensors, ""
@@ -221,11 +221,11 @@ def wanted_shapes(network: PublishedConfig) -> dict[str, tuple[int, ...]]:
     return shapes | {"scale": (SCALE_ENTRIES,)}
 
 
-def _check_values(found: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: Path) -> None:
+def _check_values(state: Mapping[str, Tensor], tensors: Mapping[str, Tensor], where: Path) -> None:
     """InputError for values that no such model has: not finite, a schedule that keeps signal, a rescale outside (0,
     1]."""
     weights.refuse_bad_values(tensors, str(where))
-    scale, alpha_bar = tensors["scale"].float(), found.get("alphas_cumprod")
+    scale, alpha_bar = tensors["scale"].float(), state.get("alphas_cumprod")
     if float(scale.min()) <= 0 or float(scale.max()) > 1 + 1e-6:
         raise InputError(
             "the dynamic rescale table is out of range",

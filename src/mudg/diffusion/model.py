@@ -377,17 +377,17 @@ class MDM(nn.Module):
         ids = refined.scores.argmax(1, keepdim=True).to(torch.uint8)
         return Made(refined.rgb, refined.depth_code, ids, refined.log_error)
 
-    def _pixel_terms(self, made: Refined, truth: PixelTruth, settings: LossSettings, name: str) -> dict[str, Tensor]:
+    def _pixel_terms(self, refined: Refined, truth: PixelTruth, settings: LossSettings, name: str) -> dict[str, Tensor]:
         """Weighted terms of refined pixels; depth in the sky counts threefold."""
         codec = self.config.codec
         log_per_code = math.log(codec.far_m / codec.near_m) / 2
         counted = (1.0 + 2.0 * (truth.ids == SKY).unsqueeze(1)) * truth.depth_known
-        error = made.rgb - truth.rgb
+        error = refined.rgb - truth.rgb
         return {
             f"{name}_rgb": losses.image_error(error, square=2.0, gradient=0.5),
-            f"{name}_depth": losses.depth_code_error(made.depth_code, truth.depth_code, counted, log_per_code),
-            f"{name}_semantics": 0.2 * losses.class_error(made.scores, truth.ids, settings.class_weights),
-            f"{name}_error": 0.05 * losses.stated_error(made.log_error, error),
+            f"{name}_depth": losses.depth_code_error(refined.depth_code, truth.depth_code, counted, log_per_code),
+            f"{name}_semantics": 0.2 * losses.class_error(refined.scores, truth.ids, settings.class_weights),
+            f"{name}_error": 0.05 * losses.stated_error(refined.log_error, error),
         }
 
     @staticmethod
@@ -402,11 +402,11 @@ class MDM(nn.Module):
             spans.append(slice(start, start + size))
         return spans[0], spans[1]
 
-    def refine(self, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int) -> Refined:
+    def refine(self, latents: dict[Modality, Tensor], condition: ConditionPixels, frames: int) -> Refined:
         """Pixels from latents [N,C,h,w] of all modalities and the condition (see `network.py`)."""
         if self.refiner is None:
             raise UsageError("this model has no refiner", where="MDM.refine")
-        return self.refiner(self.codec, latents, given, frames)
+        return self.refiner(self.codec, latents, condition, frames)
 
     def trained_part(self) -> nn.ModuleDict:
         """What training changes once the codec is fixed, by attribute name: the denoiser and, if there are any, refiner
@@ -496,11 +496,11 @@ class MDM(nn.Module):
         own = {"rgb": decoded.rgb, "semantics": decoded.semantics, "log_error": made.log_error}
         return replace(clip, depth=depth, confidence=confidence, **own)
 
-    def _decoded(self, made: Made) -> Decoded:
+    def _decoded(self, generated: Made) -> Decoded:
         """Colour in [0, 1], depth in metres and classes i64[T,H,W] of what the refiner or the finisher made; takes its
         colour over."""
-        rgb = made.rgb.add_(1).div_(2).clamp_(0, 1)
-        return Decoded(rgb, code_to_depth(made.depth_code, self.config.codec), made.ids[:, 0].long())
+        rgb = generated.rgb.add_(1).div_(2).clamp_(0, 1)
+        return Decoded(rgb, code_to_depth(generated.depth_code, self.config.codec), generated.ids[:, 0].long())
 
     def _denoise(self, encoded: ConditionLatents, request: SampleRequest) -> tuple[dict[Modality, Tensor], Tensor]:
         """Draw a clip; returns latents [1,T,C,h,w] and how much the colour's still changed, [1,T,1,h,w]."""

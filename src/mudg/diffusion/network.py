@@ -437,29 +437,29 @@ class Refiner(CellNet):
             self.leave.bias.copy_(torch.cat(parts))
 
     def forward(
-        self, codec: PatchCodec, latents: dict[Modality, Tensor], given: ConditionPixels, frames: int
+        self, codec: PatchCodec, latents: dict[Modality, Tensor], condition: ConditionPixels, frames: int
     ) -> Refined:
         """`latents` [N,C,h,w] of all modalities (N = clips times frames, frames innermost) -> pixels."""
         rgb, depth, scores = codec.decode_raw(latents)
         fold = lambda x: functional.pixel_unshuffle(x, 2)
-        seen = [given.color, given.backdrop, given.depth_code, given.valid, given.warped]
+        seen = [condition.color, condition.backdrop, condition.depth_code, condition.valid, condition.warped]
         planes = [*(latents[m] for m in MODALITIES), *map(fold, (rgb, depth, *seen))]
-        planes += [shares(given.ids), shares(given.backdrop_ids)]
+        planes += [shares(condition.ids), shares(condition.backdrop_ids)]
         if self.renders:
-            planes += map(fold, (given.render, given.render_code, given.alpha, given.certainty))
-            planes.append(shares(given.render_ids))
+            planes += map(fold, (condition.render, condition.render_code, condition.alpha, condition.certainty))
+            planes.append(shares(condition.render_ids))
         out = self.pixels(joined(planes, rgb.dtype), frames)
         parts = out.split([size // 4 for size in self.sizes], 1)
         more, take, take_far, deeper, take_depth, more_scores, take_ids, take_far_ids, log_error, *of_render = parts
         if self.renders:
             take_render, take_code, take_render_ids = (gate.sigmoid() for gate in of_render)
-            rgb = rgb + take_render * (given.render - rgb)
-            depth = depth + take_code * given.alpha.clamp(min=0) * (given.render_code - depth)
-            scores = scores + COPY_SCORE * take_render_ids * one_hot(given.render_ids)
-        rgb = rgb + take.sigmoid() * (given.color - rgb)
-        rgb = rgb + take_far.sigmoid() * (given.backdrop - rgb) + 0.2 * more
-        depth = depth + take_depth.sigmoid() * (given.depth_code - depth) + 0.05 * deeper
-        copied = take_ids.sigmoid() * one_hot(given.ids) + take_far_ids.sigmoid() * one_hot(given.backdrop_ids)
+            rgb = rgb + take_render * (condition.render - rgb)
+            depth = depth + take_code * condition.alpha.clamp(min=0) * (condition.render_code - depth)
+            scores = scores + COPY_SCORE * take_render_ids * one_hot(condition.render_ids)
+        rgb = rgb + take.sigmoid() * (condition.color - rgb)
+        rgb = rgb + take_far.sigmoid() * (condition.backdrop - rgb) + 0.2 * more
+        depth = depth + take_depth.sigmoid() * (condition.depth_code - depth) + 0.05 * deeper
+        copied = take_ids.sigmoid() * one_hot(condition.ids) + take_far_ids.sigmoid() * one_hot(condition.backdrop_ids)
         return Refined(rgb, depth, scores + more_scores + COPY_SCORE * copied, log_error)
 
 
@@ -582,27 +582,27 @@ class Finisher(CellNet):
             self.leave.weight.zero_()
             self.leave.bias.copy_(torch.cat([*starts, torch.zeros(16)]))
 
-    def forward(self, made: Made, given: ConditionPixels, frames: int, scale: Tensor) -> Finished:
+    def forward(self, generated: Made, condition: ConditionPixels, frames: int, scale: Tensor) -> Finished:
         """Finish clips (N = clips times frames, frames innermost).
 
         Args:
-            made: the generated clip, enlarged to the size of `given`; sides are multiples of `STRIDE_PX`.
+            generated: the generated clip, enlarged to the size of `condition`; sides are multiples of `STRIDE_PX`.
             scale: f32[N], how many times smaller the clip was.
         """
-        colors = torch.stack([made.rgb, given.color, given.backdrop, given.render], 1)
-        depths = torch.stack([made.depth_code, given.depth_code, given.render_code], 1)
-        ids = torch.stack([made.ids, given.ids, given.backdrop_ids, given.render_ids], 1)
-        masks = [given.valid, given.warped, given.alpha, given.certainty]
+        colors = torch.stack([generated.rgb, condition.color, condition.backdrop, condition.render], 1)
+        depths = torch.stack([generated.depth_code, condition.depth_code, condition.render_code], 1)
+        ids = torch.stack([generated.ids, condition.ids, condition.backdrop_ids, condition.render_ids], 1)
+        masks = [condition.valid, condition.warped, condition.alpha, condition.certainty]
         fold = lambda x: functional.pixel_unshuffle(x, 2)
         agree = (ids[:, 1:] == ids[:, :1]).float().flatten(1, 2)
-        planes = [*map(fold, (colors.flatten(1, 2), depths.flatten(1, 2), *masks, made.log_error))]
+        planes = [*map(fold, (colors.flatten(1, 2), depths.flatten(1, 2), *masks, generated.log_error))]
         planes.append(functional.avg_pool2d(agree, 2))
         planes.append(scale.log2().view(-1, 1, 1, 1).expand(-1, 1, *planes[0].shape[-2:]))
         out = self.pixels(joined(planes, colors.dtype), frames)
         of_color, of_depth, of_class, more, change = out.split([size // 4 for size in self.SIZES], 1)
         rgb = (of_color.softmax(1).unsqueeze(2) * colors).sum(1) + 0.2 * more
         depth = (of_depth.softmax(1).unsqueeze(2) * depths).sum(1)
-        return Finished(rgb, depth, ids, of_class.softmax(1), made.log_error + change)
+        return Finished(rgb, depth, ids, of_class.softmax(1), generated.log_error + change)
 
 
 def class_scores(finished: Finished) -> Tensor:
@@ -610,15 +610,15 @@ def class_scores(finished: Finished) -> Tensor:
     return finished.shares.clamp(min=LEAST_SHARE).log()
 
 
-def with_detail(rgb: Tensor, given: ConditionPixels) -> Tensor:
+def with_detail(rgb: Tensor, condition: ConditionPixels) -> Tensor:
     """Finished colours f32[N,3,H,W] in [-1,1] with the finest structure of the images warped in (the difference from
     the mean of 3x3 pixels) in place of their own, where the two agree but for that: the more, the better they agree.
     What is learned by squared error is blurred where it is unsure; a warped photograph is not."""
     coarse = lambda x: functional.avg_pool2d(functional.pad(x, (1, 1, 1, 1), mode="replicate"), 3, 1)
-    mine, theirs = coarse(rgb), coarse(given.color)
+    mine, theirs = coarse(rgb), coarse(condition.color)
     apart = (mine - theirs).abs().amax(1, keepdim=True)
-    weight = (1 - apart / DETAIL_APART).clamp(0, 1) * given.warped
-    return rgb + weight * ((given.color - theirs) - (rgb - mine))
+    weight = (1 - apart / DETAIL_APART).clamp(0, 1) * condition.warped
+    return rgb + weight * ((condition.color - theirs) - (rgb - mine))
 
 
 # tiles --------------------------------------------------------------------------------------------
@@ -645,17 +645,17 @@ class PixelSource(Protocol):
 
 
 def finish_in_tiles(
-    finisher: Finisher, made: Made, given: PixelSource, tile_px: int = TILE_PX, *, detail: bool = False
+    finisher: Finisher, generated: Made, given: PixelSource, tile_px: int = TILE_PX, *, detail: bool = False
 ) -> Made:
     """Finish one clip at the size of its condition `given` [N,..,H,W], whatever that is.
 
     Args:
-        made: the clip as generated, [N,..,h,w].
+        generated: the clip as generated, [N,..,h,w].
         tile_px: longest side of a tile's core; memory depends on it, the result does not.
         detail: colours get the finest structure of what was warped in (`with_detail`).
     """
     frames, *size = given.grid
-    small, device = made.rgb.shape[-2:], made.rgb.device
+    small, device = generated.rgb.shape[-2:], generated.rgb.device
     scale = torch.full((frames,), (size[0] * size[1] / (small[0] * small[1])) ** 0.5, device=device)
     margin = finisher.margin_px
     empty = lambda c, kind=torch.float32: torch.empty(frames, c, *size, dtype=kind, device=device)
@@ -669,7 +669,7 @@ def finish_in_tiles(
             bare = given.crop(slice(*rows), slice(*columns))
             part = _padded(bare)
             reach = (rows[0], rows[0] + part.color.shape[-2]), (columns[0], columns[0] + part.color.shape[-1])
-            found = finisher(made.enlarged((size[0], size[1]), *reach), part, frames, scale)
+            found = finisher(generated.enlarged((size[0], size[1]), *reach), part, frames, scale)
             rgb = found.rgb[..., : rows[1] - rows[0], : columns[1] - columns[0]]
             rgb = with_detail(rgb, bare) if detail else rgb
             core = (..., slice(top - rows[0], bottom - rows[0]), slice(left - columns[0], right - columns[0]))
@@ -680,10 +680,10 @@ def finish_in_tiles(
     return whole
 
 
-def _padded(given: ConditionPixels) -> ConditionPixels:
+def _padded(condition: ConditionPixels) -> ConditionPixels:
     """The condition with sides that are multiples of `STRIDE_PX`: its last row and column are repeated."""
-    height, width = given.color.shape[-2:]
+    height, width = condition.color.shape[-2:]
     below, right = -height % STRIDE_PX, -width % STRIDE_PX
     if not (below or right):
-        return given
-    return given.map(lambda x: functional.pad(x.float(), (0, right, 0, below), mode="replicate").to(x.dtype))
+        return condition
+    return condition.map(lambda x: functional.pad(x.float(), (0, right, 0, below), mode="replicate").to(x.dtype))

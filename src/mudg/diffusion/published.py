@@ -339,11 +339,13 @@ class PublishedMDM(nn.Module):
         label = torch.tensor([LABELS[m] for m in names], device=text.device)
         return _Told(label, text, tokens, self.net.context_keys(text, tokens) if ahead else None)
 
-    def _velocity(self, x: Tensor, planes: Tensor, t: Tensor, told: _Told) -> Tensor:
+    def _velocity(self, x: Tensor, planes: Tensor, t: Tensor, conditioning: _Told) -> Tensor:
         """As `predict`."""
         inputs = torch.cat([x, planes], 2).to(self.dtype)
         fps = torch.full_like(t, self.config.fps)
-        return self.net(inputs, t, told.label, fps, told.text, told.tokens, told.keys).float()
+        return self.net(
+            inputs, t, conditioning.label, fps, conditioning.text, conditioning.tokens, conditioning.keys
+        ).float()
 
     # training -------------------------------------------------------------------------------------
 

@@ -95,14 +95,14 @@ class JobInputs:
     edited: Callable[[SynthesizeConfig, JobInputs], DriveInputs] | None = None
 
 
-def recorded_drive(config: SynthesizeConfig, given: JobInputs) -> DriveInputs:
+def recorded_drive(config: SynthesizeConfig, inputs: JobInputs) -> DriveInputs:
     """The drive as it was recorded."""
-    scene = read_scene(given.scene)
-    fit = None if given.fitted is None else load_model(given.fitted)
-    return DriveInputs(scene, read_fused(given.fused), recorded_images(scene, config), fit)
+    scene = read_scene(inputs.scene)
+    fit = None if inputs.fitted is None else load_model(inputs.fitted)
+    return DriveInputs(scene, read_fused(inputs.fused), recorded_images(scene, config), fit)
 
 
-def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, work: RunDir) -> dict[str, Any]:
+def write_views(config: SynthesizeConfig, inputs: JobInputs, loaded: Scene, work: RunDir) -> dict[str, Any]:
     """Generate all trajectories of the configuration, one folder of observations each; returns a summary.
 
     Raises:
@@ -110,7 +110,7 @@ def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, work:
     """
     cameras = config.cameras or tuple(loaded.cameras)[:1]
     if not cameras or not (config.shifts_m or config.paths):
-        raise UsageError("nothing to synthesize", where=str(given.scene), expected="at least one camera and one shift")
+        raise UsageError("nothing to synthesize", where=str(inputs.scene), expected="at least one camera and one shift")
     paths = [
         *(trajectory.at_shift(loaded, camera, shift_m) for camera in cameras for shift_m in config.shifts_m),
         *(trajectory.named(loaded, camera, name) for camera in cameras for name in config.paths),
@@ -122,7 +122,7 @@ def write_views(config: SynthesizeConfig, given: JobInputs, loaded: Scene, work:
     started, frames = time.monotonic(), 0
     processes = config.processes or usual_processes(config, paths)
     model = load_any(config) if processes == 1 else None  # several processes load one each
-    jobs = [(config, given, work.path, path, model) for path in paths]
+    jobs = [(config, inputs, work.path, path, model) for path in paths]
     processes = min(processes, len(jobs))
     if processes > 1:
         release_memory()
@@ -181,7 +181,7 @@ def without_classes(cloud: FusedCloud) -> FusedCloud:
 
 
 def make_trajectory(
-    config: SynthesizeConfig, given: JobInputs, out: Path, path: Trajectory, model: DiffusionModel | None = None
+    config: SynthesizeConfig, inputs: JobInputs, out: Path, path: Trajectory, model: DiffusionModel | None = None
 ) -> int:
     """Generate one trajectory and write its folder; returns the number of views. Continues an interrupted one. `model`:
     that of the configuration, if it is in memory already."""
@@ -189,7 +189,7 @@ def make_trajectory(
     if (folder / "observations.json").is_file():
         return len(path)
     model = model or load_any(config)
-    maker = _view_maker(config, given, path, model, out)
+    maker = _view_maker(config, inputs, path, model, out)
     spans = maker.spans(len(path), config.overlap)
     state = folder / "state"
     finished = sorted(state.glob("[0-9]*.safetensors"))  # the last one's latents, by the number of windows
@@ -229,17 +229,17 @@ _recorded_again = functools.lru_cache(maxsize=1)(recorded_drive)
 
 
 def _view_maker(
-    config: SynthesizeConfig, given: JobInputs, path: Trajectory, model: DiffusionModel, scratch: Path
+    config: SynthesizeConfig, inputs: JobInputs, path: Trajectory, model: DiffusionModel, scratch: Path
 ) -> ViewMaker:
     """What makes the views of one trajectory; ``scratch``: a folder for what is large."""
-    drive = _recorded_again(config, given) if given.edited is None else given.edited(config, given)
+    drive = _recorded_again(config, inputs) if inputs.edited is None else inputs.edited(config, inputs)
     cloud = drive.cloud if config.given_classes else without_classes(drive.cloud)
     camera = path.views[0].camera
     width, height = model.image_size(camera.width, camera.height, config.width_px)
     model.check_clip(min(len(path), model.config.window), height, width)
     fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
-    rules = rules if given.edited is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
+    rules = rules if inputs.edited is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
     render_at = None if drive.fit is None else functools.partial(render_planes, drive.fit)
     near = near_sweeps(drive.scene, cloud, path) if config.condition == FREEVS else None
     sources = ConditionSources(

@@ -255,14 +255,14 @@ class ViewMaker:
     def __init__(
         self,
         model: DiffusionModel,
-        given: ConditionSources,
+        sources: ConditionSources,
         config: SynthesizeConfig,
         start_at: StartAt | None = None,
         images: PreparedImages | None = None,
     ) -> None:
-        if not given.recorded:
+        if not sources.recorded:
             log.warn("synthesize: no recorded image is available; holes are filled with the nearest point's colour")
-        self._model, self._given, self._full_size = model, given, config.full_size
+        self._model, self._given, self._full_size = model, sources, config.full_size
         self._parts: ConditionParts = config.condition
         self._images = PreparedImages() if images is None else images
         self._request = request_of(config, half_of(config) == torch.bfloat16)
@@ -380,12 +380,12 @@ def enlarge(
     return replace(clip, rgb=rgb, depth=depth, semantics=ids, confidence=trust)
 
 
-def finer_classes(enlarged: Tensor, made: Tensor, given: Tensor) -> Tensor:
-    """Classes i64[T,H,W]: those of `given` u8[T,1,H,W] where `made` i64[T,h,w] has that class in the pixel or one
+def finer_classes(enlarged: Tensor, generated: Tensor, given: Tensor) -> Tensor:
+    """Classes i64[T,H,W]: those of `given` u8[T,1,H,W] where `generated` i64[T,h,w] has that class in the pixel or one
     beside it, else `enlarged` i64[T,H,W]. The outline is the given one; what is there, the model has decided."""
     size = enlarged.shape[-2:]
-    around = functional.pad(made.unsqueeze(1).float(), (1, 1, 1, 1), mode="replicate")
-    height, width = made.shape[-2:]
+    around = functional.pad(generated.unsqueeze(1).float(), (1, 1, 1, 1), mode="replicate")
+    height, width = generated.shape[-2:]
     wanted, there = given.float(), torch.zeros_like(given, dtype=torch.bool)
     for row in range(3):
         for column in range(3):

@@ -10,6 +10,7 @@ An object of a fitted scene is a file of its own, one safetensors file with the 
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -20,6 +21,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 from pydantic import Field
+from scipy.spatial import KDTree
 
 from mudg.base import geometry, log, store
 from mudg.base.errors import InputError, UsageError
@@ -59,7 +61,7 @@ from mudg.editing.plan import (
 )
 from mudg.editing.runs import RunParts, find_run
 from mudg.editing.script import AssetSource, EditScript, conditions_of
-from mudg.editing.street import MOST_VIEWS, Hidden, noted, with_closed_sides, without_traces
+from mudg.editing.street import MOST_VIEWS, Hidden, noted, with_closed_sides, without_rows, without_traces
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode, SkyNode
 from mudg.gaussians.rendering import raster_of, render_view
@@ -138,8 +140,28 @@ def edited_model(
             model = edited.with_shadow(model, name, insertion.shadow, insertion.sun)
     if sky is not None and plan.sky is not None:
         model = replace(model, sky=panorama(sky, plan.sky.yaw_deg, model))
+    if plan.erased:
+        street = np.flatnonzero((model.table.labels["node"] == 0).cpu().numpy())
+        gone = np.zeros(len(model.table), bool)
+        gone[street] = _erased(plan, model.table["means"].detach().cpu().numpy()[street])
+        model = without_rows(model, gone)
     model.sort_rows()
     return model
+
+
+def _erased(plan: EditPlan, xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
+    """Which points f[N, 3] of the street the plan takes away."""
+    places, gone = np.asarray(xyz, np.float64), np.zeros(len(xyz), bool)
+    for edit in plan.erased:
+        if edit.balls is not None:
+            centers, radii = np.split(np.asarray(edit.balls, np.float64), [3], axis=1)
+            for hit in KDTree(places).query_ball_point(centers, radii[:, 0]):
+                gone[hit] = True
+        if edit.keep is not None:
+            world_from_box = geometry.yaw_matrix(math.radians(edit.keep.yaw_deg), edit.keep.center)
+            local = geometry.transform_points(geometry.invert(world_from_box), places)
+            gone |= (np.abs(local) > np.array(edit.keep.size_m) / 2).any(1)
+    return gone
 
 
 def spread(views: Sequence[View], most: int = MOST_VIEWS) -> list[View]:
@@ -227,6 +249,10 @@ def edited_cloud(cloud: FusedCloud, plan: EditPlan) -> FusedCloud:
         kept = {name: points for name, points in objects.items() if name not in standing}
         objects = {name: _relit_points(points, plan.objects_gain) for name, points in kept.items()}
     objects |= {name: asset_points(insertion.asset) for name, insertion in plan.inserted.items()}
+    if plan.erased:
+        left = ~_erased(plan, static.xyz)
+        ids = None if static.semantics is None else static.semantics[left]
+        static = PointCloud(static.xyz[left], static.rgb[left], static.frame, ids)
     return FusedCloud(static, objects, cloud.colors)
 
 

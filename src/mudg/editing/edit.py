@@ -125,23 +125,23 @@ def _report_of(parts: RunParts, cloud: FusedCloud) -> dict[str, object]:
         return {**kept, "tracks": {key: value for key, value in kept.get("tracks", {}).items() if key in cloud.objects}}
 
 
-def edited_scene(script: EditScript, config: SynthesizeConfig, given: JobInputs, scene: Scene) -> Scene:
+def edited_scene(script: EditScript, config: SynthesizeConfig, inputs: JobInputs, scene: Scene) -> Scene:
     """The scene as the script leaves it. What cannot be done is told here, before anything is written. UsageError: a
     condition that shows no edits, or an edit that the drive does not allow."""
     if config.condition == FREEVS:
         what = "this condition is made of recorded sweeps, which show no edits"
         remedy = "edit a whole run with `mudg edit` and give its scene"
         raise UsageError(what, where="--condition", got=FREEVS, remedy=remedy)
-    told = not shows_weather(config, script, given.fitted is not None)
-    fitted = None if given.fitted is None else load_model(given.fitted)
-    return drive_of_edits(script, scene, read_fused(given.fused), fitted, told=told).scene
+    told = not shows_weather(config, script, inputs.fitted is not None)
+    fitted = None if inputs.fitted is None else load_model(inputs.fitted)
+    return drive_of_edits(script, scene, read_fused(inputs.fused), fitted, told=told).scene
 
 
-def edited_drive(script: EditScript, config: SynthesizeConfig, given: JobInputs) -> DriveInputs:
+def edited_drive(script: EditScript, config: SynthesizeConfig, inputs: JobInputs) -> DriveInputs:
     """The drive as the script leaves it: its scene, clouds and fit, recorded images without what they show wrongly, and
     its weather."""
-    scene, cloud = read_scene(given.scene), read_fused(given.fused)
-    fit = None if given.fitted is None else load_model(given.fitted)
+    scene, cloud = read_scene(inputs.scene), read_fused(inputs.fused)
+    fit = None if inputs.fitted is None else load_model(inputs.fitted)
     drive = drive_of_edits(script, scene, cloud, fit)
     conditions, weather = conditions_of(script.canonical()), None
     if conditions is not None and drive.model is not None and shows_weather(config, script, True):

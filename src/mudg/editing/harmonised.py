@@ -171,22 +171,22 @@ def start_clip(renders: Sequence[Observation], freedom: Sequence[Tensor], size: 
     )
 
 
-def guarded(touched: Touched, render: Observation, made: Observation, other_boxes: NDArray[np.bool_]) -> Tensor:
+def guarded(touched: Touched, render: Observation, generated: Observation, other_boxes: NDArray[np.bool_]) -> Tensor:
     """Pixels bool[H,W] of `touched` whose generated class agrees with the edits: no road user came back where one was
     removed (but for those whose `other_boxes` bool[H,W] are there), and none vanished where the render has one."""
-    if render.semantics is None or made.semantics is None:
+    if render.semantics is None or generated.semantics is None:
         return touched.any
-    there, wanted = (torch.isin(seen.semantics, DYNAMIC.long()) for seen in (made, render))
+    there, wanted = (torch.isin(seen.semantics, DYNAMIC.long()) for seen in (generated, render))
     back = (touched.uncovered | touched.shaded) & there & ~torch.from_numpy(other_boxes)
     gone = touched.objects & wanted & ~there
     return touched.any & ~back & ~gone
 
 
-def pasted(render: Observation, made: Observation, weight: Tensor) -> Observation:
+def pasted(render: Observation, generated: Observation, weight: Tensor) -> Observation:
     """The render with generated colours of weight f32[H,W]; depth and classes are the generated ones where these weigh
     more than half. Where the weight is 0 every value keeps its bits."""
     inside, most = weight > 0, weight > 0.5
-    rgb = torch.where(inside, torch.lerp(render.rgb, made.rgb, weight), render.rgb)
+    rgb = torch.where(inside, torch.lerp(render.rgb, generated.rgb, weight), render.rgb)
 
     def chosen(mine: Tensor | None, theirs: Tensor | None) -> Tensor | None:
         return mine if mine is None or theirs is None else torch.where(most, theirs.to(mine.dtype), mine)
@@ -194,9 +194,9 @@ def pasted(render: Observation, made: Observation, weight: Tensor) -> Observatio
     return replace(
         render,
         rgb=rgb.clamp(0, 1) if bool(inside.any()) else rgb,
-        depth=chosen(render.depth, made.depth),
-        semantics=chosen(render.semantics, made.semantics),
-        confidence=torch.where(most, made.confidence, render.confidence),
+        depth=chosen(render.depth, generated.depth),
+        semantics=chosen(render.semantics, generated.semantics),
+        confidence=torch.where(most, generated.confidence, render.confidence),
     )
 
 
@@ -250,14 +250,14 @@ class Harmoniser:
         sure = determined(render_planes(self._sources.fitted, view), ~touched.any)
         return made, replace(touched, uncovered=touched.uncovered & ~sure)
 
-    def _repaired(self, render: Observation, touched: Touched, made: Observation) -> Observation:
-        brighter = (made.rgb - render.rgb).mean(0).numpy()
+    def _repaired(self, render: Observation, touched: Touched, generated: Observation) -> Observation:
+        brighter = (generated.rgb - render.rgb).mean(0).numpy()
         lit = touched.shaded & torch.from_numpy(ndimage.uniform_filter(brighter, 5) > BRIGHTER)
         objects = touched.objects & (self._config.objects > 0)
         touched = replace(touched, shaded=lit & (self._config.uncovered > 0), objects=objects)
         boxes = boxes_mask(render.view, others(self._sources.plan, render.view.time_s))
-        kept = guarded(touched, render, made, boxes) & made.mask[0]
-        return pasted(render, made, soft_edge(kept.numpy()))
+        kept = guarded(touched, render, generated, boxes) & generated.mask[0]
+        return pasted(render, generated, soft_edge(kept.numpy()))
 
 
 def repairing(images: EditedImages, drive: EditedDrive, recorded: Scene) -> EditedImages:
@@ -363,13 +363,15 @@ class WeatherHarmoniser:
             done, tail = span.stop, clip.latents
 
 
-def corrected(render: Observation, made: Tensor) -> Observation:
-    """A render with what `made` f32[3,h,w], of any size, changes of it (see `changed_by`)."""
-    return replace(render, rgb=changed_by(render.rgb, made))
+def corrected(render: Observation, generated: Tensor) -> Observation:
+    """A render with what `generated` f32[3,h,w], of any size, changes of it (see `changed_by`)."""
+    return replace(render, rgb=changed_by(render.rgb, generated))
 
 
-def changed_by(rgb: Tensor, made: Tensor) -> Tensor:
-    """Colours f32[3,H,W] with what `made` f32[3,h,w], of any size, changes of them at that size."""
-    area = functional.interpolate(rgb[None], size=made.shape[-2:], mode="area")
-    change = functional.interpolate(made[None] - area, size=rgb.shape[-2:], mode="bilinear", align_corners=False)[0]
+def changed_by(rgb: Tensor, generated: Tensor) -> Tensor:
+    """Colours f32[3,H,W] with what `generated` f32[3,h,w], of any size, changes of them at that size."""
+    area = functional.interpolate(rgb[None], size=generated.shape[-2:], mode="area")
+    change = functional.interpolate(generated[None] - area, size=rgb.shape[-2:], mode="bilinear", align_corners=False)[
+        0
+    ]
     return (rgb + change).clamp(0, 1)

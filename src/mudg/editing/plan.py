@@ -23,7 +23,7 @@ from mudg.core import edit as boxes
 from mudg.core import edit as paths
 from mudg.core.edit import Displacement, HeightMap, Motion
 from mudg.editing.model import Asset, motion_of
-from mudg.editing.script import EGO, AssetSource, EditScript, ScriptEdit
+from mudg.editing.script import EGO, AssetSource, EditScript, EraseEdit, ScriptEdit
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.nodes import RigidNode
 
@@ -127,6 +127,7 @@ class EditPlan:
         notes: what the reader should know, with numbers.
         views: recorded ones, which say what nobody saw of the street; none where there is no scene.
         closed: actors without whose traces the street is to be shown, if they were recorded (``editing/street.py``).
+        erased: records of ``erase``: parts of the street that are taken away.
         sides: actors whose sides that no view showed are to be closed (``editing/street.py``).
     """
 
@@ -145,6 +146,7 @@ class EditPlan:
     views: tuple[View, ...] = ()
     closed: set[str] = field(default_factory=set)
     sides: set[str] = field(default_factory=set)
+    erased: list[EraseEdit] = field(default_factory=list)
 
     def changed(self, name: str, motion: Motion) -> Motion:
         """The path of an actor of the recording with all that is done to it."""
@@ -203,19 +205,19 @@ def _located(problem: MudgError, edit: ScriptEdit) -> InputError:
 # -- verbs -----------------------------------------------------------------------------------------
 
 
-def _remove(plan: EditPlan, given: Any, sources: EditSources) -> None:
-    names = given.ids if given.ids is not None else _chosen(plan.after, given)
+def _remove(plan: EditPlan, fields: Any, sources: EditSources) -> None:
+    names = fields.ids if fields.ids is not None else _chosen(plan.after, fields)
     for name in names:
         _actor(plan.after, name)
         _take_away(plan, name)
-        _close(plan, name, given, sources)
+        _close(plan, name, fields, sources)
 
 
-def _close(plan: EditPlan, name: str, given: Any, sources: EditSources) -> None:
+def _close(plan: EditPlan, name: str, fields: Any, sources: EditSources) -> None:
     """Note whether the street is to be closed behind an object; the last edit that says so counts."""
-    if name == EGO or (given.close_street is None and not sources.close_street):
+    if name == EGO or (fields.close_street is None and not sources.close_street):
         return
-    (plan.closed.discard if given.close_street is False else plan.closed.add)(name)
+    (plan.closed.discard if fields.close_street is False else plan.closed.add)(name)
 
 
 def _take_away(plan: EditPlan, name: str) -> None:
@@ -226,16 +228,16 @@ def _take_away(plan: EditPlan, name: str) -> None:
     plan.after = replace(plan.after, actors={key: value for key, value in plan.after.actors.items() if key != name})
 
 
-def _chosen(world: EditWorld, given: Any) -> list[str]:
+def _chosen(world: EditWorld, fields: Any) -> list[str]:
     """Ids of the objects of a kind."""
     names = []
     for name, actor in world.actors.items():
-        near = given.within_m is None or _nearest_m(world, actor) <= given.within_m
-        if given.class_ in (None, actor.label) and given.moving in (None, actor.moves) and near:
+        near = fields.within_m is None or _nearest_m(world, actor) <= fields.within_m
+        if fields.class_ in (None, actor.label) and fields.moving in (None, actor.moves) and near:
             names.append(name)
     if not names:
         labels = ", ".join(sorted({actor.label for actor in world.actors.values()}))
-        got = str(given.model_dump(exclude_none=True, by_alias=True))
+        got = str(fields.model_dump(exclude_none=True, by_alias=True))
         raise InputError("no object is of this kind", expected=f"class among {labels or 'none'}", got=got)
     return names
 
@@ -248,43 +250,45 @@ def _nearest_m(world: EditWorld, actor: Actor) -> float:
     return float(np.linalg.norm(apart, axis=-1).min())
 
 
-def _move(plan: EditPlan, given: Any, _: EditSources) -> None:
-    by = Displacement(given.along_m, given.left_m, given.up_m, math.radians(given.yaw_deg), given.from_s, given.ramp_s)
-    _change(plan, given.id, functools.partial(paths.moved, by=by, ground=plan.after.ground if given.ground else None))
+def _move(plan: EditPlan, fields: Any, _: EditSources) -> None:
+    by = Displacement(
+        fields.along_m, fields.left_m, fields.up_m, math.radians(fields.yaw_deg), fields.from_s, fields.ramp_s
+    )
+    _change(plan, fields.id, functools.partial(paths.moved, by=by, ground=plan.after.ground if fields.ground else None))
 
 
-def _stop(plan: EditPlan, given: Any, _: EditSources) -> None:
-    _change(plan, given.id, functools.partial(paths.stopped, at_s=given.at_s, brake_m_s2=given.brake_m_s2))
+def _stop(plan: EditPlan, fields: Any, _: EditSources) -> None:
+    _change(plan, fields.id, functools.partial(paths.stopped, at_s=fields.at_s, brake_m_s2=fields.brake_m_s2))
 
 
-def _speed(plan: EditPlan, given: Any, _: EditSources) -> None:
-    motion = _motion(plan.after, given.id)
-    begin = float(motion.times_s[0]) if given.from_s is None else max(given.from_s, float(motion.times_s[0]))
-    ahead = max(0.0, (given.factor - 1) * (float(motion.times_s[-1]) - begin))
+def _speed(plan: EditPlan, fields: Any, _: EditSources) -> None:
+    motion = _motion(plan.after, fields.id)
+    begin = float(motion.times_s[0]) if fields.from_s is None else max(fields.from_s, float(motion.times_s[0]))
+    ahead = max(0.0, (fields.factor - 1) * (float(motion.times_s[-1]) - begin))
     if ahead > 0:
-        text = f"{given.id} goes on straight for {ahead:.1f} s of its recording that do not exist"
-        plan.notes.append({"kind": "beyond the recording", "id": given.id, "seconds": round(ahead, 3), "text": text})
-    _change(plan, given.id, functools.partial(paths.sped, factor=given.factor, from_s=given.from_s))
+        text = f"{fields.id} goes on straight for {ahead:.1f} s of its recording that do not exist"
+        plan.notes.append({"kind": "beyond the recording", "id": fields.id, "seconds": round(ahead, 3), "text": text})
+    _change(plan, fields.id, functools.partial(paths.sped, factor=fields.factor, from_s=fields.from_s))
 
 
-def _lane_change(plan: EditPlan, given: Any, _: EditSources) -> None:
-    peak = paths.QUINTIC_PEAK * abs(given.left_m) / given.duration_s**2
-    if peak > given.most_lateral_m_s2:
-        least = math.sqrt(paths.QUINTIC_PEAK * abs(given.left_m) / given.most_lateral_m_s2)
-        expected = f"at most {given.most_lateral_m_s2:g} m/s^2 sideways"
-        got = f"{peak:.2f} m/s^2 ({given.left_m:g} m in {given.duration_s:g} s)"
+def _lane_change(plan: EditPlan, fields: Any, _: EditSources) -> None:
+    peak = paths.QUINTIC_PEAK * abs(fields.left_m) / fields.duration_s**2
+    if peak > fields.most_lateral_m_s2:
+        least = math.sqrt(paths.QUINTIC_PEAK * abs(fields.left_m) / fields.most_lateral_m_s2)
+        expected = f"at most {fields.most_lateral_m_s2:g} m/s^2 sideways"
+        got = f"{peak:.2f} m/s^2 ({fields.left_m:g} m in {fields.duration_s:g} s)"
         remedy = f"a duration_s of {math.ceil(least * 100) / 100:g} or more, or a larger most_lateral_m_s2"
         raise InputError("the lane change is too sharp", where="duration_s", expected=expected, got=got, remedy=remedy)
-    text = f"{given.id} changes lanes with at most {peak:.2f} m/s^2 sideways"
-    plan.notes.append({"kind": "lateral acceleration", "id": given.id, "m_s2": round(peak, 3), "text": text})
-    by = {name: getattr(given, name) for name in ("left_m", "start_s", "duration_s")}
-    ground = plan.after.ground if given.ground else None
-    _change(plan, given.id, functools.partial(paths.lane_changed, **by, ground=ground))
+    text = f"{fields.id} changes lanes with at most {peak:.2f} m/s^2 sideways"
+    plan.notes.append({"kind": "lateral acceleration", "id": fields.id, "m_s2": round(peak, 3), "text": text})
+    by = {name: getattr(fields, name) for name in ("left_m", "start_s", "duration_s")}
+    ground = plan.after.ground if fields.ground else None
+    _change(plan, fields.id, functools.partial(paths.lane_changed, **by, ground=ground))
 
 
-def _path(plan: EditPlan, given: Any, _: EditSources) -> None:
-    ground = plan.after.ground if given.ground else None
-    _change(plan, given.id, functools.partial(_other_path, points=_points(given.points), ground=ground))
+def _path(plan: EditPlan, fields: Any, _: EditSources) -> None:
+    ground = plan.after.ground if fields.ground else None
+    _change(plan, fields.id, functools.partial(_other_path, points=_points(fields.points), ground=ground))
 
 
 def _other_path(motion: Motion, points: np.ndarray, ground: HeightMap | None) -> Motion:
@@ -304,34 +308,36 @@ def _points(points: list[list[float]]) -> np.ndarray:
     return made
 
 
-def _replace(plan: EditPlan, given: Any, sources: EditSources) -> None:
-    old, asset = _actor(plan.after, given.id), sources.asset(given.by)
+def _replace(plan: EditPlan, fields: Any, sources: EditSources) -> None:
+    old, asset = _actor(plan.after, fields.id), sources.asset(fields.by)
     up = Displacement(up_m=(asset.size_m[2] - old.size_m[2]) / 2)  # wheels stay where they were
     new = Actor(asset.label, asset.size_m, paths.moved(old.motion, up))
-    if given.id in plan.before.actors and given.id not in plan.removed:
-        plan.removed.append(given.id)
-        plan.changes.pop(given.id, None)
-    plan.inserted[given.id] = Insertion(asset, 0.0, given.match_light)
-    plan.after = replace(plan.after, actors={**plan.after.actors, given.id: new})
+    if fields.id in plan.before.actors and fields.id not in plan.removed:
+        plan.removed.append(fields.id)
+        plan.changes.pop(fields.id, None)
+    plan.inserted[fields.id] = Insertion(asset, 0.0, fields.match_light)
+    plan.after = replace(plan.after, actors={**plan.after.actors, fields.id: new})
 
 
-def _insert(plan: EditPlan, given: Any, sources: EditSources) -> None:
-    asset, world = sources.asset(given.asset), plan.after
-    name = given.id or _free_name(world, given.class_ or asset.label)
+def _insert(plan: EditPlan, fields: Any, sources: EditSources) -> None:
+    asset, world = sources.asset(fields.asset), plan.after
+    name = fields.id or _free_name(world, fields.class_ or asset.label)
     if name in world.actors:
         what, remedy = "there is an object of this id already", "give the new one another id"
         raise InputError(what, where="id", got=name, remedy=remedy)
-    ground, height = world.ground if given.ground else None, asset.size_m[2] / 2
-    if given.path is not None:
-        points = _points(given.path)
+    ground, height = world.ground if fields.ground else None, asset.size_m[2] / 2
+    if fields.path is not None:
+        points = _points(fields.path)
         if len(points) == 1:
             points = _at_all_times(points[0], world)
         motion = paths.along_points(points, height, ground, _floor(world))
     else:
-        motion = _near(world, given.near, height, ground)
-    sun = None if given.sun is None else _toward(given.sun)
-    plan.inserted[name] = Insertion(asset, given.shadow, given.match_light, sun)
-    plan.after = replace(world, actors={**world.actors, name: Actor(given.class_ or asset.label, asset.size_m, motion)})
+        motion = _near(world, fields.near, height, ground)
+    sun = None if fields.sun is None else _toward(fields.sun)
+    plan.inserted[name] = Insertion(asset, fields.shadow, fields.match_light, sun)
+    plan.after = replace(
+        world, actors={**world.actors, name: Actor(fields.class_ or asset.label, asset.size_m, motion)}
+    )
 
 
 def _free_name(world: EditWorld, label: str) -> str:
@@ -354,15 +360,15 @@ def _floor(world: EditWorld) -> float:
     return 0.0 if world.ego is None else float(np.median(world.ego.poses[:, 2, 3]))
 
 
-def _near(world: EditWorld, given: Any, height: float, ground: HeightMap | None) -> Motion:
+def _near(world: EditWorld, fields: Any, height: float, ground: HeightMap | None) -> Motion:
     """A place relative to somebody, standing still or going with them, wheels on the ground."""
-    leader = _motion(world, given.id)
-    by = Displacement(given.ahead_m, given.left_m, 0.0, math.radians(given.yaw_deg))
+    leader = _motion(world, fields.id)
+    by = Displacement(fields.ahead_m, fields.left_m, 0.0, math.radians(fields.yaw_deg))
     placed = paths.moved(leader, by)
-    if given.at_s is not None:
-        pose = placed.pose_at(given.at_s)
+    if fields.at_s is not None:
+        pose = placed.pose_at(fields.at_s)
         if pose is None:
-            got, expected = f"{given.at_s} s", f"{leader.times_s[0]:.2f}..{leader.times_s[-1]:.2f} s"
+            got, expected = f"{fields.at_s} s", f"{leader.times_s[0]:.2f}..{leader.times_s[-1]:.2f} s"
             raise InputError("nobody is there at this time", where="near.at_s", got=got, expected=expected)
         points = np.array([[0.0, *pose[:2, 3], geometry.yaw_of(pose)]])
         return paths.along_points(_at_all_times(points[0], world), height, ground, _floor(world))
@@ -371,16 +377,16 @@ def _near(world: EditWorld, given: Any, height: float, ground: HeightMap | None)
     return paths.along_points(points, height, ground, _floor(world))
 
 
-def _background(plan: EditPlan, given: Any, sources: EditSources) -> None:
+def _background(plan: EditPlan, fields: Any, sources: EditSources) -> None:
     world = plan.after
     if world.ego is None or world.ground is None:
         raise InputError("where the other street belongs is not known", remedy="give --scene, of a scene with classes")
     if plan.background is not None:
-        raise InputError("there is another background already", got=given.run)
-    other = sources.background(given.run)
+        raise InputError("there is another background already", got=fields.run)
+    other = sources.background(fields.run)
     pose = place_background(world, other)
     new = HeightMap.from_points(geometry.transform_points(pose, other.ground_xyz))
-    if "objects" not in given.keep:
+    if "objects" not in fields.keep:
         for name in list(world.actors):
             _take_away(plan, name)
     standing = [name for name, actor in plan.after.actors.items() if name in plan.before.actors and not actor.moves]
@@ -390,7 +396,7 @@ def _background(plan: EditPlan, given: Any, sources: EditSources) -> None:
     for name in list(plan.after.actors):
         _change(plan, name, again)
     _change(plan, EGO, again)
-    plan.background, plan.match_objects = (other, pose), given.match_light
+    plan.background, plan.match_objects = (other, pose), fields.match_light
     plan.after = replace(plan.after, ground=new)
     plan.notes += _seams(plan.after, new)
 
@@ -420,8 +426,8 @@ def _seams(world: EditWorld, ground: HeightMap) -> list[dict[str, Any]]:
     return [{"kind": "off the ground", "ids": list(off), "shares": off, "text": text}] if off else []
 
 
-def _sky(plan: EditPlan, given: Any, _: EditSources) -> None:
-    plan.sky = given
+def _sky(plan: EditPlan, fields: Any, _: EditSources) -> None:
+    plan.sky = fields
 
 
 _VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
@@ -435,6 +441,7 @@ _VERBS: Final[dict[str, Callable[[EditPlan, Any, EditSources], None]]] = {
     "insert": _insert,
     "background": _background,
     "sky": _sky,
+    "erase": lambda plan, fields, _: plan.erased.append(fields),
 }
 
 

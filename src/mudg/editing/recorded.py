@@ -458,13 +458,13 @@ def write_edited_scene(scene: Scene, drive: DriveChange, images: EditedImages, r
     return counts
 
 
-def _labels(scene: Scene, frame: Frame, changed: NDArray[np.bool_], made: Observation) -> dict[str, NDArray[Any]]:
+def _labels(scene: Scene, frame: Frame, changed: NDArray[np.bool_], generated: Observation) -> dict[str, NDArray[Any]]:
     """Labels of a changed image: those of the render where it is rendered."""
     found = {name: read_label(scene, frame, name) for name in KEPT_LABELS if name in frame.labels}
     ours = {RENDERED: changed | read_label(scene, frame, RENDERED) if RENDERED in frame.labels else changed}
-    if made.semantics is None or made.depth is None:
+    if generated.semantics is None or generated.depth is None:
         return ours
-    ids = made.semantics.numpy().astype(np.uint8)
+    ids = generated.semantics.numpy().astype(np.uint8)
     rendered = {"semantics": ids, "sky": ids == ID["sky"], "dynamic": np.isin(ids, DYNAMIC_IDS)}
-    rendered["depth"] = np.nan_to_num(made.depth[0].numpy(), nan=np.inf)
+    rendered["depth"] = np.nan_to_num(generated.depth[0].numpy(), nan=np.inf)
     return ours | {name: np.where(changed, rendered[name].astype(old.dtype), old) for name, old in found.items()}

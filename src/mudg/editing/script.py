@@ -236,6 +236,36 @@ class SkyEdit(StrictRecord):
     yaw_deg: Number = 0.0
 
 
+def _balls(balls: list[list[float]]) -> list[list[float]]:
+    for index, ball in enumerate(balls):
+        if len(ball) != 4 or not ball[3] > 0:
+            what, expected = "a ball is not described", "[x, y, z, radius] in metres, the radius above 0"
+            raise InputError(what, where=f"[{index}]", expected=expected, got=str(ball)[:80])
+    return balls
+
+
+class Box(StrictRecord):
+    """A box in the world: middle and size in metres, length along the heading ``yaw_deg``."""
+
+    center: Annotated[list[Number], Field(min_length=3, max_length=3)]
+    size_m: Annotated[list[Positive], Field(min_length=3, max_length=3)]
+    yaw_deg: Number = 0.0
+
+
+class EraseEdit(StrictRecord):
+    """Take parts of the street away, objects apart: what lies in ``balls``, and what lies outside the box ``keep``."""
+
+    balls: Annotated[list[list[Number]], Field(min_length=1), AfterValidator(checked_by(_balls))] | None = None
+    keep: Box | None = None
+
+    @model_validator(mode="after")
+    @checked_by
+    def _something(self) -> Self:
+        if self.balls is None and self.keep is None:
+            raise InputError("nothing says what to erase", expected="balls, keep, or both", got="neither")
+        return self
+
+
 VERBS: Final[dict[str, type[StrictRecord]]] = {
     "remove": RemoveEdit,
     "move": MoveEdit,
@@ -247,6 +277,7 @@ VERBS: Final[dict[str, type[StrictRecord]]] = {
     "insert": InsertEdit,
     "background": BackgroundEdit,
     "sky": SkyEdit,
+    "erase": EraseEdit,
     "weather": WeatherSettings,
     "light": LightSettings,
     "season": SeasonSettings,

@@ -308,26 +308,26 @@ def check(config: ExportConfig, name: str, out: Path) -> None:
 
 
 @one_torch_thread()
-def write_folder(name: str, given: Exported, recorded: Scene, work: RunDir) -> dict[str, Any]:
+def write_folder(name: str, exported: Exported, recorded: Scene, work: RunDir) -> dict[str, Any]:
     """Write cameras, or a log over time, to the work folder; returns a summary."""
     out = work.path
     if name not in CAMERAS:
-        return write_messages(name, records_of(recorded, _points(given)), out)
+        return write_messages(name, records_of(recorded, _points(exported)), out)
     names = picture_names(recorded)
     with log.task("export", len(names)) as bar:
         for place, content in pictures(recorded):
             if not (out / place).is_file():
                 store.atomic_write(out / place, content)
             bar.advance()
-    for place, content in CAMERAS[name](recorded, _points(given)).items():
+    for place, content in CAMERAS[name](recorded, _points(exported)).items():
         store.atomic_write(out / place, content)
     return {"format": name, "images": len(names)}
 
 
 @one_torch_thread()
-def write_file(config: ExportConfig, name: str, given: Exported, file: ResultFile) -> dict[str, Any]:
+def write_file(config: ExportConfig, name: str, exported: Exported, file: ResultFile) -> dict[str, Any]:
     """Write Gaussians, or a log over time, as one file; returns what the file is."""
-    about = (_messages if name in SUFFIXES else _gaussians)(config, name, given, file.path)
+    about = (_messages if name in SUFFIXES else _gaussians)(config, name, exported, file.path)
     return {"format": name, "mudg": version(), **about}
 
 
@@ -361,13 +361,13 @@ def _refuse_name(out: Path, name: str) -> None:
 # -- Gaussians -------------------------------------------------------------------------------------
 
 
-def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
+def requested(config: ExportConfig, name: str, exported: Exported) -> WriteRequest:
     """The scene in the axes of the format, and the moment."""
-    if given.model is None:
+    if exported.model is None:
         what = "there is no fitted scene"
-        raise InputError(what, where=str(given.parts.scene), expected="a folder made by `mudg fit` or `mudg run`")
-    moment = config.time_s if config.time_s is not None else middle_s(given.model, given.log)
-    scene = splat_scene(given.model, moment, config.nodes)
+        raise InputError(what, where=str(exported.parts.scene), expected="a folder made by `mudg fit` or `mudg run`")
+    moment = config.time_s if config.time_s is not None else middle_s(exported.model, exported.log)
+    scene = splat_scene(exported.model, moment, config.nodes)
     whole = "motion" in FORMATS[name].carries and config.time_s is None
     if not scene.nodes or not (whole or any(node.at(moment) is not None and len(node.cloud) for node in scene.nodes)):
         asked = ", ".join(config.nodes) or "everything"
@@ -379,23 +379,23 @@ def requested(config: ExportConfig, name: str, given: Exported) -> WriteRequest:
         scene = replace(scene, sky=None)
     facts = {**scene.facts, "generator": f"mudg {version()}"}
     scene = replace(scene, file_from_world=file_from_world(name, config.axes), facts=facts)
-    ground, road = (_ground(given), _road(given)) if name == "alpasim" else (None, None)
-    return WriteRequest(scene, None if whole else moment, config.spz_version, given.log, ground, road)
+    ground, road = (_ground(exported), _road(exported)) if name == "alpasim" else (None, None)
+    return WriteRequest(scene, None if whole else moment, config.spz_version, exported.log, ground, road)
 
 
-def _road(given: Exported) -> NDArray[np.floating] | None:
+def _road(exported: Exported) -> NDArray[np.floating] | None:
     """Fused points of the road f[N, 3]; None where no point has a class."""
-    static = None if given.parts.fused is None else read_fused(given.parts.fused).static
+    static = None if exported.parts.fused is None else read_fused(exported.parts.fused).static
     return None if static is None or static.semantics is None else static.xyz[static.semantics == ID["road"]]
 
 
-def _ground(given: Exported) -> HeightMap | None:
+def _ground(exported: Exported) -> HeightMap | None:
     """The height of the ground, by classes of points or Gaussians, else by the lowest Gaussians."""
-    if given.model is None:
+    if exported.model is None:
         return None
-    cloud = None if given.parts.fused is None else read_fused(given.parts.fused)
-    found = ground_of(cloud, given.model)
-    lowest = lowest_points(given.model) if found is None else ()
+    cloud = None if exported.parts.fused is None else read_fused(exported.parts.fused)
+    found = ground_of(cloud, exported.model)
+    lowest = lowest_points(exported.model) if found is None else ()
     return HeightMap.from_points(np.asarray(lowest)) if len(lowest) else found
 
 
@@ -407,9 +407,9 @@ def middle_s(model: SceneModel, recorded: Scene | None) -> float:
     return 0.0 if not keys else (min(float(k[0]) for k in keys) + max(float(k[-1]) for k in keys)) / 2
 
 
-def _gaussians(config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
+def _gaussians(config: ExportConfig, name: str, exported: Exported, out: Path) -> dict[str, Any]:
     """Write the Gaussians; returns what the file is."""
-    request = requested(config, name, given)
+    request = requested(config, name, exported)
     content, lost = FORMATS[name].write(request), losses(name, request)
     count = _count(request.scene) if request.time_s is None else len(request.cloud)
     store.atomic_write(out, content)
@@ -436,36 +436,36 @@ def _count(scene: SplatScene) -> int:
 # -- cameras and messages --------------------------------------------------------------------------
 
 
-def _messages(_config: ExportConfig, name: str, given: Exported, out: Path) -> dict[str, Any]:
+def _messages(_config: ExportConfig, name: str, exported: Exported, out: Path) -> dict[str, Any]:
     """Write the log as messages over time; returns what the file is."""
     splats, records = None, None
-    if name == "rerun" and given.model is not None:
-        splats = splat_scene(given.model, middle_s(given.model, given.log))
-    if name != "rerun" or given.log is not None:
-        records = records_of(recorded_scene(given), _points(given) if splats is None else None)
+    if name == "rerun" and exported.model is not None:
+        splats = splat_scene(exported.model, middle_s(exported.model, exported.log))
+    if name != "rerun" or exported.log is not None:
+        records = records_of(recorded_scene(exported), _points(exported) if splats is None else None)
     return write_log(name, records, splats, out)
 
 
-def recorded_scene(given: Exported) -> Scene:
+def recorded_scene(exported: Exported) -> Scene:
     """The recorded scene of what is exported; InputError if none is known."""
-    if given.log is None:
-        what, where = "cameras belong to a scene, and none is known here", str(given.parts.model)
+    if exported.log is None:
+        what, where = "cameras belong to a scene, and none is known here", str(exported.parts.model)
         raise InputError(what, where=where, remedy="give --scene SCENE, or a folder made by `mudg run`")
-    if given.edited:
+    if exported.edited:
         changes = "an edit script changes boxes and the vehicle's path here"
         log.warn(f"export: {changes}; pictures and sweeps stay as recorded")
-    return given.log
+    return exported.log
 
 
-def _points(given: Exported) -> PointCloud | None:
+def _points(exported: Exported) -> PointCloud | None:
     """Starting points: fused ones, else the centres of the solid Gaussians of the background."""
-    if given.parts.fused is not None:
-        static = read_fused(given.parts.fused).static
+    if exported.parts.fused is not None:
+        static = read_fused(exported.parts.fused).static
         step = -(-len(static) // MOST_POINTS) or 1
         return PointCloud(static.xyz[::step].copy(), static.rgb[::step].copy(), "world")
-    if given.model is None:
+    if exported.model is None:
         return None
-    cloud = splat_scene(given.model, 0.0, (given.model.nodes[0].name,)).nodes[0].cloud
+    cloud = splat_scene(exported.model, 0.0, (exported.model.nodes[0].name,)).nodes[0].cloud
     solid = cloud.take(cloud.opacity > 0.5)
     rgb = np.round((solid.sh[:, 0] * C0 + 0.5).clip(0, 1) * 255).astype(np.uint8)
     return PointCloud(np.ascontiguousarray(solid.means, np.float32), rgb, "world")

@@ -88,15 +88,15 @@ class FitInputs:
     start: storage.StartFit | None = None
 
 
-def write_fit(config: FitConfig, given: FitInputs, work: RunDir) -> dict[str, Any]:
+def write_fit(config: FitConfig, inputs: FitInputs, work: RunDir) -> dict[str, Any]:
     """Fit a scene and write the model to the work folder; returns a summary. An interrupted fit goes on from its newest
     checkpoint. NumericsError: a loss or gradient is not finite. InputError: damaged inputs."""
     device = drawing_device(config.device, "fit", config.raster)
     config = recipe_of(config.method).used(config)
-    if given.start is not None:
+    if inputs.start is not None:
         config = storage.whole_run(config)
     with one_torch_thread(), memory_of(device, "fit"):
-        state = _prepare(config, given, work.path).to(device)
+        state = _prepare(config, inputs, work.path).to(device)
         with contextlib.closing(state.views):
             optimise(state, config, work)
             add_certainty(state, config)
@@ -137,18 +137,18 @@ class FitState:
         return {**counts, "seconds": round(self.seconds, 2), **(self.last or {})}
 
 
-def _prepare(config: FitConfig, given: FitInputs, out: Path) -> FitState:
+def _prepare(config: FitConfig, inputs: FitInputs, out: Path) -> FitState:
     """Read views, then continue from the newest checkpoint or build the starting model."""
-    scene, fused, start = read_scene(given.scene), read_fused(given.fused), given.start
+    scene, fused, start = read_scene(inputs.scene), read_fused(inputs.fused), inputs.start
     if not METHODS[config.method].boxes:
-        scene, fused = replace(scene, tracks=()), fused_without_boxes(scene, given.fused)
-    frames, invented = views.training_frames(scene, config.cameras), sum(map(len, given.virtual.values()))
-    needed = views.recorded_bytes(frames, config.width_px) + views.virtual_bytes(given.virtual)
+        scene, fused = replace(scene, tracks=()), fused_without_boxes(scene, inputs.fused)
+    frames, invented = views.training_frames(scene, config.cameras), sum(map(len, inputs.virtual.values()))
+    needed = views.recorded_bytes(frames, config.width_px) + views.virtual_bytes(inputs.virtual)
     scratch = views.scratch_folder(len(frames) + invented, needed, out)
-    shown, classes = recorded_views(config, scene, given.virtual, start, scratch)
-    if given.virtual:
+    shown, classes = recorded_views(config, scene, inputs.virtual, start, scratch)
+    if inputs.virtual:
         measured = views.fused_lidar(fused, scene.tracks) if config.virtual.lidar_weight else None
-        loaded = views.load_virtual(given.virtual, classes, measured)
+        loaded = views.load_virtual(inputs.virtual, classes, measured)
         shown = replace(shown, virtual=views.keep(loaded, invented, scratch))
     found = checkpoint.latest(out / "steps")
     if found is None and start is None:

@@ -41,7 +41,7 @@ from mudg.labels.ground import driven_path
 from mudg.labels.inputs import DepthInput, DepthNetwork, DepthOptions, LabelInput, Labels
 from mudg.labels.labellers import labeller
 from mudg.labels.settings import AnnotateConfig
-from mudg.networks.folders import CPU, Place, find, title
+from mudg.networks.folders import CPU, Compute, find, title
 from mudg.scene.contact_sheet import spread
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene
@@ -53,10 +53,10 @@ from mudg.scene.write import SceneWriter
 # it is marked by a small file beside its labels, warned of, and counted in the notes.
 
 
-def place(config: AnnotateConfig) -> Place:
+def place(config: AnnotateConfig) -> Compute:
     """Where the networks of a configuration compute."""
     device = choose_device(config.device, "networks of annotate", NETWORK_KINDS)
-    return Place(str(device), config.precision == "bfloat16")
+    return Compute(str(device), config.precision == "bfloat16")
 
 
 def placed(config: AnnotateConfig) -> AnnotateConfig:
@@ -100,10 +100,10 @@ def digests(config: AnnotateConfig) -> dict[str, str]:
     return found
 
 
-def with_network(network: DepthNetwork, given: LabelInput, labels: Labels, frame_id: str, staging: Path) -> Labels:
+def with_network(network: DepthNetwork, inputs: LabelInput, labels: Labels, frame_id: str, staging: Path) -> Labels:
     """Labels with the network's depth, aligned to the frame's LiDAR, or as they are if it cannot be."""
-    measured = visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
-    asked = DepthInput(given.rgb, measured, labels.depth, labels.sky)
+    measured = visible_depth(inputs.view, inputs.xyz_world, HIDING_RULES["sweep"], gap_deg=inputs.beam_gap_deg)
+    asked = DepthInput(inputs.rgb, measured, labels.depth, labels.sky)
     reason = "too few LiDAR returns"
     if enough_returns(asked):
         found = align_to_lidar(network(asked), asked, RULES)

@@ -68,74 +68,74 @@ class _Surface:
     confidence: Floats
 
 
-def label_by_geometry(given: LabelInput) -> Labels:
+def label_by_geometry(inputs: LabelInput) -> Labels:
     """Label one image from LiDAR, boxes and colour; see the module text. Works, with less, without LiDAR or boxes."""
-    measured = _measure(given)
-    elevation = ray_elevation(given.view)
-    sky = find_sky(given.rgb, elevation, measured.away_px, measured.gap_px)
-    surface = _complete(given, measured, sky)
+    measured = _measure(inputs)
+    elevation = ray_elevation(inputs.view)
+    sky = find_sky(inputs.rgb, elevation, measured.away_px, measured.gap_px)
+    surface = _complete(inputs, measured, sky)
     semantics = np.full(sky.shape, UNLABELLED, np.uint8)
     confidence = np.zeros(sky.shape, np.float32)
-    greenness = greenness_of(given.rgb)
+    greenness = greenness_of(inputs.rgb)
     if measured.any:
-        _paint_surface(semantics, confidence, given, surface, greenness)
+        _paint_surface(semantics, confidence, inputs, surface, greenness)
     standing = (semantics == UNLABELLED) & (elevation > 0) & ~sky
     semantics[standing] = np.where(greenness[standing] > 0, ID["vegetation"], ID["building"])
     confidence[standing] = 0.3
     semantics[sky], confidence[sky] = ID["sky"], 0.8
-    for box in far_to_near(given):
-        _paint_box(semantics, confidence, box, given.view, measured, surface)
+    for box in far_to_near(inputs):
+        _paint_box(semantics, confidence, box, inputs.view, measured, surface)
     sky &= semantics == ID["sky"]
-    return _with_surface(given, semantics, confidence, sky, surface)
+    return _with_surface(inputs, semantics, confidence, sky, surface)
 
 
-def label_by_network(given: LabelInput, semantics: Bytes, confidence: Floats) -> Labels:
+def label_by_network(inputs: LabelInput, semantics: Bytes, confidence: Floats) -> Labels:
     """Labels around given classes u8[H, W] and their confidence f32[H, W]: sky from the classes, the rest by rules."""
-    measured = _measure(given)
+    measured = _measure(inputs)
     sky = (semantics == ID["sky"]) & ~np.isfinite(measured.depth_m)
-    return _with_surface(given, semantics, confidence, sky, _complete(given, measured, sky))
+    return _with_surface(inputs, semantics, confidence, sky, _complete(inputs, measured, sky))
 
 
-def _with_surface(given: LabelInput, semantics: Bytes, confidence: Floats, sky: Mask, surface: _Surface) -> Labels:
+def _with_surface(inputs: LabelInput, semantics: Bytes, confidence: Floats, sky: Mask, surface: _Surface) -> Labels:
     depth, depth_confidence = surface.depth.copy(), surface.confidence.copy()
     depth[sky] = RULES.sky_m
     painted_over = ~sky & (depth == RULES.sky_m)  # a box before the sky that nothing measured
     depth_confidence[painted_over] = 0
-    return Labels(semantics, confidence, sky, find_dynamic(given, semantics, surface), depth, depth_confidence)
+    return Labels(semantics, confidence, sky, find_dynamic(inputs, semantics, surface), depth, depth_confidence)
 
 
-def _measure(given: LabelInput) -> _Measured:
-    gap_px = max(1.5, float(np.deg2rad(given.beam_gap_deg)) * given.view.camera.fy)
-    depth = visible_depth(given.view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=given.beam_gap_deg)
+def _measure(inputs: LabelInput) -> _Measured:
+    gap_px = max(1.5, float(np.deg2rad(inputs.beam_gap_deg)) * inputs.view.camera.fy)
+    depth = visible_depth(inputs.view, inputs.xyz_world, HIDING_RULES["sweep"], gap_deg=inputs.beam_gap_deg)
     known = np.isfinite(depth)
     away = ndimage.distance_transform_edt(~known) if known.any() else np.full(depth.shape, np.inf)
     return _Measured(depth, np.asarray(away, np.float32), gap_px)
 
 
-def _complete(given: LabelInput, measured: _Measured, sky: Mask) -> _Surface:
+def _complete(inputs: LabelInput, measured: _Measured, sky: Mask) -> _Surface:
     """Dense depth of what is not sky, and its points."""
-    beyond = beyond_reach(given.view, measured.depth_m, given.highest_rad, gap_deg=given.beam_gap_deg)
-    for box in far_to_near(given):  # the windows of vehicles return nothing, although they are near
-        outline = box.outline(given.view, 0.0)
+    beyond = beyond_reach(inputs.view, measured.depth_m, inputs.highest_rad, gap_deg=inputs.beam_gap_deg)
+    for box in far_to_near(inputs):  # the windows of vehicles return nothing, although they are near
+        outline = box.outline(inputs.view, 0.0)
         if outline is not None:
             beyond &= ~outline
-    dense = complete_depth(given.rgb, measured.depth_m, sky, beyond, RULES)
-    return _Surface(surface_points(given.view, dense.depth), dense.depth, dense.confidence)
+    dense = complete_depth(inputs.rgb, measured.depth_m, sky, beyond, RULES)
+    return _Surface(surface_points(inputs.view, dense.depth), dense.depth, dense.confidence)
 
 
 def _paint_surface(
-    semantics: Bytes, confidence: Floats, given: LabelInput, surface: _Surface, greenness: Floats
+    semantics: Bytes, confidence: Floats, inputs: LabelInput, surface: _Surface, greenness: Floats
 ) -> None:
     """Each pixel of known depth by its height above the ground, its place beside the path, and its colour."""
     known = np.isfinite(surface.depth)
     height = np.full(known.shape, np.inf, np.float32)
     direct = np.zeros(known.shape, bool)
-    ground = map_ground(given.xyz_world, given.path_world, given.view.center_world)
+    ground = map_ground(inputs.xyz_world, inputs.path_world, inputs.view.center_world)
     if ground is not None:
         height = above_plane(ground.plane, surface.xyz_world)
         _, direct, _ = ground.under(surface.xyz_world)
     flat = known & (np.abs(height) < GROUND_M + 0.005 * surface.depth)
-    beside = beside_path(surface.xyz_world, given.path_world, 4)
+    beside = beside_path(surface.xyz_world, inputs.path_world, 4)
     green = greenness > GRASS
     semantics[flat] = np.where(green[flat], ID["terrain"], ID["road"])
     sure = np.where(beside < NEAR_ROAD_M, 0.9, np.where(direct, 0.7, 0.5))
@@ -179,11 +179,11 @@ def _paint_box(
     semantics[inside], confidence[inside] = box.train_id, (0.5 + 0.4 * certain)[inside]
 
 
-def find_dynamic(given: LabelInput, semantics: Bytes, surface: _Surface) -> Mask:
+def find_dynamic(inputs: LabelInput, semantics: Bytes, surface: _Surface) -> Mask:
     """Pixels of dynamic objects, bool[H, W]: the surface lies in their box, or is uncertain and has their class."""
     dynamic = np.zeros(semantics.shape, bool)
-    for box in far_to_near(given):
-        pixels = _box_pixels(box, given.view, surface) if box.number in given.moving else None
+    for box in far_to_near(inputs):
+        pixels = _box_pixels(box, inputs.view, surface) if box.number in inputs.moving else None
         if pixels is not None:
             window, outline, inside = pixels
             uncertain = outline & ~(surface.confidence[window] > 0.3)

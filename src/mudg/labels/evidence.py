@@ -88,29 +88,29 @@ class Evidence:
     box_labels: NDArray[np.int64]
 
 
-def gather(given: LabelInput) -> Evidence:
-    """Facts at every pixel of ``given.view``; works, with less, without returns, path or boxes."""
-    view, gap_deg = given.view, given.beam_gap_deg
-    measured = visible_depth(view, given.xyz_world, HIDING_RULES["sweep"], gap_deg=gap_deg)
+def gather(inputs: LabelInput) -> Evidence:
+    """Facts at every pixel of ``inputs.view``; works, with less, without returns, path or boxes."""
+    view, gap_deg = inputs.view, inputs.beam_gap_deg
+    measured = visible_depth(view, inputs.xyz_world, HIDING_RULES["sweep"], gap_deg=gap_deg)
     known = np.isfinite(measured)
     shape = measured.shape
     elevation = ray_elevation(view)
     zero, none = np.zeros(shape, np.float32), np.zeros(shape, bool)
     if not known.any():
-        unknown, boxes = np.full(shape, np.nan, np.float32), _boxes(given, None, measured, known)
+        unknown, boxes = np.full(shape, np.nan, np.float32), _boxes(inputs, None, measured, known)
         return Evidence(zero, unknown, zero + 90, zero, zero, none, none, zero, elevation, none, zero, *boxes)
     away_px = np.asarray(ndimage.distance_transform_edt(~known), np.float32)
-    beyond = beyond_reach(view, measured, given.highest_rad, gap_deg=gap_deg)
-    depth = complete_depth(given.rgb, measured, None, beyond).depth
+    beyond = beyond_reach(view, measured, inputs.highest_rad, gap_deg=gap_deg)
+    depth = complete_depth(inputs.rgb, measured, None, beyond).depth
     xyz = surface_points(view, depth)
-    ground = map_ground(given.xyz_world, given.path_world, view.center_world)
+    ground = map_ground(inputs.xyz_world, inputs.path_world, view.center_world)
     height = zero if ground is None else np.clip(above_plane(ground.plane, xyz), -60, 60).astype(np.float32)
     under = (none, none, zero) if ground is None else ground.under(xyz)
-    beside = beside_path(xyz, given.path_world, 2) if len(given.path_world) else np.full(shape, NO_PATH_M, np.float32)
+    beside = beside_path(xyz, inputs.path_world, 2) if len(inputs.path_world) else np.full(shape, NO_PATH_M, np.float32)
     away_deg = np.minimum(np.rad2deg(away_px / view.camera.fy), 90).astype(np.float32)
     rough = _roughness(measured, gap_deg, view.camera.fy)
     seen = (height, depth, away_deg, _upwards(xyz), beside, *under, elevation, beyond, rough)
-    return Evidence(*seen, *_boxes(given, xyz, depth, known))
+    return Evidence(*seen, *_boxes(inputs, xyz, depth, known))
 
 
 def encode(evidence: Evidence) -> NDArray[np.float32]:
@@ -168,17 +168,17 @@ def _roughness(measured: NDArray[np.float32], gap_deg: float, fy_px: float) -> N
 
 
 def _boxes(
-    given: LabelInput, xyz: NDArray[np.float32] | None, depth: NDArray[np.float32], known: NDArray[np.bool_]
+    inputs: LabelInput, xyz: NDArray[np.float32] | None, depth: NDArray[np.float32], known: NDArray[np.bool_]
 ) -> tuple[NDArray[np.uint8], NDArray[np.bool_], NDArray[np.int64]]:
     """Nearest tracked box of each pixel, see ``Evidence``: where the surface lies in it, or, with nothing nearer, in
     its outline.
 
     A box without a return in it is left out where there are returns at all: it is hidden, or empty.
     """
-    view = given.view
+    view = inputs.view
     box, in_box = np.zeros(depth.shape, np.uint8), np.zeros(depth.shape, bool)
     labels: list[int] = []
-    for placed in far_to_near(given)[-_MAX_BOXES:]:
+    for placed in far_to_near(inputs)[-_MAX_BOXES:]:
         outline = placed.outline(view)
         if outline is None:
             continue

@@ -111,11 +111,13 @@ class PlacedBox:
         return points_in_box(local, self.track.size_m, GROWTH_M, FLOOR_M)
 
 
-def far_to_near(given: LabelInput) -> list[PlacedBox]:
+def far_to_near(inputs: LabelInput) -> list[PlacedBox]:
     """Boxes that have a class and are present, the farthest first."""
-    poses = (track.pose_at(given.view.time_s) if track.label in TRAIN_ID_OF else None for track in given.tracks)
-    placed = [PlacedBox(n, track, pose) for n, (track, pose) in enumerate(zip(given.tracks, poses)) if pose is not None]
-    here = given.view.center_world
+    poses = (track.pose_at(inputs.view.time_s) if track.label in TRAIN_ID_OF else None for track in inputs.tracks)
+    placed = [
+        PlacedBox(n, track, pose) for n, (track, pose) in enumerate(zip(inputs.tracks, poses)) if pose is not None
+    ]
+    here = inputs.view.center_world
     return sorted(placed, key=lambda box: -float(np.linalg.norm(box.world_from_box[:3, 3] - here)))
 
 
@@ -161,9 +163,9 @@ class Prediction:
     space: Space
 
     @classmethod
-    def resized(cls, values: Tensor, given: DepthInput, space: Space, least: float | None = None) -> Prediction:
+    def resized(cls, values: Tensor, inputs: DepthInput, space: Space, least: float | None = None) -> Prediction:
         """From a network's values f32[1, 1, h, w], at the size of the image and at least ``least``."""
-        found = functional.interpolate(values, size=given.rgb.shape[:2], mode="bilinear", align_corners=False)
+        found = functional.interpolate(values, size=inputs.rgb.shape[:2], mode="bilinear", align_corners=False)
         return cls((found if least is None else found.clamp(min=least))[0, 0].cpu().numpy(), space)
 
 

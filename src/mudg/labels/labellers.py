@@ -16,15 +16,15 @@ from mudg.labels.by_geometry import label_by_geometry, label_by_network
 from mudg.labels.inputs import Labeller
 from mudg.labels.segmenters import Segmenter
 from mudg.labels.street_net import StreetLabeller
-from mudg.networks.folders import CPU, Place
+from mudg.networks.folders import CPU, Compute
 
 
-def _network(weights: str, place: Place) -> Labeller:
-    segmenter = Segmenter.load(weights, place)
+def _network(weights: str, compute: Compute) -> Labeller:
+    segmenter = Segmenter.load(weights, compute)
     return lambda given: label_by_network(given, *segmenter.classes(given.rgb))
 
 
-LABELLERS: Mapping[str, Callable[[str, Place], Labeller]] = {
+LABELLERS: Mapping[str, Callable[[str, Compute], Labeller]] = {
     "geometry": lambda *_: label_by_geometry,
     "embedded": StreetLabeller.load,
     "network": _network,
@@ -33,7 +33,7 @@ LABELLERS: Mapping[str, Callable[[str, Place], Labeller]] = {
 no parameters)."""
 
 
-def labeller(name: str, weights: str = "", place: Place = CPU) -> Labeller:
+def labeller(name: str, weights: str = "", compute: Compute = CPU) -> Labeller:
     """A labeller of the table, ready for use.
 
     Raises:
@@ -41,4 +41,4 @@ def labeller(name: str, weights: str = "", place: Place = CPU) -> Labeller:
     """
     if name not in LABELLERS:
         raise UsageError("there is no such labeller", expected=", ".join(LABELLERS), got=name)
-    return LABELLERS[name](weights, place)
+    return LABELLERS[name](weights, compute)

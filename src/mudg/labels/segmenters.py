@@ -23,7 +23,7 @@ from torch.nn import functional
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.palette import CLASSES, UNLABELLED
 from mudg.networks import folders
-from mudg.networks.folders import CPU, Place
+from mudg.networks.folders import CPU, Compute
 
 TILE_PX: Final = 1024
 OVERLAP: Final = 0.25
@@ -73,17 +73,17 @@ class Segmenter:
         mean: Sequence[float],
         deviation: Sequence[float],
         square_px: int = 0,
-        place: Place = CPU,
+        compute: Compute = CPU,
     ) -> None:
         """``train_ids`` [C]: our class of each of the network's, UNLABELLED = none; mean and deviation of colours in
         0..1; ``square_px``: side of the only tile that the network reads, 0 = any."""
         self._network, self._kind, self._train_ids = network, KINDS[kind], train_ids
         self._mean = torch.tensor(mean, dtype=torch.float32)[:, None, None]
         self._deviation = torch.tensor(deviation, dtype=torch.float32)[:, None, None]
-        self._square_px, self._place = square_px, place
+        self._square_px, self._compute = square_px, compute
 
     @classmethod
-    def load(cls, folder: str | Path, place: Place = CPU) -> Segmenter:
+    def load(cls, folder: str | Path, compute: Compute = CPU) -> Segmenter:
         """Read a network from a local folder, or from the Hugging Face cache by its name (``folders.find``).
 
         Raises:
@@ -106,10 +106,10 @@ class Segmenter:
         prepared = path / "preprocessor_config.json"
         colors = folders.read_settings(prepared) if prepared.is_file() else {}
         network_class = folders.member(folders.package("transformers"), KINDS[kind].class_name)
-        network = folders.load_network(network_class, path, place)
+        network = folders.load_network(network_class, path, compute)
         square_px = int(network.config.image_size) if KINDS[kind].square else 0
         mean, deviation = colors.get("image_mean", folders.MEAN), colors.get("image_std", folders.DEVIATION)
-        return cls(network, kind, train_ids, mean, deviation, square_px, place)
+        return cls(network, kind, train_ids, mean, deviation, square_px, compute)
 
     def classes(self, rgb: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Train ids u8[H, W] and the probability of each f32[H, W] of an image u8[H, W, 3]."""
@@ -137,8 +137,8 @@ class Segmenter:
         for first in range(0, len(corners), BATCH):
             chosen = corners[first : first + BATCH]
             tiles = torch.stack([image[:, y : y + tile[0], x : x + tile[1]] for y, x in chosen])
-            with torch.inference_mode(), self._place.autocast():
-                output = self._network(pixel_values=tiles.to(self._place.device))
+            with torch.inference_mode(), self._compute.autocast():
+                output = self._network(pixel_values=tiles.to(self._compute.device))
             with torch.inference_mode():
                 found = self._kind.probabilities(output, tile).cpu()
             for (y, x), probabilities in zip(chosen, found, strict=True):

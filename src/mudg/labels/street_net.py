@@ -29,7 +29,7 @@ from mudg.core.pictures import resize_area
 from mudg.labels.by_geometry import GRASS, GROUND_M, find_sky, greenness_of, label_by_network
 from mudg.labels.evidence import BOX_GROUPS, GROUP_OF, PLANE_COUNT, Evidence, encode, gather
 from mudg.labels.inputs import GAP_DEG, TRAIN_ID_OF, LabelInput, Labels
-from mudg.networks.folders import CPU, Place
+from mudg.networks.folders import CPU, Compute
 
 # street net ---------------------------------------------------------------------------------------
 #
@@ -199,37 +199,37 @@ and dark treetops resemble what the network takes for sky."""
 class StreetLabeller:
     """A network ready for labelling; called with a ``LabelInput`` it returns ``Labels``."""
 
-    def __init__(self, net: StreetNet, place: Place = CPU) -> None:
-        """``place``: where the network computes; evidence is gathered on the processor."""
-        self._net, self._place = net.to(place.ready()), place
+    def __init__(self, net: StreetNet, compute: Compute = CPU) -> None:
+        """``compute``: where the network computes; evidence is gathered on the processor."""
+        self._net, self._compute = net.to(compute.ready()), compute
 
     @classmethod
-    def load(cls, folder: Path | str = "", place: Place = CPU) -> StreetLabeller:
+    def load(cls, folder: Path | str = "", compute: Compute = CPU) -> StreetLabeller:
         """From a folder, or, without one, from the package; errors as in ``street_net.load``."""
-        return cls(load(folder or EMBEDDED), place)
+        return cls(load(folder or EMBEDDED), compute)
 
-    def __call__(self, given: LabelInput) -> Labels:
-        return label_by_network(given, *self.classes(given))
+    def __call__(self, inputs: LabelInput) -> Labels:
+        return label_by_network(inputs, *self.classes(inputs))
 
-    def classes(self, given: LabelInput) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    def classes(self, inputs: LabelInput) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Train ids u8[H, W] and the probability of each f32[H, W]."""
-        small = reduced(given, self._net.config.focal_px)
+        small = reduced(inputs, self._net.config.focal_px)
         evidence = gather(small)
-        with self._place.autocast():
+        with self._compute.autocast():
             found = self._net.probabilities(small.rgb, encode(evidence))
-        found = settled(found, evidence, any(track.label in TRAIN_ID_OF for track in given.tracks))
-        return at_size(settled_by_color(found, small.rgb, evidence), given.rgb.shape[0], given.rgb.shape[1])
+        found = settled(found, evidence, any(track.label in TRAIN_ID_OF for track in inputs.tracks))
+        return at_size(settled_by_color(found, small.rgb, evidence), inputs.rgb.shape[0], inputs.rgb.shape[1])
 
 
-def reduced(given: LabelInput, focal_px: float) -> LabelInput:
+def reduced(inputs: LabelInput, focal_px: float) -> LabelInput:
     """The same at a focal length of at most ``focal_px``; colours are averaged over areas."""
-    camera = given.view.camera
+    camera = inputs.view.camera
     scale = focal_px / max(camera.fx, camera.fy)
     if scale >= 1:
-        return given
+        return inputs
     width, height = max(1, round(camera.width * scale)), max(1, round(camera.height * scale))
-    rgb = resize_area(given.rgb, width, height)
-    return dataclasses.replace(given, view=given.view.resized(width, height), rgb=rgb)
+    rgb = resize_area(inputs.rgb, width, height)
+    return dataclasses.replace(inputs, view=inputs.view.resized(width, height), rgb=rgb)
 
 
 def settled(probabilities: NDArray[np.float32], evidence: Evidence, boxes_known: bool = False) -> NDArray[np.float32]:

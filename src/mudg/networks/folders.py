@@ -75,7 +75,7 @@ _REMEDY: Final = "pip install 'mudg[models]'"
 
 
 @dataclass(frozen=True, slots=True)
-class Place:
+class Compute:
     """Device of a network (for `choose_device`), and whether it computes in bfloat16 (convolutions, products)."""
 
     device: DeviceName = "cpu"
@@ -90,7 +90,7 @@ class Place:
         return torch.autocast(self.device.partition(":")[0], torch.bfloat16, enabled=self.bf16)
 
 
-CPU: Final = Place()
+CPU: Final = Compute()
 MEAN: Final = (0.485, 0.456, 0.406)
 DEVIATION: Final = (0.229, 0.224, 0.225)
 """Statistics of colours in 0..1 (ImageNet) where a folder names none."""
@@ -177,17 +177,17 @@ def read_settings(file: Path) -> dict[str, Any]:
     return content
 
 
-def load_network(network_class: Any, folder: Path, place: Place = CPU, subfolder: str = "") -> nn.Module:
+def load_network(network_class: Any, folder: Path, compute: Compute = CPU, subfolder: str = "") -> nn.Module:
     """A network with all its weights, in float32 on its device, ready for use; its parameters have no gradient.
 
     Args:
         network_class: class of transformers or diffusers. folder: as ``save_pretrained`` writes it.
-        place: where it shall compute. subfolder: part of the folder that holds this network.
+        compute: where it shall compute. subfolder: part of the folder that holds this network.
 
     Raises:
         InputError: the folder does not hold this network, or not all of it. ResourceError: no such device.
     """
-    device = place.ready()
+    device = compute.ready()
     where = str(folder / subfolder)
     options: dict[str, Any] = {"local_files_only": True, "use_safetensors": True, "output_loading_info": True}
     if subfolder:

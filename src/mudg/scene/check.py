@@ -61,39 +61,39 @@ def _shots(scene: Scene, name: str) -> Iterator[tuple[View, Any, Any, Any]]:
             yield frame.view, read_image(scene, frame), sweep.world_from_lidar, read_points(scene, sweep).xyz
 
 
-def describe(name: str, found: EdgeAlignment) -> str:
+def describe(name: str, alignment: EdgeAlignment) -> str:
     """One sentence about a camera."""
-    if found.verdict == "unknown":
-        if found.jumps < MIN_JUMPS:
-            return f"camera {name}: too few depth edges to compare with its images ({found.jumps})"
+    if alignment.verdict == "unknown":
+        if alignment.jumps < MIN_JUMPS:
+            return f"camera {name}: too few depth edges to compare with its images ({alignment.jumps})"
         why = "other turns fit about as well"
-        if found.contrast < MIN_CONTRAST:
+        if alignment.contrast < MIN_CONTRAST:
             why = f"no turn of up to {TURNS_DEG[-1]:g} degrees stands out"
-        elif max(abs(angle) for angle in found.best_turn_deg) == TURNS_DEG[-1]:
+        elif max(abs(angle) for angle in alignment.best_turn_deg) == TURNS_DEG[-1]:
             why = "the best turn is at the end of the range tried"
         return (
-            f"camera {name}: {found.jumps} depth edges do not tell whether LiDAR and images agree ({why}); look at the"
-            " contact sheet"
+            f"camera {name}: {alignment.jumps} depth edges do not tell whether LiDAR and images agree ({why}); look at"
+            " the contact sheet"
         )
-    score = f"score {found.score:.2f}, {found.jumps} depth edges"
-    if found.verdict == "right":
+    score = f"score {alignment.score:.2f}, {alignment.jumps} depth edges"
+    if alignment.verdict == "right":
         return f"camera {name}: LiDAR and image edges agree ({score})"
-    right, up = found.best_turn_deg
+    right, up = alignment.best_turn_deg
     return (
         f"camera {name}: LiDAR edges fit the image better when moved by {right:+.1f} degrees to the right and {up:+.1f}"
         f" up ({score}); check calibration, poses and clocks"
     )
 
 
-def to_json(found: EdgeAlignment) -> dict[str, Any]:
+def to_json(alignment: EdgeAlignment) -> dict[str, Any]:
     """Plain values for JSON."""
     return {
-        "verdict": found.verdict,
-        "score": round(found.score, 3),
-        "best_turn_deg": list(found.best_turn_deg),
-        "contrast": round(found.contrast, 3),
-        "sigmas": round(found.sigmas, 2),
-        "depth_edges": found.jumps,
+        "verdict": alignment.verdict,
+        "score": round(alignment.score, 3),
+        "best_turn_deg": list(alignment.best_turn_deg),
+        "contrast": round(alignment.contrast, 3),
+        "sigmas": round(alignment.sigmas, 2),
+        "depth_edges": alignment.jumps,
     }
 
 

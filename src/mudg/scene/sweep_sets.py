@@ -72,7 +72,7 @@ class SweepSet:
         return arrays
 
 
-def write_index(found: SweepSet) -> None:
+def write_index(sweeps: SweepSet) -> None:
     """Write ``sweeps.json``; without it the folder is not a finished set."""
     records = [
         {
@@ -84,10 +84,10 @@ def write_index(found: SweepSet) -> None:
             "end": sweep.end.tolist(),
             "file": sweep.file,
         }
-        for sweep in found.sweeps
+        for sweep in sweeps.sweeps
     ]
-    head = {"schema": SCHEMA, "trajectory": found.trajectory, "sensor": found.sensor, "shift_m": found.shift_m}
-    store.write_json(found.folder / INDEX, {**head, "sweeps": records})
+    head = {"schema": SCHEMA, "trajectory": sweeps.trajectory, "sensor": sweeps.sensor, "shift_m": sweeps.shift_m}
+    store.write_json(sweeps.folder / INDEX, {**head, "sweeps": records})
 
 
 def read_sweep_sets(folder: Path) -> dict[str, SweepSet]:

@@ -42,8 +42,8 @@ def _lpips(trunk: LpipsTrunk, flag: str) -> ScoreNetwork:
     return ScoreNetwork(flag, lambda state, where: LpipsFeatures(state, where, trunk), named, {})
 
 
-def _without_counts(found: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name: value for name, value in found.items() if not name.endswith("num_batches_tracked")}
+def _without_counts(state: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    return {name: value for name, value in state.items() if not name.endswith("num_batches_tracked")}
 
 
 _I3D_SHA256: Final = "bec6519f66ea534e953026b4ae2c65553c17bf105611c746d904657e5860a5e2"

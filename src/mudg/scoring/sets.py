@@ -211,9 +211,9 @@ class SetComparison:
         files: EmbeddingFiles,
         compare: Callable[[Rows, Rows], Entry],
         halves: tuple[Callable[[Rows], tuple[Rows, Rows]], str],
-        made: Mapping[str, Any],
+        facts: Mapping[str, Any],
     ) -> None:
-        self._scene, self._files, self._compare, self._halves, self._made = scene, files, compare, halves, made
+        self._scene, self._files, self._compare, self._halves, self._made = scene, files, compare, halves, facts
         self._recorded: dict[tuple[str, int, int], tuple[str, Rows]] = {}
         self._notes = SetNotes()
 
@@ -273,18 +273,18 @@ def distributions_of(config: ScoreConfig, scene: Scene, out: Path) -> SetCompari
     return distributions(scene, FeatureFiles(Path(config.fid_weights), config.fid_resize, folder, device))
 
 
-def distances(made: NDArray[np.float32], reference: NDArray[np.float32]) -> SetDistances:
+def distances(generated: NDArray[np.float32], reference: NDArray[np.float32]) -> SetDistances:
     """All distances of two sets of features ``[n, d]``, at least two rows each; rows in order of time."""
-    blocks = tuple(np.arange(len(rows)) // BLOCK_FRAMES for rows in (made, reference))
+    blocks = tuple(np.arange(len(rows)) // BLOCK_FRAMES for rows in (generated, reference))
     error, at_infinity, rng = None, None, lambda purpose: seeds.numpy_rng(0, 0, purpose)
     if all(len(set(numbers.tolist())) >= FEWEST_BLOCKS for numbers in blocks):
-        error = feature_distances.kernel_distance_error(made, reference, blocks, rng("blocks of KID"))
-    if min(len(made), len(reference)) >= FEWEST_TO_EXTRAPOLATE:
-        at_infinity = feature_distances.frechet_at_infinity(made, reference, rng("sizes of FID"))
+        error = feature_distances.kernel_distance_error(generated, reference, blocks, rng("blocks of KID"))
+    if min(len(generated), len(reference)) >= FEWEST_TO_EXTRAPOLATE:
+        at_infinity = feature_distances.frechet_at_infinity(generated, reference, rng("sizes of FID"))
     measures = feature_distances.frechet_distance, feature_distances.kernel_distance
-    fid, kid = (measure(made, reference) for measure in measures)
-    mind = feature_distances.mind_distance(made, reference, rng("directions of MIND"))
-    return SetDistances(len(made), len(reference), fid, kid, error, mind, at_infinity)
+    fid, kid = (measure(generated, reference) for measure in measures)
+    mind = feature_distances.mind_distance(generated, reference, rng("directions of MIND"))
+    return SetDistances(len(generated), len(reference), fid, kid, error, mind, at_infinity)
 
 
 # -- videos ----------------------------------------------------------------------------------------
@@ -329,10 +329,10 @@ def clip_count(frames: int) -> int:
     return 0 if frames < CLIP_FRAMES else (frames - CLIP_FRAMES) // HOP_FRAMES + 1
 
 
-def video_entry(made: Rows, reference: Rows) -> Entry:
+def video_entry(generated: Rows, reference: Rows) -> Entry:
     """FVD of two sets of features ``[n, d]``."""
-    value = round(frechet_distance(made, reference), 6)
-    return {"values": {"fvd": value}, "n": len(made), "n_reference": len(reference)}
+    value = round(frechet_distance(generated, reference), 6)
+    return {"values": {"fvd": value}, "n": len(generated), "n_reference": len(reference)}
 
 
 def videos_of(config: ScoreConfig, scene: Scene, out: Path) -> SetComparison:
@@ -418,11 +418,14 @@ class VideoFeatures:
         return found.astype(np.float64)
 
 
-def _compared(made: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[str, Any] | str:
-    if min(len(made), len(reference)) < FEWEST:
+def _compared(generated: NDArray[np.float64], reference: NDArray[np.float64]) -> dict[str, Any] | str:
+    if min(len(generated), len(reference)) < FEWEST:
         return score_tables.TOO_FEW
-    values = {"video_frechet": frechet_distance(made, reference), "video_mmd": polynomial_distance(made, reference)}
-    return {"values": {k: round(v, 6) for k, v in values.items()}, "n": len(made), "n_reference": len(reference)}
+    values = {
+        "video_frechet": frechet_distance(generated, reference),
+        "video_mmd": polynomial_distance(generated, reference),
+    }
+    return {"values": {k: round(v, 6) for k, v in values.items()}, "n": len(generated), "n_reference": len(reference)}
 
 
 # -- embeddings ------------------------------------------------------------------------------------
@@ -446,10 +449,10 @@ class EmbeddingScores:
         name: str,
         distance: Callable[[Rows, Rows], float],
         further: Callable[[Rows, Rows, Sequence[tuple[int, int]]], dict[str, float | str]],
-        made: dict[str, Any],
+        facts: dict[str, Any],
     ) -> None:
         self._scene, self._files, self._name, self._distance = scene, files, name, distance
-        self._further, self._made, self._notes = further, made, SetNotes()
+        self._further, self._made, self._notes = further, facts, SetNotes()
 
     def of(
         self, sets: TrajectorySets, counted: Sequence[int], views: Sequence[View]
@@ -479,14 +482,14 @@ class EmbeddingScores:
             self._notes.note_floor(sets.name, how, self._compared(*split(reference)))
         return found
 
-    def _compared(self, made: Rows, reference: Rows, fewest: int = FEWEST) -> dict[str, Any]:
+    def _compared(self, generated: Rows, reference: Rows, fewest: int = FEWEST) -> dict[str, Any]:
         """The distance and the sizes of both sets; or why there is none."""
         if fewest and not len(reference):
             return {"values": {self._name: score_tables.NO_TRUTH}}
-        if min(len(made), len(reference)) < fewest:
+        if min(len(generated), len(reference)) < fewest:
             return {"values": {self._name: score_tables.TOO_FEW}}
-        value = round(self._distance(made, reference), 6)
-        return {"values": {self._name: value}, "n": len(made), "n_reference": len(reference)}
+        value = round(self._distance(generated, reference), 6)
+        return {"values": {self._name: value}, "n": len(generated), "n_reference": len(reference)}
 
     def record(self) -> dict[str, Any]:
         """How the numbers were made, and the floors."""

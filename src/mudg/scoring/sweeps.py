@@ -55,16 +55,16 @@ class SweepScores:
         self._chamfer: list[float] = []
         self._counts = np.zeros(3)
 
-    def add(self, directions: Floats, made: Measured, true: Measured) -> None:
+    def add(self, directions: Floats, simulated: Measured, true: Measured) -> None:
         """Add a sweep."""
-        here, there = np.isfinite(made.range_m), np.isfinite(true.range_m)
+        here, there = np.isfinite(simulated.range_m), np.isfinite(true.range_m)
         both = here & there
         self._counts += (both.sum(), here.sum(), there.sum())
-        self._range.append(np.abs(made.range_m - true.range_m)[both])
-        difference = np.abs(made.intensity - true.intensity)[both]
+        self._range.append(np.abs(simulated.range_m - true.range_m)[both])
+        difference = np.abs(simulated.intensity - true.intensity)[both]
         self._intensity.append(difference[np.isfinite(difference)])
         if here.any() and there.any():
-            a, b = (directions[own] * one.range_m[own, None] for own, one in ((here, made), (there, true)))
+            a, b = (directions[own] * one.range_m[own, None] for own, one in ((here, simulated), (there, true)))
             ways = (KDTree(y).query(x, workers=-1)[0].mean() for x, y in ((a, b), (b, a)))
             self._chamfer.append(float(np.mean(list(ways))))
 
@@ -110,8 +110,8 @@ def sweep_scores(scene: Scene, methods: Mapping[str, Path]) -> list[dict[str, An
     return rows
 
 
-def _add(sums: dict[str, SweepScores], name: str, beams: Beams, made: Measured, true: Measured) -> None:
-    sums.setdefault(name, SweepScores()).add(beams.directions, made, true)
+def _add(sums: dict[str, SweepScores], name: str, beams: Beams, simulated: Measured, true: Measured) -> None:
+    sums.setdefault(name, SweepScores()).add(beams.directions, simulated, true)
 
 
 def _simulated(arrays: Mapping[str, NDArray[Any]]) -> Measured:
@@ -122,21 +122,23 @@ def _simulated(arrays: Mapping[str, NDArray[Any]]) -> Measured:
     return found
 
 
-def _judged(scene: Scene, world: CityWorld | None, found: SweepSet) -> Iterator[tuple[SimulatedSweep, Beams, Measured]]:
+def _judged(
+    scene: Scene, world: CityWorld | None, sweeps: SweepSet
+) -> Iterator[tuple[SimulatedSweep, Beams, Measured]]:
     """The sweeps of a set that there is truth for."""
     recorded, counted = {sweep.id: sweep for sweep in scene.sweeps}, held_out(scene)
-    for sweep in found.sweeps:
-        if sweep.id not in counted and (counted or found.shift_m == 0):
+    for sweep in sweeps.sweeps:
+        if sweep.id not in counted and (counted or sweeps.shift_m == 0):
             continue
-        arrays = found.arrays(sweep)
+        arrays = sweeps.arrays(sweep)
         nan = np.full(len(arrays["share"]), np.nan)
         times = (sweep.start_s, sweep.end_s)
         directions, share = arrays["directions"].astype(np.float64), arrays["share"].astype(np.float64)
         beams = Beams(directions, share, nan, nan, sweep.start, sweep.end, *times)
-        if found.shift_m == 0 and sweep.own_beams and sweep.id in recorded:
+        if sweeps.shift_m == 0 and sweep.own_beams and sweep.id in recorded:
             true = with_silent(beams_of(scene, recorded[sweep.id]))
             if len(true) != len(beams):
-                what, where = "a simulated sweep has other beams than the recorded one", str(found.folder / sweep.file)
+                what, where = "a simulated sweep has other beams than the recorded one", str(sweeps.folder / sweep.file)
                 remedy = "render it again with this version"
                 raise InputError(what, where=where, expected=str(len(true)), got=str(len(beams)), remedy=remedy)
             yield sweep, beams, Measured(true.range_m, true.intensity)

@@ -97,14 +97,14 @@ def document(
     methods: Sequence[str],
     results: Sequence[Mapping[str, Any]],
     rows: Mapping[str, Mapping[str, Any]],
-    made: Mapping[str, Any],
+    facts: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Everything ``metrics.json`` holds. ``scene``: what was scored. ``exact``: whether truth exists at any view.
     ``trajectories``: as JSON values. ``methods``: in the order of the tables. ``results``: one entry per method and
-    trajectory. ``rows``: title, unit, better and needs of each metric. ``made``: how the numbers were made:
+    trajectory. ``rows``: title, unit, better and needs of each metric. ``facts``: how the numbers were made:
     ``depth_limit_m``, beyond which depths do not count; ``anchors``; and by the entries of ``SET_METRICS``,
     ``detections`` and ``lpips`` what is known of their metrics; entries that are missing were not computed."""
-    depth_limit_m, distributions, videos = made["depth_limit_m"], made.get("distributions"), made.get("videos")
+    depth_limit_m, distributions, videos = facts["depth_limit_m"], facts.get("distributions"), facts.get("videos")
     held_out = len(scene.frames_in("test"))
     limit = f"{depth_limit_m:g} m"
     off = "A recorded log has no ground truth off its path: shifted views are shown, not scored."
@@ -118,8 +118,8 @@ def document(
         "Class scores are pooled over all views of a trajectory; mIoU is the mean over the classes in its truth.",
         *([_rule_of_sets(distributions)] if distributions else []),
         *([_rule_of_videos(videos)] if videos else []),
-        *_further_rules(made),
-        *(LIDAR_RULES if made.get("sweeps") else ()),
+        *_further_rules(facts),
+        *(LIDAR_RULES if facts.get("sweeps") else ()),
     ]
     return {
         "schema": 1,
@@ -140,40 +140,40 @@ def document(
         "trajectories": list(trajectories),
         "results": list(results),
         "by_distance": by_distance(trajectories, methods, results, list(rows)),
-        **{name: value for name, value in made.items() if name != "depth_limit_m" and value},
+        **{name: value for name, value in facts.items() if name != "depth_limit_m" and value},
     }
 
 
-def _rule_of_sets(made: Mapping[str, Any]) -> str:
-    other = f"weights that are not the published file ({made['weights_sha256'][:12]})"
-    weights = "the published weights" if made["published_weights"] else other
+def _rule_of_sets(facts: Mapping[str, Any]) -> str:
+    other = f"weights that are not the published file ({facts['weights_sha256'][:12]})"
+    weights = "the published weights" if facts["published_weights"] else other
     return (
-        f"FID and KID compare the views of a trajectory with the {made['reference']}, with {weights} and the resize"
-        f" rule {made['resize']}. They depend on the number of images: compare methods within a column only, and read"
+        f"FID and KID compare the views of a trajectory with the {facts['reference']}, with {weights} and the resize"
+        f" rule {facts['resize']}. They depend on the number of images: compare methods within a column only, and read"
         " them beside the floor, which the truth itself scores."
     )
 
 
-def _rule_of_videos(made: Mapping[str, Any]) -> str:
+def _rule_of_videos(facts: Mapping[str, Any]) -> str:
     return (
-        f"FVD compares clips of {made['clip_frames']} views, one at every {made['hop_frames']}th, with those of the"
-        f" {made['reference']} (resize rule {made['resize']}, epsilon {made['norm_epsilon']:g}); all views count. With"
-        " so few clips it is mostly bias: read it beside the floor."
+        f"FVD compares clips of {facts['clip_frames']} views, one at every {facts['hop_frames']}th, with those of the"
+        f" {facts['reference']} (resize rule {facts['resize']}, epsilon {facts['norm_epsilon']:g}); all views count."
+        " With so few clips it is mostly bias: read it beside the floor."
     )
 
 
-def _further_rules(made: Mapping[str, Any]) -> list[str]:
+def _further_rules(facts: Mapping[str, Any]) -> list[str]:
     """One sentence for each other metric whose definition has variants."""
     rules = []
-    if made.get("lpips"):
-        how = "in -1..1" if made["lpips"]["input"] == "correct" else "unscaled, in 0..1"
+    if facts.get("lpips"):
+        how = "in -1..1" if facts["lpips"]["input"] == "correct" else "unscaled, in 0..1"
         rules.append(f"LPIPS gets its colours {how}.")
-    if made.get("dinov2"):
-        rules.append(f"FD-DINOv2 is made with {made['dinov2']['network']}; read it beside the floor.")
-    if made.get("clip"):
+    if facts.get("dinov2"):
+        rules.append(f"FD-DINOv2 is made with {facts['dinov2']['network']}; read it beside the floor.")
+    if facts.get("clip"):
         pairs = "CLIP-F (neighbouring views) and CLIP-V (recorded frame of the same time)"
-        rules.append(f"CMMD, {pairs} are made with {made['clip']['network']}.")
-    detections = made.get("detections", {})
+        rules.append(f"CMMD, {pairs} are made with {facts['clip']['network']}.")
+    detections = facts.get("detections", {})
     if of := detections.get("nta_iou"):
         of = f"true boxes {of['boxes']}; classes: {of['classes']}; points: {of['points']}"
         rules.append(f"NTA-IoU: {of}. What hides a box is not asked.")

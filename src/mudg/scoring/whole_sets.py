@@ -119,8 +119,8 @@ def anchors_of(results: Rows, trajectories: Sequence[ScoredTrajectory], referenc
 def _sets_of(trajectory: ScoredTrajectory, reference: Reference, out: Path, counted: Sequence[int]) -> TrajectorySets:
     """The images at the counted views of a trajectory whose views have been scored and written."""
 
-    def chosen(found: ObservationSet, indices: Sequence[int]) -> ImageSet:
-        return ImageSet(len(counted), lambda number: found.rgb_u8(indices[counted[number]]))
+    def chosen(views: ObservationSet, indices: Sequence[int]) -> ImageSet:
+        return ImageSet(len(counted), lambda number: views.rgb_u8(indices[counted[number]]))
 
     def true_image(number: int) -> NDArray[np.uint8]:
         place = counted[number]

@@ -191,16 +191,16 @@ def _evenly(sweeps: Sequence[Sweep], most: int) -> tuple[Sweep, ...]:
     return tuple(sweeps[k] for k in at)
 
 
-def _with_losses(scene: Scene, sweeps: Sequence[Sweep], found: LogReturns) -> LogReturns:
+def _with_losses(scene: Scene, sweeps: Sequence[Sweep], returns: LogReturns) -> LogReturns:
     """The same with ``Returns.missed``: every beam of some of these sweeps that was lost counts, by weight, at the
     returns that it met. Returns that more beams went through than met are traces of what moved; they are left out."""
     chosen = _evenly(sweeps, MOST_SILENT)
-    sizes = [len(part) for part in found.parts.values()]
+    sizes = [len(part) for part in returns.parts.values()]
     missed, met_here, gone_through = (np.zeros(sum(sizes)) for _ in range(3))
     for sweep in chosen:
         beams = with_silent(beams_of(scene, sweep))
         for share, own in beams.parts(SECTORS):
-            met = found.meet(beams.directions[own], beams.pose(share), found.poses(beams.time_s(share), {}))
+            met = returns.meet(beams.directions[own], beams.pose(share), returns.poses(beams.time_s(share), {}))
             away, surface = beams.range_m[own], met.range_m
             with np.errstate(invalid="ignore"):
                 kinds = (np.isnan(away), away <= 1.05 * surface + THROUGH_M, away > 1.05 * surface + THROUGH_M)
@@ -208,22 +208,22 @@ def _with_losses(scene: Scene, sweeps: Sequence[Sweep], found: LogReturns) -> Lo
                 sums += np.bincount(met.rows[kind].reshape(-1), met.weights[kind].reshape(-1), len(sums))
     missed *= len(sweeps) / max(1, len(chosen))
     parts, first = {}, 0
-    for name, part in found.parts.items():
+    for name, part in returns.parts.items():
         own = slice(first, first + len(part))
         parts[name] = part.with_missed(missed[own]).taken(gone_through[own] <= met_here[own] + UNDECIDED)
         first += len(part)
-    return replace(found, parts=parts)
+    return replace(returns, parts=parts)
 
 
-def _samples(scene: Scene, sweeps: Sequence[Sweep], found: LogReturns) -> tuple[Floats, NDArray[np.bool_]]:
+def _samples(scene: Scene, sweeps: Sequence[Sweep], returns: LogReturns) -> tuple[Floats, NDArray[np.bool_]]:
     """Features of the beams of sweeps that are not in the cloud, and which returned."""
     rows, answers = [np.zeros((0, 7))], [np.zeros(0, bool)]
     for sweep in sweeps:
         beams = with_silent(beams_of(scene, sweep))
         for share, own in beams.parts(SECTORS):
-            met = found.meet(beams.directions[own], beams.pose(share), found.poses(beams.time_s(share), {}))
+            met = returns.meet(beams.directions[own], beams.pose(share), returns.poses(beams.time_s(share), {}))
             seen = np.isfinite(met.range_m)
-            rows.append(found.features(met)[seen])
+            rows.append(returns.features(met)[seen])
             answers.append(beams.returned[own][seen])
     return np.concatenate(rows), np.concatenate(answers)
 

@@ -134,16 +134,16 @@ class EditDesk:
                 self._planned = {**_last(self._planned, KEPT - 1), text: drive}
             return self._planned[text]
 
-    def answer(self, asked: EditRequest) -> tuple[bytes, str]:
+    def answer(self, request: EditRequest) -> tuple[bytes, str]:
         """What a script does, as JSON: paths of changed objects, who is gone, notes, the file that was saved."""
         said: dict[str, Any] = {"paths": {}, "removed": [], "inserted": [], "notes": [], "saved": None}
-        if asked.script.strip():
-            drive = self._checked(asked.script)
+        if request.script.strip():
+            drive = self._checked(request.script)
             notes = [note["text"] for note in drive.notes] + _unseen(drive)
             said |= {"paths": self._paths(drive), "removed": list(drive.plan.removed)}
             said |= {"inserted": list(drive.plan.inserted), "notes": notes}
-        if asked.save:
-            said["saved"] = str(self.save(asked.script))
+        if request.save:
+            said["saved"] = str(self.save(request.script))
         return store.json_text(said, indent=None).encode(), "application/json"
 
     def _checked(self, text: str) -> EditedDrive:
@@ -313,18 +313,18 @@ class FrameSource:
         self._shown: _Shown | None = None
         self._lock, self._filming = threading.Lock(), threading.Lock()
 
-    def png(self, asked: FrameRequest) -> bytes:
+    def png(self, request: FrameRequest) -> bytes:
         """A frame as PNG bytes. InputError: a camera that is none, or edits that cannot be carried out."""
-        content, view = io.BytesIO(), View(self._camera(asked), _pose(asked), float(asked.time_s))
-        picture = self._picture(asked.layer, self._drawer(asked), view)
+        content, view = io.BytesIO(), View(self._camera(request), _pose(request), float(request.time_s))
+        picture = self._picture(request.layer, self._drawer(request), view)
         Image.fromarray(picture).save(content, "PNG", compress_level=1)
         return content.getvalue()
 
-    def film(self, asked: VideoRequest, send: Callable[[bytes], None]) -> None:
+    def film(self, request: VideoRequest, send: Callable[[bytes], None]) -> None:
         """Make a video and send it: after each frame a line of JSON with its number, then one with the number of bytes,
         then the MP4 file. Frames that are asked for meanwhile are drawn in between. InputError: as ``png``, or too many
         pixels. ResourceError: another video is being made. OSError: of ``send``; nothing is left."""
-        camera, count = self._camera(asked), len(asked.moments)
+        camera, count = self._camera(request), len(request.moments)
         if camera.width * camera.height * count > MOST_PIXELS:
             expected = f"at most {MOST_PIXELS:,} pixels in all frames together"
             got = f"{count} frames of {camera.width} x {camera.height}"
@@ -334,32 +334,34 @@ class FrameSource:
             remedy = "wait for it, or cancel it where it was asked for"
             raise ResourceError("another video is being made", remedy=remedy)
         try:
-            content = mp4_bytes(self._pictures(asked, camera, send), asked.fps, crf=VIDEO_CRF)
+            content = mp4_bytes(self._pictures(request, camera, send), request.fps, crf=VIDEO_CRF)
         finally:
             self._filming.release()
         send(_line(bytes=len(content)))
         send(content)
 
     def _pictures(
-        self, asked: VideoRequest, camera: Camera, send: Callable[[bytes], None]
+        self, request: VideoRequest, camera: Camera, send: Callable[[bytes], None]
     ) -> Iterator[NDArray[np.uint8]]:
-        draw = self._drawer(asked)
-        for number, moment in enumerate(asked.moments, 1):
-            yield self._picture(asked.layer, draw, View(camera, _pose(moment), float(moment.time_s)))
-            send(_line(frame=number, frames=len(asked.moments)))
+        draw = self._drawer(request)
+        for number, moment in enumerate(request.moments, 1):
+            yield self._picture(request.layer, draw, View(camera, _pose(moment), float(moment.time_s)))
+            send(_line(frame=number, frames=len(request.moments)))
 
-    def _drawer(self, asked: Wanted) -> Drawer:
+    def _drawer(self, request: Wanted) -> Drawer:
         """What draws the scene that is asked for, without what is hidden, in the weather and light of the script."""
         with self._lock:
-            if self._shown is None or self._shown.edits != asked.edits:
-                self._shown = _Shown(asked.edits, [model.to(self._device) for model in self._edited(asked.edits)], {})
-            index = min(asked.scene, len(self._shown.models) - 1)
+            if self._shown is None or self._shown.edits != request.edits:
+                self._shown = _Shown(
+                    request.edits, [model.to(self._device) for model in self._edited(request.edits)], {}
+                )
+            index = min(request.scene, len(self._shown.models) - 1)
             model = self._shown.models[index]
-            gone = [name for name in asked.hidden if name in model.node_names()]
-            seen = model if asked.camera else over_ground(model)
+            gone = [name for name in request.hidden if name in model.node_names()]
+            seen = model if request.camera else over_ground(model)
             draw = _drawer_of(seen.without_nodes(gone) if gone else seen)
             conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
-            if conditions is None or asked.layer != "color":
+            if conditions is None or request.layer != "color":
                 return draw
             if index not in self._shown.weather:
                 self._shown.weather[index] = weather_of(_drawer_of(model), conditions, self._scene)
@@ -369,19 +371,21 @@ class FrameSource:
         with self._lock:
             return _colors(draw(view), layer)
 
-    def _camera(self, asked: Wanted) -> Camera:
+    def _camera(self, request: Wanted) -> Camera:
         """The camera, not wider than allowed."""
-        camera = Camera(asked.camera or "free", asked.width, asked.height, asked.fx, asked.fy, asked.cx, asked.cy)
-        if asked.width > self._widest:
-            camera = camera.resized(self._widest, max(1, round(asked.height * self._widest / asked.width)))
+        camera = Camera(
+            request.camera or "free", request.width, request.height, request.fx, request.fy, request.cx, request.cy
+        )
+        if request.width > self._widest:
+            camera = camera.resized(self._widest, max(1, round(request.height * self._widest / request.width)))
         return camera
 
 
-def _pose(asked: Moment) -> NDArray[np.float64]:
+def _pose(moment: Moment) -> NDArray[np.float64]:
     """World from camera, f64[4, 4]."""
     pose = np.eye(4)
-    pose[:3, :3] = orthonormal(np.array(asked.axes, np.float64).T)
-    pose[:3, 3] = asked.eye
+    pose[:3, :3] = orthonormal(np.array(moment.axes, np.float64).T)
+    pose[:3, 3] = moment.eye
     return pose
 
 

@@ -2,12 +2,15 @@
 // `mudg view` the server checks every script with the program's own reader and knows the paths of what the page cannot show itself.
 
 import { Ground, Motion, SHOWN, carriedOut, scriptText, summary, verbOf, withMove } from "mudg/edits";
+import { ballsOf, boxOf, withErased } from "mudg/erase";
 import { PoseKeys } from "mudg/math";
 import { COVERS, LIGHTS, RAINS_MM_H, SNOWS_MM_H, VISIBILITIES_M, conditionsOf, withConditions } from "mudg/weather";
 
 const WAIT_MS = 350;
 const MOST_STEPS = 200;
 const AHEAD_M = 12; // where an inserted object stands
+const ROUND_M = [80, 80, 40]; // of the street round the drive
+const BOX_FIELDS = { "box-x": ["center", 0], "box-y": ["center", 1], "box-z": ["center", 2], "box-length": ["size_m", 0], "box-width": ["size_m", 1], "box-height": ["size_m", 2] };
 const FIELDS = { "edit-along": "along_m", "edit-left": "left_m", "edit-yaw": "yaw_deg" };
 const $ = (id) => document.getElementById(id);
 
@@ -99,6 +102,14 @@ export class Editor {
     if (scriptText(made) !== scriptText(edits)) this.set(made);
   }
 
+  /** Keeps only a box of the street: one round the drive to begin with, then with other numbers. */
+  crop(values = {}) {
+    const { edits } = this.app.state, places = this.app.drive.ego.positions;
+    const [low, high] = [Math.min, Math.max].map((of) => [0, 1, 2].map((k) => of(...places.map((place) => place[k]))));
+    const round = { center: low.map((v, k) => Math.round((v + high[k]) / 2)), size_m: low.map((v, k) => Math.ceil(high[k] - v) + ROUND_M[k]), yaw_deg: 0 };
+    this.set(withErased(edits, { keep: { ...(boxOf(edits) ?? round), ...values } }));
+  }
+
   /** The last entry if it moves this object for good. */
   lastMove(id) {
     const { edits } = this.app.state, [verb, given] = edits.length ? verbOf(edits[edits.length - 1]) : [];
@@ -119,6 +130,7 @@ export class Editor {
     for (const { scene } of app.loaded) for (const node of scene.nodes) if (node.recorded) path(node, node.name);
     for (const track of app.tracks) path(track, track.id);
     app.renderer.conditions = conditionsOf(edits);
+    app.renderer.erased = { balls: ballsOf(edits), box: boxOf(edits) };
   }
 
   /** Has the server check the entries, and takes from it what the page cannot compute. */
@@ -180,6 +192,16 @@ export class Editor {
         this.set([...(last ? edits.slice(0, -1) : edits), { move: settings }]);
       };
     }
+    $("brush").onclick = () => { app.brush.set(!app.brush.on); };
+    $("brush-radius").onchange = ({ target }) => { if (Number(target.value) > 0) app.brush.radius = Number(target.value); };
+    $("crop").onclick = () => (boxOf(app.state.edits) ? this.set(withErased(app.state.edits, { keep: null })) : this.crop());
+    for (const [field, [name, k]] of Object.entries(BOX_FIELDS)) {
+      $(field).onchange = ({ target }) => {
+        const value = Number(target.value), box = boxOf(app.state.edits);
+        if (box && Number.isFinite(value) && (name === "center" || value > 0)) this.crop({ [name]: box[name].map((one, i) => (i === k ? value : one)) });
+      };
+    }
+    $("box-yaw").onchange = ({ target }) => { if (Number.isFinite(Number(target.value))) this.crop({ yaw_deg: Number(target.value) }); };
     const by = $("edit-by");
     by.append(...[...this.own].map((name) => new Option(name, name)));
     $("edit-replace").onclick = () => this.replace(id(), by.value);
@@ -203,6 +225,12 @@ export class Editor {
       $(`${name}-text`).textContent = text(value);
     }
     $("light").value = now.time;
+    const box = boxOf(this.app.state.edits), brush = this.app.brush?.on ?? false;
+    $("brush").setAttribute("aria-pressed", String(brush));
+    $("crop").setAttribute("aria-pressed", String(Boolean(box)));
+    $("box").hidden = !box;
+    const numbers = box ? { ...Object.fromEntries(Object.entries(BOX_FIELDS).map(([field, [name, k]]) => [field, box[name][k]])), "box-yaw": box.yaw_deg ?? 0 } : {};
+    for (const [field, value] of Object.entries(numbers)) if (document.activeElement !== $(field)) $(field).value = String(value);
     const { selected } = this.app.state, shown = selected !== null && this.can(selected);
     $("edit-object").hidden = !shown;
     $("edit-hint").hidden = shown;

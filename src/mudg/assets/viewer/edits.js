@@ -7,7 +7,7 @@ const STEP_S = 0.05; // distance of the keys that describe a changed stretch of 
 const TILT_M = 2;
 const DEFAULT_RAMP_S = 1, DEFAULT_BRAKE_M_S2 = 4;
 /** Verbs that the page shows by itself; the server behind `mudg view` knows the paths of the others. */
-export const SHOWN = ["remove", "move", "stop"];
+export const SHOWN = ["remove", "move", "stop", "erase"];
 
 // ---- the ground ----
 
@@ -201,7 +201,9 @@ const flow = (value) => Array.isArray(value) ? `[${value.map(flow).join(", ")}]`
 
 /** One line about an edit. */
 export function summary(entry) {
-  const [verb, given] = verbOf(entry), who = given?.ids?.join(", ") ?? given?.id ?? "";
+  const [verb, given] = verbOf(entry);
+  if (verb === "erase") return [given.balls && `erase ${given.balls.length} brush mark${given.balls.length > 1 ? "s" : ""}`, given.keep && `keep a box of ${given.keep.size_m.join(" x ")} m`].filter(Boolean).join(", ");
+  const who = given?.ids?.join(", ") ?? given?.id ?? "";
   const short = (value) => { const text = value?.run && value.id ? value.id : typeof value === "object" ? flow(value) : String(value); return text.length > 60 ? "..." : text; };
   const rest = Object.entries(given ?? {}).filter(([name]) => name !== "id" && name !== "ids").map(([name, value]) => `${name} ${short(value)}`);
   return `${[verb, who].filter(Boolean).join(" ")}${rest.length ? `: ${rest.join(", ")}` : ""}`;

@@ -16,16 +16,17 @@ export function listen(app, controls) {
 
 function pointers(app) {
   const { stage } = app, fingers = new Map();
-  let spread = 0, moved = 0, holder = null;
+  let spread = 0, moved = 0, holder = null, tool = null; // the pointer that a tool holds
   stage.addEventListener("pointerdown", (event) => {
     if (event.target.id === "divider") return;
     stage.setPointerCapture(event.pointerId);
-    if (!fingers.size && app.gizmo.take(...placeOf(app, event))) { holder = event.pointerId; return; }
+    tool = fingers.size ? null : [app.brush, app.gizmo].find((one) => one.take(...placeOf(app, event)));
+    if (tool) { holder = event.pointerId; return; }
     fingers.set(event.pointerId, [event.clientX, event.clientY]);
     moved = 0;
   });
   stage.addEventListener("pointermove", (event) => {
-    if (event.pointerId === holder) { app.gizmo.drag(...placeOf(app, event)); return; }
+    if (event.pointerId === holder) { tool.drag(...placeOf(app, event)); return; }
     const before = fingers.get(event.pointerId);
     if (!before) { hover(app, event); return; }
     const dx = event.clientX - before[0], dy = event.clientY - before[1];
@@ -40,7 +41,7 @@ function pointers(app) {
     app.change();
   });
   const up = (event) => {
-    if (event.pointerId === holder) { holder = null; app.gizmo.release(); return; }
+    if (event.pointerId === holder) { holder = null; tool.release(); return; }
     if (fingers.delete(event.pointerId) && moved < 4 && event.type === "pointerup") click(app, event);
     spread = 0;
   };
@@ -94,7 +95,9 @@ function edited(app, event) {
     if (letter === "y" || event.shiftKey) editor.redo(); else editor.undo();
     return true;
   }
-  if (event.ctrlKey || event.metaKey || event.altKey || id === null) return false;
+  if (event.ctrlKey || event.metaKey || event.altKey) return false;
+  if (letter === "x" || (event.key === "Escape" && app.brush.on)) { app.brush.set(letter === "x" && !app.brush.on); return true; }
+  if (id === null) return false;
   if (event.shiftKey && NUDGES[event.key]) editor.move(id, NUDGES[event.key]);
   else if (event.key === "Delete" || event.key === "Backspace") editor.remove(id);
   else if (event.key === "Escape") app.change({ selected: null });

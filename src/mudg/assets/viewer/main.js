@@ -1,6 +1,7 @@
 // Starts the page: reads its facts, unpacks, shows the controls; says what is wrong where it cannot.
 
 import { App } from "mudg/app";
+import { Brush } from "mudg/brush";
 import { Editor } from "mudg/editor";
 import { exactFrames } from "mudg/exact";
 import { Gizmo } from "mudg/gizmo";
@@ -19,6 +20,7 @@ async function start() {
   await app.load((share) => { $("progress").value = share; });
   app.editor = new Editor(app);
   app.gizmo = app.overlayDrawer.gizmo = new Gizmo(app, app.editor);
+  app.brush = app.overlayDrawer.brush = new Brush(app, app.editor);
   exactFrames(app);
   listen(app, new Controls(app));
   $("loading").hidden = true;

@@ -1,6 +1,7 @@
 // Boxes, paths, LiDAR points and recorded cameras, drawn over the picture. They are not hidden by what stands before them.
 
 import { add, dot, project, sub, turn } from "mudg/math";
+import { boxOf } from "mudg/erase";
 import { along } from "mudg/path";
 
 const EDGES = [[0, 1], [2, 3], [4, 5], [6, 7], [0, 2], [1, 3], [4, 6], [5, 7], [0, 4], [1, 5], [2, 6], [3, 7]];
@@ -41,7 +42,7 @@ export class Overlay {
     this.thumbnails = [];
     this.labels = [];
     const flown = state.mode !== "path" && state.keys.length > 0;
-    const empty = !(flown || state.boxes || state.paths || state.lidar || state.cameras || state.selected);
+    const empty = !(flown || state.boxes || state.paths || state.lidar || state.cameras || state.selected || boxOf(state.edits));
     this.canvas.style.visibility = empty ? "hidden" : "visible"; // a canvas that is only cleared may keep its old picture on the screen
     if (empty) return;
     c.save();
@@ -63,6 +64,7 @@ export class Overlay {
     if (state.paths) this.line(view, this.drive.ego.positions, "rgb(255 255 255 / .8)", 2);
     if (flown) this.flown(view, state.keys);
     if (state.selected) this.gizmo?.draw(c, view, ratio);
+    this.brush?.draw(c, view, ratio);
     c.restore();
   }
 

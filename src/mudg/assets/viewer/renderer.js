@@ -3,6 +3,7 @@
 
 import { TEXTURE_WIDTH } from "mudg/data";
 import * as shaders from "mudg/shaders";
+import { MOST_BALLS, headingOf } from "mudg/erase";
 import { Sorter } from "mudg/sorter";
 import { streaks } from "mudg/particles";
 import { conditionsOf, fallingOf, preview } from "mudg/weather";
@@ -47,6 +48,7 @@ export class Renderer {
     this.empty = gl.createVertexArray();
     this.photos = new Map(); // place -> {key, texture}
     this.conditions = conditionsOf([]);
+    this.erased = { balls: [], box: null };
     this.velocity = () => [0, 0, 0]; // of the vehicle at a time, m/s; it tilts the streaks of drops
     this.drops = this.program(shaders.dropVertex, shaders.dropFragment);
     this.dropRows = gl.createBuffer();
@@ -224,6 +226,12 @@ export class Renderer {
     gl.uniform4fv(places.fog, fog);
     gl.uniform4fv(places.veil, veil);
     gl.uniform4fv(places.snow, snow);
+    const { balls, box } = this.erased, shown = balls.slice(-MOST_BALLS);
+    gl.uniform1i(places.ballCount, shown.length);
+    if (shown.length) gl.uniform4fv(places.balls, shown.flat());
+    gl.uniform4f(places.boxPlace, ...(box?.center ?? [0, 0, 0]), box ? 1 : 0);
+    gl.uniform3f(places.boxHalf, ...(box?.size_m ?? [0, 0, 0]).map((size) => size / 2));
+    gl.uniform2f(places.boxHeading, ...headingOf(box ?? {}));
     gl.uniform1ui(places.ground, loaded.scene.ground);
     gl.uniform1f(places.nearest, NEAR_M);
     gl.uniform1i(places.layer, layer);

@@ -1,6 +1,8 @@
 // The programs of the graphics card. They follow core/raster/torch_twin.py: elliptical weighted averaging, 0.3 square pixels of blur,
 // alpha at most 0.99 and at least 1/255, pixel centres at one half.
 
+import { MOST_BALLS } from "mudg/erase";
+
 /** Kinds of pictures, in the order in which the programs number them. */
 export const LAYERS = ["color", "depth", "class", "instance", "normal", "confidence", "recorded"];
 /** Classes counted in one pass: four targets with three classes each; every target needs its alpha for blending. */
@@ -15,6 +17,7 @@ export const splatVertex = (degree, texels, width, rows) => HEAD + `
 uniform usampler2DArray data; uniform sampler2D nodes, grids;
 uniform mat3 cameraFromWorld; uniform vec3 eye; uniform vec4 intrinsics; uniform vec2 size;
 uniform vec2 colorRange; uniform vec4 fog, veil, snow; uniform uint ground; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias;
+uniform vec4 balls[${MOST_BALLS}], boxPlace; uniform vec3 boxHalf; uniform vec2 boxHeading; uniform int ballCount; // what is erased of the street
 in uint row;
 out vec2 place; flat out vec4 payload; flat out uvec2 vote;
 
@@ -63,6 +66,14 @@ vec3 harmonics(vec3 d) {
 
 vec3 tint(int node) { return node == 0 ? vec3(0.42) : 0.55 + 0.45 * cos(6.2831853 * (fract(float(node) * 0.61803399) + vec3(0.0, 0.33, 0.67))); }
 
+bool erased(vec3 at) { // as in editing/apply.py
+  for (int k = 0; k < ballCount; k++) if (distance(at, balls[k].xyz) <= balls[k].w) return true;
+  if (boxPlace.w < 0.5) return false;
+  vec3 way = at - boxPlace.xyz;
+  vec2 flat_ = vec2(dot(way.xy, boxHeading), dot(way.xy, vec2(-boxHeading.y, boxHeading.x)));
+  return any(greaterThan(abs(vec3(flat_, way.z)), boxHalf));
+}
+
 void main() {
   gl_Position = vec4(0.0, 0.0, 2.0, 1.0); // outside: nothing is drawn
   place = vec2(0.0); payload = vec4(0.0); vote = uvec2(255u, 0u);
@@ -76,7 +87,7 @@ void main() {
   if (state.y >= 0.0) mean = displaced(mean, node, state.y);
   vec3 fromEye = vec3(dot(r0.xyz, mean) + r0.w, dot(r1.xyz, mean) + r1.w, dot(r2.xyz, mean) + r2.w) - eye;
   vec3 c = cameraFromWorld * fromEye;
-  if (c.z <= nearest) return;
+  if (c.z <= nearest || (node == 0 && erased(fromEye + eye))) return;
 
   mat3 worldFromNode = transpose(mat3(r0.xyz, r1.xyz, r2.xyz)), axes = worldFromNode * turned(second.x);
   vec2 xy = unpackHalf2x16(second.y);

@@ -42,7 +42,7 @@ from mudg.labels.depth import marigold
 from mudg.labels.depth.marigold import check_steps, ddim_scheduler, working_size
 from mudg.labels.inputs import PLAIN, DepthInput, DepthOptions, Prediction
 from mudg.networks import clip, folders
-from mudg.networks.folders import CPU, Place
+from mudg.networks.folders import CPU, Compute
 
 KIND: Final = "depthlab"
 SCHEMA: Final = 1
@@ -160,7 +160,7 @@ class DepthLabParts:
     scheduler: Any
 
 
-def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -> DepthLabParts:
+def read_parts(folder: Path, described: Mapping[str, Any], compute: Compute = CPU) -> DepthLabParts:
     """The networks of a converted folder in float32 on their device, every file checked against its sha256.
 
     Raises:
@@ -168,7 +168,7 @@ def read_parts(folder: Path, described: Mapping[str, Any], place: Place = CPU) -
             altered.
         ResourceError: a package or the device is missing.
     """
-    device, where = place.ready(), folder / DESCRIPTION
+    device, where = compute.ready(), folder / DESCRIPTION
     try:
         configs = {name: dict(described["parts"][name]["config"]) for name in PARTS}
         files = {name: {str(f): str(d) for f, d in described["parts"][name]["files"].items()} for name in PARTS}
@@ -277,22 +277,22 @@ class Prepared:
     high_m: float
 
 
-def prepare(given: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: int) -> Prepared:
+def prepare(inputs: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: int) -> Prepared:
     """Inputs of the networks for an image; ``cell``: pixels per latent cell and side, ``crop_px``: side of CLIP's
     image.
 
     Raises:
         InputError: no depth is known.
     """
-    size = working_size(given.rgb, sampling.processing_px)
-    depth = known_depth(np.where(given.sky, np.float32(np.nan), given.measured), size)
+    size = working_size(inputs.rgb, sampling.processing_px)
+    depth = known_depth(np.where(inputs.sky, np.float32(np.nan), inputs.measured), size)
     known = np.isfinite(depth)
     if not known.any():
         raise InputError("no LiDAR return in the image", where="depth network", expected="at least one")
     low, high = float(depth[known].min()), float(depth[known].max())
     values = ((depth - low) / (high - low + 1e-6) - 0.5) * (2 * sampling.normalize_scale)
     index: Any = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
-    scaled = resize_bicubic(given.rgb, size[1], size[0])
+    scaled = resize_bicubic(inputs.rgb, size[1], size[0])
     fill = (0, -size[1] % cell, 0, -size[0] % cell)
 
     def padded(planes: NDArray[Any]) -> Tensor:
@@ -300,7 +300,7 @@ def prepare(given: DepthInput, sampling: DepthLabSampling, cell: int, crop_px: i
 
     image = padded(scaled.transpose(2, 0, 1)) / 127.5 - 1
     nearest, linear = padded(values[tuple(index)][None]), padded(linear_fill(values)[None])
-    return Prepared(image, clip_crop(given.rgb, crop_px), nearest, linear, padded(~known[None]), size, low, high)
+    return Prepared(image, clip_crop(inputs.rgb, crop_px), nearest, linear, padded(~known[None]), size, low, high)
 
 
 def known_depth(measured: NDArray[np.float32], size: tuple[int, int]) -> NDArray[np.float32]:
@@ -343,16 +343,16 @@ class DepthLab:
     """A DepthLab model ready for use; ``load`` makes one from a converted folder."""
 
     def __init__(
-        self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, place: Place = CPU
+        self, parts: DepthLabParts, sampling: DepthLabSampling = PUBLISHED_SAMPLING, compute: Compute = CPU
     ) -> None:
         """Raises: UsageError: more steps than the noise schedule has."""
         check_steps(parts.scheduler, sampling.steps)
-        self._parts, self._sampling, self._place = parts, sampling, place
+        self._parts, self._sampling, self._compute = parts, sampling, compute
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
         share_features(parts.reference_unet, parts.denoising_unet)
 
     @classmethod
-    def load(cls, folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> DepthLab:
+    def load(cls, folder: str | Path, compute: Compute = CPU, options: DepthOptions = PLAIN) -> DepthLab:
         """Read a folder that ``mudg convert`` wrote.
 
         Raises:
@@ -367,52 +367,52 @@ class DepthLab:
             raise InputError(what, where=str(file), expected=f"kind {KIND}, schema {SCHEMA}", got=got, remedy=remedy)
         sampling = records.parse_dataclass(DepthLabSampling, described.get("sampling"), f"{file}: sampling")
         sampling = dataclasses.replace(sampling, steps=options.steps or sampling.steps)
-        return cls(read_parts(Path(folder), described, place), sampling, place)
+        return cls(read_parts(Path(folder), described, compute), sampling, compute)
 
-    def __call__(self, given: DepthInput) -> Prediction:
+    def __call__(self, inputs: DepthInput) -> Prediction:
         """Depth of one image at the image's size, near metres: it is to be aligned.
 
         Raises:
             InputError: no depth is known in the image.
         """
-        made = prepare(given, self._sampling, self._cell, int(self._parts.image_encoder.config.image_size))
+        made = prepare(inputs, self._sampling, self._cell, int(self._parts.image_encoder.config.image_size))
         shape = (1, self._parts.vae.config.latent_channels, *(side // self._cell for side in made.image.shape[2:]))
         noise = torch.randn(shape, generator=seeds.torch_generator(0, 0, "depthlab"))
         found = self.predict(made, noise) * (made.high_m - made.low_m) + made.low_m
-        return Prediction.resized(found, given, "depth", least=0)
+        return Prediction.resized(found, inputs, "depth", least=0)
 
-    def predict(self, made: Prepared, noise: Tensor) -> Tensor:
+    def predict(self, prepared: Prepared, noise: Tensor) -> Tensor:
         """Depth f32[1, 1, h, w], 0..1 between least and greatest known (others go beyond), from noise [1, C, H, W]."""
-        parts, sampling, device = self._parts, self._sampling, self._place.device
+        parts, sampling, device = self._parts, self._sampling, self._compute.device
         noise = noise.to(device)
         with torch.inference_mode():
-            planes = (made.nearest, made.linear, 2 * made.missing - 1, made.image)
+            planes = (prepared.nearest, prepared.linear, 2 * prepared.missing - 1, prepared.image)
             depth, known, mask, image = map(self._encoded, planes)
             # one pixel of every cell decides, as published
-            missing = functional.interpolate(made.missing, size=noise.shape[2:], mode="nearest").to(device)
-            with self._place.autocast():
-                embedding = parts.mapping_layer(parts.image_encoder(made.crop.to(device)).image_embeds[:, None])
+            missing = functional.interpolate(prepared.missing, size=noise.shape[2:], mode="nearest").to(device)
+            with self._compute.autocast():
+                embedding = parts.mapping_layer(parts.image_encoder(prepared.crop.to(device)).image_embeds[:, None])
                 parts.reference_unet(image, torch.zeros((), dtype=torch.int64), encoder_hidden_states=embedding)
             parts.scheduler.set_timesteps(sampling.steps)
             times = parts.scheduler.timesteps[sampling.steps - int(sampling.steps * sampling.strength) :]
             latent = parts.scheduler.add_noise(depth, noise, times[:1]) if sampling.strength < 1 else noise
             for i, t in enumerate(times):
-                with self._place.autocast():
+                with self._compute.autocast():
                     seen = torch.cat([latent, mask, known], 1)
                     output = parts.denoising_unet(seen, t, encoder_hidden_states=embedding, return_dict=False)[0]
                 latent = parts.scheduler.step(output.float(), t, latent).prev_sample
                 if i + 1 < len(times):
                     as_known = parts.scheduler.add_noise(depth, noise, times[i + 1 : i + 2])
                     latent = missing * latent + (1 - missing) * as_known
-            with self._place.autocast():
+            with self._compute.autocast():
                 decoded = parts.vae.decode(latent / LATENT_SCALE, return_dict=False)[0]
-        found = decoded.float().mean(1, keepdim=True)[..., : made.size[0], : made.size[1]]
+        found = decoded.float().mean(1, keepdim=True)[..., : prepared.size[0], : prepared.size[1]]
         return (found / sampling.normalize_scale + 1) / 2
 
     def _encoded(self, plane: Tensor) -> Tensor:
         """Latent f32 of an image [1, 3, H, W], or of one channel thrice."""
-        with self._place.autocast():
-            latent = self._parts.vae.encode(plane.expand(-1, 3, -1, -1).to(self._place.device)).latent_dist.mode()
+        with self._compute.autocast():
+            latent = self._parts.vae.encode(plane.expand(-1, 3, -1, -1).to(self._compute.device)).latent_dist.mode()
         return latent.float() * LATENT_SCALE
 
 

@@ -33,7 +33,7 @@ from mudg.base.errors import InputError, UsageError
 from mudg.core.depth import AffineFit, Space, fit_affine
 from mudg.labels.inputs import PLAIN, DepthInput, DepthOptions, Prediction
 from mudg.networks import folders
-from mudg.networks.folders import CPU, Place
+from mudg.networks.folders import CPU, Compute
 
 GUIDED_STEPS: Final = 50
 PLAIN_STEPS: Final = 10
@@ -76,7 +76,7 @@ class Marigold:
         steps: int = PLAIN_STEPS,
         guided: bool = False,
         longest_px: int = PROCESSING_PX,
-        place: Place = CPU,
+        compute: Compute = CPU,
     ) -> None:
         """``longest_px``: longest side for the networks.
 
@@ -85,11 +85,11 @@ class Marigold:
         """
         check_steps(parts.scheduler, steps)
         self._parts, self._space, self._steps, self._guided = parts, space, steps, guided
-        self._longest_px, self._place = longest_px, place
+        self._longest_px, self._compute = longest_px, compute
         self._cell = 2 ** (len(parts.vae.config.block_out_channels) - 1)
 
     @classmethod
-    def load(cls, folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> Marigold:
+    def load(cls, folder: str | Path, compute: Compute = CPU, options: DepthOptions = PLAIN) -> Marigold:
         """Read the networks of a folder.
 
         Raises:
@@ -99,27 +99,27 @@ class Marigold:
         path = Path(folder)
         index = folders.read_settings(path / "model_index.json")
         diffusers, transformers = folders.package("diffusers"), folders.package("transformers")
-        text = folders.load_network(folders.member(transformers, "CLIPTextModel"), path, place, "text_encoder")
+        text = folders.load_network(folders.member(transformers, "CLIPTextModel"), path, compute, "text_encoder")
         with torch.no_grad():
-            empty_text = text(_empty_tokens(path).to(place.device))[0].float()
+            empty_text = text(_empty_tokens(path).to(compute.device))[0].float()
         schedule = path / SCHEDULE_FILE
-        unet = folders.load_network(folders.member(diffusers, "UNet2DConditionModel"), path, place, "unet")
-        vae = folders.load_network(folders.member(diffusers, "AutoencoderKL"), path, place, "vae")
+        unet = folders.load_network(folders.member(diffusers, "UNet2DConditionModel"), path, compute, "unet")
+        vae = folders.load_network(folders.member(diffusers, "AutoencoderKL"), path, compute, "vae")
         parts = MarigoldParts(unet, vae, ddim_scheduler(folders.read_settings(schedule), str(schedule)), empty_text)
         space: Space = "disparity" if index.get("prediction_type") == "disparity" else "depth"
         usual = GUIDED_STEPS if options.guided else int(index.get("default_denoising_steps") or PLAIN_STEPS)
         longest_px = int(index.get("default_processing_resolution") or PROCESSING_PX)
         steps, guided = options.steps or usual, options.guided
-        return cls(parts, space=space, steps=steps, guided=guided, longest_px=longest_px, place=place)
+        return cls(parts, space=space, steps=steps, guided=guided, longest_px=longest_px, place=compute)
 
-    def __call__(self, given: DepthInput) -> Prediction:
+    def __call__(self, inputs: DepthInput) -> Prediction:
         """Depth of one image at the image's size, up to scale and shift (to what is near the LiDAR's with guidance)."""
-        image, size = self._prepared(given.rgb)
+        image, size = self._prepared(inputs.rgb)
         shape = (1, self._parts.vae.config.latent_channels, *(side // self._cell for side in image.shape[2:]))
         noise = torch.randn(shape, generator=seeds.torch_generator(0, 0, "marigold"))
-        returns = _returns(given, self._space, self._place.device) if self._guided else None
+        returns = _returns(inputs, self._space, self._compute.device) if self._guided else None
         found = self.predict(image, size, noise, returns)
-        return Prediction.resized(found, given, self._space)
+        return Prediction.resized(found, inputs, self._space)
 
     def _prepared(self, rgb: NDArray[np.uint8]) -> tuple[Tensor, tuple[int, int]]:
         """Image u8[H, W, 3] -> f32[1, 3, h, w] in -1..1, its borders repeated to whole cells; and its unpadded size."""
@@ -127,13 +127,13 @@ class Marigold:
         size = working_size(rgb, self._longest_px)
         image = functional.interpolate(image, size=size, mode="bilinear", antialias=True)
         fill = (0, -size[1] % self._cell, 0, -size[0] % self._cell)
-        return functional.pad(image, fill, mode="replicate").to(self._place.device), size
+        return functional.pad(image, fill, mode="replicate").to(self._compute.device), size
 
     def predict(self, image: Tensor, size: tuple[int, int], noise: Tensor, returns: _Returns | None = None) -> Tensor:
         """Depth f32[1, 1, h, w] in 0..1 of a prepared image, from noise [1, C, h, w] in cells; steered by returns."""
         scheduler, vae = self._parts.scheduler, self._parts.vae
         scheduler.set_timesteps(self._steps)
-        with torch.no_grad(), self._place.autocast():
+        with torch.no_grad(), self._compute.autocast():
             image_latent = vae.encode(image).latent_dist.mode() * vae.config.scaling_factor
         latent = noise.to(image.device)
         adam = _Adam(latent.shape, latent.device)
@@ -153,7 +153,7 @@ class Marigold:
             return self._decoded(latent, size).clamp(0, 1)
 
     def _denoised(self, image_latent: Tensor, latent: Tensor, t: Tensor) -> Tensor:
-        with self._place.autocast():
+        with self._compute.autocast():
             given = torch.cat([image_latent.to(latent.dtype), latent], 1)
             output = self._parts.unet(given, t, encoder_hidden_states=self._parts.empty_text, return_dict=False)[0]
         return output.float()
@@ -161,7 +161,7 @@ class Marigold:
     def _decoded(self, latent: Tensor, size: tuple[int, int]) -> Tensor:
         """Latent -> f32[1, 1, h, w], 0..1 but for overshoots, cut to the unpadded size."""
         vae = self._parts.vae
-        with self._place.autocast():
+        with self._compute.autocast():
             found = vae.decode(latent / vae.config.scaling_factor, return_dict=False)[0]
         return (found.float().mean(1, keepdim=True)[..., : size[0], : size[1]] + 1) / 2
 
@@ -214,15 +214,15 @@ def _towards(fit: AffineFit, goal: Tensor) -> tuple[float, float, float]:
     return high - low, low, 0.5
 
 
-def _returns(given: DepthInput, space: Space, device: str) -> _Returns | None:
-    row, column = np.nonzero(np.isfinite(given.measured) & ~given.sky)
+def _returns(inputs: DepthInput, space: Space, device: str) -> _Returns | None:
+    row, column = np.nonzero(np.isfinite(inputs.measured) & ~inputs.sky)
     if len(row) == 0:
         return None
     keep = np.linspace(0, len(row) - 1, min(len(row), MAX_RETURNS)).astype(int)
     row, column = row[keep], column[keep]
-    height, width = given.measured.shape
+    height, width = inputs.measured.shape
     grid = np.stack([2 * (column + 0.5) / width - 1, 2 * (row + 0.5) / height - 1], 1).astype(np.float32)
-    depth_m = torch.from_numpy(given.measured[row, column]).to(device)
+    depth_m = torch.from_numpy(inputs.measured[row, column]).to(device)
     goal = depth_m if space == "depth" else 1 / depth_m
     return _Returns(torch.from_numpy(grid)[None, None].to(device), depth_m, goal)
 

@@ -34,7 +34,7 @@ from mudg.labels.depth.depthlab import DepthLab
 from mudg.labels.depth.marigold import Marigold
 from mudg.labels.inputs import PLAIN, DepthInput, DepthNetwork, DepthOptions, Prediction
 from mudg.networks import folders
-from mudg.networks.folders import CPU, Place
+from mudg.networks.folders import CPU, Compute
 
 CUE_PX: Final = 256
 """Longest side of the small depth map that PromptDepthAnything is given (its training had 256x192)."""
@@ -88,22 +88,22 @@ class TransformersDepth:
     """A depth network of transformers, ready for use; ``with_lidar``: it reads a small depth map beside the image."""
 
     def __init__(
-        self, network: Any, preparation: Preparation, space: Space, *, with_lidar: bool, place: Place = CPU
+        self, network: Any, preparation: Preparation, space: Space, *, with_lidar: bool, compute: Compute = CPU
     ) -> None:
         self._network, self._preparation, self._space = network, preparation, space
-        self._with_lidar, self._place = with_lidar, place
+        self._with_lidar, self._compute = with_lidar, compute
 
-    def __call__(self, given: DepthInput) -> Prediction:
+    def __call__(self, inputs: DepthInput) -> Prediction:
         """Depth of one image at the image's size."""
-        inputs = {"pixel_values": self._preparation.pixels(given.rgb)}
+        tensors = {"pixel_values": self._preparation.pixels(inputs.rgb)}
         if self._with_lidar:
-            inputs["prompt_depth"] = lidar_cue(given)
-        with torch.inference_mode(), self._place.autocast():
-            output = self._network(**{name: value.to(self._place.device) for name, value in inputs.items()})
-        return Prediction.resized(output.predicted_depth.float()[:, None], given, self._space)
+            tensors["prompt_depth"] = lidar_cue(inputs)
+        with torch.inference_mode(), self._compute.autocast():
+            output = self._network(**{name: value.to(self._compute.device) for name, value in tensors.items()})
+        return Prediction.resized(output.predicted_depth.float()[:, None], inputs, self._space)
 
 
-def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
+def lidar_cue(inputs: DepthInput, longest_px: int = CUE_PX) -> Tensor:
     """Small depth map f32[1, 1, h, w] metres without holes: returns filled along the image, the sky as far as the
     farthest.
 
@@ -113,11 +113,11 @@ def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
     Raises:
         InputError: nothing was measured.
     """
-    ground = np.isfinite(given.filled) & ~given.sky
+    ground = np.isfinite(inputs.filled) & ~inputs.sky
     if not ground.any():
         raise InputError("no LiDAR return in the image", where="depth network", expected="at least one")
-    far_m, near_m = (float(np.quantile(given.filled[ground], share)) for share in (0.995, 0.005))
-    dense = np.where(ground, given.filled, np.float32(far_m)).clip(near_m, max(far_m, near_m * 1.01))
+    far_m, near_m = (float(np.quantile(inputs.filled[ground], share)) for share in (0.995, 0.005))
+    dense = np.where(ground, inputs.filled, np.float32(far_m)).clip(near_m, max(far_m, near_m * 1.01))
     height, width = dense.shape
     scale = min(1.0, longest_px / max(height, width))
     size = (max(1, round(height * scale)), max(1, round(width * scale)))
@@ -128,18 +128,18 @@ def lidar_cue(given: DepthInput, longest_px: int = CUE_PX) -> Tensor:
     return small
 
 
-def _load_transformers(folder: Path, place: Place, *, with_lidar: bool) -> TransformersDepth:
+def _load_transformers(folder: Path, compute: Compute, *, with_lidar: bool) -> TransformersDepth:
     class_name = "PromptDepthAnythingForDepthEstimation" if with_lidar else "DepthAnythingForDepthEstimation"
     network_class = folders.member(folders.package("transformers"), class_name)
-    network: Any = folders.load_network(network_class, folder, place)
+    network: Any = folders.load_network(network_class, folder, compute)
     preparation = Preparation.read(folder, 756 if with_lidar else 518, int(network.config.patch_size))
     space = "depth" if with_lidar or network.config.depth_estimation_type == "metric" else "disparity"
-    return TransformersDepth(network, preparation, space, with_lidar=with_lidar, place=place)
+    return TransformersDepth(network, preparation, space, with_lidar=with_lidar, compute=compute)
 
 
 # --- folders --------------------------------------------------------------------------------------
 
-KINDS: Final[Mapping[str, Callable[[Path, Place, DepthOptions], DepthNetwork]]] = {
+KINDS: Final[Mapping[str, Callable[[Path, Compute, DepthOptions], DepthNetwork]]] = {
     "prompt_depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=True),
     "depth_anything": lambda folder, place, _: _load_transformers(folder, place, with_lidar=False),
     **dict.fromkeys(("MarigoldDepthPipeline", "MarigoldPipeline"), Marigold.load),
@@ -171,7 +171,7 @@ def kind_of(folder: str | Path) -> str:
     raise ResourceError("the depth network's weights are missing", where=where, expected=expected, remedy=remedy)
 
 
-def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOptions = PLAIN) -> DepthNetwork:
+def load_depth_network(folder: str | Path, compute: Compute = CPU, options: DepthOptions = PLAIN) -> DepthNetwork:
     """A depth network of the table, read from its folder, or from the Hugging Face cache by its name
     (``folders.find``).
 
@@ -179,7 +179,7 @@ def load_depth_network(folder: str | Path, place: Place = CPU, options: DepthOpt
         ResourceError: folder, package or device is missing. InputError: another kind of network, or not all of it.
     """
     path = folders.find(folder)
-    return KINDS[kind_of(path)](path, place, options)
+    return KINDS[kind_of(path)](path, compute, options)
 
 
 # --- alignment to LiDAR, for every network --------------------------------------------------------
@@ -193,23 +193,25 @@ class Aligned:
     fit: AffineFit
 
 
-def align_to_lidar(prediction: Prediction, given: DepthInput, rules: CompletionRules) -> Aligned:
+def align_to_lidar(prediction: Prediction, inputs: DepthInput, rules: CompletionRules) -> Aligned:
     """A network's depth brought to the frame's LiDAR: one scale and shift, the sky at ``rules.sky_m``, a confidence.
 
     Raises:
         InputError: prediction and image differ in size.
     """
-    if prediction.values.shape != given.measured.shape:
+    if prediction.values.shape != inputs.measured.shape:
         what, where = "a network's depth and its image differ in size", "depth network"
-        raise InputError(what, where=where, expected=str(given.measured.shape), got=str(prediction.values.shape))
-    known = np.isfinite(given.measured) & ~given.sky
-    values, measured = prediction.values[known], given.measured[known]
+        raise InputError(what, where=where, expected=str(inputs.measured.shape), got=str(prediction.values.shape))
+    known = np.isfinite(inputs.measured) & ~inputs.sky
+    values, measured = prediction.values[known], inputs.measured[known]
     fit = fit_affine(torch.from_numpy(values), torch.from_numpy(measured), prediction.space)
     if not fit.used:
         return Aligned(None, fit)
     depth = fit.depth(torch.from_numpy(prediction.values).double(), rules.near_m, rules.far_m).float().numpy()
-    confidence = residual_confidence(depth, np.where(known, given.measured, np.float32(np.nan)), given.sky, rules.sky_m)
-    depth[given.sky] = rules.sky_m
+    confidence = residual_confidence(
+        depth, np.where(known, inputs.measured, np.float32(np.nan)), inputs.sky, rules.sky_m
+    )
+    depth[inputs.sky] = rules.sky_m
     return Aligned(DenseDepth(depth, confidence), fit)
 
 
@@ -245,6 +247,6 @@ def residual_confidence(
     return confidence
 
 
-def enough_returns(given: DepthInput) -> bool:
+def enough_returns(inputs: DepthInput) -> bool:
     """Whether the image has enough returns for an alignment."""
-    return int((np.isfinite(given.measured) & ~given.sky).sum()) >= MIN_POINTS
+    return int((np.isfinite(inputs.measured) & ~inputs.sky).sum()) >= MIN_POINTS
