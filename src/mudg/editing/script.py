@@ -244,7 +244,7 @@ def _balls(balls: list[list[float]]) -> list[list[float]]:
     return balls
 
 
-class Box(StrictRecord):
+class KeptBox(StrictRecord):
     """A box in the world: middle and size in metres, length along the heading ``yaw_deg``."""
 
     center: Annotated[list[Number], Field(min_length=3, max_length=3)]
@@ -256,7 +256,7 @@ class EraseEdit(StrictRecord):
     """Take parts of the street away, objects apart: what lies in ``balls``, and what lies outside the box ``keep``."""
 
     balls: Annotated[list[list[Number]], Field(min_length=1), AfterValidator(checked_by(_balls))] | None = None
-    keep: Box | None = None
+    keep: KeptBox | None = None
 
     @model_validator(mode="after")
     @checked_by
