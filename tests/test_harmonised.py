@@ -292,6 +292,57 @@ def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
         PublishedMDM.check_request(SampleRequest(2, start=begun))
 
 
+def test_a_repaired_view_is_the_mean_of_render_and_generated_view(run: Path, tmp_path: Path) -> None:
+    """Against the folders that render and synthesize write, mixed here in numpy; the same after an interruption."""
+    shifts = {"shifts_m": (1.0,), "video": False, "device": "cpu"}
+    how = HarmonizeConfig(model=str(run / "model"), steps=1, precision="float32")
+    parts = {"scene": run / "scene", "model": run / FITTED}
+    plain = RenderViews(**parts, out=tmp_path / "plain", settings=RenderConfig(**shifts)).run()
+    step = RenderViews(
+        **parts,
+        fused=run / "fuse",
+        out=tmp_path / "repaired",
+        settings=RenderConfig(**shifts, repair=True, harmonize=how),
+    )
+    again = SynthesizeConfig(model=how.model, shifts_m=(1.0,), steps=1, processes=1, precision="float32", device="cpu")
+    made = synthesized(run, tmp_path / "made", again, fitted=run / FITTED)
+    name = "front_shift+1.0"
+    repaired = views_of(step.run(), name)
+    for render, view, one in zip(views_of(plain, name), views_of(made, name), repaired, strict=True):
+        share = (view.confidence / (1 + view.confidence)).numpy()
+        wanted = (1 - share) * render.rgb.numpy() + share * view.rgb.numpy()
+        assert np.abs(one.rgb.numpy() - wanted).max() < 2 / 255  # each was rounded to 8 bits
+        assert np.abs(one.rgb.numpy() - render.rgb.numpy()).max() > 0.05
+        a, b, depth = (np.nan_to_num(seen.depth.numpy(), nan=-1.0) for seen in (render, view, one))
+        both = (a > 0) & (b > 0)
+        assert np.allclose(depth[both], ((1 - share) * a + share * b)[both], rtol=2e-3)
+        assert np.array_equal(depth[~both], np.where(a > 0, a, b)[~both])
+        assert torch.equal(one.semantics, render.semantics)
+    folder = tmp_path / "repaired"
+    whole = {path.name: path.read_bytes() for path in (folder / name / "rgb").iterdir()}
+    for path in ("manifest.json", f"{name}/observations.json", f"{name}/data/000003.npz", f"{name}/rgb/000003.png"):
+        (folder / path).unlink()  # as if stopped in the last window
+    state = store.read_json(folder / "run.json") | {"state": "interrupted"}
+    store.write_json(folder / "run.json", state)
+    step.run()
+    assert {path.name: path.read_bytes() for path in (folder / name / "rgb").iterdir()} == whole
+
+
+def test_what_cannot_be_repaired_is_refused(run: Path, tmp_path: Path) -> None:
+    parts = {"scene": run / "scene", "model": run / FITTED, "out": tmp_path / "out"}
+    settings = RenderConfig(shifts_m=(0.0,), video=False, repair=True)
+    with pytest.raises(UsageError, match="no --fused"):
+        RenderViews(**parts, settings=settings).run()
+    edits = script(tmp_path, CAR_GONE)
+    with pytest.raises(UsageError, match="--harmonize.on"):
+        RenderViews(**parts, fused=run / "fuse", edits=edits, settings=settings).run()
+    alone = {"source": run / FITTED, "script": edits, "scene": run / "scene", "out": tmp_path / "changed"}
+    changed = Edit(**alone, settings=EditConfig())
+    with pytest.raises(UsageError, match="as it was recorded"):
+        RenderViews(**parts | {"model": changed.run()}, fused=run / "fuse", settings=settings).run()
+    assert not (tmp_path / "out").exists()
+
+
 def test_synthesize_shows_the_edited_drive(run: Path, tmp_path: Path) -> None:
     settings = {"shifts_m": (0.0,), "steps": 1, "full_size": False, "processes": 1, "precision": "float32"}
     config, edits = SynthesizeConfig(model=str(run / "model"), **settings), script(tmp_path, CAR_GONE)

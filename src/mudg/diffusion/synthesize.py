@@ -28,7 +28,7 @@ from mudg.base.errors import UsageError
 from mudg.base.processes import run_in_processes
 from mudg.base.records import understood
 from mudg.base.run_folder import RunDir
-from mudg.base.types import Condition, FusedCloud, Photo, Scene, Trajectory
+from mudg.base.types import Condition, FusedCloud, Photo, Scene, Trajectory, View
 from mudg.core import trajectory
 from mudg.core.fusion import SweepShots
 from mudg.core.pictures import class_colors, depth_colors, gray, to_bytes
@@ -163,9 +163,9 @@ def usual_processes(config: SynthesizeConfig, paths: Sequence[Trajectory]) -> in
 # one trajectory -----------------------------------------------------------------------------------
 
 
-def near_sweeps(scene: Scene, cloud: FusedCloud, path: Trajectory) -> NearSweeps:
+def near_sweeps(scene: Scene, cloud: FusedCloud, views: Sequence[View]) -> NearSweeps:
     """The sweeps of a scene for FreeVS' condition, each coloured by the images of its time that are not held out."""
-    times = [view.time_s for view in path.views]
+    times = [view.time_s for view in views]
     period_s = float(np.median(np.diff(times))) if len(times) > 1 else 0.1
 
     def read(number: int) -> SweepShots:
@@ -189,7 +189,7 @@ def make_trajectory(
     if (folder / "observations.json").is_file():
         return len(path)
     model = model or load_any(config)
-    maker = _view_maker(config, inputs, path, model, out)
+    maker = view_maker(config, inputs, path.views, model, out)
     spans = maker.spans(len(path), config.overlap)
     state = folder / "state"
     finished = sorted(state.glob("[0-9]*.safetensors"))  # the last one's latents, by the number of windows
@@ -228,20 +228,20 @@ _recorded_again = functools.lru_cache(maxsize=1)(recorded_drive)
 """The same for the next trajectory of a run, which forgets it at its end."""
 
 
-def _view_maker(
-    config: SynthesizeConfig, inputs: JobInputs, path: Trajectory, model: DiffusionModel, scratch: Path
+def view_maker(
+    config: SynthesizeConfig, inputs: JobInputs, views: Sequence[View], model: DiffusionModel, scratch: Path
 ) -> ViewMaker:
-    """What makes the views of one trajectory; ``scratch``: a folder for what is large."""
+    """What makes the views of one path; ``scratch``: a folder for what is large."""
     drive = _recorded_again(config, inputs) if inputs.edited is None else inputs.edited(config, inputs)
     cloud = drive.cloud if config.given_classes else without_classes(drive.cloud)
-    camera = path.views[0].camera
+    camera = views[0].camera
     width, height = model.image_size(camera.width, camera.height, config.width_px)
-    model.check_clip(min(len(path), model.config.window), height, width)
+    model.check_clip(min(len(views), model.config.window), height, width)
     fine = (camera.width, camera.height) if config.full_size or model.points_alone else (2 * width, 2 * height)
     rules = ConditionRules(width, height, *fine, published=model.points_alone)
     rules = rules if inputs.edited is None else replace(rules, images_per_view=EDITED_IMAGES_PER_VIEW)
     render_at = None if drive.fit is None else functools.partial(render_planes, drive.fit)
-    near = near_sweeps(drive.scene, cloud, path) if config.condition == FREEVS else None
+    near = near_sweeps(drive.scene, cloud, views) if config.condition == FREEVS else None
     sources = ConditionSources(
         cloud, drive.scene.tracks, drive.recorded, rules, render_at, near, drive.vacated, drive.weather
     )

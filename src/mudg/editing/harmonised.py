@@ -19,6 +19,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final, Protocol
 
 import numpy as np
@@ -38,6 +39,7 @@ from mudg.diffusion.inputs import ConditionSources, InWeather, conditions_of
 from mudg.diffusion.published import is_published, window_of
 from mudg.diffusion.requests import StartClip, generated
 from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
+from mudg.diffusion.synthesize import JobInputs, view_maker
 from mudg.diffusion.views import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_at_pose, recorded_images, windows
 from mudg.editing import recorded as records
 from mudg.editing.apply import EditedDrive
@@ -303,6 +305,44 @@ class RepairedViews:
         if not any(view is own for own in self._views):
             return self._draw(view)[1]
         return next(made for own, made in self._left if own is view)
+
+
+# -- the last repair --------------------------------------------------------------------------------
+
+
+class RenderMixer:
+    """Views of a fit, mixed with what the diffusion model makes of them, window after window along a path.
+
+    The model makes the view once more, from the fused points, the photographs and the render, and says how sure it is.
+    ``inputs``: folders of the scene, its clouds and the fit. ``scratch``: a folder for what is large.
+    """
+
+    def __init__(self, inputs: JobInputs, config: HarmonizeConfig, device: str, scratch: Path) -> None:
+        alone = is_published(config.model)
+        self._settings = loading.check_config(settings_of(config, device), fitted=not alone)
+        self._inputs = replace(inputs, fitted=None) if alone else inputs
+        self._model, self._scratch = loading.load_any(self._settings), scratch
+
+    def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
+        """The views of a path, in order; ``draw`` makes their renders."""
+        maker = view_maker(self._settings, self._inputs, views, self._model, self._scratch)
+        spans = maker.spans(len(views), self._settings.overlap)
+        for number, fresh, made in maker.along(views, spans):
+            for index in fresh if made is not None else ():
+                yield mixed(draw(views[index])[1], made[2][index - spans[number].start])
+
+
+def mixed(render: Observation, generated: Observation) -> Observation:
+    """The mean of a render and of the generated view with its confidence as weight, colour and depth; depth that only
+    one of them has is taken from it. Classes and confidence are the render's."""
+    weight = generated.confidence * generated.mask
+    mean = lambda a, b: (a + weight * b) / (1 + weight)
+    depth = render.depth
+    if depth is not None and generated.depth is not None:
+        known = torch.isfinite(depth)
+        depth = torch.where(known & torch.isfinite(generated.depth), mean(depth, generated.depth), depth)
+        depth = torch.where(known, depth, generated.depth)
+    return replace(render, rgb=mean(render.rgb, generated.rgb).clamp(0, 1), depth=depth)
 
 
 # -- weather ---------------------------------------------------------------------------------------

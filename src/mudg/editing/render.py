@@ -13,7 +13,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import torch
 
@@ -30,6 +30,7 @@ from mudg.core import trajectory
 from mudg.core.pictures import panels_of, side_by_side
 from mudg.core.raster.rasterize import drawing_device
 from mudg.diffusion.inputs import InWeather
+from mudg.diffusion.synthesize import JobInputs
 from mudg.editing import harmonised
 from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, scene_seen_by, weather_of
 from mudg.editing.harmonised import EditedSources, RepairedViews
@@ -72,6 +73,12 @@ def prepare(
     if path is not None:
         trajectories(read_scene(scene), config, path)
     radiance = kind_of(model) == RADIANCE
+    if config.repair and (radiance or FACT in load_model(model).facts):
+        what, expected = (
+            "only fits of the drive as it was recorded can be repaired",
+            "a folder of Gaussians made by fit",
+        )
+        raise UsageError(what, where="--repair", expected=expected, got=str(model), remedy="leave it out")
     if radiance and (config.remove_tracks or script is not None):
         what = "a radiance field has no objects to leave out or to edit"
         raise UsageError(what, where=str(model), remedy="leave --remove-tracks and --edits out")
@@ -83,12 +90,19 @@ def prepare(
 
 
 def write_views(
-    config: RenderConfig, scene: Path, model: Path, edited: Edited | None, work: RunDir, *, path: Path | None = None
+    config: RenderConfig,
+    scene: Path,
+    model: Path,
+    edited: Edited | None,
+    work: RunDir,
+    *,
+    path: Path | None = None,
+    fused: Path | None = None,
 ) -> dict[str, Any]:
     """Render every camera and shift of the configuration, one observation folder (and video) per trajectory; returns a
     summary. An interrupted run continues with the next missing view. ``scene``: gives cameras, times and the path of
     the vehicle. ``model``: folder made by fit. ``edited``: what ``prepare`` made of them. ``path``: as of
-    ``trajectories``."""
+    ``trajectories``. ``fused``: fused clouds of the scene, for ``config.repair``."""
     followers, out = list[RepairedViews](), work.path
     if kind_of(model) == RADIANCE:
         device = choose_device(config.device, "render")
@@ -97,6 +111,12 @@ def write_views(
         device = drawing_device(config.device, "render", config.raster)
         loaded, fitted, drive = edited or _edited(scene, model, None)
         draw, source = _scene_drawer(config, fitted.to(device))
+        if config.repair:
+            mixer = harmonised.RenderMixer(
+                JobInputs(scene, cast("Path", fused), model), config.harmonize, config.device, out
+            )
+            draw = RepairedViews(mixer, functools.partial(_twice, draw))
+            followers.append(draw)
         if config.harmonize.on and drive is not None:
             draw = _repaired(config, drive, fitted, scene, model, draw)
             followers.append(draw)
@@ -147,6 +167,10 @@ def _edited(
     return drive.scene or loaded, drive.model(fitted), drive
 
 
+def _twice(draw: Drawer, view: View) -> tuple[Observation, Observation]:
+    return (draw(view),) * 2
+
+
 def _repaired(
     config: RenderConfig, drive: EditedDrive, fitted: SceneModel, scene: Path, model: Path, draw: Drawer
 ) -> RepairedViews:
@@ -167,7 +191,7 @@ def _corrected(
     recorded = scene_seen_by(read_scene(scene), fitted.facts)
     sources, size = EditedSources.of(drive, fitted, recorded), _size(recorded, config)
     correct = harmonised.WeatherHarmoniser(sources, how, config.harmonize, size, config.device)
-    return RepairedViews(correct, lambda view: (draw(view),) * 2)
+    return RepairedViews(correct, functools.partial(_twice, draw))
 
 
 def _size(scene: Scene, config: RenderConfig) -> tuple[int, int]:

@@ -46,6 +46,9 @@ class RenderConfig:
     flow to the next view in pixels, distance along the ray in metres, and how certain a pixel is (docs/datasets.md)."""
     video: bool = True
     """Also write one MP4 video per trajectory."""
+    repair: bool = False
+    """Let the diffusion model make every view once more from its render, and mix both by its confidence. Better off the
+    recorded path, slower: half a second a view. --harmonize.model names the model (docs/edit/repair.md)."""
     harmonize: HarmonizeConfig = setting(default_factory=HarmonizeConfig)
     """With an edit script: let the diffusion model repair what the edits touch."""
     raster: Literal["auto", "cpu", "torch", "gsplat"] = "auto"

@@ -35,7 +35,7 @@ class RenderViews(Output):
     )
     short = (
         *("cameras", "shifts_m", "paths", "width_px", "fov_deg", "lidar", "layers", "video", "remove_tracks", "device"),
-        *("harmonize.on", "harmonize.model"),
+        *("repair", "harmonize.on", "harmonize.model"),
     )
     scene: Annotated[Path, Flag("SCENE", "first", "scene")]
     """Scene directory that the Gaussian scene was fitted to, or folder of mudg run."""
@@ -45,7 +45,7 @@ class RenderViews(Output):
     edits: Annotated[Path | None, FILE_YAML] = None
     """Edit script (docs/edit.md) to carry out before rendering."""
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
-    """Point clouds written by fuse; for --harmonize.on."""
+    """Point clouds written by fuse; for --harmonize.on and --repair (not given: those of the run at SCENE)."""
     path: Annotated[Path | None, Flag("FILE")] = None
     """Camera path to draw in place of the shifts: poses in the format of TUM or KITTI (.txt), or nerfstudio's
     transforms.json, on the scene's clock and in its world. It has the optics of the first camera."""
@@ -57,6 +57,9 @@ class RenderViews(Output):
             got = f"no --{'edits' if self.edits is None else 'fused'}"
             remedy = "give --edits and --fused, or leave it out"
             raise UsageError(what, where="--harmonize.on", got=got, remedy=remedy)
+        if self.settings.repair and (self.edits is not None or self.settings.layers or self.settings.remove_tracks):
+            what, remedy = "views of the drive as it was fitted can be repaired", "with --edits, use --harmonize.on"
+            raise UsageError(what, where="--repair", got="--edits, --layers or --remove-tracks", remedy=remedy)
         if self.settings.layers and (self.settings.harmonize.on or self.settings.remove_tracks):
             what, remedy = "layers are drawn of what an edit script makes", "take objects out with --edits"
             raise UsageError(what, where="--layers", got="--harmonize.on or --remove-tracks", remedy=remedy)
@@ -65,11 +68,14 @@ class RenderViews(Output):
             raise UsageError(what, where="--path", got="--harmonize.on or --lidar", remedy=remedy)
         return self
 
+    def required(self) -> tuple[str, ...]:
+        return (*self.from_run, "fused") if self.settings.repair else self.from_run
+
     def inputs(self) -> dict[str, str]:
         table = Path(self.settings.lidar) if self.settings.lidar.endswith(".json") else None
         files = {"edits": self.edits, "lidar": table, "path": self.path}
         read = self.digests({"scene": self.scene, "model": self.model, **files})
-        if not self.settings.harmonize.on:
+        if not self.settings.harmonize.on and not self.settings.repair:
             return read
         from mudg.diffusion.model_files import digest
 
@@ -80,7 +86,7 @@ class RenderViews(Output):
 
         model, script = cast("Path", self.model), script_of(self.edits)
         edited = render.prepare(self.settings, self.scene, model, script, self.fused, self.path)
-        views = partial(render.write_views, self.settings, self.scene, model, edited, path=self.path)
+        views = partial(render.write_views, self.settings, self.scene, model, edited, path=self.path, fused=self.fused)
         if not self.settings.lidar and not self.settings.layers:
             return views
         from mudg.datasets import layers
