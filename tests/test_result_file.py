@@ -200,6 +200,10 @@ def test_a_large_page_stopped_and_repeated(toy: Path, tmp_path: Path, monkeypatc
         again = page(place)["page"]
         assert {path.name: path.read_bytes() for path in again.parent.iterdir()} == whole, done[number - 1]
         assert {path.name for path in place.iterdir()} == {"a_page", "a.html.json"}
+    with monkeypatch.context() as newer:
+        newer.setattr(view.pages, "import_map", lambda: "{}")
+        with pytest.raises(UsageError, match="other settings"):  # a page of another viewer is no longer this one
+            page(tmp_path / "x")
     (made["page"].parent / "index.html").write_text("altered")
     with pytest.raises(Exception, match="altered"):
         page(tmp_path / "x")

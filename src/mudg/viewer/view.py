@@ -4,6 +4,7 @@ machine, with exact frames where the camera rests. The page is ``assets/viewer``
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
@@ -84,7 +85,8 @@ def run_page(
     folder = out.with_name(f"{out.stem}_page")
     _refuse_foreign(folder)
     sources = find_sources(config, run, scene, compare)
-    settings, inputs = {**result_settings(config), "report": report}, sources.digests()
+    viewer = hashlib.sha256(pages.import_map().encode()).hexdigest()  # a newer viewer makes another page
+    settings, inputs = {**result_settings(config), "report": report, "viewer": viewer}, sources.digests()
     with ResultFile.open(out, "page", settings, inputs, forms=(out, folder), overwrite=overwrite) as file:
         if file.complete:
             made, place = file.description(), file.reused()
