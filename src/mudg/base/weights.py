@@ -20,7 +20,7 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from mudg.base import checkpoint
+from mudg.base import checkpoint, failures
 from mudg.base.errors import InputError
 from mudg.base.plain_pickle import PERSISTENT, Maker, Name, PickledObject, read_pickle
 
@@ -403,17 +403,12 @@ def _unpickle(path: Path) -> Any:
             expected = "tensors, numbers, text and plain containers"
             remedy = "do not load it elsewhere either, unless you trust its maker; ask for safetensors"
             raise InputError(what, where=str(path), expected=expected, got=refused.group(1), remedy=remedy) from error
-        if out_of_memory(error):
+        if failures.is_memory(error):
             raise MemoryError(text) from error
         where, expected = str(path), "a complete file written by torch.save, or safetensors"
         got = text.splitlines()[0][:200] if text else type(error).__name__
         remedy = "fetch the file again and compare its size"
         raise InputError("not a readable checkpoint", where=where, expected=expected, got=got, remedy=remedy) from error
-
-
-def out_of_memory(error: Exception) -> bool:
-    """Whether an error of torch says that memory ran out."""
-    return any(sign in str(error) for sign in ("DefaultCPUAllocator", "not enough memory", "Cannot allocate memory"))
 
 
 _UNREADABLE: tuple[type[Exception], ...] = (

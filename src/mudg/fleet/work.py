@@ -319,8 +319,7 @@ class _Step:
             if not (place / store.MANIFEST).is_file():
                 return place if place.exists() else None
             try:
-                store.verify_manifest(place)
-                store.verify_record(place)
+                store.verify_result(place)
             except (IntegrityError, InputError):
                 log.warn(f"{place} is damaged and is made again")
                 shutil.rmtree(place)
@@ -487,10 +486,7 @@ def digest_of(folder: Path) -> str:
         return store.sha256_file(folder / store.MANIFEST)
     manifests = sorted(path.relative_to(folder).as_posix() for path in folder.rglob(store.MANIFEST))
     names = manifests or (store.list_files(folder) if folder.is_dir() else [""])
-    total = hashlib.sha256()
-    for name in names:
-        total.update(f"{name}\0{store.sha256_file(folder / name if name else folder)}\n".encode())
-    return total.hexdigest()
+    return store.digest_of_files(folder, names)
 
 
 def facts_of(folder: Path) -> CorpusFacts | None:
