@@ -194,25 +194,32 @@ def run_in_processes(
             for index, items in enumerate(arguments):
                 yield index, function(*items)
         return
-    with child_environment(1):
-        pool = Pool(processes)
+    with child_environment(1), _working(processes) as pool:
         try:
             yield from _in_turn(pool, function, arguments, processes)
-        except (KeyboardInterrupt, GeneratorExit):
-            _stop(pool)
+        except BrokenProcessPool:
             raise
-        except BrokenProcessPool as error:  # nobody waits for a worker that may never answer
-            _each(BaseProcess.kill, pool.members)
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise ended_process(str(error)) from error
-        except BaseException:
-            try:
-                pool.shutdown(wait=True, cancel_futures=True)
-            except KeyboardInterrupt:  # stopped while the other calls end
-                _stop(pool)
-                raise
+        except Exception:
+            pool.shutdown(cancel_futures=True)  # the other calls end
             raise
         pool.shutdown()
+
+
+@contextlib.contextmanager
+def _working(processes: int) -> Iterator[Pool]:
+    """A pool for this block. Where the block is stopped, so are the calls; a worker that died ends all others: nobody
+    waits for one that may never answer."""
+    pool = Pool(processes)
+    try:
+        yield pool
+    except (KeyboardInterrupt, GeneratorExit):
+        _stop(pool)
+        raise
+    except BrokenProcessPool as error:
+        _each(BaseProcess.kill, pool.members)
+        raise ended_process(str(error)) from error
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 @contextlib.contextmanager
@@ -227,35 +234,26 @@ def calls_beside(
     Raises:
         ResourceError: a process ended from outside. Whatever the function raises, at the end of the block.
     """
-    with child_environment(1):
-        pool = Pool(processes)
-        futures = [pool.submit(_stoppable, function, items) for items in arguments]
+    with _working(processes) as pool:
+        with child_environment(1):
+            futures = [pool.submit(_stoppable, function, items) for items in arguments]
 
-    def drop_rest(done: Future[Any]) -> None:
-        if not done.cancelled() and done.exception() is not None:
-            for future in futures:
-                future.cancel()
+        def drop_rest(done: Future[Any]) -> None:
+            if not done.cancelled() and done.exception() is not None:
+                for future in futures:
+                    future.cancel()
 
-    for future in futures:
-        future.add_done_callback(drop_rest)
-    try:
-        yield
-    except BaseException:
-        _stop(pool)
-        raise
-    try:
+        for future in futures:
+            future.add_done_callback(drop_rest)
+        try:
+            yield
+        except BaseException:
+            _stop(pool)
+            raise
         for future in futures:
             future.cancel()
         for _ in _as_completed(pool, {future: index for index, future in enumerate(futures) if not future.cancelled()}):
             pass
-    except KeyboardInterrupt:
-        _stop(pool)
-        raise
-    except BrokenProcessPool as error:
-        _each(BaseProcess.kill, pool.members)
-        raise ended_process(str(error)) from error
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _in_turn(

@@ -610,10 +610,7 @@ def take_lock(lock: Path, what: Path | None = None) -> None:
 
 def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
     """ResourceError if the process that wrote this lock still runs on this machine."""
-    owner = _owner(lock) if lock.is_file() else None
-    if owner is None:
-        return
-    pid, host = owner
+    pid, host = (_owner(lock) if lock.is_file() else None) or (os.getpid(), "")
     if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
         busy = "writing this file" if what else "working in this folder"
         got = f"pid {pid} on {host}"

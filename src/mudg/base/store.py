@@ -33,7 +33,6 @@ MANIFEST = "manifest.json"
 RUN_STATE, RUN_LOG, RUN_SCHEMA = "run.json", "log.jsonl", 2
 """Record and log of the run that made a folder, and the record's schema."""
 _MAX_JSON_BYTES = 512 * 1024 * 1024
-_CHUNK = 1 << 20
 
 # single files -------------------------------------------------------------------------------------
 
@@ -220,13 +219,6 @@ def remove(path: Path) -> None:
     """Remove a file; none there is no error."""
     with disk_errors("cannot remove a file", path, "check who may write there"):
         Path(path).unlink(missing_ok=True)
-
-
-def blocks_of(path: Path) -> Iterator[bytes]:
-    """The content of a file, piece by piece."""
-    with open_file(path) as handle:
-        while block := handle.read(_CHUNK):
-            yield block
 
 
 def write_text(path: Path, text: str) -> None:
