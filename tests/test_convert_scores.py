@@ -19,7 +19,7 @@ from mudg.diffusion.settings import ConvertConfig
 from mudg.editing.settings import ScoreConfig
 from mudg.networks import i3d, inception
 from mudg.scoring import converted
-from mudg.steps.convert import Convert
+from mudg.steps.export import Convert
 from mudg.steps.render import Score
 
 STATES = {

@@ -29,7 +29,7 @@ from mudg.datasets.samples import LabelledView, Labeller, ObjectBox, around, out
 from mudg.datasets.settings import DatasetConfig
 from mudg.datasets.tensors import as_dataset, collate
 from mudg.sim.session import Session, Trust
-from mudg.steps.dataset import Dataset
+from mudg.steps.export import Dataset
 
 CAMERA = Camera("front", 160, 96, 120.0, 118.0, 79.0, 47.0)
 

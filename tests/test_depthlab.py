@@ -34,7 +34,7 @@ from mudg.labels.settings import AnnotateConfig
 from mudg.networks.folders import Compute
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_scene
-from mudg.steps.convert import Convert
+from mudg.steps.export import Convert
 from mudg.steps.ingest import Annotate
 
 pytestmark = pytest.mark.filterwarnings("ignore")

@@ -42,17 +42,12 @@ from mudg.base import processes
 import test_hostile_places
 if __name__ == "__main__":
     resource.setrlimit(resource.RLIMIT_AS, ({limit}, {limit}))
-    print(processes.run_limited(test_hostile_places.nothing, 64 << 30, Path("file"), test_hostile_places.never))
+    print(processes.run_limited(test_hostile_places.nothing, 64 << 30, Path("file")))
 """
 
 
 def nothing() -> None:
     """Work that needs nothing."""
-
-
-def never(_error: RuntimeError) -> bool:
-    """No error is want of memory."""
-    return False
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs a limit of address space")

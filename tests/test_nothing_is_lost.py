@@ -42,7 +42,7 @@ from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
 from mudg.scene.write import write_zip
 from mudg.steps import pipeline
-from mudg.steps.convert import Convert
+from mudg.steps.export import Convert
 from mudg.steps.fit import Fit
 from mudg.steps.ingest import Annotate, Fuse, Ingest
 from mudg.steps.render import DrawTruth, RenderViews, Score

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import difflib
+import functools
 import os
 import re
 from collections.abc import Iterable
@@ -100,11 +101,7 @@ class MudgError(Exception):
 
     def __reduce__(self) -> tuple[object, ...]:
         """Keep the fields when the error crosses a process boundary."""
-        return (_rebuild, (type(self), self.what, self.fields))
-
-
-def _rebuild(cls: type[MudgError], what: str, fields: dict[str, str]) -> MudgError:
-    return cls(what, **fields)
+        return functools.partial(type(self), **self.fields), (self.what,)
 
 
 class UsageError(MudgError):

@@ -47,7 +47,7 @@ def in_words(error: BaseException, smaller: str = "") -> MudgError | None:
 
     if isinstance(error, MudgError):
         return error
-    if _is_memory(error):
+    if is_memory(error):
         free = memory.free_bytes()
         got, remedy = f"{memory.in_words(free)} free" if free else "", f"{smaller}; {SMALLER}" if smaller else SMALLER
         return ResourceError("there is not enough memory", expected=_asked(error), got=got, remedy=remedy)
@@ -66,7 +66,8 @@ def ended_process(got: str = "") -> ResourceError:
     return ResourceError("a process ended without a word, most likely for want of memory", got=got, remedy=remedy)
 
 
-def _is_memory(error: BaseException) -> bool:
+def is_memory(error: BaseException) -> bool:
+    """Whether an error says that memory ran out."""
     if isinstance(error, MemoryError) or (isinstance(error, OSError) and error.errno == errno.ENOMEM):
         return True
     kind = isinstance(error, RuntimeError | ImportError | SystemError)

@@ -90,14 +90,8 @@ def transform_points(a_from_b: Matrix, xyz_b: NDArray[Floating]) -> NDArray[Floa
 def quaternion_from_matrix(rotation: ArrayLike) -> Matrix:
     """Unit quaternion f64[4] (w, x, y, z) with w >= 0 of a rotation [3, 3] or a rigid motion [4, 4]."""
     r = np.asarray(rotation, np.float64)[:3, :3]
-    four_squares = np.array(
-        [
-            1 + r[0, 0] + r[1, 1] + r[2, 2],
-            1 + r[0, 0] - r[1, 1] - r[2, 2],
-            1 - r[0, 0] + r[1, 1] - r[2, 2],
-            1 - r[0, 0] - r[1, 1] + r[2, 2],
-        ]
-    )
+    x, y, z = np.diag(r)
+    four_squares = np.array([1 + x + y + z, 1 + x - y - z, 1 - x + y - z, 1 - x - y + z])
     largest = int(four_squares.argmax())
     products = {
         0: (four_squares[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]),

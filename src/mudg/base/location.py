@@ -275,17 +275,20 @@ class Location:
 
     # single files ---------------------------------------------------------------------------------
 
-    def _kind(self) -> str:
-        """``file``, ``directory``, or empty where nothing is."""
+    def _facts(self) -> tuple[str, int]:
+        """``file`` and its size in bytes, or ``directory``; an empty text where nothing is."""
         if self.local is not None:
-            return "directory" if self.local.is_dir() else "file" if self.local.exists() else ""
+            if self.local.is_file():
+                return "file", self.local.stat().st_size
+            return "directory" if self.local.is_dir() else "file" if self.local.exists() else "", 0
         with contextlib.suppress(FileNotFoundError), _in_words("looking it up", self.text):
-            return str(self._files.info(self._path)["type"])
-        return ""
+            facts = self._files.info(self._path)
+            return str(facts["type"]), int(facts.get("size") or 0)
+        return "", 0
 
     def exists(self) -> bool:
         """Whether a file, or a folder with something in it, is there."""
-        return self._kind() != ""
+        return self._facts()[0] != ""
 
     def load(self) -> bytes:
         """The content of a file. InputError: none is there."""
@@ -334,7 +337,7 @@ class Location:
 
     def remove(self) -> None:
         """Remove a file, or a folder with all below it, its manifest first. Nothing there is no error."""
-        if self._kind() == "directory" and not (self.local is not None and self.local.is_symlink()):
+        if self._facts()[0] == "directory" and not (self.local is not None and self.local.is_symlink()):
             if "/" not in (self._path or self.text).strip("/"):
                 raise UsageError("a whole bucket or disk is not removed", where=self.text)
             (self / store.MANIFEST).remove()
@@ -397,14 +400,20 @@ class Location:
             InputError: nothing is there, or its upload was not finished. IntegrityError: what came is not what was
                 uploaded.
         """
-        to, kind = Path(to), self._kind()
+        to, (kind, bytes_there) = Path(to), self._facts()
         if not kind:
             remedy = "check it, and whether its upload was finished"
             raise InputError("nothing is at this address", where=self.text, remedy=remedy)
-        wanted = self._wanted() if kind == "directory" else {"": Expected(self._size())}
-        missing = [name for name, one in wanted.items() if not _is_here(to / name if name else to, one)]
+        wanted = self._wanted() if kind == "directory" else {"": Expected(bytes_there)}
+        missing = [name for name, one in wanted.items() if not (one.sha256 and _is(to / name if name else to, one))]
         missing.sort(key=lambda name: (PurePosixPath(name).name in (store.MANIFEST, store.RUN_STATE), name))
-        self._require_space(to, sum(wanted[name].size for name in missing))
+        size = sum(wanted[name].size for name in missing)
+        free = shutil.disk_usage(next(one for one in (to.absolute(), *to.absolute().parents) if one.exists())).free
+        if size + _LEFT_FREE > free:
+            what, got = "not enough space to fetch data", f"{memory.in_words(free)} free"
+            remedy = "free disk space, or choose a folder on a larger disk (--scratch)"
+            expected = f"{memory.in_words(size)} for {self}"
+            raise ResourceError(what, where=str(to), expected=expected, got=got, remedy=remedy)
         store.make_folder(to if kind == "directory" else to.parent)
         with log.task(f"fetching {self}", len(missing)) as bar:
             for names in _grouped(missing, 4 * _FILES_AT_ONCE):
@@ -419,12 +428,6 @@ class Location:
             for path in [path for path in to.rglob("*") if not path.is_dir()]:
                 if path.relative_to(to).as_posix() not in wanted:
                     store.remove(path)
-
-    def _size(self) -> int:
-        if self.local is not None:
-            return self.local.stat().st_size
-        with _in_words("looking it up", self.text):
-            return int(self._files.info(self._path)["size"] or 0)
 
     def _wanted(self) -> dict[str, Expected]:
         record, sizes = self.uploaded(), self.tree()
@@ -447,15 +450,6 @@ class Location:
                         raise IntegrityError("a file is missing", where=f"{self}/{full}")
                     wanted[full] = Expected(sizes[full], str(entry["sha256"]))
         return wanted
-
-    def _require_space(self, to: Path, missing: int) -> None:
-        at = next(one for one in (to.absolute(), *to.absolute().parents) if one.exists())
-        free = shutil.disk_usage(at).free
-        if missing + _LEFT_FREE > free:
-            what = "not enough space to fetch data"
-            expected, got = f"{memory.in_words(missing)} for {self}", f"{memory.in_words(free)} free"
-            remedy = "free disk space, or choose a folder on a larger disk (--scratch)"
-            raise ResourceError(what, where=str(to), expected=expected, got=got, remedy=remedy)
 
     def _get(self, parts: Mapping[str, Path]) -> None:
         if self.local is not None:
@@ -532,7 +526,8 @@ class Location:
     def put_file(self, file: Path) -> None:
         """Upload one file to this place."""
         if self.local is not None:
-            store.write_blocks(self.local, store.blocks_of(file))
+            with store.atomic_path(self.local) as temporary:
+                shutil.copyfile(store.regular(file), temporary)
             return
         with _in_words("uploading", self.text, _NO_BUCKET):
             self._files.put_file(str(file), self._path)
@@ -542,9 +537,8 @@ def _grouped(names: Sequence[str], count: int) -> Iterable[Sequence[str]]:
     return (names[begin : begin + count] for begin in range(0, len(names), count))
 
 
-def _is_here(path: Path, wanted: Expected) -> bool:
-    known = bool(wanted.sha256) and path.is_file() and path.stat().st_size == wanted.size
-    return known and store.sha256_file(path) == wanted.sha256
+def _is(path: Path, wanted: Expected) -> bool:
+    return path.is_file() and path.stat().st_size == wanted.size and store.sha256_file(path) == wanted.sha256
 
 
 def _verify(part: Path, wanted: Expected, where: str) -> None:

@@ -99,17 +99,10 @@ def system_text(path: str) -> str:
 
 # usage --------------------------------------------------------------------------------------------
 #
-# What a piece of work takes: seconds, processor seconds, and the most memory that the program and its child processes
-# held together.
-#
-#     meter = Meter()
-#     ...
-#     meter.stop()        Usage(seconds=12.3, processor_s=20.1, peak_bytes=812345678)
-#
-# Memory is looked at every `PERIOD_S` by one thread for all meters, at the start and at the end: a peak that lasts less
-# is missed. It is known where the system has ``/proc``, else None. A page that several of the processes share counts
-# once (Linux: proportional set sizes). Asking for these costs about 15 ms per GB, so it is done only when the resident
-# sizes allow a new peak, and never for more than `MOST_OF_TIME` of the time.
+# One thread looks at memory every `PERIOD_S` for all meters, and each looks at its start and end: a peak that lasts
+# less is missed. Proportional set sizes cost about 15 ms per GB, so they are read only when the resident sizes allow a
+# new peak, and never for more than `MOST_OF_TIME` of the time. psutil reads neither their anonymous part nor
+# ``children`` of a process without a look at all processes.
 
 PERIOD_S: Final = 0.25
 MOST_OF_TIME: Final = 0.05
@@ -125,7 +118,8 @@ class Resident(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """What was taken so far. processor_s: of all threads, and of child processes that ended. peak_bytes: if known."""
+    """What was taken so far. processor_s: of all threads, and of child processes that ended. peak_bytes: None where the
+    system has no ``/proc``."""
 
     seconds: float = 0.0
     processor_s: float = 0.0
@@ -150,31 +144,26 @@ class Usage:
 
 
 class Meter:
-    """Measures from its making on."""
+    """Measures from its making on: time, and the most memory that this process and its descendants held together."""
 
     def __init__(self) -> None:
         self._began_s, self._processor_s = time.monotonic(), _processor_seconds()
-        self._peak = held_bytes()
+        self.peak = held_bytes() or 0
         self._last: Usage | None = None
         _SAMPLER.add(self)
 
     def seen(self, held: int | None) -> None:
         """Take a sample of memory."""
-        if held is not None:
-            self._peak = max(self._peak or 0, held)
-
-    def exceeded_by(self, held: int) -> bool:
-        """Whether so many bytes were a new peak."""
-        return held > (self._peak or 0)
+        self.peak = max(self.peak, held or 0)
 
     def usage(self) -> Usage:
         """Up to now; after `stop`, up to then."""
         if self._last is not None:
             return self._last
         sizes = resident_sizes()
-        if self.exceeded_by(_most(sizes)):
+        if _most(sizes) > self.peak:
             self.seen(held_bytes(sizes))
-        return Usage(time.monotonic() - self._began_s, _processor_seconds() - self._processor_s, self._peak)
+        return Usage(time.monotonic() - self._began_s, _processor_seconds() - self._processor_s, self.peak or None)
 
     def stop(self) -> Usage:
         """Measure no further."""
@@ -213,7 +202,7 @@ class _Sampler:
                     self._thread = None
                     return
             began_s, sizes = time.monotonic(), resident_sizes()
-            if began_s >= rest_until_s and any(meter.exceeded_by(_most(sizes)) for meter in meters):
+            if began_s >= rest_until_s and any(_most(sizes) > meter.peak for meter in meters):
                 held, now_s = held_bytes(sizes), time.monotonic()
                 rest_until_s = now_s + (now_s - began_s) / MOST_OF_TIME
                 for meter in meters:

@@ -111,22 +111,16 @@ def _new_array(kind: Any, _shape: Any, _code: Any) -> Array:
     return Array()
 
 
-def _from_buffer(content: Any, dtype: Any, shape: Any, order: Any) -> Array:
-    return Array(_filled(shape, dtype, str(order), content))
-
-
-def _scalar(dtype: Any, content: Any) -> Any:
-    return _filled((), dtype, "C", content).item()
-
-
 Maker = Callable[..., Any]
-
+_OF_NUMPY: Final[Mapping[str, Maker]] = {
+    "multiarray._reconstruct": _new_array,
+    "multiarray.scalar": lambda dtype, content: _filled((), dtype, "C", content).item(),
+    "numeric._frombuffer": lambda content, dtype, shape, order: Array(_filled(shape, dtype, str(order), content)),
+}
 NUMPY_MAKERS: Final[Mapping[str, Maker | None]] = {
     "numpy.ndarray": None,
     "numpy.dtype": Dtype,
-    **{f"numpy.{core}.multiarray._reconstruct": _new_array for core in ("core", "_core")},
-    **{f"numpy.{core}.multiarray.scalar": _scalar for core in ("core", "_core")},
-    **{f"numpy.{core}.numeric._frombuffer": _from_buffer for core in ("core", "_core")},
+    **{f"numpy.{core}.{name}": maker for core in ("core", "_core") for name, maker in _OF_NUMPY.items()},
 }
 """Names by which numpy pickles arrays -> what is made of them here (None = a name that is only passed on)."""
 
@@ -204,8 +198,10 @@ class _Machine:
             stack.append(_MARK)
         elif opcode in ("GLOBAL", "STACK_GLOBAL"):
             self._global(opcode, argument)
-        elif opcode in _MEMO:
-            self._remember(opcode, argument)
+        elif opcode in ("MEMOIZE", "PUT", "BINPUT", "LONG_BINPUT"):
+            self._memo[len(self._memo) if opcode == "MEMOIZE" else int(argument)] = stack[-1]
+        elif opcode in ("GET", "BINGET", "LONG_BINGET"):
+            stack.append(self._memo[int(argument)])
         elif opcode in _CONTAINERS:
             self._container(opcode)
         elif opcode in ("REDUCE", "NEWOBJ", "NEWOBJ_EX", "BUILD"):
@@ -240,14 +236,6 @@ class _Machine:
             remedy = "nothing was run. If the file comes from the data set itself, convert it to a plain format"
             raise InputError(what, where=where, expected="numbers, texts, lists and arrays", got=got, remedy=remedy)
         self._stack.append(Name(text))
-
-    def _remember(self, opcode: str, argument: Any) -> None:
-        if opcode == "MEMOIZE":
-            self._memo[len(self._memo)] = self._stack[-1]
-        elif opcode in ("PUT", "BINPUT", "LONG_BINPUT"):
-            self._memo[int(argument)] = self._stack[-1]
-        else:
-            self._stack.append(self._memo[int(argument)])
 
     def _container(self, opcode: str) -> None:
         stack = self._stack
@@ -306,7 +294,6 @@ class _Machine:
             stack.append(PickledObject(kind.text, arguments) if maker is None else maker(*arguments))
 
 
-_MEMO: Final = frozenset("MEMOIZE PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET".split())
 _CONTAINERS: Final = frozenset(
     "EMPTY_LIST EMPTY_DICT EMPTY_TUPLE TUPLE1 TUPLE2 TUPLE3 TUPLE LIST APPEND APPENDS DICT SETITEM SETITEMS".split()
 )

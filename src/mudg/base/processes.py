@@ -3,7 +3,7 @@ here.
 
     run_in_processes    one function over many arguments, several processes at a time
     calls_beside        the same while the caller does something else
-    process_pool        the processes themselves
+    Pool                the processes themselves
     computed_ahead      one function over numbers in order, several threads at a time
     run_limited         one call on a foreign file, under a limit of address space
     Interruption        Ctrl-C and SIGTERM wait for the end of a step
@@ -22,7 +22,6 @@ import contextlib
 import functools
 import itertools
 import multiprocessing
-import multiprocessing.process
 import os
 import signal
 import sys
@@ -30,18 +29,20 @@ import threading
 import time
 import types
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing.connection import wait
+from multiprocessing.context import SpawnContext
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any, TypeVar
 
 from mudg.base import log
 from mudg.base.errors import InputError, IntegrityError, MudgError, NumericsError, ResourceError, UsageError
-from mudg.base.failures import ended_process
+from mudg.base.failures import ended_process, is_memory
+from mudg.base.memory import GIB
 
 Result = TypeVar("Result")
-Pool = concurrent.futures.ProcessPoolExecutor
 Future = concurrent.futures.Future
 
 _ERRORS = {cls.__name__: cls for cls in (UsageError, InputError, IntegrityError, ResourceError, NumericsError)}
@@ -52,7 +53,6 @@ _PATIENCE_S = 60.0
 """Time that workers have to end when a command is stopped: a fit ends its step and writes a checkpoint."""
 _SAME_SIGNAL_S = 10.0
 """A worker takes signals that come together for one: Ctrl-C reaches it from the terminal and again from its parent."""
-GIB = 1 << 30
 
 # ---- threads and environment ---------------------------------------------------------------------
 
@@ -194,25 +194,32 @@ def run_in_processes(
             for index, items in enumerate(arguments):
                 yield index, function(*items)
         return
-    with child_environment(1):
-        pool = process_pool(processes)
+    with child_environment(1), _working(processes) as pool:
         try:
             yield from _in_turn(pool, function, arguments, processes)
-        except (KeyboardInterrupt, GeneratorExit):
-            _stop(pool)
+        except BrokenProcessPool:
             raise
-        except BrokenProcessPool as error:
-            _kill(pool)
-            pool.shutdown(wait=False, cancel_futures=True)
-            raise ended_process(str(error)) from error
-        except BaseException:
-            try:
-                pool.shutdown(wait=True, cancel_futures=True)
-            except KeyboardInterrupt:  # stopped while the other calls end
-                _stop(pool)
-                raise
+        except Exception:
+            pool.shutdown(cancel_futures=True)  # the other calls end
             raise
         pool.shutdown()
+
+
+@contextlib.contextmanager
+def _working(processes: int) -> Iterator[Pool]:
+    """A pool for this block. Where the block is stopped, so are the calls; a worker that died ends all others: nobody
+    waits for one that may never answer."""
+    pool = Pool(processes)
+    try:
+        yield pool
+    except (KeyboardInterrupt, GeneratorExit):
+        _stop(pool)
+        raise
+    except BrokenProcessPool as error:
+        _each(BaseProcess.kill, pool.members)
+        raise ended_process(str(error)) from error
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 @contextlib.contextmanager
@@ -227,35 +234,26 @@ def calls_beside(
     Raises:
         ResourceError: a process ended from outside. Whatever the function raises, at the end of the block.
     """
-    with child_environment(1):
-        pool = process_pool(processes)
-        futures = [pool.submit(_stoppable, function, items) for items in arguments]
+    with _working(processes) as pool:
+        with child_environment(1):
+            futures = [pool.submit(_stoppable, function, items) for items in arguments]
 
-    def drop_rest(done: Future[Any]) -> None:
-        if not done.cancelled() and done.exception() is not None:
-            for future in futures:
-                future.cancel()
+        def drop_rest(done: Future[Any]) -> None:
+            if not done.cancelled() and done.exception() is not None:
+                for future in futures:
+                    future.cancel()
 
-    for future in futures:
-        future.add_done_callback(drop_rest)
-    try:
-        yield
-    except BaseException:
-        _stop(pool)
-        raise
-    try:
+        for future in futures:
+            future.add_done_callback(drop_rest)
+        try:
+            yield
+        except BaseException:
+            _stop(pool)
+            raise
         for future in futures:
             future.cancel()
         for _ in _as_completed(pool, {future: index for index, future in enumerate(futures) if not future.cancelled()}):
             pass
-    except KeyboardInterrupt:
-        _stop(pool)
-        raise
-    except BrokenProcessPool as error:
-        _kill(pool)
-        raise ended_process(str(error)) from error
-    finally:
-        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _in_turn(
@@ -290,39 +288,29 @@ def _as_completed(
             result = future.result()
             waiting.update(next_of())
             yield futures[future], result
-        dead_for = dead_for + 1 if not done and any(not one.is_alive() for one in _members(pool)) else 0
+        dead_for = dead_for + 1 if not done and any(not one.is_alive() for one in pool.members) else 0
         if dead_for > _NOTICED_AFTER:
             raise BrokenProcessPool("a worker is gone")
 
 
-def _members(pool: Pool) -> list[multiprocessing.process.BaseProcess]:
-    return list((getattr(pool, "_processes", None) or {}).values())
-
-
-def _kill(pool: Pool) -> None:
-    """End what is left of a broken pool: nobody waits for a worker that may never answer."""
-    for process in _members(pool):
-        with contextlib.suppress(OSError, ValueError):
-            process.kill()
+def _each(act: Callable[[BaseProcess], None], members: Iterable[BaseProcess]) -> None:
+    for process in members:
+        with contextlib.suppress(OSError, ValueError):  # it has ended
+            act(process)
 
 
 def _stop(pool: Pool) -> None:
     """End the calls of a pool: a fit writes its checkpoint. Who does not end in time, or at an interrupt, is killed."""
-    members = _members(pool)
+    waiting, begun_s = {process.sentinel: process for process in pool.members}, time.monotonic()
     pool.shutdown(wait=False, cancel_futures=True)
-    waiting, begun_s = {process.sentinel for process in members}, time.monotonic()
     try:
         while waiting and time.monotonic() < begun_s + _PATIENCE_S:
             if time.monotonic() < begun_s + _SAME_SIGNAL_S / 2:  # again: one that another thread takes wakes nobody
-                for process in (p for p in members if p.sentinel in waiting):
-                    with contextlib.suppress(OSError, ValueError):
-                        process.terminate()
-            waiting -= set(wait(list(waiting), _POLL_S))  # type: ignore[arg-type]
+                _each(BaseProcess.terminate, waiting.values())
+            for ended in wait(list(waiting), _POLL_S):
+                del waiting[ended]  # type: ignore[arg-type]
     finally:
-        for process in members:
-            if process.sentinel in waiting:
-                with contextlib.suppress(OSError, ValueError):
-                    process.kill()
+        _each(BaseProcess.kill, waiting.values())
 
 
 _stop_asked = threading.Event()
@@ -353,10 +341,28 @@ def _note_stop(_number: int, _frame: types.FrameType | None) -> None:
     _stop_asked.set()
 
 
-def process_pool(processes: int) -> Pool:
+class _Spawning(SpawnContext):
+    """Starts the processes of one pool, and knows them."""
+
+    def __init__(self) -> None:
+        self.made: list[BaseProcess] = []
+
+    def Process(self, *args: Any, **options: Any) -> BaseProcess:  # type: ignore[override]
+        self.made.append(SpawnContext.Process(*args, **options))
+        return self.made[-1]
+
+
+class Pool(concurrent.futures.ProcessPoolExecutor):
     """A pool of quiet processes of one torch thread each."""
-    context = multiprocessing.get_context("spawn")
-    return Pool(processes, mp_context=context, initializer=_prepare_child)
+
+    def __init__(self, processes: int) -> None:
+        self._spawning = _Spawning()
+        super().__init__(processes, mp_context=self._spawning, initializer=_prepare_child)
+
+    @property
+    def members(self) -> list[BaseProcess]:
+        """All processes that were started, also those that have ended."""
+        return [process for process in self._spawning.made if process.pid is not None]
 
 
 def _prepare_child() -> None:
@@ -423,15 +429,12 @@ def computed_ahead(compute: Callable[[int], Result], count: int, threads: int) -
 # ---- one call under a limit of memory ------------------------------------------------------------
 
 
-def run_limited(
-    work: Callable[[], None], limit_bytes: int, where: Path, out_of_memory: Callable[[RuntimeError], bool]
-) -> int:
+def run_limited(work: Callable[[], None], limit_bytes: int, where: Path) -> int:
     """Do the work in a fresh process that may take ``limit_bytes`` of address space beyond the program's own (on
     Linux).
 
     Args:
         work: a call that can be sent to another process. where: the file it reads, for messages.
-        out_of_memory: whether a RuntimeError (of torch) says that memory is short; a module's function.
 
     Returns:
         Peak of resident memory in bytes, 0 where the system has no such limit.
@@ -441,9 +444,9 @@ def run_limited(
     """
     if sys.platform != "linux":
         log.warn("this system has no limit of address space; a hostile file may take all memory")
-    with process_pool(1) as pool:
+    with Pool(1) as pool:
         try:
-            return pool.submit(_limited, work, limit_bytes, where, out_of_memory).result()
+            return pool.submit(_limited, work, limit_bytes, where).result()
         except BrokenProcessPool as error:
             what = "the converting process was ended from outside, most likely for want of memory"
             expected = f"about {limit_bytes / GIB:.0f} GiB of address space, of which the file takes most"
@@ -451,9 +454,7 @@ def run_limited(
             raise ResourceError(what, where=str(where), expected=expected, remedy=remedy) from error
 
 
-def _limited(
-    work: Callable[[], None], limit_bytes: int, where: Path, out_of_memory: Callable[[RuntimeError], bool]
-) -> int:
+def _limited(work: Callable[[], None], limit_bytes: int, where: Path) -> int:
     if sys.platform != "linux":
         work()
         return 0
@@ -468,7 +469,7 @@ def _limited(
     try:
         work()
     except (MemoryError, RuntimeError) as error:
-        if isinstance(error, RuntimeError) and not out_of_memory(error):
+        if not is_memory(error):
             raise
         what, expected = "conversion needs more memory than it may take", f"<= {limit_bytes / 1e9:.1f} GB"
         got, remedy = (str(error).splitlines() or [""])[0][:200], "raise --memory-gb, unless the file should be small"

@@ -48,7 +48,8 @@ class StrictRecord(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _refuse_unknown_fields(cls, value: Any) -> Any:
-        if isinstance(value, dict) and not value.keys() <= _field_names(cls).keys():
+        strict = cls.model_config.get("extra") == "forbid"
+        if strict and isinstance(value, dict) and not value.keys() <= _field_names(cls).keys():
             checked_by(functools.partial(refuse_unknown, known=_field_names(cls)))(value)
         return value
 
@@ -56,12 +57,7 @@ class StrictRecord(BaseModel):
 class ForeignRecord(StrictRecord):
     """A JSON object of somebody else's format: no types are converted; fields that it does not know are passed over."""
 
-    model_config = ConfigDict(strict=True, frozen=True, extra="allow")
-
-    @model_validator(mode="before")
-    @classmethod
-    def _refuse_unknown_fields(cls, value: Any) -> Any:
-        return value
+    model_config = ConfigDict(extra="allow")
 
     def unknown(self, prefix: str = "") -> list[str]:
         """Names of the fields that were passed over, those of records within as ``record.field``."""

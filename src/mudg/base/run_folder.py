@@ -2,7 +2,7 @@
 
 A folder is finished when its manifest verifies and its key (verb, version, configuration, hashes of the inputs) is the
 one asked for. A finished folder of another key is replaced only on demand, and only when the new result is finished:
-until then that is made in a folder beside it (see ``run_folder.py``).
+until then that is made in a folder beside it.
 """
 
 from __future__ import annotations
@@ -27,15 +27,9 @@ from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageErr
 from mudg.base.memory import Meter, Usage, folder_bytes
 from mudg.base.processes import process_alive
 from mudg.base.records import ForeignRecord, Number, parse_record
+from mudg.base.store import all_names
 
 # replacement --------------------------------------------------------------------------------------
-#
-# Replacing a folder by one that was made beside it, so that nothing is lost on the way.
-#
-#     .NAME.new.part   the new content while it is made; the old content stays as it is
-#     .NAME.old.part   the old content, from the moment the new one has its name until it is removed
-#
-# Of the old content only the files of the old result are removed. Files of somebody else move to the new folder.
 
 OwnNames = Callable[[Path], Sequence[str]]
 """Folder -> relative names of the files in it that belong to the result, in the order in which they may be removed:
@@ -44,7 +38,9 @@ those last that the function itself reads. All other files belong to somebody el
 
 @dataclass(frozen=True)
 class Replacement:
-    """A folder whose content is to be replaced as a whole (links are resolved: see ``Replacement.at``)."""
+    """A folder whose content is replaced as a whole by one that is made beside it: ``.NAME.new.part``. The old content
+    is ``.NAME.old.part`` from the moment the new one has its name until the files of the old result are removed; those
+    of somebody else move to the new folder. Links are resolved: see ``Replacement.at``."""
 
     folder: Path
 
@@ -146,15 +142,6 @@ class Replacement:
         return target
 
 
-def all_names(folder: Path) -> list[str]:
-    """Relative POSIX names of all files and links below a folder, sorted; links are not followed."""
-    names = []
-    for top, folders, files in os.walk(folder):
-        links = [name for name in folders if (Path(top) / name).is_symlink()]
-        names += [(Path(top) / name).relative_to(folder).as_posix() for name in (*files, *links)]
-    return sorted(names)
-
-
 def remove_files(folder: Path, names: Sequence[str]) -> None:
     """Remove files of a folder in this order, and then the sub-folders that are empty."""
     for name in names:
@@ -183,27 +170,23 @@ _LONGEST_NAME, _LONGEST_PATH = 230, 3800
 """Bytes: what file systems take (255 and 4096), less what temporary names and files inside the folder add."""
 
 
-def refuse_overlap(out: Path | str, inputs: Mapping[str, Path | str | None]) -> None:
+def refuse_overlap(out: Path | str | Sequence[Path], inputs: Mapping[str, Path | str | None]) -> None:
     """Refuse an output that is, holds or lies in an input. To be called before anything is written.
 
     Links, ``..`` and, where the file system does not tell them apart, upper and lower case make no difference.
 
     Args:
-        out: folder to write; it need not exist.
+        out: folder to write, or several; it need not exist.
         inputs: name for messages -> file or folder that is read (None or empty: not given).
 
     Raises:
-        UsageError: they overlap.
+        UsageError: they overlap, or an output cannot be.
     """
-    refuse_overlaps([out], inputs)
-
-
-def refuse_overlaps(outs: Sequence[Path | str], inputs: Mapping[str, Path | str | None]) -> None:
-    """``refuse_overlap`` for many outputs; every input may be read for each of them."""
-    for out in outs:
-        _refuse_impossible(out)
-    lines_out = {str(out): _line_of(Path(out)) for out in outs}
-    heads_out = {line[0]: out for out, line in lines_out.items()}
+    outs = [out] if isinstance(out, Path | str) else out
+    for one in outs:
+        _refuse_impossible(one)
+    lines_out = {str(one): _line_of(Path(one)) for one in outs}
+    heads_out = {line[0]: one for one, line in lines_out.items()}
     heads_in: dict[object, tuple[str, Path | str]] = {}
     for name, given in inputs.items():
         if given is None or not str(given):
@@ -213,10 +196,10 @@ def refuse_overlaps(outs: Sequence[Path | str], inputs: Mapping[str, Path | str 
         for head in line:
             if head in heads_out:
                 _refuse("is also" if head == line[0] else "holds", heads_out[head], name, given)
-    for out, line in lines_out.items():
+    for one, line in lines_out.items():
         for head in line:
             if head in heads_in:
-                _refuse("lies in", out, *heads_in[head])
+                _refuse("lies in", one, *heads_in[head])
 
 
 def _refuse_impossible(out: Path | str) -> None:
@@ -243,16 +226,13 @@ def _refuse(relation: str, out: str, name: str, given: Path | str) -> None:
 
 def _line_of(path: Path) -> list[object]:
     """What identifies a path, then each folder above it: the file system's own number, else the name."""
-    real = Path(os.path.realpath(path))
-    return [_identity(one) for one in (real, *real.parents)]
-
-
-def _identity(path: Path) -> object:
-    try:
-        found = path.stat()
-    except OSError:
-        return os.path.normcase(path)
-    return (found.st_dev, found.st_ino) if found.st_ino else os.path.normcase(path)
+    real, found = Path(os.path.realpath(path)), list[object]()
+    for one in (real, *real.parents):
+        facts = None
+        with contextlib.suppress(OSError):
+            facts = one.stat()
+        found.append((facts.st_dev, facts.st_ino) if facts and facts.st_ino else os.path.normcase(one))
+    return found
 
 
 class _State(ForeignRecord):
@@ -383,8 +363,7 @@ def own_names(output: VerbOutput, folder: Path) -> list[str]:
 def _is_finished(folder: Path) -> bool:
     with contextlib.suppress(UsageError, InputError, IntegrityError):
         if run_state(folder).get("state") == "complete":
-            store.verify_manifest(folder)
-            store.verify_record(folder)
+            store.verify_result(folder)
             return True
     return False
 
@@ -457,7 +436,9 @@ class RunDir:
                 log.info(f"{output.verb}: {replacement.staging} holds an unfinished replacement of {out}")
             _drop_lock_of_the_dead(out / _LOCK)
             return cls(out, out, output, key, inputs, complete=True)
-        in_the_way = (not same or state["state"] == "complete") and _has_made_something(out)
+        in_the_way = (not same or state["state"] == "complete") and out.is_dir()
+        # a run that failed before it made anything (a mistyped flag) left its bookkeeping alone
+        in_the_way = in_the_way and any(e.name not in _BEGUN and not is_temporary(e.name) for e in out.iterdir())
         if in_the_way and not overwrite:
             _refuse_other(out, output.verb, config, inputs, state)
         work = out
@@ -576,15 +557,9 @@ class RunDir:
         return self.path
 
 
-def _has_made_something(folder: Path) -> bool:
-    """Whether a run left more than its bookkeeping; one that failed before (a mistyped flag) is in nobody's way."""
-    return folder.is_dir() and any(e.name not in _BEGUN and not is_temporary(e.name) for e in folder.iterdir())
-
-
 def _verified(path: Path, overwrite: bool) -> bool:
     try:
-        store.verify_manifest(path)
-        store.verify_record(path)
+        store.verify_result(path)
     except IntegrityError as error:
         if overwrite:
             return False
@@ -619,11 +594,7 @@ def _drop_lock_of_the_dead(lock: Path) -> None:
 
 @contextlib.contextmanager
 def locked(lock: Path, what: Path | None = None) -> Iterator[None]:
-    """Hold a lock for this process alone: that of a file ``what``, else of the folder in which the lock lies.
-
-    Raises:
-        ResourceError: another live process of this machine holds it.
-    """
+    """``take_lock`` for this block."""
     take_lock(lock, what)
     try:
         yield
@@ -633,7 +604,8 @@ def locked(lock: Path, what: Path | None = None) -> Iterator[None]:
 
 
 def take_lock(lock: Path, what: Path | None = None) -> None:
-    """Write this process into a lock; of several that try at the same moment one succeeds.
+    """Write this process into a lock: that of a file ``what``, else of the folder in which the lock lies. Of several
+    that try at the same moment one succeeds.
 
     Raises:
         ResourceError: another live process of this machine holds it.
@@ -653,10 +625,7 @@ def take_lock(lock: Path, what: Path | None = None) -> None:
 
 def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
     """ResourceError if the process that wrote this lock still runs on this machine."""
-    owner = _owner(lock) if lock.is_file() else None
-    if owner is None:
-        return
-    pid, host = owner
+    pid, host = (_owner(lock) if lock.is_file() else None) or (os.getpid(), "")
     if pid != os.getpid() and host == socket.gethostname() and process_alive(pid):
         busy = "writing this file" if what else "working in this folder"
         got = f"pid {pid} on {host}"
@@ -666,15 +635,10 @@ def refuse_while_others_work(lock: Path, what: Path | None = None) -> None:
 
 # result file --------------------------------------------------------------------------------------
 #
-# The output of a verb that is one file: one writer at a time, a description beside it, verified when the command is
-# repeated.
-#
-#     OUT         the file; a verb may have a second form of it, such as the folder of a large page
-#     OUT.json    its description: verb, key of settings and inputs, SHA-256, and what else the verb says
-#
-# Whoever finds a file finds the description of just this file: an older file leaves before the new description gets its
-# name, and the new file gets its name last. What a stop leaves in between is completed, or undone, by the next command
-# that writes there.
+# Beside the file OUT (or a second form of it, such as the folder of a large page) lies OUT.json, its description: verb,
+# key of settings and inputs, SHA-256, and what else the verb says. Whoever finds a file finds the description of just
+# this file: an older file leaves before the new description gets its name, and the new file gets its name last. What a
+# stop leaves in between is completed, or undone, by the next command that writes there.
 
 
 def description_path(out: Path) -> Path:

@@ -16,13 +16,14 @@ import stat
 import tempfile
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from io import BufferedReader
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mudg.base.errors import InputError, IntegrityError, ResourceError, similar_path
+from mudg.base.errors import InputError, IntegrityError, MudgError, ResourceError, similar_path
 
 if TYPE_CHECKING:
     from PIL import Image
@@ -32,7 +33,6 @@ MANIFEST = "manifest.json"
 RUN_STATE, RUN_LOG, RUN_SCHEMA = "run.json", "log.jsonl", 2
 """Record and log of the run that made a folder, and the record's schema."""
 _MAX_JSON_BYTES = 512 * 1024 * 1024
-_CHUNK = 1 << 20
 
 # single files -------------------------------------------------------------------------------------
 
@@ -48,16 +48,22 @@ def fsync_directory(path: Path) -> None:
 
 
 @contextlib.contextmanager
-def disk_errors(what: str, where: Path, remedy: str = "choose another --out") -> Iterator[None]:
-    """Turn an OSError of this block into a ResourceError that says what could not be done, where, and what to do."""
+def disk_errors(
+    what: str, where: Path, remedy: str = "choose another --out", kind: type[MudgError] = ResourceError
+) -> Iterator[None]:
+    """Turn an OSError of this block into an error that says what could not be done, where, and what to do."""
     try:
         yield
     except OSError as error:
-        raise ResourceError(what, where=str(where), got=str(error), remedy=remedy) from error
+        raise kind(what, where=str(where), got=str(error), remedy=remedy) from error
 
 
 def _writing(path: Path) -> contextlib.AbstractContextManager[None]:
     return disk_errors("writing failed", path, "free disk space or choose another --out")
+
+
+def _reading(path: Path) -> contextlib.AbstractContextManager[None]:
+    return disk_errors("file cannot be read", path, "", InputError)
 
 
 _umask_lock = threading.Lock()
@@ -69,6 +75,24 @@ def _umask() -> int:
         mask = os.umask(0)
         os.umask(mask)
     return mask
+
+
+@contextlib.contextmanager
+def _temporary(path: Path) -> Iterator[Path]:
+    """A new file beside ``path`` (same suffix). It goes at the end, unless it has got another name."""
+    fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
+    os.close(fd)
+    try:
+        yield Path(name)
+    finally:
+        Path(name).unlink(missing_ok=True)
+
+
+def _complete(temporary: Path) -> None:
+    """Wait until a temporary file is on the disk; it gets the rights of any new file."""
+    with temporary.open("rb+") as handle:
+        os.fsync(handle.fileno())
+    temporary.chmod(0o666 & ~_umask())
 
 
 @contextlib.contextmanager
@@ -86,19 +110,11 @@ def atomic_path(path: Path) -> Iterator[Path]:
         if path.exists() and not path.is_file():  # a device would be replaced by a file
             got, remedy = "not a regular file", "choose another --out"
             raise ResourceError("cannot write here", where=str(path), got=got, remedy=remedy)
-        fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
-    os.close(fd)
-    temporary = Path(name)
-    try:
-        with _writing(path):
+        with _temporary(path) as temporary, _writing(path):
             yield temporary
-            with temporary.open("rb+") as handle:
-                os.fsync(handle.fileno())
-            temporary.chmod(0o666 & ~_umask())
+            _complete(temporary)
             temporary.replace(path)
             fsync_directory(path.parent)
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def atomic_write(path: Path, content: bytes) -> None:
@@ -165,17 +181,10 @@ def create_once(path: Path, content: bytes) -> bool:
     with disk_errors("cannot write here", path):
         if os.path.lexists(path):
             return False
-        fd, name = tempfile.mkstemp(prefix=f".{path.stem}.", suffix=f".part{path.suffix}", dir=path.parent)
-        temporary = Path(name)
-        try:
-            with os.fdopen(fd, "wb") as handle:
-                handle.write(content)
-                handle.flush()
-                os.fsync(handle.fileno())
-            temporary.chmod(0o666 & ~_umask())
+        with _temporary(path) as temporary:
+            temporary.write_bytes(content)
+            _complete(temporary)
             return _linked(temporary, path, content)
-        finally:
-            temporary.unlink(missing_ok=True)
 
 
 def _linked(temporary: Path, path: Path, content: bytes) -> bool:
@@ -210,13 +219,6 @@ def remove(path: Path) -> None:
     """Remove a file; none there is no error."""
     with disk_errors("cannot remove a file", path, "check who may write there"):
         Path(path).unlink(missing_ok=True)
-
-
-def blocks_of(path: Path) -> Iterator[bytes]:
-    """The content of a file, piece by piece."""
-    with open_file(path) as handle:
-        while block := handle.read(_CHUNK):
-            yield block
 
 
 def write_text(path: Path, text: str) -> None:
@@ -320,13 +322,11 @@ def regular(path: Path) -> Path:
     return path
 
 
-def open_file(path: Path) -> BinaryIO:
+def open_file(path: Path) -> BufferedReader:
     """Open a regular file for reading; InputError as in ``regular``."""
     regular(path)  # a pipe or device is not even opened; the second look is for one that took its place meanwhile
-    try:
+    with _reading(path):
         handle = os.fdopen(os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)), "rb")
-    except OSError as error:
-        raise InputError("file cannot be read", where=str(path), got=str(error)) from error
     if not stat.S_ISREG(os.fstat(handle.fileno()).st_mode):
         handle.close()
         raise InputError("not a regular file", where=str(path), expected="a file on a disk")
@@ -335,11 +335,8 @@ def open_file(path: Path) -> BinaryIO:
 
 def read_bytes(path: Path) -> bytes:
     """Read a file; one that is missing, unreadable or no regular file is an InputError that names it."""
-    with open_file(path) as handle:
-        try:
-            return handle.read()
-        except OSError as error:
-            raise InputError("file cannot be read", where=str(path), got=str(error)) from error
+    with open_file(path) as handle, _reading(path):
+        return handle.read()
 
 
 def read_text(path: Path) -> str:
@@ -386,10 +383,8 @@ def _end_of_lines(handle: BinaryIO) -> int:
 
 def sha256_file(path: Path) -> str:
     """Hex sha256 of a file's bytes."""
-    digest = hashlib.sha256()
-    for block in blocks_of(path):
-        digest.update(block)
-    return digest.hexdigest()
+    with open_file(path) as handle:
+        return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def write_safetensors(
@@ -489,16 +484,19 @@ def retired_path(folder: Path) -> Path:
     return folder.parent / f".{folder.name}.old.part"
 
 
+def all_names(folder: Path) -> list[str]:
+    """Relative POSIX names of all files and links below a folder, sorted; links are not followed."""
+    names = []
+    for top, folders, files in os.walk(folder):
+        links = [name for name in folders if (Path(top) / name).is_symlink()]
+        names += [(Path(top) / name).relative_to(folder).as_posix() for name in (*files, *links)]
+    return sorted(names)
+
+
 def list_files(folder: Path) -> list[str]:
     """Relative POSIX paths of the files below ``folder``, sorted, without temporary and bookkeeping files."""
-    names = []
-    for path in Path(folder).rglob("*"):
-        if path.is_file():
-            relative = path.relative_to(folder).as_posix()
-            if relative in (MANIFEST, "lock") or any(".part" in part for part in relative.split("/")):
-                continue
-            names.append(relative)
-    return sorted(names)
+    names = (name for name in all_names(folder) if name not in (MANIFEST, "lock") and ".part" not in name)
+    return [name for name in names if (folder / name).is_file()]
 
 
 def write_manifest(folder: Path, names: Sequence[str] | None = None) -> str:
@@ -592,6 +590,12 @@ def verify_record(folder: Path) -> None:
             raise _altered(file, expected)
 
 
+def verify_result(folder: Path) -> None:
+    """Check a finished result and its bookkeeping; errors as in ``verify_manifest`` and ``verify_record``."""
+    verify_manifest(folder)
+    verify_record(folder)
+
+
 def require(path: Path) -> None:
     """InputError where nothing is at a path that is to be read."""
     if not path.exists():
@@ -614,7 +618,10 @@ def digest(path: Path) -> str:
     verify_record(path)
     if (path / MANIFEST).is_file():
         return verify_manifest(path)
-    total = hashlib.sha256()
-    for name in list_files(path):
-        total.update(f"{name}\0{sha256_file(path / name)}\n".encode())
-    return total.hexdigest()
+    return digest_of_files(path, list_files(path))
+
+
+def digest_of_files(folder: Path, names: Sequence[str]) -> str:
+    """One digest of the names and contents of these files (an empty name: of the folder, which is a file)."""
+    lines = (f"{name}\0{sha256_file(folder / name if name else folder)}\n" for name in names)
+    return hashlib.sha256("".join(lines).encode()).hexdigest()

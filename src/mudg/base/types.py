@@ -11,7 +11,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, Final, Literal
+from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,10 +24,11 @@ if TYPE_CHECKING:
     import torch
     from torch import Tensor
 
+Matrix = NDArray[np.float64]
+TrajectoryOrigin = Literal["recorded", "shifted"]
+ObservationKind = Literal["recorded", "virtual"]
 
-# checks -------------------------------------------------------------------------------------------
-#
-# What the constructors of ``base/types.py`` check. Each refusal is an InputError whose place is ``OWNER: FIELD``.
+# checks of the constructors; a refusal is an InputError whose place is ``OWNER: FIELD`` -------------------------------
 
 
 def rigid(value: Any, where: str) -> Matrix:
@@ -135,6 +136,23 @@ class _Brief:
         return f"{type(self).__name__}({', '.join(texts)})"
 
 
+class _Tensors(_Brief):
+    """What holds tensors, also in fields that are of this kind."""
+
+    __slots__ = ()
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Self:
+        """The same with ``change`` applied to each tensor, for example a crop or a mirror image."""
+        given = {f.name: getattr(self, f.name) for f in fields(self)}  # type: ignore[arg-type]
+        inner = {name: value.map(change) for name, value in given.items() if isinstance(value, _Tensors)}
+        tensors = {name: change(value) for name, value in given.items() if hasattr(value, "device")}
+        return replace(self, **inner, **tensors)  # type: ignore[type-var]
+
+    def to(self, device: torch.device) -> Self:
+        """The same with its tensors on a device."""
+        return self.map(lambda x: x.to(device))
+
+
 def _in_brief(value: Any) -> str:
     if hasattr(value, "shape"):
         return f"{str(value.dtype).removeprefix('torch.')}{list(value.shape)}"
@@ -143,11 +161,8 @@ def _in_brief(value: Any) -> str:
     return repr(value.name) if isinstance(value, Camera) else short(repr(value))
 
 
-# what a fitted scene shows at some views, as the diffusion model's condition holds it. Imports no torch ---------------
-
-
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class RenderPlanes(_Brief):
+class RenderPlanes(_Tensors):
     """What a fitted scene shows at T views (or at one view, without the leading dimension).
 
     Args:
@@ -168,27 +183,6 @@ class RenderPlanes(_Brief):
         lead, (h, w) = tuple(self.color.shape[:-3]), tuple(self.color.shape[-2:])
         one = (*lead, 1, h, w)
         check_tensors(self, color=(*lead, 3, h, w), depth=one, alpha=one, certainty=one, semantics=one)
-
-    def to(self, device: torch.device) -> RenderPlanes:
-        """The same planes on a device."""
-        return self.map(lambda x: x.to(device))
-
-    def map(self, change: Callable[[Tensor], Tensor]) -> RenderPlanes:
-        """The planes with ``change`` applied to each, for example a crop or a mirror image."""
-        return RenderPlanes(*(change(getattr(self, f.name)) for f in fields(self)))
-
-
-# types --------------------------------------------------------------------------------------------
-
-Matrix = NDArray[np.float64]
-TrajectoryOrigin = Literal["recorded", "shifted"]
-ObservationKind = Literal["recorded", "virtual"]
-
-
-def _moved(value: Any, device: torch.device) -> dict[str, Tensor]:
-    """The tensors among the fields of a dataclass, on a device."""
-    given = {f.name: getattr(value, f.name) for f in fields(value)}
-    return {name: tensor.to(device) for name, tensor in given.items() if hasattr(tensor, "device")}
 
 
 def _freeze(mapping: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -583,7 +577,7 @@ class Scene(_Brief):
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class SparseDepth(_Brief):
+class SparseDepth(_Tensors):
     """Measured depth f32[T, 1, H, W] in metres, known where ``valid`` bool[T, 1, H, W] and meaningless elsewhere."""
 
     depth: Tensor
@@ -592,13 +586,9 @@ class SparseDepth(_Brief):
     def __post_init__(self) -> None:
         check_tensors(self, depth=(None, 1, None, None), valid=tuple(self.depth.shape))
 
-    def map(self, change: Callable[[Tensor], Tensor]) -> SparseDepth:
-        """Depth and mask with ``change`` applied to each, for example a crop or a mirror image."""
-        return SparseDepth(change(self.depth), change(self.valid))
-
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Condition(_Brief):
+class Condition(_Tensors):
     """What the diffusion model is given for T views.
 
     Args:
@@ -647,15 +637,9 @@ class Condition(_Brief):
         """Depth to hold generated depth against."""
         return SparseDepth(self.depth, self.valid) if self.measured is None else self.measured
 
-    def to(self, device: torch.device) -> Condition:
-        """The same condition with its tensors on a device."""
-        renders = None if self.renders is None else self.renders.to(device)
-        measured = None if self.measured is None else self.measured.map(lambda x: x.to(device))
-        return replace(self, **_moved(self, device), renders=renders, measured=measured)
-
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class FinePatch(_Brief):
+class FinePatch(_Tensors):
     """A rectangle of a training clip at a higher resolution.
 
     Args:
@@ -669,13 +653,9 @@ class FinePatch(_Brief):
     column: int
     scale: int
 
-    def to(self, device: torch.device) -> FinePatch:
-        """The same patch with its tensors on a device."""
-        return replace(self, clip=self.clip.to(device))
-
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
-class Clip(_Brief):
+class Clip(_Tensors):
     """A training example: a condition and the truth for its T views.
 
     Args:
@@ -711,11 +691,6 @@ class Clip(_Brief):
         """What depth counts in a loss, f32[T, 1, H, W]: its confidence, 0 where it is not valid."""
         known = self.depth_valid.float()
         return known if self.depth_confidence is None else known * self.depth_confidence
-
-    def to(self, device: torch.device) -> Clip:
-        """The same clip with its tensors on a device."""
-        fine = None if self.fine is None else self.fine.to(device)
-        return replace(self, condition=self.condition.to(device), **_moved(self, device), fine=fine)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

@@ -17,6 +17,7 @@ def _of(package: str, missing: str) -> str:
         return missing
 
 
+@functools.cache
 def version() -> str:
     """Version of this package, or ``0+unknown`` when it runs uninstalled."""
     return _of("mudg", "0+unknown")

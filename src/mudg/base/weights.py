@@ -20,18 +20,14 @@ from typing import Any, Final
 import torch
 from torch import Tensor
 
-from mudg.base import checkpoint
+from mudg.base import checkpoint, failures
 from mudg.base.errors import InputError
 from mudg.base.plain_pickle import PERSISTENT, Maker, Name, PickledObject, read_pickle
 
 # torchscript --------------------------------------------------------------------------------------
 #
-# The tensors of a TorchScript archive, without its program.
-#
-# ``torch.jit.load`` would take in code from the file. What the networks of the scores need are the tensors alone: the
-# archive is a zip, its ``data.pkl`` a pickle that names classes of the program and places in ``data/``. It is read by
-# the interpreter of ``base/plain_pickle.py``, which runs nothing; classes become plain objects, and the tensors get the
-# names of the attributes that lead to them.
+# ``torch.jit.load`` would take in code. The archive is a zip, its ``data.pkl`` a pickle that names classes of the
+# program and places in ``data/``: the interpreter of ``base/plain_pickle.py`` makes plain objects of them.
 
 
 def _pairs(text: str) -> list[tuple[str, str]]:
@@ -46,7 +42,6 @@ _STORAGES: Final = {
         "Char int8, Byte uint8, Bool bool"
     )
 }
-_PROGRAM: Final = "__torch__."
 _BUILDERS: Final = "torch.jit._pickle."
 _DEEPEST: Final = 64
 
@@ -61,7 +56,7 @@ class _Names(dict[str, Maker | None]):
         self[f"{_BUILDERS}restore_type_tag"] = lambda value, _kind: value
 
     def __contains__(self, name: object) -> bool:
-        return super().__contains__(name) or str(name).startswith(_PROGRAM)
+        return super().__contains__(name) or str(name).startswith("__torch__.")
 
     def __missing__(self, _of_the_program: str) -> None:
         return None
@@ -175,79 +170,62 @@ _TOWER_BLOCK = _pairs(
 )
 
 
+_QUERIES = _pairs("norm1 norm_image, norm2 norm_queries, to_q query, to_kv key_value, to_out out")
+_UNET_ENDS = _pairs(
+    "time_embed.0 time.0, time_embed.2 time.2, class_embed.0 label.0, class_embed.2 label.2, fps_embedding.0 fps.0, "
+    "fps_embedding.2 fps.2, input_blocks.0.0 down.0.conv, input_blocks.{i}.0.op down.{i}.conv, out.0 norm, "
+    "output_blocks.{i}.3.conv up.{i}.grow, output_blocks.{i}.1.conv up.{i}.grow, out.2 leave"
+)
+_VAE_ENDS = _pairs(
+    "quant_conv to_moments, post_quant_conv from_latent, encoder.down.{i}.downsample.conv encoder.down.{i}.scale, "
+    "decoder.up.{i}.upsample.conv decoder.up.{i}.scale"
+)
+
+
 def _block(published: str, clean: str) -> list[tuple[str, str]]:
     """A residual block and its transformers."""
     parts = (("0.", "res.", _RES), ("1.", "spatial.", _TRANSFORMER), ("2.", "temporal.", _TRANSFORMER))
     return [row for a, b, leaves in parts for row in _at(published + a, clean + b, leaves)]
 
 
-def _parameters(rows: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+def _parameters(*groups: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
     """Each row for its weight and for its bias."""
-    return [(f"{a}.{kind}", f"{b}.{kind}") for a, b in rows for kind in ("weight", "bias")]
+    return [(f"{a}.{kind}", f"{b}.{kind}") for rows in groups for a, b in rows for kind in ("weight", "bias")]
 
 
 RULES: tuple[tuple[str, str], ...] = (
     # denoising network
     *_parameters(
-        [
-            *(
-                (f"{_UNET}{a}.{n}", f"net.{b}.{n}")
-                for a, b in _pairs("time_embed time, class_embed label, fps_embedding fps")
-                for n in (0, 2)
-            ),
-            (f"{_UNET}input_blocks.0.0", "net.down.0.conv"),
-            *_at(f"{_UNET}init_attn.0.", "net.first.", _TRANSFORMER),
-            *_block(f"{_UNET}input_blocks.{{i}}.", "net.down.{i}."),
-            (f"{_UNET}input_blocks.{{i}}.0.op", "net.down.{i}.conv"),
-            *_at(f"{_UNET}middle_block.0.", "net.middle.res1.", _RES),
-            *_at(f"{_UNET}middle_block.1.", "net.middle.spatial.", _TRANSFORMER),
-            *_at(f"{_UNET}middle_block.2.", "net.middle.temporal.", _TRANSFORMER),
-            *_at(f"{_UNET}middle_block.3.", "net.middle.res2.", _RES),
-            *_block(f"{_UNET}output_blocks.{{i}}.", "net.up.{i}."),
-            (f"{_UNET}output_blocks.{{i}}.3.conv", "net.up.{i}.grow"),
-            (f"{_UNET}output_blocks.{{i}}.1.conv", "net.up.{i}.grow"),
-            (f"{_UNET}out.0", "net.norm"),
-            (f"{_UNET}out.2", "net.leave"),
-        ]
+        _at(_UNET, "net.", _UNET_ENDS),
+        _at(f"{_UNET}init_attn.0.", "net.first.", _TRANSFORMER),
+        _block(f"{_UNET}input_blocks.{{i}}.", "net.down.{i}."),
+        _at(f"{_UNET}middle_block.0.", "net.middle.res1.", _RES),
+        _at(f"{_UNET}middle_block.1.", "net.middle.spatial.", _TRANSFORMER),
+        _at(f"{_UNET}middle_block.2.", "net.middle.temporal.", _TRANSFORMER),
+        _at(f"{_UNET}middle_block.3.", "net.middle.res2.", _RES),
+        _block(f"{_UNET}output_blocks.{{i}}.", "net.up.{i}."),
     ),
     # autoencoder
     *_parameters(
-        [
-            *_at(f"{_VAE}encoder.", "codec.encoder.", _ENDS),
-            *_at(f"{_VAE}decoder.", "codec.decoder.", _ENDS),
-            *_at(_VAE, "codec.", _pairs("quant_conv to_moments, post_quant_conv from_latent")),
-            *_at(f"{_VAE}encoder.down.{{i}}.block.{{j}}.", "codec.encoder.down.{i}.blocks.{j}.", _VAE_BLOCK),
-            (f"{_VAE}encoder.down.{{i}}.downsample.conv", "codec.encoder.down.{i}.scale"),
-            *_at(f"{_VAE}encoder.mid.", "codec.encoder.middle.", _VAE_MIDDLE),
-            *_at(f"{_VAE}decoder.mid.", "codec.decoder.middle.", _VAE_MIDDLE),
-            *_at(f"{_VAE}decoder.up.{{i}}.block.{{j}}.", "codec.decoder.up.{i}.blocks.{j}.", _VAE_BLOCK),
-            (f"{_VAE}decoder.up.{{i}}.upsample.conv", "codec.decoder.up.{i}.scale"),
-        ]
+        _at(_VAE, "codec.", _VAE_ENDS),
+        *(_at(f"{_VAE}{side}.", f"codec.{side}.", _ENDS) for side in ("encoder", "decoder")),
+        *(_at(f"{_VAE}{side}.mid.", f"codec.{side}.middle.", _VAE_MIDDLE) for side in ("encoder", "decoder")),
+        _at(f"{_VAE}encoder.down.{{i}}.block.{{j}}.", "codec.encoder.down.{i}.blocks.{j}.", _VAE_BLOCK),
+        _at(f"{_VAE}decoder.up.{{i}}.block.{{j}}.", "codec.decoder.up.{i}.blocks.{j}.", _VAE_BLOCK),
     ),
-    # text tower
+    # towers
     *_at(_TEXT, "text.", _pairs("token_embedding.weight tokens.weight, positional_embedding places")),
     *_at(f"{_TEXT}transformer.resblocks.{{i}}.", "text.blocks.{i}.", _TOWER_BLOCK),
-    *_parameters([(f"{_TEXT}ln_final", "text.norm")]),
-    # image tower
-    *_at(
-        f"{_IMAGE}visual.",
-        "image.",
-        _pairs("class_embedding whole, positional_embedding places, conv1.weight patches.weight"),
-    ),
-    *_parameters([(f"{_IMAGE}visual.ln_pre", "image.norm")]),
+    *_at(f"{_IMAGE}visual.", "image.", _pairs("class_embedding whole, positional_embedding places")),
+    (f"{_IMAGE}visual.conv1.weight", "image.patches.weight"),
+    *_parameters([(f"{_TEXT}ln_final", "text.norm"), (f"{_IMAGE}visual.ln_pre", "image.norm")]),
     *_at(f"{_IMAGE}visual.transformer.resblocks.{{i}}.", "image.blocks.{i}.", _TOWER_BLOCK),
     # image tokens
     (f"{_IMAGE_TOKENS}latents", "image_tokens.queries"),
     *_parameters(
-        [
-            *_at(_IMAGE_TOKENS, "image_tokens.", _pairs("proj_in enter, proj_out leave, norm_out norm")),
-            *_at(
-                f"{_IMAGE_TOKENS}layers.{{i}}.0.",
-                "image_tokens.layers.{i}.attention.",
-                _pairs("norm1 norm_image, norm2 norm_queries, to_q query, to_kv key_value, to_out out"),
-            ),
-            *_at(f"{_IMAGE_TOKENS}layers.{{i}}.1.", "image_tokens.layers.{i}.feed.", _pairs("0 0, 1 1, 3 3")),
-        ]
+        _at(_IMAGE_TOKENS, "image_tokens.", _pairs("proj_in enter, proj_out leave, norm_out norm")),
+        _at(f"{_IMAGE_TOKENS}layers.{{i}}.0.", "image_tokens.layers.{i}.attention.", _QUERIES),
+        _at(f"{_IMAGE_TOKENS}layers.{{i}}.1.", "image_tokens.layers.{i}.feed.", _pairs("0 0, 1 1, 3 3")),
     ),
     # the dynamic rescale table: the one buffer whose values decide
     ("scale_arr", "scale"),
@@ -330,11 +308,6 @@ class _Ignored:
     def __setstate__(self, _: object) -> None: ...
 
 
-def _mapping(*_: object) -> OrderedDict[str, Any]:
-    """Stand-in for the making of a mapping whose entries follow."""
-    return OrderedDict()
-
-
 INERT = tuple(
     (
         "omegaconf.dictconfig.DictConfig omegaconf.listconfig.ListConfig omegaconf.base.ContainerMetadata "
@@ -351,7 +324,7 @@ INERT = tuple(
 """Names in pickles that are replaced by `_Ignored`. Not one of them is imported or called."""
 
 INERT_MAPPINGS: dict[str, Any] = {
-    "collections.defaultdict": _mapping,
+    "collections.defaultdict": lambda *_: OrderedDict(),
     "lightning_fabric.utilities.data.AttributeDict": OrderedDict,
     "pytorch_lightning.utilities.parsing.AttributeDict": OrderedDict,
 }
@@ -403,17 +376,12 @@ def _unpickle(path: Path) -> Any:
             expected = "tensors, numbers, text and plain containers"
             remedy = "do not load it elsewhere either, unless you trust its maker; ask for safetensors"
             raise InputError(what, where=str(path), expected=expected, got=refused.group(1), remedy=remedy) from error
-        if out_of_memory(error):
+        if failures.is_memory(error):
             raise MemoryError(text) from error
         where, expected = str(path), "a complete file written by torch.save, or safetensors"
         got = text.splitlines()[0][:200] if text else type(error).__name__
         remedy = "fetch the file again and compare its size"
         raise InputError("not a readable checkpoint", where=where, expected=expected, got=got, remedy=remedy) from error
-
-
-def out_of_memory(error: Exception) -> bool:
-    """Whether an error of torch says that memory ran out."""
-    return any(sign in str(error) for sign in ("DefaultCPUAllocator", "not enough memory", "Cannot allocate memory"))
 
 
 _UNREADABLE: tuple[type[Exception], ...] = (

@@ -19,7 +19,6 @@ class Bench(Output):
     """Run a benchmark: mdm, poses, edit, shift or loop against exact truth, real on real logs, paper for tables of
     papers."""
 
-    section = "benchmarks"
     examples = (
         *("mudg bench mdm --out runs/bench", "mudg bench poses --out runs/poses"),
         *("mudg bench edit --out runs/edits", "mudg bench edit runs/a runs/b --out runs/edited"),

@@ -76,7 +76,7 @@ def run(config: ConvertConfig, checkpoint: Path, to: Path, conversion: Conversio
         replacement.begin()
     try:
         with log.task("convert", 1) as bar:
-            peak = processes.run_limited(work, limit, checkpoint, weights.out_of_memory)
+            peak = processes.run_limited(work, limit, checkpoint)
             bar.advance()
         if replaces:
             replacement.swap(own_names)

@@ -17,12 +17,7 @@ from typing import Any, BinaryIO, Final
 
 from mudg.base import processes, store
 from mudg.base.errors import ResourceError, UsageError
-
-fcntl: Any
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None
+from mudg.base.run_folder import fcntl
 
 KILLED: Final = 137
 """Code of a step that was killed, as the system does where memory runs out."""

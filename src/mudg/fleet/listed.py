@@ -19,7 +19,7 @@ from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.errors import InputError, UsageError, plain
 from mudg.base.location import Location
-from mudg.base.run_folder import refuse_overlaps
+from mudg.base.run_folder import refuse_overlap
 from mudg.fleet.child import Stop
 from mudg.fleet.engines import LocalRun
 from mudg.fleet.plan import CITY, BatchPlan, Entry, listed_plan, parse_shard, shard
@@ -94,7 +94,7 @@ def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: 
     logs = (entry for entry in entries if entry.source != CITY)
     read: dict[str, Path | str | None] = {f"source of {entry.name}": entry.source for entry in logs}
     read["list"] = listed if listed is not None and listed.is_file() else None
-    refuse_overlaps([status, *(out / entry.name for entry in entries)], read)
+    refuse_overlap([status, *(out / entry.name for entry in entries)], read)
     if status.exists():
         try:
             known = {"schema", "verb", "counts", "scenes"} <= set(store.read_json(status))

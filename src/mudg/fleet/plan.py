@@ -5,7 +5,6 @@ A list has one source a line, ``SOURCE [name=NAME] [setting=value ...]``, quoted
 
 from __future__ import annotations
 
-import functools
 import hashlib
 import os
 import re
@@ -221,12 +220,9 @@ class BatchPlan:
             yield unit
 
 
-_version = functools.cache(version)
-
-
 def _key(stage: BatchStage, entry: Entry, needs: Mapping[str, str]) -> str:
     """Content key: of the log's identity, settings, version and the keys of what is read."""
-    values = [RULES_VERSION, _version(), stage.name, list(stage.words), without_devices(stage.settings)]
+    values = [RULES_VERSION, version(), stage.name, list(stage.words), without_devices(stage.settings)]
     values += [entry.name, entry.source, dict(entry.settings), dict(needs)]
     return hashlib.sha256(store.json_text(values, indent=None).encode()).hexdigest()[:32]
 

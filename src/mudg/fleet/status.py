@@ -135,20 +135,10 @@ class BatchStatus:
             stages[name] |= {"written_bytes": one.written_bytes, "peak_bytes": one.peak_bytes}
             stages[name] |= {"slowest": one.slowest[1]}
         reasons = [{"reason": words, "steps": count, "example": example} for words, count, example in self.reasons()]
-        return {
-            "out": self.out,
-            "scenes": self.scenes,
-            "finished": self.finished,
-            "left": self.steps_left(),
-            "stages": stages,
-            "reasons": reasons,
-            "steps_per_hour": round(self.rate() * 3600, 2),
-            "forecast_s": self.forecast_s(),
-            "costs": self.costs(),
-            "price": self.price,
-            "corpus": self.corpus(),
-            "drivers": self.drivers,
-        }
+        record = {"out": self.out, "scenes": self.scenes, "finished": self.finished, "left": self.steps_left()}
+        record |= {"stages": stages, "reasons": reasons, "steps_per_hour": round(self.rate() * 3600, 2)}
+        record |= {"forecast_s": self.forecast_s(), "costs": self.costs(), "price": self.price}
+        return {**record, "corpus": self.corpus(), "drivers": self.drivers}
 
 
 def reason_of(code: int) -> str:

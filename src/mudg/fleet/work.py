@@ -40,12 +40,7 @@ from mudg.fleet.records import BatchFolder, CorpusFacts, Ended
 
 DONE, FAILED, STOPPED, LOST = "done", "failed", "stopped", "lost"
 REASONS: Final[Mapping[int, str]] = {
-    1: "a mistake in the program",
-    2: "usage",
-    3: "bad input",
-    4: "damaged result",
-    5: "memory or disk",
-    6: "numbers",
+    **dict(enumerate("a mistake in the program,usage,bad input,damaged result,memory or disk,numbers".split(","), 1)),
     130: "interrupted",
     KILLED: "killed, most likely for want of memory",
     ASKED_TO_STOP: "asked to stop",
@@ -319,8 +314,7 @@ class _Step:
             if not (place / store.MANIFEST).is_file():
                 return place if place.exists() else None
             try:
-                store.verify_manifest(place)
-                store.verify_record(place)
+                store.verify_result(place)
             except (IntegrityError, InputError):
                 log.warn(f"{place} is damaged and is made again")
                 shutil.rmtree(place)
@@ -445,22 +439,12 @@ class _Step:
     # ends -----------------------------------------------------------------------------------------
 
     def _ended(self, state: str, ending: Ending, **more: Any) -> Ended:
-        unit = self._unit
-        return Ended(
-            scene=unit.entry.name,
-            stage=unit.stage.name,
-            key=unit.key,
-            source=unit.entry.source,
-            place=unit.place,
-            state=state,
-            host=socket.gethostname(),
-            code=ending.code,
-            words=ending.words[:2000],
-            ended=round(time.time(), 3),
-            **{name: round(getattr(ending, name), 3) for name in ("seconds", "processor_s")},
-            lost_s=round(self._lost_s, 3),
-            **more,
-        )
+        unit, times = self._unit, {"ended": time.time(), "lost_s": self._lost_s}
+        times |= {"seconds": ending.seconds, "processor_s": ending.processor_s}
+        what: dict[str, Any] = {"scene": unit.entry.name, "stage": unit.stage.name, "source": unit.entry.source}
+        what |= {"key": unit.key, "place": unit.place, "host": socket.gethostname()} | more
+        what |= {name: round(value, 3) for name, value in times.items()}
+        return Ended(state=state, code=ending.code, words=ending.words[:2000], **what)
 
     def _record(self, result: Path, ending: Ending) -> Ended:
         if self._direct is not None:
@@ -487,10 +471,7 @@ def digest_of(folder: Path) -> str:
         return store.sha256_file(folder / store.MANIFEST)
     manifests = sorted(path.relative_to(folder).as_posix() for path in folder.rglob(store.MANIFEST))
     names = manifests or (store.list_files(folder) if folder.is_dir() else [""])
-    total = hashlib.sha256()
-    for name in names:
-        total.update(f"{name}\0{store.sha256_file(folder / name if name else folder)}\n".encode())
-    return total.hexdigest()
+    return store.digest_of_files(folder, names)
 
 
 def facts_of(folder: Path) -> CorpusFacts | None:

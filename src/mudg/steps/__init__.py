@@ -8,34 +8,37 @@ from typing import Final
 
 from mudg.steps.step import Step
 
-_HOMES: Final[Mapping[str, str]] = {
-    "demo": "mudg.steps.run:Demo",
-    "run": "mudg.steps.run:Run",
-    "doctor": "mudg.steps.doctor:Doctor",
-    "ingest": "mudg.steps.ingest:Ingest",
-    "annotate": "mudg.steps.ingest:Annotate",
-    "fuse": "mudg.steps.ingest:Fuse",
-    "learn": "mudg.steps.synthesize:Learn",
-    "fit": "mudg.steps.fit:Fit",
-    "adapt": "mudg.steps.synthesize:Adapt",
-    "synthesize": "mudg.steps.synthesize:Synthesize",
-    "render": "mudg.steps.render:RenderViews",
-    "score": "mudg.steps.render:Score",
-    "view": "mudg.steps.view:ViewScene",
-    "page": "mudg.steps.view:Page",
-    "serve": "mudg.steps.view:Serve",
-    "report": "mudg.steps.view:Report",
-    "edit": "mudg.steps.edit:Edit",
-    "asset export": "mudg.steps.edit:AssetExport",
-    "asset import": "mudg.steps.edit:AssetImport",
-    "export": "mudg.steps.export:Export",
-    "dataset": "mudg.steps.dataset:Dataset",
-    "batch run": "mudg.steps.batch:BatchRun",
-    "batch status": "mudg.steps.batch:BatchProgress",
-    "batch retry": "mudg.steps.batch:BatchRetry",
-    "bench": "mudg.benchmarks.step:Bench",
-    "convert": "mudg.steps.convert:Convert",
+_SECTIONS: Final[Mapping[str, Mapping[str, str]]] = {
+    "start here": {"demo": ".run:Demo", "run": ".run:Run", "doctor": ".doctor:Doctor"},
+    "single steps, in the order of use": {
+        "ingest": ".ingest:Ingest",
+        "annotate": ".ingest:Annotate",
+        "fuse": ".ingest:Fuse",
+        "learn": ".synthesize:Learn",
+        "fit": ".fit:Fit",
+        "adapt": ".synthesize:Adapt",
+        "synthesize": ".synthesize:Synthesize",
+        "render": ".render:RenderViews",
+        "score": ".render:Score",
+    },
+    "look at a drive": {
+        "view": ".view:ViewScene",
+        "page": ".view:Page",
+        "serve": ".view:Serve",
+        "report": ".view:Report",
+    },
+    "change a drive": {"edit": ".edit:Edit", "asset export": ".edit:AssetExport", "asset import": ".edit:AssetImport"},
+    "other programs": {"export": ".export:Export", "dataset": ".export:Dataset"},
+    "many drives": {
+        "batch run": ".batch:BatchRun",
+        "batch status": ".batch:BatchProgress",
+        "batch retry": ".batch:BatchRetry",
+    },
+    "benchmarks": {"bench": "..benchmarks.step:Bench"},
+    "published models": {"convert": ".export:Convert"},
 }
+"""Titles of the overview, and the verbs of each with their steps."""
+_HOMES: Final = {verb: home for homes in _SECTIONS.values() for verb, home in homes.items()}
 VERBS: Final = tuple(_HOMES)
 """Names of all verbs, in the order in which the overview lists them."""
 
@@ -43,15 +46,12 @@ VERBS: Final = tuple(_HOMES)
 def step_class(verb: str) -> type[Step]:
     """The step of a verb; KeyError for a name that is none."""
     module, _, name = _HOMES[verb].partition(":")
-    return getattr(importlib.import_module(module), name)
+    return getattr(importlib.import_module(module, __name__), name)
 
 
 def sections() -> Iterator[tuple[str, list[str]]]:
     """Titles of the overview, each with its verbs."""
-    by_title: dict[str, list[str]] = {}
-    for verb in VERBS:
-        by_title.setdefault(step_class(verb).section, []).append(verb)
-    yield from by_title.items()
+    return ((title, list(homes)) for title, homes in _SECTIONS.items())
 
 
 def groups() -> dict[str, list[str]]:

@@ -24,7 +24,6 @@ class BatchRun(Step):
     """Process a long list of logs, on this machine, Ray, Slurm or any scheduler, or go on with it."""
 
     verb_name = "batch run"
-    section = "many drives"
     examples = (
         "mudg batch run --list logs.txt --out runs --stages ingest annotate fuse --jobs 2",
         (
@@ -70,18 +69,9 @@ class BatchRun(Step):
         from mudg.steps import batching
 
         settings = batching.settings_of(self.preset, self.config, self.set)
-        return batching.run(
-            self.list,
-            self.out,
-            self.settings,
-            settings,
-            stage_lines(),
-            shard_text=self.shard,
-            wait=self.wait,
-            scratch=self.scratch,
-            take_over=self.take_over,
-            dry=self.dry_run,
-        )
+        how: dict[str, Any] = {"scratch": self.scratch, "take_over": self.take_over, "dry": self.dry_run}
+        how |= {"shard_text": self.shard, "wait": self.wait}
+        return batching.run(self.list, self.out, self.settings, settings, stage_lines(), **how)
 
 
 def stage_lines() -> dict[str, tuple[str, ...]]:
@@ -107,7 +97,6 @@ class BatchProgress(Step):
     """Show how far a batch is, what failed and what it took."""
 
     verb_name = "batch status"
-    section = "many drives"
     examples = ("mudg batch status runs --html --price 0.04",)
     out: Annotated[str, OUT]
     """Folder or address of a batch."""
@@ -128,7 +117,6 @@ class BatchRetry(Step):
     """Forget failures of a batch, so that the next run tries them again."""
 
     verb_name = "batch retry"
-    section = "many drives"
     examples = ("mudg batch retry runs --reason 5,137",)
     out: Annotated[str, OUT]
     """Folder or address of a batch."""

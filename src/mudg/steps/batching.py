@@ -19,7 +19,7 @@ from mudg.base import log
 from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.base.plain_yaml import parse_yaml
-from mudg.base.run_folder import refuse_overlaps
+from mudg.base.run_folder import refuse_overlap
 from mudg.fleet import engines, status
 from mudg.fleet.child import Stop
 from mudg.fleet.listed import exit_code
@@ -158,7 +158,7 @@ def _refuse_overlap(entries: Sequence[Entry], folder: BatchFolder, listed: str) 
     local = [entry for entry in entries if entry.source != CITY and "://" not in entry.source]
     read: dict[str, Path | str | None] = {f"source of {entry.name}": entry.source for entry in local}
     read["list"] = place if place is not None and place.is_file() else None
-    refuse_overlaps([out], read)
+    refuse_overlap(out, read)
 
 
 def show_status(out: str, html: bool = False, price: float = 0.0, every_s: float = 0.0) -> dict[str, Any]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import os
+import re
 import shutil
 import textwrap
 import typing
@@ -240,7 +241,7 @@ def _row(cls: type[Step], option: Option, whole: bool) -> list[str]:
         head = flag_name(f"{group}{dot}[no-]{last}") if option.default is True else head
     else:
         head = f"{head} {metavar or metavar_of(option.kind)}"
-    text = option.text if whole else _first_sentence(option.text)
+    text = option.text if whole else re.split(r"\. (?=[A-Z])", option.text, maxsplit=1)[0].rstrip(".")
     switch = "default: on" if option.default is True else ""
     default = switch if option.kind is bool else "" if position in ("first", "rest") else default_words(option.default)
     text = f"{text} ({default})" if default and "(not given:" not in text else text
@@ -248,13 +249,6 @@ def _row(cls: type[Step], option: Option, whole: bool) -> list[str]:
     body = textwrap.wrap(text, width - _FLAG_COLUMNS - 2, break_long_words=False, break_on_hyphens=False) or [""]
     first = [f"  {head}"] if len(head) > _FLAG_COLUMNS - 2 else [f"  {head:<{_FLAG_COLUMNS - 2}}  {body.pop(0)}"]
     return [*first, *(" " * (_FLAG_COLUMNS + 2) + line for line in body)]
-
-
-def _first_sentence(text: str) -> str:
-    for end in range(len(text)):
-        if text[end] == "." and text[end + 1 : end + 2] in ("", " ") and text[end + 2 : end + 3].isupper():
-            return text[:end]
-    return text.rstrip(".")
 
 
 def metavar_of(kind: Any) -> str:

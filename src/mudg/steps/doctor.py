@@ -29,7 +29,6 @@ if TYPE_CHECKING:
 class Doctor(Step):
     """Report what this machine offers, or check a scene or log for errors."""
 
-    section = "start here"
     examples = ("mudg doctor", "mudg doctor runs/kitti/scene", "mudg doctor --json")
     scene: Annotated[Path | None, Flag("[SCENE]", "first")] = None
     """Scene directory, folder of mudg run, or log in the custom format, to check (not given: report on this
@@ -178,16 +177,10 @@ def scene_size(scene: Scene, config: RunConfig | None = None) -> SceneSize:
     exact = scene.source.recipe is not None
     config = config or run_preset()
     cameras = [name for name in config.synthesize.cameras or (first.name,) if name in scene.cameras]
-    return SceneSize(
-        len(scene.frames),
-        sum(len(scene.frames_of(name)) for name in cameras),
-        first.width,
-        first.height,
-        points,
-        exact,
-        labelled=all("semantics" in frame.labels for frame in scene.frames),
-        adapts=not exact and not why_not(scene, replace(config.adapt, cameras=tuple(cameras))),
-    )
+    on_path = sum(len(scene.frames_of(name)) for name in cameras)
+    labelled = all("semantics" in frame.labels for frame in scene.frames)
+    adapts = not exact and not why_not(scene, replace(config.adapt, cameras=tuple(cameras)))
+    return SceneSize(len(scene.frames), on_path, first.width, first.height, points, exact, labelled, adapts)
 
 
 def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:

@@ -21,7 +21,6 @@ if TYPE_CHECKING:
 class Edit(Output):
     """Change a drive as an edit script says: remove, move, insert, change lanes, weather and light."""
 
-    section = "change a drive"
     examples = (
         "mudg edit runs/kitti edits.yaml --out runs/edited",
         "mudg edit runs/mudg_s edits.yaml --scene scenes/city --fused runs/fused --out runs/edited",
@@ -83,7 +82,6 @@ class AssetExport(Result):
     """Write one object of a fitted scene to a file that edit scripts can insert."""
 
     verb_name = "asset export"
-    section = "change a drive"
     examples = ("mudg asset export runs/kitti car-003 --out assets/van.safetensors",)
     result = "asset"
     source: Annotated[Path, RUN]
@@ -133,7 +131,6 @@ class AssetImport(Result):
     """Make an object, or a scene, of a file of Gaussians from another program."""
 
     verb_name = "asset import"
-    section = "change a drive"
     examples = ("mudg asset import van.ply --label van --length-m 5.2 --out assets/van.safetensors",)
     result = "asset"
     file: Annotated[Path, Flag("FILE", "first")]

@@ -27,7 +27,6 @@ def _dotted(values: Mapping[str, Any], path: str = "") -> Iterator[str]:
 class Fit(Watched):
     """Fit a dynamic 3D Gaussian scene to recorded (and virtual) views."""
 
-    section = "single steps, in the order of use"
     examples = (
         "mudg fit scenes/city --fused runs/fused --method street_gaussians --out runs/plain",
         "mudg fit scenes/city --fused runs/fused --observations runs/virtual --out runs/mudg_s",

@@ -34,7 +34,6 @@ OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolu
 class Ingest(Listed):
     """Convert a driving log, or the built-in city, to a scene directory."""
 
-    section = "single steps, in the order of use"
     examples = (
         "mudg ingest city scenes/city",
         "mudg ingest ~/kitti/2011_09_26_drive_0001_sync scenes/kitti --resolution 960",
@@ -122,7 +121,6 @@ class Ingest(Listed):
 class Annotate(Listed):
     """Add missing labels to a scene: semantics, sky and depth, with confidences."""
 
-    section = "single steps, in the order of use"
     examples = ("mudg annotate scenes/kitti --out scenes/kitti_labelled", "mudg annotate --list scenes --out labelled")
     smaller = "one process (--processes 1), or smaller images (mudg ingest --resolution)"
     result = "scene"
@@ -160,7 +158,6 @@ class Annotate(Listed):
 class Fuse(Listed):
     """Fuse LiDAR and images: a static coloured point cloud, one more per dynamic object."""
 
-    section = "single steps, in the order of use"
     examples = ("mudg fuse scenes/city --out runs/fused", "mudg fuse --list labelled --out fused --jobs 2")
     smaller = "larger voxels (--voxel-m), or a shorter log (mudg ingest --frames)"
     result = "fused"

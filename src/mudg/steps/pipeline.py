@@ -93,7 +93,9 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
         ledger.ahead = [*steps, "viewer", "report"]
         for name, step in steps.items():
             ledger.timed(name, step.out, step.run)
-        key = _report_key(out)
+        # what the page is made of: the scores (which name the views), the settings and the program
+        made_of = (store.sha256_file(out / name) for name in (f"score/{store.MANIFEST}", "run.yaml"))
+        key = " ".join([*made_of, version()])
         if not ledger.has_report(key):
             ledger.timed("viewer", out / "viewer.html", lambda: _write_viewer(out))
         reels = None if ledger.has_report(key) else ledger.timed("report", page, lambda: run_report.film(out))
@@ -103,7 +105,8 @@ def _run_locked(config: RunConfig, source: str | Path, out: Path, overwrite: boo
     except MudgError:
         ledger.save("failed")
         raise
-    ledger.digests = _digests(out)
+    names = sorted(path.parent.relative_to(out).as_posix() for path in out.rglob(store.MANIFEST))
+    ledger.digests = {name: store.sha256_file(out / name / store.MANIFEST) for name in names if ".part" not in name}
     ledger.save("complete")
     if reels is not None:  # written last, when the seconds of all steps are known
         run_report.write_page(out, reels)
@@ -273,17 +276,6 @@ def steps_of(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> dict
         "score": Score(scene=scene, views=views, fused=fused, out=out / "score", settings=config.score),
     }
     return {name: replace(step, overwrite=overwrite) for name, step in steps.items() if name != "adapt" or adapts}
-
-
-def _report_key(out: Path) -> str:
-    """What the page is made of: the scores (which name the views), the settings and the program."""
-    return f"{store.sha256_file(out / 'score' / store.MANIFEST)} {store.sha256_file(out / 'run.yaml')} {version()}"
-
-
-def _digests(out: Path) -> dict[str, str]:
-    """Hash of each artefact's manifest."""
-    names = sorted(path.parent.relative_to(out).as_posix() for path in out.rglob(store.MANIFEST))
-    return {name: store.sha256_file(out / name / store.MANIFEST) for name in names if ".part" not in name}
 
 
 def _closing_text(out: Path, source: str, report: Path, ledger: _Ledger) -> str:
@@ -474,13 +466,6 @@ class _Ledger:
         """Write OUT/run.json, and before the end the page of the unfinished run."""
         if state != "complete":
             self._show(state)
-        record = {
-            "schema": 1,
-            "state": state,
-            "asked": self._asked,
-            "steps": self._steps,
-            "digests": self.digests,
-            "report": self._report,
-            "environment": environment(),
-        }
+        record = {"schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "digests": self.digests}
+        record |= {"report": self._report, "environment": environment()}
         store.write_json(self._out / "run.json", store.with_check(record))

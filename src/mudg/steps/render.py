@@ -21,7 +21,6 @@ class RenderViews(Output):
     """Render RGB, depth and semantics of a fitted scene on shifted trajectories."""
 
     verb_name = "render"
-    section = "single steps, in the order of use"
     examples = (
         "mudg render scenes/city --model runs/mudg_s --shifts-m 0 3 -3 --out runs/render",
         "mudg render runs/kitti --shifts-m 2 --out x",
@@ -117,7 +116,6 @@ _FILES = (
 class Score(Output):
     """Compare views with ground truth: metrics, tables, error images."""
 
-    section = "single steps, in the order of use"
     examples = ("mudg score scenes/city --views mudg_s=runs/render mudg_r=runs/virtual --out runs/score",)
     smaller = "smaller views (--width-px), fewer --views"
     version = 7

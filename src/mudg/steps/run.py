@@ -16,7 +16,6 @@ if TYPE_CHECKING:
 class Run(Output):
     """Run all steps on your own driving log or scene and write a report page."""
 
-    section = "start here"
     examples = (
         "mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti",
         "mudg run scenes/a --out runs/a --preset quality",

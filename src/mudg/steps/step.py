@@ -14,18 +14,7 @@ import typing
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from pathlib import Path
-from typing import (
-    Annotated,
-    Any,
-    ClassVar,
-    Final,
-    Literal,
-    Self,
-    dataclass_transform,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, ClassVar, Final, Literal, Self, dataclass_transform, get_args, get_origin
 
 from mudg.base.errors import UsageError, nearest
 
@@ -67,7 +56,6 @@ class Step:
 
     verb_name: ClassVar[str] = ""
     """Its name on the command line, where that is not the class's."""
-    section: ClassVar[str] = ""
     examples: ClassVar[tuple[str, ...]] = ()
     smaller: ClassVar[str] = ""
     """The settings that make its work need less memory."""
@@ -129,7 +117,7 @@ class Step:
         """
         left, values, names = list(words), dict[str, Any](), positions(cls)
         for name in names:
-            kind, field = hint_of(cls, name), field_of(cls, name)
+            kind, field = hint_of(cls, name), cls.__dataclass_fields__[name]
             rest = flag_of(cls, name).position == "rest"
             if not left:
                 if field.default is MISSING and flag_of(cls, name).position in ("first", "rest"):
@@ -246,7 +234,7 @@ class _Settings(dict[str, Any]):
 @functools.cache
 def hints(cls: type[Any]) -> dict[str, Any]:
     """Types of the fields of a step or of settings, with their `Flag` where they have one."""
-    return get_type_hints(cls, localns=_Settings(), include_extras=True)
+    return typing.get_type_hints(cls, localns=_Settings(), include_extras=True)
 
 
 def hint_of(cls: type[Any], name: str) -> Any:
@@ -262,11 +250,6 @@ def flag_of(cls: type[Any], name: str) -> Flag:
 
 def _notes(kind: Any) -> tuple[Any, ...]:
     return get_args(kind)[1:] if get_origin(kind) is Annotated else ()
-
-
-def field_of(cls: type[Any], name: str) -> Any:
-    """The dataclass field of a name."""
-    return next(field for field in fields(cls) if field.name == name)
 
 
 def positions(cls: type[Any]) -> list[str]:

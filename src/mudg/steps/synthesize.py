@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 class Learn(Watched):
     """Train a diffusion model on generated cities, or fine-tune one on your own logs."""
 
-    section = "single steps, in the order of use"
     examples = (
         "mudg learn --out runs/mdm",
         "mudg learn --config recipe.yaml --out runs/mdm",
@@ -69,7 +68,6 @@ class Learn(Watched):
 class Adapt(Output):
     """Adapt the diffusion model to one recorded log, with the log's own photographs."""
 
-    section = "single steps, in the order of use"
     examples = (
         "mudg adapt scenes/kitti --fused runs/fused --fitted runs/plain --out runs/adapted",
         (
@@ -142,7 +140,6 @@ def fit_scene(settings: FitConfig, scene: Path, fused: Path | None, out: Path) -
 class Synthesize(Output):
     """Generate dense RGB, depth and semantics on laterally shifted trajectories."""
 
-    section = "single steps, in the order of use"
     examples = ("mudg synthesize scenes/city --fused runs/fused --shifts-m 2 -2 --out runs/virtual",)
     smaller = "one process (--processes 1), smaller views (--width-px), fewer --cameras and --shifts-m"
     result = "views"

@@ -16,7 +16,6 @@ class ViewScene(Step):
     """Show a fitted scene in a browser, with exact frames from the rasterizer."""
 
     verb_name = "view"
-    section = "look at a drive"
     examples = (
         "mudg view runs/kitti",
         "mudg view runs/a runs/b",
@@ -47,7 +46,6 @@ class ViewScene(Step):
 class Page(Step):
     """Write a fitted scene as one HTML page: fly through it, any layer, any time, without a network."""
 
-    section = "look at a drive"
     result = "page"
     examples = (
         "mudg page runs/kitti --out kitti.html",
@@ -77,7 +75,6 @@ class Page(Step):
 class Report(Step):
     """Write one page over many finished runs: pictures, links, and a table of all scores to sort and filter."""
 
-    section = "look at a drive"
     result = "page"
     examples = ("mudg report runs/kitti runs/city --out runs.html", "mudg report runs --out runs.html")
     runs: Annotated[tuple[Path, ...], Flag("RUN ...", "rest")]
@@ -96,7 +93,6 @@ class Report(Step):
 class Serve(Step):
     """Serve a fitted scene to driving simulators over gRPC, as a renderer of cameras and LiDAR."""
 
-    section = "look at a drive"
     examples = ("mudg serve runs/kitti --port 50051", "mudg serve runs/kitti --edits cut_in.yaml --metrics-port 9100")
     source: Annotated[Path, RUN]
     """Folder of a finished mudg run, or Gaussian scene written by fit."""
