@@ -417,7 +417,7 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     root, drive = _find(source, options)
     images_folder, raw_folder = root / "data_2d_raw" / drive, root / "data_3d_raw" / drive
     calibration = read_calibration(root / "calibration")
-    images = {}
+    images: dict[str, dict[int, Path]] = {}
     for name in CAMERAS:
         folder = images_folder / name / ("data_rect" if name in USUAL else "data_rgb")
         images[name] = common.numbered_files(folder, (".png", ".jpg"))
