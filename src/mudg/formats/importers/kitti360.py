@@ -45,7 +45,6 @@ from mudg.base.geometry import from_rotation_translation, invert, transform_poin
 from mudg.base.palette import UNLABELLED
 from mudg.base.types import Camera, EgoPath, Scene, Source, SweepPoints, Track
 from mudg.formats.importers import common
-from mudg.formats.importers import kitti_files as kitti_poses
 from mudg.formats.importers.clouds import read_float_rows
 from mudg.formats.importers.common import ImportOptions, LogFiles, name_table
 from mudg.formats.importers.drive_log import BoxTracks, SceneContent, SceneImage, SceneSweep, write_scene
@@ -54,8 +53,12 @@ from mudg.formats.importers.kitti_files import (
     SENSOR,
     line_numbers,
     pinhole_camera,
+    pose_entry,
+    read_lines,
     read_number_table,
     read_scan,
+    read_timestamps,
+    rotation_entry,
     table_entry,
 )
 from mudg.formats.unknown_fields import note_unknown
@@ -95,13 +98,9 @@ _MAX_SHEAR: Final = 0.05
 class Kitti360Box:
     """One box in the data set's world.
 
-    Args:
-        object_id: the same for all boxes of an object.
-        label: class as in ``LABEL_OF``.
-        frame: frame number of a box that moves; -1 for an object that stands.
-        window: first and last frame of the part of the drive the box was drawn in.
-        size_m: length, width, height.
-        world_from_box: f64[4, 4], x forward, y left, z up, origin in the centre.
+    ``label``: class as in ``LABEL_OF``. ``frame``: number of a box that moves; -1 for an object that stands.
+    ``window``: first and last frame of the part of the drive the box was drawn in. ``size_m``: length, width, height.
+    ``world_from_box``: f64[4, 4], x forward, y left, z up, origin in the centre.
     """
 
     object_id: str
@@ -124,7 +123,10 @@ def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
         if item.find("transform") is None:
             continue
         note_unknown(path.name, [field.tag for field in item], _OFFICIAL)
-        label = _label(item, where)
+        if item.find("semanticId") is not None:
+            label = LABEL_OF_ID.get(_integer(item, "semanticId", where), "")
+        else:  # words are told apart by capital letters only
+            label = re.sub("([A-Z])", r" \1", item.findtext("label", "").strip()).lower().strip()
         if label not in LABEL_OF:
             left_out["of classes that do not move"] += 1
             continue
@@ -138,35 +140,44 @@ def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
             window = (_integer(item, "start_frame", where), _integer(item, "end_frame", where))
         else:
             window = (0, 2**31) if frame < 0 else (frame, frame)
-        yield Kitti360Box(_object_id(item, frame, where), label, frame, window, size_m, pose)
+        if item.find("instanceId") is not None and item.find("semanticId") is not None:
+            name = f"{_integer(item, 'semanticId', where)}-{_integer(item, 'instanceId', where)}"
+        elif frame >= 0 and item.find("dynamicSeq") is not None:
+            name = f"d-{_integer(item, 'dynamicSeq', where)}"
+        else:
+            name = f"i-{_integer(item, 'index', where)}"
+        yield Kitti360Box(name, label, frame, window, size_m, pose)
 
 
 def _objects(path: Path) -> Iterator[ElementTree.Element]:
     """The children of the top element, each freed after use."""
     parser = ElementTree.XMLPullParser(("start", "end"))
-    depth = 0
-    top: ElementTree.Element | None = None
+    open_elements: list[ElementTree.Element] = []
     tail = b""
     try:
         if path.stat().st_size > MAX_FILE_BYTES:
             raise InputError("box file is too large", where=str(path), expected=f"<= {MAX_FILE_BYTES} bytes")
         with store.open_file(path) as handle:
             while chunk := handle.read(_CHUNK):
-                _refuse_entities(tail + chunk, str(path), first=not tail)
+                # entities can blow a small file up; other encodings could hide them from this look
+                content, head = tail + chunk, b"" if tail else chunk[:200].lower()
+                other = b"encoding" in head and b"utf-8" not in head and b"ascii" not in head
+                if other or any(word in content for word in (b"<!ENTITY", b"<!DOCTYPE", b"\0")):
+                    what = "box file declares a document type, entities or another encoding"
+                    what, remedy = f"{what}, which the data set's files do not", "use the file from the data set"
+                    raise InputError(what, where=str(path), remedy=remedy)
                 tail = chunk[-16:]
                 parser.feed(chunk)
                 events: Iterator[Any] = parser.read_events()
                 for event, element in events:
                     if event == "start":
-                        depth += 1
-                        top = element if depth == 1 else top
-                    else:
-                        depth -= 1
-                        if depth == 1:
-                            yield element
-                            element.clear()
-                            if top is not None:
-                                top.clear()
+                        open_elements.append(element)
+                        continue
+                    open_elements.pop()
+                    if len(open_elements) == 1:
+                        yield element
+                        element.clear()
+                        open_elements[0].clear()
         parser.close()
     except FileNotFoundError as error:
         raise InputError("box file does not exist", where=str(path)) from error
@@ -174,30 +185,6 @@ def _objects(path: Path) -> Iterator[ElementTree.Element]:
         raise InputError("box file cannot be read", where=str(path), got=str(error)) from error
     except ElementTree.ParseError as error:
         raise InputError("box file is not valid XML (is it cut off?)", where=str(path), got=str(error)) from error
-
-
-def _refuse_entities(content: bytes, where: str, first: bool) -> None:
-    """Entities can blow a small file up; other encodings could hide them from this look."""
-    head = content[:200].lower()
-    other = first and b"encoding" in head and not any(name in head for name in (b"utf-8", b"ascii"))
-    if b"<!ENTITY" in content or b"<!DOCTYPE" in content or b"\0" in content or other:
-        what = "box file declares a document type, entities or another encoding, which the data set's files do not"
-        raise InputError(what, where=where, remedy="use the file from the data set")
-
-
-def _label(item: ElementTree.Element, where: str) -> str:
-    if item.find("semanticId") is not None:
-        return LABEL_OF_ID.get(_integer(item, "semanticId", where), "")
-    text = (item.findtext("label") or "").strip()
-    return "".join(f" {letter.lower()}" if letter.isupper() else letter for letter in text).strip()
-
-
-def _object_id(item: ElementTree.Element, frame: int, where: str) -> str:
-    if item.find("instanceId") is not None and item.find("semanticId") is not None:
-        return f"{_integer(item, 'semanticId', where)}-{_integer(item, 'instanceId', where)}"
-    if frame >= 0 and item.find("dynamicSeq") is not None:
-        return f"d-{_integer(item, 'dynamicSeq', where)}"
-    return f"i-{_integer(item, 'index', where)}"
 
 
 def _integer(item: ElementTree.Element, key: str, where: str) -> int:
@@ -212,17 +199,18 @@ def _matrix(item: ElementTree.Element, key: str, where: str) -> Matrix:
     node = item.find(key)
     if node is None:
         raise InputError(f"box has no {key}", where=where)
-    rows, columns = _integer(node, "rows", f"{where}.{key}"), _integer(node, "cols", f"{where}.{key}")
-    texts = (node.findtext("data") or "").split()
+    where = f"{where}.{key}"
+    rows, columns = _integer(node, "rows", where), _integer(node, "cols", where)
+    texts = node.findtext("data", "").split()
     if rows * columns != len(texts) or not 0 < rows * columns <= _MAX_VALUES:
-        what, where = "matrix does not have the size it declares", f"{where}.{key}"
-        raise InputError(what, where=where, expected=f"{rows} x {columns} numbers", got=f"{len(texts)} values")
+        what, expected = "matrix does not have the size it declares", f"{rows} x {columns} numbers"
+        raise InputError(what, where=where, expected=expected, got=f"{len(texts)} values")
     try:
         values = np.array([float(text) for text in texts])
     except ValueError as error:
-        raise InputError("matrix holds no number", where=f"{where}.{key}", got=str(error)) from error
+        raise InputError("matrix holds no number", where=where, got=str(error)) from error
     if not np.isfinite(values).all():
-        raise InputError("matrix holds a value that is not finite", where=f"{where}.{key}")
+        raise InputError("matrix holds a value that is not finite", where=where)
     return values.reshape(rows, columns)
 
 
@@ -319,22 +307,16 @@ def read_calibration(folder: Path) -> Kitti360Calibration:
     Raises:
         InputError: a file or entry is missing, or a matrix is not a rigid motion.
     """
-    path = folder / "calib_cam_to_pose.txt"
+    path, perspective, sick = (
+        folder / f"{name}.txt" for name in ("calib_cam_to_pose", "perspective", "calib_sick_to_velo")
+    )
     table = read_number_table(path)
-    imu_from_camera = {
-        name: common.rigid_pose(table_entry(table, (name,), (3, 4), path), f"{path}: {name}")
-        for name in ("image_00", "image_01", "image_02", "image_03")
-        if name == "image_00" or name in table
-    }
+    imu_from_camera = {n: pose_entry(table, (n,), path) for n in CAMERAS if n == "image_00" or n in table}
     imu_from_velo = imu_from_camera["image_00"] @ invert(_rigid_file(folder / "calib_cam_to_velo.txt"))
-    perspective = folder / "perspective.txt"
     numbers = read_number_table(perspective)
-    for name in ("image_00", "image_01"):
-        if name in imu_from_camera:
-            where = f"{perspective}: R_rect_{name[-2:]}"
-            rectify = common.rigid_rotation(table_entry(numbers, (f"R_rect_{name[-2:]}",), (3, 3), perspective), where)
-            imu_from_camera[name] = imu_from_camera[name] @ from_rotation_translation(rectify.T, np.zeros(3))
-    sick, ego_from_imu = folder / "calib_sick_to_velo.txt", invert(IMU_FROM_EGO)
+    for name in (name for name in USUAL if name in imu_from_camera):
+        imu_from_camera[name] @= invert(rotation_entry(numbers, (f"R_rect_{name[-2:]}",), perspective))
+    ego_from_imu = invert(IMU_FROM_EGO)
     ego_from_camera = {name: ego_from_imu @ pose for name, pose in imu_from_camera.items()}
     velo_from_sick, rect0 = _rigid_file(sick) if sick.is_file() else None, imu_from_camera["image_00"]
     return Kitti360Calibration(folder, ego_from_camera, ego_from_imu @ imu_from_velo, velo_from_sick, rect0)
@@ -392,28 +374,6 @@ unlabelled."""
 _LAST_ID: Final = 44
 
 
-@dataclass(frozen=True, slots=True)
-class _Folders:
-    """The data set's folder and the drive."""
-
-    root: Path
-    drive: str
-
-    def images(self, camera: str) -> Path:
-        return self.root / "data_2d_raw" / self.drive / camera / ("data_rect" if camera in USUAL else "data_rgb")
-
-    def raw(self, sensor: str) -> Path:
-        return self.root / "data_3d_raw" / self.drive / sensor
-
-    def semantics(self, camera: str, kind: str, number: int) -> Path:
-        return self.root / "data_2d_semantics" / "train" / self.drive / camera / kind / f"{number:010d}.png"
-
-    def boxes(self) -> tuple[Path, Path]:
-        """Where boxes may be, the better first."""
-        folder = self.root / "data_3d_bboxes"
-        return folder / "train_full" / f"{self.drive}.xml", folder / "train" / f"{self.drive}.xml"
-
-
 def looks_like_kitti360(source: Path) -> bool:
     """Whether ``source`` is the data set's folder, or a drive's in its ``data_2d_raw``."""
     if not source.is_dir():
@@ -422,23 +382,61 @@ def looks_like_kitti360(source: Path) -> bool:
     return (root / "data_2d_raw").is_dir() and (root / "calibration" / "calib_cam_to_pose.txt").is_file()
 
 
+def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
+    """The calibration and the parts of the chosen drive."""
+    root, drive = _find(source, options)
+    parts = [root / "calibration", *(root / name / drive for name in ("data_2d_raw", "data_3d_raw", "data_poses"))]
+    parts += [root / "data_2d_semantics" / "train" / drive, *_box_files(root, drive)]
+    return LogFiles(tuple(part for part in parts if part.exists()))
+
+
+def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
+    """The data set's folder and the drive."""
+    if not source.is_dir():
+        raise InputError("KITTI-360 folder does not exist", where=str(source), expected="a folder")
+    if source.absolute().parent.name == "data_2d_raw":
+        return source.absolute().parent.parent, source.absolute().name
+    raw = source / "data_2d_raw"
+    if not raw.is_dir():
+        what, got = "no KITTI-360 recording found", common.folder_contents(source)
+        raise InputError(what, where=str(source), got=got, expected="data_2d_raw, data_poses and calibration in it")
+    drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
+    wanted = options.sequence
+    matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
+    return source, common.the_only(matching, drives, options, raw, "drive")
+
+
+def _box_files(root: Path, drive: str) -> list[Path]:
+    """Where boxes may be, the better first."""
+    return [root / "data_3d_bboxes" / name / f"{drive}.xml" for name in ("train_full", "train")]
+
+
 def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import one drive of the data set's folder, or ``data_2d_raw/<drive>`` in it. ``options.sequence``: the drive
     (``2013_05_28_drive_0000_sync``, or ``0000``); ``cameras`` default to the stereo pair."""
-    folders = _find(source, options)
-    calibration = read_calibration(folders.root / "calibration")
-    images = {name: common.numbered_files(folders.images(name), (".png", ".jpg")) for name in CAMERAS}
+    root, drive = _find(source, options)
+    images_folder, raw_folder = root / "data_2d_raw" / drive, root / "data_3d_raw" / drive
+    calibration = read_calibration(root / "calibration")
+    images: dict[str, dict[int, Path]] = {}
+    for name in CAMERAS:
+        folder = images_folder / name / ("data_rect" if name in USUAL else "data_rgb")
+        images[name] = common.numbered_files(folder, (".png", ".jpg"))
     available = {name: ours for name, ours in CAMERAS.items() if images[name] and name in calibration.ego_from_camera}
-    chosen = common.chosen_cameras(available, options, str(folders.root / "data_2d_raw" / folders.drive), USUAL)
-    scans = common.numbered_files(folders.raw("velodyne_points") / "data", (".bin",))
+    chosen = common.chosen_cameras(available, options, str(images_folder), USUAL)
+    scans = common.numbered_files(raw_folder / "velodyne_points" / "data", (".bin",))
     streams = {**{name: images[name] for name in chosen}, **({SENSOR: scans} if scans else {})}
     notes: list[str] = []
-    clock = _clock(folders, streams, notes)
-    poses = _find_poses(folders, options)
+    clock = _clock(raw_folder / "velodyne_points", images_folder / "image_00", streams, notes)
+    here = root / "data_poses" / drive
+    poses = common.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
+    if poses is None:
+        where, expected = str(options.poses or here), "poses.txt or cam0_to_world.txt"
+        remedy = "download the data set's vehicle poses"
+        raise InputError("no vehicle poses found", where=where, expected=expected, remedy=remedy)
     notes.append(f"poses from {poses.name}")
     ego = common.mended_path(_read_motion(poses, calibration, clock), options, notes)
     placed = {name: [n for n in found if _has_pose(ego, clock[n])] for name, found in streams.items()}
-    frames = common.complete_frames(placed, options, str(folders.root), "kitti360")
+    frames = common.complete_frames(placed, options, str(root), "kitti360")
     begin, end = options.frames or (0, 2**63)
     lost = {n for found in streams.values() for n in found if begin <= n < end}.difference(*placed.values())
     if lost:
@@ -447,7 +445,7 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
     first = common.pose_near(ego, clock[frames[0]])
     world_from_source = common.world_from_first(first)
     notes.append(common.origin_note(first))
-    scene_s = common.seconds(clock[frames], "s", f"{folders.root}: timestamps of {folders.drive}", start_s)
+    scene_s = common.seconds(clock[frames], "s", f"{root}: timestamps of {drive}", start_s)
     ego = EgoPath(ego.times_s - start_s, world_from_source @ ego.world_from_ego)
     fits = {CAMERAS[n]: calibration.fit(n, CAMERAS[n], image_size(images[n][frames[0]]), options) for n in chosen}
     untwist = bool(scans) and options.untwist != "no"
@@ -457,97 +455,69 @@ def import_kitti360(source: Path, out: Path, options: ImportOptions) -> Scene:
         notes.append("scans untwisted: clockwise turn of 0.1 s, forward at the frame's moment")
     notes += image_notes(fits)
     notes.append(f"source frames {frames[0]} to {frames[-1]} are frames 0 to {len(frames) - 1} here")
-    sick = _SickLines.find(folders, calibration, ego, start_s, notes)
-    tracks = _read_tracks(folders, options, dict(zip(frames, scene_s, strict=True)), world_from_source, notes)
+    sick_files, sick_s = _sick_lines(raw_folder / "sick_points", calibration, notes)
+    boxes = options.boxes or common.first_file(*_box_files(root, drive))
+    tracks = _read_tracks(boxes, dict(zip(frames, scene_s, strict=True)), world_from_source, notes)
+
+    def world_from_velo(time_s: float) -> Matrix:
+        return common.pose_near(ego, time_s) @ calibration.ego_from_velo
 
     def convert(index: int) -> Iterable[SceneImage | SceneSweep]:
         number, time_s = frames[index], float(scene_s[index])
-        world_from_ego = common.pose_near(ego, time_s)
         for name in chosen:
-            world_from_cam = world_from_ego @ calibration.ego_from_camera[name]
-            path, labels = images[name][number], _labels(folders, name, number, fits[CAMERAS[name]])
+            world_from_cam = common.pose_near(ego, time_s) @ calibration.ego_from_camera[name]
+            path, semantics = images[name][number], root / "data_2d_semantics" / "train" / drive / name
+            labels = _labels(semantics, f"{number:010d}.png", fits[CAMERAS[name]])
             yield SceneImage(CAMERAS[name], index, time_s, world_from_cam, path, str(path), labels)
         if number in scans:
             points = read_scan(scans[number])
-            if untwist:
-                points = _untwisted(points, ego, calibration, time_s)
-            world_from_velo = world_from_ego @ calibration.ego_from_velo
-            yield SceneSweep(SENSOR, index, time_s, world_from_velo, points, str(scans[number]))
-        if sick is not None:
-            yield from sick.sweeps(index, time_s)
+            if untwist:  # a point at azimuth a was measured a / 2 pi turns before the frame's moment
+                azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
+                dt_s = (-azimuth / (2 * np.pi) * FRAME_PERIOD_S).astype(np.float32)
+                points = replace(points, xyz=common.deskew(points.xyz, dt_s, world_from_velo, time_s), dt_s=dt_s)
+            yield SceneSweep(SENSOR, index, time_s, world_from_velo(time_s), points, str(scans[number]))
+        if calibration.velo_from_sick is not None:
+            mount = calibration.ego_from_velo @ calibration.velo_from_sick
+            yield from _sick_sweeps(sick_files, sick_s - start_s, ego, mount, index, time_s)
 
     origin = Source("kitti360", LICENCE, None, tuple(notes))
     path = EgoPath(scene_s, np.stack([common.pose_near(ego, float(time_s)) for time_s in scene_s]))
     items = range(len(frames))
     content = SceneContent(
-        folders.drive, origin, fits, items, convert, lambda n: f"frame {frames[n]}", path, lambda: (tracks, ())
+        drive, origin, fits, items, convert, lambda n: f"frame {frames[n]}", path, lambda: (tracks, ())
     )
     return write_scene(content, out, options)
-
-
-def _find(source: Path, options: ImportOptions) -> _Folders:
-    if not source.is_dir():
-        raise InputError("KITTI-360 folder does not exist", where=str(source), expected="a folder")
-    if source.absolute().parent.name == "data_2d_raw":
-        return _Folders(source.absolute().parent.parent, source.absolute().name)
-    raw = source / "data_2d_raw"
-    if not raw.is_dir():
-        what, got = "no KITTI-360 recording found", common.folder_contents(source)
-        raise InputError(what, where=str(source), got=got, expected="data_2d_raw, data_poses and calibration in it")
-    drives = sorted(path.name for path in raw.iterdir() if path.is_dir())
-    wanted = options.sequence
-    matching = [d for d in drives if not wanted or d == wanted or d.removesuffix("_sync").endswith(f"_{wanted}")]
-    return _Folders(source, common.the_only(matching, drives, options, raw, "drive"))
-
-
-def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
-    """The calibration and the parts of the chosen drive."""
-    folders = _find(source, options)
-    root, drive = folders.root, folders.drive
-    parts = [root / "calibration", *(root / name / drive for name in ("data_2d_raw", "data_3d_raw", "data_poses"))]
-    parts += [root / "data_2d_semantics" / "train" / drive, *folders.boxes()]
-    return LogFiles(tuple(part for part in parts if part.exists()))
 
 
 # --- time and motion ------------------------------------------------------------------------------
 
 
-def _clock(folders: _Folders, streams: Mapping[str, Mapping[int, Path]], notes: list[str]) -> NDArray[np.float64]:
+def _clock(
+    velodyne: Path, camera: Path, streams: Mapping[str, Mapping[int, Path]], notes: list[str]
+) -> NDArray[np.float64]:
     """Seconds by frame number, NaN where there is no stamp: the velodyne's, else camera 0's, else 10 Hz."""
     last = max(max(found) for found in streams.values())
-    for path, files in (
-        (folders.raw("velodyne_points") / "timestamps.txt", streams.get(SENSOR, {})),
-        (folders.root / "data_2d_raw" / folders.drive / "image_00" / "timestamps.txt", streams.get("image_00", {})),
-    ):
-        if path.is_file():
-            return _stamps(path, files, last)
+    for folder, files in ((velodyne, streams.get(SENSOR, {})), (camera, streams.get("image_00", {}))):
+        if (folder / "timestamps.txt").is_file():
+            return _stamps(folder / "timestamps.txt", files, last)
     notes.append("no timestamps in the source: 10 Hz assumed")
     return np.arange(last + 1, dtype=np.float64) * FRAME_PERIOD_S
 
 
 def _stamps(path: Path, files: Mapping[int, Path], last: int) -> NDArray[np.float64]:
     """Seconds by number, f64[last + 1] or more; NaN where there is no stamp."""
-    stamps = kitti_poses.read_timestamps(path, list(files), last)
+    stamps = read_timestamps(path, list(files), last)
     times = np.full(max(last, *stamps, 0) + 1, np.nan)
     times[list(stamps)] = list(stamps.values())
     return times
 
 
-def _find_poses(folders: _Folders, options: ImportOptions) -> Path:
-    here = folders.root / "data_poses" / folders.drive
-    path = common.first_file(*([options.poses] if options.poses else [here / "poses.txt", here / "cam0_to_world.txt"]))
-    if path is None:
-        expected, remedy = "poses.txt or cam0_to_world.txt", "download the data set's vehicle poses"
-        raise InputError("no vehicle poses found", where=str(options.poses or here), expected=expected, remedy=remedy)
-    return path
-
-
 def _read_motion(path: Path, calibration: Kitti360Calibration, clock: NDArray[np.float64]) -> EgoPath:
     """The vehicle at the frames that have a pose, in the data set's world and clock."""
     numbers, poses, before = [], [], -1
-    for index, line in kitti_poses.read_lines(path).items():
+    for index, line in read_lines(path).items():
         where = f"{path}: line {index + 1}"
-        row = kitti_poses.line_numbers(line, (13, 17), where, "pose")
+        row = line_numbers(line, (13, 17), where, "pose")
         number = int(row[0])
         if number != row[0] or number <= before:
             what = "first column is not a list of growing frame numbers"
@@ -580,74 +550,55 @@ def _has_pose(ego: EgoPath, time_s: float) -> bool:
     return bool(np.linalg.norm(moved) < GAP_M)
 
 
-def _untwisted(points: SweepPoints, ego: EgoPath, calibration: Kitti360Calibration, time_s: float) -> SweepPoints:
-    """A scan as seen at its frame's moment: a point at azimuth a was measured a / 2 pi turns before it."""
-    azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
-    dt_s = (-azimuth / (2 * np.pi) * FRAME_PERIOD_S).astype(np.float32)
-    xyz = common.deskew(points.xyz, dt_s, lambda t: common.pose_near(ego, t) @ calibration.ego_from_velo, time_s)
-    return replace(points, xyz=xyz, dt_s=dt_s)
-
-
 # --- SICK lines -----------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _SickLines:
-    """Line scans beside the frames: files, their times in the scene's clock, and where the scanner sits."""
-
-    files: Mapping[int, Path]
-    times_s: NDArray[np.float64]
-    ego_from_sick: Matrix
-    ego: EgoPath
-
-    @classmethod
-    def find(
-        cls, folders: _Folders, calibration: Kitti360Calibration, ego: EgoPath, start_s: float, notes: list[str]
-    ) -> _SickLines | None:
-        files = common.numbered_files(folders.raw("sick_points") / "data", (".bin",))
-        stamps = folders.raw("sick_points") / "timestamps.txt"
-        if not files:
-            return None
-        if calibration.velo_from_sick is None or not stamps.is_file():
-            notes.append("SICK lines were left out: calib_sick_to_velo.txt or their timestamps.txt is missing")
-            return None
-        times = _stamps(stamps, files, max(files)) - start_s
-        return cls(files, times, calibration.ego_from_velo @ calibration.velo_from_sick, ego)
-
-    def sweeps(self, index: int, time_s: float) -> Iterable[SceneSweep]:
-        """The lines within half a frame of frame ``index`` as one sweep, brought to that moment; none without lines."""
-        pose = common.pose_near(self.ego, time_s) @ self.ego_from_sick
-        parts, delays, no_returns = [], [], 0
-        for number in np.flatnonzero(np.abs(self.times_s - time_s) < _SICK_REACH_S):
-            late = float(self.times_s[number] - time_s)
-            nearer = late >= FRAME_PERIOD_S / 2 or late < -FRAME_PERIOD_S / 2
-            if int(number) not in self.files or nearer:
-                continue
-            line, without = _read_line(self.files[int(number)])
-            no_returns += without
-            parts.append(
-                transform_points(invert(pose) @ common.pose_near(self.ego, time_s + late) @ self.ego_from_sick, line)
-            )
-            delays.append(np.full(len(line), late, np.float32))
-        xyz = np.concatenate(parts or [np.zeros((0, 3), np.float32)])
-        if len(xyz):
-            points = SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.concatenate(delays), no_returns=no_returns)
-            yield SceneSweep(SICK, index, time_s, pose, points)
+def _sick_lines(
+    folder: Path, calibration: Kitti360Calibration, notes: list[str]
+) -> tuple[Mapping[int, Path], NDArray[np.float64]]:
+    """Line scans beside the frames and their times by number; none where it is not known when or where they were
+    measured."""
+    files, stamps = common.numbered_files(folder / "data", (".bin",)), folder / "timestamps.txt"
+    if files and calibration.velo_from_sick is not None and stamps.is_file():
+        return files, _stamps(stamps, files, max(files))
+    if files:
+        notes.append("SICK lines were left out: calib_sick_to_velo.txt or their timestamps.txt is missing")
+    return {}, np.zeros(0)
 
 
-def _read_line(path: Path) -> tuple[NDArray[np.float32], int]:
-    """One SICK line f32[N, 3] from pairs in the scanner's plane (as the data set's reader); beams without return."""
-    pairs, returns = read_float_rows(path, 2, "SICK line", axes=2)
-    pairs = pairs[returns]
-    return np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1), int((~returns).sum())
+def _sick_sweeps(
+    files: Mapping[int, Path],
+    times_s: NDArray[np.float64],
+    ego: EgoPath,
+    ego_from_sick: Matrix,
+    index: int,
+    time_s: float,
+) -> Iterable[SceneSweep]:
+    """The lines within half a frame of frame ``index`` as one sweep, brought to that moment; none without lines."""
+    pose = common.pose_near(ego, time_s) @ ego_from_sick
+    parts, delays, no_returns = [], [], 0
+    for number in np.flatnonzero(np.abs(times_s - time_s) < _SICK_REACH_S).tolist():
+        late = float(times_s[number] - time_s)
+        if number not in files or not -FRAME_PERIOD_S / 2 <= late < FRAME_PERIOD_S / 2:  # nearer to another frame
+            continue
+        # pairs in the scanner's plane, as the data set's reader has them
+        pairs, returns = read_float_rows(files[number], 2, "SICK line", axes=2)
+        no_returns, pairs = no_returns + int((~returns).sum()), pairs[returns]
+        line = np.stack([np.zeros(len(pairs), np.float32), -pairs[:, 0], pairs[:, 1]], 1)
+        parts.append(transform_points(invert(pose) @ common.pose_near(ego, time_s + late) @ ego_from_sick, line))
+        delays.append(np.full(len(line), late, np.float32))
+    xyz = np.concatenate(parts or [np.zeros((0, 3), np.float32)])
+    if len(xyz):
+        points = SweepPoints(xyz, np.zeros(len(xyz), np.float32), np.concatenate(delays), no_returns=no_returns)
+        yield SceneSweep(SICK, index, time_s, pose, points)
 
 
 # --- labels and boxes -----------------------------------------------------------------------------
 
 
-def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[str, NDArray[Any]]:
+def _labels(folder: Path, name: str, fit: ImageFit) -> dict[str, NDArray[Any]]:
     """Semantics and their confidence, where the data set has them."""
-    path = folders.semantics(camera, "semantic", number)
+    path = folder / "semantic" / name
     if not path.is_file():
         return {}
     ids = _grey(path)
@@ -657,7 +608,7 @@ def _labels(folders: _Folders, camera: str, number: int, fit: ImageFit) -> dict[
     table = np.full(256, UNLABELLED, np.uint8)
     table[list(_TRAIN_IDS)] = list(_TRAIN_IDS.values())
     labels: dict[str, NDArray[Any]] = {"semantics": fit.ids(table[ids])}
-    path = folders.semantics(camera, "confidence", number)
+    path = folder / "confidence" / name
     if path.is_file():
         grey = _grey(path)
         scale = np.float32(255 if grey.dtype == np.uint8 else 65535)
@@ -679,10 +630,9 @@ def _grey(path: Path) -> NDArray[Any]:
 
 
 def _read_tracks(
-    folders: _Folders, options: ImportOptions, time_of: Mapping[int, float], world_from_source: Matrix, notes: list[str]
+    path: Path | None, time_of: Mapping[int, float], world_from_source: Matrix, notes: list[str]
 ) -> list[Track]:
     """Tracks within the imported frames: moving boxes at their frames, standing ones over their windows."""
-    path = options.boxes or common.first_file(*folders.boxes())
     if path is None:
         notes.append("no boxes found: everything counts as static")
         return []

@@ -1,5 +1,4 @@
-"""KITTI vehicle poses: GPS/IMU packets (``oxts``), odometry pose files, velodyne pose files; and the clocks beside
-them."""
+"""KITTI's files: scans, calibrations, poses, times and boxes."""
 
 from __future__ import annotations
 
@@ -19,7 +18,7 @@ from mudg.base.errors import InputError
 from mudg.base.geometry import from_rotation_translation, invert, yaw_matrix, yaw_of
 from mudg.base.types import Camera, SweepPoints, Track
 from mudg.formats.importers.clouds import read_float_rows
-from mudg.formats.importers.common import blend_motion, rigid_pose, rigid_rotation, unit_intensity
+from mudg.formats.importers.common import blend_motion, numbered_files, rigid_pose, rigid_rotation, unit_intensity
 from mudg.formats.importers.drive_log import BoxTracks, box_size
 from mudg.formats.unknown_fields import note_unknown
 
@@ -39,16 +38,9 @@ def read_scan(path: Path) -> SweepPoints:
         InputError: cut off, values that are not finite, or a reflectance outside of 0..1.
     """
     rows, returns = read_float_rows(path, 4)
-    rows = rows[returns]
-    dt_s = np.zeros(len(rows), np.float32)
-    no_returns = int((~returns).sum())
-    intensity = unit_intensity(rows[:, 3], 1, path, "divide the reflectance by its largest value, often 255")
-    return SweepPoints(np.ascontiguousarray(rows[:, :3]), intensity, dt_s, no_returns=no_returns)
-
-
-def azimuth_delay_s(azimuth_rad: float | NDArray[np.floating]) -> float | NDArray[np.floating]:
-    """Seconds from looking forward to looking to ``azimuth_rad`` (counter-clockwise from forward, -pi..pi)."""
-    return azimuth_rad / (2 * np.pi) * TURN_PERIOD_S
+    xyz, dt_s = np.ascontiguousarray(rows[returns, :3]), np.zeros(int(returns.sum()), np.float32)
+    intensity = unit_intensity(rows[returns, 3], 1, path, "divide the reflectance by its largest value, often 255")
+    return SweepPoints(xyz, intensity, dt_s, no_returns=int((~returns).sum()))
 
 
 def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s: float) -> SweepPoints:
@@ -56,7 +48,7 @@ def untwist_scan(points: SweepPoints, velo_at: Callable[[float], Matrix], time_s
     seconds after it at which they were measured. ``velo_at``: world-from-velodyne f64[4, 4] at a time; asked at 37
     moments of the turn, between which points are blended."""
     azimuth = np.arctan2(points.xyz[:, 1], points.xyz[:, 0])
-    dt_s = np.asarray(azimuth_delay_s(azimuth), np.float32)
+    dt_s = np.asarray(azimuth / (2 * np.pi) * TURN_PERIOD_S, np.float32)
     velo_from_world = invert(velo_at(time_s))
     moments_s = np.linspace(-0.5, 0.5, _TURN_STEPS + 1) * TURN_PERIOD_S
     corrections = [velo_from_world @ velo_at(time_s + float(moment)) for moment in moments_s]
@@ -101,14 +93,11 @@ class KittiCalibration:
         """Pinhole intrinsics of the rectified camera ``number``."""
         return pinhole_camera(self._projection(number), name, (width, height), f"{self.source}: P{number}")
 
-    def cam_from_rect0(self, number: int) -> Matrix:
-        """Rectified camera ``number`` from rectified camera 0: a translation only."""
-        projection = self._projection(number)
-        return from_rotation_translation(np.eye(3), np.linalg.solve(projection[:, :3], projection[:, 3]))
-
     def velo_from_cam(self, number: int) -> Matrix:
-        """Velodyne from rectified camera ``number``, f64[4, 4]."""
-        return invert(self.cam_from_rect0(number) @ self.rect0_from_velo)
+        """Velodyne from rectified camera ``number``, f64[4, 4]; rectified cameras differ by a translation only."""
+        projection = self._projection(number)
+        shift = np.linalg.solve(projection[:, :3], projection[:, 3])
+        return invert(from_rotation_translation(np.eye(3), shift) @ self.rect0_from_velo)
 
     def _projection(self, number: int) -> Matrix:
         if number not in self.projections:
@@ -176,20 +165,27 @@ def table_entry(
     return table[key].reshape(shape)
 
 
+def pose_entry(table: Mapping[str, NDArray[np.float64]], keys: tuple[str, ...], path: Path) -> Matrix:
+    """The pose f64[4, 4] of an entry of 12 numbers."""
+    return rigid_pose(table_entry(table, keys, (3, 4), path), f"{path}: {keys[0]}")
+
+
+def rotation_entry(table: Mapping[str, NDArray[np.float64]], keys: tuple[str, ...], path: Path) -> Matrix:
+    """The rotation of an entry of 9 numbers, as a pose f64[4, 4]."""
+    rotation = rigid_rotation(table_entry(table, keys, (3, 3), path), f"{path}: {keys[0]}")
+    return from_rotation_translation(rotation, np.zeros(3))
+
+
 def read_calibration_text(path: Path) -> KittiCalibration:
     """Object, tracking or odometry calibration: P0..P3, R0_rect (odometry: none), Tr_velo_to_cam, Tr_imu_to_velo."""
     table = read_number_table(path)
     projections = {n: table_entry(table, (f"P{n}",), (3, 4), path) for n in range(4) if f"P{n}" in table}
-    rectify, rectify_keys, imu_keys = np.eye(3), ("R0_rect", "R_rect"), ("Tr_imu_to_velo", "Tr_imu_velo")
+    rectify, rectify_keys, imu_keys = np.eye(4), ("R0_rect", "R_rect"), ("Tr_imu_to_velo", "Tr_imu_velo")
     if any(key in table for key in rectify_keys):
-        rectify = rigid_rotation(table_entry(table, rectify_keys, (3, 3), path), f"{path}: R0_rect")
-    velo_to_cam = table_entry(table, ("Tr_velo_to_cam", "Tr_velo_cam", "Tr"), (3, 4), path)
-    velo_to_cam = rigid_pose(velo_to_cam, f"{path}: Tr_velo_to_cam")
-    velo_from_imu = None
-    if any(key in table for key in imu_keys):
-        velo_from_imu = rigid_pose(table_entry(table, imu_keys, (3, 4), path), f"{path}: Tr_imu_to_velo")
-    rect0_from_velo = from_rotation_translation(rectify, np.zeros(3)) @ velo_to_cam
-    return KittiCalibration(projections, rect0_from_velo, velo_from_imu, str(path))
+        rectify = rotation_entry(table, rectify_keys, path)
+    velo_to_cam = pose_entry(table, ("Tr_velo_to_cam", "Tr_velo_cam", "Tr"), path)
+    velo_from_imu = pose_entry(table, imu_keys, path) if any(key in table for key in imu_keys) else None
+    return KittiCalibration(projections, rectify @ velo_to_cam, velo_from_imu, str(path))
 
 
 def read_calibration_day(folder: Path) -> KittiCalibration:
@@ -198,8 +194,7 @@ def read_calibration_day(folder: Path) -> KittiCalibration:
     path = folder / "calib_cam_to_cam.txt"
     table = read_number_table(path)
     projections = {n: table_entry(table, (f"P_rect_0{n}",), (3, 4), path) for n in range(4) if f"P_rect_0{n}" in table}
-    rectify = rigid_rotation(table_entry(table, ("R_rect_00",), (3, 3), path), f"{path}: R_rect_00")
-    rect0_from_velo = from_rotation_translation(rectify, np.zeros(3)) @ _pose_file(folder / "calib_velo_to_cam.txt")
+    rect0_from_velo = rotation_entry(table, ("R_rect_00",), path) @ _pose_file(folder / "calib_velo_to_cam.txt")
     imu_path = folder / "calib_imu_to_velo.txt"
     velo_from_imu = _pose_file(imu_path) if imu_path.is_file() else None
     return KittiCalibration(projections, rect0_from_velo, velo_from_imu, str(folder))
@@ -208,8 +203,9 @@ def read_calibration_day(folder: Path) -> KittiCalibration:
 def _pose_file(path: Path) -> Matrix:
     """Rotation ``R`` and translation ``T`` of a raw-data file as a pose f64[4, 4]."""
     table = read_number_table(path)
-    rotation = rigid_rotation(table_entry(table, ("R",), (3, 3), path), f"{path}: R")
-    return from_rotation_translation(rotation, table_entry(table, ("T",), (3,), path))
+    pose = rotation_entry(table, ("R",), path)
+    pose[:3, 3] = table_entry(table, ("T",), (3,), path)
+    return pose
 
 
 # poses --------------------------------------------------------------------------------------------
@@ -276,10 +272,9 @@ def read_packets(path: Path, frames: Sequence[int]) -> dict[int, NDArray[np.floa
     """GPS/IMU packets f64[30] by frame number, from the first to the last of ``frames``: from a folder with a file per
     frame (raw data), or one file with a line per frame (tracking). Empty files and lines are missing packets."""
     if path.is_dir():
-        found = {int(file.stem): file for file in path.iterdir() if file.stem.isdigit() and file.suffix == ".txt"}
-        wheres = {n: str(file) for n, file in sorted(found.items()) if frames[0] <= n <= frames[-1]}
-        texts = {n: list(read_lines(found[n]).values()) for n in wheres}
-        lines = {n: text[0] for n, text in texts.items() if text}
+        found = numbered_files(path, (".txt",)).items()
+        texts = {n: [*read_lines(file).values()] for n, file in found if frames[0] <= n <= frames[-1]}
+        lines, wheres = {n: text[0] for n, text in texts.items() if text}, {n: str(file) for n, file in found}
     else:
         lines = {n: line for n, line in read_lines(path).items() if frames[0] <= n <= frames[-1]}
         wheres = {n: f"{path}: line {n + 1}" for n in lines}
@@ -300,16 +295,13 @@ def poses_from_packets(packets: NDArray[np.float64], where: str) -> Matrix:
     east = scale * EARTH_RADIUS_M * longitude
     north = scale * EARTH_RADIUS_M * np.log(np.tan(np.pi / 4 + latitude / 2))
     positions = np.stack([east, north, packets[:, 2]], 1)
-    moved = zip(packets, positions - positions[0], strict=True)
-    poses = np.stack([from_rotation_translation(_roll_pitch_yaw(*packet[3:6]), place) for packet, place in moved])
-    return yaw_matrix(-yaw_of(poses[0])) @ poses
-
-
-def _roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Matrix:
-    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
-    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
-    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
-    return yaw_matrix(yaw)[:3, :3] @ about_y @ about_x
+    poses = []
+    for (roll, pitch, yaw), place in zip(packets[:, 3:6], positions - positions[0], strict=True):
+        cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+        about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+        about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+        poses.append(from_rotation_translation(yaw_matrix(yaw)[:3, :3] @ about_y @ about_x, place))
+    return yaw_matrix(-yaw_of(poses[0])) @ np.stack(poses)
 
 
 def read_timestamps(path: Path, numbers: Sequence[int], last: int) -> dict[int, float]:
@@ -365,28 +357,19 @@ _TRACKLET_POSE = frozenset(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiBox:
-    """One annotated box."""
+    """One annotated box.
+
+    ``track``: its number; object labels count lines. ``label``: lower-case class, e.g. ``car``. ``size_m``: length,
+    width, height. ``sensor_from_box``: box frame (x forward, y left, z up, origin in the centre) to the velodyne,
+    f64[4, 4]. ``box2d_px``: annotated rectangle (left, top, right, bottom) in KITTI's pixels.
+    """
 
     frame: int
     track: int
-    """Track number; object labels count lines."""
     label: str
-    """Lower-case class, e.g. ``car``."""
     size_m: tuple[float, float, float]
-    """Length, width, height."""
     sensor_from_box: Matrix
-    """Box frame (x forward, y left, z up, origin in the centre) to the velodyne, f64[4, 4]."""
     box2d_px: tuple[float, float, float, float] | None = None
-    """Annotated rectangle (left, top, right, bottom) in KITTI's pixels."""
-
-
-def rect0_from_box(bottom_centre_m: Sequence[float], height_m: float, rotation_y: float) -> Matrix:
-    """Box frame to rectified camera 0 from KITTI's bottom centre (y down) and turn about the camera's y axis, f64[4,
-    4]."""
-    c, s = np.cos(rotation_y), np.sin(rotation_y)
-    forward, left, up = (c, 0.0, -s), (s, 0.0, c), (0.0, -1.0, 0.0)
-    centre = np.asarray(bottom_centre_m, np.float64) - [0, height_m / 2, 0]
-    return from_rotation_translation(np.array([forward, left, up]).T, centre)
 
 
 def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
@@ -416,7 +399,10 @@ def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = Non
             raise InputError("label value is not finite", where=where, got=line.strip()[:100])
         left, top, right, bottom, height, width, length, x, y, z, turn = values[3:14]
         size_m = box_size(length, width, height, where)
-        pose = velo_from_rect0 @ rect0_from_box((x, y, z), height, turn)
+        # bottom centre (y down), and the turn about the camera's y axis
+        c, s = np.cos(turn), np.sin(turn)
+        rotation = np.array([(c, 0.0, -s), (s, 0.0, c), (0.0, -1.0, 0.0)]).T
+        pose = velo_from_rect0 @ from_rotation_translation(rotation, np.array([x, y - height / 2, z]))
         boxes.append(KittiBox(number, track, columns[skip].lower(), size_m, pose, (left, top, right, bottom)))
     return boxes
 
@@ -452,9 +438,9 @@ def read_tracklets(path: Path) -> list[KittiBox]:
 def _xml_number(element: ElementTree.Element, key: str, where: str) -> float:
     text = element.findtext(key)
     try:
-        value = float(text) if text is not None else float("nan")
+        value = float(text or "nan")
     except ValueError:
-        value = float("nan")
+        value = np.nan
     if not np.isfinite(value):
         raise InputError(f"tracklet field {key!r} is missing or not a number", where=where, got=repr(text))
     return value
@@ -478,32 +464,32 @@ def build_tracks(
             velocity.
     """
     collected = BoxTracks(where, {label: label for label in LABELS})
-    delays_s: dict[tuple[str, float], float] = {}
     outside = 0
     for box in boxes:
         if box.frame not in world_from_velo:
             outside += 1
             continue
-        name, time_s, pose = str(box.track), times_s[box.frame], world_from_velo[box.frame]
+        name, time_s, pose, late_s = str(box.track), times_s[box.frame], world_from_velo[box.frame], 0.0
         if velo_at is not None:
             x, y = box.sensor_from_box[:2, 3]
-            delay_s = delays_s[name, time_s] = float(azimuth_delay_s(float(np.arctan2(y, x))))
-            pose = velo_at(time_s + delay_s)
-        record = f"{where}: track {name}, frame {box.frame}"
-        collected.add(name, collected.label_of(box.label), time_s, box.size_m, pose @ box.sensor_from_box, where=record)
-    found, notes = collected.tracks()
-    if velo_at is not None:
-        found = [_at_scan_times(track, delays_s) for track in found]
+            late_s = float(np.arctan2(y, x)) / (2 * np.pi) * TURN_PERIOD_S
+            pose = velo_at(time_s + late_s)
+        label, pose, record = (
+            collected.label_of(box.label),
+            pose @ box.sensor_from_box,
+            f"track {name}, frame {box.frame}",
+        )
+        collected.add(name, label, time_s, box.size_m, pose, late_s=late_s, where=f"{where}: {record}")
+    found, notes = collected.tracks(_speeds)
     if outside:
         notes.insert(0, f"{outside} boxes lie in frames that were not imported and were left out")
     return sorted(found, key=lambda track: [int(part) for part in track.id.split(".")]), notes
 
 
-def _at_scan_times(track: Track, delays_s: Mapping[tuple[str, float], float]) -> Track:
-    """The track moved from the moments at which its boxes were measured to the times of the scans."""
-    late_s = np.array([delays_s[track.id.split(".")[0], time_s] for time_s in track.times_s])
-    if len(late_s) == 1:
-        return track
-    poses = track.world_from_object.copy()
-    poses[:, :3, 3] -= np.gradient(poses[:, :3, 3], track.times_s + late_s, axis=0) * late_s[:, None]
-    return replace(track, world_from_object=poses)
+def _speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
+    """Velocities f64[n, 3] by second-order differences within each piece of a track; 0 where it is one box."""
+    velocity = np.zeros_like(places)
+    for piece in pieces:
+        if len(piece) > 1:
+            velocity[piece] = np.gradient(places[piece], measured_s[piece], axis=0)
+    return velocity

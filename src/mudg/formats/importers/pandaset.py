@@ -75,10 +75,6 @@ def _slice(start: Any, stop: Any, step: Any) -> slice:
     return slice(start, stop, step)
 
 
-def _block(values: Any, places: Any, _dimensions: Any) -> tuple[Any, Any]:
-    return values, places
-
-
 _MAKERS: Final[Mapping[str, Maker | None]] = {
     **NUMPY_MAKERS,
     "pandas.core.frame.DataFrame": None,
@@ -87,7 +83,7 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
     "pandas.core.indexes.base.Index": None,
     **dict.fromkeys(f"pandas.core.indexes.numeric.{kind}Index" for kind in ("Int64", "UInt64", "Float64")),
     "pandas.core.indexes.range.RangeIndex": None,
-    "pandas._libs.internals._unpickle_block": _block,
+    "pandas._libs.internals._unpickle_block": lambda values, places, _dimensions: (values, places),
     _NEW_BLOCK: None,
     "functools.partial": None,
     "builtins.slice": _slice,
@@ -101,9 +97,7 @@ def read_frame(path: Path) -> dict[str, NDArray[Any]]:
         InputError: missing, cut off, not a data frame, or it asks for something that is not plain data.
     """
     content = store.read_bytes(path)
-    if content[:2] == b"\x1f\x8b":
-        content = gunzip(content, str(path))
-    return parse_frame(content, str(path))
+    return parse_frame(gunzip(content, str(path)) if content[:2] == b"\x1f\x8b" else content, str(path))
 
 
 def gunzip(content: bytes, where: str) -> bytes:
@@ -131,9 +125,8 @@ def parse_frame(content: bytes, where: str) -> dict[str, NDArray[Any]]:
     try:
         return _columns_pandas_frame(value)
     except (ValueError, IndexError, KeyError, TypeError, AttributeError, OverflowError, RecursionError) as error:
-        what = "pickle is not a plain data frame"
+        what, got = "pickle is not a plain data frame", f"{type(error).__name__}: {error}"[:200]
         expected = "a table of numbers and texts as pandas 0.2x to 2.x writes it"
-        got = f"{type(error).__name__}: {error}"[:200]
         remedy = "read it with pandas yourself and write it again with DataFrame.to_pickle of pandas 1 or 2"
         raise InputError(what, where=where, expected=expected, got=got, remedy=remedy) from error
 
@@ -149,12 +142,10 @@ def _columns_pandas_frame(frame: Any) -> dict[str, NDArray[Any]]:
         parts = [_block_parts(block) for block in blocks]
     else:
         extra = manager.state[3]["0.14.1"]
-        axes = extra["axes"]
-        parts = [(block["values"], block["mgr_locs"]) for block in extra["blocks"]]
+        axes, parts = extra["axes"], [(block["values"], block["mgr_locs"]) for block in extra["blocks"]]
     if len(axes[0]) > MAX_COLUMNS:
         raise ValueError(f"a table of {len(axes[0])} columns")
-    names = [str(name) for name in axes[0]]
-    rows = len(axes[1])
+    names, rows = [str(name) for name in axes[0]], len(axes[1])
     columns: dict[str, NDArray[Any]] = {}
     for values, places in parts:
         array = _array(values)
@@ -173,10 +164,9 @@ def _block_parts(block: Any) -> tuple[Any, Any]:
     if isinstance(block, PickledObject):
         if block.name != "functools.partial":
             raise ValueError(f"a block is a {block.name}")
-        partial, values, places = block.arguments
+        partial, *block = block.arguments
         if partial.arguments != (Name(_NEW_BLOCK),):
             raise ValueError("a block of unknown form")
-        return values, places
     values, places = block
     return values, places
 
@@ -221,9 +211,7 @@ class PointClasses:
         path = self._files.get(frame)
         if path is None:
             return None
-        table = read_frame(path)
-        common.require_columns(("class",), table, path)
-        note_unknown("annotations/semseg/*.pkl.gz", table, frozenset({"class"}))
+        table = _columns(path, ("class",), _CLASSES)
         numbers = common.finite_columns(table, ("class",), path)[:, 0].astype(np.int64)
         if len(numbers) != points:
             what, expected = "classes do not fit the points", f"{points} rows, one for each point of the frame's cloud"
@@ -233,8 +221,8 @@ class PointClasses:
         strange = [int(number) for number in present if int(number) not in self._names]
         if strange:
             log.warn(f"pandaset: {path}: classes {strange[:8]} are not in classes.json; their points are unlabelled")
-        ids = [train_id(self._names.get(int(number), "")) for number in present]
-        return np.array(ids, np.uint8)[where]
+        names = [CLASS_OF.get(self._names.get(int(number), ""), "") for number in present]
+        return np.array([palette.ID.get(name, palette.UNLABELLED) for name in names], np.uint8)[where]
 
 
 def _tables(folder: Path, frames: Sequence[int], options: ImportOptions, what: str) -> dict[int, Path]:
@@ -242,28 +230,21 @@ def _tables(folder: Path, frames: Sequence[int], options: ImportOptions, what: s
     tables = common.numbered_files(folder, (".pkl.gz", ".pkl"))
     lacks = [number for number in frames if number not in tables]
     if tables and lacks and not options.skip_missing:
-        expected, remedy = (
-            f"{lacks[0]:02d}.pkl.gz",
-            "copy it, choose frames with --frames FIRST:END, or add --skip-missing",
-        )
+        remedy = "copy it, choose frames with --frames FIRST:END, or add --skip-missing"
+        expected = f"{lacks[0]:02d}.pkl.gz"
         raise InputError(f"a frame has no {what}", where=str(folder), expected=expected, remedy=remedy)
     return tables
 
 
-def train_id(name: str) -> int:
-    """The train id of one of the data set's classes; ``UNLABELLED`` where it has none."""
-    return palette.ID.get(CLASS_OF.get(name, ""), palette.UNLABELLED)
-
-
 def _names(path: Path) -> Mapping[int, str]:
     """Number -> name of the data set's classes."""
+    where, expected = str(path), '{"1": "Smoke", ...}'
     if not path.is_file():
-        where, remedy = str(path), "copy annotations/semseg/classes.json, or leave out annotations/semseg"
-        raise InputError("table of class names is missing", where=where, expected='{"1": "Smoke", ...}', remedy=remedy)
+        remedy = "copy annotations/semseg/classes.json, or leave out annotations/semseg"
+        raise InputError("table of class names is missing", where=where, expected=expected, remedy=remedy)
     values: Any = store.read_json(path)
     if not isinstance(values, dict) or not all(str(key).isdigit() and isinstance(values[key], str) for key in values):
-        what = "table of class names is malformed"
-        raise InputError(what, where=str(path), expected='{"1": "Smoke", ...}', got=str(values)[:80])
+        raise InputError("table of class names is malformed", where=where, expected=expected, got=str(values)[:80])
     return {int(key): name for key, name in values.items()}
 
 
@@ -302,12 +283,13 @@ _POINT_COLUMNS: Final = ("x", "y", "z", "i", "t", "d")
 _CUBOID_COLUMNS: Final = tuple(
     "uuid label yaw stationary position.x position.y position.z dimensions.x dimensions.y dimensions.z".split()
 )
-_POINTS, _CUBOIDS, _POSES = "lidar/*.pkl.gz", "annotations/cuboids/*.pkl.gz", "poses.json"
+_POINTS, _CUBOIDS, _CLASSES = "lidar/*.pkl.gz", "annotations/cuboids/*.pkl.gz", "annotations/semseg/*.pkl.gz"
 OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     _POINTS: frozenset(_POINT_COLUMNS),
     _CUBOIDS: frozenset((*_CUBOID_COLUMNS, "camera_used", "cuboids.sibling_id", "cuboids.sensor_id")).union(
         f"attributes.{name}" for name in ("object_motion", "rider_status", "pedestrian_behavior", "pedestrian_age")
     ),
+    _CLASSES: frozenset({"class"}),
     "intrinsics.json": frozenset({"fx", "fy", "cx", "cy"}),
 }
 """Kinds of files -> their fields, read or not."""
@@ -331,9 +313,7 @@ class _Cuboid:
 
 def looks_like_pandaset(source: Path) -> bool:
     """Whether ``source`` is a sequence of PandaSet, or a folder of such sequences."""
-    if not source.is_dir():
-        return False
-    return _is_sequence(source) or bool(_sequences(source))
+    return source.is_dir() and (_is_sequence(source) or bool(_sequences(source)))
 
 
 def _is_sequence(folder: Path) -> bool:
@@ -354,7 +334,7 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
     clouds = common.numbered_files(folder / "lidar", (".pkl.gz", ".pkl"))
     frames = common.complete_frames({**images, "lidar": clouds}, options, str(folder), "pandaset")
     notes: list[str] = []
-    motion = _Motion.read(folder, frames, chosen, options, notes)
+    motion = _Motion(folder, frames, chosen, options, notes)
     fits = {cameras[n]: _fit(folder / "camera" / n, cameras[n], images[n][frames[0]], options) for n in chosen}
     cuboids = _tables(folder / "annotations" / "cuboids", frames, options, "boxes")
     classes = PointClasses(folder / "annotations" / "semseg", frames, options)
@@ -372,7 +352,7 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
         for name in chosen:
             time_s, pose = float(motion.camera_s[name][index]), motion.world_from_cam[name][index]
             yield SceneImage(cameras[name], index, time_s, pose, images[name][number])
-        cloud = _read_points(clouds[number], motion, index)
+        cloud = _Cloud(clouds[number], motion, index)
         train_ids = classes.of(number, len(cloud.returns))
         train_ids = None if train_ids is None else train_ids[cloud.returns]
         for d, sensor in SENSORS.items():
@@ -418,70 +398,67 @@ def files_of_pandaset(source: Path, options: ImportOptions) -> LogFiles:
 # --- poses and times ------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Motion:
     """Times and poses, in the scene's world and clock.
 
-    Args:
-        world_from_source: the scene's world from the data set's, f64[4, 4].
-        raw_s: the data set's time of each chosen frame's cloud.
-        start_s: the data set's time that is 0 in the scene.
-        camera_s: camera -> when its images were taken, seconds of the scene's clock, f64[n].
-        world_from_cam: camera -> f64[n, 4, 4].
-        path: the vehicle, x forward, y left, z up, at the clouds' times from one before the first chosen frame on.
-        places: 0 and 1 (``d``) -> place of the LiDAR on the vehicle, f64[3].
+    ``world_from_source``: the scene's world from the data set's, f64[4, 4]. ``raw_s``: the data set's time of each
+    chosen frame's cloud, ``start_s``: the one that is 0 in the scene. ``path``: the vehicle, x forward, y left, z up,
+    at the clouds' times from one before the first chosen frame on. By camera: ``camera_s`` f64[n], when its images
+    were taken, and ``world_from_cam`` f64[n, 4, 4].
     """
 
-    world_from_source: Matrix
-    raw_s: NDArray[np.float64]
-    start_s: float
-    camera_s: Mapping[str, NDArray[np.float64]]
-    world_from_cam: Mapping[str, Matrix]
-    path: EgoPath
-    places: Mapping[int, Matrix]
-
-    @classmethod
-    def read(
-        cls, folder: Path, frames: Sequence[int], cameras: Sequence[str], options: ImportOptions, notes: list[str]
-    ) -> _Motion:
+    def __init__(
+        self, folder: Path, frames: Sequence[int], cameras: Sequence[str], options: ImportOptions, notes: list[str]
+    ) -> None:
         file = folder / "lidar" / "timestamps.json"
         # those of frames that are left out tell where the vehicle was, too
         known = range(max(frames[0] - 1, 0), frames[-1] + 1)
         first = frames[0] - known[0]
         raw_s = _times(file, known)
-        start_s = float(raw_s[first])
+        self.start_s = float(raw_s[first])
         forward = _poses(folder / "lidar" / "poses.json", known) @ yaw_matrix(np.pi / 2)
-        world_from_source = common.world_from_first(forward[first])
+        self.world_from_source = common.world_from_first(forward[first])
         notes.append(common.origin_note(forward[first]))
-        path = EgoPath(common.seconds(raw_s, "s", str(file), start_s), world_from_source @ forward)
-        path = common.mended_path(path, options, notes)
-        raw_s = raw_s[[number - known[0] for number in frames]]
-        needed = dict.fromkeys((*cameras, "front_camera"))
-        camera_s, world_from_cam = {}, {}
-        for name in needed:
+        path = EgoPath(common.seconds(raw_s, "s", str(file), self.start_s), self.world_from_source @ forward)
+        self.path = common.mended_path(path, options, notes)
+        self.raw_s = raw_s[[number - known[0] for number in frames]]
+        self.camera_s: dict[str, NDArray[np.float64]] = {}
+        self.world_from_cam: dict[str, Matrix] = {}
+        camera = np.array(FRONT_CAMERA_M)
+        for name in dict.fromkeys((*cameras, "front_camera")):
             here = folder / "camera" / name
             if name not in cameras and not (here / "poses.json").is_file():
                 continue
             stamps = here / "timestamps.json"
             times = _times(stamps, frames)
-            late = np.abs(times - raw_s)
+            late = np.abs(times - self.raw_s)
             if late.max() > MAX_CAMERA_DELAY_S:
                 what, where = "camera and LiDAR do not share a clock", f"{stamps}: entry {frames[int(late.argmax())]}"
                 expected = f"within {MAX_CAMERA_DELAY_S:g} s of lidar/timestamps.json"
                 remedy = "are the times in seconds, and of this sequence?"
                 raise InputError(what, where=where, expected=expected, got=f"{late.max():.3f} s apart", remedy=remedy)
-            stamped_s = common.seconds(times, "s", str(stamps), start_s)
-            camera_s[name] = stamped_s + EXPOSURE_S
-            timed = zip(stamped_s, world_from_source @ _poses(here / "poses.json", frames), strict=True)
-            world_from_cam[name] = np.stack(
-                [pose_on_path(path, t + POSE_S) @ invert(pose_on_path(path, t)) @ pose for t, pose in timed]
+            stamped_s = common.seconds(times, "s", str(stamps), self.start_s)
+            self.camera_s[name] = stamped_s + EXPOSURE_S
+            timed = zip(stamped_s, self.world_from_source @ _poses(here / "poses.json", frames), strict=True)
+            self.world_from_cam[name] = np.stack(
+                [self.ego_at(t + POSE_S) @ invert(self.ego_at(t)) @ p for t, p in timed]
             )
-        places = _lidar_places(path, camera_s.get("front_camera"), world_from_cam.get("front_camera"))
-        return cls(world_from_source, raw_s, start_s, camera_s, world_from_cam, path, places)
+        if "front_camera" in self.camera_s:
+            timed = zip(
+                self.camera_s["front_camera"] - EXPOSURE_S + POSE_S, self.world_from_cam["front_camera"], strict=True
+            )
+            seen = [transform_points(invert(self.ego_at(t)), pose[None, :3, 3])[0] for t, pose in timed]
+            camera = np.median(seen, axis=0)
+        # places of the LiDARs on the vehicle: where the front camera is, plus the static calibration
+        self._places = {d: camera + np.array(offset) for d, offset in OFFSET_FROM_FRONT_CAMERA_M.items()}
+
+    def ego_at(self, time_s: float) -> Matrix:
+        """The vehicle's pose f64[4, 4]; beyond an end of the path it goes on as it did there."""
+        return common.pose_near(self.path, time_s, MAX_CAMERA_DELAY_S + abs(POSE_S), "lidar/poses.json")
 
     def world_from_lidar(self, d: int, time_s: float) -> Matrix:
         """Pose of a LiDAR, f64[4, 4]."""
-        return pose_on_path(self.path, time_s) @ from_rotation_translation(np.eye(3), self.places[d])
+        return self.ego_at(time_s) @ from_rotation_translation(np.eye(3), self._places[d])
 
     def ego(self) -> EgoPath:
         """The vehicle's path from its pose before the first image on; where there is none before, it starts with the
@@ -489,26 +466,9 @@ class _Motion:
         first_s = min(float(times[0]) for times in self.camera_s.values())
         times_s, poses = self.path.times_s, self.path.world_from_ego
         if first_s < times_s[0] - 1e-3:
-            poses = np.concatenate([pose_on_path(self.path, first_s)[None], poses])
+            poses = np.concatenate([self.ego_at(first_s)[None], poses])
             times_s = np.concatenate([[first_s], times_s])
         return EgoPath(times_s, poses)
-
-
-def pose_on_path(path: EgoPath, time_s: float) -> Matrix:
-    """The vehicle's pose f64[4, 4]; beyond an end of the path it goes on as it did there."""
-    return common.pose_near(path, time_s, MAX_CAMERA_DELAY_S + abs(POSE_S), "lidar/poses.json")
-
-
-def _lidar_places(
-    path: EgoPath, times_s: NDArray[np.float64] | None, world_from_cam: Matrix | None
-) -> dict[int, Matrix]:
-    """Where the LiDARs sit on the vehicle: median place of the front camera, plus the static calibration."""
-    camera = np.array(FRONT_CAMERA_M)
-    if times_s is not None and world_from_cam is not None:
-        timed = zip(times_s - EXPOSURE_S + POSE_S, world_from_cam, strict=True)
-        seen = [transform_points(invert(pose_on_path(path, t)), pose[None, :3, 3])[0] for t, pose in timed]
-        camera = np.median(seen, axis=0)
-    return {d: camera + np.array(offset) for d, offset in OFFSET_FROM_FRONT_CAMERA_M.items()}
 
 
 def _entries(path: Path, frames: Sequence[int]) -> list[Any]:
@@ -543,7 +503,7 @@ def _poses(path: Path, frames: Sequence[int]) -> Matrix:
         ):
             heading = [entry["heading"][key] for key in "wxyz"]
             poses.append(common.pose_from_quaternion(heading, [entry["position"][key] for key in "xyz"], where))
-        note_unknown_within(_POSES, entry, _POSE_FIELDS)
+        note_unknown_within(path.name, entry, _POSE_FIELDS)
     return np.stack(poses)
 
 
@@ -567,49 +527,59 @@ def _columns(path: Path, names: Sequence[str], kind: str) -> dict[str, NDArray[A
     return frame
 
 
-@dataclass(frozen=True, slots=True, eq=False)
 class _Cloud:
     """One cloud: ``xyz`` f64[N, 3] in the data set's world, ``intensity`` 0..1, ``dt_s`` seconds from ``time_s`` (of
     the scene's clock, the middle of the turn), ``d`` 0 or 1. Rows of the file without a return, where ``returns``
-    bool[M] is False, are left out; each LiDAR has ``without`` of them."""
+    bool[M] is False, are left out and counted."""
 
-    time_s: float
-    xyz: Matrix
-    intensity: NDArray[np.float32]
-    dt_s: NDArray[np.float64]
-    d: NDArray[np.float64]
-    returns: NDArray[np.bool_]
-    without: Mapping[int, int]
+    def __init__(self, path: Path, motion: _Motion, index: int) -> None:
+        frame_s = float(motion.raw_s[index])
+        frame = _columns(path, _POINT_COLUMNS, _POINTS)
+        self.returns = common.returns_of(frame, path)
+        self._without = {d: int((frame["d"][~self.returns] == d).sum()) for d in SENSORS}
+        frame = {name: values[self.returns] for name, values in frame.items()}
+        columns = {name: common.finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
+        late_s, self.d = columns["t"] - frame_s, columns["d"]
+        if len(late_s) and np.abs(late_s).max() > MAX_POINT_DELAY_S:
+            what = "points do not belong to their frame's time"
+            expected = f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})"
+            got = f"{columns['t'].min():.6g} to {columns['t'].max():.6g}"
+            remedy = "is the file of another frame or sequence?"
+            raise InputError(what, where=f"{path}: t", expected=expected, got=got, remedy=remedy)
+        if not np.isin(self.d, list(SENSORS)).all():
+            raise InputError("a point is of a LiDAR that does not exist", where=f"{path}: d", expected="0 or 1")
+        turning = late_s[self.d == 0]
+        middle_s = float(turning.min() + turning.max()) / 2 if len(turning) else 0.0
+        self.time_s, self._dt_s = frame_s - motion.start_s + middle_s, late_s - middle_s
+        self._xyz = np.stack([columns[axis] for axis in "xyz"], 1)
+        self._intensity = common.unit_intensity(columns["i"], 255, f"{path}: i")
+        self._place = (invert(motion.world_from_source) @ motion.world_from_lidar(0, self.time_s))[:2, 3]
+        self._azimuths: tuple[NDArray[np.intp], NDArray[np.float64]] | None = None
 
     def of_sensor(self, d: int, lidar_from_source: Matrix, classes: NDArray[np.uint8] | None) -> SweepPoints:
         """The points of LiDAR ``d`` in its frame."""
         mine = self.d == d
-        xyz = transform_points(lidar_from_source, self.xyz[mine]).astype(np.float32)
-        intensity, dt_s = (values[mine].astype(np.float32) for values in (self.intensity, self.dt_s))
-        return SweepPoints(xyz, intensity, dt_s, None if classes is None else classes[mine], self.without[d])
+        xyz = transform_points(lidar_from_source, self._xyz[mine]).astype(np.float32)
+        intensity, dt_s = (values[mine].astype(np.float32) for values in (self._intensity, self._dt_s))
+        return SweepPoints(xyz, intensity, dt_s, None if classes is None else classes[mine], self._without[d])
 
-
-def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
-    frame_s = float(motion.raw_s[index])
-    frame = _columns(path, _POINT_COLUMNS, _POINTS)
-    returns = common.returns_of(frame, path)
-    without = {d: int((frame["d"][~returns] == d).sum()) for d in SENSORS}
-    frame = {name: values[returns] for name, values in frame.items()}
-    columns = {name: common.finite_columns(frame, (name,), path)[:, 0] for name in _POINT_COLUMNS}
-    late_s = columns["t"] - frame_s
-    if len(late_s) and np.abs(late_s).max() > MAX_POINT_DELAY_S:
-        what = "points do not belong to their frame's time"
-        expected = f"seconds of the epoch within {MAX_POINT_DELAY_S:g} s of lidar/timestamps.json ({frame_s:.3f})"
-        got = f"{columns['t'].min():.6g} to {columns['t'].max():.6g}"
-        remedy = "is the file of another frame or sequence?"
-        raise InputError(what, where=f"{path}: t", expected=expected, got=got, remedy=remedy)
-    if not np.isin(columns["d"], list(SENSORS)).all():
-        raise InputError("a point is of a LiDAR that does not exist", where=f"{path}: d", expected="0 or 1")
-    turning = late_s[columns["d"] == 0]
-    middle_s = float(turning.min() + turning.max()) / 2 if len(turning) else 0.0
-    time_s, xyz = frame_s - motion.start_s + middle_s, np.stack([columns[axis] for axis in "xyz"], 1)
-    intensity = common.unit_intensity(columns["i"], 255, f"{path}: i")
-    return _Cloud(time_s, xyz, intensity, late_s - middle_s, columns["d"], returns, without)
+    def delay_s(self, source_from_box: Matrix, size_m: tuple[float, float, float], sensor: int) -> float:
+        """When a box was measured, seconds from the sweep's time: the median of the points inside; with few of them,
+        of those of the turning LiDAR within a degree of its direction."""
+        centre, reach = source_from_box[:3, 3], float(np.linalg.norm(size_m)) / 2
+        near = (np.abs(self._xyz[:, :2] - centre[:2]) < reach).all(1) & (self.d == max(sensor, 0))
+        near = np.flatnonzero(near)
+        inside = np.abs(transform_points(invert(source_from_box), self._xyz[near])) < np.array(size_m) / 2
+        near = near[inside.all(1)]
+        if len(near) < _MIN_BOX_POINTS:
+            if self._azimuths is None:
+                ids = np.flatnonzero(self.d == 0)
+                seen = self._xyz[ids, :2] - self._place
+                self._azimuths = ids, np.arctan2(seen[:, 1], seen[:, 0])
+            ids, azimuth = self._azimuths
+            turn = azimuth - np.arctan2(centre[1] - self._place[1], centre[0] - self._place[0])
+            near = ids[np.abs((turn + np.pi) % (2 * np.pi) - np.pi) < np.deg2rad(1.0)]
+        return float(np.median(self._dt_s[near])) if len(near) else 0.0
 
 
 # --- boxes ----------------------------------------------------------------------------------------
@@ -618,9 +588,8 @@ def _read_points(path: Path, motion: _Motion, index: int) -> _Cloud:
 def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
     frame = _columns(path, _CUBOID_COLUMNS, _CUBOIDS)
     centre = common.finite_columns(frame, ("position.x", "position.y", "position.z"), path)
-    sizes = common.finite_columns(
-        frame, ("dimensions.y", "dimensions.x", "dimensions.z"), path
-    )  # length, width, height
+    length_width_height = ("dimensions.y", "dimensions.x", "dimensions.z")
+    sizes = common.finite_columns(frame, length_width_height, path)
     yaw = common.finite_columns(frame, ("yaw",), path)[:, 0]
     sensor = np.full(len(yaw), -1.0)
     if "cuboids.sensor_id" in frame:
@@ -628,50 +597,17 @@ def _read_cuboids(path: Path, cloud: _Cloud, motion: _Motion) -> list[_Cuboid]:
         ids = np.where(np.array([one is None or one != one for one in ids], bool), -1, ids)
         sensor = common.finite_columns({"cuboids.sensor_id": ids}, ("cuboids.sensor_id",), path)[:, 0]
     siblings = frame.get("cuboids.sibling_id", np.full(len(yaw), "", object))
-    when = _MeasuringTimes(cloud, motion)
     rows = []
     for row in range(len(yaw)):
         box = yaw_matrix(yaw[row] + np.pi / 2, centre[row])
         length, width, height = sizes[row].tolist()
         size, uuid, label = (length, width, height), str(frame["uuid"][row]), str(frame["label"][row])
         standing, of = bool(frame["stationary"][row]), int(sensor[row])
-        late_s = 0.0 if standing else when.delay_s(box, size, of)
+        late_s = 0.0 if standing else cloud.delay_s(box, size, of)
         sibling = siblings[row] if isinstance(siblings[row], str) and len(siblings[row]) > 1 else ""
         world_from_box = motion.world_from_source @ box
         rows.append(_Cuboid(uuid, label, cloud.time_s, late_s, size, world_from_box, standing, of, sibling))
     return rows
-
-
-class _MeasuringTimes:
-    """When the boxes of one frame were measured."""
-
-    def __init__(self, cloud: _Cloud, motion: _Motion) -> None:
-        self._cloud = cloud
-        self._source_from_lidar = invert(motion.world_from_source) @ motion.world_from_lidar(0, cloud.time_s)
-        self._turning: tuple[NDArray[np.intp], NDArray[np.float64]] | None = None
-
-    def delay_s(self, source_from_box: Matrix, size_m: tuple[float, float, float], sensor: int) -> float:
-        """Seconds from the sweep's time: the median of the points inside; with few of them, of the points in that
-        direction."""
-        xyz, dt_s, d = self._cloud.xyz, self._cloud.dt_s, self._cloud.d
-        centre, reach = source_from_box[:3, 3], float(np.linalg.norm(size_m)) / 2
-        near = np.flatnonzero((np.abs(xyz[:, :2] - centre[:2]) < reach).all(1) & (d == max(sensor, 0)))
-        inside = np.abs(transform_points(invert(source_from_box), xyz[near])) < np.array(size_m) / 2
-        near = near[inside.all(1)]
-        if len(near) < _MIN_BOX_POINTS:
-            near = self._towards(centre)
-        return float(np.median(dt_s[near])) if len(near) else 0.0
-
-    def _towards(self, centre: Matrix) -> NDArray[np.intp]:
-        """Points of the turning LiDAR within a degree of the direction to ``centre``."""
-        place = self._source_from_lidar[:3, 3]
-        if self._turning is None:
-            ids = np.flatnonzero(self._cloud.d == 0)
-            seen = self._cloud.xyz[ids, :2] - place[:2]
-            self._turning = ids, np.arctan2(seen[:, 1], seen[:, 0])
-        ids, azimuth = self._turning
-        turn = azimuth - np.arctan2(centre[1] - place[1], centre[0] - place[0])
-        return ids[np.abs((turn + np.pi) % (2 * np.pi) - np.pi) < np.deg2rad(1.0)]
 
 
 def _add_boxes(tracks: BoxTracks, boxes: Mapping[int, Sequence[_Cuboid]]) -> list[str]:
