@@ -671,6 +671,7 @@ def render(
     lidar: str = '',
     layers: tuple[Literal['instances', 'normals', 'motion', 'distance', 'confidence'], ...] = (),
     video: bool = True,
+    repair: bool = False,
     harmonize: Mapping[str, Any] = ...,
     raster: Literal['auto', 'cpu', 'torch', 'gsplat'] = 'auto',
     device: str = 'auto',
@@ -683,7 +684,7 @@ def render(
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         edits: Edit script (docs/edit.md) to carry out before rendering.
-        fused: Point clouds written by fuse; for --harmonize.on.
+        fused: Point clouds written by fuse; for --harmonize.on and --repair (not given: those of the run at SCENE).
         path: Camera path to draw in place of the shifts: poses in the format of TUM or KITTI (.txt), or nerfstudio's transforms.json, on the scene's clock and in its world. It has the optics of the first camera.
         config: YAML file of settings, read before those given here.
         cameras: Cameras to render (empty = the first camera). A name that the scene lacks is an error.
@@ -695,6 +696,7 @@ def render(
         lidar: Also simulate the log's LiDAR sweeps at every shift: a sensor of the scene, pandar128, at128, hdl64, vlp16, or a JSON file of beams (docs/simulator.md). Empty = none.
         layers: Also write these layers of every view, with its boxes and its trust: ids of objects, normals of surfaces, optical flow to the next view in pixels, distance along the ray in metres, and how certain a pixel is (docs/datasets.md).
         video: Also write one MP4 video per trajectory.
+        repair: Let the diffusion model make every view once more from its render, and mix both by its confidence. Better off the recorded path, slower: half a second a view. --harmonize.model names the model (docs/edit/repair.md).
         harmonize: With an edit script: let the diffusion model repair what the edits touch.
         raster: Rasteriser backend. auto picks the fastest one available and prints its name.
         device: Device: auto (CUDA if there is one), cpu, cuda, cuda:N.
