@@ -571,7 +571,7 @@ def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     """Files called by a frame number, in order: ``0000000012.png`` with suffix ``.png``, ``07.pkl.gz`` with
     ``.pkl.gz``; none where there is no folder."""
     files = {}
-    for path in folder.iterdir() if folder.is_dir() else ():
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         stem, dot, rest = path.name.partition(".")
         if stem.isascii() and stem.isdigit() and dot + rest.lower() in suffixes:
             files[int(stem)] = path
@@ -617,6 +617,12 @@ def number_ranges(numbers: Sequence[int]) -> str:
 def first_file(*candidates: Path) -> Path | None:
     """The first of some paths that is a file."""
     return next((path for path in candidates if path.is_file()), None)
+
+
+def require_folder(source: Path, dataset: str) -> None:
+    """Refuse what is no folder."""
+    if not source.is_dir():
+        raise InputError(f"{dataset} folder does not exist", where=str(source), expected="a folder")
 
 
 def folder_contents(folder: Path) -> str:

@@ -392,8 +392,7 @@ def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
 
 def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
     """The data set's folder and the drive."""
-    if not source.is_dir():
-        raise InputError("KITTI-360 folder does not exist", where=str(source), expected="a folder")
+    common.require_folder(source, "KITTI-360")
     if source.absolute().parent.name == "data_2d_raw":
         return source.absolute().parent.parent, source.absolute().name
     raw = source / "data_2d_raw"

@@ -378,8 +378,7 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
 
 
 def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
-    if not source.is_dir():
-        raise InputError("PandaSet folder does not exist", where=str(source), expected="a folder")
+    common.require_folder(source, "PandaSet")
     if not options.sequence and _is_sequence(source):
         return source
     sequences = _sequences(source)
