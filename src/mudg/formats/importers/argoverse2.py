@@ -54,8 +54,8 @@ OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     "city_SE3_egovehicle.feather": frozenset({"timestamp_ns", *_POSE}),
     "egovehicle_SE3_sensor.feather": frozenset({"sensor_name", *_POSE}),
     "intrinsics.feather": frozenset("sensor_name fx_px fy_px cx_px cy_px k1 k2 k3 width_px height_px".split()),
-    "annotations.feather": frozenset(
-        ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE, "num_interior_pts", "log_id")
+    "annotations.feather": frozenset("timestamp_ns track_uuid category num_interior_pts log_id".split()).union(
+        _SIZE, _POSE
     ),
     SWEEPS: frozenset({"x", "y", "z", "intensity", "laser_number", "offset_ns"}),
 }

@@ -31,13 +31,10 @@ _LZF_MAX_GROWTH: Final = 90
 """A token of 3 bytes makes at most 264."""
 
 USUAL: Final = frozenset(
-    (
-        "x y z intensity reflectivity reflectance remission i ring channel laser_id lidar_info line tag t "
-        "time timestamp time_stamp offset_time offset_ns range distance azimuth elevation ambient noise "
-        "near_ir signal return_type return_number number_of_returns confidence rgb rgba r g b a red green "
-        "blue alpha nx ny nz normal_x normal_y normal_z curvature label class classification instance "
-        "object velocity doppler"
-    ).split()
+    """x y z intensity reflectivity reflectance remission i ring channel laser_id lidar_info line tag t time timestamp
+    time_stamp offset_time offset_ns range distance azimuth elevation ambient noise near_ir signal return_type
+    return_number number_of_returns confidence rgb rgba r g b a red green blue alpha nx ny nz normal_x normal_y
+    normal_z curvature label class classification instance object velocity doppler""".split()
 )
 """Fields that clouds of LiDARs usually have, whatever their case: no format of clouds closes its list."""
 
@@ -118,7 +115,13 @@ def read_pcd(content: bytes, where: str) -> dict[str, NDArray]:
         rows = np.frombuffer(body, layout, points)
         return {name: rows[name].copy() for name in names}
     if kind == "binary_compressed":  # field after field, all points of one together
-        flat = _pcd_unpacked(body, points, size, where)
+        _enough(body, 8, where)
+        packed, unpacked = (int(n) for n in np.frombuffer(body, "<u4", 2))
+        _enough(body, 8 + packed, where)
+        if unpacked != points * size or unpacked > packed * _LZF_MAX_GROWTH + 1:
+            what, expected = "compressed cloud contradicts itself", f"{points} points of {size} bytes"
+            raise InputError(what, where=where, expected=expected, got=f"{packed} bytes said to unpack to {unpacked}")
+        flat = lzf_decompress(body[8 : 8 + packed], unpacked, where)
         return {field.name: np.frombuffer(flat, field.kind, points, field.byte * points).copy() for field in fields}
     what = "cloud's DATA is of no known kind"
     raise InputError(what, where=where, expected="ascii, binary or binary_compressed", got=kind[:40])
@@ -176,16 +179,6 @@ def _number_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[n
         what = "cloud is cut off or has rows of another length"
         raise InputError(what, where=where, got=f"{len(table)} numbers", expected=f"{rows} rows of {columns}")
     return table.reshape(rows, columns)
-
-
-def _pcd_unpacked(body: bytes, points: int, size: int, where: str) -> bytes:
-    _enough(body, 8, where)
-    packed, unpacked = (int(n) for n in np.frombuffer(body, "<u4", 2))
-    _enough(body, 8 + packed, where)
-    if unpacked != points * size or unpacked > packed * _LZF_MAX_GROWTH + 1:
-        what, expected = "compressed cloud contradicts itself", f"{points} points of {size} bytes"
-        raise InputError(what, where=where, expected=expected, got=f"{packed} bytes said to unpack to {unpacked}")
-    return lzf_decompress(body[8 : 8 + packed], unpacked, where)
 
 
 def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:

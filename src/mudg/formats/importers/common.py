@@ -50,9 +50,9 @@ def require_columns(names: Iterable[str], there: Iterable[str], where: object) -
     """Refuse a table that lacks one of ``names``."""
     there, names = set(there), list(names)
     if not there.issuperset(names):
-        got = ", ".join(sorted(there)[:40]) or "no columns"
+        got, expected = ", ".join(sorted(there)[:40]) or "no columns", ", ".join(names)
         remedy = "is this a file of another data set, version or kind?"
-        raise InputError("table lacks columns", where=str(where), got=got, expected=", ".join(names), remedy=remedy)
+        raise InputError("table lacks columns", where=str(where), got=got, expected=expected, remedy=remedy)
 
 
 def _number_columns(columns: Columns, names: Sequence[str], where: object) -> NDArray[np.float64]:
@@ -263,9 +263,10 @@ def for_each(
         with ThreadPoolExecutor(workers, thread_name_prefix="importer") as pool:
             pending: deque[Future[None]] = deque()
 
-            def finish_first() -> None:
-                pending.popleft().result()
-                bar.advance()
+            def finish(left: int) -> None:
+                while len(pending) > left:
+                    pending.popleft().result()
+                    bar.advance()
 
             try:
                 for item in items:
@@ -273,10 +274,8 @@ def for_each(
                     done += 1
                     if any(future.done() and future.exception() for future in pending):
                         break
-                    if len(pending) == 2 * workers:
-                        finish_first()
-                while pending:
-                    finish_first()
+                    finish(2 * workers - 1)
+                finish(0)
             finally:
                 for future in pending:
                     future.cancel()
@@ -700,7 +699,6 @@ def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
 def path_inside(root: Path, name: Any, where: str) -> Path:
     """A file below ``root`` from a name in a foreign table; absolute names and ``..`` are refused."""
     if (problem := ref_problem(name)) is not None:
-        raise InputError(
-            f"file name {problem}", where=where, got=repr(name)[:120], expected="a relative path inside the log"
-        )
+        expected = "a relative path inside the log"
+        raise InputError(f"file name {problem}", where=where, got=repr(name)[:120], expected=expected)
     return root / name

@@ -223,12 +223,9 @@ def covering_camera(camera: Camera, lens: Lens) -> Camera:
 def _border_problem(target: Camera, camera: Camera, lens: Lens) -> str | None:
     """Why ``target`` cannot be filled from ``camera``, or None: a border pixel outside, or a ray whose radius turns
     back."""
-    u = np.linspace(0.5, target.width - 0.5, _BORDER_STEPS)
-    v = np.linspace(0.5, target.height - 0.5, _BORDER_STEPS)
-    border = np.concatenate(
-        [np.stack([u, np.full_like(u, y)], 1) for y in (0.5, target.height - 0.5)]
-        + [np.stack([np.full_like(v, x), v], 1) for x in (0.5, target.width - 0.5)]
-    )
+    u, v = (np.linspace(0.5, side - 0.5, _BORDER_STEPS) for side in (target.width, target.height))
+    lines = [*((u, np.full_like(u, y)) for y in v[[0, -1]]), *((np.full_like(v, x), v) for x in u[[0, -1]])]
+    border = np.concatenate([np.stack(line, 1) for line in lines])
     xy = (border - [target.cx, target.cy]) / [target.fx, target.fy]
     steps = np.linspace(0, 1, _BORDER_STEPS)[1:]
     along = lens((xy[:, None] * steps[:, None]).reshape(-1, 2)).reshape(len(xy), len(steps), 2)

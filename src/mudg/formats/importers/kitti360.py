@@ -81,10 +81,8 @@ LABEL_OF: Final = name_table(
 )
 """Classes that become tracks -> the labels of this package. Buildings, poles, vegetation and ground are no tracks."""
 _OFFICIAL: Final = frozenset(
-    (
-        "index label category semanticId semanticId_orig instanceId timestamp start_frame end_frame dynamic "
-        "dynamicSeq dynamicIdx dynamicIndex level_min level_max color transform vertices faces"
-    ).split()
+    """index label category semanticId semanticId_orig instanceId timestamp start_frame end_frame dynamic dynamicSeq
+    dynamicIdx dynamicIndex level_min level_max color transform vertices faces""".split()
 )
 """Fields of the data set's objects, read or not."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))

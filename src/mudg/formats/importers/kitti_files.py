@@ -347,10 +347,8 @@ LABELS: Final = frozenset(
 """Classes of the benchmarks, in lower case."""
 _TRACKLET = frozenset({"objectType", "h", "w", "l", "first_frame", "poses", "finished"})
 _TRACKLET_POSE = frozenset(
-    (
-        "tx ty tz rx ry rz state occlusion occlusion_kf truncation amt_occlusion amt_occlusion_kf "
-        "amt_border_l amt_border_r amt_border_kf"
-    ).split()
+    """tx ty tz rx ry rz state occlusion occlusion_kf truncation amt_occlusion amt_occlusion_kf amt_border_l
+    amt_border_r amt_border_kf""".split()
 )
 """Fields of the data set's tracklets, read or not."""
 
