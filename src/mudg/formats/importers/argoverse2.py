@@ -177,12 +177,8 @@ def _files_by_time(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
 
 
 def read_feather(path: Path, columns: Sequence[str]) -> common.Columns:
-    """Named columns of a Feather (Arrow IPC) file as arrays of one length.
-
-    Raises:
-        ResourceError: pyarrow is not installed. InputError: missing, cut off, without one of the columns, or with
-            empty values.
-    """
+    """Named columns of a Feather (Arrow IPC) file as arrays of one length. Raises ResourceError: pyarrow is not
+    installed. InputError: missing, cut off, without one of the columns, or with empty values."""
     with common.arrow_files(path):
         import pyarrow.feather
 
@@ -235,9 +231,7 @@ def _of_sensor(calibration: Mapping[str, Any], sensor: str, where: object) -> An
 
 def read_cameras(path: Path, chosen: Mapping[str, str]) -> dict[str, Camera]:
     """Cameras by scene name. Pixel centres are whole numbers in the data set: half a pixel is added here.
-
-    ``distortion`` is the original lens in OpenCV's order (k1, k2, p1, p2, k3); the images are rectified.
-    """
+    ``distortion`` is the original lens in OpenCV's order (k1, k2, p1, p2, k3); the images are rectified."""
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
     columns = read_feather(path, ("sensor_name", *names))
     numbers = common.finite_columns(columns, names, path).tolist()
@@ -276,14 +270,9 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = 
 
 
 def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()) -> SweepPoints:
-    """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time.
-
-    Beams without a return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it,
-    f64[3] each.
-
-    Raises:
-        InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn.
-    """
+    """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time. Beams without a
+    return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it, f64[3] each. Raises
+    InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn."""
     where = str(path)
     columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
     returns = common.returns_of(columns, where, places)

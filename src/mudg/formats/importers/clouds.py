@@ -52,12 +52,9 @@ class Cloud:
 
 
 def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
-    """Read a cloud by the suffix of its name.
-
-    Raises:
-        InputError: unknown suffix, cut off, sizes that contradict each other, no coordinates, values not finite.
-            ``known``: names of fields that the caller reads, or knows to be there, besides ``USUAL``.
-    """
+    """Read a cloud by the suffix of its name; ``known``: fields that the caller reads, or knows to be there, besides
+    ``USUAL``. Raises InputError: unknown suffix, cut off, sizes that contradict each other, no coordinates, values not
+    finite."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         what = "point cloud format is not known"
@@ -285,12 +282,8 @@ def read_float_rows(
     path: Path, columns: int, what: str = "scan", axes: int = 3
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], and which of them are
-    returns bool[N].
-
-    Raises:
-        InputError: missing, cut off, or values of a return that are not finite. ``what``: what one file holds, for
-            messages. ``axes``: the first so many columns are coordinates in the sensor's frame.
-    """
+    returns bool[N]. ``what``: what one file holds, for messages. ``axes``: the first so many columns are coordinates in
+    the sensor's frame. Raises InputError: missing, cut off, or values of a return that are not finite."""
     content = store.read_bytes(path)
     if len(content) % (4 * columns):
         what, got = f"{what} is cut off", f"{len(content)} bytes"
@@ -315,11 +308,8 @@ def read_bin(content: bytes, where: str) -> dict[str, NDArray]:
 
 
 def npz_arrays(content: bytes, where: str) -> dict[str, NDArray]:
-    """All arrays of a numpy archive by name.
-
-    Raises:
-        InputError: damaged, cut off, or not plain numbers of the declared size.
-    """
+    """All arrays of a numpy archive by name. Raises InputError: damaged, cut off, or not plain numbers of the declared
+    size."""
     arrays = {}
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:

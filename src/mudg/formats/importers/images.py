@@ -94,17 +94,9 @@ class ImageFit:
     """Where each pixel of the rectified image (recorded size) comes from; None if images are rectified already."""
 
     def image(self, image: NDArray[np.uint8] | Path | bytes, where: str = "") -> NDArray[np.uint8] | Path | bytes:
-        """One recorded image as ``SceneWriter.add_frame`` wants it. Raises InputError: damaged, or not of the recorded
-        size.
-
-        Args:
-            image: u8[H, W, 3], or path or bytes of a PNG or JPEG.
-            where: names the image, for errors.
-
-        Returns:
-            ``image`` itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95
-            for a JPEG, PNG for a PNG, grey for grey) for a file.
-        """
+        """One recorded image, u8[H, W, 3], or path or bytes of a PNG or JPEG, as ``SceneWriter.add_frame`` wants it:
+        itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95 for a JPEG,
+        PNG for a PNG, grey for grey) for a file. Raises InputError: damaged, or not of the recorded size."""
         if not self.note:
             return image
         if isinstance(image, np.ndarray):
@@ -197,10 +189,7 @@ def resized(width: int, height: int, resolution: Resolution | None, where: str =
 
 def covering_camera(camera: Camera, lens: Lens) -> Camera:
     """The pinhole camera of the recorded size with the shortest focal length, not below the lens', that sees no border.
-
-    Raises:
-        InputError: it would be more than ``MAX_FOCAL_GAIN`` times the lens', or the polynomial turns back inside it.
-    """
+    Raises InputError: that is more than ``MAX_FOCAL_GAIN`` times the lens', or the polynomial turns back inside it."""
     low, high = 1.0, MAX_FOCAL_GAIN
 
     def at(gain: float) -> Camera:

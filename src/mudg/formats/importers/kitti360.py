@@ -110,12 +110,9 @@ class Kitti360Box:
 
 
 def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
-    """Boxes of the classes in ``LABEL_OF``, one by one.
-
-    Raises:
-        InputError: missing, cut off, malformed, or it declares XML entities. ``path``: the XML file. ``left_out``:
-            filled with what is not read (``that are not cuboids``) and how often.
-    """
+    """Boxes of the classes in ``LABEL_OF`` in an XML file, one by one; ``left_out`` is filled with what is not read
+    (``that are not cuboids``) and how often. Raises InputError: missing, cut off, malformed, or it declares XML
+    entities."""
     for number, item in enumerate(_objects(path)):
         where = f"{path}: object {number} ({item.tag})"
         if item.find("transform") is None:
@@ -300,11 +297,7 @@ class Kitti360Calibration:
 
 
 def read_calibration(folder: Path) -> Kitti360Calibration:
-    """Read ``calibration/``.
-
-    Raises:
-        InputError: a file or entry is missing, or a matrix is not a rigid motion.
-    """
+    """Read ``calibration/``. Raises InputError: a file or entry is missing, or a matrix is not a rigid motion."""
     path, perspective, sick = (
         folder / f"{name}.txt" for name in ("calib_cam_to_pose", "perspective", "calib_sick_to_velo")
     )
