@@ -85,15 +85,11 @@ class SceneSweep:
 class SceneContent(Generic[Item]):
     """A scene that is ready to be written: all that is small, and how to get the rest.
 
-    Args:
-        name: the scene's id.
-        source: data set, licence and notes, which are logged.
-        fits: by the cameras' scene names, in the order of the scene.
-        items: what is converted one by one: frames, images, sweeps; may be a generator (``total`` says how many then).
-        convert: an item to its images and sweeps; called from several threads if ``workers`` > 1.
-        item_name: what an item is called, put before the place of an error.
-        ego: the vehicle's path in the scene's world and clock.
-        tracks: called after the last item: tracks in the world and clock of the scene, and notes about them.
+    ``name``: the scene's id. ``source``: data set, licence and notes, which are logged. ``fits``: by the cameras' scene
+    names, in the order of the scene. ``items``: what is converted one by one: frames, images, sweeps; may be a
+    generator (``total`` says how many then). ``convert``: an item to its images and sweeps; called from several threads
+    if ``workers`` > 1. ``item_name``: put before the place of an error. ``tracks``: called after the last item: tracks,
+    and notes about them. They and ``ego`` are in the world and clock of the scene.
     """
 
     name: str
@@ -237,15 +233,10 @@ class CameraOptics:
 class DriveLog:
     """What a reader found, in the frame of the data set's map.
 
-    Args:
-        name: name of the log; becomes the scene's id.
-        cameras: by scene name, in the order of the scene; the first one counts frames.
-        images, sweeps: in any order; times in seconds on one clock.
-        tracks, ego: boxes and the vehicle's path in the map's frame.
-        where: folder, for messages.
-        optics: by scene name; cameras that are not named are rectified.
-        box_times: ``sweeps``: keys of tracks are the times of the sweeps in which people saw the boxes; ``own``: the
-            boxes' own.
+    ``name``: the scene's id. ``cameras``: by scene name, in the order of the scene; the first one counts frames.
+    ``images``, ``sweeps``: in any order; times in seconds on one clock. ``where``: folder, for messages. ``optics``: by
+    scene name; cameras that are not named are rectified. ``box_times``: ``sweeps``: keys of tracks are the times of the
+    sweeps in which people saw the boxes; ``own``: the boxes' own.
     """
 
     name: str
@@ -439,10 +430,8 @@ class BoxTimes:
                 self._late_s[index, key] = float(dt_s[near[inside]].mean(dtype=np.float64))
 
     def at_sweep_times(self) -> list[Track]:
-        """The tracks with boxes at their stamps, in the order given.
-
-        Boxes without points inside take the delay of the track's neighbouring boxes.
-        """
+        """The tracks with boxes at their stamps, in the order given. Boxes without points inside take the delay of the
+        track's neighbouring boxes."""
         tracks = list(self._tracks)
         for index in self._moving:
             track = tracks[index]
@@ -458,11 +447,8 @@ class BoxTimes:
 
 
 def _track_velocity(times_s: NDArray[np.float64], late_s: NDArray[np.float64], places: Matrix) -> Matrix:
-    """Velocity at each key, f64[T, 3] m/s: a place filed under t was taken at t + late.
-
-    Steps that these delays nearly cancel (an object crosses the seam where the turn begins) tell no velocity and are
-    left out.
-    """
+    """Velocity at each key, f64[T, 3] m/s: a place filed under t was taken at t + late. Steps that these delays nearly
+    cancel (an object crosses the seam where the turn begins) tell no velocity and are left out."""
     steps_s = np.diff(times_s + late_s)
     telling = steps_s > 0.5 * np.diff(times_s)
     if not telling.any():
@@ -474,10 +460,7 @@ def _track_velocity(times_s: NDArray[np.float64], late_s: NDArray[np.float64], p
 
 def reach_images(track: Track) -> Track:
     """The track with a key ``REACH_S`` before its first and one after its last box, made with the velocity of the
-    nearest two.
-
-    Without these, objects would be missing in images taken just before the first sweep that shows them.
-    """
+    nearest two. Without these, objects would be missing in images taken just before the first sweep that shows them."""
     times, poses = track.times_s, track.world_from_object
     before, after = poses[0].copy(), poses[-1].copy()
     if len(times) > 1:
@@ -588,12 +571,10 @@ class BoxTracks:
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
-
-        Raises:
-            InputError: an object has two boxes at one moment; length and width are swapped. ``speeds``: how
-                velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box ->
-                times of the first and last image that show the object; a track reaches from the first image of its
-                first box to the last one of its last. None = from box to box.
+        ``speeds``: how velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box
+        -> times of the first and last image that show the object; a track reaches from the first image of its first
+        box to the last one of its last. None = from box to box. Raises InputError: an object has two boxes at one
+        moment; length and width are swapped.
         """
         tracks: list[Track] = []
         split = 0

@@ -82,16 +82,17 @@ def equidistant(k1: float = 0, k2: float = 0, k3: float = 0, k4: float = 0) -> L
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageFit:
-    """How the recorded images of one camera become images of the scene. Safe to use from several threads."""
+    """How the recorded images of one camera become images of the scene. Safe to use from several threads.
+
+    ``camera``: the scene's: pinhole, rectified, of the scene's size; ``recorded``: of the size of the files. ``note``:
+    what is done, for ``Source.notes``; empty if images are kept as they are. ``table``: where each pixel of the
+    rectified image (recorded size) comes from; None if images are rectified already.
+    """
 
     camera: Camera
-    """The scene's: pinhole, rectified, of the scene's size."""
     recorded: Camera
-    """Its size is that of the files."""
     note: str
-    """What is done, for ``Source.notes``; empty if images are kept as they are."""
     table: _Table | None
-    """Where each pixel of the rectified image (recorded size) comes from; None if images are rectified already."""
 
     def image(self, image: NDArray[np.uint8] | Path | bytes, where: str = "") -> NDArray[np.uint8] | Path | bytes:
         """One recorded image, u8[H, W, 3], or path or bytes of a PNG or JPEG, as ``SceneWriter.add_frame`` wants it:

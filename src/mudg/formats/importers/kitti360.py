@@ -253,16 +253,15 @@ _FISHEYE: Final = frozenset(_FISHEYE_VALUES).union(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kitti360Calibration:
-    """What is fixed on the vehicle; poses are f64[4, 4]."""
+    """What is fixed on the vehicle; poses are f64[4, 4]. ``ego_from_camera``: by ``image_00`` .. ``image_03``,
+    perspective cameras as rectified. ``velo_from_sick``: None if the file is not there. ``imu_from_rect0``: the data
+    set's vehicle frame from rectified camera 0."""
 
     folder: Path
     ego_from_camera: dict[str, Matrix]
-    """``image_00`` .. ``image_03`` -> pose; perspective cameras as rectified."""
     ego_from_velo: Matrix
     velo_from_sick: Matrix | None
-    """None if the file is not there."""
     imu_from_rect0: Matrix
-    """The data set's vehicle frame from rectified camera 0."""
 
     def fit(self, camera: str, name: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
         """How images of ``camera`` (``image_02``), of ``size`` (width, height), become those of the scene's."""

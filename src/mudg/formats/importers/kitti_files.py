@@ -77,13 +77,12 @@ drive."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiCalibration:
-    """Calibration of one recording; poses are f64[4, 4]."""
+    """Calibration of one recording; poses are f64[4, 4]. ``projections``: camera number -> P f64[3, 4], pixels from
+    rectified camera 0. ``velo_from_imu``: None if the source does not say."""
 
     projections: dict[int, Matrix]
-    """Camera number -> P f64[3, 4]: pixels from rectified camera 0."""
     rect0_from_velo: Matrix
     velo_from_imu: Matrix | None
-    """None if the source does not say."""
     source: str
 
     def camera(self, number: int, name: str, width: int, height: int) -> Camera:
