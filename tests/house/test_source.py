@@ -58,7 +58,14 @@ TORCH_FREE = (
 TORCH_ALLOWED = ("base/checkpoint.py", "base/weights.py")
 
 FORBIDDEN_MODULES = {"pickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "shelve", "random", "torchvision"}
-LITERAL_TABLES = ("__init__.py", "steps/__init__.py", "steps/step.py", "gaussians/model.py", "gaussians/recipes.py")
+LITERAL_TABLES = (
+    "__init__.py",
+    "formats/importers/__init__.py",
+    "gaussians/model.py",
+    "gaussians/recipes.py",
+    "steps/__init__.py",
+    "steps/step.py",
+)
 """Files that import by names, all of which stand in a table beside."""
 FORBIDDEN_CALLS = {
     "eval",

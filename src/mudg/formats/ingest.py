@@ -58,8 +58,12 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> dict
     if (folder.path / "scene.json").is_file():
         scene = read_scene(folder.path)  # finished by a run that was stopped before it could say so
     else:
-        scene = _make(kind, config, source, folder.path)
-        if kind not in (CITY, _SCENE):
+        if kind == CITY:
+            scene = _city(config, folder.path)
+        elif kind == _SCENE:
+            scene = _copy_scene(config, source, folder.path)
+        else:
+            scene = import_log(kind, source, folder.path, import_options(config))
             warnings = [finding for finding in check.check_records(scene) if finding.level == "warning"]
             for line in check.folded(warnings, f"mudg doctor {folder.out}"):
                 log.warn(f"ingest: {line}")
@@ -102,21 +106,12 @@ def kind_of(config: IngestConfig, source: Path) -> str:
     for name, looks_like in RECOGNISERS.items():
         if looks_like(source):
             return name
-    inside = "a file"
-    if source.is_dir():
-        inside = ", ".join(sorted(entry.name for entry in source.iterdir())[:10]) or "nothing"
+    entries = sorted(entry.name for entry in source.iterdir()) if source.is_dir() else ["a file"]
     what, expected = "the log's format was not recognised", f"a scene, or a log of one of: {', '.join(known_formats())}"
     remedy = "give the folder of one drive or sequence, or name the format with --format"
-    raise InputError(what, where=str(source), expected=expected, got=inside, remedy=remedy)
-
-
-def _make(kind: str, config: IngestConfig, source: Path, out: Path) -> Scene:
-    """Make the scene at ``out``."""
-    if kind == CITY:
-        return _city(config, out)
-    if kind == _SCENE:
-        return _copy_scene(config, source, out)
-    return import_log(kind, source, out, import_options(config))
+    raise InputError(
+        what, where=str(source), expected=expected, got=", ".join(entries[:10]) or "nothing", remedy=remedy
+    )
 
 
 def is_scene(source: Path) -> bool:
@@ -178,11 +173,8 @@ def _walk(path: Path) -> Iterator[Path]:
 def _city(config: IngestConfig, out: Path) -> Scene:
     from mudg.city.logs import write_city
 
-    what, remedy = (
-        "the generated city has settings of its own",
-        "use --city.n-frames, --city.cameras, --city.width, ...",
-    )
-    _refuse_log_settings(config, what, remedy)
+    what = "the generated city has settings of its own"
+    _refuse_log_settings(config, what, "use --city.n-frames, --city.cameras, --city.width, ...")
     return write_city(config.city, out, test_every=config.test_every)
 
 

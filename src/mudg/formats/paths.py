@@ -42,9 +42,8 @@ def read_path(file: Path, scene: Scene, camera: Camera) -> Trajectory:
     """
     rows = _of_json(file) if file.suffix == ".json" else _of_text(file)
     if not 0 < len(rows) <= MOST_VIEWS:
-        raise InputError(
-            "no usable number of poses", where=str(file), expected=f"1 to {MOST_VIEWS}", got=str(len(rows))
-        )
+        expected = f"1 to {MOST_VIEWS}"
+        raise InputError("no usable number of poses", where=str(file), expected=expected, got=str(len(rows)))
     recorded = [frame.view for frame in scene.frames]
     first, last = min(view.time_s for view in recorded), max(view.time_s for view in recorded)
     timed = [time for time, _, _ in rows if time is not None]
@@ -52,16 +51,13 @@ def read_path(file: Path, scene: Scene, camera: Camera) -> Trajectory:
         raise InputError("some poses have a time and others have none", where=str(file))
     times = np.array(timed) if timed else np.linspace(first, last, len(rows))
     for (_, pose, where), time_s in zip(rows, times.tolist(), strict=True):
-        problem = geometry.rigid_problem(pose)
-        if problem:
-            raise InputError(
-                "a pose of the path is not rigid", where=where, expected="a rotation and metres", got=problem
-            )
+        if problem := geometry.rigid_problem(pose):
+            what, expected = "a pose of the path is not rigid", "a rotation and metres"
+            raise InputError(what, where=where, expected=expected, got=problem)
         if not first - 1e-6 <= time_s <= last + 1e-6:
-            expected, remedy = f"{first:.3f} to {last:.3f} s", "times are those of the scene's clock"
-            raise InputError(
-                "the path leaves the time of the log", where=where, expected=expected, got=f"{time_s} s", remedy=remedy
-            )
+            what, remedy = "the path leaves the time of the log", "times are those of the scene's clock"
+            expected = f"{first:.3f} to {last:.3f} s"
+            raise InputError(what, where=where, expected=expected, got=f"{time_s} s", remedy=remedy)
     if (np.diff(times) < 0).any():
         raise InputError("times of the path do not increase", where=rows[int(np.argmax(np.diff(times) < 0)) + 1][2])
     places = np.stack([view.center_world for view in recorded])
@@ -107,14 +103,13 @@ def _of_json(file: Path) -> Rows:
     for number, frame in enumerate(frames):
         where = f"{file}, frames[{number}]"
         matrix = frame.get("transform_matrix") if isinstance(frame, dict) else None
+        what, here, expected = "not a matrix", f"{where}.transform_matrix", "4x4 numbers"
         try:
             pose = np.array(matrix, np.float64)
         except (TypeError, ValueError) as error:
-            raise InputError("not a matrix", where=f"{where}.transform_matrix", expected="4x4 numbers") from error
+            raise InputError(what, where=here, expected=expected) from error
         if pose.shape != (4, 4):
-            raise InputError(
-                "not a matrix", where=f"{where}.transform_matrix", expected="4x4 numbers", got=str(pose.shape)
-            )
+            raise InputError(what, where=here, expected=expected, got=str(pose.shape))
         time_s = frame.get("time")
         if time_s is not None and (isinstance(time_s, bool) or not isinstance(time_s, int | float)):
             raise InputError("not a time", where=f"{where}.time", expected="seconds", got=repr(time_s)[:40])

@@ -15,10 +15,8 @@ class IngestConfig:
 
     FIXED: ClassVar[Mapping[str, tuple[str, ...]]] = {
         "city": tuple(
-            (
-                "rate_hz hfov_deg rig_variation lidar_lower_deg lidar_upper_deg lidar_range_m lidar_noise_m "
-                "lidar_dropout style crossing shift_margin_m sensor_noise"
-            ).split()
+            """rate_hz hfov_deg rig_variation lidar_lower_deg lidar_upper_deg lidar_range_m lidar_noise_m lidar_dropout
+            style crossing shift_margin_m sensor_noise""".split()
         )
     }
 

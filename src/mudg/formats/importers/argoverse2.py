@@ -54,8 +54,8 @@ OFFICIAL: Final[Mapping[str, frozenset[str]]] = {
     "city_SE3_egovehicle.feather": frozenset({"timestamp_ns", *_POSE}),
     "egovehicle_SE3_sensor.feather": frozenset({"sensor_name", *_POSE}),
     "intrinsics.feather": frozenset("sensor_name fx_px fy_px cx_px cy_px k1 k2 k3 width_px height_px".split()),
-    "annotations.feather": frozenset(
-        ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE, "num_interior_pts", "log_id")
+    "annotations.feather": frozenset("timestamp_ns track_uuid category num_interior_pts log_id".split()).union(
+        _SIZE, _POSE
     ),
     SWEEPS: frozenset({"x", "y", "z", "intensity", "laser_number", "offset_ns"}),
 }
@@ -82,10 +82,9 @@ def looks_like_argoverse2(source: Path) -> bool:
 def import_argoverse2(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import a log's folder, or one of a folder of logs. ``options.sequence``: a log's name, or its beginning;
     ``cameras`` by either name, the seven ring cameras by default. ResourceError: pyarrow is not installed."""
-    if not source.is_dir():
-        raise InputError("Argoverse 2 folder does not exist", where=str(source), expected="a folder")
+    folder = _choose_log(source, options)
     common.refuse_untwist(options, "Argoverse 2", str(source))
-    return drive_log.write_log(read_log(_choose_log(source, options), options), out, options)
+    return drive_log.write_log(read_log(folder, options), out, options)
 
 
 def _logs(source: Path) -> list[Path]:
@@ -98,12 +97,12 @@ def _logs(source: Path) -> list[Path]:
 
 
 def _choose_log(source: Path, options: ImportOptions) -> Path:
-    logs = _logs(source)
+    common.require_folder(source, "Argoverse 2")
+    logs, got = _logs(source), common.folder_contents(source)
     if not logs:
-        what = "no Argoverse 2 log found"
         expected = "city_SE3_egovehicle.feather, calibration and sensors, here or in sub-folders"
         remedy = "give the folder of one log of the sensor data set"
-        raise InputError(what, where=str(source), got=common.folder_contents(source), expected=expected, remedy=remedy)
+        raise InputError("no Argoverse 2 log found", where=str(source), got=got, expected=expected, remedy=remedy)
     matching = [path for path in logs if path.resolve().name.startswith(options.sequence)]
     return common.the_only(matching, [path.name for path in logs], options, source, "log")
 
@@ -126,33 +125,38 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
     common.refuse_missing_cameras(there.values(), (CAMERAS[raw] for raw in RING_CAMERAS), options, image_folder)
     chosen = {there[raw]: raw for raw in common.chosen_cameras(there, options, where, RING_CAMERAS)}
     files = {name: _files_by_time(image_folder / raw, (".jpg", ".jpeg", ".png")) for name, raw in chosen.items()}
-    scans = _files_by_time(sweep_folder, (".feather",)) if sweep_folder.is_dir() else {}
+    scans = _files_by_time(sweep_folder, (".feather",))
     stamps = [stamp for found in (*files.values(), scans) for stamp in found]
     if not stamps:
         raise InputError("the log has no images", where=str(image_folder))
     zero_ns = min(stamps)
+
+    def seconds(stamp: int) -> float:
+        return (stamp - zero_ns) / NANOSECONDS
+
     ego_file, mount_file = folder / "city_SE3_egovehicle.feather", folder / "calibration/egovehicle_SE3_sensor.feather"
     notes: list[str] = []
     mounts, ego = read_mounts(mount_file), common.mended_path(read_ego(ego_file, zero_ns), options, notes)
     if options.skip_missing:
-        files = {name: _with_poses(found, ego, zero_ns, name) for name, found in files.items()}
-        scans = _with_poses(scans, ego, zero_ns, SENSOR)
+        for name, found in {**files, SENSOR: scans}.items():
+            lost = [t for t in found if not common.has_pose(ego, seconds(t), _POSE_SLACK_S)]
+            for stamp in lost:
+                del found[stamp]
+            if lost:
+                log.warn(f"argoverse2: left out {len(lost)} files of {name} without a vehicle pose")
 
     def map_from_ego(stamp: int) -> Matrix:
-        return common.pose_near(ego, (stamp - zero_ns) / NANOSECONDS, _POSE_SLACK_S, str(ego_file))
+        return common.pose_near(ego, seconds(stamp), _POSE_SLACK_S, str(ego_file))
 
-    images = [
-        ImageRecord(name, (stamp - zero_ns) / NANOSECONDS, map_from_ego(stamp) @ mount, path)
-        for name, found in files.items()
-        for mount in [_of_sensor(mounts, chosen[name], mount_file)]
-        for stamp, path in found.items()
-    ]
+    images = []
+    for name, found in files.items():
+        mount = _of_sensor(mounts, chosen[name], mount_file)
+        images += [ImageRecord(name, seconds(t), map_from_ego(t) @ mount, path) for t, path in found.items()]
     upper = _of_sensor(mounts, _UPPER, mount_file) if scans else np.eye(4)
     places = [pose[:3, 3] for name, pose in mounts.items() if name in (_UPPER, _LOWER)]
     sweeps = [
-        SweepRecord(SENSOR, (t - zero_ns) / NANOSECONDS, map_from_ego(t) @ upper, path, read)
+        SweepRecord(SENSOR, seconds(t), map_from_ego(t) @ upper, path, partial(read_sweep, path, upper, places))
         for t, path in scans.items()
-        for read in [partial(read_sweep, path, upper, places)]
     ]
     notes += [] if sweeps else ["no LiDAR sweeps in the log"]
     tracks, track_notes = read_tracks(folder / "annotations.feather", ego, zero_ns, skip_missing=options.skip_missing)
@@ -164,31 +168,17 @@ def read_log(folder: Path, options: ImportOptions) -> DriveLog:
 
 def _files_by_time(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     """Files called by nanoseconds, in order of time."""
-    found = sorted(
-        (int(path.stem), path) for path in folder.iterdir() if path.stem.isdigit() and path.suffix.lower() in suffixes
-    )
-    common.check_epoch(np.array([stamp for stamp, _ in found], np.int64), NANOSECONDS, f"{folder}: file names")
-    return dict(found)
-
-
-def _with_poses(files: Mapping[int, Path], ego: EgoPath, zero_ns: int, sensor: str) -> dict[int, Path]:
-    """The files at whose times the vehicle's path is known."""
-    placed = {t: path for t, path in files.items() if common.has_pose(ego, (t - zero_ns) / NANOSECONDS, _POSE_SLACK_S)}
-    if len(placed) < len(files):
-        log.warn(f"argoverse2: left out {len(files) - len(placed)} files of {sensor} without a vehicle pose")
-    return placed
+    found = common.numbered_files(folder, suffixes)
+    common.check_epoch(np.array(list(found), np.int64), NANOSECONDS, f"{folder}: file names")
+    return found
 
 
 # --- tables ---------------------------------------------------------------------------------------
 
 
 def read_feather(path: Path, columns: Sequence[str]) -> common.Columns:
-    """Named columns of a Feather (Arrow IPC) file as arrays of one length.
-
-    Raises:
-        ResourceError: pyarrow is not installed. InputError: missing, cut off, without one of the columns, or with
-            empty values.
-    """
+    """Named columns of a Feather (Arrow IPC) file as arrays of one length. Raises ResourceError: pyarrow is not
+    installed. InputError: missing, cut off, without one of the columns, or with empty values."""
     with common.arrow_files(path):
         import pyarrow.feather
 
@@ -241,18 +231,14 @@ def _of_sensor(calibration: Mapping[str, Any], sensor: str, where: object) -> An
 
 def read_cameras(path: Path, chosen: Mapping[str, str]) -> dict[str, Camera]:
     """Cameras by scene name. Pixel centres are whole numbers in the data set: half a pixel is added here.
-
-    ``distortion`` is the original lens in OpenCV's order (k1, k2, p1, p2, k3); the images are rectified.
-    """
-    where = str(path)
+    ``distortion`` is the original lens in OpenCV's order (k1, k2, p1, p2, k3); the images are rectified."""
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "k1", "k2", "k3", "width_px", "height_px")
     columns = read_feather(path, ("sensor_name", *names))
-    rows = dict(
-        zip(map(str, columns["sensor_name"]), common.finite_columns(columns, names, where).tolist(), strict=True)
-    )
+    numbers = common.finite_columns(columns, names, path).tolist()
+    rows = dict(zip(map(str, columns["sensor_name"]), numbers, strict=True))
     cameras = {}
     for name, raw in chosen.items():
-        fx, fy, cx, cy, k1, k2, k3, width, height = _of_sensor(rows, raw, where)
+        fx, fy, cx, cy, k1, k2, k3, width, height = _of_sensor(rows, raw, path)
         lens = (k1, k2, 0.0, 0.0, k3)
         cameras[name] = Camera(name, int(width), int(height), fx, fy, cx + 0.5, cy + 0.5, distortion=lens)
     return cameras
@@ -267,30 +253,26 @@ def read_tracks(path: Path, ego: EgoPath, zero_ns: int, *, skip_missing: bool = 
     columns = read_feather(path, ("timestamp_ns", "track_uuid", "category", *_SIZE, *_POSE))
     stamps, poses = _stamps(columns, where), _poses(columns, where)
     sizes = common.finite_columns(columns, _SIZE, where)
+    times_s = [(stamp - zero_ns) / NANOSECONDS for stamp in stamps.tolist()]
     map_from_ego = {
-        int(t): common.pose_near(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S, where)
-        for t in set(stamps)
-        if not skip_missing or common.has_pose(ego, (int(t) - zero_ns) / NANOSECONDS, _POSE_SLACK_S)
+        time_s: common.pose_near(ego, time_s, _POSE_SLACK_S, where)
+        for time_s in set(times_s)
+        if not skip_missing or common.has_pose(ego, time_s, _POSE_SLACK_S)
     }
     tracks = BoxTracks(where, LABELS)
-    for row, (stamp, pose) in enumerate(zip(stamps, poses, strict=True)):
-        if int(stamp) not in map_from_ego:
+    for row, (time_s, pose) in enumerate(zip(times_s, poses, strict=True)):
+        if time_s not in map_from_ego:
             continue
         label, track = tracks.label_of(str(columns["category"][row])), str(columns["track_uuid"][row])
-        time_s, pose = (int(stamp) - zero_ns) / NANOSECONDS, map_from_ego[int(stamp)] @ pose
-        tracks.add(track, label, time_s, tuple(sizes[row].tolist()), pose, where=f"{where}: row {row}")
+        size, pose = tuple(sizes[row].tolist()), map_from_ego[time_s] @ pose
+        tracks.add(track, label, time_s, size, pose, where=f"{where}: row {row}")
     return tracks.tracks()
 
 
 def read_sweep(path: Path, ego_from_lidar: Matrix, places: Sequence[Matrix] = ()) -> SweepPoints:
-    """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time.
-
-    Beams without a return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it,
-    f64[3] each.
-
-    Raises:
-        InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn.
-    """
+    """A sweep in the frame of the upper LiDAR: xyz, intensity 0..1, seconds since the sweep's time. Beams without a
+    return are left out: zeros of the vehicle's frame, and points at the LiDARs' ``places`` in it, f64[3] each. Raises
+    InputError: missing, cut off, not finite, or with point times that are no nanoseconds of one turn."""
     where = str(path)
     columns = read_feather(path, ("x", "y", "z", "intensity", "offset_ns"))
     returns = common.returns_of(columns, where, places)

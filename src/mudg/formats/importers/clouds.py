@@ -31,13 +31,10 @@ _LZF_MAX_GROWTH: Final = 90
 """A token of 3 bytes makes at most 264."""
 
 USUAL: Final = frozenset(
-    (
-        "x y z intensity reflectivity reflectance remission i ring channel laser_id lidar_info line tag t "
-        "time timestamp time_stamp offset_time offset_ns range distance azimuth elevation ambient noise "
-        "near_ir signal return_type return_number number_of_returns confidence rgb rgba r g b a red green "
-        "blue alpha nx ny nz normal_x normal_y normal_z curvature label class classification instance "
-        "object velocity doppler"
-    ).split()
+    """x y z intensity reflectivity reflectance remission i ring channel laser_id lidar_info line tag t time timestamp
+    time_stamp offset_time offset_ns range distance azimuth elevation ambient noise near_ir signal return_type
+    return_number number_of_returns confidence rgb rgba r g b a red green blue alpha nx ny nz normal_x normal_y
+    normal_z curvature label class classification instance object velocity doppler""".split()
 )
 """Fields that clouds of LiDARs usually have, whatever their case: no format of clouds closes its list."""
 
@@ -55,12 +52,9 @@ class Cloud:
 
 
 def read_cloud(path: Path, known: Collection[str] = ()) -> Cloud:
-    """Read a cloud by the suffix of its name.
-
-    Raises:
-        InputError: unknown suffix, cut off, sizes that contradict each other, no coordinates, values not finite.
-            ``known``: names of fields that the caller reads, or knows to be there, besides ``USUAL``.
-    """
+    """Read a cloud by the suffix of its name; ``known``: fields that the caller reads, or knows to be there, besides
+    ``USUAL``. Raises InputError: unknown suffix, cut off, sizes that contradict each other, no coordinates, values not
+    finite."""
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         what = "point cloud format is not known"
@@ -118,7 +112,13 @@ def read_pcd(content: bytes, where: str) -> dict[str, NDArray]:
         rows = np.frombuffer(body, layout, points)
         return {name: rows[name].copy() for name in names}
     if kind == "binary_compressed":  # field after field, all points of one together
-        flat = _pcd_unpacked(body, points, size, where)
+        _enough(body, 8, where)
+        packed, unpacked = (int(n) for n in np.frombuffer(body, "<u4", 2))
+        _enough(body, 8 + packed, where)
+        if unpacked != points * size or unpacked > packed * _LZF_MAX_GROWTH + 1:
+            what, expected = "compressed cloud contradicts itself", f"{points} points of {size} bytes"
+            raise InputError(what, where=where, expected=expected, got=f"{packed} bytes said to unpack to {unpacked}")
+        flat = lzf_decompress(body[8 : 8 + packed], unpacked, where)
         return {field.name: np.frombuffer(flat, field.kind, points, field.byte * points).copy() for field in fields}
     what = "cloud's DATA is of no known kind"
     raise InputError(what, where=where, expected="ascii, binary or binary_compressed", got=kind[:40])
@@ -176,16 +176,6 @@ def _number_table(body: bytes, columns: int, rows: int, where: str) -> NDArray[n
         what = "cloud is cut off or has rows of another length"
         raise InputError(what, where=where, got=f"{len(table)} numbers", expected=f"{rows} rows of {columns}")
     return table.reshape(rows, columns)
-
-
-def _pcd_unpacked(body: bytes, points: int, size: int, where: str) -> bytes:
-    _enough(body, 8, where)
-    packed, unpacked = (int(n) for n in np.frombuffer(body, "<u4", 2))
-    _enough(body, 8 + packed, where)
-    if unpacked != points * size or unpacked > packed * _LZF_MAX_GROWTH + 1:
-        what, expected = "compressed cloud contradicts itself", f"{points} points of {size} bytes"
-        raise InputError(what, where=where, expected=expected, got=f"{packed} bytes said to unpack to {unpacked}")
-    return lzf_decompress(body[8 : 8 + packed], unpacked, where)
 
 
 def lzf_decompress(packed: bytes, length: int, where: str) -> bytes:
@@ -292,12 +282,8 @@ def read_float_rows(
     path: Path, columns: int, what: str = "scan", axes: int = 3
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Rows of little-endian float32 without a header, as raw scans are kept: f32[N, columns], and which of them are
-    returns bool[N].
-
-    Raises:
-        InputError: missing, cut off, or values of a return that are not finite. ``what``: what one file holds, for
-            messages. ``axes``: the first so many columns are coordinates in the sensor's frame.
-    """
+    returns bool[N]. ``what``: what one file holds, for messages. ``axes``: the first so many columns are coordinates in
+    the sensor's frame. Raises InputError: missing, cut off, or values of a return that are not finite."""
     content = store.read_bytes(path)
     if len(content) % (4 * columns):
         what, got = f"{what} is cut off", f"{len(content)} bytes"
@@ -322,11 +308,8 @@ def read_bin(content: bytes, where: str) -> dict[str, NDArray]:
 
 
 def npz_arrays(content: bytes, where: str) -> dict[str, NDArray]:
-    """All arrays of a numpy archive by name.
-
-    Raises:
-        InputError: damaged, cut off, or not plain numbers of the declared size.
-    """
+    """All arrays of a numpy archive by name. Raises InputError: damaged, cut off, or not plain numbers of the declared
+    size."""
     arrays = {}
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:

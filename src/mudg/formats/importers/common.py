@@ -50,9 +50,9 @@ def require_columns(names: Iterable[str], there: Iterable[str], where: object) -
     """Refuse a table that lacks one of ``names``."""
     there, names = set(there), list(names)
     if not there.issuperset(names):
-        got = ", ".join(sorted(there)[:40]) or "no columns"
+        got, expected = ", ".join(sorted(there)[:40]) or "no columns", ", ".join(names)
         remedy = "is this a file of another data set, version or kind?"
-        raise InputError("table lacks columns", where=str(where), got=got, expected=", ".join(names), remedy=remedy)
+        raise InputError("table lacks columns", where=str(where), got=got, expected=expected, remedy=remedy)
 
 
 def _number_columns(columns: Columns, names: Sequence[str], where: object) -> NDArray[np.float64]:
@@ -64,11 +64,7 @@ def _number_columns(columns: Columns, names: Sequence[str], where: object) -> ND
 
 
 def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDArray[np.float64]:
-    """Columns as f64[n, k].
-
-    Raises:
-        InputError: no numbers, or not all finite.
-    """
+    """Columns as f64[n, k]. Raises InputError: no numbers, or not all finite."""
     table, where = _number_columns(columns, names, where), f"{where}: {', '.join(names)}"
     bad = ~np.isfinite(table).all(1)
     if bad.any():
@@ -79,11 +75,7 @@ def finite_columns(columns: Columns, names: Sequence[str], where: object) -> NDA
 
 def unit_intensity(values: NDArray[Any], largest: float, where: object, remedy: str = "") -> NDArray[np.float32]:
     """Intensities of a cloud, from 0 to the ``largest`` that its format has, as f32 from 0 to 1; rounding beyond that
-    is taken off.
-
-    Raises:
-        InputError: other values, which would all become 0 or 1, or some that are not finite.
-    """
+    is taken off. Raises InputError: other values, which would all become 0 or 1, or some that are not finite."""
     scaled = values.astype(np.float64) / largest
     if not ((scaled > -_ROUNDING) & (scaled < 1 + _ROUNDING)).all():
         what, got = "intensity is out of range", f"{values.min():g} to {values.max():g}"
@@ -162,11 +154,7 @@ class ImportOptions:
 
 
 def parse_frame_range(text: str) -> tuple[int, int] | None:
-    """``"10:26"`` -> (10, 26); an empty text -> None.
-
-    Raises:
-        UsageError: not of this form, or empty.
-    """
+    """``"10:26"`` -> (10, 26); an empty text -> None. Raises UsageError: not of this form, or an empty range."""
     if not text:
         return None
     match = re.fullmatch(r"(\d{1,9}):(\d{1,9})", text.strip())
@@ -177,11 +165,8 @@ def parse_frame_range(text: str) -> tuple[int, int] | None:
 
 
 def parse_resolution(text: str) -> Resolution | None:
-    """``"960"`` -> 960 (longest side), ``"960x640"`` -> (960, 640); an empty text -> None.
-
-    Raises:
-        UsageError: not of this form, or below 16 pixels.
-    """
+    """``"960"`` -> 960 (longest side), ``"960x640"`` -> (960, 640); an empty text -> None. Raises UsageError: not of
+    this form, or below 16 pixels."""
     if not text:
         return None
     match = re.fullmatch(r"(\d{2,5})(?:x(\d{2,5}))?", text.strip().lower())
@@ -263,9 +248,10 @@ def for_each(
         with ThreadPoolExecutor(workers, thread_name_prefix="importer") as pool:
             pending: deque[Future[None]] = deque()
 
-            def finish_first() -> None:
-                pending.popleft().result()
-                bar.advance()
+            def finish(left: int) -> None:
+                while len(pending) > left:
+                    pending.popleft().result()
+                    bar.advance()
 
             try:
                 for item in items:
@@ -273,10 +259,8 @@ def for_each(
                     done += 1
                     if any(future.done() and future.exception() for future in pending):
                         break
-                    if len(pending) == 2 * workers:
-                        finish_first()
-                while pending:
-                    finish_first()
+                    finish(2 * workers - 1)
+                finish(0)
             finally:
                 for future in pending:
                     future.cancel()
@@ -303,14 +287,9 @@ def _named(work: Callable[[Item], None], item: Item, name: Callable[[Item], str]
 
 
 def seconds(times: Sequence[int] | Sequence[float] | NDArray, unit: TimeUnit, where: str, start: float = 0) -> Matrix:
-    """Times of one sensor's records as seconds f64[N] since ``start`` (same unit), checked.
-
-    Integers are subtracted before they become floats, so nanoseconds of the epoch keep their digits.
-
-    Raises:
-        InputError: not increasing (with the first place), not finite, or so close or far apart that the unit is
-            wrong.
-    """
+    """Times of one sensor's records as seconds f64[N] since ``start`` (same unit). Integers are subtracted before they
+    become floats, so nanoseconds of the epoch keep their digits. Raises InputError: not increasing, not finite, or so
+    close or far apart that the unit is wrong."""
     numbers = np.asarray(times)
     if numbers.dtype.kind not in "iuf" or numbers.ndim != 1 or not np.isfinite(numbers.astype(np.float64)).all():
         raise InputError("timestamps are not a list of finite numbers", where=where, got=str(numbers)[:80])
@@ -389,11 +368,8 @@ def rigid_rotation(matrix: NDArray[np.float64], where: str) -> Matrix:
 
 
 def pose_from_quaternion(wxyz: ArrayLike, xyz_m: ArrayLike, where: str) -> Matrix:
-    """Pose f64[4, 4] from a unit quaternion (w, x, y, z) and a translation in metres.
-
-    Raises:
-        InputError: not finite, wrong count, or a quaternion whose length is not 1 within 1 %.
-    """
+    """Pose f64[4, 4] from a unit quaternion (w, x, y, z) and a translation in metres. Raises InputError: not finite,
+    wrong count, or a quaternion whose length is not 1 within 1 %."""
     q, t = np.asarray(wxyz, np.float64).reshape(-1), np.asarray(xyz_m, np.float64).reshape(-1)
     if q.shape != (4,) or t.shape != (3,) or not np.isfinite(q).all() or not np.isfinite(t).all():
         what = "pose is not a quaternion and a translation"
@@ -520,13 +496,10 @@ def check_motion(ego: EgoPath, where: str) -> None:
 def deskew(
     xyz: NDArray[np.float32], dt_s: NDArray[np.float32], world_from_lidar: Callable[[float], Matrix], time_s: float
 ) -> NDArray[np.float32]:
-    """Bring points that were measured while the sensor moved to one moment.
+    """Bring points that were measured while the sensor moved to one moment, ``time_s``.
 
-    Args:
-        xyz: f32[N, 3] metres, each in the sensor's frame at its own time.
-        dt_s: f32[N], that time less ``time_s``.
-        world_from_lidar: the sensor's pose f64[4, 4] at a time; asked at 33 moments, between which points are blended.
-        time_s: the moment wanted, whose sensor frame the points returned have.
+    ``xyz``: f32[N, 3] metres, each in the sensor's frame at its own time, which is ``dt_s`` f32[N] later.
+    ``world_from_lidar``: the sensor's pose f64[4, 4] at a time; asked at 33 moments, between which points are blended.
     """
     if len(xyz) == 0 or not dt_s.any():
         return xyz
@@ -571,7 +544,7 @@ def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
     """Files called by a frame number, in order: ``0000000012.png`` with suffix ``.png``, ``07.pkl.gz`` with
     ``.pkl.gz``; none where there is no folder."""
     files = {}
-    for path in folder.iterdir() if folder.is_dir() else ():
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
         stem, dot, rest = path.name.partition(".")
         if stem.isascii() and stem.isdigit() and dot + rest.lower() in suffixes:
             files[int(stem)] = path
@@ -580,11 +553,8 @@ def numbered_files(folder: Path, suffixes: Sequence[str]) -> dict[int, Path]:
 
 def complete_frames(streams: Mapping[str, Iterable[int]], options: ImportOptions, where: str, title: str) -> list[int]:
     """Frame numbers to import: those that every stream (name of a camera or LiDAR -> its frame numbers) has, within
-    ``options.frames``.
-
-    Raises:
-        InputError: a stream lacks frames that others have (unless ``skip_missing``), or nothing is left.
-    """
+    ``options.frames``. Raises InputError: a stream lacks frames that others have (unless ``skip_missing``), or nothing
+    is left."""
     numbers = {name: set(found) for name, found in streams.items()}
     everything = set().union(*numbers.values())
     if options.frames is not None:
@@ -619,18 +589,22 @@ def first_file(*candidates: Path) -> Path | None:
     return next((path for path in candidates if path.is_file()), None)
 
 
+def require_folder(source: Path, dataset: str) -> None:
+    """Refuse what is no folder."""
+    if not source.is_dir():
+        raise InputError(f"{dataset} folder does not exist", where=str(source), expected="a folder")
+
+
 def folder_contents(folder: Path) -> str:
     """The first names in a folder, for messages."""
     return ", ".join(sorted(path.name for path in folder.iterdir())[:12]) or "an empty folder"
 
 
 def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOptions, where: Path, kind: str) -> Item:
-    """The one log that ``options.sequence`` means.
+    """The one log that ``options.sequence`` means. Raises UsageError: none fits, or several do.
 
-    Raises:
-        UsageError: none fits, or several do. ``matching``: logs that fit it; all of them where none was chosen.
-            ``names``: of all logs that are there, for the message; ``where``: folder that holds them. ``kind``: what
-            one is called: log, scene, drive, sequence.
+    ``matching``: logs that fit it; all of them where none was chosen. ``names``: of all logs in the folder ``where``,
+    for the message. ``kind``: what one is called: log, scene, drive, sequence.
     """
     if len(matching) == 1:
         return matching[0]
@@ -641,13 +615,9 @@ def the_only(matching: Sequence[Item], names: Sequence[str], options: ImportOpti
 
 
 def chosen_cameras(available: Mapping[str, str], options: ImportOptions, where: str, usual: Sequence[str]) -> list[str]:
-    """The data set's names of the cameras to import, in the order of ``available``.
-
-    Raises:
-        UsageError: no such camera. InputError: none of the usual ones is there. ``available``: the data set's name ->
-            the name in the scene; either may be asked for. ``usual``: the data set's names taken when none is asked
-            for; those that are not there are left out.
-    """
+    """The data set's names of the cameras to import, in the order of ``available``: the data set's name -> the name in
+    the scene, either of which may be asked for. ``usual``: the data set's names taken when none is asked for; those
+    that are not there are left out. Raises UsageError: no such camera. InputError: none of the usual ones is there."""
     by_scene_name = {ours: theirs for theirs, ours in available.items()}
     listed = ", ".join(o if o == t else f"{o} ({t})" for t, o in available.items()) or "no cameras"
     if not options.cameras:
@@ -694,7 +664,6 @@ def refuse_untwist(options: ImportOptions, dataset: str, where: str) -> None:
 def path_inside(root: Path, name: Any, where: str) -> Path:
     """A file below ``root`` from a name in a foreign table; absolute names and ``..`` are refused."""
     if (problem := ref_problem(name)) is not None:
-        raise InputError(
-            f"file name {problem}", where=where, got=repr(name)[:120], expected="a relative path inside the log"
-        )
+        expected = "a relative path inside the log"
+        raise InputError(f"file name {problem}", where=where, got=repr(name)[:120], expected=expected)
     return root / name

@@ -92,10 +92,9 @@ def looks_like_dgp(source: Path) -> bool:
 def import_dgp(source: Path, out: Path, options: ImportOptions) -> Scene:
     """Import a scene's folder, or one of a folder of scenes. ``options.sequence``: a scene's folder; ``cameras`` by
     either name (``CAMERA_01`` or ``camera_01``), all by default."""
-    if not source.is_dir():
-        raise InputError("DGP folder does not exist", where=str(source), expected="a folder")
+    scene = _choose_scene(source, options)
     common.refuse_untwist(options, "DGP", str(source))
-    return drive_log.write_log(read_log(_choose_scene(source, options), options), out, options)
+    return drive_log.write_log(read_log(scene, options), out, options)
 
 
 def _scenes(source: Path) -> list[Path]:
@@ -107,6 +106,7 @@ def _scenes(source: Path) -> list[Path]:
 
 
 def _choose_scene(source: Path, options: ImportOptions) -> Path:
+    common.require_folder(source, "DGP")
     scenes = _scenes(source)
     if not scenes:
         expected = "scene_<hash>.json beside a calibration folder, here or in sub-folders"
@@ -145,10 +145,8 @@ def read_log(scene_file: Path, options: ImportOptions) -> DriveLog:
     with common.record_fields("scene record is incomplete", where, "the fields of a DGP scene"):
         data = _read_data(scene, where)
         calibrations = {key: _read_calibration(folder, key) for key in sorted({d.calibration for d in data})}
-        names = {d.sensor: d.sensor.lower() for d in data if d.kind == "image"}
-        chosen = {
-            names[raw]: raw for raw in common.chosen_cameras(dict(sorted(names.items())), options, where, tuple(names))
-        }
+        names = {d.sensor: d.sensor.lower() for d in sorted(data, key=lambda d: d.sensor) if d.kind == "image"}
+        chosen = {names[raw]: raw for raw in common.chosen_cameras(names, options, where, tuple(names))}
         clouds = [d for d in data if d.kind == "point_cloud"]
         used = [d for d in data if d.kind == "image" and d.sensor in chosen.values()] + clouds
         ticks_per_second, notes = _clock(used, where)
@@ -203,22 +201,18 @@ def _read_data(scene: Mapping[str, Any], where: str) -> list[_Datum]:
                 continue
             record = item["datum"][kind]
             pose = _pose(record["pose"], here)
-            stamp = _stamp_us(item["id"]["timestamp"], here)
-            data.append(
-                _Datum(kind, str(item["id"]["name"]), str(sample["calibration_key"]), stamp, record, pose, here)
-            )
+            text = item["id"]["timestamp"]
+            try:
+                moment = datetime.datetime.fromisoformat(text)
+            except (TypeError, ValueError) as error:
+                what, expected = "time stamp is no date", "ISO 8601, UTC"
+                raise InputError(what, where=here, got=repr(text), expected=expected) from error
+            since = (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)) - _EPOCH
+            stamp, sensor = since // datetime.timedelta(microseconds=1), str(item["id"]["name"])
+            data.append(_Datum(kind, sensor, str(sample["calibration_key"]), stamp, record, pose, here))
     if not any(datum.kind == "image" for datum in data):
         raise InputError("the scene has no images", where=where)
     return data
-
-
-def _stamp_us(text: Any, where: str) -> int:
-    try:
-        moment = datetime.datetime.fromisoformat(text)
-    except (TypeError, ValueError) as error:
-        raise InputError("time stamp is no date", where=where, got=repr(text), expected="ISO 8601, UTC") from error
-    since = (moment if moment.tzinfo else moment.replace(tzinfo=datetime.UTC)) - _EPOCH
-    return since // datetime.timedelta(microseconds=1)
 
 
 def _clock(data: Sequence[_Datum], where: str) -> tuple[int, list[str]]:
@@ -290,7 +284,9 @@ def _read_tracks(
     files = [datum.record.get("annotations", {}).get(_BOXES_3D) for datum in clouds]
     if not any(files):
         return [], ["no 3-D boxes in this scene: everything counts as static"]
-    names = _class_names(folder, scene)
+    key = scene["ontologies"].get(_BOXES_3D)
+    ontology = common.path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
+    names = {int(item["id"]): str(item["name"]) for item in _json(ontology, "ontology/*.json")["items"]}
     tracks = BoxTracks(str(folder / "bounding_box_3d"), LABELS)
     for datum, time_s, name in zip(clouds, times_s, files, strict=True):
         if not name:
@@ -307,12 +303,6 @@ def _read_tracks(
     return tracks.tracks()
 
 
-def _class_names(folder: Path, scene: Mapping[str, Any]) -> dict[int, str]:
-    key = scene["ontologies"].get(_BOXES_3D)
-    path = common.path_inside(folder, f"ontology/{key}.json", f"{folder}: ontologies")
-    return {int(item["id"]): str(item["name"]) for item in _json(path, "ontology/*.json")["items"]}
-
-
 def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
     """A cloud: array ``data`` of an npz file, columns named by ``point_format`` (empty = X, Y, Z, INTENSITY). Raises
     InputError: cut off, damaged, of another size than it declares, without coordinates, or not finite."""
@@ -323,15 +313,16 @@ def read_cloud(path: Path, point_format: Sequence[str]) -> SweepPoints:
     columns = [str(name).upper() for name in point_format] or ["X", "Y", "Z", "INTENSITY"]
     note_unknown("point_format", columns, _CHANNELS)
     fits = data.ndim == 2 and data.shape[1] == len(columns) and data.dtype.kind in "fiu"
-    if not fits or not {"X", "Y", "Z"} <= {*columns}:
+    if not fits or not {*"XYZ"} <= {*columns}:
         what, expected = "cloud does not have its columns", f"[N, {len(columns)}] numbers: {', '.join(columns)}"
         raise InputError(what, where=f"{where}: data", got=f"{data.dtype} {data.shape}", expected=expected)
-    returns = is_return(data[:, [columns.index(axis) for axis in "XYZ"]])
+    axes = [columns.index(axis) for axis in "XYZ"]
+    returns = is_return(data[:, axes])
     no_returns, data = int((~returns).sum()), data[returns].astype(np.float32)
     if not np.isfinite(data).all():
         what = "cloud holds values that are not finite"
         raise InputError(what, where=where, got=f"{int((~np.isfinite(data).all(1)).sum())} of {len(data)} points")
-    xyz = np.ascontiguousarray(data[:, [columns.index(axis) for axis in "XYZ"]])
+    xyz = np.ascontiguousarray(data[:, axes])
     intensity = data[:, columns.index("INTENSITY")] if "INTENSITY" in columns else np.zeros(len(data), np.float32)
     # the format states no range
     if len(intensity) and not (-1e-3 < float(intensity.min()) <= float(intensity.max()) < 1.001):

@@ -85,15 +85,11 @@ class SceneSweep:
 class SceneContent(Generic[Item]):
     """A scene that is ready to be written: all that is small, and how to get the rest.
 
-    Args:
-        name: the scene's id.
-        source: data set, licence and notes, which are logged.
-        fits: by the cameras' scene names, in the order of the scene.
-        items: what is converted one by one: frames, images, sweeps; may be a generator (``total`` says how many then).
-        convert: an item to its images and sweeps; called from several threads if ``workers`` > 1.
-        item_name: what an item is called, put before the place of an error.
-        ego: the vehicle's path in the scene's world and clock.
-        tracks: called after the last item: tracks in the world and clock of the scene, and notes about them.
+    ``name``: the scene's id. ``source``: data set, licence and notes, which are logged. ``fits``: by the cameras' scene
+    names, in the order of the scene. ``items``: what is converted one by one: frames, images, sweeps; may be a
+    generator (``total`` says how many then). ``convert``: an item to its images and sweeps; called from several threads
+    if ``workers`` > 1. ``item_name``: put before the place of an error. ``tracks``: called after the last item: tracks,
+    and notes about them. They and ``ego`` are in the world and clock of the scene.
     """
 
     name: str
@@ -237,15 +233,10 @@ class CameraOptics:
 class DriveLog:
     """What a reader found, in the frame of the data set's map.
 
-    Args:
-        name: name of the log; becomes the scene's id.
-        cameras: by scene name, in the order of the scene; the first one counts frames.
-        images, sweeps: in any order; times in seconds on one clock.
-        tracks, ego: boxes and the vehicle's path in the map's frame.
-        where: folder, for messages.
-        optics: by scene name; cameras that are not named are rectified.
-        box_times: ``sweeps``: keys of tracks are the times of the sweeps in which people saw the boxes; ``own``: the
-            boxes' own.
+    ``name``: the scene's id. ``cameras``: by scene name, in the order of the scene; the first one counts frames.
+    ``images``, ``sweeps``: in any order; times in seconds on one clock. ``where``: folder, for messages. ``optics``: by
+    scene name; cameras that are not named are rectified. ``box_times``: ``sweeps``: keys of tracks are the times of the
+    sweeps in which people saw the boxes; ``own``: the boxes' own.
     """
 
     name: str
@@ -280,7 +271,10 @@ def write_log(drive: DriveLog, out: Path, options: ImportOptions) -> Scene:
     for record in records:
         numbers[record] = counts[record.sensor]
         counts[record.sensor] += 1
-    ego = _ego_between(drive.ego, start_s, end_s, drive.where)
+    near = (drive.ego.times_s >= start_s - _EGO_MARGIN_S) & (drive.ego.times_s <= end_s + _EGO_MARGIN_S)
+    if not near.any():
+        raise InputError("no vehicle pose lies in the time of the chosen frames", where=drive.where)
+    ego = EgoPath(drive.ego.times_s[near], drive.ego.world_from_ego[near])
     world_from_map = common.world_from_first(ego.world_from_ego[0])
     optics = {name: drive.optics.get(name, CameraOptics(camera)) for name, camera in drive.cameras.items()}
     fits = {name: fit_images(drive.cameras[name], options, one.lens) for name, one in optics.items()}
@@ -327,7 +321,15 @@ def _place(record: Record) -> str:
 
 def _choose_frames(drive: DriveLog, options: ImportOptions) -> dict[Record, int]:
     """The chosen images and sweeps -> the frame number each belongs to."""
-    check_sensor_times(drive)
+    times: dict[str, list[float]] = {}
+    for record in (*drive.images, *drive.sweeps):
+        times.setdefault(record.sensor, []).append(record.time_s)
+    for sensor, values in times.items():
+        steps = np.diff(np.sort(values))
+        if len(steps) and steps.min() <= 0:
+            what, where = "two records of one sensor have the same time", f"{drive.where}: {sensor}"
+            got = f"{np.sort(values)[int(steps.argmin())]:.6f} s"
+            raise InputError(what, where=where, got=got, expected="a time of its own for every image and sweep")
     lacking = [name for name in drive.cameras if not any(image.sensor == name for image in drive.images)]
     if lacking:
         what, got = "a camera has no images in this log", ", ".join(lacking)
@@ -376,26 +378,6 @@ def _outside_gaps(chosen: dict[Record, int], drive: DriveLog, options: ImportOpt
     return left
 
 
-def check_sensor_times(drive: DriveLog) -> None:
-    """Refuse two images or sweeps of one sensor at one time."""
-    times: dict[str, list[float]] = {}
-    for record in (*drive.images, *drive.sweeps):
-        times.setdefault(record.sensor, []).append(record.time_s)
-    for sensor, values in times.items():
-        steps = np.diff(np.sort(values))
-        if len(steps) and steps.min() <= 0:
-            what, where = "two records of one sensor have the same time", f"{drive.where}: {sensor}"
-            got = f"{np.sort(values)[int(steps.argmin())]:.6f} s"
-            raise InputError(what, where=where, got=got, expected="a time of its own for every image and sweep")
-
-
-def _ego_between(ego: EgoPath, start_s: float, end_s: float, where: str) -> EgoPath:
-    inside = (ego.times_s >= start_s - _EGO_MARGIN_S) & (ego.times_s <= end_s + _EGO_MARGIN_S)
-    if not inside.any():
-        raise InputError("no vehicle pose lies in the time of the chosen frames", where=where)
-    return EgoPath(ego.times_s[inside], ego.world_from_ego[inside])
-
-
 # --- when a box was seen --------------------------------------------------------------------------
 #
 # A turning sensor meets an object some time before or after the sweep's time stamp. Sweeps that are compensated for the
@@ -407,7 +389,7 @@ def _ego_between(ego: EgoPath, start_s: float, end_s: float, where: str) -> EgoP
 # Images are taken a little before or after the sweep they belong to; ``reach_images`` lets a track cover those at its
 # ends.
 MOVES_M: Final = 1.0
-"""A track whose keys lie farther apart than this moves; boxes of others stay as they were drawn."""
+"""A track whose box's centre visits a region of a longer diagonal moves; other boxes stay as they were drawn."""
 REACH_S: Final = 0.05
 """Half a turn of a 10 Hz sensor; cameras look at most this far from the sweep they belong to."""
 _GROWTH_M: Final = 0.1
@@ -420,7 +402,8 @@ class BoxTimes:
 
     def __init__(self, tracks: Sequence[Track]) -> None:
         self._tracks = tuple(tracks)
-        self._moving = [i for i, track in enumerate(self._tracks) if _extent_m(track) > MOVES_M]
+        spreads = [np.ptp(track.world_from_object[:, :3, 3], axis=0) for track in self._tracks]
+        self._moving = [i for i, spread in enumerate(spreads) if np.linalg.norm(spread) > MOVES_M]
         self._late_s: dict[tuple[int, int], float] = {}
 
     def observe(self, time_s: float, map_from_lidar: Matrix, points: SweepPoints) -> None:
@@ -447,10 +430,8 @@ class BoxTimes:
                 self._late_s[index, key] = float(dt_s[near[inside]].mean(dtype=np.float64))
 
     def at_sweep_times(self) -> list[Track]:
-        """The tracks with boxes at their stamps, in the order given.
-
-        Boxes without points inside take the delay of the track's neighbouring boxes.
-        """
+        """The tracks with boxes at their stamps, in the order given. Boxes without points inside take the delay of the
+        track's neighbouring boxes."""
         tracks = list(self._tracks)
         for index in self._moving:
             track = tracks[index]
@@ -461,16 +442,13 @@ class BoxTimes:
             late_s = np.interp(times, times[known], [self._late_s[index, key] for key in known])
             poses = track.world_from_object.copy()
             poses[:, :3, 3] -= _track_velocity(times, late_s, poses[:, :3, 3]) * late_s[:, None]
-            tracks[index] = Track(track.id, track.label, track.size_m, times, poses)
+            tracks[index] = replace(track, world_from_object=poses)
         return tracks
 
 
 def _track_velocity(times_s: NDArray[np.float64], late_s: NDArray[np.float64], places: Matrix) -> Matrix:
-    """Velocity at each key, f64[T, 3] m/s: a place filed under t was taken at t + late.
-
-    Steps that these delays nearly cancel (an object crosses the seam where the turn begins) tell no velocity and are
-    left out.
-    """
+    """Velocity at each key, f64[T, 3] m/s: a place filed under t was taken at t + late. Steps that these delays nearly
+    cancel (an object crosses the seam where the turn begins) tell no velocity and are left out."""
     steps_s = np.diff(times_s + late_s)
     telling = steps_s > 0.5 * np.diff(times_s)
     if not telling.any():
@@ -480,25 +458,16 @@ def _track_velocity(times_s: NDArray[np.float64], late_s: NDArray[np.float64], p
     return np.stack([np.interp(times_s, between, speeds[:, axis]) for axis in range(3)], 1)
 
 
-def _extent_m(track: Track) -> float:
-    """Diagonal of the region that the box's centre visits; 0 for a single key."""
-    places = track.world_from_object[:, :3, 3]
-    return float(np.linalg.norm(places.max(0) - places.min(0)))
-
-
 def reach_images(track: Track) -> Track:
     """The track with a key ``REACH_S`` before its first and one after its last box, made with the velocity of the
-    nearest two.
-
-    Without these, objects would be missing in images taken just before the first sweep that shows them.
-    """
+    nearest two. Without these, objects would be missing in images taken just before the first sweep that shows them."""
     times, poses = track.times_s, track.world_from_object
     before, after = poses[0].copy(), poses[-1].copy()
     if len(times) > 1:
         before[:3, 3] -= (poses[1, :3, 3] - poses[0, :3, 3]) / (times[1] - times[0]) * REACH_S
         after[:3, 3] += (poses[-1, :3, 3] - poses[-2, :3, 3]) / (times[-1] - times[-2]) * REACH_S
-    times = np.concatenate([[times[0] - REACH_S], times, [times[-1] + REACH_S]])
-    return Track(track.id, track.label, track.size_m, times, np.concatenate([before[None], poses, after[None]]))
+    times, poses = np.r_[times[0] - REACH_S, times, times[-1] + REACH_S], np.stack([before, *poses, after])
+    return replace(track, times_s=times, world_from_object=poses)
 
 
 def clip_track(track: Track, start_s: float, end_s: float) -> Track | None:
@@ -508,7 +477,7 @@ def clip_track(track: Track, start_s: float, end_s: float) -> Track | None:
         return None
     first = max(0, int(np.searchsorted(track.times_s, start_s + 1e-6)) - 1)
     last = min(len(track.times_s), int(np.searchsorted(track.times_s, end_s - 1e-6)) + 1)
-    return Track(track.id, track.label, track.size_m, track.times_s[first:last], track.world_from_object[first:last])
+    return replace(track, times_s=track.times_s[first:last], world_from_object=track.world_from_object[first:last])
 
 
 # --- boxes of many frames -> tracks ---------------------------------------------------------------
@@ -539,13 +508,6 @@ def box_size(length: Any, width: Any, height: Any, where: str) -> tuple[float, f
     return size
 
 
-@dataclass(slots=True)
-class _BoxedObject:
-    labels: dict[str, int] = field(default_factory=dict)
-    rows: array = field(default_factory=lambda: array("d"))
-    standing: bool = False
-
-
 class BoxTracks:
     """Collects boxes in any order, 136 bytes each; ``tracks`` puts them together. ``where``: the file or folder the
     boxes come from, for messages. ``labels``: the data set's class -> the label here (``car``, ``pedestrian``, ...).
@@ -554,11 +516,13 @@ class BoxTracks:
 
     def __init__(self, where: str, labels: Mapping[str, str], max_gap_s: float = MAX_GAP_S) -> None:
         self._where, self._labels, self._max_gap_s = where, labels, max_gap_s
-        self._boxeds: dict[str, _BoxedObject] = {}
-        self._unknown: dict[str, int] = {}
+        self._rows: dict[str, array] = {}
+        self._labels_of: dict[str, Counter[str]] = {}
+        self._may_move: set[str] = set()
+        self._unknown: Counter[str] = Counter()
 
     def __len__(self) -> int:
-        return len(self._boxeds)
+        return len(self._rows)
 
     def label_of(self, category: str) -> str:
         """The label of a class of the data set; classes that are not known are counted. InputError for a name above 200
@@ -566,7 +530,7 @@ class BoxTracks:
         if category in self._labels:
             return self._labels[category]
         foreign_name(category, f"{self._where}: class of a box")
-        self._unknown[category] = self._unknown.get(category, 0) + 1
+        self._unknown[category] += 1
         return category.rsplit(".", 1)[-1].strip().lower().replace(" ", "_") or "unknown"
 
     def add(
@@ -594,10 +558,11 @@ class BoxTracks:
         """
         foreign_name(track, f"{where or self._where}: id of an object")
         size = box_size(*size_m, where=where or f"{self._where}: object {track} ({label})")
-        boxed = self._boxeds.setdefault(track, _BoxedObject())
-        boxed.labels[label] = boxed.labels.get(label, 0) + 1
-        boxed.standing = standing and (boxed.standing or not boxed.rows)
-        boxed.rows.extend((time_s, late_s, *size, *world_from_box[:3].ravel().tolist()))
+        if not standing:
+            self._may_move.add(track)
+        self._labels_of.setdefault(track, Counter())[label] += 1
+        row = (time_s, late_s, *size, *world_from_box[:3].ravel().tolist())
+        self._rows.setdefault(track, array("d")).extend(row)
 
     def tracks(
         self, speeds: Speeds | None = None, images_s: Mapping[float, tuple[float, float]] | None = None
@@ -606,17 +571,15 @@ class BoxTracks:
 
         The size is the median over the track. What stands gets one pose (median place, mean heading) from its first to
         its last moment. What may move is split where it is not seen for more than ``max_gap_s``: ``7``, ``7.1``, ...
-
-        Raises:
-            InputError: an object has two boxes at one moment; length and width are swapped. ``speeds``: how
-                velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box ->
-                times of the first and last image that show the object; a track reaches from the first image of its
-                first box to the last one of its last. None = from box to box.
+        ``speeds``: how velocities are found; None = from the neighbouring boxes of a piece. ``images_s``: time of a box
+        -> times of the first and last image that show the object; a track reaches from the first image of its first
+        box to the last one of its last. None = from box to box. Raises InputError: an object has two boxes at one
+        moment; length and width are swapped.
         """
         tracks: list[Track] = []
         split = 0
-        for name, boxed in self._boxeds.items():
-            rows = np.frombuffer(boxed.rows, np.float64).reshape(-1, _ROW)
+        for name, numbers in self._rows.items():
+            rows = np.frombuffer(numbers, np.float64).reshape(-1, _ROW)
             rows = rows[np.argsort(rows[:, 0], kind="stable")]
             times = rows[:, 0]
             if (np.diff(times) <= 0).any():
@@ -624,13 +587,17 @@ class BoxTracks:
                 what, where = "an object has two boxes at one moment", f"{self._where}: object {name}"
                 raise InputError(what, where=where, got=f"time {at:.3f} s of the log", remedy="are two logs mixed?")
             size = np.median(rows[:, 2:5], axis=0)
-            label = max(boxed.labels, key=lambda name: boxed.labels[name])
+            label = self._labels_of[name].most_common(1)[0][0]
             poses = np.tile(np.eye(4), (len(rows), 1, 1))
             poses[:, :3] = rows[:, 5:].reshape(-1, 3, 4)
-            if boxed.standing:
+            if name not in self._may_move:
                 poses, _ = motion.unflipped(times, poses, motion.MOST_TURN_RAD_S)
-                ends = _ends(times, images_s)
-                tracks.append(Track(name, label, size, ends, np.stack([_mean_pose(poses)] * len(ends))))
+                mean = quaternion_from_matrix(poses[0])  # running slerp from the first on
+                for count, pose in enumerate(poses[1:], start=2):
+                    mean = slerp(mean, quaternion_from_matrix(pose), 1 / count)
+                place, ends = np.median(poses[:, :3, 3], axis=0), _ends(times, images_s)
+                pose = from_rotation_translation(matrix_from_quaternion(mean), place)
+                tracks.append(Track(name, label, size, ends, np.stack([pose] * len(ends))))
                 continue
             pieces = np.split(np.arange(len(rows)), np.flatnonzero(np.diff(times) > self._max_gap_s) + 1)
             split += len(pieces) > 1
@@ -680,19 +647,17 @@ def check_sides(tracks: Sequence[Track], where: str) -> None:
 
 
 def neighbour_speeds(measured_s: NDArray[np.float64], places: Matrix, pieces: Sequence[NDArray[np.intp]]) -> Matrix:
-    """Velocities of an object's boxes, f64[n, 3], by their neighbours within each of the ``pieces`` of its track."""
-    return np.concatenate([_velocity(measured_s[piece], places[piece]) for piece in pieces])
-
-
-def _velocity(measured_s: NDArray[np.float64], places: Matrix) -> Matrix:
-    """Velocity at each measurement, f64[n, 3]: from the neighbours on both sides, or from the one there is."""
-    if len(places) < 2:
-        return np.zeros_like(places)
-    before, after = np.maximum(np.arange(len(places)) - 1, 0), np.minimum(np.arange(len(places)) + 1, len(places) - 1)
-    span = measured_s[after] - measured_s[before]
-    velocity = (places[after] - places[before]) / np.maximum(span, _MIN_STEP_S)[:, None]
-    short = span < _MIN_STEP_S  # two measurements at nearly one moment, at an end: go by the neighbour
-    velocity[short] = velocity[np.where(before == np.arange(len(places)), after, before)][short]
+    """Velocities of an object's boxes, f64[n, 3]: from the neighbours on both sides within each of the ``pieces`` of
+    its track, or from the one there is."""
+    velocity = np.zeros_like(places)
+    for piece in pieces:
+        numbers, times, at = np.arange(len(piece)), measured_s[piece], places[piece]
+        before, after = np.maximum(numbers - 1, 0), np.minimum(numbers + 1, len(piece) - 1)
+        span = times[after] - times[before]
+        speeds = (at[after] - at[before]) / np.maximum(span, _MIN_STEP_S)[:, None]
+        short = span < _MIN_STEP_S  # two measurements at nearly one moment, at an end: go by the neighbour
+        speeds[short] = speeds[np.where(before == numbers, after, before)][short]
+        velocity[piece] = speeds
     return velocity
 
 
@@ -717,11 +682,3 @@ def _ends(times_s: NDArray[np.float64], images_s: Mapping[float, tuple[float, fl
         start, end = images_s[first][0], images_s[last][1]
         first, last = (start if start < first - _SAME_TIME_S else first), (end if end > last + _SAME_TIME_S else last)
     return np.array([first, last] if last - first > _SAME_TIME_S else [first])
-
-
-def _mean_pose(poses: Matrix) -> Matrix:
-    """Median place and mean rotation (running slerp from the first on) of poses of one standing object."""
-    mean = quaternion_from_matrix(poses[0])
-    for count, pose in enumerate(poses[1:], start=2):
-        mean = slerp(mean, quaternion_from_matrix(pose), 1 / count)
-    return from_rotation_translation(matrix_from_quaternion(mean), np.median(poses[:, :3, 3], axis=0))

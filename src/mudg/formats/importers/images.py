@@ -82,29 +82,22 @@ def equidistant(k1: float = 0, k2: float = 0, k3: float = 0, k4: float = 0) -> L
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImageFit:
-    """How the recorded images of one camera become images of the scene. Safe to use from several threads."""
+    """How the recorded images of one camera become images of the scene. Safe to use from several threads.
+
+    ``camera``: the scene's: pinhole, rectified, of the scene's size; ``recorded``: of the size of the files. ``note``:
+    what is done, for ``Source.notes``; empty if images are kept as they are. ``table``: where each pixel of the
+    rectified image (recorded size) comes from; None if images are rectified already.
+    """
 
     camera: Camera
-    """The scene's: pinhole, rectified, of the scene's size."""
     recorded: Camera
-    """Its size is that of the files."""
     note: str
-    """What is done, for ``Source.notes``; empty if images are kept as they are."""
     table: _Table | None
-    """Where each pixel of the rectified image (recorded size) comes from; None if images are rectified already."""
 
     def image(self, image: NDArray[np.uint8] | Path | bytes, where: str = "") -> NDArray[np.uint8] | Path | bytes:
-        """One recorded image as ``SceneWriter.add_frame`` wants it. Raises InputError: damaged, or not of the recorded
-        size.
-
-        Args:
-            image: u8[H, W, 3], or path or bytes of a PNG or JPEG.
-            where: names the image, for errors.
-
-        Returns:
-            ``image`` itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95
-            for a JPEG, PNG for a PNG, grey for grey) for a file.
-        """
+        """One recorded image, u8[H, W, 3], or path or bytes of a PNG or JPEG, as ``SceneWriter.add_frame`` wants it:
+        itself if it is kept; else an array for an array, and a file of the same kind (JPEG of quality 95 for a JPEG,
+        PNG for a PNG, grey for grey) for a file. Raises InputError: damaged, or not of the recorded size."""
         if not self.note:
             return image
         if isinstance(image, np.ndarray):
@@ -197,10 +190,7 @@ def resized(width: int, height: int, resolution: Resolution | None, where: str =
 
 def covering_camera(camera: Camera, lens: Lens) -> Camera:
     """The pinhole camera of the recorded size with the shortest focal length, not below the lens', that sees no border.
-
-    Raises:
-        InputError: it would be more than ``MAX_FOCAL_GAIN`` times the lens', or the polynomial turns back inside it.
-    """
+    Raises InputError: that is more than ``MAX_FOCAL_GAIN`` times the lens', or the polynomial turns back inside it."""
     low, high = 1.0, MAX_FOCAL_GAIN
 
     def at(gain: float) -> Camera:
@@ -223,12 +213,9 @@ def covering_camera(camera: Camera, lens: Lens) -> Camera:
 def _border_problem(target: Camera, camera: Camera, lens: Lens) -> str | None:
     """Why ``target`` cannot be filled from ``camera``, or None: a border pixel outside, or a ray whose radius turns
     back."""
-    u = np.linspace(0.5, target.width - 0.5, _BORDER_STEPS)
-    v = np.linspace(0.5, target.height - 0.5, _BORDER_STEPS)
-    border = np.concatenate(
-        [np.stack([u, np.full_like(u, y)], 1) for y in (0.5, target.height - 0.5)]
-        + [np.stack([np.full_like(v, x), v], 1) for x in (0.5, target.width - 0.5)]
-    )
+    u, v = (np.linspace(0.5, side - 0.5, _BORDER_STEPS) for side in (target.width, target.height))
+    lines = [*((u, np.full_like(u, y)) for y in v[[0, -1]]), *((np.full_like(v, x), v) for x in u[[0, -1]])]
+    border = np.concatenate([np.stack(line, 1) for line in lines])
     xy = (border - [target.cx, target.cy]) / [target.fx, target.fy]
     steps = np.linspace(0, 1, _BORDER_STEPS)[1:]
     along = lens((xy[:, None] * steps[:, None]).reshape(-1, 2)).reshape(len(xy), len(steps), 2)

@@ -81,10 +81,8 @@ LABEL_OF: Final = name_table(
 )
 """Classes that become tracks -> the labels of this package. Buildings, poles, vegetation and ground are no tracks."""
 _OFFICIAL: Final = frozenset(
-    (
-        "index label category semanticId semanticId_orig instanceId timestamp start_frame end_frame dynamic "
-        "dynamicSeq dynamicIdx dynamicIndex level_min level_max color transform vertices faces"
-    ).split()
+    """index label category semanticId semanticId_orig instanceId timestamp start_frame end_frame dynamic dynamicSeq
+    dynamicIdx dynamicIndex level_min level_max color transform vertices faces""".split()
 )
 """Fields of the data set's objects, read or not."""
 VEHICLES: Final = frozenset(("car", "truck", "bus", "caravan", "trailer", "train", "motorcycle", "bicycle"))
@@ -112,12 +110,9 @@ class Kitti360Box:
 
 
 def read_boxes(path: Path, left_out: Counter[str]) -> Iterator[Kitti360Box]:
-    """Boxes of the classes in ``LABEL_OF``, one by one.
-
-    Raises:
-        InputError: missing, cut off, malformed, or it declares XML entities. ``path``: the XML file. ``left_out``:
-            filled with what is not read (``that are not cuboids``) and how often.
-    """
+    """Boxes of the classes in ``LABEL_OF`` in an XML file, one by one; ``left_out`` is filled with what is not read
+    (``that are not cuboids``) and how often. Raises InputError: missing, cut off, malformed, or it declares XML
+    entities."""
     for number, item in enumerate(_objects(path)):
         where = f"{path}: object {number} ({item.tag})"
         if item.find("transform") is None:
@@ -258,16 +253,15 @@ _FISHEYE: Final = frozenset(_FISHEYE_VALUES).union(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Kitti360Calibration:
-    """What is fixed on the vehicle; poses are f64[4, 4]."""
+    """What is fixed on the vehicle; poses are f64[4, 4]. ``ego_from_camera``: by ``image_00`` .. ``image_03``,
+    perspective cameras as rectified. ``velo_from_sick``: None if the file is not there. ``imu_from_rect0``: the data
+    set's vehicle frame from rectified camera 0."""
 
     folder: Path
     ego_from_camera: dict[str, Matrix]
-    """``image_00`` .. ``image_03`` -> pose; perspective cameras as rectified."""
     ego_from_velo: Matrix
     velo_from_sick: Matrix | None
-    """None if the file is not there."""
     imu_from_rect0: Matrix
-    """The data set's vehicle frame from rectified camera 0."""
 
     def fit(self, camera: str, name: str, size: tuple[int, int], options: ImportOptions) -> ImageFit:
         """How images of ``camera`` (``image_02``), of ``size`` (width, height), become those of the scene's."""
@@ -302,11 +296,7 @@ class Kitti360Calibration:
 
 
 def read_calibration(folder: Path) -> Kitti360Calibration:
-    """Read ``calibration/``.
-
-    Raises:
-        InputError: a file or entry is missing, or a matrix is not a rigid motion.
-    """
+    """Read ``calibration/``. Raises InputError: a file or entry is missing, or a matrix is not a rigid motion."""
     path, perspective, sick = (
         folder / f"{name}.txt" for name in ("calib_cam_to_pose", "perspective", "calib_sick_to_velo")
     )
@@ -392,8 +382,7 @@ def files_of_kitti360(source: Path, options: ImportOptions) -> LogFiles:
 
 def _find(source: Path, options: ImportOptions) -> tuple[Path, str]:
     """The data set's folder and the drive."""
-    if not source.is_dir():
-        raise InputError("KITTI-360 folder does not exist", where=str(source), expected="a folder")
+    common.require_folder(source, "KITTI-360")
     if source.absolute().parent.name == "data_2d_raw":
         return source.absolute().parent.parent, source.absolute().name
     raw = source / "data_2d_raw"

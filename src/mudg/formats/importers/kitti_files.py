@@ -33,10 +33,7 @@ _TURN_STEPS: Final = 36
 
 def read_scan(path: Path) -> SweepPoints:
     """A velodyne scan: float32 rows x, y, z, reflectance (0..1). Beams without a return are left out and counted.
-
-    Raises:
-        InputError: cut off, values that are not finite, or a reflectance outside of 0..1.
-    """
+    Raises InputError: cut off, values that are not finite, or a reflectance outside of 0..1."""
     rows, returns = read_float_rows(path, 4)
     xyz, dt_s = np.ascontiguousarray(rows[returns, :3]), np.zeros(int(returns.sum()), np.float32)
     intensity = unit_intensity(rows[returns, 3], 1, path, "divide the reflectance by its largest value, often 255")
@@ -80,13 +77,12 @@ drive."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class KittiCalibration:
-    """Calibration of one recording; poses are f64[4, 4]."""
+    """Calibration of one recording; poses are f64[4, 4]. ``projections``: camera number -> P f64[3, 4], pixels from
+    rectified camera 0. ``velo_from_imu``: None if the source does not say."""
 
     projections: dict[int, Matrix]
-    """Camera number -> P f64[3, 4]: pixels from rectified camera 0."""
     rect0_from_velo: Matrix
     velo_from_imu: Matrix | None
-    """None if the source does not say."""
     source: str
 
     def camera(self, number: int, name: str, width: int, height: int) -> Camera:
@@ -108,11 +104,7 @@ class KittiCalibration:
 
 def pinhole_camera(projection: Matrix, name: str, size: tuple[int, int], where: str) -> Camera:
     """The rectified pinhole camera of a KITTI projection matrix f64[3, 4], whose pixels are counted from the centre of
-    the top-left one.
-
-    Raises:
-        InputError: skew, another last row than 0 0 1, or a focal length that is not positive.
-    """
+    the top-left one. Raises InputError: skew, another last row than 0 0 1, or a focal length that is not positive."""
     if abs(projection[0, 1]) > 1e-6 or abs(projection[2, 2] - 1) > 1e-6:
         what = "projection matrix is not of a rectified pinhole camera"
         raise InputError(what, where=where, expected="no skew, last row 0 0 1", got=str(projection[:, :3].tolist()))
@@ -148,11 +140,8 @@ def read_number_table(path: Path) -> dict[str, NDArray[np.float64]]:
 def table_entry(
     table: Mapping[str, NDArray[np.float64]], keys: tuple[str, ...], shape: tuple[int, ...], where: object
 ) -> Matrix:
-    """The first entry of ``keys`` that the table has, as an array of ``shape``.
-
-    Raises:
-        InputError: there is none of them, or it has another number of values.
-    """
+    """The first entry of ``keys`` that the table has, as an array of ``shape``. Raises InputError: there is none of
+    them, or it has another number of values."""
     key = next((key for key in keys if key in table), None)
     if key is None:
         what, expected = f"calibration lacks {keys[0]}", " or ".join(keys)
@@ -347,10 +336,8 @@ LABELS: Final = frozenset(
 """Classes of the benchmarks, in lower case."""
 _TRACKLET = frozenset({"objectType", "h", "w", "l", "first_frame", "poses", "finished"})
 _TRACKLET_POSE = frozenset(
-    (
-        "tx ty tz rx ry rz state occlusion occlusion_kf truncation amt_occlusion amt_occlusion_kf "
-        "amt_border_l amt_border_r amt_border_kf"
-    ).split()
+    """tx ty tz rx ry rz state occlusion occlusion_kf truncation amt_occlusion amt_occlusion_kf amt_border_l
+    amt_border_r amt_border_kf""".split()
 )
 """Fields of the data set's tracklets, read or not."""
 
@@ -374,11 +361,8 @@ class KittiBox:
 
 def read_label_text(path: Path, rect0_from_velo: Matrix, frame: int | None = None) -> list[KittiBox]:
     """Boxes of a tracking label file (17 columns and optionally a score), or, with the number of its ``frame``, of an
-    object label file (15). They are given in rectified camera 0; ``DontCare`` regions are left out.
-
-    Raises:
-        InputError: another number of columns, values that are no finite numbers, or a size that makes no sense.
-    """
+    object label file (15). They are given in rectified camera 0; ``DontCare`` regions are left out. Raises InputError:
+    another number of columns, values that are no finite numbers, or a size that makes no sense."""
     velo_from_rect0 = invert(rect0_from_velo)
     boxes = []
     skip = 2 if frame is None else 0
@@ -455,13 +439,10 @@ def build_tracks(
 ) -> tuple[list[Track], list[str]]:
     """Tracks in the world from boxes per frame, in the order of their numbers, and notes (splits, boxes left out).
 
-    Args:
-        boxes: in any order; those of frames that are not imported are left out.
-        world_from_velo: pose of the velodyne f64[4, 4] by frame number.
-        times_s: time of the scan by frame number, seconds.
-        velo_at: pose of the velodyne at any time, when boxes were drawn into scans that were still twisted: each box
-            then belongs to the moment its azimuth was measured, and is moved to the scan's time with the track's
-            velocity.
+    ``world_from_velo``, ``times_s``: pose of the velodyne f64[4, 4] and time of the scan, seconds, by frame number;
+    boxes of other frames are left out. ``velo_at``: pose of the velodyne at any time, when boxes were drawn into scans
+    that were still twisted: each box then belongs to the moment its azimuth was measured, and is moved to the scan's
+    time with the track's velocity.
     """
     collected = BoxTracks(where, {label: label for label in LABELS})
     outside = 0

@@ -91,21 +91,14 @@ _MAKERS: Final[Mapping[str, Maker | None]] = {
 
 
 def read_frame(path: Path) -> dict[str, NDArray[Any]]:
-    """Columns of a pickled data frame, gzipped or not, by their names.
-
-    Raises:
-        InputError: missing, cut off, not a data frame, or it asks for something that is not plain data.
-    """
+    """Columns of a pickled data frame, gzipped or not, by their names. Raises InputError: missing, cut off, not a data
+    frame, or it asks for something that is not plain data."""
     content = store.read_bytes(path)
     return parse_frame(gunzip(content, str(path)) if content[:2] == b"\x1f\x8b" else content, str(path))
 
 
 def gunzip(content: bytes, where: str) -> bytes:
-    """Unpack gzip, not beyond ``MAX_BYTES``.
-
-    Raises:
-        InputError: cut off, damaged, or larger than that.
-    """
+    """Unpack gzip, not beyond ``MAX_BYTES``. Raises InputError: cut off, damaged, or larger than that."""
     unpacker = zlib.decompressobj(wbits=31)
     try:
         unpacked = unpacker.decompress(content, MAX_BYTES + 1)
@@ -378,8 +371,7 @@ def import_pandaset(source: Path, out: Path, options: ImportOptions) -> Scene:
 
 
 def _chosen_sequence(source: Path, options: ImportOptions) -> Path:
-    if not source.is_dir():
-        raise InputError("PandaSet folder does not exist", where=str(source), expected="a folder")
+    common.require_folder(source, "PandaSet")
     if not options.sequence and _is_sequence(source):
         return source
     sequences = _sequences(source)
