@@ -416,7 +416,7 @@ class Location:
             raise ResourceError(what, where=str(to), expected=expected, got=got, remedy=remedy)
         store.make_folder(to if kind == "directory" else to.parent)
         with log.task(f"fetching {self}", len(missing)) as bar:
-            for names in _grouped(missing, 4 * _FILES_AT_ONCE):
+            for names in _grouped(missing):
                 places = {name: to / name if name else to for name in names}
                 parts = {name: at.with_name(f".{at.name}.fetching.part") for name, at in places.items()}
                 self._get(parts)
@@ -497,7 +497,7 @@ class Location:
             (self / name).remove()
         record.save(Upload(False, files).content())
         with log.task(f"uploading {self}", len(files)) as bar:
-            for names in _grouped(sorted(set(files) - there - manifest), 4 * _FILES_AT_ONCE):
+            for names in _grouped(sorted(set(files) - there - manifest)):
                 self._put(frm, names)
                 bar.advance(len(names))
         sizes = self.tree()
@@ -533,7 +533,8 @@ class Location:
             self._files.put_file(str(file), self._path)
 
 
-def _grouped(names: Sequence[str], count: int) -> Iterable[Sequence[str]]:
+def _grouped(names: Sequence[str]) -> Iterable[Sequence[str]]:
+    count = 4 * _FILES_AT_ONCE
     return (names[begin : begin + count] for begin in range(0, len(names), count))
 
 

@@ -299,6 +299,13 @@ def read_json(path: Path) -> Any:
     return parse_json(read_bytes(path), str(path))
 
 
+def json_object(path: Path) -> dict[str, Any]:
+    """What a JSON file says; empty where it is missing, malformed or no object."""
+    with contextlib.suppress(InputError):
+        return found if isinstance(found := read_json(path), dict) else {}
+    return {}
+
+
 _KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a named pipe"), (stat.S_ISSOCK, "a socket"))
 _KINDS += ((stat.S_ISCHR, "a device"), (stat.S_ISBLK, "a device"))
 
