@@ -324,17 +324,13 @@ def _stoppable(function: Callable[..., Result], items: tuple[Any, ...]) -> Resul
         return function(*items)
     finally:
         for number in heard:
-            signal.signal(number, _note_stop)
+            signal.signal(number, lambda *_: _stop_asked.set())
 
 
 def _stop_call(_number: int, _frame: types.FrameType | None) -> None:
     if not _stop_asked.is_set():  # once: what tidies up is not stopped again
         _stop_asked.set()
         raise KeyboardInterrupt
-
-
-def _note_stop(_number: int, _frame: types.FrameType | None) -> None:
-    _stop_asked.set()
 
 
 class _Spawning(SpawnContext):

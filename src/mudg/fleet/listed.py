@@ -65,7 +65,10 @@ def run_listed(
     part = parse_shard(shard_text)
     entries = shard(entries, part)
     status = out / (f"status-{part[0]}-of-{part[1]}.json" if shard_text else "status.json")
-    _refuse_overlaps(entries, out, status, listed)
+    refuse_overlap([status, *(out / entry.name for entry in entries)], files_read(entries, listed))
+    if status.exists() and not {"schema", "verb", "counts", "scenes"} <= store.json_object(status).keys():
+        what = "the status file would replace a file that does not belong to this list"
+        raise UsageError(what, where=str(status), remedy="choose another --out")
     if jobs < 0:
         raise UsageError("number of jobs cannot be negative", where="--jobs", got=str(jobs))
     jobs = min(jobs or native.default_threads(), max(len(entries), 1))
@@ -87,14 +90,6 @@ def run_listed(
     store.write_json(status, {"schema": 1, "verb": words[0], "counts": counts, "scenes": outcomes})
     shown = {"status": status, "text": table(words[0], outcomes), "exit_code": exit_code(counts["failed"])}
     return {"scenes": outcomes, **counts, **shown}
-
-
-def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: Path | None) -> None:
-    """UsageError where a scene's output touches any source or the list, or the status would replace another file."""
-    refuse_overlap([status, *(out / entry.name for entry in entries)], files_read(entries, listed))
-    if status.exists() and not {"schema", "verb", "counts", "scenes"} <= store.json_object(status).keys():
-        what = "the status file would replace a file that does not belong to this list"
-        raise UsageError(what, where=str(status), remedy="choose another --out")
 
 
 def _outcome(entry: Entry, report: Ended, folder: Path, before: str) -> dict[str, Any]:
