@@ -516,13 +516,13 @@ def test_a_missing_compiler_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: 
 
 
 def test_doctor_says_whether_it_can_be_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
-    monkeypatch.setattr(diagnosis, "_installed", lambda name: "1.5.3" if name == "gsplat" else "0")
+    monkeypatch.setattr(diagnosis, "installed", lambda name: "1.5.3" if name == "gsplat" else "0")
     _pretend_installed(monkeypatch, tmp_path, cuda=False)
     assert diagnosis._optional()["gsplat"] == "1.5.3; cannot be used here: no CUDA device is available"
     (tmp_path / "csrc.so").touch()
     _pretend_installed(monkeypatch, tmp_path)
     assert diagnosis._optional()["gsplat"] == "1.5.3; its kernels came with it"
-    monkeypatch.setattr(diagnosis, "_installed", lambda name: None)
+    monkeypatch.setattr(diagnosis, "installed", lambda name: None)
     assert "pip install 'mudg[gsplat]'" in diagnosis._optional()["gsplat"]
 
 

@@ -394,7 +394,7 @@ def test_a_fetch_goes_on_with_the_files_that_are_here(
                 raise KeyboardInterrupt
 
     before(stop)
-    monkeypatch.setattr(location, "_grouped", lambda names, count: ([name] for name in names))
+    monkeypatch.setattr(location, "_grouped", lambda names: ([name] for name in names))
     with pytest.raises(KeyboardInterrupt):
         run.fetch(tmp_path / "back")
     assert not (tmp_path / "back/manifest.json").exists()

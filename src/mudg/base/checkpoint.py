@@ -26,13 +26,9 @@ if TYPE_CHECKING:
 
 
 def write_shards(
-    folder: Path,
-    tensors: Mapping[str, Tensor],
-    shard_bytes: int,
-    dtype: torch.dtype | None = None,
-    stem: str = "weights",
+    folder: Path, tensors: Mapping[str, Tensor], shard_bytes: int, dtype: torch.dtype | None = None
 ) -> dict[str, str]:
-    """Write tensors, on any device, as `<stem>_NN.safetensors` of at most about `shard_bytes` each; returns file name
+    """Write tensors, on any device, as `weights_NN.safetensors` of at most about `shard_bytes` each; returns file name
     -> sha256.
 
     Args:
@@ -50,7 +46,7 @@ def write_shards(
     def flush() -> None:
         nonlocal shard, size
         if shard:
-            name = f"{stem}_{len(files):02d}.safetensors"
+            name = f"weights_{len(files):02d}.safetensors"
             store.write_in_tree(folder / name, safetensors_bytes(shard))
             files[name] = store.sha256_file(folder / name)
         shard, size = {}, 0

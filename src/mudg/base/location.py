@@ -416,12 +416,19 @@ class Location:
             raise ResourceError(what, where=str(to), expected=expected, got=got, remedy=remedy)
         store.make_folder(to if kind == "directory" else to.parent)
         with log.task(f"fetching {self}", len(missing)) as bar:
-            for names in _grouped(missing, 4 * _FILES_AT_ONCE):
+            for names in _grouped(missing):
                 places = {name: to / name if name else to for name in names}
                 parts = {name: at.with_name(f".{at.name}.fetching.part") for name, at in places.items()}
                 self._get(parts)
                 for name, part in parts.items():
-                    _verify(part, wanted[name], f"{self}/{name}" if name else self.text)
+                    size, sha256 = part.stat().st_size, store.sha256_file(part) if wanted[name].sha256 else ""
+                    if wanted[name] != Expected(size, sha256):
+                        store.remove(part)
+                        what, where = "what came is not what was uploaded", f"{self}/{name}" if name else self.text
+                        expected = f"{wanted[name].size} bytes, sha256 {wanted[name].sha256[:16]}..."
+                        got = f"{size} bytes, sha256 {sha256[:16]}..."
+                        remedy = "repeat the command; if it fails again, upload the data again"
+                        raise IntegrityError(what, where=where, expected=expected, got=got, remedy=remedy)
                     store.take_place(part, places[name])
                     bar.advance()
         if mirror and kind == "directory":
@@ -497,7 +504,7 @@ class Location:
             (self / name).remove()
         record.save(Upload(False, files).content())
         with log.task(f"uploading {self}", len(files)) as bar:
-            for names in _grouped(sorted(set(files) - there - manifest), 4 * _FILES_AT_ONCE):
+            for names in _grouped(sorted(set(files) - there - manifest)):
                 self._put(frm, names)
                 bar.advance(len(names))
         sizes = self.tree()
@@ -533,19 +540,10 @@ class Location:
             self._files.put_file(str(file), self._path)
 
 
-def _grouped(names: Sequence[str], count: int) -> Iterable[Sequence[str]]:
+def _grouped(names: Sequence[str]) -> Iterable[Sequence[str]]:
+    count = 4 * _FILES_AT_ONCE
     return (names[begin : begin + count] for begin in range(0, len(names), count))
 
 
 def _is(path: Path, wanted: Expected) -> bool:
     return path.is_file() and path.stat().st_size == wanted.size and store.sha256_file(path) == wanted.sha256
-
-
-def _verify(part: Path, wanted: Expected, where: str) -> None:
-    size, sha256 = part.stat().st_size, store.sha256_file(part) if wanted.sha256 else ""
-    if (size, sha256) != (wanted.size, wanted.sha256):
-        store.remove(part)
-        what = "what came is not what was uploaded"
-        expected, got = f"{wanted.size} bytes, sha256 {wanted.sha256[:16]}...", f"{size} bytes, sha256 {sha256[:16]}..."
-        remedy = "repeat the command; if it fails again, upload the data again"
-        raise IntegrityError(what, where=where, expected=expected, got=got, remedy=remedy)

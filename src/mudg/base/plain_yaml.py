@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import codecs
 import re
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
 import yaml
@@ -66,156 +66,143 @@ def parse_with_lines(text: str | bytes, where: str) -> tuple[Any, Lines]:
 def _parse(text: str | bytes, where: str, largest: int, lines: Lines | None) -> Any:
     if len(text) > largest:
         raise InputError("YAML file is too large", where=where, expected=f"at most {largest} bytes", got=f"{len(text)}")
-    builder = _Builder(where, largest // BYTES_A_VALUE, lines)
+    reader = _Reader(where, largest // BYTES_A_VALUE, lines)
     try:
         if isinstance(text, bytes):
             text = text.decode("utf-16" if text[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "utf-8-sig")
         text.encode()  # refuses halves of surrogate pairs
         directive = _DIRECTIVE.search(text)
         if directive is not None:
-            at = _at(where, text.count("\n", 0, directive.start()))
-            raise InputError("directives of YAML are not read here", where=at, got="%", remedy="leave the line out")
+            reader.line = text.count("\n", 0, directive.start())
+            remedy = "leave the line out"
+            raise InputError("directives of YAML are not read here", where=reader.at(), got="%", remedy=remedy)
         # the same events, the first ten times faster
-        for event in yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)):
-            builder.take(event)
-        return builder.root
+        return reader.read(yaml.parse(text, Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader)))
     except (yaml.YAMLError, ValueError, OverflowError) as error:  # ValueError: bytes that are no text, no such letters
         mark, got = getattr(error, "problem_mark", None), str(getattr(error, "problem", None) or error)
-        last = str(text).rstrip().count("\n")
-        line = str(text).count("\n", 0, getattr(error, "position", 0)) or builder.line
-        line = line if mark is None else mark.line
+        line = str(text).count("\n", 0, getattr(error, "position", 0)) or reader.line
+        reader.line = min(line if mark is None else mark.line, str(text).rstrip().count("\n"))
         what = "YAML is nested too deeply" if "nesting depth" in got else "not valid YAML"
-        raise InputError(what, where=_at(where, min(line, last)), got=got.replace("\n", " ")) from error
+        raise InputError(what, where=reader.at(), got=got.replace("\n", " ")) from error
 
 
-def _at(where: str, line: int) -> str:
-    return f"{where}, line {line + 1}"
-
-
-@dataclass(slots=True)
-class _Open:
-    """A list or mapping that is being read. count: values in it so far; key: of the value that comes next, if any."""
-
-    value: Any
-    anchor: str | None
-    path: tuple[str | int, ...]
-    key: str | None = None
-    count: int = 1
-    merged: list[Any] = field(default_factory=list)
-
-
-class _Builder:
-    """Makes a value of events. ``root`` is the result, ``line`` where the last event began, from 0."""
+class _Reader:
+    """Makes a value of events. ``line``: where the last of them began, from 0."""
 
     def __init__(self, where: str, most: int, lines: Lines | None) -> None:
-        self.root: Any = None
         self.line = 0
+        self._events: Iterator[Any] = iter(())
         self._where, self._most, self._lines = where, most, lines
-        self._open: list[_Open] = []
+        self._open: list[str | None] = []
+        """Anchors of the lists and mappings that are being read."""
         self._anchored: dict[str, tuple[Any, int]] = {}
-        self._documents = 0
+        """Anchor -> its value, and how many values that stands for."""
 
-    def take(self, event: yaml.Event) -> None:
-        """The next event."""
-        line = self.line = event.start_mark.line
-        if isinstance(event, yaml.DocumentStartEvent):
-            self._documents += 1
-            if self._documents > 1:
-                where, remedy = _at(self._where, line), "leave out what follows ---"
-                raise InputError("a file holds one YAML document", where=where, remedy=remedy)
-        elif isinstance(event, yaml.CollectionEndEvent):
-            closed = self._open.pop()
-            if closed.merged:
-                own = dict(closed.value)
-                for one in (*reversed(closed.merged), own):
-                    closed.value.update(one)
-            if closed.anchor is not None:
-                self._anchored[closed.anchor] = (closed.value, closed.count)
-            self._add_count(closed.count, line)
-        elif isinstance(event, yaml.NodeEvent):
-            self._node(event, line)
+    def at(self) -> str:
+        """The place, for messages."""
+        return f"{self._where}, line {self.line + 1}"
 
-    def _node(self, event: Any, line: int) -> None:
-        at = _at(self._where, line)
+    def read(self, events: Iterable[Any]) -> Any:
+        """The value that all events together stand for."""
+        root, documents, self._events = None, 0, iter(events)
+        while (event := self._next()) is not None:
+            documents += isinstance(event, yaml.DocumentStartEvent)
+            if documents > 1:
+                raise InputError("a file holds one YAML document", where=self.at(), remedy="leave out what follows ---")
+            if isinstance(event, yaml.NodeEvent):
+                root, _ = self._value(event, ())
+        return root
+
+    def _next(self) -> Any:
+        event = next(self._events, None)
+        if event is None:
+            return None
+        self.line = event.start_mark.line
         if getattr(event, "tag", None) is not None:
             what, remedy = "a value says of which type it is", "leave out the word that begins with !"
-            raise InputError(what, where=at, got=f"{event.tag}", expected="a plain value", remedy=remedy)
-        is_alias, is_scalar = isinstance(event, yaml.AliasEvent), isinstance(event, yaml.ScalarEvent)
-        if not is_alias and event.anchor is not None and len(self._anchored) + len(self._open) > MOST_ANCHORS:
-            expected = f"at most {MOST_ANCHORS}"
-            raise InputError("YAML has too many anchors", where=at, expected=expected, remedy="write the values out")
-        holder = self._open[-1] if self._open else None
-        if holder is not None and isinstance(holder.value, dict) and holder.key is None:
-            self._key(event, holder, line)
-            return
-        path: tuple[str | int, ...] = ()
-        if holder is not None:
-            path = (*holder.path, len(holder.value) if holder.key is None else holder.key)
-            if self._lines is not None:
-                self._lines.setdefault(path, line + 1)
-        count = 1
-        if is_alias:
-            if any(one.anchor == event.anchor for one in self._open):
-                got = f"*{event.anchor}"
-                raise InputError("a value contains itself", where=at, got=got, remedy="write the value out")
+            raise InputError(what, where=self.at(), got=event.tag, expected="a plain value", remedy=remedy)
+        anchors = len(self._anchored) + len(self._open)
+        if anchors > MOST_ANCHORS and not isinstance(event, yaml.AliasEvent) and getattr(event, "anchor", None):
+            expected, remedy = f"at most {MOST_ANCHORS}", "write the values out"
+            raise InputError("YAML has too many anchors", where=self.at(), expected=expected, remedy=remedy)
+        return event
+
+    def _value(self, event: Any, path: tuple[str | int, ...]) -> tuple[Any, int]:
+        """What a node stands for, and how many values that are."""
+        if isinstance(event, yaml.AliasEvent):
+            got = f"*{event.anchor}"
+            if event.anchor in self._open:
+                raise InputError("a value contains itself", where=self.at(), got=got, remedy="write the value out")
             if event.anchor not in self._anchored:
-                raise InputError("not valid YAML", where=at, got=f"*{event.anchor} without an anchor of this name")
-            value, count = self._anchored[event.anchor]
-        elif is_scalar:
-            value = _scalar(event, at)
-            if event.anchor is not None:
-                self._anchored[event.anchor] = (value, 1)
+                raise InputError("not valid YAML", where=self.at(), got=f"{got} without an anchor of this name")
+            return self._anchored[event.anchor]
+        if isinstance(event, yaml.ScalarEvent):
+            found: tuple[Any, int] = (_scalar(event, self.at()), 1)
         else:
             if len(self._open) >= DEEPEST:
-                raise InputError("YAML is nested too deeply", where=at, expected=f"at most {DEEPEST} levels")
-            value = {} if isinstance(event, yaml.MappingStartEvent) else []
-        self._place(value, holder, at)
-        if is_alias or is_scalar:
-            self._add_count(count, line)
-        else:
-            self._open.append(_Open(value, event.anchor, path))
+                raise InputError("YAML is nested too deeply", where=self.at(), expected=f"at most {DEEPEST} levels")
+            self._open.append(event.anchor)
+            found = self._mapping(path) if isinstance(event, yaml.MappingStartEvent) else self._list(path)
+            self._open.pop()
+        if event.anchor is not None:
+            self._anchored[event.anchor] = found
+        return found
 
-    def _key(self, event: Any, holder: _Open, line: int) -> None:
-        at = _at(self._where, line)
+    def _list(self, path: tuple[str | int, ...]) -> tuple[list[Any], int]:
+        items, count = list[Any](), 1
+        while not isinstance(event := self._next(), yaml.CollectionEndEvent):
+            value, more = self._value(event, self._noted(path, len(items)))
+            items.append(value)
+            count = self._bounded(count + more)
+        return items, count
+
+    def _mapping(self, path: tuple[str | int, ...]) -> tuple[dict[str, Any], int]:
+        made, merged, count = dict[str, Any](), list[Any](), 1
+        while not isinstance(event := self._next(), yaml.CollectionEndEvent):
+            key = self._key(event, made)
+            inside, count = self._noted(path, key), self._bounded(count + 1)
+            event, at = self._next(), self.at()
+            a_list = key == _MERGE and isinstance(event, yaml.SequenceStartEvent) and len(self._open) < DEEPEST
+            value, more = (None, 0) if a_list else self._value(event, inside)
+            if key == _MERGE:
+                many = value if isinstance(value, list) and value else [value]
+                if not all(isinstance(one, dict) for one in many):
+                    raise InputError("what << merges is no mapping", where=at, expected="<<: *NAME of a mapping above")
+                merged += many
+            else:
+                made[key] = value
+            count = self._bounded(count + more)
+        for one in (*reversed(merged), dict(made)):  # later ones win; own keys come first
+            made.update(one)
+        return made, count
+
+    def _key(self, event: Any, made: dict[str, Any]) -> str:
         plain = isinstance(event, yaml.ScalarEvent)
-        key = _scalar(event, at) if plain else None
+        key = _scalar(event, self.at()) if plain else None
         if not isinstance(key, str):
             collection = isinstance(event, yaml.CollectionStartEvent)
             got = event.value if plain else "a list or mapping" if collection else f"*{event.anchor}"
             what, remedy = "a key is no text", "put quotes around it, if it is a name"
-            raise InputError(what, where=at, expected="the name of a setting", got=got or "nothing", remedy=remedy)
-        if key in holder.value and not (key == _MERGE and event.implicit[0]):
-            raise InputError(f"{key!r} is given twice", where=at, remedy="keep one of them")
+            expected = "the name of a setting"
+            raise InputError(what, where=self.at(), expected=expected, got=got or "nothing", remedy=remedy)
+        if key in made and not (key == _MERGE and event.implicit[0]):
+            raise InputError(f"{key!r} is given twice", where=self.at(), remedy="keep one of them")
         if event.anchor is not None:
             self._anchored[event.anchor] = (key, 1)
-        holder.key = key
+        return key
+
+    def _noted(self, path: tuple[str | int, ...], step: str | int) -> tuple[str | int, ...]:
+        """The place below a list or mapping; its line is kept."""
         if self._lines is not None:
-            self._lines[*holder.path, key] = line + 1
-        self._add_count(1, line)
+            self._lines[*path, step] = self.line + 1
+        return (*path, step)
 
-    def _place(self, value: Any, holder: _Open | None, at: str) -> None:
-        if holder is None:
-            self.root = value
-        elif isinstance(holder.value, list):
-            holder.value.append(value)
-        elif holder.key == _MERGE:
-            many = value if isinstance(value, list) and value else [value]
-            if not all(isinstance(one, dict) for one in many):
-                raise InputError("what << merges is no mapping", where=at, expected="<<: *NAME of a mapping above")
-            holder.merged += many
-            holder.key = None
-        else:
-            holder.value[holder.key] = value
-            holder.key = None
-
-    def _add_count(self, count: int, line: int) -> None:
-        if not self._open:
-            return
-        self._open[-1].count += count
-        if self._open[-1].count > self._most:
-            where = _at(self._where, line)
-            got = f"{self._open[-1].count}" + (", repeated by aliases" if self._anchored else "")
-            raise InputError("YAML stands for too many values", where=where, expected=f"at most {self._most}", got=got)
+    def _bounded(self, count: int) -> int:
+        if count > self._most:
+            got = f"{count}" + (", repeated by aliases" if self._anchored else "")
+            expected = f"at most {self._most}"
+            raise InputError("YAML stands for too many values", where=self.at(), expected=expected, got=got)
+        return count
 
 
 def _scalar(event: yaml.ScalarEvent, at: str) -> Any:

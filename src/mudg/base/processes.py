@@ -71,13 +71,9 @@ def one_torch_thread() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def child_environment(threads: int, torch_threads: int = 1) -> Iterator[None]:
-    """Environment of processes started in this block: their threads, and waiting without spinning.
-
-    Args:
-        threads: threads of the native library in each child. torch_threads: threads of torch and OpenMP in each child.
-    """
-    wanted = {"OMP_NUM_THREADS": str(torch_threads), "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": str(threads)}
+def child_environment() -> Iterator[None]:
+    """Environment of processes started in this block: one thread each, and waiting without spinning."""
+    wanted = {"OMP_NUM_THREADS": "1", "OMP_WAIT_POLICY": "PASSIVE", "MUDG_THREADS": "1"}
     before = {name: os.environ[name] for name in wanted if name in os.environ}
     os.environ.update(wanted)
     try:
@@ -194,7 +190,7 @@ def run_in_processes(
             for index, items in enumerate(arguments):
                 yield index, function(*items)
         return
-    with child_environment(1), _working(processes) as pool:
+    with child_environment(), _working(processes) as pool:
         try:
             yield from _in_turn(pool, function, arguments, processes)
         except BrokenProcessPool:
@@ -235,7 +231,7 @@ def calls_beside(
         ResourceError: a process ended from outside. Whatever the function raises, at the end of the block.
     """
     with _working(processes) as pool:
-        with child_environment(1):
+        with child_environment():
             futures = [pool.submit(_stoppable, function, items) for items in arguments]
 
         def drop_rest(done: Future[Any]) -> None:
@@ -328,17 +324,13 @@ def _stoppable(function: Callable[..., Result], items: tuple[Any, ...]) -> Resul
         return function(*items)
     finally:
         for number in heard:
-            signal.signal(number, _note_stop)
+            signal.signal(number, lambda *_: _stop_asked.set())
 
 
 def _stop_call(_number: int, _frame: types.FrameType | None) -> None:
     if not _stop_asked.is_set():  # once: what tidies up is not stopped again
         _stop_asked.set()
         raise KeyboardInterrupt
-
-
-def _note_stop(_number: int, _frame: types.FrameType | None) -> None:
-    _stop_asked.set()
 
 
 class _Spawning(SpawnContext):

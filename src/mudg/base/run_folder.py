@@ -344,10 +344,7 @@ def own_names(output: VerbOutput, folder: Path) -> list[str]:
         state = run_state(folder)
     except UsageError:
         return []
-    try:
-        listed: Collection[str] = store.read_json(folder / store.MANIFEST)["files"]
-    except (InputError, KeyError, TypeError):
-        listed = ()
+    listed: Collection[str] = store.json_object(folder / store.MANIFEST).get("files") or ()
     patterns = state.get("files", output.files if state.get("verb") == output.verb else ())
     finished = state.get("state") == "complete" and listed
 
@@ -737,12 +734,8 @@ class ResultFile:
 
     def description(self) -> dict[str, Any]:
         """What ``OUT.json`` says; empty where it is missing or somebody else's."""
-        try:
-            found = store.read_json(description_path(self.out))
-        except InputError:
-            return {}
-        texts = map(found.get, ("verb", "key", "file", "sha256")) if isinstance(found, dict) else (None,)
-        return found if all(isinstance(text, str) for text in texts) else {}
+        found = store.json_object(description_path(self.out))
+        return found if all(isinstance(found.get(name), str) for name in ("verb", "key", "file", "sha256")) else {}
 
     def _examine(self, overwrite: bool) -> None:
         about, file = self.description(), description_path(self.out)

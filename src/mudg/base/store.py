@@ -69,14 +69,6 @@ def _reading(path: Path) -> contextlib.AbstractContextManager[None]:
 _umask_lock = threading.Lock()
 
 
-def _umask() -> int:
-    """The process's file mask. Reading it means setting it, so two threads must not do that at once."""
-    with _umask_lock:
-        mask = os.umask(0)
-        os.umask(mask)
-    return mask
-
-
 @contextlib.contextmanager
 def _temporary(path: Path) -> Iterator[Path]:
     """A new file beside ``path`` (same suffix). It goes at the end, unless it has got another name."""
@@ -92,7 +84,9 @@ def _complete(temporary: Path) -> None:
     """Wait until a temporary file is on the disk; it gets the rights of any new file."""
     with temporary.open("rb+") as handle:
         os.fsync(handle.fileno())
-    temporary.chmod(0o666 & ~_umask())
+    with _umask_lock:  # reading the mask means setting it, which two threads must not do at once
+        os.umask(mask := os.umask(0))
+    temporary.chmod(0o666 & ~mask)
 
 
 @contextlib.contextmanager
@@ -297,6 +291,13 @@ def parse_json(text: str | bytes, where: str) -> Any:
 def read_json(path: Path) -> Any:
     """Read strict JSON; a missing or malformed file is an InputError that names it."""
     return parse_json(read_bytes(path), str(path))
+
+
+def json_object(path: Path) -> dict[str, Any]:
+    """What a JSON file says; empty where it is missing, malformed or no object."""
+    with contextlib.suppress(InputError):
+        return found if isinstance(found := read_json(path), dict) else {}
+    return {}
 
 
 _KINDS = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a named pipe"), (stat.S_ISSOCK, "a socket"))

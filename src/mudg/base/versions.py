@@ -8,19 +8,20 @@ import platform
 from typing import Any
 
 
-def _of(package: str, missing: str) -> str:
+def installed(package: str) -> str:
+    """Version of an installed package; empty where it is missing."""
     from importlib import metadata  # late: it takes a sixth of what --help takes
 
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
-        return missing
+        return ""
 
 
 @functools.cache
 def version() -> str:
     """Version of this package, or ``0+unknown`` when it runs uninstalled."""
-    return _of("mudg", "0+unknown")
+    return installed("mudg") or "0+unknown"
 
 
 @functools.cache
@@ -28,5 +29,7 @@ def environment() -> dict[str, Any]:
     """Versions and machine facts that results may depend on. Holds no host name, user name or path. Looked up once:
     metadata is parsed anew at every question."""
     machine = {"system": platform.system(), "machine": platform.machine(), "cpu_count": os.cpu_count()}
-    packages = {name: _of(name, "missing") for name in ("torch", "numpy", "scipy", "pillow", "safetensors", "av")}
+    packages = {
+        name: installed(name) or "missing" for name in ("torch", "numpy", "scipy", "pillow", "safetensors", "av")
+    }
     return {"mudg": version(), "python": platform.python_version(), **machine, "packages": packages}

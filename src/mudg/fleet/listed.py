@@ -17,12 +17,12 @@ from typing import Any, Final
 from mudg import native
 from mudg.base import config as configuration
 from mudg.base import log, store
-from mudg.base.errors import InputError, UsageError, plain
+from mudg.base.errors import UsageError, plain
 from mudg.base.location import Location
 from mudg.base.run_folder import refuse_overlap
 from mudg.fleet.child import Stop
 from mudg.fleet.engines import LocalRun
-from mudg.fleet.plan import CITY, BatchPlan, Entry, listed_plan, parse_shard, shard
+from mudg.fleet.plan import BatchPlan, Entry, files_read, listed_plan, parse_shard, shard
 from mudg.fleet.records import BatchFolder, Ended
 from mudg.fleet.work import DONE, Job
 
@@ -65,7 +65,10 @@ def run_listed(
     part = parse_shard(shard_text)
     entries = shard(entries, part)
     status = out / (f"status-{part[0]}-of-{part[1]}.json" if shard_text else "status.json")
-    _refuse_overlaps(entries, out, status, listed)
+    refuse_overlap([status, *(out / entry.name for entry in entries)], files_read(entries, listed))
+    if status.exists() and not {"schema", "verb", "counts", "scenes"} <= store.json_object(status).keys():
+        what = "the status file would replace a file that does not belong to this list"
+        raise UsageError(what, where=str(status), remedy="choose another --out")
     if jobs < 0:
         raise UsageError("number of jobs cannot be negative", where="--jobs", got=str(jobs))
     jobs = min(jobs or native.default_threads(), max(len(entries), 1))
@@ -89,45 +92,21 @@ def run_listed(
     return {"scenes": outcomes, **counts, **shown}
 
 
-def _refuse_overlaps(entries: Sequence[Entry], out: Path, status: Path, listed: Path | None) -> None:
-    """UsageError where a scene's output touches any source or the list, or the status would replace another file."""
-    logs = (entry for entry in entries if entry.source != CITY)
-    read: dict[str, Path | str | None] = {f"source of {entry.name}": entry.source for entry in logs}
-    read["list"] = listed if listed is not None and listed.is_file() else None
-    refuse_overlap([status, *(out / entry.name for entry in entries)], read)
-    if status.exists():
-        try:
-            known = {"schema", "verb", "counts", "scenes"} <= set(store.read_json(status))
-        except (InputError, TypeError):
-            known = False
-        if not known:
-            what = "the status file would replace a file that does not belong to this list"
-            raise UsageError(what, where=str(status), remedy="choose another --out")
-
-
 def _outcome(entry: Entry, report: Ended, folder: Path, before: str) -> dict[str, Any]:
     """What became of a scene: ``done``, ``reused`` or ``failed``, with one line of what it holds or why it failed."""
     state, words, error = "failed", report.words, f"code {report.code}"
     if report.state == DONE:
         state = "reused" if before and before == _finished(folder) else "done"
-        summary, error = _state(folder).get("summary"), ""
+        summary, error = store.json_object(folder / store.RUN_STATE).get("summary"), ""
         facts = summary.items() if isinstance(summary, Mapping) else ()
         words = ", ".join(f"{value} {name}" for name, value in facts if isinstance(value, int | str))
     outcome = {"name": entry.name, "source": entry.source, "state": state, "seconds": round(report.seconds, 2)}
     return {**outcome, "words": words, "error": error}
 
 
-def _state(folder: Path) -> Mapping[str, Any]:
-    try:
-        state = store.read_json(folder / store.RUN_STATE)
-    except InputError:
-        return {}
-    return state if isinstance(state, dict) else {}
-
-
 def _finished(folder: Path) -> str:
     """What tells one finished result from another; empty if there is none."""
-    state = _state(folder)
+    state = store.json_object(folder / store.RUN_STATE)
     if state.get("state") != "complete":
         return ""
     return f"{state.get('key')} {(folder / store.RUN_STATE).stat().st_mtime_ns}"

@@ -108,6 +108,13 @@ def _below(folder: str, source: str) -> str:
     return os.path.abspath(Path("" if "://" in folder else folder) / Path(source).expanduser())
 
 
+def files_read(entries: Sequence[Entry], listed: Path | None) -> dict[str, Path | str | None]:
+    """What scenes of a list read on this machine, by names for messages, and the list, where it is a file."""
+    local = (entry for entry in entries if entry.source != CITY and "://" not in entry.source)
+    sources: dict[str, Path | str | None] = {f"source of {entry.name}": entry.source for entry in local}
+    return sources | {"list": listed if listed is not None and listed.is_file() else None}
+
+
 def shard_of(name: str, count: int) -> int:
     """Which of ``count`` shards a scene belongs to: a hash of its name, so that it stays there when the list grows."""
     return int.from_bytes(hashlib.sha256(name.encode()).digest()[:8]) % count

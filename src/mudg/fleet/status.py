@@ -116,15 +116,11 @@ class BatchStatus:
         cameras, objects = sorted(Counter(log.cameras for log in self.logs).items()), Counter[str]()
         for log in self.logs:
             objects.update(log.objects)
-        return {
-            "scenes": len(self.logs),
-            "images": sum(log.images for log in self.logs),
-            "hours": round(sum(log.seconds for log in self.logs) / 3600, 4),
-            "kilometres": round(sum(log.metres for log in self.logs) / 1000, 4),
-            "cameras": {str(count): scenes for count, scenes in cameras},
-            "datasets": dict(Counter(log.dataset for log in self.logs).most_common()),
-            "objects": dict(objects.most_common()),
-        }
+        hours, kilometres = sum(log.seconds for log in self.logs) / 3600, sum(log.metres for log in self.logs) / 1000
+        sums = {"scenes": len(self.logs), "images": sum(log.images for log in self.logs), "hours": round(hours, 4)}
+        sums |= {"kilometres": round(kilometres, 4), "cameras": {str(count): scenes for count, scenes in cameras}}
+        datasets = Counter(log.dataset for log in self.logs)
+        return {**sums, "datasets": dict(datasets.most_common()), "objects": dict(objects.most_common())}
 
     def record(self) -> dict[str, Any]:
         """As JSON values."""
@@ -223,30 +219,16 @@ def page_of(state: BatchStatus) -> str:
     """The status as a page, with figures of the logs."""
     from mudg.base import html
 
-    corpus = state.corpus()
-    return html.render(
-        "batch.html.j2",
-        title="Batch",
-        kicker="mudg batch",
-        heading=state.out,
-        lead=f"{_lead(state)}.",
-        drivers=state.drivers,
-        funnel=[(name, one.done, one.failed, state.scenes) for name, one in state.stages.items()],
-        heads=HEADS,
-        rows=stage_rows(state),
-        slowest=[(name, one.slowest[1], f"{one.slowest[0]:.1f} s") for name, one in state.stages.items() if one.done],
-        reasons=state.reasons(),
-        failures=state.failures[:500],
-        failed=len(state.failures),
-        figures=[
-            ("Logs", str(corpus["scenes"])),
-            ("Hours driven", f"{corpus['hours']:.2f}"),
-            ("Kilometres driven", f"{corpus['kilometres']:.2f}"),
-            ("Images", str(corpus["images"])),
-            ("Tracked objects", str(sum(corpus["objects"].values()))),
-        ],
-        cameras=[(name, str(count)) for name, count in corpus["cameras"].items()],
-        datasets=[(name, str(count)) for name, count in list(corpus["datasets"].items())[:30]],
-        objects=[(name, str(count)) for name, count in list(corpus["objects"].items())[:40]],
-        at=time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime()),
-    )
+    corpus, stages = state.corpus(), state.stages.items()
+    values: dict[str, Any] = {"title": "Batch", "kicker": "mudg batch", "heading": state.out, "heads": HEADS}
+    values |= {"lead": f"{_lead(state)}.", "drivers": state.drivers, "rows": stage_rows(state)}
+    values |= {"reasons": state.reasons(), "failures": state.failures[:500], "failed": len(state.failures)}
+    values["funnel"] = [(name, one.done, one.failed, state.scenes) for name, one in stages]
+    values["slowest"] = [(name, one.slowest[1], f"{one.slowest[0]:.1f} s") for name, one in stages if one.done]
+    figures = {"Logs": str(corpus["scenes"]), "Hours driven": f"{corpus['hours']:.2f}"}
+    figures |= {"Kilometres driven": f"{corpus['kilometres']:.2f}", "Images": str(corpus["images"])}
+    values["figures"] = [*figures.items(), ("Tracked objects", str(sum(corpus["objects"].values())))]
+    for name, most in (("cameras", None), ("datasets", 30), ("objects", 40)):
+        values[name] = [(one, str(count)) for one, count in list(corpus[name].items())[:most]]
+    values["at"] = time.strftime("%Y-%m-%d %H:%M UTC", time.gmtime())
+    return html.render("batch.html.j2", **values)

@@ -249,7 +249,9 @@ class _Step:
         ending, adopted = self._unpublished or Ending(0), None
         try:
             adopted = self._adopted()
-            if adopted is None and not self._unpublished:
+            if adopted is not None:
+                self._take_over()  # what else the driver left that was cut off goes with this attempt
+            elif not self._unpublished:
                 self._prepare()
                 if alone:
                     how = "alone on this machine, with one thread"
@@ -277,7 +279,9 @@ class _Step:
         words, folder = self._command(), None if self._direct is not None else self._path
         ending = run_step(words, folder, threads, self._stop, alone=alone)
         # of another state of the source
-        if ending.code == UsageError.exit_code and self._is_unfinished() and "--overwrite" not in words:
+        state = "" if self._unit.stage.is_own else store.json_object(self._result / store.RUN_STATE).get("state")
+        begun = state in ("running", "interrupted")
+        if ending.code == UsageError.exit_code and begun and "--overwrite" not in words:
             ending = run_step([*words, "--overwrite"], folder, threads, self._stop, alone=alone)
         if alone and ending.code == KILLED:
             words = "its process was killed by signal 9, also alone on its machine with one thread: out of memory?"
@@ -285,13 +289,6 @@ class _Step:
         if ending.code == 0 and not self._result.exists():
             return replace(ending, code=1, words="it ended well but wrote nothing")
         return ending
-
-    def _is_unfinished(self) -> bool:
-        try:
-            begun = ("running", "interrupted")
-            return not self._unit.stage.is_own and store.read_json(self._result / store.RUN_STATE)["state"] in begun
-        except (InputError, KeyError, TypeError):
-            return False
 
     def _command(self) -> list[str]:
         source, settings = self._unit.entry.source, _SETTINGS if self._unit.stage.settings else ""
@@ -479,7 +476,7 @@ def facts_of(folder: Path) -> CorpusFacts | None:
     with contextlib.suppress(AttributeError, IndexError, TypeError, ValueError):  # any command may have made it
         for scene in (folder, folder / "scene"):
             index = _json(scene / "scene.json")
-            if isinstance(index, Mapping) and "frames" in index:
+            if "frames" in index:
                 ego, tracks = index.get("ego", {}), _json(scene / "tracks.json")
                 times = [float(time) for time in ego.get("times_s", [])]
                 path = [(float(pose[3]), float(pose[7]), float(pose[11])) for pose in ego.get("world_from_ego", [])]
@@ -503,8 +500,5 @@ def peak_of(folder: Path) -> int | None:
     return None
 
 
-def _json(path: Path) -> Any:
-    try:
-        return store.read_json(path) if path.is_file() and path.stat().st_size <= _LARGEST else {}
-    except InputError:
-        return {}
+def _json(path: Path) -> dict[str, Any]:
+    return store.json_object(path) if path.is_file() and path.stat().st_size <= _LARGEST else {}

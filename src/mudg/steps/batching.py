@@ -23,7 +23,18 @@ from mudg.base.run_folder import refuse_overlap
 from mudg.fleet import engines, status
 from mudg.fleet.child import Stop
 from mudg.fleet.listed import exit_code
-from mudg.fleet.plan import CITY, COMMAND, OF_A_LINE, REVISION, BatchPlan, Entry, parse_shard, plan_of, read_list, shard
+from mudg.fleet.plan import (
+    COMMAND,
+    OF_A_LINE,
+    REVISION,
+    BatchPlan,
+    Entry,
+    files_read,
+    parse_shard,
+    plan_of,
+    read_list,
+    shard,
+)
 from mudg.fleet.records import BatchFolder, Ended, slurm_tasks_left
 from mudg.fleet.settings import BatchConfig
 from mudg.fleet.work import DONE, STOPPED, Job, is_open
@@ -67,7 +78,8 @@ def run(
     plan, folder = plan_for(batch, settings, lines), BatchFolder(Location.of(out))
     if folder.out.local is not None:
         folder = BatchFolder(Location.of(folder.out.local.absolute()))
-    _refuse_overlap(scenes, folder, listed)
+    if folder.out.local is not None:
+        refuse_overlap(folder.out.local, files_read(scenes, Location.of(listed).local))
     if not dry:
         folder.begin(plan, scenes)
     done, failed, ours = folder.keys("done"), folder.keys("failed"), shard(scenes, part)
@@ -149,16 +161,6 @@ def _with_absolute_paths(values: Any) -> Any:
         return {name: _with_absolute_paths(value) for name, value in values.items()}
     is_path = isinstance(values, str) and "/" in values and os.path.exists(values)
     return os.path.abspath(values) if is_path else values
-
-
-def _refuse_overlap(entries: Sequence[Entry], folder: BatchFolder, listed: str) -> None:
-    out, place = folder.out.local, Location.of(listed).local
-    if out is None:
-        return
-    local = [entry for entry in entries if entry.source != CITY and "://" not in entry.source]
-    read: dict[str, Path | str | None] = {f"source of {entry.name}": entry.source for entry in local}
-    read["list"] = place if place is not None and place.is_file() else None
-    refuse_overlap(out, read)
 
 
 def show_status(out: str, html: bool = False, price: float = 0.0, every_s: float = 0.0) -> dict[str, Any]:

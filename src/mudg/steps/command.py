@@ -44,7 +44,8 @@ class _Parser(argparse.ArgumentParser):
 def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
     """The words behind a verb as its step, and the flags that every command has. UsageError: an unknown flag (the
     nearest is named), a missing or wrong value. InputError: --config cannot be read."""
-    listed = {option.name: option for option in _all_options(cls)}
+    listed = {option.name: option for option in options(cls)}
+    listed |= {option.name: option for option in common_options() if option.name not in listed}
     parser = _Parser(prog=f"mudg {cls.verb()}", add_help=False, allow_abbrev=False)
     for option in listed.values():
         _add(parser, option)
@@ -65,13 +66,6 @@ def parse(cls: type[Step], words: Sequence[str]) -> tuple[Step, Common]:
     given |= {name: by_words.pop(name) for name in by_words.keys() - its_own}
     settings = configuration.nested({name: _value(listed[name].kind, value) for name, value in given.items()})
     return cls.build({**by_words, **own}, settings, common.config), common
-
-
-def _all_options(cls: type[Step]) -> list[Option]:
-    """Flags of a step and those of every command; a step that has one of its own keeps it."""
-    own = list(options(cls))
-    names = {option.name for option in own}
-    return [*own, *(option for option in common_options() if option.name not in names)]
 
 
 def common_options() -> list[Option]:

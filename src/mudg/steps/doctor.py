@@ -8,7 +8,6 @@ import shutil
 import sys
 from collections.abc import Mapping
 from dataclasses import replace
-from importlib import metadata
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,7 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from mudg.base import memory
 from mudg.base.errors import plain_lines
 from mudg.base.plugins import origin, plugins
-from mudg.base.versions import version
+from mudg.base.versions import installed, version
 from mudg.steps.step import Flag, Step
 
 if TYPE_CHECKING:
@@ -241,15 +240,8 @@ def _native(problems: list[str]) -> dict[str, str]:
     return {"status": native.status().removeprefix("native library: ")}
 
 
-def _installed(package: str) -> str | None:
-    try:
-        return metadata.version(package)
-    except metadata.PackageNotFoundError:
-        return None
-
-
 def _packages(problems: list[str]) -> dict[str, str]:
-    rows = {name: _installed(name) or "missing" for name in _CORE}
+    rows = {name: installed(name) or "missing" for name in _CORE}
     missing = [name for name, found in rows.items() if found == "missing"]
     if missing:
         problems.append(f"packages are missing: {', '.join(missing)}; reinstall mudg with pip")
@@ -260,10 +252,10 @@ def _packages(problems: list[str]) -> dict[str, str]:
 
 def _optional() -> dict[str, str]:
     rows = {
-        name: found if (found := _installed(name)) else f"not installed ({use}; {how})"
+        name: found if (found := installed(name)) else f"not installed ({use}; {how})"
         for name, (use, how) in _OPTIONAL.items()
     }
-    if _installed("gsplat") and find_spec("torch") is not None:
+    if installed("gsplat") and find_spec("torch") is not None:
         from mudg.core.raster import gsplat_cuda
 
         rows["gsplat"] += f"; {gsplat_cuda.status()}"

@@ -122,9 +122,8 @@ class AssetExport(Result):
 def refuse_other_name(out: Path) -> None:
     """UsageError for a file with another suffix than assets have."""
     if out.suffix != ".safetensors":
-        raise UsageError(
-            "an asset is a safetensors file", where="--out", expected="a name that ends in .safetensors", got=str(out)
-        )
+        what, expected = "an asset is a safetensors file", "a name that ends in .safetensors"
+        raise UsageError(what, where="--out", expected=expected, got=str(out))
 
 
 class AssetImport(Result):

@@ -9,15 +9,10 @@ from typing import Any, Final
 from mudg import steps
 from mudg.steps.step import python_function
 
-VERBS: Final = {
-    **{name: name for name in "adapt annotate bench convert dataset demo doctor edit export".split()},
-    "export_asset": "asset export",
-    "fit": "fit",
-    "fuse": "fuse",
-    "import_asset": "asset import",
-    **{name: name for name in "ingest learn page render report run score synthesize".split()},
-}
-"""Functions, and the verbs that they are."""
+_COMMANDS: Final = ("view", "serve", "batch run", "batch status", "batch retry")
+"""Verbs that are no functions."""
+VERBS: Final = dict(sorted(("_".join(verb.split()[::-1]), verb) for verb in steps.VERBS if verb not in _COMMANDS))
+"""Functions, and the verbs that they are: ``export_asset`` is ``asset export``."""
 
 
 def __getattr__(name: str) -> Callable[..., Any]:

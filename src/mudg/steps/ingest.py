@@ -23,10 +23,6 @@ if TYPE_CHECKING:
 FORMATS = ("kitti360", "waymo", "nuscenes", "argoverse2", "pandaset", "nuplan", "dgp", "ncore", "custom", "kitti")
 
 
-def _is_format(word: str) -> bool:
-    return word in ("auto", *FORMATS) or word in plugins("importer")
-
-
 OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolution", "skip_missing", "untwist")
 """Settings that a generated city does not have."""
 
@@ -62,7 +58,8 @@ class Ingest(Listed):
         """``[FORMAT] LOG [OUT]``, with ``--list`` ``[FORMAT] [OUT]``; the format is a setting."""
         left, values, many, named = list(words), dict[str, Any](), "list" in given, "out" in given
         of_a_log = (not many) + (not named)
-        if left and _is_format(left[0]) and (len(left) > of_a_log or not Path(left[0]).exists()):
+        is_format = left and (left[0] in ("auto", *FORMATS) or left[0] in plugins("importer"))
+        if is_format and (len(left) > of_a_log or not Path(left[0]).exists()):
             values["format"] = left.pop(0)
         if not many and not left:
             raise UsageError("no log was given", expected=usage(cls))
