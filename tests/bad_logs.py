@@ -107,6 +107,8 @@ def city(folder: Path) -> Scene:
 @functools.cache
 def written(kind: str, folder: Path) -> Files | write_waymo.Log:
     """The log of a format below ``folder``, which all tests share."""
+    if kind in NEEDS_PYARROW:
+        pytest.importorskip("pyarrow")
     if kind == "kitti":
         (folder / "kitti").mkdir()
         root = kitti_folders.write_derived(folder / "kitti")

@@ -9,7 +9,7 @@ from pathlib import Path
 import bad_logs
 import numpy as np
 import pytest
-from bad_logs import FORMATS, NEEDS_PYARROW, Change
+from bad_logs import FORMATS, Change
 from PIL import Image
 from roundtrip import needs_native
 
@@ -34,16 +34,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bad_logs.shared(tmp_path_factory)
 
 
-def log_of(kind: str, folder: Path) -> bad_logs.Files | bad_logs.write_waymo.Log:
-    if kind in NEEDS_PYARROW:
-        pytest.importorskip("pyarrow")
-    return bad_logs.written(kind, folder)
-
-
 @pytest.mark.parametrize("case", IMAGES)
 @pytest.mark.parametrize("kind", FORMATS)
 def test_a_bad_image_is_refused_by_name(kind: str, case: str, folder: Path, tmp_path: Path) -> None:
-    log = log_of(kind, folder)
+    log = bad_logs.written(kind, folder)
     change, words = IMAGES[case]
     with bad_logs.damaged(log, kind, "image", change, tmp_path) as (source, where):
         bad_logs.assert_refused(kind, source, tmp_path, bad_logs.options_of(log), words, where)
@@ -53,7 +47,7 @@ def test_a_bad_image_is_refused_by_name(kind: str, case: str, folder: Path, tmp_
 def test_a_grey_image_is_taken_and_noted_but_not_from_a_log_of_ones_own(
     kind: str, folder: Path, tmp_path: Path
 ) -> None:
-    log = log_of(kind, folder)
+    log = bad_logs.written(kind, folder)
 
     def grey(content: bytes) -> bytes:
         return bad_logs.png(bad_logs.opened(content).convert("L"))

@@ -23,7 +23,7 @@ import write_av2
 import write_dgp
 import write_nuscenes
 import write_waymo
-from bad_logs import NEEDS_PYARROW, Change
+from bad_logs import Change
 from pandas_pickles import frame_bytes, write_frame
 from roundtrip import needs_native
 
@@ -36,12 +36,6 @@ pytestmark = needs_native
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return bad_logs.shared(tmp_path_factory)
-
-
-def written(kind: str, folder: Path) -> bad_logs.Files | write_waymo.Log:
-    if kind in NEEDS_PYARROW:
-        pytest.importorskip("pyarrow")
-    return bad_logs.written(kind, folder)
 
 
 # --- clouds ---------------------------------------------------------------------------------------
@@ -89,14 +83,14 @@ CLOUDS: dict[tuple[str, str], tuple[Change, str]] = {
 
 @pytest.mark.parametrize(("kind", "case"), CLOUDS)
 def test_a_bad_cloud_is_refused_by_name(kind: str, case: str, folder: Path, tmp_path: Path) -> None:
-    log = written(kind, folder)
+    log = bad_logs.written(kind, folder)
     change, words = CLOUDS[kind, case]
     with bad_logs.damaged(log, kind, "cloud", change, tmp_path) as (source, where):
         bad_logs.assert_refused(kind, source, tmp_path, bad_logs.options_of(log), words, where)
 
 
 def test_a_missing_cloud_is_refused_where_the_log_names_it(folder: Path, tmp_path: Path) -> None:
-    log = written("dgp", folder)
+    log = bad_logs.written("dgp", folder)
     assert isinstance(log, bad_logs.Files)
     content = log.cloud.read_bytes()
     log.cloud.unlink()
@@ -125,7 +119,7 @@ def brighter_frame(content: bytes) -> bytes:
 def test_intensities_of_another_scale_are_refused_not_clipped(
     kind: str, change: Change, folder: Path, tmp_path: Path
 ) -> None:
-    log = written(kind, folder)
+    log = bad_logs.written(kind, folder)
     with bad_logs.damaged(log, kind, "cloud", change, tmp_path) as (source, where):
         words, options = "intensity is out of range", bad_logs.options_of(log)
         error = bad_logs.assert_refused(kind, source, tmp_path, options, words, where)
@@ -172,7 +166,7 @@ WAYMO: dict[str, tuple[Callable[[write_waymo.Log], None], str]] = {
 @pytest.mark.parametrize("form", ["waymo v1", "waymo v2"])
 @pytest.mark.parametrize("case", WAYMO)
 def test_a_bad_waymo_record_is_refused(form: str, case: str, folder: Path, tmp_path: Path) -> None:
-    log = copy.deepcopy(written(form, folder))
+    log = copy.deepcopy(bad_logs.written(form, folder))
     assert isinstance(log, write_waymo.Log)
     spoil, words = WAYMO[case]
     spoil(log)
@@ -182,7 +176,7 @@ def test_a_bad_waymo_record_is_refused(form: str, case: str, folder: Path, tmp_p
 
 def test_a_page_of_a_waymo_table_that_does_not_fit_its_checksum_is_refused(folder: Path, tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet")
-    log = written("waymo v2", folder)
+    log = bad_logs.written("waymo v2", folder)
     assert isinstance(log, write_waymo.Log)
     source = bad_logs.write_waymo_log(log, "waymo v2", tmp_path / "log")
     table = next((source / "camera_image").iterdir())
@@ -317,7 +311,7 @@ RECORDS: dict[tuple[str, str], tuple[Callable[[Path], None], str, str]] = {
 
 @pytest.mark.parametrize(("kind", "case"), RECORDS)
 def test_a_bad_record_is_refused_by_name(kind: str, case: str, folder: Path, tmp_path: Path) -> None:
-    log = written(kind, folder)
+    log = bad_logs.written(kind, folder)
     assert isinstance(log, bad_logs.Files)
     spoil, words, where = RECORDS[kind, case]
     root = shutil.copytree(folder / kind, tmp_path / kind)
@@ -330,7 +324,7 @@ def test_a_bad_record_is_refused_by_name(kind: str, case: str, folder: Path, tmp
 
 
 def test_an_unknown_class_of_kitti_keeps_its_name_and_is_noted(folder: Path, tmp_path: Path) -> None:
-    log = written("kitti", folder)
+    log = bad_logs.written("kitti", folder)
     assert isinstance(log, bad_logs.Files)
     root = shutil.copytree(log.source, tmp_path / "kitti")
     label(lambda row: row.__setitem__(2, "Hoverboard"))(root)
@@ -346,7 +340,7 @@ def test_rows_in_any_order_give_the_same_scene(folder: Path, tmp_path: Path) -> 
         ("argoverse2", reversed_tables),
         ("dgp", dgp("scene_abc.json", lambda r: r["samples"].reverse())),
     ):
-        log = written(kind, folder)
+        log = bad_logs.written(kind, folder)
         assert isinstance(log, bad_logs.Files)
         options = bad_logs.options_of(log)
         plain = bad_logs.ingest(kind, log.source, tmp_path / f"{kind} plain", options)
