@@ -32,6 +32,7 @@ import write_nuscenes
 import write_pandaset
 import write_waymo
 from PIL import Image
+from refusals import refused  # noqa: F401 (tests of formats take it from here)
 
 from mudg.base.errors import InputError
 from mudg.base.types import Scene
@@ -79,13 +80,6 @@ def whole_city(folder: Path) -> Scene:
 def importer(kind: str, **usual: Any) -> Callable[..., Scene]:
     """``ingest(source, out, **options)`` of a format, with its ``usual`` options."""
     return lambda source, out, **options: IMPORTERS[kind](source, out, ImportOptions(**{**usual, **options}))
-
-
-def refused(words: str, call: Callable[..., object], *args: Any, raises: type = InputError, **options: Any) -> Any:
-    """The error that a call ends in; ``words``: a pattern in it."""
-    with pytest.raises(raises, match=words) as caught:
-        call(*args, **options)
-    return caught.value
 
 
 class Asks:

@@ -1,5 +1,4 @@
-"""Small images whose headers claim 60,000 x 60,000 pixels: refused by every reader of pictures, without the memory that
-they claim."""
+"""Small images whose headers claim 60,000 x 60,000 pixels: every reader refuses them, without the memory they claim."""
 
 from __future__ import annotations
 

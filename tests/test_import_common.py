@@ -7,8 +7,8 @@ import threading
 
 import numpy as np
 import pytest
-from bad_logs import refused
 from PIL import Image
+from refusals import refused
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import from_rotation_translation, matrix_from_quaternion, yaw_matrix
@@ -17,9 +17,6 @@ from mudg.formats.importers import common, images
 from mudg.formats.importers.common import ImportOptions, number_ranges, parse_resolution
 
 CAMERA = Camera("front", 96, 64, 70.0, 72.0, 47.0, 33.0)
-
-
-# ---- work over frames ----
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3])
@@ -64,9 +61,6 @@ def test_the_earliest_error_wins_and_names_its_item(workers: int) -> None:
     assert len(started) < 2000
 
 
-# ---- time and poses ----
-
-
 def test_nanoseconds_of_the_epoch_keep_their_digits() -> None:
     start = 1_532_402_927_647_951_001
     times = common.seconds([start, start + 100_000_001], "ns", "log", start)
@@ -103,12 +97,8 @@ def test_poses_are_cleaned_or_refused_in_words() -> None:
     refused("length 1", common.pose_from_quaternion, q * 1.2, [1, 2, 3], "x")
 
 
-# ---- images ----
-
-
 def smooth_picture(camera: Camera, lens: images.Lens | None = None) -> np.ndarray:
-    """A picture of a smooth function of the ray; with a lens, as that lens sees it (the map is inverted by
-    iteration)."""
+    """A picture of a smooth function of the ray; with a lens, as that lens sees it."""
     u, v = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     seen = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], -1).reshape(-1, 2)
     xy = seen.copy()

@@ -1,5 +1,4 @@
-"""FID's network: its layers against a twin in numpy and its traps one by one, its input rules against other
-implementations."""
+"""FID's network: its layers against a twin in numpy, its traps, its input rules against other implementations."""
 
 from __future__ import annotations
 
@@ -10,6 +9,7 @@ import pytest
 import torch
 import toy_inception
 from PIL import Image
+from refusals import refused
 
 from mudg.base import seeds
 from mudg.base.errors import InputError
@@ -29,9 +29,6 @@ def network(state: dict[str, torch.Tensor]) -> inception.InceptionFeatures:
 def picture(height: int = 64, width: int = 96, seed: int = 0) -> np.ndarray:
     rough = seeds.numpy_rng(seed, 0, "picture").integers(0, 256, (height // 8, width // 8, 3), dtype=np.uint8)
     return np.array(Image.fromarray(rough).resize((width, height), Image.Resampling.BILINEAR))
-
-
-# ---- names and shapes ----------------------------------------------------------------------------
 
 
 def test_the_published_file_has_these_tensors() -> None:
@@ -82,9 +79,6 @@ def test_taps_have_their_widths_and_do_not_depend_on_the_batch(network: inceptio
 def test_other_sizes_are_refused(network: inception.InceptionFeatures) -> None:
     with pytest.raises(InputError, match="images of one size"):
         network(torch.zeros(1, 3, 224, 224))
-
-
-# ---- layers --------------------------------------------------------------------------------------
 
 
 def convolved(x: np.ndarray, state: dict[str, torch.Tensor], name: str) -> np.ndarray:
@@ -183,9 +177,6 @@ def test_float64_agrees(state) -> None:
     assert float((single - double).abs().max() / double.abs().max()) < 1e-5
 
 
-# ---- weights that do not fit ---------------------------------------------------------------------
-
-
 def test_counts_of_batches_are_left_alone(network, state) -> None:
     counted = inception.InceptionFeatures({**state, "Mixed_5b.branch1x1.bn.num_batches_tracked": torch.tensor(7)})
     x = torch.rand(1, 192, 5, 5, generator=torch.Generator().manual_seed(4))
@@ -196,18 +187,12 @@ def test_counts_of_batches_are_left_alone(network, state) -> None:
 
 def test_other_weights_are_refused_and_named(state) -> None:
     missing = {name: value for name, value in state.items() if name != "Mixed_6e.branch7x7_3.bn.running_mean"}
-    with pytest.raises(InputError, match=r"mine: Mixed_6e.branch7x7_3.bn.running_mean"):
-        inception.InceptionFeatures(missing, "mine")
-    with pytest.raises(InputError, match="another network"):
-        inception.InceptionFeatures({**state, "fc.weight": torch.zeros(1000, 2048)})
-    with pytest.raises(InputError, match="AuxLogits"):
-        inception.InceptionFeatures({**state, "AuxLogits.fc.weight": torch.zeros(1000, 768)})
+    refused(r"mine: Mixed_6e.branch7x7_3.bn.running_mean", inception.InceptionFeatures, missing, "mine")
+    refused("another network", inception.InceptionFeatures, {**state, "fc.weight": torch.zeros(1000, 2048)})
+    refused("AuxLogits", inception.InceptionFeatures, {**state, "AuxLogits.fc.weight": torch.zeros(1000, 768)})
     for value in (math.nan, -1.0):
         with pytest.raises(InputError, match="impossible values"):
             inception.InceptionFeatures({**state, "Conv2d_1a_3x3.bn.running_var": torch.full((32,), value)})
-
-
-# ---- rules of input ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("rule", inception.RULES)

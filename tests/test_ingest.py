@@ -11,7 +11,7 @@ from typing import Any
 import kitti_folders as made
 import numpy as np
 import pytest
-from bad_logs import refused
+from refusals import refused
 from toy_scene import ToyStreet
 
 from mudg import app, native

@@ -1,5 +1,4 @@
-"""Views in a scratch file are those in memory, to the bit; threads that read ahead change nothing and leave nothing
-behind."""
+"""Views in a scratch file are those in memory, to the bit; threads that read ahead leave nothing behind."""
 
 from __future__ import annotations
 
@@ -37,8 +36,7 @@ OPTIONAL = ("channels", "sky", "mask", "lidar", "depth", "confidence")
 
 
 def threads_at_work() -> int:
-    """Threads of this process but for the one that looks at memory (`base/memory.py`): it ends a moment after the last
-    meter."""
+    """Threads of this process but for the memory meter's, which ends a moment after the last meter."""
     return sum(thread.name != "memory meter" for thread in threading.enumerate())
 
 

@@ -1,5 +1,4 @@
-"""KITTI importer: every layout against folders written from an exact drive, and the real pieces against known
-answers."""
+"""KITTI importer: every layout against an exact drive, and the real pieces against known answers."""
 
 from __future__ import annotations
 
@@ -11,7 +10,7 @@ import bad_logs
 import kitti_folders as made
 import numpy as np
 import pytest
-from bad_logs import refused
+from refusals import refused
 
 from mudg.base import geometry, store
 from mudg.base.errors import UsageError

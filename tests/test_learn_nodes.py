@@ -1,5 +1,4 @@
-"""Training under torchrun whose processes are killed, warned and changed in number: the losses of an uninterrupted
-run."""
+"""Training whose processes are killed, warned and changed in number: the losses of an uninterrupted run."""
 
 import contextlib
 import hashlib
@@ -149,8 +148,7 @@ def max_difference(one, other, steps=STEPS):
 
 
 def test_checkpoints_are_cut_anew_bit_equal(tmp_path):
-    """Saved by 1, 2 and 4 processes, sharded and in replicas, read by each other number: the same bytes of
-    everything."""
+    """Saved by 1, 2 and 4 processes, sharded and in replicas, read by each other number: the same bytes."""
     here, sums = Path(__file__).parent, {}
     environment = os.environ | {
         "PYTHONPATH": os.pathsep.join([str(here), *sys.path]),

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from refusals import refused
 from torch import nn
 from toy_clips import losses_of, tiny, training_words, write_clips
 
@@ -175,10 +176,8 @@ def test_rows_of_any_cut_are_put_together(tmp_path):
     got = torch.zeros(10, 3)
     read_rows(tmp_path, "net", {"w": got})
     assert torch.equal(got, value)
-    with pytest.raises(IntegrityError, match="does not fit"):
-        read_rows(tmp_path, "net", {"w": torch.zeros(9, 3)})
-    with pytest.raises(IntegrityError, match="does not fit"):
-        read_rows(tmp_path, "net", {"v": got})
+    refused("does not fit", read_rows, tmp_path, "net", {"w": torch.zeros(9, 3)}, raises=IntegrityError)
+    refused("does not fit", read_rows, tmp_path, "net", {"v": got}, raises=IntegrityError)
     (tmp_path / "net.0001.json").unlink()
     with pytest.raises(IntegrityError, match="rows"):
         read_rows(tmp_path, "net", {"w": got})

@@ -64,8 +64,7 @@ def corners(settings, clips, *draw):
 
 @pytest.mark.slow
 def test_two_stages_from_a_converted_model(converted, clips, street, tmp_path):
-    """Stage 1 moves all of the network; stage 2, larger, all but the temporal transformers; `synthesize` reads the
-    result."""
+    """Stage 1 moves all of the network; stage 2, larger, all but the temporal transformers."""
     one = Learn(out=tmp_path / "one", settings=published_settings(converted, clips, steps=1, batch_frames=4)).run()
     large = write_clips(tmp_path / "large", 36, 32, points=True)
     config = published_settings(

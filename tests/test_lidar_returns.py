@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from test_edit import gaussians
 
 from mudg.base import geometry, store
@@ -160,7 +161,6 @@ def test_learning_does_not_read_held_out_sweeps(city: Scene, tmp_path: Path) -> 
     gone = held_out(city)
     without = replace(city, sweeps=tuple(sweep for sweep in city.sweeps if sweep.id not in gone), split={})
     one, other = learn_returns(city), learn_returns(without)
-    assert one is not None and other is not None and one.weights is not None and other.weights is not None
     assert one.weights.tobytes() == other.weights.tobytes()
     for name, part in one.parts.items():
         assert part.xyz.tobytes() == other.parts[name].xyz.tobytes()
@@ -215,7 +215,6 @@ def test_equal_requests_on_a_log_get_equal_bytes_and_objects_move_with_the_calle
 
 def test_a_surface_that_the_log_looked_through_is_no_answer(city: Scene) -> None:
     found = learn_returns(city)
-    assert found is not None
     station = found.stations[2]
     beams = beams_of(city, city.sweeps[2])
     far = np.flatnonzero(beams.range_m > 15)[::40]
@@ -277,10 +276,8 @@ def test_tables_come_by_name_and_from_files(tmp_path: Path) -> None:
 
 
 def test_an_unknown_lidar_is_refused_in_words(city: Scene) -> None:
-    with pytest.raises(UsageError, match=r"no such LiDAR(.|\n)*lidar(.|\n)*vlp16(.|\n)*velodine"):
-        wanted_sweeps("velodine", city)
-    with pytest.raises(UsageError, match="no LiDAR sweeps"):
-        wanted_sweeps("lidar", replace(city, sweeps=()))
+    refused(r"no such LiDAR(.|\n)*lidar(.|\n)*vlp16(.|\n)*velodine", wanted_sweeps, "velodine", city, raises=UsageError)
+    refused("no LiDAR sweeps", wanted_sweeps, "lidar", replace(city, sweeps=()), raises=UsageError)
     assert wanted_sweeps("vlp16", city).sensor == "lidar"
 
 

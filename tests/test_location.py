@@ -1,5 +1,4 @@
-"""Locations: the same calls on this machine and in an object store; nothing half there, nothing silently wrong, no
-secret shown."""
+"""Locations: the same calls on this machine and in an object store; nothing half there, no secret shown."""
 
 from __future__ import annotations
 
@@ -12,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import refused
 
 from mudg.base import location, store
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
@@ -133,10 +133,8 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
 
     location._file_system.cache_clear()
     monkeypatch.setattr(fsspec, "filesystem", missing)
-    with pytest.raises(ResourceError, match=r"s3fs[\s\S]*pip install 'mudg\[s3\]'"):
-        Location.of("s3://bucket/x").load()
-    with pytest.raises(ResourceError, match=r"gcsfs[\s\S]*mudg\[gs\]"):
-        Location.of("gs://bucket/x").exists()
+    refused(r"s3fs[\s\S]*pip install 'mudg\[s3\]'", Location.of("s3://bucket/x").load, raises=ResourceError)
+    refused(r"gcsfs[\s\S]*mudg\[gs\]", Location.of("gs://bucket/x").exists, raises=ResourceError)
     location._file_system.cache_clear()
 
 
@@ -274,10 +272,8 @@ def test_a_folder_that_other_tools_uploaded_is_fetched(root: Location, tmp_path:
 
 
 def test_nothing_there_is_an_error(root: Location, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="nothing is at"):
-        (root / "run").fetch(tmp_path / "back")
-    with pytest.raises(InputError, match="no folder"):
-        (root / "run").push(tmp_path / "missing")
+    refused("nothing is at", (root / "run").fetch, tmp_path / "back")
+    refused("no folder", (root / "run").push, tmp_path / "missing")
 
 
 @pytest.mark.parametrize("damage", ["altered", "short", "missing"])

@@ -1,5 +1,4 @@
-"""What reaches a terminal: names and values of foreign files cannot forge a line, say something to the terminal, or
-fill it."""
+"""What reaches a terminal: foreign files cannot forge a line, command the terminal, or fill it."""
 
 from __future__ import annotations
 

@@ -16,10 +16,12 @@ from mudg.core.metrics import METRICS, Pair
 
 
 def pair(**given) -> Pair:
-    empty = dict.fromkeys(
-        ("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics")
-    )
-    return Pair(**{**empty, **given})
+    names = ("rgb", "depth", "semantics", "truth_rgb", "truth_depth", "truth_depth_valid", "truth_semantics")
+    return Pair(**{**dict.fromkeys(names), **given})
+
+
+def add(metric, **given) -> None:
+    metric.add(metric.source(pair(**given)))
 
 
 def test_psnr_known_value_mask_and_limits():
@@ -83,40 +85,24 @@ def test_prediction_outside_the_classes_is_wrong_not_ignored():
 
 def test_miou_is_pooled_over_the_trajectory_not_averaged_over_views():
     metric = metrics.Segmentation("miou")
-    metric.add(
-        metric.source(
-            pair(semantics=torch.zeros(1, 9, dtype=torch.long), truth_semantics=torch.zeros(1, 9, dtype=torch.long))
-        )
-    )
-    metric.add(
-        metric.source(
-            pair(semantics=torch.ones(1, 1, dtype=torch.long), truth_semantics=torch.zeros(1, 1, dtype=torch.long))
-        )
-    )
+    for made in (torch.zeros(1, 9, dtype=torch.long), torch.ones(1, 1, dtype=torch.long)):
+        add(metric, semantics=made, truth_semantics=torch.zeros_like(made))
     assert metric.value() == pytest.approx(0.9)
 
 
 def test_rmse_is_pooled_over_pixels():
-    metric = metrics.DepthError("rmse_m")
-    valid = torch.ones(1, 1, 3, dtype=torch.bool)
-    metric.add(
-        metric.source(
-            pair(depth=torch.full((1, 1, 3), 12.0), truth_depth=torch.full((1, 1, 3), 10.0), truth_depth_valid=valid)
-        )
-    )
-    metric.add(metric.source(pair(depth=torch.full((1, 1, 1), 10.0), truth_depth=torch.full((1, 1, 1), 10.0))))
+    metric, ten = metrics.DepthError("rmse_m"), torch.full((1, 1, 3), 10.0)
+    add(metric, depth=ten + 2, truth_depth=ten, truth_depth_valid=ten > 0)
+    add(metric, depth=ten[..., :1], truth_depth=ten[..., :1])
     assert metric.value() == pytest.approx(math.sqrt(3 * 4 / 4))
 
 
 def test_absent_modalities_are_said_in_words():
     accumulators = metrics.build_all()
     rgb = torch.rand(3, 16, 16, generator=torch.Generator().manual_seed(0))
+    truth = {"truth_rgb": rgb, "truth_depth": torch.ones(1, 16, 16), "truth_semantics": torch.zeros(16, 16)}
     for metric in accumulators.values():
-        metric.add(
-            metric.source(
-                pair(rgb=rgb, truth_rgb=rgb, truth_depth=torch.ones(1, 16, 16), truth_semantics=torch.zeros(16, 16))
-            )
-        )
+        add(metric, rgb=rgb, **truth)
     table = metrics.results(accumulators)
     assert table["psnr"] == 100.0
     assert table["ssim"] == pytest.approx(1.0, abs=1e-6)
@@ -147,14 +133,8 @@ def test_a_full_mask_and_none_give_the_same_similarity():
 
 
 def test_metrics_of_one_source_share_one_measurement(monkeypatch):
-    asked = []
-    found = metrics.depth_errors
-
-    def counted(*given):
-        asked.append(1)
-        return found(*given)
-
-    monkeypatch.setattr(metrics, "depth_errors", counted)
+    asked, found = [], metrics.depth_errors
+    monkeypatch.setattr(metrics, "depth_errors", lambda *given: asked.append(1) or found(*given))
     depth = torch.full((1, 4, 4), 12.0)
     of = metrics.build_all()
     measured = metrics.measure(pair(depth=depth, truth_depth=torch.full((1, 4, 4), 10.0)), of)
@@ -175,16 +155,9 @@ def test_large_images_are_measured_in_pieces_with_the_same_result(monkeypatch):
 
     def numbers() -> list[float]:
         depths = metrics.depth_errors(depth, true_depth, mask)
-        return [
-            metrics.psnr(made, true),
-            metrics.psnr(made, true, mask),
-            depths.abs_rel,
-            depths.rmse_m,
-            depths.delta1,
-            depths.pixels,
-            flicker.change(made, true, moved),
-            *metrics.confusion(ids, true_ids, mask).flatten().tolist(),
-        ]
+        found = [depths.abs_rel, depths.rmse_m, depths.delta1, depths.pixels, flicker.change(made, true, moved)]
+        found += [metrics.psnr(made, true), metrics.psnr(made, true, mask)]
+        return found + metrics.confusion(ids, true_ids, mask).flatten().tolist()
 
     whole = numbers()
     monkeypatch.setattr(metrics, "PIECE_VALUES", 100)

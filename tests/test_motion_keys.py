@@ -15,7 +15,7 @@ import roundtrip
 import write_av2
 import write_custom
 import write_nuplan
-from bad_logs import refused
+from refusals import refused
 
 from mudg.base.geometry import yaw_matrix
 from mudg.base.types import EgoPath, Scene, Sweep, Track, View
@@ -44,9 +44,6 @@ def arc(first_s: float, last_s: float, step_s: float, lost_s: tuple[float, float
 
 def warnings(scene: Scene, place: str) -> str:
     return "\n".join(f.message for f in check_records(scene) if f.level == "warning" and f.where.startswith(place))
-
-
-# --- gaps -----------------------------------------------------------------------------------------
 
 
 def curve_log(truth: Scene, root: Path, path: EgoPath) -> Path:
@@ -158,9 +155,6 @@ def test_lost_rows_of_argoverse2_and_nuplan(truth: Scene, tmp_path: Path) -> Non
         assert 0 < len(left.frames) < len(truth.frames)
 
 
-# --- flips ----------------------------------------------------------------------------------------
-
-
 def poses_of(headings: list[float], step_m: float) -> np.ndarray:
     return np.stack([yaw_matrix(np.deg2rad(h), (step_m * n, 0, 0)) for n, h in enumerate(headings)])
 
@@ -229,9 +223,6 @@ def test_flips_of_boxes_in_another_format(truth: Scene, tmp_path: Path) -> None:
         assert np.allclose(one.world_from_object, other.world_from_object, atol=1e-8)
 
 
-# --- jumps ----------------------------------------------------------------------------------------
-
-
 def test_doctor_names_what_no_vehicle_does(tmp_path: Path) -> None:
     from toy_scene import ToyStreet
 
@@ -256,9 +247,6 @@ def test_doctor_names_what_no_vehicle_does(tmp_path: Path) -> None:
     boxes = np.stack([yaw_matrix(0.0, (8 * t + (6 if t > 0.95 else 0), 3, 0)) for t in times])
     track = Track("swapped", "car", np.array([4.5, 1.9, 1.5]), times, boxes)
     assert "it jumps by 6.0 m after 0.900 s (key 9" in warnings(replace(scene, tracks=(track,)), "track swapped")
-
-
-# --- float32 --------------------------------------------------------------------------------------
 
 
 @roundtrip.needs_native

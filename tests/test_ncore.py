@@ -1,5 +1,4 @@
-"""NCore recordings both ways: what is written means the same to NVIDIA's own functions, comes back as it was, and
-damage is told."""
+"""NCore recordings: they mean the same to NVIDIA's functions, come back as they were, and damage is told."""
 
 from __future__ import annotations
 
@@ -20,8 +19,8 @@ import bad_logs
 import numpy as np
 import pytest
 import roundtrip
-from bad_logs import refused
 from memory_limits import at_most
+from refusals import refused
 from roundtrip import needs_native
 
 from mudg import app
@@ -120,7 +119,6 @@ def test_boxes_stand_where_the_package_puts_them(truth: Scene, loaded: Any) -> N
     for one in found:
         track = truth.track(one.track_id)
         expected = track.pose_at((one.timestamp_us - zero) / 1e6)
-        assert expected is not None
         assert one.class_id == track.label and one.bbox3.dim == tuple(track.size_m)
         placed = bbox_pose(np.array([*one.bbox3.centroid, *one.bbox3.dim, *one.bbox3.rot]))
         assert np.abs(placed - expected).max() < 1e-9
@@ -168,8 +166,7 @@ def test_the_same_log_gives_the_same_bytes(truth: Scene, recording: Path, tmp_pa
 
 @needs_package
 def test_shutters_masks_classes_and_sensors_that_move(truth: Scene, tmp_path: Path) -> None:
-    """What the city does not have: a rolling shutter, a camera that shakes on the vehicle, the own bonnet, classes of
-    points."""
+    """What the city lacks: a rolling shutter, a camera that shakes on the vehicle, the bonnet, classes of points."""
     rng = np.random.default_rng(2)
     cameras = {**truth.cameras, "front": replace(truth.cameras["front"], readout_s=0.03)}
     bonnet = np.zeros((64, 96), bool)
@@ -208,8 +205,7 @@ def test_shutters_masks_classes_and_sensors_that_move(truth: Scene, tmp_path: Pa
 
 @needs_package
 def test_other_peoples_recordings(truth: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Stores per sensor, single-precision poses, boxes told in a sensor's frame, a lens, two returns: as NVIDIA's
-    converters write."""
+    """As NVIDIA's converters write: a store per sensor, float32 poses, boxes in a sensor's frame, a lens, two returns."""
     v4, data = package().v4, package().data
     interval = package().transformations.HalfClosedInterval(1_000_000, 1_400_001)
     writer = v4.SequenceComponentGroupsWriter(tmp_path, "clip", "clip-7", interval, {}, store_type="directory")
@@ -652,8 +648,7 @@ def test_recordings_that_contradict_themselves_are_refused(case: str, recording:
 
 @needs_package
 def test_frames_in_a_gap_of_a_curve_are_refused_or_left_out(recording: Path, tmp_path: Path) -> None:
-    """12 m/s on a circle of 3 m, without the keys from 1.15 to 1.45 s: a straight line is half a metre off in the
-    middle."""
+    """12 m/s on a circle of 3 m, without the keys from 1.15 to 1.45 s: a straight line is half a metre off."""
     keys = [at for at in range(1_000_000, 1_500_001, 25_000) if not 1_150_000 < at < 1_450_000]
 
     def on_circle(metadata: dict[str, Any]) -> None:
@@ -691,8 +686,7 @@ def test_rays_of_distance_0_are_no_points_and_are_counted(recording: Path, tmp_p
 
 @needs_package
 def test_every_cut_and_flipped_bytes_end_in_words(recording: Path, tmp_path: Path) -> None:
-    """Cut at some lengths and flipped in metadata and data: an error in words, or (pixels and points have no checksum)
-    a scene."""
+    """An error in words; or a scene, where pixels and points, which have no checksum, were flipped."""
     (store,) = recording.glob("*.itar")
     content, rng = store.read_bytes(), np.random.default_rng(3)
     target = tmp_path / "log" / store.name

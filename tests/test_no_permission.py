@@ -1,5 +1,4 @@
-"""A user who is not root, before files and folders that others have closed: errors in words, and what can go on goes
-on."""
+"""A user who is not root, before closed files and folders: errors in words, and what can go on goes on."""
 
 from __future__ import annotations
 
@@ -39,8 +38,7 @@ def open_folder() -> Iterator[Path]:
 
 
 def as_nobody(work: Callable[[], object], said: Path) -> int:
-    """Do the work in a copy of this process that is not root's; returns its exit code. What it says on stderr goes to a
-    file."""
+    """Exit code of the work in a copy of this process that is not root's; what it says on stderr goes to a file."""
     child = os.fork()
     if child == 0:
         code = 99

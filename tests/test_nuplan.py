@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 import roundtrip
 import write_nuplan as made
-from bad_logs import refused
 from PIL import Image
+from refusals import refused
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.types import Scene

@@ -1,5 +1,4 @@
-"""nuScenes importer: a release written from a known log, broken releases, the reader of large tables, and the real key
-frame."""
+"""nuScenes importer: a release of a known log, broken ones, the reader of large tables, the real key frame."""
 
 from __future__ import annotations
 
@@ -14,7 +13,7 @@ import numpy as np
 import pytest
 import roundtrip
 import write_nuscenes as made
-from bad_logs import refused
+from refusals import refused
 
 from mudg.base.errors import InputError, UsageError
 from mudg.base.geometry import invert, transform_points, yaw_matrix
@@ -327,8 +326,7 @@ def test_real_boxes_hold_the_points_that_were_counted_in_them(shared_data: Calla
 
 
 def test_real_camera_times_agree_with_the_turn(shared_data: Callable[[str], Path]) -> None:
-    """Each camera is triggered when the beam passes it: point times at its azimuth must be its time before the
-    stamp."""
+    """A camera is triggered when the beam passes it: point times there are its time before the stamp."""
     source = shared_data("nuscenes_one_sample")
     sample = json.loads((source / "info.json").read_bytes())["data_list"][0]
     rows = np.fromfile(next(source.glob("*.pcd.bin")), "<f4").reshape(-1, 5)

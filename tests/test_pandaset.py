@@ -14,8 +14,8 @@ import bad_logs
 import numpy as np
 import pytest
 import roundtrip
-from bad_logs import refused
 from pandas_pickles import write_frame
+from refusals import refused
 from write_pandaset import CAMERA_OF, EPOCH_S, SOURCE_FROM_WORLD, cuboids, pose_entry, write_pandaset
 
 from mudg.base.errors import UsageError
@@ -110,7 +110,6 @@ def test_point_times_stay_and_boxes_come_from_the_time_they_were_measured(truth:
             late_s = 0.0
             for _ in range(6):
                 pose = paths[track.id].pose_at(sweep.time_s + late_s)
-                assert pose is not None
                 inside = (np.abs(transform_points(invert(pose), world)) < track.size_m / 2).all(1)
                 late_s = float(np.median(points.dt_s[turning][inside])) if inside.sum() >= 5 else 0.0
             if late_s:
@@ -168,8 +167,7 @@ def test_siblings_are_one_object(truth: Scene, source: Path, tmp_path: Path) -> 
 
 
 def test_published_poses_of_a_sequence_give_a_vehicle_that_drives_forward(source: Path, tmp_path: Path) -> None:
-    """Two poses of sequence 002 as published: x of the vehicle is its motion, its front camera looks ahead, 1.8 m
-    up."""
+    """Two poses of sequence 002: x of the vehicle is its motion, its front camera looks ahead, 1.8 m up."""
     lidar = """0 0 0 0.9227878803693977 0.004463029824737836 0.017858463809403605 -0.3848683989086472
         13.445349134518345 13.366435600237008 -0.01126648 0.923331091922337 0.0043070355 0.0159992193 -0.383647193545"""
     camera = """0.6558286953029124 0.555863909647736 1.8011768068489773
@@ -188,7 +186,6 @@ def test_published_poses_of_a_sequence_give_a_vehicle_that_drives_forward(source
     assert np.linalg.norm(moved) == pytest.approx(18.96, abs=0.01)
     assert abs(np.arctan2(moved[1], moved[0])) < np.deg2rad(1.0)  # along x of the scene's world
     ego = scene.ego.pose_at(scene.frames[0].view.time_s)
-    assert ego is not None
     in_ego = invert(ego) @ scene.frames[0].view.world_from_cam
     assert in_ego[:3, 2] == pytest.approx([1, 0, 0], abs=0.03)  # looks forward
     assert in_ego[:3, 0] == pytest.approx([0, -1, 0], abs=0.03)  # its right is the vehicle's
@@ -424,7 +421,6 @@ def test_real_points_have_the_classes_of_the_boxes_they_lie_in(
     scene = ingest(source, tmp_path / "out", frames=(40, 42), cameras=("front",), resolution=320)
     sweep = next(s for s in scene.sweeps if s.id == "pandar64/000000")
     classes = read_points(scene, sweep).classes
-    assert classes is not None
     world, vehicles = world_points(scene, "pandar64", 0), np.zeros(len(classes), bool)
     for track in scene.tracks:
         pose = track.pose_at(sweep.time_s)
@@ -435,7 +431,6 @@ def test_real_points_have_the_classes_of_the_boxes_they_lie_in(
     assert kept[vehicles].mean() > 0.97
     assert kept[~vehicles].mean() < 0.1
     shown = image_point_classes(scene, scene.frames[0])
-    assert shown is not None
     sky = shown.row < 20  # of 180 rows: what the LiDAR meets there is no road
     assert ID["road"] not in shown.classes[sky]
     assert (shown.classes[shown.row > 150] == ID["road"]).mean() > 0.5

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pandas_pickles
 import pytest
-from bad_logs import Asks, refused
+from bad_logs import Asks
+from refusals import refused
 
 from mudg.base import plain_pickle
 from mudg.base.errors import InputError
@@ -92,9 +93,6 @@ def test_the_writer_of_these_tests_writes_what_pandas_does(new: bool) -> None:
     }
 
 
-# --- nothing is run -------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("protocol", range(6))
 def test_a_pickle_that_asks_for_a_command_is_refused_by_name(
     protocol: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -143,9 +141,6 @@ def test_allowed_names_cannot_be_bent_into_a_call() -> None:
         b"\x80\x04\x8c\x05numpy\x8c\x07ndarray\x93(K\x01tR.",  # the class itself, called
     ):
         refused("not a plain data frame", pandas_frame.parse_frame, content, "x")
-
-
-# --- damage and absurd sizes ----------------------------------------------------------------------
 
 
 def test_every_beginning_of_a_frame_is_refused() -> None:

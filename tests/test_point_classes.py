@@ -110,7 +110,6 @@ def fused_classes(classes_for: str, labels: bool) -> tuple[np.ndarray | None, np
 def test_fused_clouds_carry_the_classes_of_points_before_those_of_images() -> None:
     for labels in (False, True):
         semantics, car = fused_classes("all", labels)
-        assert semantics is not None
         assert car.sum() > 100
         assert (semantics[car] == palette.ID["car"]).all()
         assert palette.ID["bicycle"] not in semantics
@@ -126,7 +125,6 @@ def test_classes_in_an_image_are_those_of_its_pixels_also_for_a_car_that_drives(
     frame = scene.frames[2]
     _, truth, depth = street.image(street.view(street.times[2] + 0.02))
     found = image_point_classes(scene, frame)
-    assert found is not None
     right = found.classes == truth[found.row, found.column]
     assert right.mean() > 0.99  # only at borders a pixel's centre may meet another thing than the point
     car = found.classes == palette.ID["car"]

@@ -7,11 +7,12 @@ from pathlib import Path
 from typing import Any, get_args
 
 import pytest
+from refusals import refused
 
 import mudg
 from mudg import app
 from mudg.base import config as configuration
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.steps import pipeline
 from mudg.steps.run import Run
 from mudg.steps.settings import DEMO_CITY, PRESETS, PresetName, RunConfig, run_preset, with_seed
@@ -88,17 +89,14 @@ def test_help_names_every_preset(verb: str, capsys: pytest.CaptureFixture[str]) 
 
 def test_paper_needs_a_published_model_and_lpips_before_anything_is_written(tmp_path: Path) -> None:
     out, paper = tmp_path / "out", run_preset("paper")
-    with pytest.raises(UsageError, match="published-type diffusion model"):
-        Run(source="city", out=out, settings=paper).run()
-    with pytest.raises(UsageError, match="published-type diffusion model"):
-        mudg.run("city", out=out, preset="paper")
+    refused("published-type diffusion model", Run(source="city", out=out, settings=paper).run, raises=UsageError)
+    refused("published-type diffusion model", mudg.run, "city", out=out, preset="paper", raises=UsageError)
     weights = replace(paper.fit, virtual=replace(paper.fit.virtual, lpips_weights=str(tmp_path / "lpips.safetensors")))
     other = replace(paper, fit=weights, synthesize=replace(paper.synthesize, model="embedded"))
     with pytest.raises(UsageError, match="published-type models only"):
         Run(source="city", out=out, settings=other).run()
     without = replace(paper, fit=weights, synthesize=replace(paper.synthesize, model=str(tmp_path / "none")))
-    with pytest.raises(InputError, match="no diffusion model here"):
-        Run(source="city", out=out, settings=without).run()
+    refused("no diffusion model here", Run(source="city", out=out, settings=without).run)
     with pytest.raises(UsageError, match="LPIPS needs a weight file"):
         mudg.run("city", out=out, preset="paper", synthesize={"model": "embedded"})
     assert not out.exists()

@@ -144,8 +144,7 @@ BESIDE = "with calls_beside(t.call, calls, 2):\n        time.sleep(600)"
 def stopped_command(
     tmp_path: Path, number: int, *, group: bool, calling: str = IN_TURN, first: str = "steps", after_s: float = 0.2
 ) -> tuple[int, str, list[int]]:
-    """A command with two workers, two calls that have begun and three that wait, is sent a signal: exit code, what it
-    said, workers."""
+    """A command with two calls that run and three that wait gets a signal: exit code, what it said, workers."""
     names = [first, "cleanup", "never", "never", "never"]
     given = folders(tmp_path, *(f"{index}{name}" for index, name in enumerate(names)))
     script = (

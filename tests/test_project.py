@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 
 from mudg import native
 from mudg.base import geometry
-from mudg.base.errors import InputError, UsageError
+from mudg.base.errors import UsageError
 from mudg.base.types import Camera, FusedCloud, PointCloud, View
 from mudg.core import project
 from mudg.core.project import ProjectConfig, project_cloud, project_points
@@ -134,9 +135,6 @@ def test_empty_and_bad_input() -> None:
     assert not nothing.valid.any()
     behind = project_points(np.array([[-5, 0, 0]], np.float32), None, VIEW)
     assert not behind.valid.any()
-    with pytest.raises(InputError, match=r"\[N, 3\]"):
-        project_points(np.zeros((3, 2), np.float32), None, VIEW)
-    with pytest.raises(UsageError, match="near_m"):
-        ProjectConfig(near_m=5.0, far_m=1.0)
-    with pytest.raises(UsageError, match="static_splat_px"):
-        ProjectConfig(static_splat_px=0.0)
+    refused(r"\[N, 3\]", project_points, np.zeros((3, 2), np.float32), None, VIEW)
+    refused("near_m", ProjectConfig, near_m=5.0, far_m=1.0, raises=UsageError)
+    refused("static_splat_px", ProjectConfig, static_splat_px=0.0, raises=UsageError)

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from toy_published import TINY, choose_trainable, fill, tiny_model, write_tiny
 from toy_scene import ToyStreet
 
@@ -390,8 +391,7 @@ def test_checkpointing_gives_the_same_gradients():
 
 
 def test_loss_is_the_velocity_error_and_repeats(model):
-    """Against the same numbers computed here, from the same draws, with the network's passes replaced by a known
-    function."""
+    """Against the numbers computed here from the same draws; a known function stands in for the network."""
     truth, encoded = batch_of(model)
     seen = {}
 
@@ -446,16 +446,13 @@ def test_shares_of_modalities_and_missing_context(model):
 def test_configuration_is_strict():
     values = json.loads(json.dumps(asdict(TINY)))
     assert parse_dataclass(PublishedConfig, values, "model.json") == TINY
-    with pytest.raises(InputError, match="unknown field 'lens'"):
-        parse_dataclass(PublishedConfig, {**values, "lens": 3}, "model.json")
+    refused("unknown field 'lens'", parse_dataclass, PublishedConfig, {**values, "lens": 3}, "model.json")
     with pytest.raises(InputError, match="'width' is missing"):
         parse_dataclass(
             PublishedConfig, {**values, "net": {k: v for k, v in values["net"].items() if k != "width"}}, "model.json"
         )
-    with pytest.raises(InputError, match="not a whole number"):
-        parse_dataclass(PublishedConfig, {**values, "fps": "10"}, "model.json")
-    with pytest.raises(UsageError, match="context"):
-        replace(TINY, text=TowerConfig(32, 2, 2))
+    refused("not a whole number", parse_dataclass, PublishedConfig, {**values, "fps": "10"}, "model.json")
+    refused("context", replace, TINY, text=TowerConfig(32, 2, 2), raises=UsageError)
 
 
 @pytest.fixture(scope="module")

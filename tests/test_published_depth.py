@@ -30,8 +30,7 @@ DISTORTIONS = ((0.5, 0.0), (0.8, 0.0), (1.25, 0.0), (2.0, 0.0), (1.0, 3.0), (1.0
 
 
 def standing_in(monkeypatch, depth):
-    """A published-type model whose networks are gone: its generated depth is `depth` f32[T,1,H,W], all else is
-    empty."""
+    """A published-type model without networks: its generated depth is `depth` f32[T,1,H,W], all else is empty."""
     model = tiny_model()
     frames, _, height, width = depth.shape
     factor = model.codec.factor
@@ -123,8 +122,7 @@ def kitti(shared_data, tmp_path_factory):
 
 
 def points_at(cloud, view):
-    """Depth f64[H,W] of the nearest static point of every pixel, by pinhole arithmetic in float64, gaps taking the
-    nearest pixel's."""
+    """Depth f64[H,W] of the nearest static point of every pixel, in float64, gaps taking the nearest pixel's."""
     camera = view.camera
     x, y, z = (
         np.linalg.inv(view.world_from_cam) @ np.c_[cloud.static.xyz.astype(np.float64), np.ones(len(cloud.static))].T

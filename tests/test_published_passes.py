@@ -1,5 +1,4 @@
-"""Sampling of the published kind of model: how often which network runs, what is shared, and what fits into which
-memory."""
+"""Sampling of published models: how often which network runs, what is shared, what fits into which memory."""
 
 from __future__ import annotations
 
@@ -30,14 +29,10 @@ def same(one, other):
     )
 
 
-# passes -------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("steps", [50, 20, 8])
 @pytest.mark.parametrize("guidance", [None, 1.0])
 def test_passes_for_a_clip(model, monkeypatch, steps, guidance):
-    """The numbers of docs/research/published.md: the denoising network once per step, with everything in one batch; the
-    rest once per clip."""
+    """The numbers of docs/research/published.md: the denoiser once per step, the rest once per clip."""
     rows: dict[str, list[int]] = {}
 
     def watch(owner, name="forward", answer=None):
@@ -102,9 +97,6 @@ def test_a_compiled_network_makes_the_same(model):
     torch._dynamo.reset()
 
 
-# memory -------------------------------------------------------------------------------------------
-
-
 @pytest.fixture(scope="module")
 def full():
     """The full model in bfloat16 on the meta device, and what it needs."""
@@ -130,8 +122,7 @@ def test_inputs_that_die_hide_nothing():
 )
 @pytest.mark.slow
 def test_what_fits_on_a_card(full, card_gb, together, frames):
-    """At 576x1024; and a whole clip, from condition to pixels, run on the meta device as the plan says, takes no
-    more."""
+    """At 576x1024; a whole clip, run on the meta device as the plan says, takes no more."""
     model, needs = full
     split, peak_bytes = memory_plan.choose(needs, card_gb * 10**9)
     assert ((split.modalities_together, split.guidance_together), split.frames_at_once, split.offload) == (

@@ -10,6 +10,7 @@ import pytest
 import torch
 from fit_settings import SMALL_RADIANCE, fit_config
 from pretend_device import pretend_device
+from refusals import refused
 from toy_world import fused_cloud, view_at, write_scene
 
 from mudg.base import seeds, store
@@ -348,8 +349,7 @@ def test_what_needs_gaussians_refuses_a_radiance_field(world, tmp_path):
             out=tmp_path / "virtual",
             settings=SynthesizeConfig(),
         ).run()
-    with pytest.raises(InputError, match="no radiance field"):
-        load_field_of_gaussians(tmp_path)
+    refused("no radiance field", load_field_of_gaussians, tmp_path)
     with pytest.raises(UsageError, match="cannot go on"):
         Fit(scene=world / "scene", start_from=world / "fit", out=tmp_path / "more", settings=fit_config(**TINY)).run()
     with pytest.raises(UsageError, match="needs fused clouds"):

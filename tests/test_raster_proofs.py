@@ -1,5 +1,4 @@
-"""Proofs of the rasteriser's numbers: finite differences without cut-offs, the published formulas written out,
-memory."""
+"""The rasteriser's numbers: finite differences without cut-offs, the published formulas, memory."""
 
 from __future__ import annotations
 
@@ -48,16 +47,12 @@ def _gaussians(parts: dict[str, Tensor], dtype: torch.dtype = torch.float64) -> 
     return Gaussians(**cast, node=torch.zeros(len(cast["means"]), dtype=torch.int32))
 
 
-# ---- finite differences --------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("antialias", [False, True])
 def test_gradients_match_finite_differences_without_cut_offs(monkeypatch: pytest.MonkeyPatch, antialias: bool) -> None:
-    """With the alpha cut at 1e-12 and no stop the picture is smooth in everything, so that every derivative can be
-    checked."""
+    """With the alpha cut at 1e-12 and no stop the picture is smooth in everything."""
     monkeypatch.setattr(torch_twin, "ALPHA_MIN", 1e-12)
     monkeypatch.setattr(torch_twin, "STOP_TRANSMITTANCE", 0.0)
-    view, values = _view(), _values(6, 2, 2)
+    view, values = _view(5, 4), _values(3, 2, 2)
     values["scales"] *= 3
     inputs = [values[name].requires_grad_() for name in GROUPS]
     pose = torch.tensor(view.world_from_cam, requires_grad=True)
@@ -76,12 +71,8 @@ def test_gradients_match_finite_differences_without_cut_offs(monkeypatch: pytest
     assert torch.autograd.gradcheck(draw, (*inputs, pose, background), eps=1e-6, atol=2e-5, rtol=1e-4, fast_mode=False)
 
 
-# ---- the published formulas, written out ---------------------------------------------------------
-
-
 def _dense(parts: dict[str, Tensor], view: View, blur: float = 0.3) -> dict[str, NDArray[np.float64]]:
-    """Every Gaussian at every pixel, front to back, by Zwicker et al. 2001 and Kerbl et al. 2023; degree 1 of
-    harmonics."""
+    """Every Gaussian at every pixel, front to back, by Zwicker et al. 2001 and Kerbl et al. 2023; harmonics of degree 1."""
     camera, p = view.camera, {name: value.numpy().astype(np.float64) for name, value in parts.items()}
     rotation, center = view.world_from_cam[:3, :3].T, view.world_from_cam[:3, 3]
     ys, xs = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5
@@ -109,11 +100,8 @@ def _dense(parts: dict[str, Tensor], view: View, blur: float = 0.3) -> dict[str,
         alpha[done] = 0
         direction = (p["means"][i] - center) / np.linalg.norm(p["means"][i] - center)
         sh, c1 = p["sh"][i], 0.4886025119029199
-        color = (
-            0.5
-            + 0.28209479177387814 * sh[0]
-            + c1 * (-direction[1] * sh[1] + direction[2] * sh[2] - direction[0] * sh[3])
-        )
+        color = 0.5 + 0.28209479177387814 * sh[0]
+        color += c1 * (-direction[1] * sh[1] + direction[2] * sh[2] - direction[0] * sh[3])
         values = np.concatenate([np.maximum(color, 0), [z], p["extra"][i]])
         total += values[:, None, None] * (alpha * left)
         left = left * (1 - alpha)
@@ -135,9 +123,6 @@ def test_pictures_follow_the_published_formulas(backend: Any, seed: int) -> None
         far |= error > (1e-10 if exact else 1e-5)
     assert far.mean() <= (0.0 if exact else 0.005)  # float32: pixels on the edge of the alpha cut
     assert want["alpha"].max() > 0.9
-
-
-# ---- memory --------------------------------------------------------------------------------------
 
 
 @needs_native

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from fit_settings import fit_config
+from refusals import refused
 from toy_world import CAR_SIZE, car_pose, fused_cloud, write_scene
 
 from mudg.base import geometry, store
@@ -126,10 +127,8 @@ def test_any_camera_any_width(world):
     assert [path.name for path in paths] == ["left_recorded", "left_shift-1.5"]
     assert paths[0].views[0].camera.width == 30
     assert paths[0].views[0].camera.height == 20
-    with pytest.raises(UsageError, match="no camera named 'rear'"):
-        render.trajectories(scene, RenderConfig(cameras=("rear",)))
-    with pytest.raises(UsageError, match="no shifts"):
-        render.trajectories(scene, RenderConfig(shifts_m=()))
+    refused("no camera named 'rear'", render.trajectories, scene, RenderConfig(cameras=("rear",)), raises=UsageError)
+    refused("no shifts", render.trajectories, scene, RenderConfig(shifts_m=()), raises=UsageError)
 
 
 def test_writer_and_render_agree_on_finished(rendered):

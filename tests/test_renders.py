@@ -1,5 +1,4 @@
-"""Renders of a fitted scene in the condition: what they tell, how they are stored and varied, how a model takes them
-up."""
+"""Renders of a fitted scene in the condition: what they tell, how they are stored, varied and taken up."""
 
 from dataclasses import asdict, replace
 

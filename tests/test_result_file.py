@@ -1,5 +1,4 @@
-"""Outputs that are one file: with their own description at any moment, one writer at a time, verified when a command is
-repeated."""
+"""Outputs that are one file: described at any moment, one writer at a time, verified on reuse."""
 
 from __future__ import annotations
 
@@ -214,8 +213,7 @@ def test_a_large_page_stopped_and_repeated(toy: Path, tmp_path: Path, monkeypatc
 
 @pytest.fixture(scope="module")
 def crowd(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fit of 95,003 Gaussians: torch divides them among its threads, and rounds otherwise where a part does not fill
-    a vector."""
+    """A fit of 95,003 Gaussians: torch rounds otherwise where a thread's part does not fill a vector."""
     root = tmp_path_factory.mktemp("crowd").resolve()
     scene, _, _, small = write_toy_run(root, degree=0)
     rng = np.random.default_rng(0)

@@ -1,5 +1,4 @@
-"""Beams without a return: zeros, NaN and points at a sensor's own place are left out of every format's clouds, and
-counted."""
+"""Beams without a return: zeros, NaN and points at the sensor are left out of every format, and counted."""
 
 from __future__ import annotations
 
@@ -189,8 +188,7 @@ def test_zeros_in_every_form_of_cloud(suffix: str, tmp_path: Path, tmp_path_fact
 
 
 def test_zeros_that_a_format_moved_lie_at_the_sensor_when_they_were_measured(tmp_path: Path) -> None:
-    """A sensor 2 m ahead of a vehicle at 20 m/s: a beam at dt was 20 dt away from the sweep's origin. Worked out by
-    hand."""
+    """A sensor 2 m ahead of a vehicle at 20 m/s: a beam at dt was 20 dt away from the sweep's origin."""
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 0, 3] = 20.0
     ego, pose = EgoPath(np.array([0.0, 1.0]), poses), np.eye(4)
@@ -226,7 +224,6 @@ def test_zeros_of_merged_lidars_lie_at_their_mounts(tmp_path: Path, tmp_path_fac
     truth = bad_logs.city(bad_logs.shared(tmp_path_factory) / "truth")
     database = write_nuplan.write_nuplan(truth, tmp_path / "log")
     ego = truth.ego.pose_at(truth.sweeps[0].time_s)
-    assert ego is not None
     mount = invert(ego) @ truth.sweeps[0].world_from_lidar
     side = mount[:3, 3] + [0.5, 0.8, -1.0]
     with sqlite3.connect(database) as connection:

@@ -1,5 +1,4 @@
-"""A verb's output folder: reused, continued, replaced when the new result is finished; nobody else's files are
-touched."""
+"""A verb's output folder: reused, continued, replaced by a finished result; others' files stay."""
 
 from __future__ import annotations
 
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from refusals import refused
 
 from mudg.base import store
 from mudg.base.errors import InputError, IntegrityError, ResourceError, UsageError
@@ -55,10 +55,8 @@ def test_run_folder_is_reused_only_when_it_verifies(tmp_path: Path) -> None:
 
 def test_run_folder_refuses_another_configuration_and_names_the_difference(tmp_path: Path) -> None:
     run(tmp_path / "r").finish()
-    with pytest.raises(UsageError, match="value: 1 there, 2 asked"):
-        run(tmp_path / "r", value=2)
-    with pytest.raises(UsageError, match="scene"):
-        RunDir.open(tmp_path / "r", OUTPUT, {"value": 1, **SETTINGS}, {"scene": "xyz"})
+    refused("value: 1 there, 2 asked", run, tmp_path / "r", value=2, raises=UsageError)
+    refused("scene", RunDir.open, tmp_path / "r", OUTPUT, {"value": 1, **SETTINGS}, {"scene": "xyz"}, raises=UsageError)
 
 
 def test_a_run_that_failed_before_it_made_anything_is_in_nobodys_way(tmp_path: Path) -> None:
@@ -296,8 +294,7 @@ class Crash(BaseException):
 
 
 def crashed(folder: Path, monkeypatch: pytest.MonkeyPatch, stop: tuple[str, int]) -> None:
-    """Replace result 1 by result 2, and crash before the n-th call of a method of ``Path`` below ``folder``'s
-    parent."""
+    """Replace result 1 by result 2, and crash before the n-th call of a method of ``Path`` there."""
     new = run(folder, 2, overwrite=True)
     store.write_text(new.path / "out.txt", "result 2")
     store.write_text(new.path / "rows" / "2.txt", "row")

@@ -1,5 +1,4 @@
-"""The folder of a run stands for each of its parts; wrong paths are refused at once; help of every command and of its
-parts."""
+"""A run's folder stands for each of its parts; wrong paths are refused at once; help of every command."""
 
 from __future__ import annotations
 
@@ -12,6 +11,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from refusals import refused
 from test_edit_run import run  # noqa: F401
 from test_engine import ANSWERS
 from toy_fitted import write_toy_run
@@ -19,7 +19,6 @@ from toy_fitted import write_toy_run
 import mudg
 from mudg import FittedScene, app, steps
 from mudg.base import store
-from mudg.base.errors import InputError
 from mudg.benchmarks import run as bench
 from mudg.formats.importers import FORMATS
 from mudg.scoring import score
@@ -105,10 +104,8 @@ def test_wrong_paths_are_refused_before_anything_heavy_is_loaded(tmp_path: Path)
 
 def test_in_python_wrong_paths_are_refused_too(tmp_path: Path) -> None:
     scene, fitted, _, _ = write_toy_run(tmp_path)
-    with pytest.raises(InputError, match="file not found"):
-        mudg.synthesize(scene, fitted, out=tmp_path / "out")
-    with pytest.raises(InputError, match="no fitted scene"):
-        FittedScene.read(scene)
+    refused("file not found", mudg.synthesize, scene, fitted, out=tmp_path / "out")
+    refused("no fitted scene", FittedScene.read, scene)
 
 
 @functools.cache

@@ -47,9 +47,6 @@ def rng(step):
     return seeds.numpy_rng(0, step, "test")
 
 
-# lists --------------------------------------------------------------------------------------------
-
-
 def test_scenes_are_drawn_by_the_weights_of_their_data_sets():
     scenes = [ListedScene(path=f"a{n}", data_set="a") for n in range(30)]
     scenes += [ListedScene(path="b0", data_set="b"), ListedScene(path="b1", data_set="b", weight=3.0)]
@@ -155,9 +152,6 @@ def test_a_training_on_a_list_resumes_bit_equal(clips, tmp_path):
         Learn(out=tmp_path / "scenes" / "1" / "out", settings=from_list(text)).run()
     with pytest.raises(UsageError, match="list of scenes says"):
         Learn(out=tmp_path / "both", settings=tiny(clips, scenes=(text,))).run()
-
-
-# streamed clips -----------------------------------------------------------------------------------
 
 
 def test_streamed_clips_give_the_same_losses(clips, address, tmp_path):

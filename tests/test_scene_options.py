@@ -110,9 +110,6 @@ def test_a_saved_scene_renders_as_the_fitted_one(world, tmp_path):
         assert torch.equal(mine.rgb, theirs.rgb)
 
 
-# ---- odd scenes ----------------------------------------------------------------------------------
-
-
 def test_everything_on_without_tracks_and_with_one_frame(tmp_path):
     write_scene(tmp_path / "scene", frames=1, width=SIZE[0], height=SIZE[1], labels=False, tracks=False)
     write_fused(tmp_path / "fuse", FusedCloud(fused_cloud(1, semantics=False).static, {}), {})
@@ -193,9 +190,6 @@ def test_a_virtual_picture_that_is_not_finite_is_refused_when_written(tmp_path):
         ObservationWriter(tmp_path / "v", "v", "test") as writer,
     ):
         writer.add(seen)
-
-
-# ---- starting points -----------------------------------------------------------------------------
 
 
 def test_mirrored_points_appear_where_nothing_was_measured():

@@ -1,5 +1,4 @@
-"""FID and KID in the scorer: what is compared with what, floors, refusals, kept features, and what is said where there
-is no number."""
+"""FID and KID in the scorer: what is compared, floors, refusals, kept features, words for missing numbers."""
 
 from __future__ import annotations
 

@@ -1,5 +1,4 @@
-"""Perceptual distance, flicker and dynamic objects: order of known degradations, known values, and what the scorer does
-with them."""
+"""Perceptual distance, flicker and dynamic objects: known degradations, known values, the scorer."""
 
 from __future__ import annotations
 
@@ -11,6 +10,7 @@ import pytest
 import torch
 import toy_views
 from PIL import Image
+from refusals import refused
 from torch.nn import functional
 
 from mudg.base import store
@@ -70,8 +70,7 @@ def jpeg(rgb, quality):
 
 
 def scrambled(rgb, seed=0):
-    """Blocks of 4x4 pixels change places within 32x32: colours and their local statistics stay, what is drawn does
-    not."""
+    """Blocks of 4x4 pixels change places within 32x32: colours stay, what is drawn does not."""
     blocks = rgb.reshape(3, 4, 8, 4, 6, 8, 4).permute(1, 4, 2, 5, 0, 3, 6).reshape(24, 64, 3, 4, 4)
     order = torch.stack([torch.randperm(64, generator=torch.Generator().manual_seed(seed + n)) for n in range(24)])
     moved = torch.stack([cell[o] for cell, o in zip(blocks, order)])
@@ -168,8 +167,7 @@ def lpips_state(trunk="alex"):
 
 
 def lpips_twin(made, truth, state, trunk, taps, scaled=True):
-    """LPIPS in float64 from torch's layers and the paper's equation, written down a second time, and the number of
-    layers after which features are read."""
+    """LPIPS in float64 from torch's layers and the paper's equation, and how many layers features are read from."""
     trunk = trunk.double()
     trunk.load_state_dict({name.split(".", 2)[2]: v.double() for name, v in state.items() if name.startswith("net.")})
     x = torch.stack([made, truth]).double()
@@ -190,18 +188,15 @@ def lpips_twin(made, truth, state, trunk, taps, scaled=True):
 def test_incomplete_lpips_weights_are_refused_and_named(tmp_path):
     state = lpips_state()
     del state["lin3.model.1.weight"]
-    with pytest.raises(InputError, match="lin3.model.1.weight"):
-        LpipsFeatures(state, "file")
-    with pytest.raises(InputError, match="too small"):
-        LpipsFeatures(lpips_state())(torch.zeros(3, 20, 64))
+    refused("lin3.model.1.weight", LpipsFeatures, state, "file")
+    refused("too small", LpipsFeatures(lpips_state()), torch.zeros(3, 20, 64))
 
 
 # ---- flicker and dynamic objects -----------------------------------------------------------------
 
 
 def still_pair(number, made_noise):
-    """A wall 10 m ahead whose true picture flickers by 0.1 and the made one by ``made_noise`` (each frame against the
-    next)."""
+    """A wall 10 m ahead whose true picture flickers by 0.1 and the made one by ``made_noise``."""
     wall = torch.rand(3, 12, 16, generator=torch.Generator().manual_seed(0)) * 0.2 + 0.4
     sign = 1.0 if number % 2 else -1.0
     view = View(Camera("front", 16, 12, 20.0, 20.0, 8.0, 6.0), np.eye(4), 0.1 * number)

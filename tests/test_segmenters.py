@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from refusals import refused
 from tiny_networks import NAMES as TINY_NAMES
 from tiny_networks import eomt, mask2former, segformer
 
@@ -183,10 +184,8 @@ def test_classes_without_a_name_of_ours_are_left_out() -> None:
 
 
 def test_what_is_missing_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ResourceError, match="weights"):
-        Segmenter.load("")
-    with pytest.raises(InputError, match="another kind"):
-        Segmenter.load(folder_of(tmp_path, "bert"))
+    refused("weights", Segmenter.load, "", raises=ResourceError)
+    refused("another kind", Segmenter.load, folder_of(tmp_path, "bert"))
     folder_of(tmp_path, "eomt")
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ResourceError, match="models"):

@@ -1,5 +1,4 @@
-"""Rules of glTF with KHR_gaussian_splatting and of USD with ParticleField3DGaussianSplat, checked as validators do;
-motion in both."""
+"""Rules of KHR_gaussian_splatting and ParticleField3DGaussianSplat, as validators check them; motion."""
 
 from __future__ import annotations
 
@@ -44,9 +43,6 @@ def at_time(times: list[float], values: np.ndarray, time_s: float, turns: bool =
     u = float(np.clip((time_s - times[after - 1]) / (times[after] - times[after - 1]), 0, 1))
     a, b = values[after - 1], values[after]
     return geometry.slerp(a, b, u) if turns else (1 - u) * a + u * b
-
-
-# -- glTF ------------------------------------------------------------------------------------------
 
 
 def gltf_problems(content: bytes) -> list[str]:
@@ -162,9 +158,6 @@ def test_a_glb_moves_as_the_scene_does(time_s: float) -> None:
     assert np.abs(ordered(np.concatenate(shown)) - moment(stiff, time_s)).max() < 1e-4
 
 
-# -- USD -------------------------------------------------------------------------------------------
-
-
 def usd_problems(prim: dict[str, Any]) -> list[str]:
     """What NVIDIA's and our rules say of a field of particles."""
     found = []
@@ -232,7 +225,6 @@ def test_a_package_begins_with_its_stage_and_shows_the_sky_where_it_is() -> None
     dome = slow.parse_usda(archive.read("scene.usda").decode())["World"]["Sky"]
     picture = np.asarray(Image.open(io.BytesIO(archive.read("sky.png"))))
     turn = geometry.matrix_from_quaternion(dome["xformOp:orient"])
-    assert scene.sky is not None
     rows, columns = scene.sky.shape[:2]
     for row in range(rows):
         for column in range(columns):  # OpenEXR: longitude from pi to -pi, 0 along z, pi/2 along x

@@ -1,5 +1,4 @@
-"""The shipped segmentation network: exact evidence on a made-up street, rules that evidence settles, files, and
-training that resumes."""
+"""The shipped segmentation network: evidence on a made-up street, what it settles, files, training that resumes."""
 
 from __future__ import annotations
 
@@ -91,7 +90,6 @@ def test_the_outline_of_a_nearer_box_does_not_take_what_lies_in_a_farther_one() 
     nearer = replace(car, id="nearer", label="truck", world_from_object=toward @ car.world_from_object)
     nearer = replace(nearer, size_m=car.size_m * [0.1, 1, 1])
     pose = nearer.pose_at(given.view.time_s)
-    assert pose is not None
     rng = np.random.default_rng(0)
     half = nearer.size_m / 2
     # of its back only this is seen

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 from fit_settings import fit_config
+from refusals import refused
 from toy_scene import ToyStreet
 
 from mudg import app
@@ -219,16 +220,12 @@ def test_detail_is_given_back_where_the_sample_agrees():
 
 
 def test_bad_requests(world, tmp_path):
-    with pytest.raises(UsageError, match="overlap"):
-        windows(20, 8, 8)
-    with pytest.raises(InputError, match="no diffusion model"):
-        made(world, tmp_path / "a", model=str(tmp_path / "nowhere"))
+    refused("overlap", windows, 20, 8, 8, raises=UsageError)
+    refused("no diffusion model", made, world, tmp_path / "a", model=str(tmp_path / "nowhere"))
     with pytest.raises((InputError, UsageError)):
         made(world, tmp_path / "b", cameras=("roof",))
-    with pytest.raises(UsageError, match="nothing to synthesize"):
-        made(world, tmp_path / "c", shifts_m=())
-    with pytest.raises(UsageError, match="same trajectory"):
-        made(world, tmp_path / "d", shifts_m=(1.0, 1.01))
+    refused("nothing to synthesize", made, world, tmp_path / "c", shifts_m=(), raises=UsageError)
+    refused("same trajectory", made, world, tmp_path / "d", shifts_m=(1.0, 1.01), raises=UsageError)
 
 
 def test_further_paths_are_made_and_parts_of_the_condition_switched_off(world, usual, tmp_path):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from refusals import refused
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
@@ -40,6 +41,12 @@ def circle(count: int = 20) -> Scene:
     return drive([geometry.yaw_matrix(a, (RADIUS_M * math.sin(a), RADIUS_M * (1 - math.cos(a)), 0.3)) for a in angles])
 
 
+def move(scene: Scene, camera: str, shift_m: float, index: int) -> np.ndarray:
+    """How a shift moves a view."""
+    views = trajectory.shifted(scene, camera, shift_m).views, trajectory.recorded(scene, camera).views
+    return views[0][index].center_world - views[1][index].center_world
+
+
 @pytest.mark.parametrize("shift_m", [2.0, -3.0, 4.0])
 def test_on_a_circle_the_ego_stays_on_a_concentric_circle(shift_m):
     """Left of a left turn is inside: the radius shrinks by exactly the shift, at every frame."""
@@ -68,57 +75,43 @@ def test_every_camera_moves_by_the_distance_to_the_left_of_travel(camera, shift_
         assert np.array_equal(new.world_from_cam[:3, :3], old.world_from_cam[:3, :3])
 
 
-def test_a_side_camera_does_not_slide_along_its_own_x_axis():
-    """The camera looking left has its x axis along the road; a lateral shift must not follow it."""
-    scene = drive([geometry.yaw_matrix(0.0, (float(i), 0.0, 0.0)) for i in range(3)], {"side": math.pi / 2})
-    old, new = trajectory.recorded(scene, "side").views[1], trajectory.shifted(scene, "side", 2.0).views[1]
-    assert abs(old.world_from_cam[:3, 0] @ (new.center_world - old.center_world)) < 1e-12
-    assert (new.center_world - old.center_world).tolist() == pytest.approx([0.0, 2.0, 0.0])
+TILT = np.array(
+    [[1, 0, 0, 0], [0, math.cos(0.2), -math.sin(0.2), 0], [0, math.sin(0.2), math.cos(0.2), 0], [0, 0, 0, 1]]
+)
+DRIVES = {
+    "a side camera, whose x axis lies along the road": (
+        drive([geometry.yaw_matrix(0.0, (float(i), 0.0, 0.0)) for i in range(3)], {"side": math.pi / 2}),
+        *("side", 2.0, [0, 2, 0]),
+    ),
+    "standing": (
+        drive([geometry.yaw_matrix(0.7, (5.0, 1.0, 0.0))] * 4),
+        *("front", 3.0, [-3 * math.sin(0.7), 3 * math.cos(0.7), 0]),
+    ),
+    "reversing": (
+        drive([geometry.yaw_matrix(0.0, (-float(i), 0.0, 0.0)) for i in range(4)]),
+        *("front", 1.0, [0, 1, 0]),
+    ),
+    "a banked road": (drive([TILT] * 2), "front", 2.0, [0, 2, 0]),
+}
 
 
-def test_a_standing_car_still_has_a_left():
-    scene = drive([geometry.yaw_matrix(0.7, (5.0, 1.0, 0.0))] * 4)
-    move = (
-        trajectory.shifted(scene, "front", 3.0).views[2].center_world
-        - trajectory.recorded(scene, "front").views[2].center_world
-    )
-    assert move.tolist() == pytest.approx([-3 * math.sin(0.7), 3 * math.cos(0.7), 0.0])
-
-
-def test_reversing_keeps_the_vehicles_left():
-    scene = drive([geometry.yaw_matrix(0.0, (-float(i), 0.0, 0.0)) for i in range(4)])
-    move = (
-        trajectory.shifted(scene, "front", 1.0).views[1].center_world
-        - trajectory.recorded(scene, "front").views[1].center_world
-    )
-    assert move.tolist() == pytest.approx([0.0, 1.0, 0.0])
-
-
-def test_a_banked_road_shifts_horizontally():
-    roll = np.eye(4)
-    roll[:3, :3] = [[1, 0, 0], [0, math.cos(0.2), -math.sin(0.2)], [0, math.sin(0.2), math.cos(0.2)]]
-    scene = drive([roll] * 2)
-    move = (
-        trajectory.shifted(scene, "front", 2.0).views[0].center_world
-        - trajectory.recorded(scene, "front").views[0].center_world
-    )
-    assert move.tolist() == pytest.approx([0.0, 2.0, 0.0])
+@pytest.mark.parametrize("name", DRIVES)
+def test_a_shift_goes_to_the_vehicles_left_and_is_level(name):
+    scene, camera, shift_m, expected = DRIVES[name]
+    assert move(scene, camera, shift_m, 1).tolist() == pytest.approx(expected)
 
 
 def test_names_and_origin():
     scene = circle(3)
-    assert trajectory.recorded(scene, "front").name == "front_recorded"
-    assert trajectory.shifted(scene, "front", 2.0).name == "front_shift+2.0"
-    assert trajectory.shifted(scene, "front", -4.0).name == "front_shift-4.0"
-    assert trajectory.shifted(scene, "front", -4.0).origin == "shifted"
+    paths = (trajectory.recorded(scene, "front"), *(trajectory.shifted(scene, "front", m) for m in (2.0, -4.0)))
+    assert [path.name for path in paths] == ["front_recorded", "front_shift+2.0", "front_shift-4.0"]
+    assert paths[2].origin == "shifted"
 
 
 def test_errors_in_words():
     scene = circle(3)
-    with pytest.raises(UsageError, match="no camera named 'rear'"):
-        trajectory.recorded(scene, "rear")
-    with pytest.raises(UsageError, match="shift_m"):
-        trajectory.shifted(scene, "front", math.nan)
+    refused("no camera named 'rear'", trajectory.recorded, scene, "rear", raises=UsageError)
+    refused("shift_m", trajectory.shifted, scene, "front", math.nan, raises=UsageError)
     side = np.eye(4)
     side[:3, :3] = [[1, 0, 0], [0, 0, -1], [0, 1, 0]]
     with pytest.raises(InputError, match="left axis is vertical"):

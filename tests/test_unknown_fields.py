@@ -24,7 +24,7 @@ import write_dgp
 import write_nuscenes
 import write_pandaset
 import write_waymo
-from bad_logs import refused
+from refusals import refused
 from roundtrip import needs_native
 
 from mudg.base import log
@@ -44,9 +44,6 @@ def passed_over(names: str, kind: str) -> str:
 def said(capsys: pytest.CaptureFixture[str]) -> list[str]:
     """Lines on stderr about what was passed over."""
     return [line for line in capsys.readouterr().err.splitlines() if "passed over" in line]
-
-
-# --- a field in every record of a file ------------------------------------------------------------
 
 
 def to_calibration(root: Path, names: Sequence[str]) -> None:
@@ -247,8 +244,6 @@ def test_tracklets_of_a_raw_drive(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert said(capsys) == ["passed over: 'bar', 'foo' in tracklet_labels.xml, which this program does not know"]
 
 
-# --- real logs ------------------------------------------------------------------------------------
-
 REAL = {
     "kitti": ("kitti_2011_09_26", {"frames": (0, 2)}),
     "pandaset": ("pandaset_002", {"frames": (33, 35), "cameras": ("front",)}),
@@ -268,8 +263,7 @@ def test_real_logs_hold_no_unknown_field(
 def test_parts_of_real_logs_hold_no_unknown_field(
     shared_data: Callable[[str], Path], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Files of logs that lack what a scene needs: both tables of calibration, boxes, poses and sweeps; frames;
-    calibration text."""
+    """Files of logs that lack what a scene needs."""
     pytest.importorskip("pyarrow")
     from mudg.formats.importers import argoverse2
     from mudg.formats.importers.kitti_files import read_calibration_text, read_label_text

@@ -7,6 +7,7 @@ import io
 import av
 import numpy as np
 import pytest
+from refusals import refused
 
 from mudg.base.errors import InputError
 from mudg.core.pictures import side_by_side
@@ -74,7 +75,5 @@ def test_side_by_side_places_panels_in_a_row():
     sheet = side_by_side(panels)
     assert sheet.shape == (20, 94, 3)
     assert sheet[0, [0, 29, 30, 31, 32, 64, 93], 0].tolist() == [10, 10, 255, 255, 20, 30, 30]
-    with pytest.raises(InputError, match="one size"):
-        side_by_side([panels[0], panels[1][:10]])
-    with pytest.raises(InputError, match="one size"):
-        side_by_side([])
+    refused("one size", side_by_side, [panels[0], panels[1][:10]])
+    refused("one size", side_by_side, [])

@@ -1,5 +1,4 @@
-"""A video on a disk that is full, or under a limit of file size (as a quota): an error in words, and nothing
-half-written."""
+"""A video on a full disk or under a limit of file size: an error in words, and nothing half-written."""
 
 from __future__ import annotations
 

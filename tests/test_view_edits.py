@@ -1,5 +1,4 @@
-"""Edits on the viewer's page: what the server carries out and saves, and that the page shows what ``mudg render
---edits`` draws."""
+"""Edits on the viewer's page: what the server does and saves, and that the page shows ``mudg render --edits``."""
 
 from __future__ import annotations
 
@@ -17,6 +16,7 @@ import pytest
 import torch
 from browser import Browser
 from PIL import Image
+from refusals import refused
 from toy_fitted import STREET, write_toy_run
 from view_server import serving
 
@@ -157,8 +157,7 @@ def test_a_page_may_insert_objects_of_its_own_run_and_of_no_other(toy: Toy, tmp_
     (edited,) = desk.edited(script)
     (name,) = told["inserted"]
     assert name in edited.node_names() and name not in toy[2].node_names()
-    with pytest.raises(InputError, match="no files"):
-        said(desk, script.replace(desk.run, str(tmp_path / "another")))
+    refused("no files", said, desk, script.replace(desk.run, str(tmp_path / "another")))
     with pytest.raises(InputError, match="no files"):  # a fit alone is no run
         said(desk_of(toy, tmp_path / "edits.yaml"), script)
 

@@ -1,5 +1,4 @@
-"""Rows of the scores that need more than a true image: LiDAR points, detectors, vehicles, markings, motion, and their
-anchors."""
+"""Scores that need more than a true image: LiDAR points, detectors, vehicles, markings, motion; anchors."""
 
 from __future__ import annotations
 
@@ -60,7 +59,6 @@ def anchors(document: dict, trajectory: str, metric: str) -> dict:
 
 
 def farther(seen: Observation) -> Observation:
-    assert seen.depth is not None
     return dataclasses.replace(seen, depth=seen.depth * 1.1)
 
 
@@ -298,8 +296,7 @@ CAMERA = Camera("front", 24, 16, 20.0, 20.0, 12.0, 8.0)
 
 
 def wall_pair(number: int, rgb: torch.Tensor, object_at: float | None = None) -> Pair:
-    """A wall 10 m ahead of a camera that stands still; ``object_at``: left column of a vehicle of 4 columns, a metre in
-    front of it."""
+    """A wall 10 m ahead of a camera that stands still; ``object_at``: left column of a vehicle before it."""
     depth, ids = torch.full((1, 16, 24), 10.0), torch.zeros(16, 24, dtype=torch.int64)
     instance = np.zeros((16, 24), np.int32)
     if object_at is not None:

@@ -211,7 +211,6 @@ def test_a_server_with_few_files_serves_others_and_does_not_spin() -> None:
     script = FEW_FILES.format(tests=str(Path(__file__).parent))
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
     with subprocess.Popen([sys.executable, "-c", script], **pipes) as child:
-        assert child.stdout is not None and child.stderr is not None
         port = int(child.stdout.readline())
         idle = []
         try:

@@ -1,5 +1,4 @@
-"""Videos that the server of ``mudg view`` makes of the exact frames: what they show, who may ask, and how one is
-cancelled."""
+"""Videos of the exact frames by ``mudg view``: what they show, who may ask, how one is cancelled."""
 
 from __future__ import annotations
 

@@ -21,6 +21,7 @@ import pytest
 import torch
 from browser import Browser, BrowserError
 from PIL import Image
+from refusals import refused
 from toy_fitted import STREET, toy_fitted, write_toy_run
 from view_server import ask, serving
 
@@ -233,7 +234,6 @@ def folder_page(
     assert made["page"] == root / "page_page" / "index.html"
     text = made["page"].read_text(encoding="utf-8")
     found = re.search(r'<script type="application/json" id="facts">(.*?)</script>', text, re.DOTALL)
-    assert found is not None
     return made["page"].parent, json.loads(found[1])
 
 
@@ -702,10 +702,8 @@ def test_a_free_exact_frame_shows_ground_below_the_horizon(served: tuple[int, st
 
 
 def test_other_machines_need_a_token() -> None:
-    with pytest.raises(UsageError, match="token"):
-        token_for("0.0.0.0", "")
-    with pytest.raises(UsageError, match="short"):
-        token_for("0.0.0.0", "abc")
+    refused("token", token_for, "0.0.0.0", "", raises=UsageError)
+    refused("short", token_for, "0.0.0.0", "abc", raises=UsageError)
     assert token_for("192.168.1.2", "long enough a secret") == "long enough a secret"
     assert len(token_for("127.0.0.1", "")) >= 16
 

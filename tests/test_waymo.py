@@ -12,8 +12,8 @@ import pytest
 import roundtrip
 import waymo_logs
 import write_waymo as made
-from bad_logs import refused
 from PIL import Image
+from refusals import refused
 from waymo_logs import COLUMNS, ingest, write
 
 from mudg.base import geometry
@@ -31,8 +31,6 @@ from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points
 
 pytestmark = roundtrip.needs_native
-
-# --- round trips ----------------------------------------------------------------------------------
 
 
 @pytest.fixture
@@ -65,7 +63,6 @@ def test_round_trip(
     assert scene.split["front_left/000004"] == "test"
     assert scene.frames[0].view.time_s == pytest.approx(0.05, abs=1e-6)  # the clock begins with the LiDAR's turn
     at_first = truth.ego.pose_at(truth.sweeps[0].time_s)
-    assert at_first is not None
     standing = {track.id for track in own if np.ptp(track.world_from_object, axis=0).max() < 1e-9}
     assert standing & {track.id for track in truth.tracks}
     uncarried_m = 0.0
@@ -197,9 +194,6 @@ def test_panoptic_labels(form: str, bare: made.Log, tmp_path: Path) -> None:
     assert (read_label(scene, frame, "sky") == (ids == 25000)).all()
     assert (read_label(scene, frame, "ego") == (ids == 1000)).all()
     assert (read_label(scene, frame, "instance") == np.where(ids == 10004, 10004, 0)).all()
-
-
-# --- the real pieces ------------------------------------------------------------------------------
 
 
 def test_the_real_frame(shared_data: Callable[[str], Path], tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 import roundtrip
 import waymo_logs
 import write_waymo as made
-from bad_logs import refused
+from refusals import refused
 from waymo_logs import ingest, write
 
 from mudg.base.errors import ResourceError, UsageError

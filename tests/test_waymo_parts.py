@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 import write_waymo as made
-from bad_logs import refused
 from hypothesis import given
 from hypothesis import strategies as st
+from refusals import refused
 
 from mudg.base import geometry
 from mudg.base.errors import InputError
@@ -31,9 +31,6 @@ def random_pose(generator: np.random.Generator, reach_m: float = 3.0) -> np.ndar
     return from_rotation_translation(
         matrix_from_quaternion(generator.normal(size=4)), generator.uniform(-reach_m, reach_m, 3)
     )
-
-
-# --- checksums and messages -----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -120,9 +117,6 @@ def test_no_bytes_raise_anything_but_an_input_error(data: bytes) -> None:
             messages.parse_message(data, message, "x")
         except InputError:
             continue
-
-
-# --- geometry -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("uneven", [True, False])

@@ -431,7 +431,6 @@ def test_a_drive_is_edited_image_by_image() -> None:
         shown.append(weather.ShownView(view, tone.SRGB.encode(scene.color), scene.depth, scene.classes))
     drive = weather.drive_facts(shown, tone.SRGB)
     assert drive.surroundings.ground_z_m == pytest.approx(0, abs=1e-3)
-    assert drive.heights is not None
     assert drive.heights.top_m.max() == pytest.approx(6, abs=0.3)
     same, result = weather.edited_view(shown[0], Conditions(), 1, drive)
     np.testing.assert_allclose(same, shown[0].rgb, atol=1e-5)
@@ -445,8 +444,7 @@ def test_a_drive_is_edited_image_by_image() -> None:
 
 
 def test_ripples_of_the_ground_are_smoothed_farther_than_those_of_walls() -> None:
-    """Normals that sway by ten degrees over 12 pixels: on the road they become level, on a wall they stay about as they
-    are."""
+    """Normals that sway by ten degrees over 12 pixels: on the road they become level, on a wall not."""
     sway = np.broadcast_to(np.radians(10) * np.sin(np.arange(96) * 2 * np.pi / 12), (64, 96))
     normal = np.stack([np.sin(sway), np.zeros_like(sway), np.cos(sway)], -1).astype(np.float32)
     found = {

@@ -22,9 +22,6 @@ def view_at(x: float = 0.0, yaw: float = 0.0, time_s: float = 0.0, size: tuple[i
     return View(Camera("front", width, height, 50.0, 50.0, width / 2, height / 2), pose, time_s)
 
 
-# --- sizes ----------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("mm_h", [2.0, 10.0, 50.0])
 def test_numbers_and_areas_of_drops_agree_with_integration(mm_h: float) -> None:
     d = np.linspace(1, 5, 400_001)
@@ -42,15 +39,12 @@ def test_the_published_extinction_of_rain_is_twice_the_area_of_the_drops(mm_h: f
 
 
 def test_drops_carry_the_water_of_the_rate() -> None:
-    """Flux of water over all drops, by integration: the law of drop sizes and the fall speeds belong together (known to
-    be a bit high)."""
+    """Flux of water over all drops, by integration; known to be a bit high."""
     d = np.linspace(0.25, 8, 100_000)
     speed = 9.65 - 10.3 * np.exp(-0.6 * d)
     flux = np.trapezoid(8000 * np.exp(-4.1 * 10**-0.21 * d) * math.pi / 6 * d**3 * 1e-9 * speed, d)  # m/s
     assert flux * 3.6e6 == pytest.approx(10, rel=0.2)
 
-
-# --- places ---------------------------------------------------------------------------------------
 
 SIZE = air.ParticleSize(60.0, 0.002, 5.0)
 FALL = np.array([0.0, 0.0, -5.0])
@@ -95,9 +89,6 @@ def test_the_number_of_drops_is_that_of_the_volume() -> None:
     assert np.std(counts) == pytest.approx(math.sqrt(60 * volume), rel=0.6)
 
 
-# --- what they cover ------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("velocity", [(0, 0, 0), (0, 0, -6.0), (15.0, 0, -6)], ids=["still", "falling", "driving"])
 def test_a_drop_covers_the_area_of_its_disc_whatever_its_streak(velocity: tuple[float, float, float]) -> None:
     view = view_at(size=(300, 200))
@@ -127,8 +118,6 @@ def test_all_drops_together_cover_what_the_density_says() -> None:
     assert np.mean(shown) == pytest.approx(air.area_per_m(sizes) * (6.0 - air.NEAREST_M), rel=0.05)
 
 
-# --- LiDAR ----------------------------------------------------------------------------------------
-
 SENSOR = lidar.LidarSensor(range_10_m=90.0)
 COUNT = 40_000
 
@@ -139,8 +128,7 @@ def beams() -> tuple[np.ndarray, np.ndarray]:
 
 
 def detected_in(share: np.ndarray, at: np.ndarray, floor: np.ndarray | float = 0.0) -> float:
-    """Mean share of reflectances uniform in 0.02..1 whose hard return exceeds the threshold (or the fog's own
-    return)."""
+    """Share of reflectances uniform in 0.02..1 whose hard return exceeds the threshold or the fog's return."""
     limit = np.maximum(SENSOR.threshold, floor)
     least = limit * math.pi * at**2 / share
     return float(np.clip((1 - np.maximum(least, 0.02)) / 0.98, 0, 1).mean())
@@ -152,8 +140,7 @@ LATE = lidar.LidarSensor(range_10_m=90.0, cross_from_m=10.0, cross_to_m=20.0)
 @pytest.mark.parametrize("sensor", [SENSOR, LATE], ids=["near", "far"])
 @pytest.mark.parametrize("visibility_m", [50.0, 150.0, 600.0, 3000.0])
 def test_shares_of_lost_hard_and_soft_returns_in_fog(visibility_m: float, sensor: lidar.LidarSensor) -> None:
-    """Against an integration of its own: the fog's return at every distance by a direct sum, the shares by the
-    reflectances."""
+    """Against an integration: the fog's return by a direct sum, the shares by the reflectances."""
     ranges, reflectances = beams()
     found = lidar.in_fog(ranges, reflectances, visibility_m, 3, sensor)
     at = np.linspace(5, 120, 2001)
@@ -222,7 +209,6 @@ def test_a_sweep_in_fog_and_rain_keeps_its_beams() -> None:
     found, _ = lidar.sweep_in_weather(points, bad, 1, LATE)
     assert 0 < len(found.xyz) < COUNT
     near, kinds = lidar.sweep_in_weather(points, bad, 1, SENSOR)
-    assert near.classes is not None
     assert set(near.classes[kinds == 2].tolist()) == {255}
     assert set(near.classes[kinds == 1].tolist()) == {2}
     again = lidar.sweep_in_weather(points, bad, 1, LATE)[0]
