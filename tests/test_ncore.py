@@ -205,7 +205,7 @@ def test_shutters_masks_classes_and_sensors_that_move(truth: Scene, tmp_path: Pa
 
 @needs_package
 def test_other_peoples_recordings(truth: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """As NVIDIA's converters write: a store per sensor, float32 poses, boxes in a sensor's frame, a lens, two returns."""
+    """As NVIDIA's converters write: a store per sensor, float32 poses, boxes in a sensor's frame, two returns."""
     v4, data = package().v4, package().data
     interval = package().transformations.HalfClosedInterval(1_000_000, 1_400_001)
     writer = v4.SequenceComponentGroupsWriter(tmp_path, "clip", "clip-7", interval, {}, store_type="directory")

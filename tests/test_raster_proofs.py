@@ -72,7 +72,7 @@ def test_gradients_match_finite_differences_without_cut_offs(monkeypatch: pytest
 
 
 def _dense(parts: dict[str, Tensor], view: View, blur: float = 0.3) -> dict[str, NDArray[np.float64]]:
-    """Every Gaussian at every pixel, front to back, by Zwicker et al. 2001 and Kerbl et al. 2023; harmonics of degree 1."""
+    """Every Gaussian at every pixel, front to back (Zwicker et al. 2001, Kerbl et al. 2023); harmonics of degree 1."""
     camera, p = view.camera, {name: value.numpy().astype(np.float64) for name, value in parts.items()}
     rotation, center = view.world_from_cam[:3, :3].T, view.world_from_cam[:3, 3]
     ys, xs = np.mgrid[0 : camera.height, 0 : camera.width] + 0.5

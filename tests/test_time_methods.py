@@ -228,7 +228,7 @@ def test_a_flat_network_is_the_network_it_stands_for():
 
 
 def test_a_deformed_object_stays_one_through_everything_a_scene_does():
-    """At first it is rigid; then it moves as the field says, at other times and for other objects otherwise, saved and alone."""
+    """At first it is rigid; then it moves as the field says, otherwise for other times and objects, saved and alone."""
     field, node = person()
     columns = columns_from_points(
         np.random.default_rng(1).random((4, 3), np.float32) - 0.5, np.zeros((4, 3), np.uint8), None, (), 0
