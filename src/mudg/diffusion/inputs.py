@@ -151,7 +151,7 @@ class WeatheredPoints:
         return self.how.image(view, rgb, shown.depth, shown.semantics)
 
 
-# ablated ------------------------------------------------------------------------------------------
+# with only some of its parts ----------------------------------------------------------------------
 
 
 ConditionParts = Literal["full", "reference", "points", "concat", "freevs", "repair"]
