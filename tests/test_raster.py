@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from refusals import refused
 from torch import Tensor
 
 from mudg import native
@@ -18,6 +17,7 @@ from mudg.base import geometry
 from mudg.base.errors import InputError, NumericsError, ResourceError, UsageError
 from mudg.base.types import Camera, Gaussians, Render, View
 from mudg.core.raster import gsplat_cuda, torch_twin
+from mudg.core.raster import gsplat_cuda as gsplat_package
 from mudg.core.raster import rasterize as raster
 from mudg.core.raster.rasterize import BACKENDS, RasterConfig, rasterize
 
@@ -72,7 +72,8 @@ def _axis_view(width: int, height: int, focal: float = 20.0) -> View:
 def _parameters(
     count: int, seed: int = 0, degree: int = 3, channels: int = 5, dtype: torch.dtype = torch.float32
 ) -> Parameters:
-    """Large, small, flat, faint and nearly opaque Gaussians before `_view`, some behind the camera."""
+    """A cloud in front of `_view`, with large, small, flat, faint and nearly opaque Gaussians, some behind the
+    camera."""
     rng = np.random.default_rng(seed)
     z = np.exp(rng.uniform(np.log(1.5), np.log(40), count)) * np.where(rng.random(count) < 0.08, -1, 1)
     xyz = np.stack([z * rng.uniform(-0.7, 0.7, count), z * rng.uniform(-0.6, 0.6, count), z], 1)
@@ -90,7 +91,15 @@ def _parameters(
 
 
 def _gaussians(p: Parameters) -> Gaussians:
-    return Gaussians(**{"extra": None, **p}, node=torch.zeros(len(p["means"]), dtype=torch.int32))
+    return Gaussians(
+        p["means"],
+        p["quats"],
+        p["scales"],
+        p["opacity"],
+        p["sh"],
+        p.get("extra"),
+        torch.zeros(len(p["means"]), dtype=torch.int32),
+    )
 
 
 def _leaves(p: Parameters, dtype: torch.dtype = torch.float32) -> Parameters:
@@ -127,6 +136,7 @@ def test_one_gaussian_on_the_axis_has_the_alpha_of_the_formula(config: RasterCon
     np.testing.assert_allclose(out.alpha[0].numpy(), alpha, atol=2e-6)
     for channel, value in enumerate((0.9, 0.5, 0.1)):
         np.testing.assert_allclose(out.rgb[channel].numpy(), alpha * value, atol=2e-6)
+    assert out.extra is not None
     np.testing.assert_allclose(out.extra[0].numpy(), alpha * 2, atol=4e-6)
     np.testing.assert_allclose(out.depth[0].numpy(), np.where(alpha > 0, z, 0), rtol=2e-5)
     assert out.trace.visible.tolist() == [True]
@@ -203,12 +213,23 @@ def test_native_agrees_with_the_float64_reference(isa: str, antialias: bool, see
     pose64 = pose32.detach().double().requires_grad_()
     color32 = torch.tensor([0.2, 0.5, 0.7], requires_grad=True)
     color64 = color32.detach().double().requires_grad_()
-    got, want = (
-        rasterize(
-            _gaussians(p), view, replace(config, antialias=antialias), background=c, world_from_cam=pose, absgrad=True
-        )
-        for p, config, c, pose in ((single, CPU, color32, pose32), (double, TORCH, color64, pose64))
+    got = rasterize(
+        _gaussians(single),
+        view,
+        replace(CPU, antialias=antialias),
+        background=color32,
+        world_from_cam=pose32,
+        absgrad=True,
     )
+    want = rasterize(
+        _gaussians(double),
+        view,
+        replace(TORCH, antialias=antialias),
+        background=color64,
+        world_from_cam=pose64,
+        absgrad=True,
+    )
+
     # A pixel on the very edge of the alpha cut or of the stopping rule may fall to either side: such pixels (the stated
     # band) may be at most 0.5 % and are left out of the rest.
     names = ("rgb", "depth", "alpha", "extra")
@@ -229,6 +250,8 @@ def test_native_agrees_with_the_float64_reference(isa: str, antialias: bool, see
         "abs": (got.trace.abs_grad2d, want.trace.abs_grad2d),
     }
     for name, (mine, reference) in pairs.items():
+        assert mine is not None
+        assert reference is not None
         assert reference.norm() > 0, name
         assert (mine.double() - reference).norm() / reference.norm() < 1e-4, name
     assert torch.equal(got.trace.visible, want.trace.visible)
@@ -331,6 +354,8 @@ def test_any_number_of_channels_gives_the_same_numbers(channels: int) -> None:
     full = _leaves(p)
     part = _leaves({**p, "extra": p["extra"][:, :channels]})
     a, b = rasterize(_gaussians(full), view, CPU), rasterize(_gaussians(part), view, CPU)
+    assert a.extra is not None
+    assert b.extra is not None
     assert torch.equal(a.rgb, b.rgb)
     assert torch.equal(a.extra[:channels], b.extra)
     (a.extra[:channels].square().sum() + a.rgb.sum()).backward()
@@ -420,9 +445,12 @@ def test_no_gradient_is_recorded_where_none_is_wanted(config: RasterConfig) -> N
 
 
 def _three_views() -> tuple[View, ...]:
-    view, nearer = _view(), _view().world_from_cam.copy()
+    view = _view()
+    nearer, other = (
+        view.world_from_cam.copy(),
+        Camera("left", view.camera.width, view.camera.height, 30.0, 31.0, 20.0, 22.0),
+    )
     nearer[:3, 3] += [0.1, 0.05, 0.4]
-    other = Camera("left", view.camera.width, view.camera.height, 30.0, 31.0, 20.0, 22.0)
     return view, View(view.camera, nearer, 0.1), View(other, view.world_from_cam, 0.0)
 
 
@@ -452,21 +480,29 @@ def test_several_views_at_once_equal_the_single_ones(config: RasterConfig, backg
     torch.testing.assert_close(batch_poses.grad, single_poses.grad, rtol=1e-6, atol=1e-6)
     for name in GROUPS:  # sums over the views, in another order
         mine, theirs = together[name].grad, alone[name].grad
+        assert mine is not None
+        assert theirs is not None
         assert (mine - theirs).norm() <= 1e-6 * theirs.norm(), name
 
 
 def test_one_view_in_a_list_keeps_its_leading_dimension(config: RasterConfig) -> None:
     out = rasterize(_gaussians(_parameters(20)), [_view()], config)
-    shapes = [tuple(x.shape) for x in (out.rgb, out.extra, out.trace.means2d)]
-    assert shapes == [(1, 3, 37, 50), (1, 5, 37, 50), (1, 20, 2)]
+    assert out.rgb.shape == (1, 3, 37, 50)
+    assert out.extra is not None
+    assert out.extra.shape == (1, 5, 37, 50)
+    assert out.trace.means2d.shape == (1, 20, 2)
 
 
 def test_views_that_do_not_fit_together_are_refused() -> None:
     g = _gaussians(_parameters(5))
-    refused("no view", rasterize, g, [], TORCH)
-    refused("one image size", rasterize, g, [_view(), _view(40, 30)], TORCH)
-    refused("world_from_cam", rasterize, g, [_view(), _view()], TORCH, world_from_cam=torch.eye(4))
-    refused("background", rasterize, g, [_view(), _view()], TORCH, background=torch.zeros(3, 3))
+    with pytest.raises(InputError, match="no view"):
+        rasterize(g, [], TORCH)
+    with pytest.raises(InputError, match="one image size"):
+        rasterize(g, [_view(), _view(40, 30)], TORCH)
+    with pytest.raises(InputError, match="world_from_cam"):
+        rasterize(g, [_view(), _view()], TORCH, world_from_cam=torch.eye(4))
+    with pytest.raises(InputError, match="background"):
+        rasterize(g, [_view(), _view()], TORCH, background=torch.zeros(3, 3))
 
 
 def test_a_rolling_shutter_is_named_and_old_lens_coefficients_change_nothing(
@@ -525,10 +561,25 @@ def test_parameters_that_are_not_finite_are_refused_by_name(config: RasterConfig
 
 @pytest.mark.parametrize(
     ("name", "bad"),
-    [("means", x) for x in (1e38, -1e38, 1e-40)]
-    + [("quats", x) for x in (0.0, 1e-30, 1e38)]
-    + [("scales", x) for x in (0.0, 1e-40, 1e38, 1e15, -0.5)]
-    + [("opacity", x) for x in (0.0, 1.0, 1 / 255, 1e-40, -1.0, 7.0)],
+    [
+        ("means", 1e38),
+        ("means", -1e38),
+        ("means", 1e-40),
+        ("quats", 0.0),
+        ("quats", 1e-30),
+        ("quats", 1e38),
+        ("scales", 0.0),
+        ("scales", 1e-40),
+        ("scales", 1e38),
+        ("scales", 1e15),
+        ("scales", -0.5),
+        ("opacity", 0.0),
+        ("opacity", 1.0),
+        ("opacity", 1 / 255),
+        ("opacity", 1e-40),
+        ("opacity", -1.0),
+        ("opacity", 7.0),
+    ],
 )
 @pytest.mark.parametrize("antialias", [False, True])
 def test_finite_poison_is_drawn_or_culled_and_never_spreads(
@@ -538,6 +589,7 @@ def test_finite_poison_is_drawn_or_culled_and_never_spreads(
     with torch.no_grad():
         p[name][::3] = bad
     out = rasterize(_gaussians(p), _view(), replace(config, antialias=antialias), absgrad=True)
+    assert out.extra is not None
     for image in (out.rgb, out.depth, out.alpha, out.extra):
         assert torch.isfinite(image).all()
     (out.rgb.sum() + out.depth.sum() + out.extra.sum()).backward()
@@ -578,12 +630,18 @@ def test_bad_requests_are_refused_in_words() -> None:
         with pytest.raises(UsageError):
             RasterConfig(**wrong)
     p = _parameters(5)
-    refused("coefficients", rasterize, _gaussians({**p, "sh": p["sh"][:, :4]}), _view(), replace(TORCH, sh_degree=2))
-    refused("feature channels", rasterize, _gaussians({**p, "extra": torch.zeros(5, 29)}), _view(), TORCH)
-    refused("background", rasterize, _gaussians(p), _view(), TORCH, background=torch.zeros(4))
-    refused("background", rasterize, _gaussians(p), _view(), TORCH, background=torch.zeros(3, 2, 2))
-    refused("share", rasterize, _gaussians({**p, "quats": p["quats"].double()}), _view(), TORCH)
-    refused("world_from_cam", rasterize, _gaussians(p), _view(), TORCH, world_from_cam=torch.eye(3))
+    with pytest.raises(InputError, match="coefficients"):
+        rasterize(_gaussians({**p, "sh": p["sh"][:, :4]}), _view(), replace(TORCH, sh_degree=2))
+    with pytest.raises(InputError, match="feature channels"):
+        rasterize(_gaussians({**p, "extra": torch.zeros(5, 29)}), _view(), TORCH)
+    with pytest.raises(InputError, match="background"):
+        rasterize(_gaussians(p), _view(), TORCH, background=torch.zeros(4))
+    with pytest.raises(InputError, match="background"):
+        rasterize(_gaussians(p), _view(), TORCH, background=torch.zeros(3, 2, 2))
+    with pytest.raises(InputError, match="share"):
+        rasterize(_gaussians({**p, "quats": p["quats"].double()}), _view(), TORCH)
+    with pytest.raises(InputError, match="world_from_cam"):
+        rasterize(_gaussians(p), _view(), TORCH, world_from_cam=torch.eye(3))
 
 
 @needs_native
@@ -606,45 +664,103 @@ def test_without_the_library_auto_takes_torch_and_cpu_is_refused(monkeypatch: py
 
 
 def test_gsplat_is_refused_where_it_is_missing() -> None:
-    if not gsplat_cuda.problem():
+    if not gsplat_package.problem():
         pytest.skip("gsplat is installed here")
     with pytest.raises(ResourceError, match="gsplat"):
         rasterize(_gaussians(_parameters(5)), _view(), RasterConfig(backend="gsplat"))
 
 
 class _FakeGsplat(SimpleNamespace):
-    """Records the calls; what comes back is compared in ``test_gsplat.py``, with the package's own code."""
+    """Records the call and returns images whose values depend on the inputs in a simple way."""
+
+    def __init__(self) -> None:
+        super().__init__(calls=[])
 
     def spherical_harmonics(self, degree: int, directions: Tensor, coefficients: Tensor) -> Tensor:
-        self.degree, self.directions = degree, directions
+        self.calls.append(("sh", degree, directions))
         return coefficients[..., 0, :]
 
     def rasterization(self, **arguments: Any) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        self.draw = arguments
-        colors, views = arguments["colors"], len(arguments["viewmats"])
-        size = (views, arguments["height"], arguments["width"])
-        info = {"means2d": arguments["means"][None, :, :2], "radii": torch.ones(views, colors.shape[1], 2)}
-        return torch.zeros(*size, colors.shape[-1]), torch.zeros(*size, 1), info
+        self.calls.append(("draw", arguments))
+        colors, height, width = arguments["colors"], arguments["height"], arguments["width"]
+        views = len(arguments["viewmats"])
+        means2d = arguments["means"][None, :, :2].expand(views, -1, -1) * 1.0
+        if means2d.requires_grad:
+            means2d.retain_grad()
+            means2d.register_hook(lambda g: setattr(means2d, "absgrad", 2 * g.abs()))
+        channels = colors.sum(1)
+        channels = torch.cat([channels[:, :-1], channels[:, -1:] + means2d.sum((1, 2))[:, None]], 1)
+        image = channels[:, None, None].expand(views, height, width, -1)
+        alpha = torch.full((views, height, width, 1), 0.25)
+        radii = torch.ones(views, colors.shape[1], 2, dtype=torch.int32)
+        return image, alpha, {"means2d": means2d, "radii": radii}
 
 
 def test_the_gsplat_adapter_maps_every_argument() -> None:
-    fake, view, p = _FakeGsplat(), _view(6, 4), _parameters(7, degree=2, channels=3)
+    fake, view = _FakeGsplat(), _view(6, 4)
+    p = _leaves(_parameters(7, degree=2, channels=3))
     config = RasterConfig(near_m=0.2, far_m=90.0, blur_px2=0.1, antialias=True)
     pose = torch.tensor(view.world_from_cam, dtype=torch.float32)
     request = raster.Request(_gaussians(p), (view,), False, config, 2, (torch.tensor([0.0, 0.0, 1.0]),), (pose,), True)
-    gsplat_cuda.render(request, module=fake)
-    draw, offset = fake.draw, p["means"] - pose[:3, 3]
+    out = gsplat_cuda.render(request, module=fake)
+    (_, degree, directions), (_, draw) = fake.calls
+    assert degree == 2
     # Everything is handed over relative to the camera, so that float32 serves far from the world's origin.
-    assert fake.degree == 2 and torch.allclose(fake.directions, offset) and torch.allclose(draw["means"], offset)
-    wanted = {"near_plane": 0.2, "far_plane": 90.0, "eps2d": 0.1, "rasterize_mode": "antialiased", "width": 6}
-    wanted |= {"render_mode": "RGB", "absgrad": True, "packed": False, "sh_degree": None, "height": 4}
-    assert {name: draw[name] for name in wanted} == wanted
+    offset = p["means"] - pose[:3, 3]
+    torch.testing.assert_close(directions, offset)
+    torch.testing.assert_close(draw["means"], offset)
+    assert draw["near_plane"] == 0.2
+    assert draw["far_plane"] == 90.0
+    assert draw["eps2d"] == 0.1
+    assert draw["rasterize_mode"] == "antialiased"
+    assert draw["render_mode"] == "RGB"
+    assert draw["absgrad"] is True
+    assert draw["packed"] is False
+    assert draw["sh_degree"] is None
+    assert (draw["width"], draw["height"]) == (6, 4)
     seen = draw["means"] @ draw["viewmats"][0, :3, :3].T + draw["viewmats"][0, :3, 3]
     torch.testing.assert_close(seen, p["means"] @ pose[:3, :3] - pose[:3, 3] @ pose[:3, :3])
     np.testing.assert_allclose(draw["Ks"][0].numpy(), view.camera.matrix, rtol=1e-6)
     torch.testing.assert_close(draw["opacities"], p["opacity"])
-    columns = ((p["sh"][:, 0] + 0.5).clamp_min(0), p["extra"], seen[:, 2:])
-    torch.testing.assert_close(draw["colors"][0], torch.cat(columns, 1))
+    torch.testing.assert_close(draw["colors"][0, :, :3], (p["sh"][:, 0] + 0.5).clamp_min(0))
+    torch.testing.assert_close(draw["colors"][0, :, 3:-1], p["extra"])
+    torch.testing.assert_close(draw["colors"][0, :, -1], seen[:, 2])
+    assert out.extra is not None
+    torch.testing.assert_close(out.extra[:, 0, 0], p["extra"].sum(0))
+    torch.testing.assert_close(out.rgb[2, 0, 0], (p["sh"][:, 0, 2] + 0.5).clamp_min(0).sum() + 0.75)
+    torch.testing.assert_close(out.depth * out.alpha, (seen[:, 2].sum() + offset[:, :2].sum()).expand(1, 4, 6))
+    out.depth.sum().backward()
+    assert out.trace.means2d.grad is not None
+    torch.testing.assert_close(out.trace.means2d.grad, torch.full((7, 2), 4 * 24.0))
+    assert out.trace.abs_grad2d is not None
+    torch.testing.assert_close(out.trace.abs_grad2d, torch.full((7, 2), 8 * 24.0))
+    assert out.trace.visible.all()
+
+
+def test_gsplat_draws_several_views_in_one_call() -> None:
+    fake, views = _FakeGsplat(), (_view(6, 4), _axis_view(6, 4))
+    p = _leaves(_parameters(7, degree=1, channels=2))
+    request = raster.Request(_gaussians(p), views, True, RasterConfig(), 1, (None, torch.ones(3)), (None, None), True)
+    out = gsplat_cuda.render(request, module=fake)
+    assert [name for name, *_ in fake.calls] == ["sh", "sh", "draw"]
+    draw = fake.calls[2][1]
+    for index, view in enumerate(views):
+        seen = draw["means"] @ draw["viewmats"][index, :3, :3].T + draw["viewmats"][index, :3, 3]
+        cam_from_world = torch.tensor(view.cam_from_world, dtype=torch.float32)
+        torch.testing.assert_close(seen, p["means"] @ cam_from_world[:3, :3].T + cam_from_world[:3, 3])
+        np.testing.assert_allclose(draw["Ks"][index].numpy(), view.camera.matrix, rtol=1e-6)
+        torch.testing.assert_close(
+            fake.calls[index][2], p["means"] - torch.tensor(view.world_from_cam[:3, 3], dtype=torch.float32)
+        )
+    assert out.rgb.shape == (2, 3, 4, 6)
+    assert out.depth.shape == out.alpha.shape == (2, 1, 4, 6)
+    torch.testing.assert_close(out.rgb[1] - out.rgb[0], torch.full((3, 4, 6), 0.75))
+    out.depth[1].sum().backward()
+    assert out.trace.means2d.grad is not None
+    assert out.trace.means2d.grad[0].abs().max() == 0
+    torch.testing.assert_close(out.trace.means2d.grad[1], torch.full((7, 2), 4 * 24.0))
+    assert out.trace.radii.shape == (2, 7, 2)
+    assert out.trace.visible.shape == (2, 7)
 
 
 @needs_native
@@ -652,9 +768,11 @@ def test_the_gsplat_adapter_maps_every_argument() -> None:
 def test_five_million_gaussians() -> None:
     generator = torch.Generator().manual_seed(0)
     count = 5_000_000
-    places = torch.rand(count, 3, generator=generator) - torch.tensor([0.5, 0.5, 0.0])
+    means = torch.rand(count, 3, generator=generator) * torch.tensor([60.0, 30.0, 90.0]) - torch.tensor(
+        [30.0, 15.0, 0.0]
+    )
     p = {
-        "means": places * torch.tensor([60.0, 30.0, 90.0]),
+        "means": means,
         "quats": torch.randn(count, 4, generator=generator),
         "scales": torch.full((count, 3), 0.03),
         "opacity": torch.full((count,), 0.2),
