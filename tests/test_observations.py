@@ -68,9 +68,13 @@ def test_modalities_not_produced_stay_none(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_folder_is_not_readable_but_its_files_are_kept(tmp_path: Path) -> None:
-    with pytest.raises(KeyboardInterrupt), ObservationWriter(tmp_path / "t", "t", "x") as writer:
-        writer.add(_observation(0))
-        raise KeyboardInterrupt
+    def interrupted() -> None:
+        with ObservationWriter(tmp_path / "t", "t", "x") as writer:
+            writer.add(_observation(0))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
     refused("finished", read_observations, tmp_path / "t")
     with ObservationWriter(tmp_path / "t", "t", "x") as writer:
         assert writer.done == 1
