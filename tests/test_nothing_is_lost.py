@@ -407,11 +407,11 @@ def test_a_user_file_in_the_folder_of_a_failing_import_stays(
 ) -> None:
     out = tmp_path / "out"
 
-    def fail(_kind: str, _config: IngestConfig, _source: Path, folder: Path) -> Any:
+    def fail(_kind: str, _source: Path, folder: Path, _options: Any) -> Any:
         (folder / "mine.md").write_text("mine")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(ingest, "_make", fail)
+    monkeypatch.setattr(ingest, "import_log", fail)
     with pytest.raises(KeyboardInterrupt):
         Ingest(log=world["log"], out=out, settings=IngestConfig()).run()
     assert [p.name for p in out.iterdir()] == ["mine.md"]

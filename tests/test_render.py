@@ -92,7 +92,7 @@ def test_continues_after_an_interruption_and_reuses_what_is_finished(world, tmp_
     monkeypatch.setattr(render, "render_view", stop_at_third)
     with pytest.raises(KeyboardInterrupt):
         RenderViews(**world, out=tmp_path / "parts", settings=config).run()
-    kept = len(list((tmp_path / "parts").rglob("*.safetensors")))
+    kept = len(list((tmp_path / "parts").rglob("*.npz")))
     assert kept == 2
     calls.clear()
     parts = RenderViews(**world, out=tmp_path / "parts", settings=config).run()

@@ -43,8 +43,9 @@ def rigid_problem(transform: ArrayLike, tolerance: float = 1e-4) -> str | None:
     if np.abs(matrix[3] - [0, 0, 0, 1]).max() > tolerance:
         return f"last row is {matrix[3].tolist()} instead of [0, 0, 0, 1]"
     rotation = matrix[:3, :3].astype(np.float64)
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if error > tolerance:
+    with np.errstate(over="ignore", invalid="ignore"):  # 1e300 is no rotation either
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not error <= tolerance:
         return f"rotation part is not orthonormal (largest deviation {error:.3g})"
     if np.linalg.det(rotation) < 0:
         return "rotation part is a reflection (determinant -1)"
@@ -56,8 +57,9 @@ def all_rigid(transforms: Matrix, tolerance: float = 1e-4) -> bool:
     rotation = transforms[:, :3, :3]
     if not np.isfinite(transforms).all() or (np.abs(transforms[:, 3] - [0, 0, 0, 1]) > tolerance).any():
         return False
-    error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))
-    return not (error > tolerance).any() and not (np.linalg.det(rotation) < 0).any()
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(rotation @ np.swapaxes(rotation, 1, 2) - np.eye(3))
+    return bool((error <= tolerance).all()) and not (np.linalg.det(rotation) < 0).any()
 
 
 def from_rotation_translation(rotation: ArrayLike, translation: ArrayLike) -> Matrix:
