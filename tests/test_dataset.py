@@ -353,7 +353,7 @@ def test_words_for_what_cannot_be(run: tuple[Path, Path], tmp_path: Path) -> Non
 def test_a_loader_with_workers_gives_what_indexing_gives(run: tuple[Path, Path]) -> None:
     scene, fit = run
     views = as_dataset(fit, scene, cameras="front", shifts_m=(0.0, 0.5), width_px=80, least_pixels=1)
-    loader = torch.utils.data.DataLoader(views, batch_size=2, num_workers=2, collate_fn=collate)
+    loader = torch.utils.data.DataLoader(views, batch_size=2, num_workers=1, collate_fn=collate)
     index = 0
     for batch in loader:
         for row in range(len(batch["name"])):
