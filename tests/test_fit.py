@@ -173,7 +173,7 @@ def test_tensorboard_shows_the_log_and_changes_nothing(world, tmp_path, monkeypa
     class Writer:
         def __init__(self, folder: str) -> None:
             Path(folder).mkdir()
-            (Path(folder) / "events").write_bytes(b"")
+            (Path(folder) / f"events.out.tfevents.{len(told)}").write_bytes(b"")
 
         def add_scalar(self, *entry) -> None:
             told.append(entry)
@@ -192,8 +192,10 @@ def test_tensorboard_shows_the_log_and_changes_nothing(world, tmp_path, monkeypa
     lines = [store.parse_json(line, "log") for line in (watched / "log.jsonl").read_text().splitlines()]
     numbers = [(f"fit/{k}", v, line["step"]) for line in lines for k, v in line.items() if k not in ("step", "view")]
     assert told == numbers and len(numbers) > 3
+    (watched / "tensorboard" / "mine.txt").write_text("mine")
     assert replace(step, overwrite=True, settings=settings(iterations=13)).run() == watched
-    assert len(list((watched / "tensorboard").iterdir())) == 1, "the folder of the result that was replaced is gone"
+    left = sorted(path.name for path in (watched / "tensorboard").iterdir())
+    assert left == [f"events.out.tfevents.{len(numbers)}", "mine.txt"], "files of the run went, that of the user stays"
 
 
 def test_densification_grows_within_its_cap(world, tmp_path):

@@ -26,8 +26,7 @@ TOP_M, TOP_PX = 40.0, 720
 
 
 def labels(view: dict[str, Any]) -> NDArray[np.uint8]:
-    """What is known of every pixel of a view: colour with boxes, depth, classes, objects, certainty, borders of
-    objects on the colour."""
+    """What is known of every pixel of a view: colour with boxes, depth, classes, objects."""
     rgb = (255 * view["rgb"]).round().byte().permute(1, 2, 0).numpy()
     objects, colors = view["instances"].numpy(), np.random.default_rng(5).integers(60, 255, (2**12, 3))
     picture = Image.fromarray(rgb)

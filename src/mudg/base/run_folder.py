@@ -160,7 +160,9 @@ try:
 except ImportError:  # Windows
     fcntl = None
 
-_STATE, _SETTINGS, _LOCK, _LOG, _BOARD = store.RUN_STATE, "run.yaml", "lock", store.RUN_LOG, "tensorboard/"
+_STATE, _SETTINGS, _LOCK, _LOG = store.RUN_STATE, "run.yaml", "lock", store.RUN_LOG
+_BOARD = "tensorboard/events.out.tfevents.*"
+"""What ``RunDir.watch`` writes."""
 _BEGUN = frozenset({_STATE, _SETTINGS, _LOCK})
 """What a run folder holds before anything is made."""
 _BOOKKEEPING = _BEGUN | {_LOG, store.MANIFEST}
@@ -349,7 +351,7 @@ def own_names(output: VerbOutput, folder: Path) -> list[str]:
     finished = state.get("state") == "complete" and listed
 
     def is_own(name: str) -> bool:
-        if name in _BOOKKEEPING or name.startswith(_BOARD) or name in listed or is_temporary(name):
+        if name in _BOOKKEEPING or name in listed or is_temporary(name) or fnmatchcase(name, _BOARD):
             return True
         return (not finished or ".part" in name) and _matches(name, patterns)  # no manifest lists temporary folders
 
@@ -508,7 +510,7 @@ class RunDir:
         it."""
         from torch.utils.tensorboard import SummaryWriter
 
-        self._board = SummaryWriter(str(self.path / _BOARD))
+        self._board = SummaryWriter(str((self.path / _BOARD).parent))
 
     def pause(self, summary: Mapping[str, Any] | None = None) -> None:
         """Record an interruption, once: the time spent is kept, the lock released; the same command continues."""
@@ -532,7 +534,7 @@ class RunDir:
         remove_files(self.path, list(filter(is_temporary, all_names(self.path))))  # of runs that were killed
         if self._board is not None:
             self._board.close()
-        names = [n for n in store.list_files(self.path) if n not in (_LOG, _STATE) and not n.startswith(_BOARD)]
+        names = [n for n in store.list_files(self.path) if n not in (_LOG, _STATE) and not fnmatchcase(n, _BOARD)]
         own = [name for name in names if name == _SETTINGS or _matches(name, self._output.files)]
         if others := sorted(set(names) - set(own)):
             log.warn(f"{self.path} holds files that {self.verb} did not make: {', '.join(others[:8])}")

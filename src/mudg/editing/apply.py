@@ -13,6 +13,7 @@ import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
@@ -152,15 +153,13 @@ def edited_model(
 def _erased(plan: EditPlan, xyz: NDArray[np.floating]) -> NDArray[np.bool_]:
     """Which points f[N, 3] of the street the plan takes away."""
     places, gone = np.asarray(xyz, np.float64), np.zeros(len(xyz), bool)
-    for edit in plan.erased:
-        if edit.balls is not None:
-            centers, radii = np.split(np.asarray(edit.balls, np.float64), [3], axis=1)
-            for hit in KDTree(places).query_ball_point(centers, radii[:, 0]):
-                gone[hit] = True
-        if edit.keep is not None:
-            world_from_box = geometry.yaw_matrix(math.radians(edit.keep.yaw_deg), edit.keep.center)
-            local = geometry.transform_points(geometry.invert(world_from_box), places)
-            gone |= (np.abs(local) > np.array(edit.keep.size_m) / 2).any(1)
+    if balls := [ball for edit in plan.erased for ball in edit.balls or ()]:
+        centers, radii = np.split(np.array(balls), [3], axis=1)
+        gone[list(set(chain.from_iterable(KDTree(places).query_ball_point(centers, radii[:, 0]))))] = True
+    for box in (edit.keep for edit in plan.erased if edit.keep is not None):
+        world_from_box = geometry.yaw_matrix(math.radians(box.yaw_deg), box.center)
+        local = geometry.transform_points(geometry.invert(world_from_box), places)
+        gone |= (np.abs(local) > np.array(box.size_m) / 2).any(1)
     return gone
 
 

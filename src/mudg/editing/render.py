@@ -57,7 +57,7 @@ Drawers = Callable[[Sequence[View]], AbstractContextManager[Iterator[Observation
 
 
 Edited = tuple[Scene, SceneModel, EditedDrive | None]
-"""Scene and fit as they are rendered, and what an edit script did to them."""
+"""Scene and fit as they are rendered, and what an edit script did to them (None: there is none)."""
 
 
 def prepare(
@@ -73,19 +73,19 @@ def prepare(
     if path is not None:
         trajectories(read_scene(scene), config, path)
     radiance = kind_of(model) == RADIANCE
-    if config.repair and (radiance or FACT in load_model(model).facts):
-        what, expected = (
-            "only fits of the drive as it was recorded can be repaired",
-            "a folder of Gaussians made by fit",
-        )
-        raise UsageError(what, where="--repair", expected=expected, got=str(model), remedy="leave it out")
     if radiance and (config.remove_tracks or script is not None):
         what = "a radiance field has no objects to leave out or to edit"
         raise UsageError(what, where=str(model), remedy="leave --remove-tracks and --edits out")
     choose_device(config.device, "render") if radiance else drawing_device(config.device, "render", config.raster)
-    edited = None if script is None else _edited(scene, model, script, fused if config.harmonize.on else None)
-    if edited is not None and config.harmonize.on:
-        harmonised.check_paths(config.harmonize, {path.name: len(path) for path in trajectories(edited[0], config)})
+    edited = None
+    if script is not None or (config.repair and not radiance):
+        edited = _edited(scene, model, script, fused if config.harmonize.on else None)
+    if config.repair and (edited is None or FACT in edited[1].facts):
+        what, expected = "only a fit of the drive as it was recorded can be repaired", "Gaussians made by fit"
+        raise UsageError(what, where="--repair", expected=expected, got=str(model), remedy="leave it out")
+    if edited is not None and (config.harmonize.on or config.repair):
+        lengths = {one.name: len(one) for one in trajectories(edited[0], config, path)}
+        harmonised.check_paths(config.harmonize, lengths)
     return edited
 
 

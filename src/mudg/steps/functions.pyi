@@ -684,7 +684,7 @@ def render(
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         edits: Edit script (docs/edit.md) to carry out before rendering.
-        fused: Point clouds written by fuse; for --harmonize.on and --repair (not given: those of the run at SCENE).
+        fused: Point clouds written by fuse; for --harmonize.on, and for --repair (there, not given: those of the run at SCENE).
         path: Camera path to draw in place of the shifts: poses in the format of TUM or KITTI (.txt), or nerfstudio's transforms.json, on the scene's clock and in its world. It has the optics of the first camera.
         config: YAML file of settings, read before those given here.
         cameras: Cameras to render (empty = the first camera). A name that the scene lacks is an error.

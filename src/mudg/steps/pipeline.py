@@ -416,16 +416,15 @@ class _Ledger:
 
     def _show(self, state: str) -> None:
         """Write the page of the unfinished run, but not over a report."""
-        from mudg.viewer.report import progress_page
+        from mudg.viewer.report import PROGRESS, progress_page
 
         page = self._out / "report.html"
-        if page.is_file() and self._report.get("progress") != store.sha256_file(page):
+        if page.is_file() and PROGRESS not in store.read_text(page):
             return
         names, spent = dict.fromkeys((*self._steps, self._now, *self.ahead)), self.seconds()
         of = lambda name: "done" if self.has_done(name) else state if name == self._now else ""
         steps = [(name, of(name), spent.get(name, 0.0)) for name in names if name]
         store.write_text(page, progress_page(self._out, steps, state, self._standing(self._now).capitalize()))
-        self._report = {"progress": store.sha256_file(page)}
 
     def timed(self, name: str, result: Path, run: Callable[[], Any]) -> Any:
         """Do one step, which makes a folder or file, and add its seconds, also when it is interrupted; a reused result
@@ -463,9 +462,9 @@ class _Ledger:
         }
 
     def save(self, state: str) -> None:
-        """Write OUT/run.json, and before the end the page of the unfinished run."""
-        if state != "complete":
-            self._show(state)
+        """Write OUT/run.json, and until the end the page of the unfinished run."""
         record = {"schema": 1, "state": state, "asked": self._asked, "steps": self._steps, "digests": self.digests}
         record |= {"report": self._report, "environment": environment()}
         store.write_json(self._out / "run.json", store.with_check(record))
+        if state != "complete":
+            self._show(state)

@@ -44,7 +44,8 @@ class RenderViews(Output):
     edits: Annotated[Path | None, FILE_YAML] = None
     """Edit script (docs/edit.md) to carry out before rendering."""
     fused: Annotated[Path | None, Flag("FOLDER", "", "fused")] = None
-    """Point clouds written by fuse; for --harmonize.on and --repair (not given: those of the run at SCENE)."""
+    """Point clouds written by fuse; for --harmonize.on, and for --repair (there, not given: those of the run at
+    SCENE)."""
     path: Annotated[Path | None, Flag("FILE")] = None
     """Camera path to draw in place of the shifts: poses in the format of TUM or KITTI (.txt), or nerfstudio's
     transforms.json, on the scene's clock and in its world. It has the optics of the first camera."""

@@ -584,6 +584,8 @@ def _panel(seen: Observation, row: str, size: tuple[int, int], true_rgb: Tensor 
 PANEL_WIDTH: Final = 320
 BUDGET_BYTES: Final = 9 * 2**19
 """For all videos together, before base64; with the posters the page stays under 8 MB."""
+PROGRESS: Final = "mudg-unfinished-run"
+"""Marks the page of a run that has not ended."""
 SO_FAR: Final = (
     ("Fit with diffusion: photograph, render, depth", f"{GUIDED}/preview/*.png"),
     ("Fit without diffusion: photograph, render, depth", f"{PLAIN}/preview/*.png"),
@@ -653,7 +655,7 @@ def progress_page(out: Path, steps: Sequence[tuple[str, str, float]], state: str
         "interrupted": "The run was stopped. Repeat the same command to go on.",
         "failed": "The run has failed; the terminal says why. Repeat the same command to go on where it ended.",
     }
-    found = [(title, max(out.glob(pattern), default=None)) for title, pattern in SO_FAR]
+    newest = [(title, max(out.glob(pattern), default=None)) for title, pattern in SO_FAR]
     kinds = {".png": "image/png", ".jpg": "image/jpeg"}
     return html.render(
         "progress.html.j2",
@@ -661,9 +663,10 @@ def progress_page(out: Path, steps: Sequence[tuple[str, str, float]], state: str
         kicker="mudg run",
         heading=out.name,
         lead=leads[state],
+        mark=PROGRESS,
         running=state == "running",
         steps=steps,
-        pictures=[(title, _data_uri(kinds[path.suffix], store.read_bytes(path))) for title, path in found if path],
+        pictures=[(title, _data_uri(kinds[path.suffix], store.read_bytes(path))) for title, path in newest if path],
     )
 
 

@@ -1,8 +1,5 @@
 // The verb `erase` of edit scripts: balls of the street that are taken away, and a box outside which nothing of it is kept.
 
-/** Balls that the page shows as taken away; exact frames show all. */
-export const MOST_BALLS = 128;
-
 const erasures = (entries) => entries.flatMap((entry) => entry.erase ?? []);
 
 /** All balls of a script, [x, y, z, radius] each. */

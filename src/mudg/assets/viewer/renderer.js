@@ -3,7 +3,7 @@
 
 import { TEXTURE_WIDTH } from "mudg/data";
 import * as shaders from "mudg/shaders";
-import { MOST_BALLS, headingOf } from "mudg/erase";
+import { headingOf } from "mudg/erase";
 import { Sorter } from "mudg/sorter";
 import { streaks } from "mudg/particles";
 import { conditionsOf, fallingOf, preview } from "mudg/weather";
@@ -45,6 +45,7 @@ export class Renderer {
     this.blank = this.texture(gl.RGBA8, 1, 1, gl.RGBA, gl.UNSIGNED_BYTE, new Uint8Array(4));
     this.nodes = gl.createTexture();
     this.grids = gl.createTexture();
+    this.balls = gl.createTexture();
     this.empty = gl.createVertexArray();
     this.photos = new Map(); // place -> {key, texture}
     this.conditions = conditionsOf([]);
@@ -122,6 +123,15 @@ export class Renderer {
   bind(unit, texture, kind = this.gl.TEXTURE_2D) {
     this.gl.activeTexture(this.gl.TEXTURE0 + unit);
     this.gl.bindTexture(kind, texture);
+  }
+
+  /** Puts numbers, four per texel in rows of `TEXTURE_WIDTH`, into a texture of a unit. */
+  table(unit, texture, values) {
+    const gl = this.gl, rows = Math.max(1, Math.ceil(values.length / 4 / TEXTURE_WIDTH)), all = new Float32Array(4 * rows * TEXTURE_WIDTH);
+    all.set(values);
+    this.bind(unit, texture);
+    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, TEXTURE_WIDTH, rows, 0, gl.RGBA, gl.FLOAT, all);
+    this.filtered(gl.NEAREST);
   }
 
   /** Makes room for a scene on the card; its Gaussians come with `add`. */
@@ -210,14 +220,13 @@ export class Renderer {
     this.bind(1, this.nodes);
     gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, 6, placed.rows.length / 24, 0, gl.RGBA, gl.FLOAT, placed.rows);
     this.filtered(gl.NEAREST);
-    this.bind(2, this.grids);
-    const rows = Math.ceil(placed.deform.length / 4 / TEXTURE_WIDTH), grid = new Float32Array(4 * rows * TEXTURE_WIDTH);
-    grid.set(placed.deform);
-    gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA32F, TEXTURE_WIDTH, rows, 0, gl.RGBA, gl.FLOAT, grid);
-    this.filtered(gl.NEAREST);
+    const { balls, box } = this.erased;
+    this.table(2, this.grids, placed.deform);
+    this.table(3, this.balls, balls.flat());
     gl.uniform1i(places.data, 0);
     gl.uniform1i(places.nodes, 1);
     gl.uniform1i(places.grids, 2);
+    gl.uniform1i(places.balls, 3);
     this.camera(places, view);
     gl.uniform3fv(places.eye, view.eye);
     gl.uniform2f(places.colorRange, loaded.scene.facts.color_low, loaded.scene.facts.color_high);
@@ -226,9 +235,7 @@ export class Renderer {
     gl.uniform4fv(places.fog, fog);
     gl.uniform4fv(places.veil, veil);
     gl.uniform4fv(places.snow, snow);
-    const { balls, box } = this.erased, shown = balls.slice(-MOST_BALLS);
-    gl.uniform1i(places.ballCount, shown.length);
-    if (shown.length) gl.uniform4fv(places.balls, shown.flat());
+    gl.uniform1i(places.ballCount, balls.length);
     gl.uniform4f(places.boxPlace, ...(box?.center ?? [0, 0, 0]), box ? 1 : 0);
     gl.uniform3f(places.boxHalf, ...(box?.size_m ?? [0, 0, 0]).map((size) => size / 2));
     gl.uniform2f(places.boxHeading, ...headingOf(box ?? {}));

@@ -1,8 +1,6 @@
 // The programs of the graphics card. They follow core/raster/torch_twin.py: elliptical weighted averaging, 0.3 square pixels of blur,
 // alpha at most 0.99 and at least 1/255, pixel centres at one half.
 
-import { MOST_BALLS } from "mudg/erase";
-
 /** Kinds of pictures, in the order in which the programs number them. */
 export const LAYERS = ["color", "depth", "class", "instance", "normal", "confidence", "recorded"];
 /** Classes counted in one pass: four targets with three classes each; every target needs its alpha for blending. */
@@ -17,7 +15,7 @@ export const splatVertex = (degree, texels, width, rows) => HEAD + `
 uniform usampler2DArray data; uniform sampler2D nodes, grids;
 uniform mat3 cameraFromWorld; uniform vec3 eye; uniform vec4 intrinsics; uniform vec2 size;
 uniform vec2 colorRange; uniform vec4 fog, veil, snow; uniform uint ground; uniform float harmonicStep, nearest; uniform int layer; uniform bool antialias;
-uniform vec4 balls[${MOST_BALLS}], boxPlace; uniform vec3 boxHalf; uniform vec2 boxHeading; uniform int ballCount; // what is erased of the street
+uniform sampler2D balls; uniform vec4 boxPlace; uniform vec3 boxHalf; uniform vec2 boxHeading; uniform int ballCount; // what is erased of the street
 in uint row;
 out vec2 place; flat out vec4 payload; flat out uvec2 vote;
 
@@ -67,11 +65,14 @@ vec3 harmonics(vec3 d) {
 vec3 tint(int node) { return node == 0 ? vec3(0.42) : 0.55 + 0.45 * cos(6.2831853 * (fract(float(node) * 0.61803399) + vec3(0.0, 0.33, 0.67))); }
 
 bool erased(vec3 at) { // as in editing/apply.py
-  for (int k = 0; k < ballCount; k++) if (distance(at, balls[k].xyz) <= balls[k].w) return true;
+  for (int k = 0; k < ballCount; k++) {
+    vec4 ball = texelFetch(balls, ivec2(k % ${width}, k / ${width}), 0);
+    if (distance(at, ball.xyz) <= ball.w) return true;
+  }
   if (boxPlace.w < 0.5) return false;
   vec3 way = at - boxPlace.xyz;
-  vec2 flat_ = vec2(dot(way.xy, boxHeading), dot(way.xy, vec2(-boxHeading.y, boxHeading.x)));
-  return any(greaterThan(abs(vec3(flat_, way.z)), boxHalf));
+  vec2 own = vec2(dot(way.xy, boxHeading), dot(way.xy, vec2(-boxHeading.y, boxHeading.x)));
+  return any(greaterThan(abs(vec3(own, way.z)), boxHalf));
 }
 
 void main() {
