@@ -4,6 +4,7 @@ import collections
 import json
 import os
 import shutil
+import threading
 from dataclasses import replace
 
 import numpy as np
@@ -206,17 +207,23 @@ def test_what_arrives_is_verified(clips, address, tmp_path):
     assert inner.key == folder.key
 
 
-def test_reading_ahead_brings_what_will_be_drawn(address, tmp_path):
+def test_drawing_ahead_draws_what_would_be_drawn(address, tmp_path):
+    """The same clips, whether drawn before or at their step; nothing is drawn ahead that would be waited for."""
     shards = StreamedShards(address, ShardCache(tmp_path, 10**9), 2)
     source = replace(learn.clips_of_cities(tiny(address.text), tmp_path), shards=shards)
-    with learn.ReadingAhead(lambda step: source.bring(step, 4, 2, [slice(0, 4)]), 2, 4) as ahead:
-        ahead.beyond(0)
-        ahead._pool.shutdown(wait=True)
-        brought = len(list(tmp_path.rglob("*.safetensors")))
-    assert brought >= 1
-    for step in (1, 2):
-        source.draw(step, 4, 2, "batch")
-    assert len(list(tmp_path.rglob("*.safetensors"))) == brought
+    plain, asked = [source.draw(step, 4, 2, "batch") for step in range(4)], []
+
+    def draw(step):
+        asked.append((step, threading.current_thread() is threading.main_thread()))
+        return [source.draw(step, 4, 2, "batch")]
+
+    with learn.DrawingAhead(draw, lambda step: step != 2, 2, 4) as ahead:
+        taken = [ahead.take(step)[0] for step in range(4)]
+    assert sorted(asked) == [(0, True), (1, False), (2, True), (3, False)]
+    for clips, others in zip(taken, plain, strict=True):
+        assert all(torch.equal(a.rgb, b.rgb) for a, b in zip(clips, others, strict=True))
+    local = replace(source, shards=tmp_path / "none yet")
+    assert source.ready(0) and not local.ready(0)
 
 
 def test_a_listed_log_is_cut_when_it_is_drawn(tmp_path, monkeypatch):

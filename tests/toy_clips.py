@@ -15,7 +15,8 @@ import torch
 
 from mudg.base.types import Camera, Clip, Condition, FinePatch, RenderPlanes, View
 from mudg.diffusion.city_clips import HELD_OUT
-from mudg.diffusion.clips import TrainingClips, pack_clips, write_shard
+from mudg.diffusion.clips import pack_clips, write_shard
+from mudg.diffusion.learn import DrawingAhead
 from mudg.diffusion.settings import LearnCodec, LearnConfig
 
 WIDTH, HEIGHT, WINDOW = 48, 32, 4
@@ -136,19 +137,18 @@ def tiny(clips: Path | str, **changes: Any) -> LearnConfig:
 
 @contextlib.contextmanager
 def before_each_batch(act: Callable[[int], None]) -> Iterator[None]:
-    """Within, `act(step)` is called before the network's clips of a step are drawn."""
-    draw = TrainingClips.draw
+    """Within, `act(step)` is called before the clips of a step are taken."""
+    take = DrawingAhead.take
 
-    def acted(self: TrainingClips, step: int, count: int, frames: int, purpose: str, *rest: Any) -> list[Clip]:
-        if purpose == "batch":
-            act(step)
-        return draw(self, step, count, frames, purpose, *rest)
+    def acted(self: DrawingAhead, step: int) -> list[list[Clip]]:
+        act(step)
+        return take(self, step)
 
-    TrainingClips.draw = acted
+    DrawingAhead.take = acted
     try:
         yield
     finally:
-        TrainingClips.draw = draw
+        DrawingAhead.take = take
 
 
 def interrupted_at(step: int) -> contextlib.AbstractContextManager[None]:

@@ -215,9 +215,9 @@ def _check_values(planes: Mapping[str, Tensor], path: Path) -> None:
     for name, value in planes.items():
         if value.is_floating_point() and not bool(torch.isfinite(value).all()):
             raise _damaged(path, "finite numbers", name)
-        labels = value[value != UNLABELLED]
-        if name in _IDS and bool((labels >= len(CLASSES)).any()):
-            raise _damaged(path, f"classes below {len(CLASSES)}, or {UNLABELLED}", f"{name}: {int(labels.max())}")
+        if name in _IDS and bool(((value >= len(CLASSES)) & (value != UNLABELLED)).any()):
+            worst = int(value[value != UNLABELLED].max())
+            raise _damaged(path, f"classes below {len(CLASSES)}, or {UNLABELLED}", f"{name}: {worst}")
 
 
 def _damaged(path: Path, expected: str, got: str) -> InputError:
@@ -314,7 +314,7 @@ def vary(clip: Clip, rng: np.random.Generator) -> Clip:
     """
     gain = rng.uniform(0.7, 1.4) * (1 + rng.uniform(-0.08, 0.08, 3))
     gamma, contrast, saturation = rng.uniform(0.75, 1.35), rng.uniform(0.75, 1.35), rng.uniform(0.5, 1.4)
-    middle = float(clip.rgb.mean())
+    middle = float(clip.rgb.numpy().mean(dtype=np.float64))  # the same by any number of threads
     error = rng.uniform(0.97, 1.03)
 
     def curve(x: Tensor, extra: float) -> Tensor:
@@ -489,13 +489,10 @@ class TrainingClips:
         near = shard - shard % len(self.sizes) + first % len(self.sizes)
         return next((n for n in (near, near - len(self.sizes), near + len(self.sizes)) if n in shards), first)
 
-    def bring(self, step: int, count: int, frames: int, parts: Sequence[slice]) -> None:
-        """Fetch or make the shards that a process needs for its `parts` of a step, so that drawing them need not
-        wait."""
-        if not isinstance(self.shards, Path):
-            picks = self._picks(step, count, frames, "batch")
-            for shard, _, _ in (pick for part in parts for pick in picks[part]):
-                self.shards.reading(shard, lambda path: None)
+    def ready(self, step: int) -> bool:
+        """Whether `draw` at a step waits for no city that is still being made."""
+        folder = self.shards
+        return not isinstance(folder, Path) or all(shard_path(folder, n).is_file() for n in self.in_use(step))
 
     def have_patches(self) -> bool:
         """Whether the clips have patches at a higher resolution; seen in the first one."""

@@ -37,6 +37,7 @@ from mudg.base.errors import InputError, ResourceError, UsageError
 from mudg.base.location import Location
 from mudg.base.processes import Interruption, calls_beside, run_in_processes
 from mudg.base.run_folder import RunDir, VerbOutput
+from mudg.base.types import Clip
 from mudg.diffusion import city_clips, log_clips, model_files, models, parallel, score
 from mudg.diffusion.city_clips import CityClipRules
 from mudg.diffusion.clips import TrainingClips, class_weights, clips_at, shard_path
@@ -380,33 +381,37 @@ def listed_clips(config: LearnConfig, multiple: int, points_alone: bool, out: Pa
     return ListedClips(config, shards, size, [size], range(0), 0, (), about)
 
 
-class ReadingAhead:
-    """Threads that bring the shards of the next steps while a step is computed. What fails there fails again when it is
-    drawn.
+Drawn = list[list[Clip]]
+"""The clips of a step, by portions."""
+
+
+class DrawingAhead:
+    """Threads that draw the clips of the next steps while a step is computed.
 
     Args:
-        bring: brings the shards of a step.
-        depth: so many steps ahead. 0: nothing is brought.
+        draw: the clips of a step, by portions. ready: whether nothing has to be waited for to draw them.
+        depth: so many steps ahead. 0: none.
         steps: of the training.
     """
 
-    def __init__(self, bring: Callable[[int], None], depth: int, steps: int) -> None:
-        self._bring, self._depth, self._steps, self._next = bring, depth, steps, 0
-        self._pool = concurrent.futures.ThreadPoolExecutor(min(4, depth)) if depth else None
+    def __init__(self, draw: Callable[[int], Drawn], ready: Callable[[int], bool], depth: int, steps: int) -> None:
+        self._draw, self._ready, self._depth, self._steps = draw, ready, depth, steps
+        self._pool = concurrent.futures.ThreadPoolExecutor(max(1, depth))
+        self._drawn: dict[int, concurrent.futures.Future[Drawn]] = {}
 
-    def __enter__(self) -> ReadingAhead:
+    def __enter__(self) -> DrawingAhead:
         return self
 
     def __exit__(self, *_: object) -> None:
-        if self._pool is not None:
-            self._pool.shutdown(wait=True, cancel_futures=True)
+        self._pool.shutdown(wait=True, cancel_futures=True)
 
-    def beyond(self, step: int) -> None:
-        """Begin with what is missing for the steps after `step`."""
-        self._next = max(self._next, step + 1)
-        while self._pool is not None and self._next <= min(step + self._depth, self._steps - 1):
-            self._pool.submit(self._bring, self._next)
-            self._next += 1
+    def take(self, step: int) -> Drawn:
+        """The clips of a step. Begins with those of the steps after it."""
+        for later in range(step + 1, min(step + 1 + self._depth, self._steps)):
+            if later not in self._drawn and self._ready(later):
+                self._drawn[later] = self._pool.submit(self._draw, later)
+        future = self._drawn.pop(step, None)
+        return self._draw(step) if future is None else future.result()
 
 
 # network ------------------------------------------------------------------------------------------
@@ -463,9 +468,9 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
     weights = class_weights(source.shards, source.weighed(), config.loss.class_balance).to(ranks.device)
     settings = loss_settings(config, weights)
 
-    def bring(step: int) -> None:
+    def draw(step: int) -> Drawn:
         frames, count, parts = _batch(config, ranks, step)
-        source.bring(step, count, frames, parts)
+        return [source.draw(step, count, frames, "batch", part) for part in parts]
 
     def watch(weights: dict[str, Tensor], step: int) -> None:
         """Score the model with these weights on a few held-out clips and draw a grid of what it makes."""
@@ -485,21 +490,19 @@ def _train_network(model: Model, source: TrainingClips, run_dir: RunDir, bf16: b
     facts = {"seed": config.seed, "layout": config.compute.parallel}
     recent: list[dict[str, float]] = []
     begun, clock, saved_at = state.step, time.monotonic(), state.step
-    ahead_of = 0 if isinstance(source.shards, Path) else config.compute.read_ahead
     with (
         log.task("network", config.steps, begun) as bar,
         Interruption(SAME_SIGNAL_S) as interruption,
-        ReadingAhead(bring, ahead_of, config.steps) as ahead,
+        DrawingAhead(draw, source.ready, config.compute.read_ahead, config.steps) as ahead,
     ):
         for step in range(begun, config.steps):
-            ahead.beyond(step)
             for group in state.optimizer.param_groups:
                 group["lr"] = learning_rate(config, step)
             frames, count, parts = _batch(config, ranks, step)
             terms: dict[str, float] = {}
             state.optimizer.zero_grad(set_to_none=True)
-            for part in parts:
-                clips = [clip.to(ranks.device) for clip in source.draw(step, count, frames, "batch", part)]
+            for part, drawn in zip(parts, ahead.take(step), strict=True):
+                clips = [clip.to(ranks.device) for clip in drawn]
                 with spread.portion(last=part is parts[-1]):
                     with torch.autocast(ranks.device.type, torch.bfloat16, enabled=bf16):
                         loss = spread.network(clips, BatchPart(config.seed, step, part.start, count), settings)

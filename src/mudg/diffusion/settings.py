@@ -388,7 +388,7 @@ class LearnCompute:
     cache_gb: float = setting(default=50.0, gt=0)
     """Largest size of that folder in GB. The clips that were not used for the longest time are removed first."""
     read_ahead: int = setting(default=4, ge=0)
-    """Steps ahead for which training clips are fetched or made (0 = none)."""
+    """Steps ahead for which training clips are fetched, made and drawn by threads beside the training (0 = none)."""
     log_every: int = setting(default=50, ge=1)
     """Steps between lines of log.jsonl."""
 

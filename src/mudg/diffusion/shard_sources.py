@@ -559,11 +559,10 @@ class ListedClips(TrainingClips):
 
         return self.shards.draw(seeds.numpy_rng(seed, step, f"{purpose}, scene {place}"), take)
 
-    def bring(self, step: int, count: int, frames: int, parts: Sequence[slice]) -> None:
-        """Fetch or make the shards of some parts of a step."""
-        del frames
-        for place in (place for part in parts for place in range(count)[part]):
-            self.shards.draw(seeds.numpy_rng(self.config.seed, step, f"batch, scene {place}"), self.shards.clips_in)
+    def ready(self, step: int) -> bool:
+        """Nothing is being made elsewhere."""
+        del step
+        return True
 
     def have_patches(self) -> bool:
         """Whether the clips have patches at a higher resolution."""
