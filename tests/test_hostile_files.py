@@ -81,7 +81,7 @@ def test_only_regular_files_are_opened(tmp_path: Path) -> None:
     [
         ["fuse", "SCENE", "--out", "OUT", "--config", "PIPE"],
         ["fuse", "PIPE", "--out", "OUT"],
-        ["fuse", "--list", "PIPE", "--out", "OUT"],
+        ["batch", "run", "--list", "PIPE", "--out", "OUT"],
         ["doctor", "PIPE"],
         ["ingest", "PIPE", "OUT"],
         ["edit", "FIT", "PIPE", "--out", "OUT"],

@@ -34,8 +34,6 @@ from mudg.diffusion import model_files as files
 from mudg.diffusion.model import MDM
 from mudg.diffusion.settings import ConvertConfig, SynthesizeConfig
 from mudg.editing.settings import RenderConfig, ScoreConfig
-from mudg.fleet.listed import run_listed
-from mudg.fleet.plan import Entry
 from mudg.formats import ingest
 from mudg.formats.settings import IngestConfig
 from mudg.labels.settings import AnnotateConfig
@@ -199,33 +197,6 @@ def test_an_output_that_touches_an_input_is_refused(name: str, world: Given, tmp
             assert str(out) in refused.value.where
             assert str(path) in refused.value.got or out == tmp_path / "in"
     assert tree(tmp_path) == before
-
-
-def test_the_outputs_of_a_list_keep_apart_from_all_its_sources(world: Given, tmp_path: Path) -> None:
-    given = copied(world, ("scene", "plain scene"), tmp_path / "in")
-    scenes = tmp_path / "scenes"
-    for name, path in zip(("a", "b"), given.values(), strict=True):
-        shutil.copytree(path, scenes / name)
-    listed = tmp_path / "list.txt"
-    for text, out in (
-        ("scenes/a\nscenes/b\n", scenes),
-        ("scenes/a name=b\n", scenes / "a"),
-        ("scenes/a name=scenes\n", tmp_path),
-        ("scenes/a name=b\nscenes/b name=c\n", scenes),
-    ):
-        listed.write_text(text)
-        before = tree(tmp_path)
-        with pytest.raises(UsageError, match="an input"):
-            Fuse(list=listed, out=out, jobs=1, overwrite=True, settings=FuseConfig()).run()
-        assert tree(tmp_path) == before
-    with pytest.raises(UsageError, match="an input"):
-        Fuse(list=scenes, out=scenes, jobs=1, overwrite=True, settings=FuseConfig()).run()
-    (tmp_path / "status.json").write_text("scenes/a\n")
-    entries = [Entry("c", str(scenes / "a"))]
-    for list_file, words in ((tmp_path / "status.json", "an input"), (None, "status file would replace")):
-        with pytest.raises(UsageError, match=words):
-            run_listed(("fuse", "{source}"), FuseConfig(), entries, tmp_path, jobs=1, listed=list_file)
-    assert (tmp_path / "status.json").read_text() == "scenes/a\n"
 
 
 def test_files_of_a_log_that_lie_beside_it_count(world: Given, tmp_path: Path) -> None:

@@ -152,7 +152,6 @@ def test_every_kind_of_flag_is_staged(scratch: Path) -> None:
         ("fuse memory://bucket/a --out memory://bucket/a", "touches an input"),
         ("fuse memory://bucket/a --out memory://bucket/a/fused", "touches an input"),
         ("fuse memory://bucket/none --out memory://bucket/fused", "nothing is at"),
-        ("fuse --list memory://bucket/list --out somewhere", "--list"),
         ("fuse https://host/a --out memory://bucket/fused", "no storage of this kind"),
         ("fuse memory://bucket/a --out memory://bucket", "in a bucket"),
         ("fuse memory://bucket/a --out memory://bucket/theirs", "something else"),

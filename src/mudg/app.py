@@ -50,7 +50,7 @@ def overview() -> str:
         "Repeat a command to resume it: finished results are verified and reused, interrupted ones are continued.",
         "Exit codes: 0 ok, 2 usage, 3 bad input, 4 damaged result, 5 missing resource, 6 numerical error, 130"
         " interrupted;",
-        "with --list, and of batch: 10 + number of failed scenes (99: 89 or more); 143 stopped by SIGTERM.",
+        "of batch: 10 + number of failed scenes (99: 89 or more); 143 stopped by SIGTERM.",
     ]
     return "\n".join(lines)
 

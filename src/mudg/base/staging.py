@@ -120,9 +120,6 @@ class _Staging:
         return place if isinstance(value, Path) else str(place)
 
     def _check(self) -> None:
-        if getattr(self.args, "list", None) is not None:
-            got, remedy = str(next(iter((*self.inputs, *self.outputs)))), "give paths for --list and --out"
-            raise UsageError("a list is worked on in folders of this machine", where="--list", got=got, remedy=remedy)
         for out in self.outputs:
             if out.text.count("/") < 3:
                 raise UsageError("an output is a folder or file in a bucket", where=str(out), expected=f"{out}/name")

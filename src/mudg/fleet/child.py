@@ -64,11 +64,11 @@ class Ending:
     processor_s: float = 0.0
 
 
-def run_step(words: Sequence[str], folder: Path | None, threads: int, stop: Stop, *, alone: bool = False) -> Ending:
+def run_step(words: Sequence[str], folder: Path, threads: int, stop: Stop, *, alone: bool = False) -> Ending:
     """Run a command in a process group of its own and wait for its end. It ends with this process, however that ends.
 
     Args:
-        folder: where it runs (None: here). threads: that it may use. alone: wait until no other step runs on this
+        folder: where it runs. threads: that it may use. alone: wait until no other step runs on this
             machine.
 
     Raises:

@@ -98,7 +98,7 @@ class LocalRun:
             thread.join(0.2)
         for following in list(waiting)[:1]:
             first = next(self.job.plan.units(following))
-            reads = "://" in following.source and "{source}" in " ".join(first.stage.words) and not first.stage.direct
+            reads = "://" in following.source and "{source}" in " ".join(first.stage.words)
             if reads and following.name not in self._ahead and not self.job.folder.record("done", first.key).exists():
                 source, version = Location.of(following.source), following.settings.get(REVISION, "")
                 self._ahead[following.name] = self.job.inputs.fetch_ahead(source, version, self.stop)

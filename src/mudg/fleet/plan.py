@@ -25,7 +25,7 @@ from mudg.scene.schema import NAME_PATTERN
 CITY: Final = "city"
 BOOKKEEPING: Final = "_batch"
 """Folder of a batch's own records, in its output."""
-_LEFT_OUT: Final = re.compile(rf"{BOOKKEEPING}|\..*|status(-\d+-of-\d+)?\.json")
+_LEFT_OUT: Final = re.compile(rf"{BOOKKEEPING}|\..*")
 SHARD_VARIABLES: Final[tuple[tuple[str, str, str], ...]] = (
     ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_COUNT", "SLURM_ARRAY_TASK_MIN"),
     ("JOB_COMPLETION_INDEX", "", ""),
@@ -171,13 +171,12 @@ COMMAND: Final = "command"
 @dataclass(frozen=True)
 class BatchStage:
     """A step of a batch. words: its command, with names in braces; needs: steps whose results it reads; settings: what
-    ``--config`` holds for it; direct: whether results are made right below the output, by the scene's name alone."""
+    ``--config`` holds for it."""
 
     name: str
     words: tuple[str, ...]
     needs: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
-    direct: bool = False
 
     @property
     def is_own(self) -> bool:
@@ -198,7 +197,7 @@ class Unit:
     @property
     def place(self) -> str:
         """Folder of its result below the output."""
-        return self.entry.name if self.stage.direct else f"{self.entry.name}/{self.stage.name}/{self.key[:12]}"
+        return f"{self.entry.name}/{self.stage.name}/{self.key[:12]}"
 
     @property
     def title(self) -> str:
@@ -271,11 +270,6 @@ def plan_of(
     if len(set(names)) < len(names) or not names:
         raise UsageError("each step at most once, and at least one", where="--stages", got=" ".join(names))
     return BatchPlan(tuple(stages))
-
-
-def listed_plan(words: Sequence[str], settings: Mapping[str, Any]) -> BatchPlan:
-    """The plan of one step over a list, whose results lie right below the output."""
-    return BatchPlan((BatchStage(words[0], tuple(words), (), settings, direct=True),))
 
 
 def command_of(unit: Unit, places: Mapping[str, str], out: str, config: str) -> list[str]:

@@ -182,11 +182,10 @@ def run_scene(job: Job, entry: Entry, stop: Stop) -> list[Ended]:
     ended: list[Ended] = []
     with contextlib.ExitStack() as held:
         for unit in job.plan.units(entry):
-            if not unit.stage.direct:
-                if job.folder.record("done", unit.key).exists():
-                    continue
-                if job.folder.record("failed", unit.key).exists():
-                    break
+            if job.folder.record("done", unit.key).exists():
+                continue
+            if job.folder.record("failed", unit.key).exists():
+                break
             ended.append(_Step(job, unit, stop, held).run())
             if ended[-1].state != DONE:
                 log.warn(f"{unit.title} {ended[-1].state}: {ended[-1].words or 'the same command goes on'}")
@@ -204,17 +203,12 @@ class _Step:
 
     def __init__(self, job: Job, unit: Unit, stop: Stop, held: contextlib.ExitStack) -> None:
         self._job, self._unit, self._stop, self._held = job, unit, stop, held
-        self._direct = job.folder.out / unit.place if unit.stage.direct else None
         self._path = job.work_root / f"{unit.key}.{os.getpid()}-{time.time_ns():x}"
+        self._result = self._path / _RESULT
         self._lost_s = 0.0
         self._unpublished: Ending | None = None
         """How the command ended whose result could not be published yet."""
         self._in_output = job.folder.out.local is not None and job.scratch is None
-
-    @property
-    def _result(self) -> Path:
-        at = self._direct.local if self._direct is not None else None
-        return at if at is not None else self._path / _RESULT
 
     @property
     def _published(self) -> Location:
@@ -231,8 +225,7 @@ class _Step:
                 break
             self._lost_s += ending.processor_s
             waits = WAITS_S.get(ending.code, (5.0,) if ending.code > 128 else ())
-            again = self._direct is None or ending.code == KILLED
-            if not again or tries[ending.code] >= len(waits):
+            if tries[ending.code] >= len(waits):
                 return self._fail(ending)
             if ending.code == IntegrityError.exit_code:
                 self._remove()  # what was made is thrown away first
@@ -264,8 +257,7 @@ class _Step:
             if adopted is None:
                 self._publish()
             self._remove()
-            if self._direct is None:
-                self._job.folder.end("done", record)
+            self._job.folder.end("done", record)
             return ending, record
         except (MudgError, OSError, MemoryError) as error:
             told = failures.in_words(error)
@@ -276,7 +268,7 @@ class _Step:
 
     def _run_command(self, alone: bool) -> Ending:
         threads = 1 if alone else self._job.threads
-        words, folder = self._command(), None if self._direct is not None else self._path
+        words, folder = self._command(), self._path
         ending = run_step(words, folder, threads, self._stop, alone=alone)
         # of another state of the source
         state = "" if self._unit.stage.is_own else store.json_object(self._result / store.RUN_STATE).get("state")
@@ -292,9 +284,6 @@ class _Step:
 
     def _command(self) -> list[str]:
         source, settings = self._unit.entry.source, _SETTINGS if self._unit.stage.settings else ""
-        if self._direct is not None:
-            config = str(self._path / settings) if settings else ""
-            return command_of(self._unit, {"source": source}, str(self._result), config)
         if "://" in source:
             source = f"source/{Location.of(source).name}"
         places = {"source": source, **{name: f"inputs/{name}" for name in self._unit.needs}}
@@ -305,8 +294,6 @@ class _Step:
     def _adopted(self) -> Path | None:
         """The published result, where its driver was cut off before it put it on record."""
         place = self._published.local
-        if self._direct is not None:
-            return None
         if self._in_output and place is not None:
             if not (place / store.MANIFEST).is_file():
                 return place if place.exists() else None
@@ -331,8 +318,7 @@ class _Step:
 
     def _prepare(self) -> None:
         """Make the folder, with what earlier attempts left, and stage in what the command reads."""
-        if self._direct is None:
-            self._take_over()
+        self._take_over()
         store.make_folder(self._path)
         for name, key in self._unit.needs.items():
             place = self._job.folder.out / f"{self._unit.entry.name}/{name}/{key[:12]}"
@@ -344,7 +330,7 @@ class _Step:
                 self._held.callback(shutil.rmtree, local, True)
             self._link(local, f"inputs/{name}")
         source = self._unit.entry.source
-        if "{source}" in " ".join(self._unit.stage.words) and "://" in source and self._direct is None:
+        if "{source}" in " ".join(self._unit.stage.words) and "://" in source:
             place = Location.of(source)
             self._link(self._hold(place, self._unit.entry.settings.get(REVISION, "")), f"source/{place.name}")
         if self._unit.stage.settings:
@@ -397,8 +383,6 @@ class _Step:
     def _publish(self) -> None:
         """Bring the result to its place in the output. Another attempt's result of the same key is as good."""
         place = self._published
-        if self._direct is not None:
-            return
         if not self._in_output or place.local is None:
             place.push(self._result)
             # it stays for the next step
@@ -419,7 +403,7 @@ class _Step:
 
     def _leave(self) -> None:
         """Keep an unfinished result for the next attempt, on whatever machine it is."""
-        if self._direct is not None or not self._result.is_dir():
+        if not self._result.is_dir():
             self._remove()
         elif not self._in_output:
             with contextlib.suppress(MudgError):
@@ -430,7 +414,7 @@ class _Step:
         shutil.rmtree(self._path, ignore_errors=True)
         partial = self._job.folder.partial(self._unit.key)
         with contextlib.suppress(MudgError):
-            if not self._in_output and self._direct is None and partial.exists():
+            if not self._in_output and partial.exists():
                 partial.remove()
 
     # ends -----------------------------------------------------------------------------------------
@@ -444,18 +428,15 @@ class _Step:
         return Ended(state=state, code=ending.code, words=ending.words[:2000], **what)
 
     def _record(self, result: Path, ending: Ending) -> Ended:
-        if self._direct is not None:
-            return self._ended(DONE, ending)
         facts: dict[str, Any] = {"digest": digest_of(result), "written_bytes": folder_bytes(result)}
         return self._ended(DONE, ending, **facts, peak_bytes=peak_of(result), facts=facts_of(result))
 
     def _fail(self, ending: Ending) -> Ended:
         record = self._ended(FAILED, replace(ending, processor_s=0.0))
         self._remove()
-        if self._direct is None:
-            if ending.text:
-                self._job.folder.log(self._unit.key).save(ending.text.encode())
-            self._job.folder.end("failed", record)
+        if ending.text:
+            self._job.folder.log(self._unit.key).save(ending.text.encode())
+        self._job.folder.end("failed", record)
         return record
 
 

@@ -22,7 +22,6 @@ from mudg.base.plain_yaml import parse_yaml
 from mudg.base.run_folder import refuse_overlap
 from mudg.fleet import engines, status
 from mudg.fleet.child import Stop
-from mudg.fleet.listed import exit_code
 from mudg.fleet.plan import (
     COMMAND,
     OF_A_LINE,
@@ -41,6 +40,12 @@ from mudg.fleet.work import DONE, STOPPED, Job, is_open
 from mudg.steps.settings import PresetName, RunConfig, run_preset
 
 _POLL_S = 10.0
+FAILED_BASE, FAILED_MOST = 10, 99
+
+
+def exit_code(failed: int) -> int:
+    """Exit code of so many failures: 10 more, at most 99; apart from all codes with a meaning of their own."""
+    return min(FAILED_BASE + failed, FAILED_MOST) if failed else 0
 
 
 def run(

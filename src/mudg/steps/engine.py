@@ -10,8 +10,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Self
 
-from mudg.base.errors import ResourceError, UsageError
-from mudg.steps.step import Flag, Step, flag_of, hint_of, hints, positions
+from mudg.base.errors import ResourceError
+from mudg.steps.step import Flag, Step, flag_of, hint_of, hints
 
 if typing.TYPE_CHECKING:
     from mudg.base.run_folder import RunDir, VerbOutput
@@ -211,42 +211,3 @@ class Watched(Output):
         if self.tensorboard and importlib.util.find_spec("tensorboard") is None:
             what, remedy = "TensorBoard is not installed", "pip install 'mudg[track]', or leave the flag out"
             raise ResourceError(what, where="--tensorboard", remedy=f"{remedy}: log.jsonl holds the same")
-
-
-class Listed(Output):
-    """A step that also works on a list of sources."""
-
-    list: Annotated[Path | None, Flag("FILE")] = None
-    """Process many sources: a file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Each
-    result goes to OUT/NAME. The exit code is 0, or 10 + the number of failures."""
-    shard: Annotated[str, Flag("i/n")] = ""
-    """With --list: process the i-th of n parts of the list; i counts from 0 to n-1. A scene's part depends on its name
-    alone. Use it to split a list over machines."""
-    jobs: int = 0
-    """With --list: number of scenes processed at the same time (0 = one per processor)."""
-
-    of_a_line: ClassVar[tuple[str, ...]] = ()
-    """Settings that a line of the list may give."""
-
-    def act(self) -> Any:
-        source = getattr(self, positions(type(self))[0])
-        if self.list is None and (self.shard or self.jobs):
-            raise UsageError("--shard and --jobs need --list", remedy="leave them out, or give --list FILE")
-        if self.list is None and not source:
-            raise UsageError(f"no {self.verb()} input was given", expected=f"{self.examples[0]}, or --list FILE")
-        if self.list is not None and source:
-            raise UsageError("give a source or a list, not both", got=f"{source} and --list {self.list}")
-        if self.list is None:
-            return super().act()
-        from mudg.fleet.listed import run_listed
-        from mudg.fleet.plan import read_list
-        from mudg.steps.command import words_of
-
-        one = type(self).build({positions(type(self))[0]: "{source}", "out": self.out, "overwrite": self.overwrite})
-        entries, settings, words = read_list(self.list, self.of_a_line), self.settings_in_list(), words_of(one)
-        how = {"jobs": self.jobs, "shard_text": self.shard, "listed": self.list}
-        return run_listed(words, settings, entries, self.out, **how)
-
-    def settings_in_list(self) -> Any:
-        """Settings of the steps over a list, several of which run at a time."""
-        return vars(self)["settings"]

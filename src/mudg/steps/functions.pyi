@@ -58,13 +58,10 @@ def adapt(
     ...
 
 def annotate(
-    scene: str | Path | None = None,
+    scene: str | Path,
     *,
     out: str | Path,
     overwrite: bool = False,
-    list: str | Path | None = None,
-    shard: str = '',
-    jobs: int = 0,
     config: str | Path | None = None,
     labeller: Literal['embedded', 'geometry', 'network'] = 'embedded',
     weights: str = '',
@@ -85,9 +82,6 @@ def annotate(
         scene: Scene directory written by ingest, or folder of mudg run.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
-        list: Process many sources: a file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Each result goes to OUT/NAME. The exit code is 0, or 10 + the number of failures.
-        shard: With --list: process the i-th of n parts of the list; i counts from 0 to n-1. A scene's part depends on its name alone. Use it to split a list over machines.
-        jobs: With --list: number of scenes processed at the same time (0 = one per processor).
         config: YAML file of settings, read before those given here.
         labeller: Source of classes and sky. embedded: the small shipped network, from image, heights and boxes. geometry: rules on heights and boxes, without a network. network: a segmentation network from `weights`.
         weights: labeller network: folder of a SegFormer, Mask2Former or EoMT with Cityscapes classes in the transformers format, or its name in the Hugging Face cache (owner/name or owner/name@revision). labeller embedded: folder of a network trained with tools/train_segmenter.py (empty = the shipped network).
@@ -464,13 +458,10 @@ def fit(
     ...
 
 def fuse(
-    scene: str | Path | None = None,
+    scene: str | Path,
     *,
     out: str | Path,
     overwrite: bool = False,
-    list: str | Path | None = None,
-    shard: str = '',
-    jobs: int = 0,
     config: str | Path | None = None,
     voxel_m: float = 0.0,
     occlusion_test: bool = True,
@@ -486,9 +477,6 @@ def fuse(
         scene: Scene directory written by ingest or annotate, or folder of mudg run.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
-        list: Process many sources: a file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Each result goes to OUT/NAME. The exit code is 0, or 10 + the number of failures.
-        shard: With --list: process the i-th of n parts of the list; i counts from 0 to n-1. A scene's part depends on its name alone. Use it to split a list over machines.
-        jobs: With --list: number of scenes processed at the same time (0 = one per processor).
         config: YAML file of settings, read before those given here.
         voxel_m: Keep one point per voxel of this size, in metres (0 = keep all).
         occlusion_test: Do not colour points that lie behind a nearer surface.
@@ -530,13 +518,10 @@ def import_asset(
     ...
 
 def ingest(
-    log: str = '',
+    log: str,
     *,
     out: str | Path,
     overwrite: bool = False,
-    list: str | Path | None = None,
-    shard: str = '',
-    jobs: int = 0,
     config: str | Path | None = None,
     resolution: str = '',
     workers: int = 0,
@@ -559,9 +544,6 @@ def ingest(
         log: LOG: folder of a dataset log, a scene directory, or the word city. FORMAT: its format, only needed if it is not recognised. OUT: the folder to write, in place of --out.
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
-        list: Process many sources: a file with one source per line (SOURCE [name=NAME] ...), or a folder of sources. Each result goes to OUT/NAME. The exit code is 0, or 10 + the number of failures.
-        shard: With --list: process the i-th of n parts of the list; i counts from 0 to n-1. A scene's part depends on its name alone. Use it to split a list over machines.
-        jobs: With --list: number of scenes processed at the same time (0 = one per processor).
         config: YAML file of settings, read before those given here.
         resolution: Image size of the scene: the longest side in pixels, e.g. 960, or WIDTHxHEIGHT (empty = as recorded). Images are never enlarged.
         workers: Threads that convert frames (0 = one per processor). The result does not depend on it.

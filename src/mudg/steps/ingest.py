@@ -7,13 +7,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Self, cast
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from mudg.base.errors import InputError, UsageError, similar_path
 from mudg.base.layout import SCENE_FILES
 from mudg.base.plugins import plugins
-from mudg.steps.engine import Listed, Make
-from mudg.steps.step import Flag, usage
+from mudg.steps.engine import Make, Output
+from mudg.steps.step import SCENE, Flag, usage
 
 if TYPE_CHECKING:
     from mudg.formats.settings import IngestConfig
@@ -27,14 +27,13 @@ OF_A_LOG = ("format", "frames", "cameras", "sequence", "poses", "boxes", "resolu
 """Settings that a generated city does not have."""
 
 
-class Ingest(Listed):
+class Ingest(Output):
     """Convert a driving log, or the built-in city, to a scene directory."""
 
     examples = (
         "mudg ingest city scenes/city",
         "mudg ingest ~/kitti/2011_09_26_drive_0001_sync scenes/kitti --resolution 960",
         "mudg ingest custom my_log scenes/mine --cameras front --frames 0:40",
-        "mudg ingest kitti --list drives.txt --out scenes --shard 0/4 --jobs 2",
     )
     smaller = "smaller images (--resolution; of a city --city.width), fewer --frames, one image at a time (--workers 1)"
     result = "scene"
@@ -47,27 +46,25 @@ class Ingest(Listed):
     parts = {"city": "Generate a city: a scene with exact truth."} | {
         name: f"Convert a log in the format {name} to a scene directory." for name in FORMATS
     }
-    log: Annotated[str, Flag("[FORMAT] LOG [OUT]", "first")] = ""
+    log: Annotated[str, Flag("[FORMAT] LOG [OUT]", "first")]
     """LOG: folder of a dataset log, a scene directory, or the word city. FORMAT: its format, only needed if it is not
     recognised. OUT: the folder to write, in place of --out."""
     settings: IngestConfig
-    of_a_line = ("format", "frames", "cameras", "sequence", "poses", "boxes", "seed")
 
     @classmethod
     def from_words(cls, words: Sequence[str], given: Mapping[str, Any]) -> dict[str, Any]:
-        """``[FORMAT] LOG [OUT]``, with ``--list`` ``[FORMAT] [OUT]``; the format is a setting."""
-        left, values, many, named = list(words), dict[str, Any](), "list" in given, "out" in given
-        of_a_log = (not many) + (not named)
+        """``[FORMAT] LOG [OUT]``; the format is a setting."""
+        left, values, named = list(words), dict[str, Any](), "out" in given
+        of_a_log = 1 + (not named)
         is_format = left and (left[0] in ("auto", *FORMATS) or left[0] in plugins("importer"))
         if is_format and (len(left) > of_a_log or not Path(left[0]).exists()):
             values["format"] = left.pop(0)
-        if not many and not left:
+        if not left:
             raise UsageError("no log was given", expected=usage(cls))
-        if not many:
-            values["log"] = left.pop(0)
+        values["log"] = left.pop(0)
         if left and not named:
             values["out"] = left.pop(0)
-        if left and not many and values["log"] != "city" and not Path(values["log"]).exists():
+        if left and values["log"] != "city" and not Path(values["log"]).exists():
             formats = ", ".join(("auto", *FORMATS, *plugins("importer")))
             raise UsageError("no such format and no such log", expected=formats, got=values["log"])
         if left:
@@ -115,21 +112,18 @@ class Ingest(Listed):
         return functools.partial(ingest.write_scene, self.settings, Path(self.log), self.kind)
 
 
-class Annotate(Listed):
+class Annotate(Output):
     """Add missing labels to a scene: semantics, sky and depth, with confidences."""
 
-    examples = ("mudg annotate scenes/kitti --out scenes/kitti_labelled", "mudg annotate --list scenes --out labelled")
+    examples = ("mudg annotate scenes/kitti --out scenes/kitti_labelled",)
     smaller = "one process (--processes 1), or smaller images (mudg ingest --resolution)"
     result = "scene"
     version, files = 4, (*SCENE_FILES, "labels.html", "pictures/*.jpg", "labelled/")
     idle = ("processes",)
     short = ("labeller", "weights", "depth_network", "device", "sweeps", "ego", "processes")
-    scene: Annotated[Path | None, Flag("[SCENE]", "first", "scene")] = None
+    scene: Annotated[Path, SCENE]
     """Scene directory written by ingest, or folder of mudg run."""
     settings: AnnotateConfig
-
-    def settings_in_list(self) -> AnnotateConfig:
-        return replace(self.settings, processes=1)
 
     def checked(self) -> Self:
         from mudg.labels import annotate as depth
@@ -149,17 +143,17 @@ class Annotate(Listed):
     def prepare(self, inputs: dict[str, str]) -> Make:
         from mudg.labels import annotate
 
-        return partial(annotate.write_labelled, self.settings, cast("Path", self.scene))
+        return partial(annotate.write_labelled, self.settings, self.scene)
 
 
-class Fuse(Listed):
+class Fuse(Output):
     """Fuse LiDAR and images: a static coloured point cloud, one more per dynamic object."""
 
-    examples = ("mudg fuse scenes/city --out runs/fused", "mudg fuse --list labelled --out fused --jobs 2")
+    examples = ("mudg fuse scenes/city --out runs/fused",)
     smaller = "larger voxels (--voxel-m), or a shorter log (mudg ingest --frames)"
     result = "fused"
     version, files = 2, ("static.safetensors", "objects/*.safetensors", "fuse.json", "top.png")
-    scene: Annotated[Path | None, Flag("[SCENE]", "first", "scene")] = None
+    scene: Annotated[Path, SCENE]
     """Scene directory written by ingest or annotate, or folder of mudg run."""
     settings: FuseConfig
 
@@ -167,6 +161,6 @@ class Fuse(Listed):
         from mudg.scene import fuse
         from mudg.scene.read import read_scene
 
-        scene = read_scene(cast("Path", self.scene))
+        scene = read_scene(self.scene)
         fuse.refuse_without_lidar(scene)
         return partial(fuse.write_fusion, self.settings, scene)
