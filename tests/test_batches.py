@@ -261,9 +261,10 @@ def test_a_slow_attempt_that_another_took_over_publishes_nothing(tmp_path: Path)
 def test_a_killed_step_is_tried_again_alone_and_with_less(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Stop, "sleep", lambda *_: None)
     made, order = Scenes(tmp_path, 2), tmp_path / "order"
-    made.does("s0", f"[ $MUDG_THREADS -gt 1 ] && kill -9 $$; echo a >> {order}; sleep 0.3; echo a >> {order}")
-    wait = f"while [ $(wc -l < {tmp_path}/tally/s0.runs) -lt 1 ]; do sleep 0.02; done"
-    made.does("s1", f"{wait}; sleep 0.5; echo b >> {order}")
+    both = f"while [ ! -f {tmp_path}/tally/s0.runs ] || [ ! -f {tmp_path}/tally/s1.runs ]; do sleep 0.02; done"
+    first = f"[ $MUDG_THREADS -gt 1 ] && {{ {both}; kill -9 $$; }}"
+    made.does("s0", f"{first}; echo a >> {order}; sleep 0.3; echo a >> {order}")
+    made.does("s1", f"{both}; sleep 0.5; echo b >> {order}")
     assert made.run(jobs=2, threads=4) == {"done": 2} and made.runs() == {"s0": 2, "s1": 1}
     assert "".join(order.read_text().split()) == "baa", "the second try waited for the other step"
     made.entries.append(Entry("s2", "/logs/2"))
