@@ -26,7 +26,7 @@ from mudg.core.fusion import SweepShots, fuse_sweeps
 from mudg.core.project import DrawLimits, PointLayer, draw_points
 from mudg.formats.importers import RECOGNISERS
 from mudg.formats.importers.pandaset import CLASS_OF, read_frame
-from mudg.scene.check import camera_alignment, check_scene, image_point_classes
+from mudg.scene.check import camera_alignment, check_scene
 from mudg.scene.read import read_image, read_points, read_scene
 
 truth = bad_logs.truth
@@ -430,10 +430,6 @@ def test_real_points_have_the_classes_of_the_boxes_they_lie_in(
     kept = np.isin(classes, [ID["car"], ID["truck"]])
     assert kept[vehicles].mean() > 0.97
     assert kept[~vehicles].mean() < 0.1
-    shown = image_point_classes(scene, scene.frames[0])
-    sky = shown.row < 20  # of 180 rows: what the LiDAR meets there is no road
-    assert ID["road"] not in shown.classes[sky]
-    assert (shown.classes[shown.row > 150] == ID["road"]).mean() > 0.5
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ from mudg.base.errors import InputError
 from mudg.base.types import EgoPath, Photo, Scene, Source, SweepPoints
 from mudg.core.fusion import FusionRules, SweepShots, fuse_sweeps
 from mudg.labels.settings import AnnotateConfig
-from mudg.scene.check import image_point_classes
 from mudg.scene.read import read_points, read_scene
 from mudg.scene.write import SceneWriter
 from mudg.steps.ingest import Annotate
@@ -117,22 +116,3 @@ def test_fused_clouds_carry_the_classes_of_points_before_those_of_images() -> No
     assert semantics is not None
     assert (semantics == palette.ID["bicycle"]).all()
     assert fused_classes("none", labels=False)[0] is None
-
-
-def test_classes_in_an_image_are_those_of_its_pixels_also_for_a_car_that_drives(tmp_path: Path) -> None:
-    street = replace(PARKED, car_velocity=(15.0, 0.0))
-    scene = write(street, tmp_path / "scene")
-    frame = scene.frames[2]
-    _, truth, depth = street.image(street.view(street.times[2] + 0.02))
-    found = image_point_classes(scene, frame)
-    right = found.classes == truth[found.row, found.column]
-    assert right.mean() > 0.99  # only at borders a pixel's centre may meet another thing than the point
-    car = found.classes == palette.ID["car"]
-    assert car.sum() > 30
-    assert right[car].mean() > 0.9
-    assert np.median(np.abs(found.depth_m - depth[found.row, found.column])) < 0.1
-    hidden = depth[found.row, found.column] < found.depth_m - 1.0
-    assert hidden.mean() < 0.01  # behind the panel that the LiDAR looks over
-    assert image_point_classes(scene, frame, max_gap_s=0.001) is None
-    plain = street.write(tmp_path / "plain")
-    assert image_point_classes(plain, plain.frames[0]) is None

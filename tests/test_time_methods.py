@@ -24,9 +24,8 @@ from mudg.baselines import emernerf as rays
 from mudg.baselines import pvg
 from mudg.baselines.bezier import BezierNode, bernstein, distance_change, fit_path
 from mudg.baselines.omnire import DeformationField, DeformedNode
-from mudg.baselines.pvg import VibrationNode, average_velocity, moving_rows, starting_columns
+from mudg.baselines.pvg import VibrationNode, average_velocity, starting_columns
 from mudg.baselines.s3gaussian import SHORT_GAIN, HexPlaneNode, plane_smoothness
-from mudg.baselines.s3gaussian import moving_rows as hexplane_moving
 from mudg.baselines.timed import FlatNetwork, waves
 from mudg.core import losses, metrics
 from mudg.core.grids import PlaneSizes
@@ -149,8 +148,6 @@ def test_children_lie_on_their_parents_path():
     assert born["means"][:, 0].tolist() == pytest.approx([3 * math.exp(-0.1) * 0.04, -3 * math.exp(-0.0125) * 0.01])
     assert born["log_beta"].exp().tolist() == pytest.approx([0.04 / 1.6, 0.005])
     assert node.born_later(columns, torch.zeros(2), late=False)["log_beta"].tolist() == columns["log_beta"].tolist()
-    assert moving_rows(columns).tolist() == [True, True]
-    assert moving_rows(columns, 0.01).tolist() == [False, True]
 
 
 @pytest.mark.parametrize(("step", "late", "rows"), [(10, 20, 5), (20, 20, 6)])
@@ -331,7 +328,6 @@ def test_what_is_far_from_the_frustum_is_not_asked():
     means = torch.from_numpy(np.stack([center + 20 * look, center - 20 * look])).float()
     assert node.asked(means).tolist() == [0, 1]
     assert node.with_values(view=view).asked(means).tolist() == [0]
-    assert hexplane_moving(torch.tensor([[0.0, 0, 0], [0.0, 3, 0]])).tolist() == [False, True]
 
 
 def test_the_losses_of_s3gaussian_by_hand():

@@ -114,12 +114,6 @@ def starting_columns(count: int, tau: Tensor, duration: float) -> dict[str, Tens
     return {"tau": tau.float(), "log_beta": torch.full((count,), math.log(beta)), "velocity": torch.zeros(count, 3)}
 
 
-def moving_rows(columns: Mapping[str, Tensor], least_beta: float = 0.2) -> Tensor:
-    """Bool[N]: Gaussians that show for a short while only, which draw what moves (published: all with beta at most
-    0.2)."""
-    return columns["log_beta"].detach().exp() <= least_beta
-
-
 # pvg ----------------------------------------------------------------------------------------------
 
 SMOOTHING_PROBABILITY: Final = 0.5

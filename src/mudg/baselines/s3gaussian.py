@@ -155,13 +155,6 @@ def _near_frustum(view: View, means: Tensor) -> Tensor:
     return (z > -margin) & (x.abs() < ahead * across + margin) & (y.abs() < ahead * down + margin)
 
 
-def moving_rows(displacement_m: Tensor) -> Tensor:
-    """Bool[N]: Gaussians whose largest displacement component ``[N, 3]`` is above the mean of all (published rule for
-    display)."""
-    largest = displacement_m.detach().abs().amax(1)
-    return largest > largest.mean()
-
-
 def plane_smoothness(node: HexPlaneNode) -> tuple[Tensor, Tensor, Tensor]:
     """Three scalars, sums over planes: mean squared second differences of the planes of space (both axes) and of time
     (along the time), and the mean |1 - value| of the planes of time."""
