@@ -3,6 +3,7 @@ keeps."""
 
 from __future__ import annotations
 
+import io
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 from fit_settings import fit_config
+from PIL import Image
 from test_clips import RULES, image_of_wall, stripes, view_at, wall
 from tiny_networks import small_mdm
 from toy_published import write_tiny
@@ -25,6 +27,7 @@ from mudg.base.weather_settings import Conditions
 from mudg.benchmarks import run as bench
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core.edit import Motion
+from mudg.core.pictures import to_bytes
 from mudg.core.weather import DriveFacts
 from mudg.core.weather.gbuffer import Surroundings
 from mudg.core.weather.light import SRGB
@@ -36,22 +39,28 @@ from mudg.diffusion.model import MDM
 from mudg.diffusion.published import PublishedMDM
 from mudg.diffusion.requests import SampleRequest, StartClip
 from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
+from mudg.diffusion.synthesize import JobInputs, view_maker
 from mudg.diffusion.views import recorded_images
 from mudg.editing import harmonised
-from mudg.editing.harmonised import Touched, corrected, guarded, pasted, soft_edge
+from mudg.editing.harmonised import RenderMixer, Touched, corrected, guarded, pasted, soft_edge
 from mudg.editing.plan import Actor, EditPlan, EditSources, EditWorld, plan_edits
 from mudg.editing.recorded import boxes_mask, cleared_cloud, ground_mask, photos_of_edited, vacated_at
 from mudg.editing.script import parse_edits
 from mudg.editing.settings import EditConfig, RenderConfig
 from mudg.gaussians import fit
+from mudg.gaussians.rendering import raster_of, render_view
+from mudg.gaussians.storage import load_model
 from mudg.scene.clouds import read_fused
 from mudg.scene.labels import read_label
 from mudg.scene.observations import read_observations
 from mudg.scene.read import read_image, read_scene
+from mudg.sim.optics import Pinhole
+from mudg.sim.session import CameraRequest, Instant, Session
 from mudg.steps.edit import Edit
 from mudg.steps.fit import Fit
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
+from mudg.viewer.live import FrameRequest, FrameSource
 
 CAR = (0.6, 1.0, 1.0)
 
@@ -293,7 +302,8 @@ def test_a_sample_stays_at_its_start_where_it_is_not_free(run: Path) -> None:
 
 
 def test_a_repaired_view_is_the_mean_of_render_and_generated_view(run: Path, tmp_path: Path) -> None:
-    """Against the folders that render and synthesize write, mixed here in numpy; the same after an interruption."""
+    """Against what render writes and what the model makes of each view, mixed here in numpy; the same after an
+    interruption."""
     shifts = {"shifts_m": (1.0,), "video": False, "device": "cpu"}
     how = HarmonizeConfig(model=str(run / "model"), steps=1, precision="float32")
     parts = {"scene": run / "scene", "model": run / FITTED}
@@ -305,10 +315,12 @@ def test_a_repaired_view_is_the_mean_of_render_and_generated_view(run: Path, tmp
         settings=RenderConfig(**shifts, repair=True, harmonize=how),
     )
     again = SynthesizeConfig(model=how.model, shifts_m=(1.0,), steps=1, processes=1, precision="float32", device="cpu")
-    made = synthesized(run, tmp_path / "made", again, fitted=run / FITTED)
+    inputs, model = JobInputs(run / "scene", run / "fuse", run / FITTED), files.load(how.model)
     name = "front_shift+1.0"
+    views = [seen.view for seen in views_of(plain, name)]
+    made = [view_maker(again, inputs, [view], model, None).make([view], 0, None)[2][0] for view in views]
     repaired = views_of(step.run(), name)
-    for render, view, one in zip(views_of(plain, name), views_of(made, name), repaired, strict=True):
+    for render, view, one in zip(views_of(plain, name), made, repaired, strict=True):
         share = (view.confidence / (1 + view.confidence)).numpy()
         wanted = (1 - share) * render.rgb.numpy() + share * view.rgb.numpy()
         assert np.abs(one.rgb.numpy() - wanted).max() < 2 / 255  # each was rounded to 8 bits
@@ -326,6 +338,41 @@ def test_a_repaired_view_is_the_mean_of_render_and_generated_view(run: Path, tmp
     store.write_json(folder / "run.json", state)
     step.run()
     assert {path.name: path.read_bytes() for path in (folder / name / "rgb").iterdir()} == whole
+
+
+def test_sessions_and_exact_frames_are_repaired_like_renders(run: Path) -> None:
+    """Pictures of a session and frames of the viewer against one view of ``RenderMixer``, with the shipped model."""
+    scene, model = read_scene(run / "scene"), load_model(run / FITTED)
+    raster = raster_of(model)
+    frame = scene.frames_of("front")[1].view
+    pose = frame.world_from_cam @ geometry.from_rotation_translation(np.eye(3), [-0.5, 0.0, 0.0])
+    view, camera = replace(frame, world_from_cam=pose), frame.camera
+    mixer = RenderMixer(JobInputs(run / "scene", run / "fuse", run / FITTED), HarmonizeConfig(), "cpu")
+    render = render_view(model, view, raster)
+    wanted = to_bytes(mixer(view, render).rgb)
+    assert np.abs(wanted.astype(int) - to_bytes(render.rgb)).max() > 5
+    session = Session(run, device="cpu", repair=True)
+    start = Instant(view.time_s, pose)
+    asked = CameraRequest(
+        optics=Pinhole(camera.width, camera.height, *camera.intrinsics), start=start, layers=("rgb",), colors_of="front"
+    )
+    assert np.abs(session.render([asked])[0].layers["rgb"].astype(int) - wanted).max() <= 1
+    for other in (
+        replace(asked, start=replace(start, objects={})),
+        replace(asked, end=Instant(view.time_s + 0.1, pose)),
+    ):
+        with pytest.raises(UsageError, match="cannot be repaired"):
+            session.render([other])
+    with pytest.raises(UsageError, match="repaired here"):
+        Session(run / FITTED, scene=run / "scene", repair=True)
+    source = FrameSource(lambda _: [model], scene, 1600, torch.device("cpu"), [mixer])
+    lens = {name: getattr(camera, name) for name in ("width", "height", "fx", "fy", "cx", "cy")}
+    at = {"eye": pose[:3, 3].tolist(), "axes": pose[:3, :3].T.tolist(), "time_s": view.time_s}
+    question = FrameRequest(scene=0, layer="color", hidden=[], camera="front", **lens, **at)
+    shown = lambda request: np.asarray(Image.open(io.BytesIO(source.png(request)))).astype(int)
+    assert np.abs(shown(question) - wanted).max() <= 1
+    plain = render_view(model.without_nodes(["car"]), view, raster)
+    assert np.abs(shown(question.model_copy(update={"hidden": ["car"]})) - to_bytes(plain.rgb)).max() <= 1
 
 
 def test_what_cannot_be_repaired_is_refused(run: Path, tmp_path: Path) -> None:

@@ -229,9 +229,9 @@ _recorded_again = functools.lru_cache(maxsize=1)(recorded_drive)
 
 
 def view_maker(
-    config: SynthesizeConfig, inputs: JobInputs, views: Sequence[View], model: DiffusionModel, scratch: Path
+    config: SynthesizeConfig, inputs: JobInputs, views: Sequence[View], model: DiffusionModel, scratch: Path | None
 ) -> ViewMaker:
-    """What makes the views of one path; ``scratch``: a folder for what is large."""
+    """What makes the views of one path; ``scratch``: a folder for what is large (None: it stays in memory)."""
     drive = _recorded_again(config, inputs) if inputs.edited is None else inputs.edited(config, inputs)
     cloud = drive.cloud if config.given_classes else without_classes(drive.cloud)
     camera = views[0].camera

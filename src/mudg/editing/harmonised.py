@@ -19,7 +19,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Final, Protocol
 
 import numpy as np
@@ -311,25 +310,32 @@ class RepairedViews:
 
 
 class RenderMixer:
-    """Views of a fit, mixed with what the diffusion model makes of them, window after window along a path.
+    """Views of a fit, each mixed with what the diffusion model makes of it.
 
     The model makes the view once more, from the fused points, the photographs and the render, and says how sure it is.
-    ``inputs``: folders of the scene, its clouds and the fit. ``scratch``: a folder for what is large.
+    What it makes of a view does not depend on other views: in windows of a path they come out the same to 58 dB.
+
+    Args:
+        inputs: folders of the scene, its clouds and the fit.
+
+    Raises:
+        UsageError: a published-type model, which makes clips of many frames from noise, or one that uses no renders.
     """
 
-    def __init__(self, inputs: JobInputs, config: HarmonizeConfig, device: str, scratch: Path) -> None:
-        alone = is_published(config.model)
-        self._settings = loading.check_config(settings_of(config, device), fitted=not alone)
-        self._inputs = replace(inputs, fitted=None) if alone else inputs
-        self._model, self._scratch = loading.load_any(self._settings), scratch
+    def __init__(self, inputs: JobInputs, config: HarmonizeConfig, device: str) -> None:
+        if is_published(config.model):
+            what, expected = "a published-type model uses no renders and cannot repair them", "a small model"
+            raise UsageError(what, where="--harmonize.model", expected=expected, got=config.model)
+        self._settings = loading.check_config(settings_of(config, device), fitted=True)
+        self._inputs, self._model = inputs, loading.load_any(self._settings)
+        self._maker: tuple[tuple[int, int], ViewMaker] | None = None
 
-    def along(self, views: Sequence[View], draw: DrawPair) -> Iterator[Observation]:
-        """The views of a path, in order; ``draw`` makes their renders."""
-        maker = view_maker(self._settings, self._inputs, views, self._model, self._scratch)
-        spans = maker.spans(len(views), self._settings.overlap)
-        for number, fresh, made in maker.along(views, spans):
-            for index in fresh if made is not None else ():
-                yield mixed(draw(views[index])[1], made[2][index - spans[number].start])
+    def __call__(self, view: View, render: Observation) -> Observation:
+        """The view, from its render, which has its depth."""
+        size = view.camera.width, view.camera.height
+        if self._maker is None or self._maker[0] != size:
+            self._maker = size, view_maker(self._settings, self._inputs, [view], self._model, None)
+        return mixed(render, self._maker[1].make([view], 0, None)[2][0])
 
 
 def mixed(render: Observation, generated: Observation) -> Observation:

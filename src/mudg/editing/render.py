@@ -83,7 +83,7 @@ def prepare(
     if config.repair and (edited is None or FACT in edited[1].facts):
         what, expected = "only a fit of the drive as it was recorded can be repaired", "Gaussians made by fit"
         raise UsageError(what, where="--repair", expected=expected, got=str(model), remedy="leave it out")
-    if edited is not None and (config.harmonize.on or config.repair):
+    if edited is not None and config.harmonize.on:
         lengths = {one.name: len(one) for one in trajectories(edited[0], config, path)}
         harmonised.check_paths(config.harmonize, lengths)
     return edited
@@ -112,11 +112,8 @@ def write_views(
         loaded, fitted, drive = edited or _edited(scene, model, None)
         draw, source = _scene_drawer(config, fitted.to(device))
         if config.repair:
-            mixer = harmonised.RenderMixer(
-                JobInputs(scene, cast("Path", fused), model), config.harmonize, config.device, out
-            )
-            draw = RepairedViews(mixer, functools.partial(_twice, draw))
-            followers.append(draw)
+            inputs = JobInputs(scene, cast("Path", fused), model)
+            draw = mixing(harmonised.RenderMixer(inputs, config.harmonize, config.device), draw)
         if config.harmonize.on and drive is not None:
             draw = _repaired(config, drive, fitted, scene, model, draw)
             followers.append(draw)
@@ -129,7 +126,7 @@ def write_views(
                 followers.append(draw)
     paths = trajectories(loaded, config, path)
     _require_memory(paths)
-    threads = 1 if followers or device.type != "cpu" else native.threads()
+    threads = 1 if followers or config.repair or device.type != "cpu" else native.threads()
     with (
         log.task(f"render {source}", sum(len(path) for path in paths)) as bar,
         memory_of(device, "render"),
@@ -165,6 +162,11 @@ def _edited(
         return loaded, fitted, None
     drive = carry_out(script, fitted, loaded, None if fused is None else read_fused(Path(fused)))
     return drive.scene or loaded, drive.model(fitted), drive
+
+
+def mixing(mixer: harmonised.RenderMixer, draw: Drawer) -> Drawer:
+    """What draws views and repairs each."""
+    return lambda view: mixer(view, draw(view))
 
 
 def _twice(draw: Drawer, view: View) -> tuple[Observation, Observation]:

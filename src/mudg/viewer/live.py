@@ -26,8 +26,10 @@ from mudg.core.pictures import class_colors, depth_colors, to_bytes
 from mudg.core.table import Table
 from mudg.diffusion.inputs import InWeather
 from mudg.editing.apply import FACT, Drawer, EditedDrive, carry_out, in_weather, left_behind, street_left, weather_of
+from mudg.editing.harmonised import RenderMixer
 from mudg.editing.model import motion_of
 from mudg.editing.plan import EditPlan
+from mudg.editing.render import mixing
 from mudg.editing.runs import find_run
 from mudg.editing.script import EditScript, conditions_of, parse_edits, read_edits
 from mudg.formats.exporters.video import mp4_bytes
@@ -304,11 +306,18 @@ def _drawer_of(model: SceneModel) -> Drawer:
 class FrameSource:
     """Draws frames of one or two fitted scenes, one at a time. ``edited``: the scenes with a script carried out; "" =
     as they are. ``scene``: the log; its recorded views tell the light of the drive, where a script asks for other
-    weather or light. ``widest``: pixels of the widest frame."""
+    weather or light. ``widest``: pixels of the widest frame. ``mixers``: by number of the scene, what repairs frames of
+    it as it was fitted."""
 
     def __init__(
-        self, edited: Callable[[str], Sequence[SceneModel]], scene: Scene, widest: int, device: torch.device
+        self,
+        edited: Callable[[str], Sequence[SceneModel]],
+        scene: Scene,
+        widest: int,
+        device: torch.device,
+        mixers: Sequence[RenderMixer] = (),
     ) -> None:
+        self._mixers = mixers
         self._edited, self._scene, self._widest, self._device = edited, scene, widest, device
         self._shown: _Shown | None = None
         self._lock, self._filming = threading.Lock(), threading.Lock()
@@ -360,6 +369,8 @@ class FrameSource:
             gone = [name for name in request.hidden if name in model.node_names()]
             seen = model if request.camera else over_ground(model)
             draw = _drawer_of(seen.without_nodes(gone) if gone else seen)
+            if self._mixers and request.layer != "class" and not gone and not request.edits.strip():
+                return mixing(self._mixers[index], draw)
             conditions = conditions_of(model.facts.get(FACT, {}).get("script", ()))
             if conditions is None or request.layer != "color":
                 return draw

@@ -21,7 +21,10 @@ from mudg.base.run_folder import ResultFile, refuse_overlap
 from mudg.base.types import FusedCloud, Scene
 from mudg.core.edit import HeightMap
 from mudg.core.raster.rasterize import drawing_device
+from mudg.diffusion.settings import HarmonizeConfig
+from mudg.diffusion.synthesize import JobInputs
 from mudg.editing.apply import SEED, ground_of
+from mudg.editing.harmonised import RenderMixer
 from mudg.editing.runs import RunParts, find_run
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.storage import load_model, model_of_scene
@@ -310,7 +313,8 @@ def server_of(
 ) -> tuple[SiteServer, Site]:
     """The server of a run's page, listening, and what it serves."""
     token = token_for(config.host, config.token)
-    shown = find_shown(config, run, scene, compare)
+    sources = find_sources(config, run, scene, compare)
+    shown, mixers = sources.read(), _mixers(config, sources, run)
     layers = list(LAYERS) if config.exact else []
     desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), files or EditFiles())
     live = {"layers": layers, "token": token, "edits": desk.entries(), "place": desk.place.name, "run": desk.run}
@@ -325,8 +329,20 @@ def server_of(
     streams: dict[str, Stream] = {}
     answers: dict[str, Answer] = {"edits": lambda asked: desk.answer(parse_record(EditRequest, asked, "request"))}
     if config.exact:
-        source = FrameSource(desk.edited, shown.scene, config.width_px, drawing_device(config.device, "view"))
+        device = drawing_device(config.device, "view")
+        source = FrameSource(desk.edited, shown.scene, config.width_px, device, mixers)
         answers["frame"] = lambda asked: (source.png(parse_record(FrameRequest, asked, "request")), "image/png")
         streams["video"] = lambda asked, send: source.film(parse_record(VideoRequest, asked, "request"), send)
     site = Site(served, answers, token, streams)
     return open_server(site, config.host, config.port), site
+
+
+def _mixers(config: ViewConfig, sources: ShownSources, run: Path) -> list[RenderMixer]:
+    """What repairs exact frames of each fit. UsageError: they are wanted without clouds, or of edited Gaussians."""
+    if not config.repair:
+        return []
+    if sources.cloud is None or not config.exact:
+        what, remedy = "exact frames are repaired from the clouds of a run", "give the folder of a run"
+        raise UsageError(what, where="--repair", got=str(run), remedy=remedy)
+    inputs = [JobInputs(sources.scene, sources.cloud, folder) for folder, _ in sources.fits]
+    return [RenderMixer(each, HarmonizeConfig(), config.device) for each in inputs]
