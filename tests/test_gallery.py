@@ -57,6 +57,10 @@ def test_a_page_has_a_card_and_the_scores_of_every_run(tmp_path: Path) -> None:
     store.write_text(runs / "c" / "viewer_page" / "index.html", "a large viewer page")
     found = gallery.run([runs, runs / "c"], tmp_path / "pages" / "all.html")
     assert found["shown"] == 4  # c once
+    (tmp_path / "fleet" / "_batch").mkdir(parents=True)
+    for name in ("c1", "c2"):
+        run_of(tmp_path / "fleet" / name / "run" / "0123456789ab")
+    assert gallery.run([tmp_path / "fleet"], tmp_path / "fleet.html")["shown"] == 2
     page = (tmp_path / "pages" / "all.html").read_text()
     assert 'href="../runs/a%20b/report.html"' in page and 'href="../runs/bench/page.html"' in page
     assert "viewer.html" not in page  # there is none, but a folder

@@ -78,7 +78,7 @@ class Report(Step):
     result = "page"
     examples = ("mudg report runs/kitti runs/city --out runs.html", "mudg report runs --out runs.html")
     runs: Annotated[tuple[Path, ...], Flag("RUN ...", "rest")]
-    """Folders of mudg run, score or bench; of any other folder, the folders in it."""
+    """Folders of mudg run, score, bench or batch; of any other folder, the folders in it."""
     out: Annotated[Path, Flag("FILE.html")]
     """Page to write."""
     overwrite: bool = False

@@ -19,6 +19,7 @@ from mudg.base import html, log, store
 from mudg.base.errors import InputError, UsageError
 from mudg.base.records import understood
 from mudg.base.run_folder import ResultFile
+from mudg.fleet.plan import BOOKKEEPING
 from mudg.scoring.tables import TERMINAL_METRICS, number_text
 from mudg.viewer.report import viewer_address
 
@@ -205,7 +206,8 @@ def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str
     """Write the page of finished runs, scores and benchmarks.
 
     Args:
-        runs: folders of ``mudg run``, ``mudg score`` or ``mudg bench``; of any other folder, those directly in it.
+        runs: folders of ``mudg run``, ``mudg score`` or ``mudg bench``; of any other folder, those directly in it; of
+            ``mudg batch``, the runs of its logs.
         out: the file to write. overwrite: replace it if it exists.
 
     Returns:
@@ -245,11 +247,13 @@ def run(runs: Sequence[Path], out: Path, *, overwrite: bool = False) -> dict[str
 
 
 def _folders(runs: Sequence[Path]) -> list[Path]:
-    """The folders asked for, each once; a folder that is no run stands for the folders in it."""
+    """The folders asked for, each once; a folder that is no run stands for the folders in it, one of ``mudg batch`` for
+    the runs of its logs."""
     found: list[Path] = []
     for given in map(Path, runs):
         own = any((given / name).is_file() for name in (store.RUN_STATE, "bench.json"))
-        below = [] if own or not given.is_dir() else sorted(given.iterdir())
+        pattern = "*/run/*" if (given / BOOKKEEPING).is_dir() else "*"
+        below = [] if own or not given.is_dir() else sorted(given.glob(pattern))
         inside = [one for one in below if one.is_dir() and not one.name.startswith((".", "_"))]
         found += [one for one in inside or [given] if one.resolve() not in {known.resolve() for known in found}]
     return found
