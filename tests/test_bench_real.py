@@ -18,7 +18,7 @@ from mudg.base.palette import ID
 from mudg.base.types import Camera, Observation, SweepPoints, View
 from mudg.baselines.settings import MethodConfig
 from mudg.benchmarks import columns, places, real
-from mudg.benchmarks.chain import Chain, FillViews
+from mudg.benchmarks.chain import FillViews
 from mudg.benchmarks.places import PROTOCOLS, SPLITS
 from mudg.benchmarks.rows import real_rows
 from mudg.benchmarks.settings import BenchConfig
@@ -28,7 +28,7 @@ from mudg.core import calibration, lidar
 from mudg.core.fusion import STATIC
 from mudg.diffusion import model_files as mdm_files
 from mudg.diffusion.model import MDM
-from mudg.diffusion.settings import AdaptConfig, SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing import render
 from mudg.editing.settings import RenderConfig
 from mudg.formats import ingest
@@ -52,10 +52,9 @@ def city(tmp_path_factory):
     return Ingest(log=ingest.CITY, out=tmp_path_factory.mktemp("log") / "city", settings=settings).run()
 
 
-def job_of(out, source, split, config, model="", rows=()):
+def job_of(out, source, split, config, rows=()):
     """A log under a way of hiding."""
-    adapt = dataclasses.replace(ADAPT, model=model) if model else ADAPT
-    return real.SplitJob(out, source, split, (), rows, config, adapt, False)
+    return real.SplitJob(out, source, split, (), rows, config, False)
 
 
 # ---- what is hidden ------------------------------------------------------------------------------
@@ -150,15 +149,11 @@ def model(tmp_path_factory):
     return str(folder)
 
 
-ADAPT = AdaptConfig(block=1, held_out_every=2, fit_iterations=2, steps=1, shifts_m=(2.0,), gaps=False, batch_frames=2)
-"""Such an adaptation takes a second."""
-
-
 def made_from(source, out, split, model):
     """Everything that methods make of a log under a split, by name, as bytes."""
     settings = {"fit": MethodConfig(densify={"kind": "none"}), "synthesize": SynthesizeConfig(steps=1, shifts_m=(2.0,))}
     config = BenchConfig(model=model, iterations=6, methods=("nearest_fill", "mudg_s"), **settings)
-    job = job_of(out, source, split, config, model, real_rows(config))
+    job = job_of(out, source, split, config, real_rows(config))
     whole = read_scene(source)
     held = places.held_out(whole, split, ())
     job.write_seen(whole, held)
@@ -186,7 +181,6 @@ def test_held_out_content_changes_no_fit_no_cloud_no_model_and_no_view(city, mod
     held = places.held_out(scene, split, ())
     corrupted(scene, tmp_path / "noise", set(held.frames), set(held.sweeps))
     assert any("fit/mudg_s" in name for name in plain) and any("virtual/" in name for name in plain)
-    assert any("adapt/model/weights" in name for name in plain)
     assert any("render/mudg_s" in name for name in plain) and any("fuse/static" in name for name in plain)
     again = made_from(tmp_path / "noise", tmp_path / "out", split, model)
     assert [name for name in plain if again[name] != plain[name]] == [] and set(again) == set(plain)
@@ -426,14 +420,14 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     split = out / "city" / "gap-1"
     watched = [split / "fit" / "street_gaussians" / "run.json", out / "city" / "truth" / "lidar" / "run.json"]
     before = [path.stat().st_mtime_ns for path in watched]
-    added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_s-no-renders", "mudg_r-no-adapt")
+    added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_s-no-renders", "mudg_r")
     variant, settings = ("rough=densify.kind:none,method:gs3d",), SynthesizeConfig(shifts_m=(2.0,))
     changes = {"methods": added, "protocols": ("gap-1",), "model": model, "variant": variant, "synthesize": settings}
     more = dataclasses.replace(config, **changes)
     real.run(more, [city], out)
     assert [path.stat().st_mtime_ns for path in watched] == before
     document = store.read_json(out / "bench.json")
-    names = ["street_gaussians", "street_gaussians-longer", "mudg_r-no-adapt", "mudg_s", "mudg_s-no-renders", "rough"]
+    names = ["street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_s", "mudg_s-no-renders", "rough"]
     assert [row["name"] for row in document["methods"]] == names
     assert isinstance(document["protocols"]["gap-1"]["against"]["mudg_s"]["psnr"], float)
     start = store.digest(split / "fit" / "street_gaussians")
@@ -447,53 +441,24 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     assert {of: inputs[of].get("fitted") for of in inputs} == {"points": None, "renders": start}
 
 
-@pytest.mark.slow
-def test_a_log_too_short_to_adapt_to_is_compared_without_and_says_so(made, city):
-    out, _ = made  # with the methods added above
-    document = store.read_json(out / "bench.json")
-    used = document["logs"][0]["diffusion"]["gap-1"]
-    assert (used["mudg_s"]["sees"], used["mudg_s-no-renders"]["sees"]) == ("renders", "points")
-    assert "not adapted to the log: it is too short" in used["mudg_s"]["note"] and not used["mudg_r-no-adapt"]["note"]
-    words = "city: mudg_s: the model was not adapted to the log: it is too short"
-    assert words in (out / "bench.md").read_text() and words in (out / "page.html").read_text()
-    assert set(document["protocols"]["gap-1"]["pooled"]) >= {"mudg_s", "mudg_s-no-renders"}
-
-
-def test_an_adapted_model_is_used_where_it_helps_and_an_error_of_adapting_is_said(city, model, tmp_path, monkeypatch):
-    job = job_of(tmp_path / "out", city, SPLITS["all"], BenchConfig(model=model, iterations=4), model)
-    scene = read_scene(city)
-    job.write_seen(scene, places.held_out(scene, SPLITS["all"], ()))
-    chain = job.chain()
-    monkeypatch.setattr(Chain, "first", lambda _: tmp_path / "first")
-    monkeypatch.setattr(real.Adapt, "run", lambda _: job.folder / "adapt" / "model")
-    numbers = {"before": {"psnr": 20.0}, "after": {"psnr": 21.0}}
-    for helped, sees in ((True, "adapted"), (False, "renders")):
-        store.write_json(job.folder / "adapt" / "adapt.json", {"adapted": helped, **numbers})
-        use = job.use("adapted", chain)
-        assert use.sees == sees and "20.00 dB before, 21.00 dB after" in use.note
-        assert use.model == (str(job.folder / "adapt" / "model") if helped else model)
-
-    def fail(*_, **__):
-        raise InputError("the log is too short to adapt to", got="1 clip")
-
-    monkeypatch.setattr(real.Adapt, "run", fail)
-    use = job.use("adapted", chain)
-    assert (use.sees, use.model) == ("renders", model) and "too short to adapt to, 1 clip" in use.note
+def test_a_model_without_renders_sees_points_and_says_so(city, model, tmp_path):
+    job = job_of(tmp_path / "out", city, SPLITS["all"], BenchConfig(model=model, iterations=4))
+    assert job.use("renders") == real.DiffusionUse("renders", model)
+    assert job.use("points") == real.DiffusionUse("points", model)
     plain = str(tmp_path / "plain")
     mdm_files.save(MDM(SMALL), tmp_path / "plain", "a model without renders", {})
-    use = dataclasses.replace(job, config=BenchConfig(model=plain)).use("adapted", chain)
+    use = dataclasses.replace(job, config=BenchConfig(model=plain)).use("renders")
     assert (use.sees, use.model) == ("points", plain) and "does not use renders" in use.note
-    assert job.use("points", chain) == real.DiffusionUse("points", model)
 
 
 def test_rows_say_what_they_leave_out():
     config = BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",))
     rows = {row.name: row for row in real_rows(config)}
-    base, ends = "street_gaussians street_gaussians-longer", ("", "-no-adapt", "-no-renders")
+    base, ends = "street_gaussians street_gaussians-longer", ("", "-no-renders")
     assert list(rows) == [*base.split(), *(f"mudg_{one}{end}" for one in "rs" for end in ends), "a"]
     sees = {name: rows[name].sees for name in (*(f"mudg_s{end}" for end in ends), "a")}
-    assert list(sees.values()) == ["adapted", "renders", "points", "adapted"]
-    assert rows["mudg_s"].title != rows["mudg_s-no-adapt"].title
+    assert list(sees.values()) == ["renders", "points", "renders"]
+    assert rows["mudg_s"].title != rows["mudg_s-no-renders"].title
 
 
 CLASS_NAMES = {"5": "Road", "7": "Building"}

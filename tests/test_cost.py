@@ -25,7 +25,7 @@ DEMO = cost.SceneSize(images=72, path_images=24, width=384, height=256, points=1
 """What `mudg demo` makes."""
 FAST = cost.SceneSize(images=12, path_images=12, width=240, height=160, points=100_600)
 UNLABELLED = {"points": 31_336, "exact": False, "labelled": False}
-LOG = cost.SceneSize(images=16, path_images=16, width=480, height=145, **UNLABELLED, adapts=True)
+LOG = cost.SceneSize(images=16, path_images=16, width=480, height=145, **UNLABELLED)
 SIX = (2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
 SLOWER = 0.46
 """Speed of two cores without AVX-512, as the probe found it between the runs."""
@@ -48,11 +48,11 @@ def city(images: int, path_images: int, width: int, height: int) -> cost.SceneSi
     return cost.SceneSize(images, path_images, width, height, 100_600)
 
 
-def drive(frames: int, width: int, height: int, adapts: bool = False) -> cost.SceneSize:
-    return cost.SceneSize(frames, frames, width, height, **UNLABELLED, adapts=adapts)
+def drive(frames: int, width: int, height: int) -> cost.SceneSize:
+    return cost.SceneSize(frames, frames, width, height, **UNLABELLED)
 
 
-WHOLE, SHORT = replace(LOG, width=1242, height=375), settings("default", 60, (2.0,))
+WHOLE = replace(LOG, width=1242, height=375)
 MEASURED = {
     # run: settings, scene, cores, speed; seconds by the clock, processor seconds, most memory in MB, results in MB,
     # from its run.json
@@ -61,8 +61,7 @@ MEASURED = {
     "demo --fast with six trajectories": (settings("fast", 250, SIX), FAST, 1, 1.0, None, 115.4, 1641, None),
     "demo --fast, slower machine": (settings("fast"), FAST, 2, SLOWER, None, 153.0, 1859, 75.0),
     "run --fast on a KITTI drive, slower machine": (settings("fast"), LOG, 2, SLOWER, None, 231.5, 1948, 122.6),
-    "run on that drive at full size": (settings("default"), WHOLE, 2, 1.0, 653.0, None, 3221, None),
-    "16 frames of it, adapted": (SHORT, drive(16, 320, 97, True), 1, 1.0, None, 270.8, 2139, None),
+    "run on that drive at full size": (settings("default"), WHOLE, 2, 1.0, 514.0, None, 3221, None),
     "10 frames of it": (settings("default", 100, (2.0, -2.0), 2), drive(10, 480, 145), 1, 1.0, None, 67.9, None, None),
     "6 frames of it": (settings("default", 60, (2.0,)), drive(6, 320, 97), 1, 1.0, None, 17.5, None, None),
     "two cameras": (settings("default", 100, (2.0, -2.0), 2), city(16, 8, 320, 208), 1, 1.0, None, 73.2, None, None),
@@ -117,16 +116,12 @@ def test_a_long_fit_of_many_gaussians_takes_more_memory() -> None:
     assert cost.VIEWS_BYTES == kept.IN_MEMORY_BYTES
 
 
-def test_a_log_without_labels_is_annotated_and_adapted_to() -> None:
-    """Steps that a generated city does not need are counted where they are taken, in the order in which they come."""
+def test_a_log_without_labels_is_annotated() -> None:
+    """A step that a generated city does not need is counted where it is taken, in the order in which it comes."""
     found = cost.estimate(run_preset(), LOG, 2)
-    assert list(found.seconds)[:4] == ["annotate", "fuse", "fit without diffusion", "adapt"]
+    assert list(found.seconds)[:3] == ["annotate", "fuse", "fit without diffusion"]
     assert all(found.seconds.values())
-    off = replace(run_preset(), adaptation="off")
-    assert "adapt" not in cost.estimate(off, LOG, 2).seconds
-    assert not {"annotate", "adapt"} & set(cost.estimate(run_preset(), DEMO, 2).seconds)
-    row = next(line for line in cost.in_words(cost.of_presets(LOG, 2), 0) if line.strip().startswith("adapt "))
-    assert row.count("not taken") == 2, "the presets fast and paper do not adapt"
+    assert "annotate" not in cost.estimate(run_preset(), DEMO, 2).seconds
 
 
 def test_what_the_flags_promise_of_fast_is_what_is_forecast() -> None:

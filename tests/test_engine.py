@@ -27,7 +27,6 @@ LINES = {
     "fuse": "fuse TOY/scene",
     "fit": "fit TOY/scene --fused TOY/fuse --observations TOY/views",
     "synthesize": "synthesize TOY/scene --fused TOY/fuse --fitted TOY/fit --edits TOY/edits.yaml",
-    "adapt": "adapt TOY/scene --fused TOY/fuse --fitted TOY/fit",
     "render": "render TOY/scene --model TOY/fit --edits TOY/edits.yaml",
     "score": "score TOY/scene --views a=TOY/views b=TOY/more --fused TOY/fuse",
     "edit": "edit TOY/fit TOY/edits.yaml --scene TOY/scene",

@@ -29,7 +29,7 @@ from mudg.viewer import report
 def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     """Stand-ins that note their calls and write a folder; ``trouble[verb]`` is raised once by that verb,
     ``during[verb]`` called while it runs."""
-    seen: dict[str, Any] = {"calls": [], "trouble": {}, "during": {}, "labelled": True, "teaches": (True, "")}
+    seen: dict[str, Any] = {"calls": [], "trouble": {}, "during": {}, "labelled": True}
 
     def stand_in(step: Step) -> Any:
         if isinstance(step, Run | Demo):
@@ -52,7 +52,6 @@ def verbs(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
     monkeypatch.setattr(
         pipeline, "_forecast", lambda _config, scene: (f"forecast of {scene.name}", {"fuse": 200, "score": 100})
     )
-    monkeypatch.setattr(pipeline, "_teaches", lambda _config, _scene: seen["teaches"])
     monkeypatch.setattr(score, "summary_table", lambda _out: "table")
 
     def film(_out: Path) -> list[Any]:
@@ -143,42 +142,13 @@ def test_two_runs_in_one_folder_at_a_time(
     assert not (out / "lock").exists()
 
 
-def test_a_recorded_log_is_adapted_to(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    verbs["teaches"] = (False, "")
-    chain(tmp_path)
-    assert verbs["calls"] == [*CHAIN[:3], "adapt", *CHAIN[3:]]
-    adapt = verbs["adapt"]
-    fitted = tmp_path / "out" / "fit" / "street_gaussians"
-    assert adapt.settings.model == "embedded" and adapt.fitted == fitted
-    assert adapt.settings.cameras == RunConfig().synthesize.cameras
-    assert verbs["synthesize"].settings.model == str(tmp_path / "out" / "adapt" / "model")
-    assert verbs["synthesize"].fitted == fitted
-
-
-@pytest.mark.parametrize(
-    ("when", "teaches", "model", "renders"),
-    [
-        ("off", (False, ""), "embedded", True),
-        ("auto", (True, ""), "embedded", True),
-        ("auto", (False, "too short"), "embedded", True),
-        ("auto", (False, ""), "embedded-tiny", False),
-    ],
-)
-def test_no_adaptation_where_it_is_not_wanted_or_not_possible(
-    tmp_path: Path, verbs: dict[str, Any], when: Any, teaches: tuple[bool, str], model: str, renders: bool
+@pytest.mark.parametrize(("model", "renders"), [("embedded", True), ("embedded-tiny", False)])
+def test_renders_are_shown_to_models_that_use_them(
+    tmp_path: Path, verbs: dict[str, Any], model: str, renders: bool
 ) -> None:
-    verbs["teaches"] = teaches
-    plain = RunConfig(adaptation=when)
-    chain(tmp_path, replace(plain, synthesize=replace(plain.synthesize, model=model)))
-    assert verbs["calls"] == CHAIN
+    chain(tmp_path, replace(USUAL, synthesize=replace(USUAL.synthesize, model=model)))
     assert verbs["synthesize"].settings.model == model
     assert (verbs["synthesize"].fitted is not None) == renders
-
-
-def test_adaptation_that_is_asked_for_but_not_possible_is_refused(tmp_path: Path, verbs: dict[str, Any]) -> None:
-    verbs["teaches"] = (False, "too short")
-    with pytest.raises(UsageError, match="adapted"):
-        chain(tmp_path, RunConfig(adaptation="on"))
 
 
 def test_a_repeat_makes_no_second_report_unless_it_was_touched(tmp_path: Path, verbs: dict[str, Any]) -> None:

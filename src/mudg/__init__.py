@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from mudg.scene.read import read_image, read_points
     from mudg.steps.fitted import FittedScene, Picture, camera_path, read_scene
     from mudg.steps.functions import (
-        adapt,
         annotate,
         bench,
         convert,
@@ -77,7 +76,6 @@ _HOMES = {
     "read_observations": "mudg.scene.observations",
     "read_points": "mudg.scene.read",
     "read_scene": "mudg.steps.fitted",
-    "adapt": _FUNCTIONS,
     "annotate": _FUNCTIONS,
     "bench": _FUNCTIONS,
     "convert": _FUNCTIONS,
@@ -115,7 +113,6 @@ __all__ = [
     "Trajectory",
     "View",
     "__version__",
-    "adapt",
     "annotate",
     "as_dataset",
     "bench",

@@ -7,7 +7,7 @@ hidden was removed (``scene/part.py``), so they cannot use it. Whatever is finis
     OUT/<log>/scene                                         the whole log; read by truth and scores alone
     OUT/<log>/<split>/shown annotate scene asked            what the methods see; with labels; and places of held-out
                                                             frames
-    OUT/<log>/<split>/fuse adapt fit/<method> virtual/<sees>   what methods make of it; what the diffusion model sees
+    OUT/<log>/<split>/fuse fit/<method> virtual/<sees>   what methods make of it; what the diffusion model sees
     OUT/<log>/<split>/nearest_fill generated/<sees> render/<method>   the views to score
     OUT/<log>/truth/<protocol>  OUT/<log>/score/<protocol>/<method>
     OUT/bench.json  OUT/bench.md  OUT/page.html
@@ -22,7 +22,6 @@ from typing import Any, Final
 
 from mudg.base import config as configuration
 from mudg.base import store
-from mudg.base.errors import InputError
 from mudg.base.html import TextTable, markdown_table
 from mudg.base.html import markdown as rendered
 from mudg.base.layout import SCENE_FILES
@@ -56,15 +55,12 @@ from mudg.benchmarks.rows import (
 from mudg.benchmarks.settings import BenchConfig
 from mudg.benchmarks.shift import virtual_fits_of
 from mudg.diffusion import model_files as mdm_files
-from mudg.diffusion.adapt import why_not
-from mudg.diffusion.settings import AdaptConfig
 from mudg.editing import render
 from mudg.editing.settings import RenderConfig
 from mudg.scene.read import read_scene
 from mudg.scene.write import write_part
 from mudg.steps.engine import Output
-from mudg.steps.settings import PresetName, on_device
-from mudg.steps.synthesize import Adapt
+from mudg.steps.settings import PresetName
 
 PAGES: Final = ("bench.json", "bench.md", "page.html")
 
@@ -91,19 +87,12 @@ class PartOfScene(Output):
 
 
 def run(
-    config: BenchConfig,
-    sources: Sequence[Path],
-    out: Path,
-    *,
-    preset: PresetName = "default",
-    overwrite: bool = False,
-    adaptation: AdaptConfig | None = None,
+    config: BenchConfig, sources: Sequence[Path], out: Path, *, preset: PresetName = "default", overwrite: bool = False
 ) -> Path:
     """Compare methods on real logs; returns ``out`` with ``bench.json``, ``bench.md`` and ``page.html``; what lies
     there of the same settings is reused, and logs, protocols and methods may be added later. ``sources``: folders of
     dataset logs, or scenes made by ``mudg ingest``. ``preset``: what ``config`` started from. ``overwrite``: replace
-    what other settings left in ``out``. ``adaptation``: how the diffusion model is adapted to a log; its model,
-    cameras, precision and seed are those of ``config``. UsageError: no log, an unknown method or protocol, a setting
+    what other settings left in ``out``. UsageError: no log, an unknown method or protocol, a setting
     that no row uses, two logs of one name, or ``out`` holds something else. Whatever a verb raises."""
     rows, protocols, logs, out = real_rows(config, preset), protocols_of(config.protocols), names_of(sources), Path(out)
     read = {f"log {name}": path for name, path in logs.items()}
@@ -111,11 +100,8 @@ def run(
     refuse_foreign(out, PAGES, lambda document: document["bench"] == "real")
     generates = any(row.sees and row.fit is None for row in rows)
     refuse_unfit(config, preset, rows, [generator_of(config)] * generates)
-    training = replace(adaptation or AdaptConfig(), model=config.model, processes=1, seed=config.seed)
-    if mdm_files.uses_renders(config.model):  # no other model is adapted
-        training = replace(training, precision=config.precision)
     scenes = {name: imported(config, path, out / name / "scene", overwrite) for name, path in logs.items()}
-    last, own = (rows, config, on_device(training, config.device), overwrite), {}
+    last, own = (rows, config, overwrite), {}
     for protocol in protocols:
         own.setdefault(protocol.split, []).append(protocol)
     every = [(name, scene, split) for name, scene in scenes.items() for split in own]
@@ -163,7 +149,6 @@ class SplitJob:
     protocols: tuple[Protocol, ...]
     rows: tuple[Row, ...]
     config: BenchConfig
-    adapt: AdaptConfig
     overwrite: bool
 
     @property
@@ -258,32 +243,15 @@ class SplitJob:
                 return virtual[0], use
         return chain.rendered(row, virtual, drawn, places), use
 
-    def use(self, sees: Sees, chain: Chain) -> DiffusionUse:
-        """How the diffusion model is used where a method asks for ``sees``; adapted to what the method sees of the log
-        if need be. What the model or the log does not allow is left out, and the note says so."""
+    def use(self, sees: Sees) -> DiffusionUse:
+        """How the diffusion model is used where a method asks for ``sees``. What the model does not allow is left out,
+        and the note says so."""
         model = self.config.model
         if sees == "points":
             return DiffusionUse("points", model)
         if not mdm_files.uses_renders(model):
             return DiffusionUse("points", model, "the model does not use renders, so it sees points alone")
-        if sees == "renders":
-            return DiffusionUse("renders", model)
-        scene = read_scene(chain.scene)
-        settings = replace(self.adapt, cameras=(first_camera(scene, self.config.shown),))
-        reason, folder = why_not(scene, settings), self.folder / "adapt"
-        if not reason:
-            first = chain.first()
-            try:
-                chain.run(Adapt(scene=chain.scene, fused=chain.fused, fitted=first, out=folder, settings=settings))
-            except InputError as error:
-                reason = f"{error.what}, {error.got}" if error.got else error.what
-        if reason:
-            return DiffusionUse("renders", model, f"the model was not adapted to the log: {reason}")
-        record = store.read_json(folder / "adapt.json")
-        numbers = f"{record['before']['psnr']:.2f} dB before, {record['after']['psnr']:.2f} dB after"
-        if not record["adapted"]:
-            return DiffusionUse("renders", model, f"adapting did not help ({numbers}), so the model was taken as it is")
-        return DiffusionUse("adapted", str(folder / "model"), f"the model was adapted ({numbers})")
+        return DiffusionUse("renders", model)
 
 
 # ---- numbers ----

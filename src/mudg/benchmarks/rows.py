@@ -218,14 +218,9 @@ ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
 }
 """Rows beside the fit without virtual views and that with all terms, as in table 3 of the paper, and the most that
 virtual views can bring at this number of steps: row -> (what is learned from, settings ``virtual`` of the fit)."""
-Sees = Literal["", "adapted", "renders", "points"]
-"""How a method uses its diffusion model: adapted to the log, with renders of the first fit, or with points and
-photographs alone."""
-LESS: Final[dict[Sees, tuple[str, str]]] = {
-    "adapted": ("", ""),
-    "renders": ("-no-adapt", ", model not adapted"),
-    "points": ("-no-renders", ", points alone"),
-}
+Sees = Literal["", "renders", "points"]
+"""What a method shows its diffusion model: renders of the first fit too, or points and photographs alone."""
+LESS: Final[dict[Sees, tuple[str, str]]] = {"renders": ("", ""), "points": ("-no-renders", ", points alone")}
 """What a method sees -> the endings of its name and title."""
 PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
 """Settings of generated views that are the benchmark's matter, not the user's."""
@@ -387,7 +382,7 @@ def real_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row,
             rows.append(replace(row, name=name, title=row.title + words, sees=sees))
     for text in config.variant:
         row = variant_of(text, usual)
-        rows.append(replace(row, title=title_of(row.name), sees="adapted" if row.learns_virtual else ""))
+        rows.append(replace(row, title=title_of(row.name), sees="renders" if row.learns_virtual else ""))
     return _without_twins(rows)
 
 

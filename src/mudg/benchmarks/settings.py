@@ -56,8 +56,8 @@ class BenchOwn:
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
     """shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian,
     bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on for as many steps as mudg_s, without
-    generated views. real also has mudg_r-no-adapt, mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without
-    adapting the diffusion model to the log, and with points alone in its input. paper: any of these of shift, and
+    generated views. real also has mudg_r-no-renders and mudg_s-no-renders, with points alone in the diffusion
+    model's input. paper: any of these of shift, and
     freevs; with the default, all of them."""
     iterations: int = setting(default=1000, ge=1)
     """shift, real, loop, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for
@@ -67,7 +67,7 @@ class BenchOwn:
     nothing with all steps, as published."""
     ablation: bool = False
     """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and
-    with exact views instead of generated ones. real: add the rows without adaptation and without renders."""
+    with exact views instead of generated ones. real: add the rows without renders."""
     variant: tuple[str, ...] = ()
     """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is
     a setting such as virtual.color_weight. Both of its fits have them."""

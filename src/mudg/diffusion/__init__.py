@@ -1,1 +1,1 @@
-"""The multi-modal diffusion model: condition, network, training, adaptation, sampling."""
+"""The multi-modal diffusion model: condition, network, training, sampling."""

@@ -16,7 +16,6 @@ _SECTIONS: Final[Mapping[str, Mapping[str, str]]] = {
         "fuse": ".ingest:Fuse",
         "learn": ".synthesize:Learn",
         "fit": ".fit:Fit",
-        "adapt": ".synthesize:Adapt",
         "synthesize": ".synthesize:Synthesize",
         "render": ".render:RenderViews",
         "score": ".render:Score",

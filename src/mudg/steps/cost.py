@@ -28,8 +28,6 @@ steps more."""
 VIRTUAL: Final = 1.5
 NETWORK_VIEW_S, NETWORK_PIXEL_S = 0.25, 5.5e-6
 """A view that a network makes or labels, and each of its pixels; every denoising step adds a tenth of the first."""
-TRAINED_FRAME_S, LESSON_S = 0.25, 15.0
-"""adapt: a frame of a training step; a lesson with its short fit and its clips."""
 SHOWN_VIEW_S, SHOWN_PIXEL_S = 0.05, 1.5e-6
 """A view that is scored or reported; a pixel that is rendered or scored."""
 POINT_S: Final = 6e-7
@@ -62,7 +60,7 @@ class SceneSize:
             pixels.
         points: LiDAR points of a sweep (0 = not counted). exact: the truth of shifted views is known (generated
             cities).
-        labelled: semantic labels are there. adapts: the diffusion model can be adapted to the log.
+        labelled: semantic labels are there.
     """
 
     images: int
@@ -72,7 +70,6 @@ class SceneSize:
     points: int = 0
     exact: bool = True
     labelled: bool = True
-    adapts: bool = False
 
 
 @dataclass(frozen=True)
@@ -101,7 +98,7 @@ def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0,
     """Forecast ``mudg run SCENE``. ``cores``: that the steps may use. ``speed``: 1 = the machine of the unit costs.
     ``device``: ``cpu`` or ``cuda``."""
     fit, pixels, published = config.fit, size.width * size.height, config.synthesize.guidance is not None
-    lines, adapts = len(config.synthesize.shifts_m), size.adapts and config.adaptation != "off" and not published
+    lines = len(config.synthesize.shifts_m)
     made, rendered = size.path_images * lines, size.path_images * len(config.render.shifts_m)
     scored = 2 * rendered + made if size.exact else rendered
     processes = 1 if published or device != "cpu" else max(1, min(config.synthesize.processes or cores, lines))
@@ -112,13 +109,10 @@ def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0,
     step_s, part = FIT_S * (gaussians + fit_pixels), 0.5 if config.continue_fit else 1.0
     share = fit.virtual.continued_probability if config.continue_fit else fit.virtual.probability
     view_s = NETWORK_VIEW_S * (1 + config.synthesize.steps / 10) + NETWORK_PIXEL_S * pixels
-    lessons = 2 * config.adapt.gaps + len(config.adapt.shifts_m)
-    trained = config.adapt.steps * config.adapt.batch_frames
     work = {  # core-seconds, and processes among which they are divided (0: threads)
         "annotate": (size.images * (NETWORK_VIEW_S + NETWORK_PIXEL_S * pixels), cores),
         "fuse": (size.images * size.points * POINT_S, 0),
         "fit without diffusion": (fit.iterations * step_s, 0),
-        "adapt": (lessons * LESSON_S + trained * TRAINED_FRAME_S, cores),
         "synthesize": (PROCESS_S * processes + made * view_s, processes),
         "fit with diffusion": (part * fit.iterations * step_s * (1 + VIRTUAL * share * fit.virtual.beside), 0),
         "render without diffusion": (rendered * SHOWN_PIXEL_S * pixels, 0),
@@ -129,7 +123,7 @@ def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0,
     }
     seconds, processor_s = dict[str, float | None](), dict[str, float | None]()
     for name, (core_s, among) in work.items():
-        if (name == "annotate" and size.labelled) or (name == "adapt" and not adapts):
+        if name == "annotate" and size.labelled:
             continue
         known = device == "cpu" and not (name == "synthesize" and published)
         spread = 1 / min(among, cores) if among else 1 - SHARED + SHARED / cores
@@ -137,7 +131,7 @@ def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0,
         seconds[name], processor_s[name] = times
     columns = 11 + 3 * (fit.sh_degree + 1) ** 2 + len(CLASSES) * fit.semantics
     views = min(VIEW_PIXEL_BYTES * (size.images + made) * fit_pixels, VIEWS_BYTES) if device == "cpu" else 0
-    networks = max(processes * (NETWORK_BYTES + NETWORK_PIXEL_BYTES * pixels), adapts * (processes + 1) * NETWORK_BYTES)
+    networks = processes * (NETWORK_BYTES + NETWORK_PIXEL_BYTES * pixels)
     held = PUBLISHED_BYTES[device] if published else networks
     memory_bytes = max(PARAMETER_BYTES * columns * gaussians + views, held)
     judged = (rendered if size.exact else size.path_images) + (0 if size.labelled else size.images)

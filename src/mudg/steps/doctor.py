@@ -7,7 +7,6 @@ import platform
 import shutil
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -166,7 +165,6 @@ def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
 def scene_size(scene: Scene, config: RunConfig | None = None) -> SceneSize:
     """What forecasts depend on. The first sweep stands for all. config: of the run, whose cameras are shifted (None:
     the first)."""
-    from mudg.diffusion.adapt import why_not
     from mudg.scene.read import read_points
     from mudg.steps.cost import SceneSize
     from mudg.steps.settings import run_preset
@@ -178,8 +176,7 @@ def scene_size(scene: Scene, config: RunConfig | None = None) -> SceneSize:
     cameras = [name for name in config.synthesize.cameras or (first.name,) if name in scene.cameras]
     on_path = sum(len(scene.frames_of(name)) for name in cameras)
     labelled = all("semantics" in frame.labels for frame in scene.frames)
-    adapts = not exact and not why_not(scene, replace(config.adapt, cameras=tuple(cameras)))
-    return SceneSize(len(scene.frames), on_path, first.width, first.height, points, exact, labelled, adapts)
+    return SceneSize(len(scene.frames), on_path, first.width, first.height, points, exact, labelled)
 
 
 def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:

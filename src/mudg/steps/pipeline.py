@@ -1,6 +1,6 @@
 """The pipeline behind ``mudg demo`` and ``mudg run``: steps in order, each skipped when its result verifies.
 
-OUT/scene  OUT/fuse  OUT/adapt  OUT/synthesize/<trajectory>  OUT/fit/<method>  OUT/render/<method>/<trajectory>
+OUT/scene  OUT/fuse  OUT/synthesize/<trajectory>  OUT/fit/<method>  OUT/render/<method>/<trajectory>
 OUT/score
 OUT/report.html  OUT/viewer.html  OUT/run.yaml (settings)  OUT/run.json (state, seconds per step over all continuations)
 """
@@ -26,7 +26,7 @@ from mudg.steps.fit import Fit
 from mudg.steps.ingest import Annotate, Fuse, Ingest
 from mudg.steps.render import RenderViews, Score
 from mudg.steps.settings import NO_MODEL, PRESETS, RunConfig, with_device
-from mudg.steps.synthesize import Adapt, Synthesize
+from mudg.steps.synthesize import Synthesize
 
 CITY = "city"
 WITHOUT_DIFFUSION = "street_gaussians"
@@ -220,54 +220,22 @@ def _has_semantics(scene: Path) -> bool:
     return all("semantics" in frame.labels for frame in loaded.frames)
 
 
-def _diffusion_of(config: RunConfig, scene: Path) -> tuple[bool, bool]:
-    """Whether the chain's diffusion model has renders of the first fit in its input, and whether it is adapted to the
-    log; said in a line where that is not what the settings say at first sight. UsageError: adaptation is asked for, but
-    the model cannot be adapted or the log is too short."""
-    from mudg.diffusion.model_files import uses_renders
-
-    renders = uses_renders(config.synthesize.model)
-    if config.adaptation == "off" or (config.adaptation == "auto" and not renders):
-        return renders, False
-    generated, reason = _teaches(config, scene)
-    if config.adaptation == "auto" and generated:
-        return renders, False  # what the model was trained on
-    reason = reason if renders else "the model does not use renders"
-    if reason and config.adaptation == "on":
-        what = "the diffusion model cannot be adapted to this log"
-        raise UsageError(what, where="--adaptation", got=reason, remedy="leave it at auto")
-    if reason:
-        log.info(f"adapt: left out, {reason}")
-    return renders, not reason
-
-
-def _teaches(config: RunConfig, scene: Path) -> tuple[bool, str]:
-    """Whether a scene is a generated city, and why the diffusion model cannot be adapted to it (empty: it can)."""
-    from mudg.diffusion.adapt import why_not
-    from mudg.scene.read import read_scene
-
-    loaded = read_scene(scene)
-    return loaded.source.recipe is not None, why_not(loaded, replace(config.adapt, cameras=config.synthesize.cameras))
-
-
 def steps_of(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> dict[str, Output]:
     """The pipeline on a labelled scene, by the names that tables give its steps: each reads what others before it
     write."""
-    renders, adapts = _diffusion_of(config, scene)
+    from mudg.diffusion.model_files import uses_renders
+
     plain, guided = fits_of(config.fit, config.continue_fit)
     first, last = out / "fit" / WITHOUT_DIFFUSION, out / "fit" / WITH_DIFFUSION
-    fused, adapted, virtual = out / "fuse", out / "adapt", out / "synthesize"
+    fused, virtual = out / "fuse", out / "synthesize"
     render = {method: out / "render" / method for method in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
-    adaptation = replace(config.adapt, model=config.synthesize.model, cameras=config.synthesize.cameras)
-    generator = replace(config.synthesize, model=str(adapted / "model")) if adapts else config.synthesize
     views = {WITHOUT_DIFFUSION: render[WITHOUT_DIFFUSION], DIFFUSION: virtual, WITH_DIFFUSION: render[WITH_DIFFUSION]}
-    seen, begun = first if renders else None, first if config.continue_fit else None
+    seen, begun = first if uses_renders(config.synthesize.model) else None, first if config.continue_fit else None
     drawn = {"scene": scene, "settings": config.render}
     steps: dict[str, Output] = {
         "fuse": Fuse(scene=scene, out=fused, settings=config.fuse),
         "fit without diffusion": Fit(scene=scene, fused=fused, out=first, settings=plain),
-        "adapt": Adapt(scene=scene, fused=fused, fitted=first, out=adapted, settings=adaptation),
-        "synthesize": Synthesize(scene=scene, fused=fused, fitted=seen, out=virtual, settings=generator),
+        "synthesize": Synthesize(scene=scene, fused=fused, fitted=seen, out=virtual, settings=config.synthesize),
         "fit with diffusion": Fit(
             scene=scene, fused=fused, observations=(virtual,), start_from=begun, out=last, settings=guided
         ),
@@ -275,7 +243,7 @@ def steps_of(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> dict
         "render with diffusion": RenderViews(model=last, out=render[WITH_DIFFUSION], **drawn),
         "score": Score(scene=scene, views=views, fused=fused, out=out / "score", settings=config.score),
     }
-    return {name: replace(step, overwrite=overwrite) for name, step in steps.items() if name != "adapt" or adapts}
+    return {name: replace(step, overwrite=overwrite) for name, step in steps.items()}
 
 
 def _closing_text(out: Path, source: str, report: Path, ledger: _Ledger) -> str:

@@ -20,7 +20,7 @@ class Run(Output):
         "mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti",
         "mudg run scenes/a --out runs/a --preset quality",
     )
-    short = ("device", "adaptation", "continue_fit")
+    short = ("device", "continue_fit")
     source: Annotated[str, Flag("SOURCE", "first")]
     """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
     preset: PresetName | None = None
@@ -28,8 +28,8 @@ class Run(Output):
     quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type
     model (docs/presets.md)."""
     fast: bool = False
-    """The same as --preset fast: images of a log 480 pixels wide, 3 m to each side, no adaptation. One to two minutes
-    on 2 cores for 16 frames of one camera; a line at the start forecasts what it takes here."""
+    """The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for
+    16 frames of one camera; a line at the start forecasts what it takes here."""
     seed: Annotated[int | None, Flag("INT")] = None
     """Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
     cameras: tuple[str, ...] = ()

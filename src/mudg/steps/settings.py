@@ -14,7 +14,7 @@ from mudg.base.config import changed, setting, settings
 from mudg.base.devices import DeviceName
 from mudg.base.errors import UsageError
 from mudg.baselines.settings import MethodConfig
-from mudg.diffusion.settings import AdaptConfig, SynthesizeConfig
+from mudg.diffusion.settings import SynthesizeConfig
 from mudg.editing.settings import RenderConfig, ScoreConfig
 from mudg.formats.settings import IngestConfig
 from mudg.labels.settings import AnnotateConfig
@@ -25,9 +25,6 @@ from mudg.scene.settings import FuseConfig
 class RunConfig:
     """Settings of all steps, in one group per step."""
 
-    adaptation: Literal["auto", "on", "off"] = "auto"
-    """Adapt the diffusion model to the log before it generates views. auto: for recorded logs that are long enough, not
-    for generated cities."""
     device: DeviceName = "auto"
     """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by
     --fit.device, keeps that one."""
@@ -37,7 +34,6 @@ class RunConfig:
     ingest: IngestConfig = setting(default_factory=IngestConfig)
     annotate: AnnotateConfig = setting(default_factory=AnnotateConfig)
     fuse: FuseConfig = setting(default_factory=FuseConfig)
-    adapt: AdaptConfig = setting(default_factory=AdaptConfig)
     synthesize: SynthesizeConfig = setting(default_factory=SynthesizeConfig)
     fit: MethodConfig = setting(default_factory=MethodConfig)
     render: RenderConfig = setting(default_factory=RenderConfig)
@@ -99,7 +95,6 @@ PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
     "fast": {
         **_of("ingest.city", n_frames=12, width=240, height=160, cameras=("front",)),
         **_of("ingest", resolution="480"),
-        "adaptation": "off",
         **_of("fit", iterations=250),
         **_of("synthesize", steps=1, shifts_m=(3.0, -3.0)),
         **_of("render", shifts_m=(0.0, 3.0, -3.0)),
@@ -119,7 +114,6 @@ PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
         **_of("synthesize", steps=2),  # of the shipped model; more lowered its scores (docs/diffusion.md)
     },
     "paper": {
-        "adaptation": "off",
         "continue_fit": False,
         **_of("ingest.city", n_frames=60, width=960, height=640),
         **_of("fuse", match_colors=False, occlusion_test=False, box_growth_m=0.0, floor_margin_m=0.25),

@@ -202,7 +202,6 @@ class Step:
 # -- what a declaration says -----------------------------------------------------------------------
 
 HOMES: Final[Mapping[str, str]] = {
-    "AdaptConfig": "mudg.diffusion.settings",
     "AnnotateConfig": "mudg.labels.settings",
     "BatchConfig": "mudg.fleet.settings",
     "ConvertConfig": "mudg.diffusion.settings",

@@ -47,7 +47,7 @@ from mudg.scoring.tables import (
 PLAIN: Final = "fit/street_gaussians"
 GUIDED: Final = "fit/mudg_s"
 STEPS: Final = (
-    *("scene", "annotate", "fuse", PLAIN, "adapt", "synthesize", GUIDED),
+    *("scene", "annotate", "fuse", PLAIN, "synthesize", GUIDED),
     *("render/street_gaussians", "render/mudg_s", "score"),
 )
 """Folders of the chain, in the order in which they are made."""
@@ -180,21 +180,12 @@ class TrajectoryVideo:
         return shift_title(self.shift_m, self.name)
 
 
-@dataclass(frozen=True)
-class Adaptation:
-    """How the diffusion model was adapted: the content of ``adapt.json``, and pictures (title, data URI)."""
-
-    record: Mapping[str, Any]
-    pictures: Sequence[tuple[str, str]]
-
-
 def page(
     scores: Mapping[str, Any],
     ledger: Mapping[str, Any],
     settings: str,
     videos: Sequence[TrajectoryVideo],
     columns: Sequence[str],
-    adaptation: Adaptation | None = None,
     viewer: str = "",
     out: Path = Path(),
     curves: Sequence[Mapping[str, Any]] = (),
@@ -203,8 +194,7 @@ def page(
 
     Args:
         scores: ``metrics.json``. ledger: ``run.json`` of the chain. settings: ``run.yaml``. videos: one per trajectory.
-        columns: panel columns in the order in which they stand in the videos. adaptation: of the diffusion model, if
-            there was one.
+        columns: panel columns in the order in which they stand in the videos.
         viewer: relative address of the page that shows the fitted scene, or empty. out: folder of the run, for
             commands. curves: as of ``fit_charts``.
     """
@@ -225,8 +215,6 @@ def page(
         methods=scores["methods"],
         settings=settings,
         provenance=_provenance(scores, ledger),
-        adaptation=None if adaptation is None else adaptation.record,
-        adaptation_pictures=() if adaptation is None else adaptation.pictures,
         next_commands=next_commands(out, source),
         step_commands=step_commands(out, source),
         **_player_values(scores, videos, columns),
@@ -637,8 +625,8 @@ def write_page(out: Path, videos: Sequence[TrajectoryVideo]) -> Path:
     text = store.read_text(settings) if settings.is_file() else ""
     with understood("a scored run", str(out)):
         scores, ledger = store.read_json(out / "score" / "metrics.json"), store.read_json(out / "run.json")
-        columns, adaptation = list(_folders(out, scores)), _adaptation(out / "adapt")
-        content = page(scores, ledger, text, videos, columns, adaptation, viewer_address(out), out, fit_charts(out))
+        columns = list(_folders(out, scores))
+        content = page(scores, ledger, text, videos, columns, viewer_address(out), out, fit_charts(out))
     store.write_text(out / "report.html", content)
     return out / "report.html"
 
@@ -674,15 +662,6 @@ def viewer_address(out: Path) -> str:
     """The viewer page of a run, relative to its folder: one file, or the first page of a folder; empty if there is
     none."""
     return next((name for name in (VIEWER, VIEWER_FOLDER) if (out / name).is_file()), "")
-
-
-def _adaptation(folder: Path) -> Adaptation | None:
-    """The adaptation in a finished folder of the verb adapt; None if there is no such folder."""
-    if not (folder / store.MANIFEST).is_file():
-        return None
-    names = (("Before", "before.png"), ("After", "after.png"))
-    pictures = [(title, _data_uri("image/png", store.read_bytes(folder / name))) for title, name in names]
-    return Adaptation(store.read_json(folder / "adapt.json"), pictures)
 
 
 def _folders(out: Path, scores: Mapping[str, Any]) -> dict[str, dict[str, Path]]:
