@@ -202,7 +202,7 @@ ROWS = [
     {"name": "mudg_s", "title": "With diffusion (mudg_s)", "method": "mudg_s", "changes": {}},
 ]
 SETTINGS = {"list": "city:reported", "missing_scenes": [], "iterations": 10, "seed": 0}
-SETTINGS |= {"continued_share": 0.5, "videos": False}
+SETTINGS |= {"guided_share": 1.5, "videos": False}
 FIDS = {"truth": [5.0, 7.0], "nearest_fill": [90.0, 110.0], "gs3d": [40.0, 60.0], "mudg_s": [40.0, 50.0]}
 
 

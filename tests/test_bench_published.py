@@ -88,7 +88,7 @@ def test_the_default_preset_changes_nothing():
 def test_a_preset_of_a_benchmark_is_that_of_a_run(preset):
     benchmark, run = bench_preset(preset), run_preset(preset)
     assert (benchmark.model, benchmark.iterations) == (run.synthesize.model, run.fit.iterations)
-    assert (benchmark.fuse, benchmark.continue_fit) == (run.fuse, run.continue_fit)
+    assert (benchmark.fuse, benchmark.guided_share) == (run.fuse, run.guided_share)
     for mine, theirs, own in (
         (benchmark.synthesize, run.synthesize, {"model", "cameras"}),
         (benchmark.fit, run.fit, {"iterations"}),
@@ -130,7 +130,7 @@ REFUSED = [
     ("paper", ["--score.perceptual-views", "3"], "--score.perceptual-views", "leave it out"),
     ("shift", ["--methods", "gs3d", "--synthesize.steps", "4"], "--synthesize.steps", "leave it out"),
     ("shift", ["--methods", "gs3d", "--fit.virtual.probability", "0.3"], "--fit.virtual.probability", "leave it out"),
-    ("shift", ["--methods", "mudg_s", LONGER, "--no-continue-fit"], "--methods", "leave it out"),
+    ("shift", ["--methods", "mudg_s", LONGER, "--guided-share", "1"], "--methods", "leave it out"),
     ("shift", ["--methods", "difix", "--model", "embedded-tiny"], "--methods", "leave difix out"),
     ("shift", ["--synthesize.guidance", "7.5"], "--model", ""),
     ("shift", ["--preset", "paper"], "--model", "convert a checkpoint"),
@@ -192,7 +192,7 @@ def test_table_2_runs_with_a_published_type_model_as_recorded(weights, tmp_path,
     assert sum(passes) == videos(len(TABLES["mudg2"].rows))
     document = store.read_json(out / "bench.json")
     asked = document["settings"]["synthesize"]
-    assert document["settings"]["preset"] == "paper" and document["settings"]["renders"] is False
+    assert document["settings"]["preset"] == "paper"
     sampling = {"steps": 3, "overlap": 2, "eta": 1.0, "guidance": 7.5, "guidance_rescale": 0.7}
     assert asked.items() >= {**sampling, "align_depth": False, "full_size": False}.items()
     log = out / document["logs"][0]["log"]
@@ -224,7 +224,7 @@ def test_table_3_runs_with_a_published_type_model_as_recorded(weights, tmp_path,
     recorded = document["settings"]["fit"]
     assert (recorded["loss"]["object_weight"], recorded["virtual"]["probability"]) == (0.1, 0.2)
     assert recorded["iterations"] == 6
-    assert document["settings"]["fuse"]["box_growth_m"] == 0.0 and document["settings"]["continued_share"] is None
+    assert document["settings"]["fuse"]["box_growth_m"] == 0.0 and document["settings"]["guided_share"] == 1.0
     fused = configuration.load(FuseConfig, yaml_path=log / "fuse" / "run.yaml")
     assert (fused.box_growth_m, fused.occlusion_test) == (0.0, False)
 
@@ -254,8 +254,6 @@ def test_real_runs_with_a_published_type_model_as_recorded(weights, scene, tmp_p
     assert sum(passes) == videos(generated, guided=False)
     document = store.read_json(out / "bench.json")
     assert document["settings"]["virtual_shifts_m"] == [2.0] and document["settings"]["synthesize"]["guidance"] == 1.0
-    use = document["logs"][0]["diffusion"]["all"]["mudg_s"]
-    assert use["sees"] == "points" and "does not use renders" in use["note"]
     assert isinstance(document["protocols"]["lidar"]["pooled"]["mudg_s"]["abs_rel_static"], float)
     state = store.read_json(out / "city" / "all" / "fit" / "mudg_s" / "run.json")
     assert state["summary"]["steps"] == 6 and "start" not in state["inputs"]

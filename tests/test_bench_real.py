@@ -420,45 +420,32 @@ def test_finished_work_is_reused_and_a_method_can_be_added(made, city, model):
     split = out / "city" / "gap-1"
     watched = [split / "fit" / "street_gaussians" / "run.json", out / "city" / "truth" / "lidar" / "run.json"]
     before = [path.stat().st_mtime_ns for path in watched]
-    added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_s-no-renders", "mudg_r")
+    added = ("street_gaussians", "street_gaussians-longer", "mudg_s", "mudg_r")
     variant, settings = ("rough=densify.kind:none,method:gs3d",), SynthesizeConfig(shifts_m=(2.0,))
     changes = {"methods": added, "protocols": ("gap-1",), "model": model, "variant": variant, "synthesize": settings}
     more = dataclasses.replace(config, **changes)
     real.run(more, [city], out)
     assert [path.stat().st_mtime_ns for path in watched] == before
     document = store.read_json(out / "bench.json")
-    names = ["street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_s", "mudg_s-no-renders", "rough"]
+    names = ["street_gaussians", "street_gaussians-longer", "mudg_r", "mudg_s", "rough"]
     assert [row["name"] for row in document["methods"]] == names
     assert isinstance(document["protocols"]["gap-1"]["against"]["mudg_s"]["psnr"], float)
     start = store.digest(split / "fit" / "street_gaussians")
-    # all go on with the same fit, for half as many steps
-    for name in ("mudg_s", "mudg_s-no-renders", "street_gaussians-longer"):
-        state = store.read_json(split / "fit" / name / "run.json")
-        assert state["inputs"]["start"] == start and state["summary"]["steps"] == config.iterations // 2
+    states = {
+        name: store.read_json(split / "fit" / name / "run.json") for name in ("mudg_s", "street_gaussians-longer")
+    }
+    assert [states[name]["inputs"].get("start") for name in states] == [None, start]
+    assert [states[name]["summary"]["steps"] for name in states] == [config.iterations * 3 // 2, config.iterations // 2]
     inputs = store.read_json(split / "fit" / "street_gaussians-longer" / "run.json")["inputs"]
     assert not [name for name in inputs if "virtual" in name or "observations" in name]
-    inputs = {of: store.read_json(split / "virtual" / of / "run.json")["inputs"] for of in ("points", "renders")}
-    assert {of: inputs[of].get("fitted") for of in inputs} == {"points": None, "renders": start}
+    assert "fitted" not in store.read_json(split / "virtual" / "run.json")["inputs"]
 
 
-def test_a_model_without_renders_sees_points_and_says_so(city, model, tmp_path):
-    job = job_of(tmp_path / "out", city, SPLITS["all"], BenchConfig(model=model, iterations=4))
-    assert job.use("renders") == real.DiffusionUse("renders", model)
-    assert job.use("points") == real.DiffusionUse("points", model)
-    plain = str(tmp_path / "plain")
-    mdm_files.save(MDM(SMALL), tmp_path / "plain", "a model without renders", {})
-    use = dataclasses.replace(job, config=BenchConfig(model=plain)).use("renders")
-    assert (use.sees, use.model) == ("points", plain) and "does not use renders" in use.note
-
-
-def test_rows_say_what_they_leave_out():
-    config = BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",))
-    rows = {row.name: row for row in real_rows(config)}
-    base, ends = "street_gaussians street_gaussians-longer", ("", "-no-renders")
-    assert list(rows) == [*base.split(), *(f"mudg_{one}{end}" for one in "rs" for end in ends), "a"]
-    sees = {name: rows[name].sees for name in (*(f"mudg_s{end}" for end in ends), "a")}
-    assert list(sees.values()) == ["renders", "points", "renders"]
-    assert rows["mudg_s"].title != rows["mudg_s-no-renders"].title
+def test_an_ablation_adds_the_control():
+    rows = {
+        row.name: row for row in real_rows(BenchConfig(methods=("mudg_s",), ablation=True, variant=("a=sh_degree:1",)))
+    }
+    assert list(rows) == ["street_gaussians", "street_gaussians-longer", "mudg_s", "a"]
 
 
 CLASS_NAMES = {"5": "Road", "7": "Building"}

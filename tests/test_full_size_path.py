@@ -118,7 +118,7 @@ def test_from_a_published_checkpoint_to_a_table_of_the_paper(mudg, tmp_path):
     for row in ("street_gaussians", "only_I", "only_I_D", "only_I_S", "mudg_s"):
         assert document["cells"][row]["0"]["psnr"]["mean"] > 5.0
     settings = document["settings"]
-    assert settings["preset"] == "paper" and settings["continued_share"] is None and settings["iterations"] == 10
+    assert settings["preset"] == "paper" and settings["guided_share"] == 1.0 and settings["iterations"] == 10
     (log,) = (tmp_path / "table" / entry["log"] for entry in document["logs"])
     folders = {"fuse": "fuse", "fit": "fit/mudg_s", "synthesize": "virtual"}
     ran = {group: yaml.safe_load((log / folder / "run.yaml").read_text()) for group, folder in folders.items()}

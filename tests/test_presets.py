@@ -117,6 +117,6 @@ def test_the_same_presets_from_python(tmp_path: Path, monkeypatch: pytest.Monkey
 
 def test_the_published_fit_starts_from_nothing_with_all_steps() -> None:
     config = run_preset("paper")
-    plain, guided = pipeline.fits_of(config.fit, config.continue_fit)
+    plain, guided = pipeline.fits_of(config.fit, config.guided_share)
     assert plain.iterations == guided.iterations == 30_000
-    assert pipeline.fits_of(config.fit)[1].iterations == 15_000
+    assert pipeline.fits_of(config.fit, run_preset().guided_share)[1].iterations == 45_000

@@ -138,6 +138,8 @@ def seconds_of(out: Path) -> dict[str, float]:
 
 REPAIR_STEPS: Final = 3
 """Steps in which repaired views move from the recorded path to the places of generated views."""
+REPAIR_SHARE: Final = 0.5
+"""Iterations of a fit that goes on under repaired views, as a share of those of the first one."""
 
 
 @dataclass(frozen=True)
@@ -165,10 +167,9 @@ class Chain:
         """Make the clouds."""
         return self.run(Fuse(scene=self.scene, out=self.fused, settings=self.config.fuse))
 
-    def generated(self, settings: SynthesizeConfig, out: Path, *, renders: bool) -> Path:
-        """Views of the diffusion model; ``renders``: on top of those of the first fit."""
-        fitted = self.first() if renders else None
-        return self.run(Synthesize(scene=self.scene, fused=self.fused, fitted=fitted, out=out, settings=settings))
+    def generated(self, settings: SynthesizeConfig, out: Path) -> Path:
+        """Views of the diffusion model."""
+        return self.run(Synthesize(scene=self.scene, fused=self.fused, out=out, settings=settings))
 
     def filled(self, paths: Sequence[Trajectory]) -> Path:
         """The fused points, holes filled, as views."""
@@ -184,32 +185,27 @@ class Chain:
 
     def first(self) -> Path:
         """The fit on recorded views with the usual settings."""
-        return self._fit(fits_of(usual_fit(self.config))[0], self.out / "fit" / WITHOUT_DIFFUSION)
+        plain = replace(usual_fit(self.config), method=WITHOUT_DIFFUSION)
+        return self._fit(plain, self.out / "fit" / WITHOUT_DIFFUSION)
 
     def fitted(self, row: Row, virtual: Sequence[Path] = ()) -> Path:
-        """The fit of a row. Where its method learns from ``virtual`` views, it goes on with a fit on recorded views of
-        the same settings: the first one, if these are the usual ones but for virtual views."""
-        out, settings, usual = self.out / "fit" / row.name, row.fit or usual_fit(self.config), usual_fit(self.config)
+        """The fit of a row; ``virtual``: views that it learns from, if its method learns from such."""
+        out, settings = self.out / "fit" / row.name, row.fit or usual_fit(self.config)
         if row.name == LONGER:
-            plain, guided = fits_of(usual)
-            return self._fit(replace(plain, iterations=guided.iterations), out, begun=self.first())
+            further = max(1, round((self.config.guided_share - 1) * settings.iterations))
+            return self._fit(replace(settings, iterations=further), out, begun=self.first())
         if settings.method == REPAIRED:
             return self._repaired(row.name, settings)
         if not row.learns_virtual:
             return self._fit(settings, out)
-        plain, guided = fits_of(settings, self.config.continue_fit)
-        if not self.config.continue_fit:
-            return self._fit(guided, out, virtual)
-        plain = replace(plain, virtual=usual.virtual)
-        begun = self.first() if plain == fits_of(usual)[0] else self._fit(plain, self.out / "start" / row.name)
-        return self._fit(guided, out, virtual, begun)
+        return self._fit(fits_of(settings, self.config.guided_share)[1], out, virtual)
 
     def _repaired(self, name: str, settings: MethodConfig) -> Path:
         """Step by step towards the places of generated views: render there, repair, and fit under all that was repaired
         so far. Every fit goes on with the first one. Where steps pass the same place (2 m is the end of the way to 2 m,
         and two thirds of that to 3 m), the newest views count."""
         model, seen = self.first(), {}
-        settings = replace(fits_of(settings)[1], method=settings.method)
+        settings = replace(settings, iterations=max(1, round(REPAIR_SHARE * settings.iterations)))
         for number in range(1, REPAIR_STEPS + 1):
             views, last = self.out / "repair" / str(number), number == REPAIR_STEPS
             repaired = repair_settings(self.generator, number / REPAIR_STEPS)

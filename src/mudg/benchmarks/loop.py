@@ -102,7 +102,7 @@ class LoopLog(Views):
         for row in self.rows:
             virtual: tuple[Path, ...] = ()
             if row.learns_virtual:
-                virtual = (self.chain.generated(self.off_path, self.out / self.virtual, renders=self.renders),)
+                virtual = (self.chain.generated(self.off_path, self.out / self.virtual),)
             cockpit = Cockpit(Session(self.chain.fitted(row, virtual), scene=self.scene), (), 0, SEEN)
             sweep = partial(sweep_errors, course, cockpit.session, lidar)
             values[row.name] = {}
@@ -255,8 +255,7 @@ def run(
     refuse_unfit(config, preset, rows, [])
     shifts_m = [d * side for d in (2.0, 3.0, 4.0) for side in (1, -1)]
     table = PaperTable(name="loop", places=[PaperPlace(name="off", title="", shifts_m=shifts_m)], columns=[])
-    renders = model_files.uses_renders(config.model)
-    last = (config, score_settings(config, table), renders, overwrite, "synthesize")
+    last = (config, score_settings(config, table), overwrite, "synthesize")
     logs = listed_cities(config.list, config.logs, rules)
     jobs = {log.name: LoopLog(log, out / log.name, table, rows, *last, rules=rules).measure for log in logs}
     settings = {

@@ -139,16 +139,15 @@ def run(
     refuse_foreign(out, PAGES, lambda doc: doc["bench"] == "paper" and doc["table"]["name"] == table.name)
     generates = [row.changes for row in rows if METHODS[row.method].made_by == "synthesize" and not row.left_out]
     refuse_unfit(config, preset, rows, [replace(generator_of(config), **changes) for changes in generates])
-    measured, renders = score_settings(config, table), mdm_files.uses_renders(config.model)
+    measured = score_settings(config, table)
     jobs, first = {}, (table, (Row(FILL, ANCHORS[FILL]), *rows), config)
     for log in logs:
         own = of_log(measured, log.name)
-        jobs[log.name] = PaperLog(log, out / log.name, *first, own, renders, overwrite).measure
+        jobs[log.name] = PaperLog(log, out / log.name, *first, own, overwrite).measure
     settings = {
         "list": str(sources[0]) if isinstance(logs[0], ListedCity) else "",
         "missing_scenes": missing_scenes(table, logs),
         **model_settings(config),
-        "renders": renders,
         "videos": config.videos,
         "score": configuration.result_settings(measured),
         "digests": digests,

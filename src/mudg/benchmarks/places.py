@@ -378,9 +378,8 @@ PER_LOG: Final = ("detections", "lanes", "video_features")
 @dataclass(frozen=True)
 class Views:
     """The views of one log, in the folder ``out``, at the places of a table. ``rows``: those that are scored, in order.
-    ``score``: how every row is scored. ``renders``: whether the diffusion model uses those of a fit. ``virtual``:
-    folder of the views that fits learn from. ``on_path``: the diffusion model's own rows have views of the recorded
-    path, too."""
+    ``score``: how every row is scored. ``virtual``: folder of the views that fits learn from. ``on_path``: the
+    diffusion model's own rows have views of the recorded path, too."""
 
     log: Log
     out: Path
@@ -388,7 +387,6 @@ class Views:
     rows: tuple[Row, ...]
     config: BenchConfig
     score: ScoreConfig
-    renders: bool
     overwrite: bool
     virtual: str = "virtual"
     on_path: bool = True
@@ -447,22 +445,21 @@ class Views:
     def _of(self, row: Row) -> tuple[Path, ...]:
         if row.name == FILL:
             return (self.chain.filled(self.paths),)
-        renders = self.renders and row.changes.get("condition", "full") == "full"
         if METHODS[row.method].made_by == "synthesize":
             folders = []
             if any(path.origin != "recorded" for path in self.paths):
                 folder = self.out / "generated" / row.name if row.changes else self.out / self.virtual
-                folders.append(self.chain.generated(replace(self.off_path, **row.changes), folder, renders=renders))
+                folders.append(self.chain.generated(replace(self.off_path, **row.changes), folder))
             if self.on_path and any(path.origin == "recorded" for path in self.paths):
                 on_path = replace(self.off_path, shifts_m=(0.0,), paths=(), **row.changes)
                 folder = self.out / "generated" / f"{row.name}-{RECORDED}"
-                folders.append(self.chain.generated(on_path, folder, renders=renders))
+                folders.append(self.chain.generated(on_path, folder))
             return tuple(folders)
         virtual: tuple[Path, ...] = ()
         if row.name == EXACT:
             virtual = (self.chain.run(ExactViews(truth=self.truth, paths=self.paths, out=self.out / EXACT)),)
         elif row.learns_virtual:
-            virtual = (self.chain.generated(self.off_path, self.out / self.virtual, renders=self.renders),)
+            virtual = (self.chain.generated(self.off_path, self.out / self.virtual),)
         return (self.chain.rendered(row, virtual, self.drawn),)
 
     def scores(self, name: str, folders: Sequence[Path]) -> dict[Path, Mapping[str, Any]]:

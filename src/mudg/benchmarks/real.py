@@ -7,8 +7,8 @@ hidden was removed (``scene/part.py``), so they cannot use it. Whatever is finis
     OUT/<log>/scene                                         the whole log; read by truth and scores alone
     OUT/<log>/<split>/shown annotate scene asked            what the methods see; with labels; and places of held-out
                                                             frames
-    OUT/<log>/<split>/fuse fit/<method> virtual/<sees>   what methods make of it; what the diffusion model sees
-    OUT/<log>/<split>/nearest_fill generated/<sees> render/<method>   the views to score
+    OUT/<log>/<split>/fuse fit/<method> virtual           what methods make of it; generated views
+    OUT/<log>/<split>/nearest_fill generated render/<method>   the views to score
     OUT/<log>/truth/<protocol>  OUT/<log>/score/<protocol>/<method>
     OUT/bench.json  OUT/bench.md  OUT/page.html
 """
@@ -43,9 +43,9 @@ from mudg.benchmarks.places import (
 )
 from mudg.benchmarks.rows import (
     BASE,
+    DIFFUSION,
     FILL,
     Row,
-    Sees,
     chain_settings,
     generator_of,
     model_settings,
@@ -98,7 +98,7 @@ def run(
     read = {f"log {name}": path for name, path in logs.items()}
     refuse_overlap(out, {"model": mdm_files.folder_of(config.model), **read})
     refuse_foreign(out, PAGES, lambda document: document["bench"] == "real")
-    generates = any(row.sees and row.fit is None for row in rows)
+    generates = any(row.name == DIFFUSION for row in rows)
     refuse_unfit(config, preset, rows, [generator_of(config)] * generates)
     scenes = {name: imported(config, path, out / name / "scene", overwrite) for name, path in logs.items()}
     last, own = (rows, config, overwrite), {}
@@ -130,16 +130,6 @@ def run(
 
 
 @dataclass(frozen=True)
-class DiffusionUse:
-    """How a method uses the diffusion model on a log: what is left of what it asks for, the model, and a sentence about
-    it."""
-
-    sees: Sees
-    model: str
-    note: str = ""
-
-
-@dataclass(frozen=True)
 class SplitJob:
     """Everything of one log under one way of hiding."""
 
@@ -168,7 +158,7 @@ class SplitJob:
         held = held_out(whole, self.split, self.config.shown)
         if held.reason:
             left_out = {p.name: {"left_out": held.reason} for p in self.protocols}
-            return {"split": self.split.name, "held_out": {}, "diffusion": {}, "protocols": left_out}
+            return {"split": self.split.name, "held_out": {}, "protocols": left_out}
         self.write_seen(whole, held)
         chain, cameras = self.chain(), self.cameras(whole, held)
         truths, result = {}, {}
@@ -183,18 +173,15 @@ class SplitJob:
                 result[protocol.name]["left_out"] = targets.reason
         if truths:
             chain.fuse()
-        used: dict[str, dict[str, str]] = {}
         for row in self.rows if truths else ():
-            views, use = self.views(row, chain, cameras)
-            if use is not None:
-                used[row.name] = {"sees": use.sees, "note": use.note}
+            views = self.views(row, chain, cameras)
             for name, truth in truths.items():
                 protocol = next(protocol for protocol in self.protocols if protocol.name == name)
                 step = {"log": self.source, "truth": truth, "views": views, "protocol": protocol}
                 out = self.out / "score" / name / row.name
                 scored = chain.run(ScoreTargets(**step, device=self.config.device, out=out))
                 result[name]["values"][row.name] = store.read_json(scored / "metrics.json")
-        return {"split": self.split.name, "held_out": dict(held.facts), "diffusion": used, "protocols": result}
+        return {"split": self.split.name, "held_out": dict(held.facts), "protocols": result}
 
     def write_seen(self, whole: Scene, held: HeldOut) -> None:
         """Write what the methods see: the shown frames and sweeps; these with the labels that they lack; the same with
@@ -221,37 +208,22 @@ class SplitJob:
         hidden = {frame.view.camera.name for frame in held.places(whole)}
         return tuple(name for name in whole.cameras if name in hidden)
 
-    def views(self, row: Row, chain: Chain, cameras: tuple[str, ...]) -> tuple[Path, DiffusionUse | None]:
-        """The folder with a method's views at all places that are asked for, made if need be; and how it used the
-        diffusion model. Fits learn from generated views beside the recorded path, and where views of hidden frames are
-        asked for."""
+    def views(self, row: Row, chain: Chain, cameras: tuple[str, ...]) -> Path:
+        """The folder with a method's views at all places that are asked for, made if need be. Fits learn from generated
+        views beside the recorded path, and where views of hidden frames are asked for."""
         places = self.folder / "asked" if (self.folder / "asked").is_dir() else chain.scene
         drawn = RenderConfig(cameras=cameras, shifts_m=self.split.shifts_m, video=False, device=self.config.device)
         if row.name == FILL:
-            return chain.filled(render.trajectories(read_scene(places), drawn)), None
-        use, virtual = self.use(row.sees, chain) if row.sees else None, []
-        if use is not None:
-            scored = replace(chain.generator, cameras=cameras, shifts_m=self.split.shifts_m)
-            for folder, settings, needed in (
-                ("virtual", chain.generator, row.fit is not None),
-                ("generated", scored, row.fit is None or self.split.by_camera or self.split.block),
-            ):
-                if needed:
-                    made = replace(settings, model=use.model)
-                    virtual.append(chain.generated(made, self.folder / folder / use.sees, renders=use.sees != "points"))
-            if row.fit is None:
-                return virtual[0], use
-        return chain.rendered(row, virtual, drawn, places), use
-
-    def use(self, sees: Sees) -> DiffusionUse:
-        """How the diffusion model is used where a method asks for ``sees``. What the model does not allow is left out,
-        and the note says so."""
-        model = self.config.model
-        if sees == "points":
-            return DiffusionUse("points", model)
-        if not mdm_files.uses_renders(model):
-            return DiffusionUse("points", model, "the model does not use renders, so it sees points alone")
-        return DiffusionUse("renders", model)
+            return chain.filled(render.trajectories(read_scene(places), drawn))
+        scored = replace(chain.generator, cameras=cameras, shifts_m=self.split.shifts_m)
+        if row.fit is None:
+            return chain.generated(scored, self.folder / "generated")
+        virtual = list[Path]()
+        if row.learns_virtual:
+            virtual.append(chain.generated(chain.generator, self.folder / "virtual"))
+            if self.split.by_camera or self.split.block:
+                virtual.append(chain.generated(scored, self.folder / "generated"))
+        return chain.rendered(row, virtual, drawn, places)
 
 
 # ---- numbers ----
@@ -260,7 +232,7 @@ class SplitJob:
 def _row_values(row: Row) -> dict[str, Any]:
     changes = configuration.result_settings(row.fit) if row.varied else None
     fit = "" if row.fit is None else row.method
-    return {"name": row.name, "title": row.title, "fit": fit, "sees": row.sees, "changes": changes}
+    return {"name": row.name, "title": row.title, "fit": fit, "changes": changes}
 
 
 def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str, Any]:
@@ -270,7 +242,7 @@ def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str
     cameras = {camera: {"size_px": of, "frames": len(loaded.frames_of(camera))} for camera, of in sizes.items()}
     names = {"log": name, "id": loaded.id, "dataset": loaded.source.dataset, "digest": store.digest(scene)}
     counts = {"cameras": cameras, "sweeps": len(loaded.sweeps), "tracks": len(loaded.tracks)}
-    of_split = {part: {s["split"]: s[part] for s in splits} for part in ("held_out", "diffusion")}
+    of_split = {part: {s["split"]: s[part] for s in splits} for part in ("held_out",)}
     protocols = {protocol: result for s in splits for protocol, result in s["protocols"].items()}
     return {**names, **counts, **of_split, "protocols": protocols}
 
@@ -336,10 +308,6 @@ def notes_of(doc: Facts, protocol: str) -> list[str]:
             words.append(f"colour map of {place}: gain {gain}, offset {offset}")
         words += [f"{place} is left out ({reason})" for place, reason in facts["left_out"].items()]
         lines.append(f"{name}: {'; '.join(words)}.")
-        notes: dict[str, list[str]] = {}
-        for method, use in log["diffusion"].get(split, {}).items():
-            notes.setdefault(use["note"], []).append(method)
-        lines += [f"{name}: {', '.join(methods)}: {note}." for note, methods in notes.items() if note]
     return lines
 
 

@@ -26,7 +26,7 @@ from mudg.gaussians.settings import METHODS, PUBLISHED, UNFIT, WEIGHTS
 from mudg.networks.inception import ResizeRule
 from mudg.scoring import score
 from mudg.scoring.tables import title_of
-from mudg.steps.pipeline import CONTINUED_SHARE, WITHOUT_DIFFUSION, refuse_missing
+from mudg.steps.pipeline import WITHOUT_DIFFUSION, refuse_missing
 from mudg.steps.settings import PresetName
 
 FILE: Final = Path(__file__).with_name("papers.yaml")
@@ -204,7 +204,7 @@ SCENE_LISTS: Final[Mapping[str, Sequence[SceneRange]]] = PAPERS.scene_lists
 
 FILL, BASE, DIFFUSION, FULL = score.BASELINE, WITHOUT_DIFFUSION, "mudg_r", "mudg_s"
 LONGER: Final = f"{BASE}-longer"
-"""The control of ``mudg_s``: goes on with the first fit for as many iterations, without generated views."""
+"""The control of ``mudg_s``: goes on with the first fit until it has as many iterations, without generated views."""
 LONGER_TITLE: Final = title_of(BASE) + ", as many iterations"
 REPAIRED: Final = "difix"
 EXACT: Final = "exact"
@@ -218,10 +218,6 @@ ABLATION: Final[dict[str, tuple[str, Mapping[str, float]]]] = {
 }
 """Rows beside the fit without virtual views and that with all terms, as in table 3 of the paper, and the most that
 virtual views can bring at this number of steps: row -> (what is learned from, settings ``virtual`` of the fit)."""
-Sees = Literal["", "renders", "points"]
-"""What a method shows its diffusion model: renders of the first fit too, or points and photographs alone."""
-LESS: Final[dict[Sees, tuple[str, str]]] = {"renders": ("", ""), "points": ("-no-renders", ", points alone")}
-"""What a method sees -> the endings of its name and title."""
 PLACES: Final = ("cameras", "shifts_m", "paths", "condition", "processes")
 """Settings of generated views that are the benchmark's matter, not the user's."""
 SAMPLING: Final = (
@@ -236,15 +232,14 @@ _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.+-]*")
 class Row:
     """A row that is computed. ``method``: of `METHODS`; empty = fused points, holes filled. ``fit``: settings of its
     fit (those of the first fit where it is ``LONGER``); None = no fit. ``changes``: other settings of its fit or of
-    synthesize; ``model: ""`` = there is no model, so the row has no numbers. ``sees``: how it uses the diffusion model,
-    where benchmarks let it choose. ``varied``: its settings stand in the table."""
+    synthesize; ``model: ""`` = there is no model, so the row has no numbers. ``varied``: its settings stand in the
+    table."""
 
     name: str
     title: str
     method: str = ""
     fit: MethodConfig | None = None
     changes: Mapping[str, Any] = field(default_factory=dict)
-    sees: Sees = ""
     varied: bool = False
 
     @property
@@ -287,12 +282,11 @@ def method_fit(usual: MethodConfig, method: str, preset: PresetName) -> MethodCo
 
 
 def chain_settings(config: BenchConfig, preset: PresetName) -> dict[str, Any]:
-    """What the chain of a benchmark runs with, for ``bench.json``; ``continued_share`` is None where fits under virtual
-    views begin from nothing."""
+    """What the chain of a benchmark runs with, for ``bench.json``."""
     generator = configuration.result_settings(generator_of(config))
     return {
         "preset": preset,
-        "continued_share": CONTINUED_SHARE if config.continue_fit else None,
+        "guided_share": config.guided_share,
         "fuse": configuration.result_settings(config.fuse),
         "fit": configuration.result_settings(usual_fit(config)),
         "synthesize": {name: value for name, value in generator.items() if name not in PLACES},
@@ -324,18 +318,16 @@ def refuse_unfit(
     such model."""
     fits = [row.fit for row in rows if row.fit is not None]
     virtual = [fit for fit in fits if METHODS[fit.method].learns_virtual]
-    renders = model_files.uses_renders(config.model)
-    if any(fit.method == REPAIRED for fit in fits) and not renders:
+    if any(fit.method == REPAIRED for fit in fits) and not model_files.uses_renders(config.model):
         what, remedy = "repairs renders, and this diffusion model uses none", f"leave {REPAIRED} out, or choose"
         raise UsageError(f"{REPAIRED} {what}", where="--methods", got=config.model, remedy=f"{remedy} another --model")
-    if fits and not config.continue_fit and LONGER in config.methods:
-        what = f"with --no-continue-fit every fit has the same iterations, so this row is that of {BASE}"
+    if fits and config.guided_share <= 1 and LONGER in config.methods:
+        what = f"no fit has more iterations than {BASE}, so this row is the same"
         raise UsageError(what, where="--methods", got=LONGER, remedy="leave it out")
-    some_fit = fits or (renders and generators)
     idle = {
         "no row of this table generates views": () if generators or virtual else ("synthesize",),
-        "no row of this table fits a scene": () if some_fit else ("fit", "iterations", "continue_fit"),
-        "no row of this table learns from virtual views": () if virtual else ("fit.virtual", "continue_fit"),
+        "no row of this table fits a scene": () if fits else ("fit", "iterations", "guided_share"),
+        "no row of this table learns from virtual views": () if virtual else ("fit.virtual", "guided_share"),
     }
     for name in changed_settings(config, bench_preset(preset)):
         for reason, unused in idle.items():
@@ -365,25 +357,13 @@ def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row
 
 
 def real_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
-    """The methods and variants of ``mudg bench real``; ``mudg_r`` and ``mudg_s`` are the chain of ``mudg run`` for
-    recorded logs, the rows after each leave out parts of it. Raises as `shift_rows`."""
-    usual = usual_fit(config)
-    less = {name + ending: (name, sees, words) for name in (DIFFUSION, FULL) for sees, (ending, words) in LESS.items()}
-    known = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, *less)
-    wanted = {*config.methods, *((BASE, LONGER, *less) if config.ablation else ())}
+    """The methods and variants of ``mudg bench real``. Raises as `shift_rows`."""
+    known, usual = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL), usual_fit(config)
+    wanted = {*config.methods, *((BASE, LONGER) if config.ablation else ())}
     _refuse_unknown(wanted, known)
-    if not config.continue_fit and LONGER not in config.methods:
-        wanted -= {LONGER}
-    rows = []
-    for name in known:
-        whole, sees, words = less.get(name, (name, "", ""))
-        if name in wanted:
-            row = _method_row(whole, usual, preset)
-            rows.append(replace(row, name=name, title=row.title + words, sees=sees))
-    for text in config.variant:
-        row = variant_of(text, usual)
-        rows.append(replace(row, title=title_of(row.name), sees="renders" if row.learns_virtual else ""))
-    return _without_twins(rows)
+    rows = [_method_row(name, usual, preset) for name in known if name in wanted]
+    variants = (variant_of(text, usual) for text in config.variant)
+    return _without_twins([*rows, *(replace(row, title=title_of(row.name)) for row in variants)])
 
 
 def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "default") -> tuple[Row, ...]:
@@ -403,7 +383,7 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
         known = [name for method in METHODS for name in ((method, LONGER) if method == BASE else (method,))]
         methods = [name for name in config.methods if name != FILL]
         if config.methods == usual_methods:
-            methods = [name for name in known if config.continue_fit or name != LONGER]
+            methods = [name for name in known if config.guided_share > 1 or name != LONGER]
         _refuse_unknown(methods, known, some=False)
         if freevs and "freevs" not in methods:
             got, remedy = f"--methods {' '.join(config.methods)}", "leave it out, or add freevs to --methods"

@@ -44,7 +44,7 @@ USED: Final[Mapping[str, tuple[str, ...]]] = {
         (("mdm", "poses", EDIT, RUNS), "threads"),
         (("mdm", "poses", EDIT, *CHAINS), "seed"),
         (("mdm", "poses", EDIT, RUNS, *CHAINS), "device"),
-        (CHAINS, "methods iterations continue_fit processes fuse synthesize fit"),
+        (CHAINS, "methods iterations guided_share processes fuse synthesize fit"),
         ((SHIFT, LOOP), "list"),
         ((SHIFT, PAPER, LOOP), "logs"),
         ((SHIFT, PAPER), "videos"),

@@ -55,19 +55,16 @@ class BenchOwn:
     4)."""
     methods: tuple[str, ...] = ("nearest_fill", "gs3d", "street_gaussians", "mudg_r", "mudg_s")
     """shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian,
-    bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on for as many steps as mudg_s, without
-    generated views. real also has mudg_r-no-renders and mudg_s-no-renders, with points alone in the diffusion
-    model's input. paper: any of these of shift, and
+    bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s,
+    without generated views. paper: any of these of shift, and
     freevs; with the default, all of them."""
     iterations: int = setting(default=1000, ge=1)
-    """shift, real, loop, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for
-    half as many more."""
-    continue_fit: bool = True
-    """shift, real, loop, paper: make fits under virtual views from the one without, with half as many steps. Off: from
-    nothing with all steps, as published."""
+    """shift, real, loop, paper: optimisation steps of every fit without virtual views."""
+    guided_share: float = setting(default=1.5, gt=0)
+    """shift, real, loop, paper: steps of fits under virtual views, as a multiple of the others'."""
     ablation: bool = False
     """shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and
-    with exact views instead of generated ones. real: add the rows without renders."""
+    with exact views instead of generated ones. real: add street_gaussians-longer."""
     variant: tuple[str, ...] = ()
     """shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is
     a setting such as virtual.color_weight. Both of its fits have them."""
@@ -126,7 +123,7 @@ def bench_preset(name: PresetName = "default") -> BenchConfig:
         {
             "model": run.synthesize.model,
             "iterations": run.fit.iterations,
-            "continue_fit": run.continue_fit,
+            "guided_share": run.guided_share,
             "fuse": run.fuse,
             "synthesize": changed(run.synthesize, {"model": usual.model, "cameras": usual.cameras}),
             "fit": changed(run.fit, {"iterations": MethodConfig().iterations}),

@@ -122,15 +122,14 @@ def run(
     refuse_foreign(out, _PAGES, own, lambda entry: entry.name.isdigit())
     shifts = {RECORDED: [0.0], **{f"{d:g}": [d, -d] for d in distances_m}}
     places = [PaperPlace(name=name, title="", shifts_m=shifts_m) for name, shifts_m in shifts.items()]
-    table, renders = PaperTable(name="shift", places=places, columns=[]), mdm_files.uses_renders(config.model)
-    last = (config, score_settings(config, table), renders, overwrite, "synthesize")
+    table = PaperTable(name="shift", places=places, columns=[])
+    last = (config, score_settings(config, table), overwrite, "synthesize")
     logs = listed_cities(config.list, config.logs, rules)
     jobs = {log.name: ShiftLog(log, out / log.name, table, rows, *last, on_path=False).measure for log in logs}
     refuse_unfit(config, preset, rows, [generator_of(config)] * any(row.method == DIFFUSION for row in rows))
     settings = {
         "list": config.list,
         **model_settings(config),
-        "renders": renders,
         "frames": rules.frames,
         "size_px": [rules.width, rules.height],
         "cameras": list(rules.cameras),
@@ -232,14 +231,11 @@ def standard_error(of: Callable[[Sequence[Any]], float | None], items: Sequence[
 
 def virtual_fits_of(settings: Facts) -> str:
     """How many iterations fits under virtual views have, as part of a sentence."""
-    share = settings["continued_share"]
-    more = "under virtual views {:g} times as many more after the fit on recorded views"
-    return more.format(share) if share else "those under virtual views too, from nothing"
+    return f"{settings['guided_share']:g} times as many under virtual views"
 
 
 def _summary(settings: Facts) -> str:
-    seen = " with renders of the fit on recorded views" if settings["renders"] else " without renders"
-    return f"{settings['iterations']} iterations per fit, {virtual_fits_of(settings)}; generated{seen}"
+    return f"{settings['iterations']} iterations per fit, {virtual_fits_of(settings)}"
 
 
 def markdown(doc: Facts) -> str:

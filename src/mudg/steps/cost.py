@@ -106,15 +106,15 @@ def estimate(config: RunConfig, size: SceneSize, cores: int, speed: float = 1.0,
     recorded = size.images * pixels
     most = recorded / 3 if fit.iterations > SHORT_FIT else 3 * size.points or recorded
     gaussians = min(fit.densify.max_gaussians, recorded, most)
-    step_s, part = FIT_S * (gaussians + fit_pixels), 0.5 if config.continue_fit else 1.0
-    share = fit.virtual.continued_probability if config.continue_fit else fit.virtual.probability
+    step_s = FIT_S * (gaussians + fit_pixels)
+    guided_s = step_s * (1 + VIRTUAL * fit.virtual.probability * fit.virtual.beside)
     view_s = NETWORK_VIEW_S * (1 + config.synthesize.steps / 10) + NETWORK_PIXEL_S * pixels
     work = {  # core-seconds, and processes among which they are divided (0: threads)
         "annotate": (size.images * (NETWORK_VIEW_S + NETWORK_PIXEL_S * pixels), cores),
         "fuse": (size.images * size.points * POINT_S, 0),
         "fit without diffusion": (fit.iterations * step_s, 0),
         "synthesize": (PROCESS_S * processes + made * view_s, processes),
-        "fit with diffusion": (part * fit.iterations * step_s * (1 + VIRTUAL * share * fit.virtual.beside), 0),
+        "fit with diffusion": (config.guided_share * fit.iterations * guided_s, 0),
         "render without diffusion": (rendered * SHOWN_PIXEL_S * pixels, 0),
         "render with diffusion": (rendered * SHOWN_PIXEL_S * pixels, 0),
         "score": (scored * (SHOWN_VIEW_S + SHOWN_PIXEL_S * pixels), 0),

@@ -33,15 +33,13 @@ WITHOUT_DIFFUSION = "street_gaussians"
 DIFFUSION = "mudg_r"
 WITH_DIFFUSION = "mudg_s"
 CONVERTED = "a folder written by mudg convert"
-CONTINUED_SHARE = 0.5
-"""Further steps of the fit with diffusion, as a share of those of the fit that it continues."""
 
 
-def fits_of(config: MethodConfig, continued: bool = True) -> tuple[MethodConfig, MethodConfig]:
-    """Settings of the chain's two fits: the one on recorded views, and the one under virtual views, which goes on with
-    it unless ``continued`` is off."""
-    further = max(1, round(CONTINUED_SHARE * config.iterations)) if continued else config.iterations
-    return replace(config, method=WITHOUT_DIFFUSION), replace(config, method=WITH_DIFFUSION, iterations=further)
+def fits_of(config: MethodConfig, guided_share: float) -> tuple[MethodConfig, MethodConfig]:
+    """Settings of the chain's two fits, both from nothing: the one on recorded views, and the one under virtual views,
+    with ``guided_share`` times as many iterations."""
+    guided = max(1, round(guided_share * config.iterations))
+    return replace(config, method=WITHOUT_DIFFUSION), replace(config, method=WITH_DIFFUSION, iterations=guided)
 
 
 def run_chain(config: RunConfig, source: str | Path, out: Path, *, overwrite: bool = False) -> dict[str, Any]:
@@ -223,22 +221,17 @@ def _has_semantics(scene: Path) -> bool:
 def steps_of(config: RunConfig, scene: Path, out: Path, overwrite: bool) -> dict[str, Output]:
     """The pipeline on a labelled scene, by the names that tables give its steps: each reads what others before it
     write."""
-    from mudg.diffusion.model_files import uses_renders
-
-    plain, guided = fits_of(config.fit, config.continue_fit)
+    plain, guided = fits_of(config.fit, config.guided_share)
     first, last = out / "fit" / WITHOUT_DIFFUSION, out / "fit" / WITH_DIFFUSION
     fused, virtual = out / "fuse", out / "synthesize"
     render = {method: out / "render" / method for method in (WITHOUT_DIFFUSION, WITH_DIFFUSION)}
     views = {WITHOUT_DIFFUSION: render[WITHOUT_DIFFUSION], DIFFUSION: virtual, WITH_DIFFUSION: render[WITH_DIFFUSION]}
-    seen, begun = first if uses_renders(config.synthesize.model) else None, first if config.continue_fit else None
     drawn = {"scene": scene, "settings": config.render}
     steps: dict[str, Output] = {
         "fuse": Fuse(scene=scene, out=fused, settings=config.fuse),
         "fit without diffusion": Fit(scene=scene, fused=fused, out=first, settings=plain),
-        "synthesize": Synthesize(scene=scene, fused=fused, fitted=seen, out=virtual, settings=config.synthesize),
-        "fit with diffusion": Fit(
-            scene=scene, fused=fused, observations=(virtual,), start_from=begun, out=last, settings=guided
-        ),
+        "synthesize": Synthesize(scene=scene, fused=fused, out=virtual, settings=config.synthesize),
+        "fit with diffusion": Fit(scene=scene, fused=fused, observations=(virtual,), out=last, settings=guided),
         "render without diffusion": RenderViews(model=first, out=render[WITHOUT_DIFFUSION], **drawn),
         "render with diffusion": RenderViews(model=last, out=render[WITH_DIFFUSION], **drawn),
         "score": Score(scene=scene, views=views, fused=fused, out=out / "score", settings=config.score),

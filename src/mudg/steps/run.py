@@ -20,7 +20,7 @@ class Run(Output):
         "mudg run ~/kitti/2011_09_26_drive_0001_sync --out runs/kitti",
         "mudg run scenes/a --out runs/a --preset quality",
     )
-    short = ("device", "continue_fit")
+    short = ("device", "guided_share")
     source: Annotated[str, Flag("SOURCE", "first")]
     """Folder of a dataset log (its format is recognised), a scene directory, or the word city."""
     preset: PresetName | None = None

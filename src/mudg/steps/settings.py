@@ -28,9 +28,8 @@ class RunConfig:
     device: DeviceName = "auto"
     """Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by
     --fit.device, keeps that one."""
-    continue_fit: bool = True
-    """Make the fit with virtual views from the one without, with half as many steps. Off: from nothing with all steps,
-    as published."""
+    guided_share: float = setting(default=1.5, gt=0)
+    """Iterations of the fit with virtual views, as a multiple of those of the fit without. Both begin from nothing."""
     ingest: IngestConfig = setting(default_factory=IngestConfig)
     annotate: AnnotateConfig = setting(default_factory=AnnotateConfig)
     fuse: FuseConfig = setting(default_factory=FuseConfig)
@@ -114,7 +113,7 @@ PRESETS: Final[Mapping[PresetName, Mapping[str, Value]]] = {
         **_of("synthesize", steps=2),  # of the shipped model; more lowered its scores (docs/diffusion.md)
     },
     "paper": {
-        "continue_fit": False,
+        "guided_share": 1.0,
         **_of("ingest.city", n_frames=60, width=960, height=640),
         **_of("fuse", match_colors=False, occlusion_test=False, box_growth_m=0.0, floor_margin_m=0.25),
         **_of("fuse", moving_distance_m=0.5, min_object_points=100),
