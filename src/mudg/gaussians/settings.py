@@ -123,11 +123,11 @@ class VirtualConfig:
     confidence_power: float = setting(default=0.5, ge=0)
     """Every virtual loss term is weighted by the confidence of the generated pixel, raised to this power (0 = all
     pixels count the same)."""
-    color_weight: float = setting(default=1.0, ge=0)
+    color_weight: float = setting(default=0.5, ge=0)
     """Weight of colour."""
     ssim_weight: float = setting(default=0.3, ge=0, le=1)
     """Share of structural similarity (SSIM) in the colour term, 0 to 1."""
-    perceptual_weight: float = setting(default=0.3, ge=0)
+    perceptual_weight: float = setting(default=0.15, ge=0)
     """Weight of the perceptual distance, measured by `perception`."""
     perception: Literal["filters", "lpips"] = "filters"
     """Features of the perceptual distance. filters: a fixed filter bank. lpips: the LPIPS network, which needs

@@ -4,59 +4,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
-def adapt(
-    scene: str | Path,
-    fused: str | Path | None = None,
-    *,
-    out: str | Path,
-    overwrite: bool = False,
-    fitted: str | Path | None = None,
-    config: str | Path | None = None,
-    model: str = 'embedded',
-    cameras: tuple[str, ...] = ('front',),
-    shifts_m: tuple[float, ...] = (2.5, -2.5),
-    gaps: bool = True,
-    block: int = 4,
-    held_out_every: int = 4,
-    fit_iterations: int = 150,
-    steps: int = 40,
-    batch_frames: int = 16,
-    lr: float = 0.0001,
-    trained: Literal['all', 'refiner'] = 'all',
-    precision: Literal['auto', 'float32', 'bfloat16'] = 'auto',
-    device: str = 'auto',
-    processes: int = 0,
-    threads: int = 0,
-    seed: int = 0,
-) -> Any:
-    """Adapt the diffusion model to one recorded log, with the log's own photographs.
-
-    Args:
-        scene: Scene directory written by ingest or annotate, or folder of mudg run.
-        fused: Point clouds written by fuse. The folder may also follow SCENE without the flag (not given: those of the run at SCENE).
-        out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
-        overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
-        fitted: Gaussian scene written by fit, without virtual views (not given: that of the run at SCENE).
-        config: YAML file of settings, read before those given here.
-        model: Diffusion model to start from: "embedded", shipped with the package, or a model folder written by learn. It must use renders.
-        cameras: Cameras whose photographs are learned (empty = the first camera).
-        shifts_m: Lateral shifts in metres of the made-up drives beside the recorded path, from which the model learns to generate the photographs.
-        gaps: Also learn to generate photographs from those of other times: half of the log is left out of a fit, then the other half.
-        block: Frames per training clip, and consecutive frames left out together.
-        held_out_every: Every n-th block of frames is kept for comparing the adapted model with the one it started from.
-        fit_iterations: Optimisation steps of each of the fits that the clips are made with.
-        steps: Training steps.
-        batch_frames: Frames per training step.
-        lr: Largest learning rate.
-        trained: Parts that are trained. refiner: refiner and finisher only.
-        precision: Number format of the diffusion model. auto: bfloat16 on CUDA devices and CPUs that compute in it, float32 elsewhere.
-        device: Device of the diffusion model: auto (CUDA if there is one), cpu, cuda, cuda:N, mps.
-        processes: Number of fits made at the same time, with one thread each (0 = one per core; at most four where the diffusion model is not on the CPU). The result does not depend on it.
-        threads: Threads of the training (0 = one per core). Results are repeatable for the same number of threads.
-        seed: Seed of all random numbers; the same seed gives the same result.
-    """
-    ...
-
 def annotate(
     scene: str | Path,
     *,
@@ -120,7 +67,7 @@ def bench(
     logs: int = 8,
     methods: tuple[str, ...] = ('nearest_fill', 'gs3d', 'street_gaussians', 'mudg_r', 'mudg_s'),
     iterations: int = 1000,
-    continue_fit: bool = True,
+    guided_share: float = 1.5,
     ablation: bool = False,
     variant: tuple[str, ...] = (),
     processes: int = 0,
@@ -160,10 +107,10 @@ def bench(
         seed: Seed of all random numbers; the same seed gives the same result.
         list: shift, loop: list of logs. Choose settings on development; report results on reported, on which nothing was chosen.
         logs: shift, loop; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4).
-        methods: shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on for as many steps as mudg_s, without generated views. real also has mudg_r-no-adapt, mudg_r-no-renders, mudg_s-no-adapt and mudg_s-no-renders: without adapting the diffusion model to the log, and with points alone in its input. paper: any of these of shift, and freevs; with the default, all of them.
-        iterations: shift, real, loop, paper: optimisation steps of every fit. mudg_s goes on with the fit of street_gaussians for half as many more.
-        continue_fit: shift, real, loop, paper: make fits under virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published.
-        ablation: shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact views instead of generated ones. real: add the rows without adaptation and without renders.
+        methods: shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. paper: any of these of shift, and freevs; with the default, all of them.
+        iterations: shift, real, loop, paper: optimisation steps of every fit without virtual views.
+        guided_share: shift, real, loop, paper: steps of fits under virtual views, as a multiple of the others'.
+        ablation: shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact views instead of generated ones. real: add street_gaussians-longer.
         variant: shift, real: add rows for mudg_s with other settings of fit, each as NAME=FIELD:VALUE,FIELD:VALUE, where FIELD is a setting such as virtual.color_weight. Both of its fits have them.
         processes: shift, real, loop, paper: number of logs (real: also ways of hiding frames) processed at the same time, with one thread each (0 = one per core). Results do not depend on it.
         videos: shift, paper: also write videos of all methods side by side.
@@ -263,13 +210,11 @@ def demo(
     seed: int | None = None,
     shifts_m: tuple[float, ...] = (),
     config: str | Path | None = None,
-    adaptation: Literal['auto', 'on', 'off'] = 'auto',
     device: str = 'auto',
-    continue_fit: bool = True,
+    guided_share: float = 1.5,
     ingest: Mapping[str, Any] = ...,
     annotate: Mapping[str, Any] = ...,
     fuse: Mapping[str, Any] = ...,
-    adapt: Mapping[str, Any] = ...,
     synthesize: Mapping[str, Any] = ...,
     fit: Mapping[str, Any] = ...,
     render: Mapping[str, Any] = ...,
@@ -285,13 +230,11 @@ def demo(
         seed: Seed of the city and of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
         shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.
         config: YAML file of settings, read before those given here.
-        adaptation: Adapt the diffusion model to the log before it generates views. auto: for recorded logs that are long enough, not for generated cities.
         device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by --fit.device, keeps that one.
-        continue_fit: Make the fit with virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published.
+        guided_share: Iterations of the fit with virtual views, as a multiple of those of the fit without. Both begin from nothing.
         ingest:
         annotate:
         fuse:
-        adapt:
         synthesize:
         fit:
         render:
@@ -694,7 +637,7 @@ def report(
     """Write one page over many finished runs: pictures, links, and a table of all scores to sort and filter.
 
     Args:
-        runs: Folders of mudg run, score or bench; of any other folder, the folders in it.
+        runs: Folders of mudg run, score, bench or batch; of any other folder, the folders in it.
         out: Page to write.
         overwrite: Replace the page if it exists.
     """
@@ -711,13 +654,11 @@ def run(
     cameras: tuple[str, ...] = (),
     shifts_m: tuple[float, ...] = (),
     config: str | Path | None = None,
-    adaptation: Literal['auto', 'on', 'off'] = 'auto',
     device: str = 'auto',
-    continue_fit: bool = True,
+    guided_share: float = 1.5,
     ingest: Mapping[str, Any] = ...,
     annotate: Mapping[str, Any] = ...,
     fuse: Mapping[str, Any] = ...,
-    adapt: Mapping[str, Any] = ...,
     synthesize: Mapping[str, Any] = ...,
     fit: Mapping[str, Any] = ...,
     render: Mapping[str, Any] = ...,
@@ -730,18 +671,16 @@ def run(
         out: Folder to write; it must not be one of the inputs. A finished result of the same settings and inputs is verified and reused.
         overwrite: Replace a result of other settings or inputs in --out instead of refusing. The old result stays until the new one is finished, so the disk must hold both. Files that do not belong to the old result are kept.
         preset: Settings to start from. fast: smaller images, fewer frames and iterations. default: minutes on two cores. quality: 30,000 iterations, millions of Gaussians, for a GPU. paper: the published set-up, with a published-type model (docs/presets.md).
-        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side, no adaptation. One to two minutes on 2 cores for 16 frames of one camera; a line at the start forecasts what it takes here.
+        fast: The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for 16 frames of one camera; a line at the start forecasts what it takes here.
         seed: Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config).
         cameras: Cameras for which shifted trajectories are made (not given: the first camera).
         shifts_m: Lateral shifts in metres, positive to the left (not given: 2, 3 and 4 m to both sides; --fast: 3 m). They apply to synthesize, render and score.
         config: YAML file of settings, read before those given here.
-        adaptation: Adapt the diffusion model to the log before it generates views. auto: for recorded logs that are long enough, not for generated cities.
         device: Device of all steps: auto (CUDA if there is one), cpu, cuda, cuda:N. A step whose own device is set, as by --fit.device, keeps that one.
-        continue_fit: Make the fit with virtual views from the one without, with half as many steps. Off: from nothing with all steps, as published.
+        guided_share: Iterations of the fit with virtual views, as a multiple of those of the fit without. Both begin from nothing.
         ingest:
         annotate:
         fuse:
-        adapt:
         synthesize:
         fit:
         render:
