@@ -26,7 +26,6 @@ DEMO = cost.SceneSize(images=72, path_images=24, width=384, height=256, points=1
 FAST = cost.SceneSize(images=12, path_images=12, width=240, height=160, points=100_600)
 UNLABELLED = {"points": 31_336, "exact": False, "labelled": False}
 LOG = cost.SceneSize(images=16, path_images=16, width=480, height=145, **UNLABELLED)
-SIX = (2.0, -2.0, 3.0, -3.0, 4.0, -4.0)
 SLOWER = 0.46
 """Speed of two cores without AVX-512, as the probe found it between the runs."""
 
@@ -52,21 +51,19 @@ def drive(frames: int, width: int, height: int) -> cost.SceneSize:
     return cost.SceneSize(frames, frames, width, height, **UNLABELLED)
 
 
-WHOLE = replace(LOG, width=1242, height=375)
+IDLE, BUSY = 1.9, 1.45
+"""Speed of the machine that these runs were made on, alone and beside other programs, as the probe found it."""
 MEASURED = {
     # run: settings, scene, cores, speed; seconds by the clock, processor seconds, most memory in MB, results in MB,
     # from its run.json
-    "demo on two cores": (settings("default"), DEMO, 2, 1.0, 341.6, None, None, 448.0),
-    "demo on two cores, another day": (settings("default"), DEMO, 2, 1.0, 297.4, None, None, None),
-    "demo --fast with six trajectories": (settings("fast", 250, SIX), FAST, 1, 1.0, None, 115.4, 1641, None),
-    "demo --fast, slower machine": (settings("fast"), FAST, 2, SLOWER, None, 153.0, 1859, 75.0),
-    "run --fast on a KITTI drive, slower machine": (settings("fast"), LOG, 2, SLOWER, None, 231.5, 1948, 122.6),
-    "run on that drive at full size": (settings("default"), WHOLE, 2, 1.0, 514.0, None, 3221, None),
-    "10 frames of it": (settings("default", 100, (2.0, -2.0), 2), drive(10, 480, 145), 1, 1.0, None, 67.9, None, None),
-    "6 frames of it": (settings("default", 60, (2.0,)), drive(6, 320, 97), 1, 1.0, None, 17.5, None, None),
-    "two cameras": (settings("default", 100, (2.0, -2.0), 2), city(16, 8, 320, 208), 1, 1.0, None, 73.2, None, None),
-    "ten frames": (settings("default", 150, (3.0,)), city(10, 10, 192, 128), 1, 1.0, None, 30.2, 965, None),
-    "small": (settings("default", 200, (2.0, -2.0)), city(6, 6, 120, 80), 1, 1.0, None, 33.8, None, None),
+    "demo on two cores": (settings("default"), DEMO, 2, IDLE, 193.2, 321.4, 2190, 582.0),
+    "demo --fast": (settings("fast"), FAST, 2, BUSY, None, 61.2, 1563, 104.5),
+    "run --fast on a KITTI drive": (settings("fast"), LOG, 2, BUSY, None, 84.7, 1809, 134.0),
+    "10 frames of it": (settings("default", 100, (2.0, -2.0), 2), drive(10, 480, 145), 2, BUSY, None, 44.5, 1757, 87.4),
+    "6 frames of it": (settings("default", 60, (2.0,)), drive(6, 320, 97), 2, BUSY, None, 12.8, None, 34.8),
+    "two cameras": (settings("default", 100, (2.0, -2.0), 2), city(16, 8, 320, 208), 2, BUSY, None, 45.8, 1872, 110.1),
+    "ten frames": (settings("default", 150, (3.0,)), city(10, 10, 192, 128), 2, BUSY, None, 28.1, None, 68.9),
+    "small": (settings("default", 200, (2.0, -2.0)), city(6, 6, 120, 80), 2, BUSY, None, 28.9, 1424, None),
 }
 
 
