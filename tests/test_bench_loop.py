@@ -125,5 +125,5 @@ def test_the_benchmark_fits_drives_and_is_reused(tmp_path: Path) -> None:
     assert len(times) == 6
     loop.run(config, tmp_path / "loop", rules=RULES)
     assert times == {path: path.stat().st_mtime_ns for path in out.rglob("drives/*")}
-    with pytest.raises(UsageError, match="fits no scene"):
+    with pytest.raises(UsageError, match="is no scene"):
         loop.run(BenchConfig(logs=1, methods=("mudg_r",)), tmp_path / "other", rules=RULES)

@@ -217,24 +217,27 @@ def test_the_command_compares_methods_and_reuses_what_is_there(made):
 
 
 @pytest.mark.slow
-def test_fits_under_virtual_views_go_on_with_the_one_on_recorded_views(made, tmp_path):
+def test_fits_under_virtual_views_begin_from_nothing_and_their_control_goes_on(made, tmp_path):
     out, config = made
     torch.manual_seed(0)
     model_files.save(MDM(dataclasses.replace(SMALL, renders=True)), tmp_path / "model", "a model of tests", {})
     log = out / str(city_logs.DEVELOPMENT[0])
-    variants = ("louder=virtual.color_weight:2", "flat=sh_degree:1")
-    changes = {"methods": ("mudg_s", LONGER), "model": str(tmp_path / "model"), "variant": variants, "videos": False}
+    methods, variants = ("mudg_s", "mudg_f", LONGER), ("louder=virtual.color_weight:2", "flat=sh_degree:1")
+    changes = {"methods": methods, "model": str(tmp_path / "model"), "variant": variants, "videos": False}
     shift.run(dataclasses.replace(config, **changes), out, rules=TINY, distances_m=(3.0,), overwrite=True)
     states = {name: store.read_json(log / "fit" / name / "run.json") for name in ("mudg_s", LONGER, "louder", "flat")}
     first = store.digest(log / "fit" / "street_gaussians")
-    assert {states[name]["inputs"]["start"] for name in ("mudg_s", "louder", LONGER)} == {first}
-    assert states["flat"]["inputs"]["start"] == store.digest(log / "start" / "flat") != first
-    assert not (log / "start" / "louder").exists()
-    for state in states.values():
-        assert state["summary"]["steps"] == 15
+    starts = {name: state["inputs"].get("start") for name, state in states.items()}
+    assert starts == {"mudg_s": None, LONGER: first, "louder": None, "flat": None}
+    steps = {name: state["summary"]["steps"] for name, state in states.items()}
+    assert steps == {"mudg_s": 45, LONGER: 15, "louder": 45, "flat": 45}
     digests = {store.digest(log / "fit" / name / "gaussians.safetensors") for name in ("louder", "mudg_s")}
     assert len(digests) == 2
-    assert store.read_json(log / "synthesize" / "run.json")["inputs"]["fitted"] == first
+    assert "fitted" not in store.read_json(log / "synthesize" / "run.json")["inputs"]
+    repaired = store.read_json(log / "render" / "mudg_f" / "run.json")["inputs"]  # of the same fit
+    assert repaired["model"] == store.digest(log / "fit" / "mudg_s") and not (log / "fit" / "mudg_f").exists()
+    pooled = store.read_json(out / "bench.json")["pooled"]
+    assert pooled["mudg_f"]["3"]["psnr"]["mean"] != pooled["mudg_s"]["3"]["psnr"]["mean"]
 
 
 @pytest.mark.slow

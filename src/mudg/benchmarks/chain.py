@@ -27,7 +27,7 @@ from mudg.base.processes import run_in_processes
 from mudg.base.run_folder import RunDir, is_temporary
 from mudg.base.types import Trajectory
 from mudg.baselines.settings import MethodConfig
-from mudg.benchmarks.rows import EXACT, FILL, LONGER, REPAIRED, Row, usual_fit
+from mudg.benchmarks.rows import EXACT, FILL, FULL, LONGER, MIXED, REPAIRED, Row, usual_fit
 from mudg.benchmarks.settings import BenchConfig
 from mudg.core.pictures import resize_area
 from mudg.core.raster.rasterize import drawing_device
@@ -179,7 +179,11 @@ class Chain:
         """Views of a row's fit. ``virtual``: views that it learns from, if its method learns from such. ``drawn``:
         which views. ``scene``: with their places, if other."""
         model, out = self.fitted(row, virtual), self.out / "render" / row.name
-        return self.run(RenderViews(scene=scene or self.scene, model=model, out=out, settings=drawn))
+        if row.name != MIXED:
+            return self.run(RenderViews(scene=scene or self.scene, model=model, out=out, settings=drawn))
+        how = replace(drawn.harmonize, model=self.config.model, precision=self.config.precision)
+        drawn = replace(drawn, repair=True, harmonize=how)
+        return self.run(RenderViews(scene=self.scene, model=model, fused=self.fused, out=out, settings=drawn))
 
     # ---- fits ----
 
@@ -191,6 +195,8 @@ class Chain:
     def fitted(self, row: Row, virtual: Sequence[Path] = ()) -> Path:
         """The fit of a row; ``virtual``: views that it learns from, if its method learns from such."""
         out, settings = self.out / "fit" / row.name, row.fit or usual_fit(self.config)
+        if row.name == MIXED:
+            out = self.out / "fit" / FULL
         if row.name == LONGER:
             further = max(1, round((self.config.guided_share - 1) * settings.iterations))
             return self._fit(replace(settings, iterations=further), out, begun=self.first())

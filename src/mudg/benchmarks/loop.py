@@ -32,6 +32,7 @@ from mudg.benchmarks.places import Views, listed_cities, score_settings
 from mudg.benchmarks.rows import (
     BASE,
     FULL,
+    MIXED,
     PaperPlace,
     PaperTable,
     chain_settings,
@@ -246,9 +247,9 @@ def run(
     if config.methods == BenchConfig().methods:
         config = replace(config, methods=(BASE, FULL))
     rows, out = shift_rows(config, preset), Path(out)
-    without = [row.name for row in rows if row.fit is None]
+    without = [row.name for row in rows if row.fit is None or row.name == MIXED]
     if without:
-        raise UsageError("nobody can drive in this row: it fits no scene", where="--methods", got=", ".join(without))
+        raise UsageError("nobody can drive in this row: it is no scene", where="--methods", got=", ".join(without))
     refuse_overlap(out, {"model": model_files.folder_of(config.model)})
     own = lambda doc: doc.get("bench") == "loop"
     refuse_foreign(out, _PAGES, own, lambda entry: entry.name.isdigit())

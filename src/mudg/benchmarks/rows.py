@@ -206,6 +206,8 @@ FILL, BASE, DIFFUSION, FULL = score.BASELINE, WITHOUT_DIFFUSION, "mudg_r", "mudg
 LONGER: Final = f"{BASE}-longer"
 """The control of ``mudg_s``: goes on with the first fit until it has as many iterations, without generated views."""
 LONGER_TITLE: Final = title_of(BASE) + ", as many iterations"
+MIXED: Final = "mudg_f"
+"""Renders of ``mudg_s``, each mixed with what the diffusion model makes of it (``mudg render --repair``)."""
 REPAIRED: Final = "difix"
 EXACT: Final = "exact"
 _NO_DEPTH: Final = {"depth_weight": 0.0, "lidar_weight": 0.0}
@@ -318,9 +320,10 @@ def refuse_unfit(
     such model."""
     fits = [row.fit for row in rows if row.fit is not None]
     virtual = [fit for fit in fits if METHODS[fit.method].learns_virtual]
-    if any(fit.method == REPAIRED for fit in fits) and not model_files.uses_renders(config.model):
-        what, remedy = "repairs renders, and this diffusion model uses none", f"leave {REPAIRED} out, or choose"
-        raise UsageError(f"{REPAIRED} {what}", where="--methods", got=config.model, remedy=f"{remedy} another --model")
+    repairs = next((row.name for row in rows if row.fit and (row.name == MIXED or row.fit.method == REPAIRED)), "")
+    if repairs and not model_files.uses_renders(config.model):
+        what, remedy = "repairs renders, and this diffusion model uses none", f"leave {repairs} out, or choose"
+        raise UsageError(f"{repairs} {what}", where="--methods", got=config.model, remedy=f"{remedy} another --model")
     if fits and config.guided_share <= 1 and LONGER in config.methods:
         what = f"no fit has more iterations than {BASE}, so this row is the same"
         raise UsageError(what, where="--methods", got=LONGER, remedy="leave it out")
@@ -346,7 +349,7 @@ def refuse_unfit(
 def shift_rows(config: BenchConfig, preset: PresetName = "default") -> tuple[Row, ...]:
     """The methods, ablation rows and variants of ``mudg bench shift``, in the order of the tables. UsageError: an
     unknown method, one that does not know a setting beyond the preset, or a malformed or repeated variant."""
-    known = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL)
+    known = (FILL, "gs3d", BASE, LONGER, *PUBLISHED, DIFFUSION, FULL, MIXED)
     wanted, usual = {*config.methods, *((BASE, FULL) if config.ablation else ())}, usual_fit(config)
     _refuse_unknown(wanted, known)
     rows = [_method_row(name, usual, preset) for name in known if name in wanted]
@@ -410,7 +413,7 @@ def paper_rows(config: BenchConfig, table: PaperTable, preset: PresetName = "def
 def _method_row(name: str, usual: MethodConfig, preset: PresetName) -> Row:
     if name in (FILL, DIFFUSION):
         return Row(name, title_of(name), "" if name == FILL else name)
-    method = BASE if name == LONGER else name
+    method = {LONGER: BASE, MIXED: FULL}.get(name, name)
     return Row(name, LONGER_TITLE if name == LONGER else title_of(name), method, method_fit(usual, method, preset))
 
 

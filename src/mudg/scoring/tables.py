@@ -50,6 +50,7 @@ TITLES: Final[dict[str, str]] = {
     "truth": "Truth",
     "nearest_fill": "Fused points, holes filled",
     **{name: method.title for name, method in METHODS.items()},
+    "mudg_f": "Gaussians with diffusion, repaired",
 }
 TERMINAL_METRICS: Final = ("psnr", "ssim", "perceptual", "abs_rel", "rmse_m", "delta1", "miou")
 WITHOUT_TRUTH: Final = ("lidar_abs_rel", "lidar_rmse_m", "lidar_psnr", "agreement", "lane_correlation")

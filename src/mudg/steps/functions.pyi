@@ -107,7 +107,7 @@ def bench(
         seed: Seed of all random numbers; the same seed gives the same result.
         list: shift, loop: list of logs. Choose settings on development; report results on reported, on which nothing was chosen.
         logs: shift, loop; paper with a list of cities: number of logs taken from the list, 1 to 8 (the development list has 4).
-        methods: shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. paper: any of these of shift, and freevs; with the default, all of them.
+        methods: shift, real, loop: methods to compare: those of the default (loop: street_gaussians and mudg_s); pvg, s3gaussian, bezier, omnire, emernerf and difix; and street_gaussians-longer, which goes on until it has as many steps as mudg_s, without generated views. shift: also mudg_f, renders of mudg_s that the diffusion model repairs. paper: any of these of shift but mudg_f, and freevs; with the default, all of them.
         iterations: shift, real, loop, paper: optimisation steps of every fit without virtual views.
         guided_share: shift, real, loop, paper: steps of fits under virtual views, as a multiple of the others'.
         ablation: shift: add rows for mudg_s with only some virtual loss terms (colour; colour and depth; colour and classes), and with exact views instead of generated ones. real: add street_gaussians-longer.
