@@ -508,6 +508,8 @@ def test_settings_and_further_paths_end_to_end(filled, table, tmp_path):
     own = [row.name for row in TABLES[table].rows]
     methods = BenchConfig().methods if own else ("mudg_r", "freevs")
     config = dataclasses.replace(config, table=table, logs=1, methods=methods, freevs_model="" if own else config.model)
+    if table != "mudg3":  # nothing is fitted
+        config = dataclasses.replace(config, iterations=BenchConfig().iterations, fit=BenchConfig().fit)
     out = bench.run("paper", config, tmp_path / "out", sources=("city:development",))
     document = store.read_json(out / "bench.json")
     for name in own or ["mudg_r", "freevs"]:
