@@ -61,6 +61,8 @@ from mudg.steps.fit import Fit
 from mudg.steps.render import RenderViews
 from mudg.steps.synthesize import Synthesize
 from mudg.viewer.live import FrameRequest, FrameSource
+from mudg.viewer.settings import ViewConfig
+from mudg.viewer.view import server_of
 
 CAR = (0.6, 1.0, 1.0)
 
@@ -388,6 +390,12 @@ def test_what_cannot_be_repaired_is_refused(run: Path, tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="as it was recorded"):
         RenderViews(**parts | {"model": changed.run()}, fused=run / "fuse", settings=settings).run()
     assert not (tmp_path / "out").exists()
+    whole = Edit(source=run, script=edits, out=tmp_path / "whole", settings=EditConfig()).run()
+    with pytest.raises(UsageError, match="as it was recorded"):
+        Session(whole, device="cpu", repair=True)
+    for source, exact, message in ((whole, True, "as it was recorded"), (run, False, "only exact frames")):
+        with pytest.raises(UsageError, match=message):
+            server_of(ViewConfig(repair=True, exact=exact, images=0, port=0, device="cpu"), source, None, None)
 
 
 def test_synthesize_shows_the_edited_drive(run: Path, tmp_path: Path) -> None:

@@ -242,9 +242,9 @@ def _entry(name: str, scene: Path, splits: Sequence[dict[str, Any]]) -> dict[str
     cameras = {camera: {"size_px": of, "frames": len(loaded.frames_of(camera))} for camera, of in sizes.items()}
     names = {"log": name, "id": loaded.id, "dataset": loaded.source.dataset, "digest": store.digest(scene)}
     counts = {"cameras": cameras, "sweeps": len(loaded.sweeps), "tracks": len(loaded.tracks)}
-    of_split = {part: {s["split"]: s[part] for s in splits} for part in ("held_out",)}
+    held_out = {s["split"]: s["held_out"] for s in splits}
     protocols = {protocol: result for s in splits for protocol, result in s["protocols"].items()}
-    return {**names, **counts, **of_split, "protocols": protocols}
+    return {**names, **counts, "held_out": held_out, "protocols": protocols}
 
 
 def document(

@@ -41,7 +41,7 @@ from mudg.diffusion.settings import HarmonizeConfig, SynthesizeConfig
 from mudg.diffusion.synthesize import JobInputs, view_maker
 from mudg.diffusion.views import EDITED_IMAGES_PER_VIEW, ViewMaker, recorded_at_pose, recorded_images, windows
 from mudg.editing import recorded as records
-from mudg.editing.apply import EditedDrive
+from mudg.editing.apply import FACT, EditedDrive
 from mudg.editing.plan import EditPlan
 from mudg.editing.recorded import EditedImages, boxes_mask, ground_mask, others, touched_boxes, vacated_at
 from mudg.gaussians.model import SceneModel
@@ -73,6 +73,15 @@ def settings_of(config: HarmonizeConfig, device: str) -> SynthesizeConfig:
         raise UsageError(what, where=name, expected="0 or 1", got=value)
     own = {name: getattr(config, name) for name in ("model", "steps", "precision", "seed")}
     return SynthesizeConfig(**own, device=device, processes=1)
+
+
+def check_as_recorded(fitted: SceneModel, where: str) -> None:
+    """UsageError if the Gaussians are of an edited drive: photographs may still show what was removed."""
+    if FACT in fitted.facts:
+        what, expected = "only a fit of the drive as it was recorded can be repaired", "Gaussians made by fit"
+        raise UsageError(
+            what, where=where, expected=expected, got="Gaussians of an edited drive", remedy="leave it out"
+        )
 
 
 def check_paths(config: HarmonizeConfig, frames: Mapping[str, int]) -> None:

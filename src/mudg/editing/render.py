@@ -80,9 +80,11 @@ def prepare(
     edited = None
     if script is not None or (config.repair and not radiance):
         edited = _edited(scene, model, script, fused if config.harmonize.on else None)
-    if config.repair and (edited is None or FACT in edited[1].facts):
-        what, expected = "only a fit of the drive as it was recorded can be repaired", "Gaussians made by fit"
-        raise UsageError(what, where="--repair", expected=expected, got=str(model), remedy="leave it out")
+    if config.repair:
+        if edited is None:
+            what, expected = "a radiance field cannot be repaired", "Gaussians made by fit"
+            raise UsageError(what, where="--repair", expected=expected, got=str(model), remedy="leave it out")
+        harmonised.check_as_recorded(edited[1], "--repair")
     if edited is not None and config.harmonize.on:
         lengths = {one.name: len(one) for one in trajectories(edited[0], config, path)}
         harmonised.check_paths(config.harmonize, lengths)

@@ -25,7 +25,7 @@ from mudg.core.raster.rasterize import MAX_EXTRA_CHANNELS, Shutter, drawing_devi
 from mudg.diffusion.settings import HarmonizeConfig
 from mudg.diffusion.synthesize import JobInputs
 from mudg.editing.apply import carry_out
-from mudg.editing.harmonised import RenderMixer
+from mudg.editing.harmonised import RenderMixer, check_as_recorded
 from mudg.editing.runs import find_run, scene_at
 from mudg.editing.script import EditScript, read_edits
 from mudg.gaussians.model import SceneModel, compose
@@ -220,6 +220,8 @@ class Session:
             parts = find_run(Path(run))
             scene = scene if scene is not None else parts.scene
             run = load_model(parts.model)
+            if repair:
+                check_as_recorded(run, "repair")
         if isinstance(scene, str | Path):
             scene = read_scene(scene_at(Path(scene)))
         self._gone = None
@@ -513,13 +515,15 @@ def _mixer_of(run: str | Path | SceneModel, edits: object, device: str) -> Rende
     return RenderMixer(JobInputs(parts.scene, parts.fused, parts.model), HarmonizeConfig(), device)
 
 
-def _repaired(mixer: RenderMixer, view: View, seen: RenderedCondition) -> RenderedCondition:
+def _repaired(mixer: RenderMixer, view: View, rendered: RenderedCondition) -> RenderedCondition:
     """A rendered view with colour and depth mixed with what the diffusion model makes of it."""
-    everywhere = torch.ones_like(seen.depth, dtype=torch.bool)[None]
-    render = Observation(view, seen.rgb, seen.depth[None], None, everywhere.float(), everywhere, "virtual", "mudg_s")
-    made = mixer(view, render)
-    depth = seen.depth if made.depth is None else made.depth[0]
-    return replace(seen, rgb=made.rgb, depth=depth)
+    everywhere = torch.ones_like(rendered.depth, dtype=torch.bool)[None]
+    render = Observation(
+        view, rendered.rgb, rendered.depth[None], None, everywhere.float(), everywhere, "virtual", "mudg_s"
+    )
+    mixed = mixer(view, render)
+    depth = rendered.depth if mixed.depth is None else mixed.depth[0]
+    return replace(rendered, rgb=mixed.rgb, depth=depth)
 
 
 def _background(model: SceneModel) -> Matrix:

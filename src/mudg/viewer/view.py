@@ -24,7 +24,7 @@ from mudg.core.raster.rasterize import drawing_device
 from mudg.diffusion.settings import HarmonizeConfig
 from mudg.diffusion.synthesize import JobInputs
 from mudg.editing.apply import SEED, ground_of
-from mudg.editing.harmonised import RenderMixer
+from mudg.editing.harmonised import RenderMixer, check_as_recorded
 from mudg.editing.runs import RunParts, find_run
 from mudg.gaussians.model import SceneModel
 from mudg.gaussians.storage import load_model, model_of_scene
@@ -314,7 +314,8 @@ def server_of(
     """The server of a run's page, listening, and what it serves."""
     token = token_for(config.host, config.token)
     sources = find_sources(config, run, scene, compare)
-    shown, mixers = sources.read(), _mixers(config, sources, run)
+    shown = sources.read()
+    mixers = _mixers(config, sources, shown, run)
     layers = list(LAYERS) if config.exact else []
     desk = desk_for([model for _, model in shown.fits], shown.scene, shown.cloud, Path(run), files or EditFiles())
     live = {"layers": layers, "token": token, "edits": desk.entries(), "place": desk.place.name, "run": desk.run}
@@ -337,12 +338,16 @@ def server_of(
     return open_server(site, config.host, config.port), site
 
 
-def _mixers(config: ViewConfig, sources: ShownSources, run: Path) -> list[RenderMixer]:
-    """What repairs exact frames of each fit. UsageError: they are wanted without clouds, or of edited Gaussians."""
+def _mixers(config: ViewConfig, sources: ShownSources, shown: Shown, run: Path) -> list[RenderMixer]:
+    """What repairs exact frames of each fit. UsageError: no exact frames, no clouds, an edited drive."""
     if not config.repair:
         return []
-    if sources.cloud is None or not config.exact:
+    if not config.exact:
+        raise UsageError("only exact frames are repaired", where="--repair", got="--no-exact", remedy="leave one out")
+    if sources.cloud is None:
         what, remedy = "exact frames are repaired from the clouds of a run", "give the folder of a run"
         raise UsageError(what, where="--repair", got=str(run), remedy=remedy)
+    for _, fitted in shown.fits:
+        check_as_recorded(fitted, "--repair")
     inputs = [JobInputs(sources.scene, sources.cloud, folder) for folder, _ in sources.fits]
     return [RenderMixer(each, HarmonizeConfig(), config.device) for each in inputs]
