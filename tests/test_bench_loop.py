@@ -30,8 +30,8 @@ def course() -> loop.Course:
 
 
 def test_exact_eyes_make_the_exact_drive_and_perfect_scores(course: loop.Course) -> None:
-    alone = loop.measure_drive(course, 3.0)
-    seen = loop.measure_drive(course, 3.0, course.exact)
+    alone = loop.measure_drive(course, "left")
+    seen = loop.measure_drive(course, "left", course.exact)
     assert seen["path"] == alone["path"]
     assert (seen["psnr"], seen["abs_rel"], seen["miou"]) == (100.0, 0.0, 1.0)
     parted = loop.parting(seen["path"], alone["path"])
@@ -40,8 +40,23 @@ def test_exact_eyes_make_the_exact_drive_and_perfect_scores(course: loop.Course)
 
 
 def test_drives_to_both_sides_leave_the_path_the_right_way(course: loop.Course) -> None:
-    ends = {aim: loop.measure_drive(course, aim)["path"][-1]["shift_m"] for aim in (3.0, -3.0)}
-    assert ends[3.0] > 0.2 and ends[-3.0] < -0.2
+    ends = {pilot: loop.measure_drive(course, pilot)["path"][-1]["shift_m"] for pilot in ("left", "right")}
+    assert ends["left"] > 0.2 and ends["right"] < -0.2
+
+
+def test_pilots_that_pull_over_steer_by_the_edge_that_they_see(course: loop.Course) -> None:
+    def narrow(drive: object) -> dict[str, np.ndarray]:
+        """Road in one column of each picture only, straight ahead."""
+        exact = course.exact(drive)
+        classes = exact["classes"].copy()
+        classes[:, : classes.shape[1] // 2 - 1] = classes[:, classes.shape[1] // 2 + 1 :] = 2
+        return {**exact, "classes": classes}
+
+    for pilot, side in (("left edge", 1), ("right edge", -1)):
+        wide, held = loop.measure_drive(course, pilot), loop.measure_drive(course, pilot, narrow)
+        assert side * wide["path"][-1]["shift_m"] > 0.1
+        assert abs(held["path"][-1]["shift_m"]) < 0.05
+        assert loop.parting(held["path"], wide["path"])["parting_m"] > 0.02
 
 
 def test_worse_pictures_score_worse_by_what_was_done_to_them(course: loop.Course) -> None:
@@ -50,7 +65,7 @@ def test_worse_pictures_score_worse_by_what_was_done_to_them(course: loop.Course
         rgb = np.clip(exact["rgb"].astype(int), 20, 235) + 20
         return {"rgb": rgb.astype(np.uint8), "depth": exact["depth"] * np.float32(1.25), "classes": exact["classes"]}
 
-    seen = loop.measure_drive(course, 0.0, worse)
+    seen = loop.measure_drive(course, "left", worse)
     assert seen["abs_rel"] == pytest.approx(0.25, abs=1e-5)
     assert seen["psnr"] == pytest.approx(20 * math.log10(255 / 20), abs=1.0)
     assert seen["miou"] == 1.0
@@ -63,7 +78,7 @@ def test_blind_eyes_drive_faster_where_somebody_is_ahead(course: loop.Course) ->
         exact = course.exact(drive)
         return {**exact, "depth": np.where(exact["depth"] < 8, exact["depth"], np.float32(np.inf))}
 
-    exact, seen = loop.measure_drive(course, 0.0), loop.measure_drive(course, 0.0, blind)
+    exact, seen = loop.measure_drive(course, "left"), loop.measure_drive(course, "left", blind)
     speeds = [path[-1]["speed_mps"] for path in (exact["path"], seen["path"])]
     assert speeds[1] >= speeds[0]
     parted = loop.parting(seen["path"], exact["path"])
@@ -122,7 +137,7 @@ def test_the_benchmark_fits_drives_and_is_reused(tmp_path: Path) -> None:
     assert doc["pooled"]["street_gaussians"]["psnr"]["mean"] == pytest.approx(mean)
     assert "street_gaussians" in (out / "bench.md").read_text()
     times = {path: path.stat().st_mtime_ns for path in out.rglob("drives/*")}
-    assert len(times) == 6
+    assert len(times) == 12
     loop.run(config, tmp_path / "loop", rules=RULES)
     assert times == {path: path.stat().st_mtime_ns for path in out.rglob("drives/*")}
     with pytest.raises(UsageError, match="is no scene"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,11 +12,12 @@ from toy_fitted import toy_fitted, write_toy_run
 
 from mudg.base import geometry
 from mudg.base.errors import InputError, UsageError
+from mudg.base.palette import ID
 from mudg.base.types import Camera
 from mudg.scene.road import Road
 from mudg.sim.cockpit import Cockpit
 from mudg.sim.drive import SURROUNDINGS, BicycleState, Box, Car, Controls, Drive, Following, RoadUser
-from mudg.sim.pilots import DriverView, PlanPilot, RoutePilot
+from mudg.sim.pilots import DriverView, EdgePilot, PlanPilot, RoutePilot
 from mudg.sim.session import Session
 
 CAR = Car()
@@ -220,6 +222,34 @@ def test_a_pilot_sees_how_far_ahead_somebody_is_and_brakes() -> None:
     gap = 12.0 + 1.4 - (CAR.length_m - CAR.overhang_m)
     assert pilot.gap_m(sight_of(drive, 12.0)) == pytest.approx(gap, abs=0.01)
     assert pilot.drive(sight_of(drive, 12.0)).acceleration_mps2 < -2
+
+
+@pytest.mark.parametrize("bend_m", [math.inf, 60.0])
+def test_a_pilot_that_pulls_over_finds_the_edge_and_keeps_clear_of_it(bend_m: float) -> None:
+    """A flat road that reaches 3 m to the left and 4 m to the right of the route; beyond it, and far away, sidewalk."""
+    road = straight() if math.isinf(bend_m) else arc(bend_m)
+
+    def sight(drive: Drive) -> DriverView:
+        rows, columns = np.mgrid[:64, :96]
+        x, y = geometry.pinhole_ray(CAMERA.intrinsics, columns + 0.5, rows + 0.5)
+        rays = np.stack([x, y, np.ones_like(x)], -1).reshape(-1, 3) @ MOUNT[:3, :3].T
+        depth = np.where(rays[:, 2] < -1e-3, MOUNT[2, 3] / np.maximum(-rays[:, 2], 1e-3), np.inf)
+        points = geometry.transform_points(drive.pose @ MOUNT, np.zeros((1, 3))) + depth.clip(max=200)[:, None] * (
+            rays @ drive.pose[:3, :3].T
+        )
+        left = points[:, 1] if math.isinf(bend_m) else bend_m - np.hypot(points[:, 0], points[:, 1] - bend_m)
+        classes = np.where((left < 3) & (left > -4), ID["road"], ID["sidewalk"]).astype(np.uint8).reshape(64, 96)
+        seen = sight_of(drive)
+        return replace(seen, depth=depth.reshape(64, 96).astype(np.float32), classes=classes)
+
+    for side, edge in ((1, 3.0), (-1, 4.0)):
+        drive = Drive(road, {}, BicycleState(0.0, 0.0, 0.0, 6.0), 0.0)
+        pilot = EdgePilot(Following(6.0), 8.0 * side)
+        assert pilot.edge_m(sight(drive), side) == pytest.approx(edge, abs=0.4)
+        for _ in range(50):
+            drive.step(pilot.drive(sight(drive)), 0.1)
+        shift = road.locate((drive.motion.x_m, drive.motion.y_m))[1]
+        assert edge - 1.9 < side * shift + CAR.width_m / 2 < edge
 
 
 class Planned:

@@ -1,7 +1,7 @@
-"""``mudg bench loop``: a pilot drives in the reconstruction of a generated log, off its recorded path.
+"""``mudg bench loop``: pilots drive in the reconstruction of a generated log, off its recorded path.
 
-Every picture that it saw is scored against the exact city at the pose that it drove to. The same pilot drives in the
-exact city, too, and sees exact pictures there. How far the two drives part, what they hit and whether they leave the
+Every picture that they saw is scored against the exact city at the pose that they drove to. The same pilots drive in
+the exact city, too, and see exact pictures there. How far the two drives part, what they hit and whether they leave the
 road is what a simulator's user wants to know. Road users move as recorded in both, and both are judged by the exact
 city: its boxes, parked vehicles included, and its kerbs.
 
@@ -52,15 +52,20 @@ from mudg.scene.road import Road
 from mudg.sim.cockpit import Cockpit
 from mudg.sim.drive import Drive, Following, RoadUser, beginning
 from mudg.sim.lidar import LidarRequest
-from mudg.sim.pilots import DriverView, RoutePilot
+from mudg.sim.pilots import DriverView, EdgePilot, RoutePilot
 from mudg.sim.session import Instant, Session
 from mudg.sim.sweeps import MountedLidar, mounted
 from mudg.steps.settings import PresetName
 
 EXACT: Final = "exact city"
 """The row of the drive in the city itself."""
-AIMS_M: Final = {"left": 3.0, "right": -3.0}
-"""Pilot -> where it aims, metres to the left of the recorded path, from the first step on."""
+PILOTS: Final[Mapping[str, tuple[type[RoutePilot], float]]] = {
+    "left": (RoutePilot, 3.0),
+    "right": (RoutePilot, -3.0),
+    "left edge": (EdgePilot, 8.0),
+    "right edge": (EdgePilot, -8.0),
+}
+"""Pilot -> its class, and where it aims, metres to the left of the recorded path, from the first step on."""
 SEEN: Final = ("rgb", "depth", "classes")
 FAR_M: Final = 80.0
 """Depth counts up to here."""
@@ -94,8 +99,8 @@ class LoopLog(Views):
         course = Course.of(CityWorld(city_logs.log_config(int(self.log.name), self.rules)))
         drives = self.out / "drives"
         exact = {
-            pilot: finished(drives / f"exact-{pilot}.json", partial(measure_drive, course, aim))
-            for pilot, aim in AIMS_M.items()
+            pilot: finished(drives / f"exact-{pilot.replace(' ', '_')}.json", partial(measure_drive, course, pilot))
+            for pilot in PILOTS
         }
         scene = read_scene(self.scene)
         lidar = mounted(scene, scene.sweeps[0].sensor)
@@ -107,10 +112,10 @@ class LoopLog(Views):
             cockpit = Cockpit(Session(self.chain.fitted(row, virtual), scene=self.scene), (), 0, SEEN)
             sweep = partial(sweep_errors, course, cockpit.session, lidar)
             values[row.name] = {}
-            for pilot, aim in AIMS_M.items():
-                name = f"{row.name}-{pilot}"
+            for pilot in PILOTS:
+                name = f"{row.name}-{pilot.replace(' ', '_')}"
                 eyes = lambda drive, cockpit=cockpit: next(iter(cockpit.see(drive).values())).layers
-                go = partial(measure_drive, course, aim, eyes, drives / f"{name}.jpg", sweep)
+                go = partial(measure_drive, course, pilot, eyes, drives / f"{name}.jpg", sweep)
                 drive = finished(drives / f"{name}.json", go)
                 scores = {key: value for key, value in drive.items() if key != "path"}
                 values[row.name][pilot] = {**scores, **parting(drive["path"], exact[pilot]["path"])}
@@ -151,16 +156,17 @@ class Course:
         truth = self.world.render(View(self.camera, drive.pose @ self.mount, drive.time_s))
         return {"rgb": truth.rgb_u8, "depth": truth.depth, "classes": truth.semantics}
 
-    def go(self, aim_m: float, eyes: Eyes) -> Iterator[tuple[Drive, Mapping[str, NDArray[Any]]]]:
+    def go(self, pilot: str, eyes: Eyes) -> Iterator[tuple[Drive, Mapping[str, NDArray[Any]]]]:
         """Drive to the end of the log; at every step the drive, before it moves on, and what the pilot saw."""
         drive, step_s = self.begin(), 1 / self.world.config.rate_hz
-        pilot = RoutePilot(Following(drive.motion.speed_mps), aim_m)
+        kind, aim_m = PILOTS[pilot]
+        driver = kind(Following(drive.motion.speed_mps), aim_m)
         for _ in range(self.world.config.n_frames - 1):
             seen = eyes(drive)
             yield drive, seen
             motion, pose = drive.motion, drive.pose
             now = (drive.time_s, step_s, motion.speed_mps, motion.steer_rad, drive.road.route(pose), pose)
-            drive.step(pilot.drive(DriverView(*now, self.camera, self.mount, **seen)), step_s)
+            drive.step(driver.drive(DriverView(*now, self.camera, self.mount, **seen)), step_s)
 
     def judge(self, drive: Drive) -> dict[str, Any]:
         """Where the vehicle is, what it hits, and whether a corner of it is beyond a kerb."""
@@ -173,7 +179,7 @@ class Course:
 
 def measure_drive(
     course: Course,
-    aim_m: float,
+    pilot: str,
     eyes: Eyes | None = None,
     picture: Path | None = None,
     sweep: Callable[[Drive], dict[str, float]] | None = None,
@@ -182,7 +188,7 @@ def measure_drive(
     score. ``picture``: where one of them is written beside the exact one. ``sweep``: judges the LiDAR at a moment."""
     path, errors, shown, swept = [], [], [], []
     counts = torch.zeros((), dtype=torch.int64)
-    for drive, seen in course.go(aim_m, eyes or course.exact):
+    for drive, seen in course.go(pilot, eyes or course.exact):
         path.append(course.judge(drive))
         if eyes is None:
             continue
@@ -264,7 +270,7 @@ def run(
         **model_settings(config),
         "frames": rules.frames,
         "size_px": [rules.width, rules.height],
-        "aims_m": AIMS_M,
+        "aims_m": {name: aim_m for name, (_, aim_m) in PILOTS.items()},
         **chain_settings(config, preset),
     }
     names = [EXACT, *(row.name for row in rows)]
@@ -289,7 +295,6 @@ def pooled(names: Sequence[str], logs: Sequence[Facts]) -> dict[str, Any]:
 def markdown(doc: Facts) -> str:
     """The tables for people."""
     settings, names = doc["settings"], doc["rows"]
-    aims = ", ".join(f"{aim:+g} m" for aim in settings["aims_m"].values())
     heads = ["row", *(title for title, _ in COLUMNS.values())]
     rows = [[name, *_cells({c: of["mean"] for c, of in doc["pooled"][name].items()})] for name in names]
     drives = [
@@ -298,11 +303,11 @@ def markdown(doc: Facts) -> str:
     each = [[str(log), name, pilot, *_cells(drive)] for log, name, pilot, drive in drives]
     title = f"# Closed loop: {len(doc['logs'])} logs of the {settings['list']} list"
     about = (
-        f"{settings['frames']} frames at 10 Hz; a pilot aims at {aims} from the recorded path and keeps its distance to"
-        " whoever it sees. Pictures are scored at the poses driven to; apart: from the drive of the same pilot in the"
-        " exact city."
+        f"{settings['frames']} frames at 10 Hz; two pilots aim 3 m to the left and right of the recorded path, two pull"
+        " over to the edges of the road that they see; all keep their distance to whoever they see. Pictures are scored"
+        " at the poses driven to; apart: from the drive of the same pilot in the exact city."
     )
-    all_drives = markdown_table(["log", "row", "aim", *heads[1:]], each)
+    all_drives = markdown_table(["log", "row", "pilot", *heads[1:]], each)
     return "\n".join([title, "", about, "", *markdown_table(heads, rows), "", "## Each drive", "", *all_drives, ""])
 
 

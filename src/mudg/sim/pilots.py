@@ -1,7 +1,8 @@
-"""Drivers for a closed loop: what they see, and two that decide by it.
+"""Drivers for a closed loop: what they see, and three that decide by it.
 
 A pilot gets a `DriverView` at every step and answers with `Controls`. `RoutePilot` knows the road by its route and
-keeps its distance to whoever it sees ahead; `PlanPilot` drives along the plans of a policy.
+keeps its distance to whoever it sees ahead; `EdgePilot` pulls over to the edge of the road that it sees; `PlanPilot`
+drives along the plans of a policy.
 """
 
 from __future__ import annotations
@@ -12,9 +13,10 @@ from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from mudg.base import geometry
-from mudg.base.palette import DYNAMIC_IDS
+from mudg.base.palette import DYNAMIC_IDS, ID
 from mudg.base.types import Camera
 from mudg.sim.drive import Car, Controls, Following, Matrix
 
@@ -22,7 +24,11 @@ STEER_RATE: Final = 0.8
 """Fastest turn of the front wheels, rad/s."""
 LEAST_LOOKAHEAD_M: Final = 6.0
 FEWEST_PIXELS: Final = 20
-"""Pixels of road users in its lane from which on a pilot believes in somebody ahead."""
+"""Pixels of road users in its lane from which on a pilot believes in somebody ahead, or of a road in its width."""
+EDGE_M: Final = (12.0, 26.0)
+"""Where along the route a pilot looks for the edge of the road: nearer, a camera does not see it."""
+EDGE_MARGIN_M: Final = 0.5
+"""Room that a pilot leaves between the vehicle and the edge."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -99,7 +105,11 @@ class RoutePilot:
         reach = self.lookahead_m(sight) + np.array([0.0, 1.0])
         aim, beyond = np.stack([np.interp(reach, arc, sight.route[:, axis]) for axis in (0, 1)], 1)
         along = (beyond - aim) / max(float(np.linalg.norm(beyond - aim)), 1e-9)
-        return aim + self.shift_m * np.array([-along[1], along[0]])
+        return aim + self.aim_m(sight) * np.array([-along[1], along[0]])
+
+    def aim_m(self, sight: DriverView) -> float:
+        """How far to the left of the route it aims."""
+        return self.shift_m
 
     def accelerate(self, sight: DriverView) -> float:
         """Acceleration by the gap that it sees, and by how that changed."""
@@ -118,6 +128,36 @@ class RoutePilot:
         if len(ahead) < FEWEST_PIXELS:
             return math.inf
         return max(float(np.quantile(ahead[:, 0], 0.02)) - bumper, 0.1)
+
+
+@dataclass(slots=True)
+class EdgePilot(RoutePilot):
+    """Pulls over: goes to the side of the route until the edge of the road that it sees, ``shift_m`` at most.
+
+    Depth and classes steer it, not the speed alone. Where they show no edge, it stays on the route.
+    """
+
+    def aim_m(self, sight: DriverView) -> float:
+        """See ``RoutePilot``."""
+        side = math.copysign(1.0, self.shift_m)
+        reach = self.edge_m(sight, side) - self.car.width_m / 2 - EDGE_MARGIN_M
+        return side * min(max(reach, 0.0), abs(self.shift_m))
+
+    def edge_m(self, sight: DriverView, side: float) -> float:
+        """How far the road reaches to the left (``side`` 1) or right (-1) of the route, at its narrowest ahead; 0
+        where none is seen."""
+        route = sight.route[:, :2]
+        steps = np.linalg.norm(np.diff(route, axis=0), axis=1)
+        stations = np.concatenate([[0.0], np.cumsum(steps)])
+        ahead = np.gradient(route, axis=0)
+        ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+        points = sight.points((ID["road"],))[:, :2]
+        nearest = cKDTree(route).query(points)[1] if len(points) else np.zeros(0, np.int64)
+        off = points - route[nearest]
+        left = ahead[nearest, 0] * off[:, 1] - ahead[nearest, 1] * off[:, 0]
+        looked = np.flatnonzero((stations >= EDGE_M[0]) & (stations <= EDGE_M[1]))
+        widths = [side * left[nearest == at] for at in looked]
+        return min((float(np.quantile(w, 0.98)) for w in widths if len(w) >= FEWEST_PIXELS), default=0.0)
 
 
 @dataclass(slots=True)
