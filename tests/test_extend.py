@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -13,10 +14,11 @@ import roundtrip
 import toy_views
 import write_custom
 from test_edit import toy
+from test_sim import LOOK, placed, wall
 
 import mudg
 from mudg import app
-from mudg.base import store
+from mudg.base import geometry, store
 from mudg.base.errors import UsageError
 from mudg.base.plugins import GROUP, load_plugin, plugins
 from mudg.base.types import Scene
@@ -25,6 +27,7 @@ from mudg.formats.splats.formats import FORMATS
 from mudg.gaussians.recipes import RECIPES
 from mudg.gaussians.storage import load_model, save_model
 from mudg.scene.read import read_scene
+from mudg.sim import Instant, Session
 
 
 @pytest.fixture
@@ -105,6 +108,23 @@ def test_an_exporter_writes_files_and_says_what_they_lose(
     rows = np.loadtxt(tmp_path / "scene.xyz")
     assert rows.shape[1] == 7 and (rows[:, 3:] >= 0).all() and (rows[:, 3:] <= 1).all()
     assert len(rows) == 690 and "motion" in str(store.read_json(tmp_path / "scene.xyz.json")["not_in_the_file"])
+
+
+def test_a_sensor_hears_the_nearest_surface_and_whose_it_is(installed: Path) -> None:
+    """A wall 10 m ahead, heard obliquely; and a car in front of the vehicle, which is gone where it is not listed."""
+    module = importlib.import_module("my_sensor")
+    (echo,) = Session(wall()).render([module.UltrasonicRequest(Instant(0.5, placed(7.0)))])
+    assert echo.range_m == pytest.approx(3.0, abs=0.02) and echo.object == ""
+    turned = placed(7.0, yaw=math.radians(45))  # the edge of the cone meets the wall at 15 degrees
+    (echo,) = Session(wall()).render([module.UltrasonicRequest(Instant(0.5, turned))])
+    assert echo.range_m == pytest.approx(3.0 / math.cos(math.radians(15)), rel=0.02)
+    session = Session(toy())
+    ahead = session.objects(0.5)["car-1"] @ geometry.yaw_matrix(0.0, (-4.0, 0.0, 0.0)) @ LOOK
+    listed, absent = session.render(
+        [module.UltrasonicRequest(Instant(0.5, ahead, objects), 15.0) for objects in (session.objects(0.5), {})]
+    )
+    assert listed.object == "car-1" and 1.0 < listed.range_m < 4.0
+    assert absent.object == ""
 
 
 def test_a_method_adds_its_loss_to_the_common_fit(
