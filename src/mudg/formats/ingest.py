@@ -171,11 +171,12 @@ def _walk(path: Path) -> Iterator[Path]:
 
 
 def _city(config: IngestConfig, out: Path) -> Scene:
+    from mudg.city.config import CityConfig
     from mudg.city.logs import write_city
 
     what = "the generated city has settings of its own"
     _refuse_log_settings(config, what, "use --city.n-frames, --city.cameras, --city.width, ...")
-    return write_city(config.city, out, test_every=config.test_every)
+    return write_city(CityConfig(**vars(config.city)), out, test_every=config.test_every)
 
 
 def _refuse_log_settings(config: IngestConfig, what: str, remedy: str) -> None:
