@@ -115,8 +115,8 @@ def kind_of(config: IngestConfig, source: Path) -> str:
 
 
 def is_scene(source: Path) -> bool:
-    """Whether ``source`` is a scene directory, or a zip, which can be nothing else."""
-    return (source.is_file() and source.suffix == ".zip") or (source / "scene.json").is_file()
+    """Whether ``source`` is a scene directory."""
+    return (source / "scene.json").is_file()
 
 
 def import_options(config: IngestConfig) -> ImportOptions:

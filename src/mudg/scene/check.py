@@ -162,7 +162,7 @@ def _note(where: str, message: str) -> Finding:
 
 
 def check_scene(path: Path | str) -> list[Finding]:
-    """Check a scene directory or stored zip, reading every image, sweep and label.
+    """Check a scene directory, reading every image, sweep and label.
 
     Nothing is raised for what is wrong with the scene: it is all in the list, worst first. An empty list means that
     nothing was found.

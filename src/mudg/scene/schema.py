@@ -311,7 +311,7 @@ def parse_scene(
     Args:
         scene_json: content of ``scene.json``.
         tracks_json: content of ``tracks.json``; None when the scene has none.
-        root: where the files lie (folder or zip), kept in the Scene.
+        root: where the files lie, kept in the Scene.
         where: path of ``scene.json`` for messages.
         complain: called with each problem; raises in the strict reader. A record with a problem is left out.
 

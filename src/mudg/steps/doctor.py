@@ -75,7 +75,7 @@ def report_machine() -> dict[str, Any]:
 
 
 def report_scene(scene: Path) -> dict[str, Any]:
-    """Check a scene directory or zip, that of a run, or a log in the neutral layout, and say in words what is wrong or
+    """Check a scene directory, that of a run, or a log in the neutral layout, and say in words what is wrong or
     odd.
 
     Returns:

@@ -166,7 +166,7 @@ def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
 
 
 def _is_scene(source: str | Path) -> bool:
-    return (Path(source) / "scene.json").is_file() or str(source).endswith(".zip")
+    return (Path(source) / "scene.json").is_file()
 
 
 def _is_own_scene(source: str | Path, out: Path) -> bool:
