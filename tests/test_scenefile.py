@@ -501,7 +501,7 @@ def test_check_names_what_is_odd(tmp_path: Path) -> None:
     for words in (
         "moves at 400 m/s",
         "down direction",
-        "vehicle moves at 500 m/s",
+        "moves at 500 m/s",
         "width and length swapped",
         "moves at 180 m/s",
         "not seen for 5.0 s",

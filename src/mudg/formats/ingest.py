@@ -75,8 +75,8 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> dict
     counts = {"frames": scene.frames, "sweeps": scene.sweeps, "tracks": scene.tracks}
     summary = {**{name: len(records) for name, records in counts.items()}, "held_out": held_out}
     if config.contact_sheet:
-        sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
-        log.info(f"ingest: check {folder.out / sheet.name}")
+        store.write_image(folder.path / contact_sheet.NAME, contact_sheet.contact_sheet(scene), quality=88)
+        log.info(f"ingest: check {folder.out / contact_sheet.NAME}")
     if kind == CITY:
         return summary
     alignment = check.camera_alignment(scene)

@@ -249,6 +249,18 @@ def read_points(scene: Scene, sweep: Sweep) -> SweepPoints:
     return checked_points(arrays, where)
 
 
+def sweeps_beside(scene: Scene, frame: Frame, max_gap_s: float) -> list[Sweep]:
+    """The nearest sweep of each LiDAR within ``max_gap_s`` seconds of the image, in the order of their distance in
+    time."""
+    nearest: dict[str, Sweep] = {}
+    for sweep in scene.sweeps:
+        best = nearest.get(sweep.sensor)
+        gap = abs(sweep.time_s - frame.view.time_s)
+        if gap <= max_gap_s and (best is None or gap < abs(best.time_s - frame.view.time_s)):
+            nearest[sweep.sensor] = sweep
+    return sorted(nearest.values(), key=lambda sweep: abs(sweep.time_s - frame.view.time_s))
+
+
 def checked_points(arrays: Mapping[str, NDArray[Any]], where: str) -> SweepPoints:
     """Points from the arrays ``xyz``, ``intensity``, ``dt_s`` and, if there, ``classes``.
 
@@ -256,27 +268,19 @@ def checked_points(arrays: Mapping[str, NDArray[Any]], where: str) -> SweepPoint
         InputError: wrong shape or type, values that are not finite, or classes that are no train ids.
     """
     count, classes = len(arrays["xyz"]), arrays.get("classes")
-    for name, shape in (("xyz", (count, 3)), ("intensity", (count,)), ("dt_s", (count,))):
+    wanted = {"xyz": ((count, 3), "float32"), **dict.fromkeys(("intensity", "dt_s"), ((count,), "float32"))}
+    wanted |= {} if classes is None else {"classes": ((count,), "uint8")}
+    for name, (shape, dtype) in wanted.items():
         array = arrays[name]
-        if array.shape != shape or array.dtype != np.float32:
-            expected, got = f"float32 {shape}", f"{array.dtype} {array.shape}"
+        if array.shape != shape or array.dtype != dtype:
+            expected, got = f"{dtype} {shape}", f"{array.dtype} {array.shape}"
             raise InputError(f"sweep tensor {name!r} has the wrong form", where=where, expected=expected, got=got)
         if not np.isfinite(array).all():
             bad = int((~np.isfinite(array.reshape(count, -1)).all(1)).sum())
             what, where = "sweep holds values that are not finite", f"{where}: {name}"
             remedy = "drop missing returns when importing"
             raise InputError(what, where=where, got=f"{bad} of {count} points", expected="finite metres", remedy=remedy)
-    if classes is not None:
-        _check_classes(classes, count, f"{where}: classes")
+    if classes is not None and (wrong := palette.other_ids(classes)):
+        what, expected = "classes of points hold values that are no train id", "0..18 or 255 (unlabelled)"
+        raise InputError(what, where=f"{where}: classes", expected=expected, got=str(wrong))
     return SweepPoints(arrays["xyz"], arrays["intensity"], arrays["dt_s"], classes)
-
-
-def _check_classes(classes: NDArray[Any], count: int, where: str) -> None:
-    """Refuse classes of points that are not u8[count] train ids or ``UNLABELLED``."""
-    if classes.shape != (count,) or classes.dtype != np.uint8:
-        expected, got = f"uint8 ({count},)", f"{classes.dtype} {classes.shape}"
-        raise InputError("sweep tensor 'classes' has the wrong form", where=where, got=got, expected=expected)
-    wrong = np.unique(classes[(classes >= len(palette.CLASSES)) & (classes != palette.UNLABELLED)])
-    if len(wrong):
-        expected, got = "0..18 or 255 (unlabelled)", str(wrong[:8].tolist())
-        raise InputError("classes of points hold values that are no train id", where=where, expected=expected, got=got)

@@ -293,7 +293,7 @@ class SceneWriter:
     def _write(self, ref: str, content: bytes) -> None:
         store.write_in_tree(self._partial / ref, content)
         with self._lock:
-            self._hashes[ref] = _manifest_entry(content)
+            self._hashes[ref] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def _partial_folder(root: Path) -> Path:
@@ -309,10 +309,6 @@ def _partial_folder(root: Path) -> Path:
             if pid.isdigit() and not process_alive(int(pid)):
                 shutil.rmtree(stale, ignore_errors=True)
     return parent / f"{prefix}{os.getpid()}-{threading.get_ident()}.part"
-
-
-def _manifest_entry(content: bytes) -> dict[str, Any]:
-    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def _sweep_ref(sweep_id: str) -> Ref:
