@@ -26,7 +26,6 @@ from mudg.scene.check import check_scene
 from mudg.scene.clouds import read_fused
 from mudg.scene.read import decode_image, read_image, read_points, read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.scene.write import write_zip
 from mudg.steps.ingest import Annotate, Fuse, Ingest
 from mudg.steps.run import Run
 from mudg.steps.settings import RunConfig
@@ -357,19 +356,16 @@ def test_damaged_images_end_in_words(kind: str) -> None:
     assert refused > 25
 
 
-def test_damaged_zips_and_indices_end_in_words(good_scene: Path, tmp_path: Path) -> None:
+def test_damaged_indices_end_in_words(good_scene: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     shutil.copytree(good_scene, tmp_path / "scene")
-    packed = write_zip(tmp_path / "scene", tmp_path / "scene.zip").read_bytes()
     index = (tmp_path / "scene" / "scene.json").read_bytes()
     refused = 0
     for _ in range(40):
-        (tmp_path / "damaged.zip").write_bytes(damaged(packed[-3000:], rng).join([packed[:-3000], b""]))
         (tmp_path / "scene" / "scene.json").write_bytes(damaged(index, rng))
-        for path in (tmp_path / "damaged.zip", tmp_path / "scene"):
-            try:
-                scene = read_scene(path)
-                read_points(scene, scene.sweeps[0])
-            except MudgError:
-                refused += 1
-    assert refused > 40
+        try:
+            scene = read_scene(tmp_path / "scene")
+            read_points(scene, scene.sweeps[0])
+        except MudgError:
+            refused += 1
+    assert refused > 20

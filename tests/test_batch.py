@@ -18,7 +18,7 @@ def test_a_list_names_sources_folders_and_settings(tmp_path: Path) -> None:
     assert [(e.name, e.source, dict(e.settings)) for e in entries] == [
         ("drive_1", str(tmp_path / "a/drive_1"), {}),
         ("two", str(tmp_path / "b/drive 2"), {"sequence": "07"}),
-        ("drive_3", "/abs/drive_3.zip", {}),
+        ("drive_3.zip", "/abs/drive_3.zip", {}),
         ("c", "city", {}),
     ]
     (tmp_path / "scenes").mkdir()

@@ -1,4 +1,4 @@
-"""Batches in an object store: inputs fetched once and a scene ahead, results uploaded, nothing left on the machine."""
+"""Batches in an object store: inputs fetched once, results uploaded, nothing left on the machine."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Literal
 
 import pytest
 import yaml
-from test_batches import Scenes, wait_for
+from test_batches import Scenes
 
 from mudg.base.errors import InputError, ResourceError
 from mudg.base.location import Location
@@ -144,20 +144,6 @@ def test_results_lie_in_the_store_and_nothing_here(bucket: Location, tmp_path: P
     assert status.read_status(made.batch).finished == 3
     assert sorted(fetched) == ["s0", "s1", "s2"], "each log once, and no result of a step that was made here"
     assert not [path for path in (tmp_path / "scratch").rglob("*") if path.is_file() and path.suffix != ".lock"]
-
-
-def test_the_next_log_comes_while_a_step_runs(bucket: Location, tmp_path: Path, fetched: list[str]) -> None:
-    made = TwoSteps(tmp_path, bucket)
-    made.does("s0", f"touch {tmp_path}/up; while [ ! -f {tmp_path}/go ]; do sleep 0.02; done")
-    thread = threading.Thread(target=made.run)
-    thread.start()
-    try:
-        wait_for((tmp_path / "up").exists)
-        wait_for(lambda: set(fetched) == {"s0", "s1"})
-    finally:
-        (tmp_path / "go").touch()
-        thread.join(30)
-    assert sorted(fetched) == ["s0", "s1", "s2"] and made.batch.keys("failed") == set()
 
 
 def test_a_driver_that_died_between_the_steps_costs_no_step(bucket: Location, tmp_path: Path) -> None:

@@ -45,7 +45,7 @@ def test_lists_are_apart_from_each_other_and_from_all_training_cities():
 @pytest.mark.parametrize("name", ["development", "reported"])
 def test_half_of_a_list_is_curved(name):
     turns = [city_logs.turn_deg(city_logs.log_config(seed)) for seed in city_logs.LISTS[name]]
-    assert sum(turn >= city_logs.CHOICE.curved_deg for turn in turns) == len(turns) / 2
+    assert sum(turn >= city_logs.CURVED_DEG for turn in turns) == len(turns) / 2
 
 
 def test_the_development_list_is_what_the_rule_gives():

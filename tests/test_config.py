@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 import pickle
 from pathlib import Path
-from typing import ClassVar
 
 import pytest
 from pydantic import ValidationError
@@ -84,22 +83,6 @@ def test_differences_tell_values_from_settings_of_another_version():
     assert "far_m, kind, tall and 1 more" in first and second == "steps: 3 there, 4 asked"
     assert config.differences({"a": {"b": 1}}, {"a": {"b": 2}}) == ["a.b: 1 there, 2 asked"]
     assert config.differences(old, old) == []
-
-
-@config.settings
-class Garage:
-    FIXED: ClassVar = {"wheels": ("kind",)}
-    wheels: Wheels = config.setting(default_factory=Wheels)
-
-
-def test_fields_of_a_group_that_are_no_settings_keep_their_defaults(tmp_path):
-    assert config.to_dict(Garage()) == {"wheels": {"kind": "steel", "count": 4}}, "a result's key has them"
-    assert config.load(Garage, overrides={"wheels": {"kind": "steel", "count": 3}}) == Garage(wheels=Wheels(count=3))
-    with pytest.raises(UsageError, match=r"wheels\.kind is no setting here(.|\n)*expected: nothing, or 'steel'"):
-        config.load(Garage, overrides={"wheels": {"kind": "wood"}})
-    with pytest.raises(UsageError, match="one of count\n"):
-        config.load(Garage, overrides={"wheels": {"colour": "red"}})
-    assert config.build(Wheels, {"kind": "wood"}, "record").kind == "wood", "by themselves they are as before"
 
 
 def test_values_are_checked_where_a_configuration_is_made_of_them():

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from toy_scene import CAR_SIZE_M, ToyStreet
 
 from mudg.base.geometry import CAM_FROM_EGO_AXES, box_corners, invert, project, transform_points, yaw_matrix
@@ -58,10 +57,9 @@ def test_a_box_around_the_camera_is_cut_and_one_behind_is_not_drawn() -> None:
 
 def test_a_sheet_has_a_row_per_camera_and_a_view_from_above(tmp_path: Path) -> None:
     scene = ToyStreet(car_start=(12, 0), car_velocity=(3, 0)).write(tmp_path / "scene", width=120, height=60)
-    path = sheets.write_contact_sheet(scene, tmp_path / "sheet.jpg")
-    with Image.open(path) as image:
-        assert image.size == (3 * sheets.TILE_WIDTH_PX, sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
-        top = np.array(image)[sheets.TILE_WIDTH_PX // 2 + 20 :]
+    image = sheets.contact_sheet(scene)
+    assert image.size == (3 * sheets.TILE_WIDTH_PX, sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
+    top = np.array(image)[sheets.TILE_WIDTH_PX // 2 + 20 :]
     assert (np.abs(top.astype(int) - above.VEHICLE_COLOR).max(2) < 60).any()
     assert (np.abs(top.astype(int) - above.PATH_COLOR).max(2) < 60).any()
 
@@ -83,7 +81,7 @@ def test_single_images_of_several_cameras_share_rows(tmp_path: Path) -> None:
     )
     many = replace(scene, cameras=cameras, frames=frames, split={})
     assert sheets.contact_sheet(many).size == (sheets.WIDTH_PX, 2 * sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
-    assert sheets.contact_sheet(scene).size == (sheets.WIDTH_PX, sheets.WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
+    assert sheets.contact_sheet(scene).size == (sheets.WIDTH_PX, sheets.TILE_WIDTH_PX // 2 + sheets.TOP_HEIGHT_PX)
 
 
 def test_boxes_have_the_colour_of_their_class_also_where_there_are_no_points(tmp_path: Path) -> None:

@@ -158,14 +158,9 @@ HOSTILE = {
     "base 60 with a point": ("a: 1" + ":1" * 40_000 + ".0", "too long.*line 1"),
     "digits": ("a: " + "9" * 5000, "number is too long.*line 1"),
     "digits behind a point": ("a: ." + "9" * 5000, "number is too long.*line 1"),
-    "anchors": ("a: [" + ",".join(f"&a{n} 1" for n in range(9000)) + "]", "too many anchors.*line 1"),
+    "anchors": ("a: [" + ",".join(f"&a{n} 1" for n in range(9000)) + "]", "anchors and aliases.*line 1"),
     "documents": ("a: 1\n" + "---\n" * 20_000, "one YAML document.*line 2"),
     "values": ("a: [" + "1," * 22_000 + "]", "too many values.*line 1"),
-    "merged mappings": (
-        "a: &a {" + ",".join(f"k{n}: 1" for n in range(999)) + "}\nb:\n" + "- {<<: *a}\n" * 5000,
-        "too many values.*line 12",
-    ),
-    "a merged text": ("a: {<<: b}", "no mapping.*line 1"),
     "a key twice": ("a: 1\nb: 1\na: 2", "'a' is given twice.*line 3"),
     "a number as key": ("a: {1: 2}", "key is no text.*line 1"),
     "nothing as key": ("a: {null: 2}", "key is no text.*line 1"),
@@ -173,10 +168,10 @@ HOSTILE = {
     "a long key": ("? " + "k" * 90_000 + "\n: 1", "too long.*line 1"),
     "nested": ("a: " + "[" * 3000 + "]" * 3000, "nested too deeply"),
     "nested by lines": ("\n".join(" " * n + "a:" for n in range(400)), "nested too deeply"),
-    "multiplied by aliases": (MULTIPLYING, "too many values"),
-    "containing itself": ("a: &x [*x]", "contains itself"),
+    "multiplied by aliases": (MULTIPLYING, "anchors and aliases"),
+    "containing itself": ("a: &x [*x]", "anchors and aliases"),
     "large": ("a: " + "x" * 5_000_000, "too large"),
-    "an alias of nothing": ("a: *x", "not valid YAML"),
+    "an alias of nothing": ("a: *x", "anchors and aliases"),
     "bytes that are no text": (b"a: \xff\xfe\x00", "not valid YAML"),
 }
 
@@ -211,7 +206,6 @@ LARGE = {
     "maps": "- {a: {b: {c: {d: 1}}}}\n",
     "dashes": "- " * 30 + "1\n",
     "brackets": "- [[[[[[[[[[[[[[[[[[[[]]]]]]]]]]]]]]]]]]]]\n",
-    "aliases": "- *a\n",
     "comments": "#\n",
 }
 
@@ -219,7 +213,7 @@ LARGE = {
 @pytest.mark.parametrize("kind", LARGE)
 def test_the_largest_yaml_is_read_or_refused_quickly(kind: str) -> None:
     """Somebody waits: the viewer parses what is typed. Five times the bound took 1.2 s."""
-    text = "- &a 1\n" + LARGE[kind] * ((LARGEST_BYTES - 7) // len(LARGE[kind]))
+    text = "- 12345\n" + LARGE[kind] * ((LARGEST_BYTES - 8) // len(LARGE[kind]))
     assert LARGEST_BYTES - 150 < len(text) <= LARGEST_BYTES
     took = []
     for _ in range(3):
@@ -230,7 +224,7 @@ def test_the_largest_yaml_is_read_or_refused_quickly(kind: str) -> None:
     assert min(took) < 0.3  # measured: 0.02 to 0.15 on two busy cores
 
 
-@pytest.mark.parametrize("name", [name for name in HOSTILE if name not in ("values", "merged mappings")])
+@pytest.mark.parametrize("name", [name for name in HOSTILE if name != "values"])
 def test_the_slow_parser_refuses_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """PyYAML is also installed without libyaml."""
     monkeypatch.delattr(yaml, "CSafeLoader", raising=False)
@@ -254,9 +248,8 @@ def test_plain_values_are_read(text: str, value: object) -> None:
     assert read == value and type(read) is type(value)
 
 
-def test_plain_yaml_with_aliases_is_read() -> None:
+def test_plain_yaml_is_read() -> None:
     deep = "a: " + "[" * (DEEPEST - 1) + "]" * (DEEPEST - 1)
-    given, value = "a: &x {b: [1, 2]}\nc: *x\nd: {<<: *x, e: 3}", {"b": [1, 2]}
-    assert parse_yaml(given, "here") == {"a": value, "c": value, "d": {**value, "e": 3}}
+    assert parse_yaml("a: {b: [1, 2]}\nc: {}", "here") == {"a": {"b": [1, 2]}, "c": {}}
     assert parse_yaml(deep, "here")
     assert parse_yaml("", "here") is None

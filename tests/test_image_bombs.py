@@ -19,7 +19,6 @@ from mudg.city import light as photos
 from mudg.formats.importers import kitti360
 from mudg.formats.importers.waymo import importer as waymo
 from mudg.scene import labels
-from mudg.scene.observations import read_image_file
 from mudg.scene.read import check_image, decode_image
 from mudg.scoring.detections import read_mask
 from mudg.viewer import gallery
@@ -48,7 +47,6 @@ def _jpeg(_mode: str) -> bytes:
 READERS: dict[str, tuple[str, Callable[[Path], object]]] = {
     "image of a scene": ("RGB", lambda path: decode_image(path.read_bytes(), "here", CAMERA)),
     "image of a scene, checked": ("RGB", lambda path: check_image(path.read_bytes(), "here", CAMERA)),
-    "image of a view": ("RGB", lambda path: read_image_file(path, CAMERA)),
     "lane mask": ("L", read_mask),
     "texture": ("RGB", photos.surface),
     "label": ("L", lambda path: labels._decode_grey(path.read_bytes(), "here")),

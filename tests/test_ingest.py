@@ -26,7 +26,6 @@ from mudg.formats.settings import IngestConfig
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points, read_scene
 from mudg.scene.schema import scene_to_json_text
-from mudg.scene.write import write_zip
 from mudg.steps.ingest import Ingest
 
 needs_native = pytest.mark.skipif(native.library() is None, reason="the city needs the native library")
@@ -228,10 +227,9 @@ def test_a_run_stopped_after_the_scene_was_made_is_finished_without_making_it_ag
     assert (out / "scene.json").stat().st_mtime_ns == made_ns
 
 
-@pytest.mark.parametrize("packed", [False, True])
-def test_a_scene_or_its_zip_is_checked_and_copied(tmp_path: Path, packed: bool) -> None:
+def test_a_scene_is_checked_and_copied(tmp_path: Path) -> None:
     scene = ToyStreet(car_start=(12, 0), car_velocity=(3, 0)).write(tmp_path / "scene")
-    source = write_zip(tmp_path / "scene", tmp_path / "scene.zip") if packed else tmp_path / "scene"
+    source = tmp_path / "scene"
     copy = read_scene(run(source, tmp_path / "out"))
     assert scene_to_json_text(copy) == scene_to_json_text(scene)
     assert (copy.tracks[0].world_from_object == scene.tracks[0].world_from_object).all()

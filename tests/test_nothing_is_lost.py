@@ -39,7 +39,6 @@ from mudg.formats.settings import IngestConfig
 from mudg.labels.settings import AnnotateConfig
 from mudg.scene.read import read_scene
 from mudg.scene.settings import FuseConfig
-from mudg.scene.write import write_zip
 from mudg.steps import pipeline
 from mudg.steps.export import Convert
 from mudg.steps.fit import Fit
@@ -96,7 +95,6 @@ def _paths(scene: Path, v: int) -> tuple[Any, ...]:
 STEPS: dict[str, tuple[tuple[str, ...], Callable[[Given, int], Any]]] = {
     "ingest a log": (("log", "poses"), _ingest),
     "ingest a scene": (("scene",), lambda g, v: _ingest({"log": g["scene"]}, v)),
-    "ingest a zip": (("zip",), lambda g, v: _ingest({"log": g["zip"]}, v)),
     "annotate": (("plain scene", "weights"), _annotate),
     "fuse": (("scene",), lambda g, v: partial(Fuse, scene=g["scene"], settings=FuseConfig(voxel_m=0.1 * v))),
     "learn": (("clips",), lambda g, v: partial(Learn, settings=tiny(g["clips"], seed=v))),
@@ -139,7 +137,6 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Given:
     ToyStreet(times=[0.0, 0.1]).write(root / "plain", width=60, height=40, labels=False)
     given = {
         "scene": toy_views.write_scene(root / "scene", lidar=True),
-        "zip": write_zip(root / "scene", root / "scene.zip"),
         "plain scene": root / "plain",
         "log": kitti_folders.write_raw_drive(root / "day"),
         "clips": write_clips(root / "clips"),
@@ -221,10 +218,10 @@ def test_clips_of_a_training_lie_in_its_folder_only_where_they_do_by_default(wor
 
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_the_chain_never_writes_into_its_log(world: Given, tmp_path: Path, overwrite: bool) -> None:
-    given = copied(world, ("log", "scene", "zip"), tmp_path)
+    given = copied(world, ("log", "scene"), tmp_path)
     before = tree(tmp_path)
     for path in given.values():
-        for out in (path, path.parent, *([path / "out"] if path.is_dir() else [])):
+        for out in (path, path.parent, path / "out"):
             with pytest.raises(UsageError, match="an input"):
                 Run(source=str(path), out=out, overwrite=overwrite, settings=RunConfig()).run()
     config = dataclasses.replace(RunConfig(), synthesize=SynthesizeConfig(model=str(given["scene"])))

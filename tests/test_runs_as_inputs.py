@@ -127,9 +127,9 @@ def test_help_all_works_for_every_verb(verb: str) -> None:
 @pytest.mark.parametrize(
     ("page", "shown", "others"),
     [
-        ("batch status", ("--html", "--watch-s", "--price"), ("--stages", "--preset", "--reason", "--shard")),
-        ("batch retry", ("--reason",), ("--stages", "--html", "--price")),
-        ("batch run", ("--list", "--stages", "--engine", "--set"), ("--watch-s", "--reason", "--price")),
+        ("batch status", ("--watch-s",), ("--stages", "--preset", "--reason", "--shard")),
+        ("batch retry", ("--reason",), ("--stages", "--watch-s")),
+        ("batch run", ("--list", "--stages", "--engine", "--set"), ("--watch-s", "--reason")),
         ("bench paper", ("--table", "--iterations"), ("--protocols", "--sampler", "--variant")),
         ("bench mdm", ("--steps", "--cities"), ("--table", "--protocols", "--score.width-px")),
         ("bench real", ("--protocols", "--variant", "--ablation"), ("--table", "--videos", "--sampler")),

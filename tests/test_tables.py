@@ -1,4 +1,4 @@
-"""Tables of text: one renderer for Markdown, LaTeX, CSV and pages."""
+"""Tables of text: one renderer for Markdown, CSV and pages."""
 
 import csv
 import io
@@ -6,14 +6,14 @@ import io
 import pytest
 
 from mudg.base import html
-from mudg.base.html import PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown, markdown_table
+from mudg.base.html import PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, markdown, markdown_table
 
 TABLE = TextTable(
     ("", "FID ↓", "a_b"),
     (
         TextLine("A paper's & method", (TextCell("50.00"), TextCell("")), PUBLISHED),
-        TextLine("the truth", (TextCell("6.00"), TextCell("-", reason="no weights")), "anchor"),
-        TextLine("ours (mudg_s)", (TextCell("45 %", best=True), TextCell("-", reason="no weights")), "ours"),
+        TextLine("the truth", (TextCell("6.00"), TextCell("-")), "anchor"),
+        TextLine("ours (mudg_s)", (TextCell("45 %", best=True), TextCell("-")), "ours"),
     ),
     "2 m",
 )
@@ -28,23 +28,6 @@ def test_markdown_marks_the_best():
         "| ours (mudg_s) | **45 %** | - |",
     ]
     assert markdown_table(["a", "b"], []) == ["| a | b |", "|---|---|"]
-
-
-def test_latex_escapes_gives_reasons_and_sets_published_lines_apart():
-    assert latex(TABLE) == [
-        "% 2 m",
-        "% -- a_b: no weights",
-        r"\begin{tabular}{lrr}",
-        r"\hline",
-        r" & FID $\downarrow$ & a\_b \\",
-        r"\hline",
-        r"A paper's \& method & 50.00 &  \\",
-        r"\hline",
-        r"the truth & 6.00 & -- \\",
-        r"ours (mudg\_s) & \textbf{45 \%} & -- \\",
-        r"\hline",
-        r"\end{tabular}",
-    ]
 
 
 def test_csv_quotes_what_it_must():

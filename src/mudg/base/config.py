@@ -1,8 +1,4 @@
-"""Frozen configuration: presets < YAML file < flags, unknown keys refused with the nearest name.
-
-The class variable ``FIXED`` maps a group to those of its fields that are no settings of this class: they have their
-defaults.
-"""
+"""Frozen configuration: presets < YAML file < flags, unknown keys refused with the nearest name."""
 
 from __future__ import annotations
 
@@ -92,27 +88,6 @@ def _plain(value: Any) -> Any:
     return [_plain(item) for item in value] if isinstance(value, tuple | list) else value
 
 
-def _without_fixed(
-    config_type: Any, values: Mapping[str, Any], where: str, path: str = "", fixed: Sequence[str] = ()
-) -> dict[str, Any]:
-    """Settings without those of ``fixed``; UsageError for one with another value than its default."""
-    known, rest = _types_of_fields(config_type), dict[str, Any]()
-    for name, value in values.items():
-        if name not in fixed:
-            group = dataclasses.is_dataclass(known.get(name)) and isinstance(value, Mapping)
-            inside = fixed_of(config_type, name)
-            rest[name] = _without_fixed(known[name], value, where, f"{path}{name}.", inside) if group else value
-        elif (usual := getattr(config_type(), name)) != value:
-            what, got = f"{path}{name} is no setting here", repr(value)
-            raise UsageError(what, where=where, expected=f"nothing, or {usual!r}", got=got, remedy="leave it out")
-    return rest
-
-
-def fixed_of(config_type: Any, group: str) -> Sequence[str]:
-    """Fields of a group that are no settings."""
-    return getattr(config_type, "FIXED", {}).get(group, ())
-
-
 def result_settings(config: Any) -> dict[str, Any]:
     """What a result depends on: ``to_dict`` without every ``device``, so that a result made or begun on one device is
     reused or resumed on another."""
@@ -147,13 +122,13 @@ def load(
     usual = config_type() if preset is None else preset
     if yaml_path is None and not overrides:
         return usual
-    values = _without_fixed(config_type, to_dict(usual), "preset")
+    values = to_dict(usual)
     if yaml_path is not None:
         content = _read_yaml(yaml_path)
         content.pop("verb", None)
-        values = _merge(values, _without_fixed(config_type, content, str(yaml_path)), str(yaml_path), config_type)
+        values = _merge(values, content, str(yaml_path), config_type)
     if overrides:
-        values = _merge(values, _without_fixed(config_type, overrides, "flags"), "flags", config_type)
+        values = _merge(values, overrides, "flags", config_type)
     from pydantic import ValidationError
 
     from mudg.base.records import first_problem
@@ -201,7 +176,7 @@ def build(config_type: type[Config], values: Mapping[str, Any], where: str) -> C
     from mudg.base.records import first_problem
 
     try:
-        return _adapter(config_type).validate_python(_without_fixed(config_type, values, where))
+        return _adapter(config_type).validate_python(values)
     except ValidationError as error:
         raise first_problem(error, f"{where}: ", UsageError) from error
 
@@ -218,10 +193,8 @@ def _read_yaml(path: Path) -> dict[str, Any]:
     return content
 
 
-def _merge(
-    base: dict[str, Any], new: Mapping[str, Any], where: str, kind: Any, path: str = "", fixed: Sequence[str] = ()
-) -> dict[str, Any]:
-    known = {name: type_ for name, type_ in _types_of_fields(kind).items() if name not in fixed}
+def _merge(base: dict[str, Any], new: Mapping[str, Any], where: str, kind: Any, path: str = "") -> dict[str, Any]:
+    known = _types_of_fields(kind)
     merged = dict(base)
     for name, value in new.items():
         group = known.get(name)
@@ -235,7 +208,7 @@ def _merge(
                 remedy = f"write each part before a dot as a group: {group_text}"
             raise UsageError(what, where=where, expected=expected, remedy=remedy)
         if is_group and is_mapping and isinstance(base.get(name), Mapping):
-            merged[name] = _merge(base[name], value, where, group, f"{path}{name}.", fixed_of(kind, name))
+            merged[name] = _merge(base[name], value, where, group, f"{path}{name}.")
         else:
             merged[name] = value
     return merged

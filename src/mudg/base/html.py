@@ -15,28 +15,22 @@ from mudg.base import palette
 
 # tables -------------------------------------------------------------------------------------------
 #
-# Tables of text as Markdown, LaTeX and CSV; the macro ``table`` of ``assets/templates/macros.html.j2`` is their HTML.
+# Tables of text as Markdown and CSV; the macro ``table`` of ``assets/templates/macros.html.j2`` is their HTML.
 # No torch.
 
 PUBLISHED: Final = "published"
-"""Kind of the lines that LaTeX sets apart from the others by a rule."""
+"""Kind of the lines with numbers of papers."""
 ARROWS: Final = {"higher": "↑", "lower": "↓", "one": "→ 1"}
 SENSES: Final = {"higher": "higher is better", "lower": "lower is better", "one": "nearest to 1 is best"}
 """Which way the numbers of a column are better, as a sign and in words."""
-_LATEX: Final = (
-    {character: f"\\{character}" for character in "&%$#_{}"}
-    | {"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"}
-    | {"↑": r"$\uparrow$", "↓": r"$\downarrow$", "→": r"$\to$"}
-)
 
 
 @dataclass(frozen=True)
 class TextCell:
-    """A cell: ``best``, the best number of its column; ``reason``, why there is no number."""
+    """A cell: ``best``, the best number of its column."""
 
     text: str
     best: bool = False
-    reason: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,7 +44,7 @@ class TextLine:
 
 @dataclass(frozen=True)
 class TextTable:
-    """A table: headings, the first above the titles of the lines; ``title`` above it, on pages and in LaTeX."""
+    """A table: headings, the first above the titles of the lines; ``title`` above it, on pages."""
 
     heads: tuple[str, ...]
     lines: tuple[TextLine, ...]
@@ -78,31 +72,6 @@ def markdown_table(heads: Sequence[str], rows: Iterable[Sequence[str]]) -> list[
 def cells(row: Mapping[str, Any], forms: Mapping[str, str]) -> list[str]:
     """Values of a row by the format of each; ``-``: there is no such number."""
     return ["-" if row[key] is None else form.format(row[key]) for key, form in forms.items()]
-
-
-def latex(table: TextTable) -> list[str]:
-    """Lines of a LaTeX ``tabular``; reasons behind cells without a number (--) are comments above it."""
-    heads = table.heads[1:]
-    cells = (pair for line in table.lines for pair in zip(heads, line.cells, strict=True))
-    reasons = dict.fromkeys(f"{head}: {cell.reason}" for head, cell in cells if cell.reason)
-    lines = [*([f"% {table.title}"] if table.title else []), *(f"% -- {reason}" for reason in reasons)]
-    first = " & ".join(map(escaped, table.heads)) + r" \\"
-    lines += [r"\begin{tabular}{l" + "r" * len(heads) + "}", r"\hline", first, r"\hline"]
-    kind = ""
-    for line in table.lines:
-        if kind and PUBLISHED in (kind, line.kind) and kind != line.kind:
-            lines.append(r"\hline")
-        kind = line.kind
-        texts = (
-            "--" if c.reason else rf"\textbf{{{escaped(c.text)}}}" if c.best else escaped(c.text) for c in line.cells
-        )
-        lines.append(" & ".join([escaped(line.title), *texts]) + r" \\")
-    return [*lines, r"\hline", r"\end{tabular}"]
-
-
-def escaped(text: str) -> str:
-    """Text with LaTeX's own characters written out."""
-    return "".join(_LATEX.get(character, character) for character in text)
 
 
 def csv_text(heads: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import re
 import sys
 import threading
 import time
@@ -12,7 +11,7 @@ import weakref
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from mudg.base.errors import ResourceError
 
@@ -98,22 +97,9 @@ def system_text(path: str) -> str:
 
 
 # usage --------------------------------------------------------------------------------------------
-#
-# One thread looks at memory every `PERIOD_S` for all meters, and each looks at its start and end: a peak that lasts
-# less is missed. Proportional set sizes cost about 15 ms per GB, so they are read only when the resident sizes allow a
-# new peak, and never for more than `MOST_OF_TIME` of the time. psutil reads neither their anonymous part nor
-# ``children`` of a process without a look at all processes.
 
 PERIOD_S: Final = 0.25
-MOST_OF_TIME: Final = 0.05
-_PROPORTIONAL: Final = re.compile(r"^(Pss|Pss_Anon):\s+(\d+) kB", re.MULTILINE)
-
-
-class Resident(NamedTuple):
-    """Memory of a process: all that is resident, and of that mapped files and shared memory."""
-
-    all_bytes: int
-    mapped_bytes: int
+"""How often a meter looks at memory, besides at its start and end: a peak that lasts less may be missed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,114 +134,54 @@ class Meter:
 
     def __init__(self) -> None:
         self._began_s, self._processor_s = time.monotonic(), _processor_seconds()
-        self.peak = held_bytes() or 0
+        self._peak = held_bytes() or 0
         self._last: Usage | None = None
-        _SAMPLER.add(self)
+        self._stopped = threading.Event()
+        watch = threading.Thread(
+            target=_watch, args=(weakref.ref(self), self._stopped), name="memory meter", daemon=True
+        )
+        with contextlib.suppress(RuntimeError):  # no thread to be had: the samples of start and end remain
+            watch.start()
 
-    def seen(self, held: int | None) -> None:
+    def look(self) -> None:
         """Take a sample of memory."""
-        self.peak = max(self.peak, held or 0)
+        self._peak = max(self._peak, held_bytes() or 0)
 
     def usage(self) -> Usage:
         """Up to now; after `stop`, up to then."""
         if self._last is not None:
             return self._last
-        sizes = resident_sizes()
-        if _most(sizes) > self.peak:
-            self.seen(held_bytes(sizes))
-        return Usage(time.monotonic() - self._began_s, _processor_seconds() - self._processor_s, self.peak or None)
+        self.look()
+        return Usage(time.monotonic() - self._began_s, _processor_seconds() - self._processor_s, self._peak or None)
 
     def stop(self) -> Usage:
         """Measure no further."""
         self._last = self.usage()
-        _SAMPLER.drop(self)
+        self._stopped.set()
         return self._last
 
 
-class _Sampler:
-    """Gives all meters samples of memory, in a thread that lives while there are any."""
-
-    def __init__(self) -> None:
-        self._meters: weakref.WeakSet[Meter] = weakref.WeakSet()
-        self._lock = threading.Lock()
-        self._thread: threading.Thread | None = None
-
-    def add(self, meter: Meter) -> None:
-        with self._lock:
-            self._meters.add(meter)
-            if self._thread is None or not self._thread.is_alive():
-                self._thread = threading.Thread(target=self._sample, name="memory meter", daemon=True)
-                with contextlib.suppress(RuntimeError):  # no thread to be had: the samples of start and end remain
-                    self._thread.start()
-
-    def drop(self, meter: Meter) -> None:
-        with self._lock:
-            self._meters.discard(meter)
-
-    def _sample(self) -> None:
-        rest_until_s = 0.0
-        while True:
-            time.sleep(PERIOD_S)
-            with self._lock:
-                meters = list(self._meters)
-                if not meters:
-                    self._thread = None
-                    return
-            began_s, sizes = time.monotonic(), resident_sizes()
-            if began_s >= rest_until_s and any(_most(sizes) > meter.peak for meter in meters):
-                held, now_s = held_bytes(sizes), time.monotonic()
-                rest_until_s = now_s + (now_s - began_s) / MOST_OF_TIME
-                for meter in meters:
-                    meter.seen(held)
-            meters = []  # a meter that nobody else holds may go
+def _watch(meter: weakref.ref[Meter], stopped: threading.Event) -> None:
+    """Let a meter look at memory until it is stopped, or nobody holds it."""
+    while not stopped.wait(PERIOD_S) and (alive := meter()) is not None:
+        alive.look()
+        del alive
 
 
-_SAMPLER: Final = _Sampler()
-
-
-def held_bytes(sizes: Mapping[int, Resident] | None = None) -> int | None:
-    """Memory that this process and its descendants hold now; what several of them share counts once. None where the
-    system does not say.
-
-    Own memory is the sum of proportional sizes. Of mapped files (libraries, mostly) at least the most that one process
-    has resident counts: in proportional sizes a part of them belongs to programs that are not ours. Where the system
-    tells no such sizes (Linux does), resident ones are added up.
-
-    Args:
-        sizes: what `resident_sizes` said just now.
-    """
-    sizes = resident_sizes() if sizes is None else sizes
-    if len(sizes) < 2:
-        return sum(size.all_bytes for size in sizes.values()) or None
-    own, mapped, mapped_by_one = 0, 0, 0
-    for process, size in sizes.items():
-        found = dict(_PROPORTIONAL.findall(system_text(f"/proc/{process}/smaps_rollup")))
-        if len(found) < 2:  # it ended meanwhile, or the system tells none
-            own += size.all_bytes
-            continue
-        own += 1024 * int(found["Pss_Anon"])
-        mapped += 1024 * (int(found["Pss"]) - int(found["Pss_Anon"]))
-        mapped_by_one = max(mapped_by_one, size.mapped_bytes)
-    return own + max(mapped, mapped_by_one)
-
-
-def resident_sizes() -> dict[int, Resident]:
-    """Resident memory of this process and of its descendants, by process; empty where the system does not say."""
-    sizes, waiting, page = {}, [os.getpid()], os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 4096
-    while waiting:
+def held_bytes() -> int | None:
+    """Memory that this process and its descendants hold now: what belongs to each alone, and of mapped files and shared
+    memory the most that one of them has resident. None where the system has no ``/proc``."""
+    own, mapped, waiting = 0, 0, [os.getpid()]
+    while waiting:  # psutil finds children only by a look at all processes
         process = waiting.pop()
         pages = system_text(f"/proc/{process}/statm").split()
         if len(pages) > 2:
-            sizes[process] = Resident(int(pages[1]) * page, int(pages[2]) * page)
+            own += int(pages[1]) - int(pages[2])
+            mapped = max(mapped, int(pages[2]))
         with contextlib.suppress(OSError):  # it ended meanwhile
             for thread in os.listdir(f"/proc/{process}/task"):
                 waiting += map(int, system_text(f"/proc/{process}/task/{thread}/children").split())
-    return sizes
-
-
-def _most(sizes: Mapping[int, Resident]) -> int:
-    """More than this cannot be held."""
-    return sum(size.all_bytes for size in sizes.values())
+    return (own + mapped) * os.sysconf("SC_PAGE_SIZE") if own else None
 
 
 def folder_bytes(folder: Path) -> int:

@@ -34,6 +34,11 @@ DISPLAY_COLORS: Final = _table(
 )
 
 
+def other_ids(ids: NDArray[np.integer]) -> list[int]:
+    """The first eight values that are neither a class nor ``UNLABELLED``."""
+    return np.setdiff1d(ids, [*range(len(CLASSES)), UNLABELLED])[:8].tolist()
+
+
 def encode(ids: NDArray[np.integer], colors: NDArray[np.uint8] = COLORS) -> NDArray[np.uint8]:
     """Class ids ``[...]`` to colours ``u8[..., 3]``; ids outside 0..18 (unlabelled) become black."""
     table = np.zeros((256, 3), np.uint8)

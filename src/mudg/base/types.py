@@ -526,7 +526,7 @@ class Scene(_Brief):
 
     Args:
         id: name of the log.
-        root: directory or stored zip that the references are relative to.
+        root: directory that the references are relative to.
         cameras: by name.
         frames: images, in time order per camera.
         sweeps: LiDAR sweeps, in time order per sensor.

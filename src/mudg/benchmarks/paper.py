@@ -5,7 +5,7 @@ reason why there is none: a method that lacks a number on one log has no mean. F
 logs at a place, as one set as in papers; a mean of the distances of small sets is mostly bias.
 
     OUT/<log>/...   see ``benchmarks/places.py``; views that fits learn from lie in OUT/<log>/virtual
-    OUT/bench.json   every number   OUT/bench.md bench.csv bench.tex   the table   OUT/page.html   table and pictures"""
+    OUT/bench.json   every number   OUT/bench.md bench.csv   the table   OUT/page.html   table and pictures"""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from mudg.base import config as configuration
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.base.html import ARROWS, PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, latex, markdown_table
+from mudg.base.html import ARROWS, PUBLISHED, TextCell, TextLine, TextTable, best_of, csv_text, markdown_table
 from mudg.base.html import markdown as rendered
 from mudg.base.run_folder import refuse_overlap
 from mudg.benchmarks.chain import Facts, compare, films, refuse_foreign, render_page, seconds_of
@@ -60,7 +60,7 @@ from mudg.scoring.sets import FEATURES_FOLDER, FEWEST, distances, video_entry
 from mudg.scoring.tables import NO_TRUTH, NOT_COMPUTED, SET_METRICS
 from mudg.steps.settings import PresetName
 
-PAGES: Final = ("bench.json", "bench.md", "bench.csv", "bench.tex", "page.html")
+PAGES: Final = ("bench.json", "bench.md", "bench.csv", "page.html")
 ANCHORS: Final = {TRUTH: "the truth itself", FILL: "fused points, holes filled"}
 """Rows that every table has, with their titles; the first is no method and enters no ranking."""
 BY_DEFINITION: Final = frozenset({"psnr", "ssim", "psnr_movers", "lpips", "perceptual", "abs_rel", "miou"})
@@ -121,7 +121,7 @@ class PaperLog(Views):
 def run(
     config: BenchConfig, sources: Sequence[Path], out: Path, *, preset: PresetName = "default", overwrite: bool = False
 ) -> Path:
-    """Fill a table; returns ``out`` with ``bench.json``, the table as Markdown, CSV and LaTeX, and ``page.html``; what
+    """Fill a table; returns ``out`` with ``bench.json``, the table as Markdown and CSV, and ``page.html``; what
     lies there of the same settings is reused, and logs and methods may be added later. ``sources``: ``city:reported``
     (or another list of cities), or folders of recorded logs. ``preset``: what ``config`` started from. ``overwrite``:
     replace what other settings left in ``out``. UsageError: an unknown method or list, a setting that no row of the
@@ -154,7 +154,7 @@ def run(
         **chain_settings(config, preset),
     }
     values = [{"name": r.name, "title": r.title, "method": r.method, "changes": dict(r.changes)} for r in rows]
-    texts = {"bench.md": markdown, "bench.csv": as_csv, "bench.tex": as_latex, "page.html": page}
+    texts = {"bench.md": markdown, "bench.csv": as_csv, "page.html": page}
     return compare(out, jobs, config, lambda logs: document(table, logs, values, settings, pooled(logs, out)), texts)
 
 
@@ -447,8 +447,7 @@ def _headed(column: Facts) -> str:
 def _ours(doc: Facts, wanted: Sequence[tuple[str, str]]) -> Iterator[TextLine]:
     shared = {cell: _shared_reason(doc, *cell) for cell in wanted}
     for row in doc["rows"]:
-        empty = {cell: TextCell(NONE, reason=reason) for cell, reason in shared.items() if reason}
-        cells = (empty.get(cell) or _printed(doc, row["name"], *cell) for cell in wanted)
+        cells = (TextCell(NONE) if shared[cell] else _printed(doc, row["name"], *cell) for cell in wanted)
         yield TextLine(row["title"], tuple(cells), "ours" if row["method"] else "anchor")
     yield TextLine("n", tuple(TextCell(_count(doc, *cell)) for cell in wanted), "n")
 
@@ -456,7 +455,7 @@ def _ours(doc: Facts, wanted: Sequence[tuple[str, str]]) -> Iterator[TextLine]:
 def _printed(doc: Facts, row: str, place: str, key: str) -> TextCell:
     result, column = doc["cells"][row][place][key], _columns(doc)[key]
     if "mean" not in result:
-        return TextCell(result["reason"], reason=result["reason"])
+        return TextCell(result["reason"])
     error = result["standard_error"]
     behind = "" if error is None else f" ({_digits(error, column)})"
     return TextCell(_digits(result["mean"], column) + behind, row in doc["best"][place][key])
@@ -491,15 +490,6 @@ def markdown(doc: Facts) -> str:
     for table in further_tables(doc):
         lines += [f"## {doc['further_title']}: {table.title}", "", *rendered(table), ""]
     return "\n".join([*lines, "## Logs", "", *markdown_table(LOG_HEADS, map(_log_cells, doc["logs"])), ""])
-
-
-def as_latex(doc: Facts) -> str:
-    """The tables as LaTeX ``tabular``; notes as comments above them."""
-    further = [replace(table, title=f"{doc['further_title']}: {table.title}") for table in further_tables(doc)]
-    lines = [f"% {note}" for note in (heading(doc), *notes_of(doc))]
-    for table in (main_table(doc), *further):
-        lines += [*latex(table), ""]
-    return "\n".join(lines)
 
 
 def as_csv(doc: Facts) -> str:

@@ -153,8 +153,7 @@ def names_of(sources: Sequence[Path]) -> dict[str, Path]:
         raise UsageError("no log was given", expected="mudg bench real LOG... --out FOLDER")
     named: dict[str, Path] = {}
     for source in map(Path, sources):
-        last = source.resolve().stem if source.suffix == ".zip" else source.resolve().name
-        name = _NAME.sub("_", last).strip("._-") or "log"
+        name = _NAME.sub("_", source.resolve().name).strip("._-") or "log"
         if name in named or name in ("bench.json", "bench.md", "page.html"):
             remedy = "rename one, or prepare it with mudg ingest in a folder of another name"
             raise UsageError("two logs have the same name", where=str(source), got=name, remedy=remedy)

@@ -107,23 +107,6 @@ class LogRules:
 
 
 @dataclass(frozen=True)
-class LogChoice:
-    """Which logs enter a list.
-
-    Args:
-        moving: at least so many moving vehicles are in view of the front camera.
-        smallest_share: in view means: covers this share of the image,
-        frames_share: in this share of the frames.
-        curved_deg: half of the list turns by at least this angle.
-    """
-
-    moving: int = 2
-    smallest_share: float = 1e-3
-    frames_share: float = 0.25
-    curved_deg: float = 5.0
-
-
-@dataclass(frozen=True)
 class LogFacts:
     """What a log holds: turn in degrees (range of headings), length in metres, moving vehicles in view of the front
     camera, the share of the image they cover together on average, and the generator's line about the city."""
@@ -137,7 +120,9 @@ class LogFacts:
 
 
 STANDARD: Final = LogRules()
-CHOICE: Final = LogChoice()
+MOVING, SMALLEST_SHARE, FRAMES_SHARE, CURVED_DEG = 2, 1e-3, 0.25, 5.0
+"""A log enters a list with so many moving vehicles in view of the front camera: they cover this share of the image, in
+this share of the frames. Half of the list turns by at least this angle."""
 VEHICLES: Final = frozenset({"car", "truck", "bus", "cyclist"})
 
 DEVELOPMENT: tuple[int, ...] = (2100000, 2100001, 2100004, 2100007)
@@ -161,14 +146,14 @@ def moving_instances(world: CityWorld, labels: Container[str] | None = None) -> 
     return tuple(world.instance_of(track.id) for track in moving)
 
 
-def facts(seed: int, rules: LogRules = STANDARD, choice: LogChoice = CHOICE) -> LogFacts:
+def facts(seed: int, rules: LogRules = STANDARD) -> LogFacts:
     """What the log of a seed holds, from small images of every fourth frame."""
     world = CityWorld(log_config(seed, rules))
     views = [view.resized(96, 64) for view in world.frame_views("front")[::4]]
     seen = np.stack([world.render(view, supersample=1).instance for view in views])
     moving = moving_instances(world, VEHICLES)
     shares = np.array([[float((image == i).mean()) for image in seen] for i in moving]).reshape(-1, len(views))
-    count = int(((shares >= choice.smallest_share).mean(1) >= choice.frames_share).sum())
+    count = int(((shares >= SMALLEST_SHARE).mean(1) >= FRAMES_SHARE).sum())
     share = float(shares.sum(0).mean())
     return LogFacts(seed, turn_deg(world.config), world.plan.drive_length, count, share, world.describe())
 
@@ -181,8 +166,8 @@ def turn_deg(config: CityConfig) -> float:
     return float(np.rad2deg(heading.max() - heading.min()))
 
 
-def choose(first_seed: int, count: int, rules: LogRules = STANDARD, choice: LogChoice = CHOICE) -> tuple[int, ...]:
-    """The first seeds from `first_seed` on that satisfy the choice: half of `count` curved, the others not, in
+def choose(first_seed: int, count: int, rules: LogRules = STANDARD) -> tuple[int, ...]:
+    """The first seeds from `first_seed` on that qualify: half of `count` curved, the others not, in
     ascending order.
 
     Raises:
@@ -193,8 +178,8 @@ def choose(first_seed: int, count: int, rules: LogRules = STANDARD, choice: LogC
     kept: dict[bool, list[int]] = {True: [], False: []}
     seed = first_seed
     while min(map(len, kept.values())) < count // 2:
-        curved = turn_deg(log_config(seed, rules)) >= choice.curved_deg
-        if len(kept[curved]) < count // 2 and facts(seed, rules, choice).moving >= choice.moving:
+        curved = turn_deg(log_config(seed, rules)) >= CURVED_DEG
+        if len(kept[curved]) < count // 2 and facts(seed, rules).moving >= MOVING:
             kept[curved].append(seed)
         seed += 1
     return tuple(sorted(kept[True] + kept[False]))

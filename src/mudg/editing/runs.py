@@ -61,7 +61,7 @@ def scene_of_run(folder: Path) -> Path | None:
         source = Path(store.read_json(folder / "run.json")["asked"]["source"])
     except (InputError, KeyError, TypeError):
         return None
-    return source if (source / "scene.json").is_file() or source.suffix == ".zip" else None
+    return source if (source / "scene.json").is_file() else None
 
 
 # where a part is asked for, and a run given -------------------------------------------------------

@@ -291,7 +291,7 @@ class Exported:
 
 def parts_of(name: str, source: Path, scene: Path | None) -> RunParts:
     """Where the parts of a source lie: of a fit, a run, or, for formats without Gaussians, a scene."""
-    alone = name not in FORMATS and ((source / "scene.json").is_file() or source.suffix == ".zip")
+    alone = name not in FORMATS and (source / "scene.json").is_file()
     return RunParts({}, scene or source, None, False) if alone else find_run(source, scene)
 
 

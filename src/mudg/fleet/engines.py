@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import concurrent.futures
 import os
-import queue
 import signal
-import threading
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -20,9 +18,8 @@ from typing import Any, Final
 
 from mudg.base import log, store
 from mudg.base.errors import ResourceError, UsageError
-from mudg.base.location import Location
 from mudg.fleet.child import Stop
-from mudg.fleet.plan import REVISION, Entry
+from mudg.fleet.plan import Entry
 from mudg.fleet.records import Ended
 from mudg.fleet.settings import BatchConfig
 from mudg.fleet.work import LOST, Job, run_scene
@@ -39,44 +36,23 @@ _GB: Final = 1_000_000_000
 
 @dataclass
 class LocalRun:
-    """Scenes on this machine, ``jobs`` at a time. The log of the next scene is fetched meanwhile."""
+    """Scenes on this machine, ``jobs`` at a time."""
 
     job: Job
     entries: Sequence[Entry]
     jobs: int
     stop: Stop
-    _threads: list[concurrent.futures.Future[None]] = field(default_factory=list)
-    _ahead: dict[str, threading.Thread] = field(default_factory=dict)
+    _scenes: list[concurrent.futures.Future[list[Ended]]] = field(default_factory=list)
 
     def run(self, tell: Tell) -> None:
         """Do them all. Ctrl-C and SIGTERM stop steps with a checkpoint, a second one at once: KeyboardInterrupt."""
-        waiting, told = deque(self.entries), queue.SimpleQueue[Ended | None]()
-
-        def work() -> None:
-            try:
-                while waiting and not self.stop.asked:
-                    try:
-                        entry = waiting.popleft()
-                    except IndexError:  # another thread took the last one
-                        return
-                    self._fetch_ahead(entry, waiting)
-                    for report in run_scene(self.job, entry, self.stop):
-                        told.put(report)
-            finally:
-                told.put(None)
-
+        steps_of = lambda entry: [] if self.stop.asked else run_scene(self.job, entry, self.stop)
         with concurrent.futures.ThreadPoolExecutor(self.jobs) as pool:
             try:
-                self._threads = [pool.submit(work) for _ in range(self.jobs)]
-                left = self.jobs
-                while left:
-                    report = told.get()
-                    if report is not None:
+                self._scenes = [pool.submit(steps_of, entry) for entry in self.entries]
+                for scene in concurrent.futures.as_completed(self._scenes):
+                    for report in scene.result():
                         tell(report)
-                        continue
-                    left -= 1
-                    for thread in concurrent.futures.wait(self._threads, 0.0).done:
-                        thread.result()
             except BaseException:
                 self.stop.ask()
                 try:
@@ -89,19 +65,7 @@ class LocalRun:
 
     def wait(self) -> None:
         """Wait until no step runs."""
-        concurrent.futures.wait(self._threads)
-
-    def _fetch_ahead(self, entry: Entry, waiting: Sequence[Entry]) -> None:
-        """Wait for the log of this scene, if it is under way, and begin to fetch that of the next one."""
-        thread = self._ahead.pop(entry.name, None)
-        while thread is not None and thread.is_alive() and not self.stop.asked:
-            thread.join(0.2)
-        for following in list(waiting)[:1]:
-            first = next(self.job.plan.units(following))
-            reads = "://" in following.source and "{source}" in " ".join(first.stage.words)
-            if reads and following.name not in self._ahead and not self.job.folder.record("done", first.key).exists():
-                source, version = Location.of(following.source), following.settings.get(REVISION, "")
-                self._ahead[following.name] = self.job.inputs.fetch_ahead(source, version, self.stop)
+        concurrent.futures.wait(self._scenes)
 
 
 # Ray ----------------------------------------------------------------------------------------------

@@ -93,7 +93,7 @@ def _entry(line: str, where: str, folder: str, settings: Sequence[str]) -> Entry
             raise InputError("unknown setting in the line", where=where, got=got, expected=expected, remedy=remedy)
         given[key] = os.path.abspath(value) if key in ("poses", "boxes") and os.path.exists(value) else value
     source = words[0] if words[0] == CITY else _below(folder, words[0])
-    name = given.pop("name", "") or Path(source).name.removesuffix(".zip")
+    name = given.pop("name", "") or Path(source).name
     if not NAME_PATTERN.fullmatch(name) or name == BOOKKEEPING:
         raise InputError("name cannot be a folder name", where=where, got=name[:80], remedy="add name=NAME to the line")
     return Entry(name, source, given)

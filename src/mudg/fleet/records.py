@@ -48,17 +48,6 @@ class _Record(BaseModel):
     model_config = ConfigDict(strict=True, extra="ignore")
 
 
-class CorpusFacts(_Record):
-    """Facts about the log that a result holds a scene of."""
-
-    dataset: str = ""
-    cameras: Count = 0
-    images: Count = 0
-    seconds: Amount = 0.0
-    metres: Amount = 0.0
-    objects: dict[str, Count] = {}
-
-
 class Ended(_Record):
     """How a step of a scene ended: done or failed, which is put on record; or stopped, or lost by its engine. lost_s:
     processor seconds of attempts without a result."""
@@ -79,7 +68,6 @@ class Ended(_Record):
     lost_s: Amount = 0.0
     written_bytes: Count = 0
     peak_bytes: Count | None = None
-    facts: CorpusFacts | None = None
 
 
 class Owner(_Record):

@@ -13,14 +13,11 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import itertools
-import math
 import os
 import re
 import shutil
 import socket
 import tempfile
-import threading
 import time
 from collections import Counter
 from collections.abc import Iterator, Mapping
@@ -36,7 +33,7 @@ from mudg.base.location import PACKAGES, Location
 from mudg.base.memory import folder_bytes
 from mudg.fleet.child import ASKED_TO_STOP, KILLED, Ending, Stop, lock, run_step
 from mudg.fleet.plan import REVISION, BatchPlan, Entry, Unit, command_of
-from mudg.fleet.records import BatchFolder, CorpusFacts, Ended
+from mudg.fleet.records import BatchFolder, Ended
 
 DONE, FAILED, STOPPED, LOST = "done", "failed", "stopped", "lost"
 REASONS: Final[Mapping[int, str]] = {
@@ -51,7 +48,6 @@ _RESULT: Final = "result"
 _SETTINGS: Final = "settings.yaml"
 _ADDRESS: Final = re.compile(rf"({'|'.join(PACKAGES)}):/+")
 """The beginning of an address, also as a path writes it."""
-_LARGEST: Final = 64 << 20
 
 
 # inputs -------------------------------------------------------------------------------------------
@@ -112,20 +108,6 @@ class InputStore:
             finally:
                 if not keep and lock(handle, True, None):
                     shutil.rmtree(place, ignore_errors=True)
-
-    def fetch_ahead(self, source: Location, version: str, stop: Stop) -> threading.Thread:
-        """Begin to fetch what is needed next. A failure is told by the step that needs it."""
-
-        def fetch() -> None:
-            try:
-                with self.held(source, version, stop, keep=True):
-                    pass
-            except (MudgError, OSError) as error:
-                log.info(f"{source} could not be fetched ahead: {error}")
-
-        thread = threading.Thread(target=fetch, name="inputs ahead", daemon=True)
-        thread.start()
-        return thread
 
     def doubt(self, source: Location, version: str) -> None:
         """Compare an input with its address before it is used again: a step said that it is bad."""
@@ -429,7 +411,7 @@ class _Step:
 
     def _record(self, result: Path, ending: Ending) -> Ended:
         facts: dict[str, Any] = {"digest": digest_of(result), "written_bytes": folder_bytes(result)}
-        return self._ended(DONE, ending, **facts, peak_bytes=peak_of(result), facts=facts_of(result))
+        return self._ended(DONE, ending, **facts, peak_bytes=peak_of(result))
 
     def _fail(self, ending: Ending) -> Ended:
         record = self._ended(FAILED, replace(ending, processor_s=0.0))
@@ -452,34 +434,10 @@ def digest_of(folder: Path) -> str:
     return store.digest_of_files(folder, names)
 
 
-def facts_of(folder: Path) -> CorpusFacts | None:
-    """Facts about the log that a result holds a scene of; None where there is none that can be read."""
-    with contextlib.suppress(AttributeError, IndexError, TypeError, ValueError):  # any command may have made it
-        for scene in (folder, folder / "scene"):
-            index = _json(scene / "scene.json")
-            if "frames" in index:
-                ego, tracks = index.get("ego", {}), _json(scene / "tracks.json")
-                times = [float(time) for time in ego.get("times_s", [])]
-                path = [(float(pose[3]), float(pose[7]), float(pose[11])) for pose in ego.get("world_from_ego", [])]
-                return CorpusFacts(
-                    dataset=str(index.get("source", {}).get("dataset", "")),
-                    cameras=len(index.get("cameras", {})),
-                    images=len(index["frames"]),
-                    seconds=round(max(times) - min(times), 3) if times else 0.0,
-                    metres=round(sum(math.dist(one, following) for one, following in itertools.pairwise(path)), 1),
-                    objects=dict(Counter(str(one.get("label")) for one in tracks.get("tracks", []))),
-                )
-    return None
-
-
 def peak_of(folder: Path) -> int | None:
     """Most memory that the record of a result tells, in bytes; None where it does not."""
     with contextlib.suppress(AttributeError, TypeError, ValueError):
-        state = _json(folder / store.RUN_STATE)
+        state = store.json_object(folder / store.RUN_STATE)
         steps = state["steps"].values() if "steps" in state else [state]
         return max((int(one["peak_bytes"]) for one in steps if one.get("peak_bytes")), default=None)
     return None
-
-
-def _json(path: Path) -> dict[str, Any]:
-    return store.json_object(path) if path.is_file() and path.stat().st_size <= _LARGEST else {}

@@ -75,8 +75,8 @@ def _fill(folder: RunDir, kind: str, config: IngestConfig, source: Path) -> dict
     counts = {"frames": scene.frames, "sweeps": scene.sweeps, "tracks": scene.tracks}
     summary = {**{name: len(records) for name, records in counts.items()}, "held_out": held_out}
     if config.contact_sheet:
-        sheet = contact_sheet.write_contact_sheet(scene, folder.path / contact_sheet.NAME)
-        log.info(f"ingest: check {folder.out / sheet.name}")
+        store.write_image(folder.path / contact_sheet.NAME, contact_sheet.contact_sheet(scene), quality=88)
+        log.info(f"ingest: check {folder.out / contact_sheet.NAME}")
     if kind == CITY:
         return summary
     alignment = check.camera_alignment(scene)
@@ -115,8 +115,8 @@ def kind_of(config: IngestConfig, source: Path) -> str:
 
 
 def is_scene(source: Path) -> bool:
-    """Whether ``source`` is a scene directory, or a zip, which can be nothing else."""
-    return (source.is_file() and source.suffix == ".zip") or (source / "scene.json").is_file()
+    """Whether ``source`` is a scene directory."""
+    return (source / "scene.json").is_file()
 
 
 def import_options(config: IngestConfig) -> ImportOptions:
@@ -171,11 +171,12 @@ def _walk(path: Path) -> Iterator[Path]:
 
 
 def _city(config: IngestConfig, out: Path) -> Scene:
+    from mudg.city.config import CityConfig
     from mudg.city.logs import write_city
 
     what = "the generated city has settings of its own"
     _refuse_log_settings(config, what, "use --city.n-frames, --city.cameras, --city.width, ...")
-    return write_city(config.city, out, test_every=config.test_every)
+    return write_city(CityConfig(**vars(config.city)), out, test_every=config.test_every)
 
 
 def _refuse_log_settings(config: IngestConfig, what: str, remedy: str) -> None:

@@ -2,23 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import ClassVar, Literal
+from typing import Literal
 
 from mudg.base.config import setting, settings
-from mudg.city.config import CityConfig
+from mudg.city.config import CitySettings
 
 
 @settings
 class IngestConfig:
     """Convert a dataset log, or the built-in procedural city, to a scene directory."""
-
-    FIXED: ClassVar[Mapping[str, tuple[str, ...]]] = {
-        "city": tuple(
-            """rate_hz hfov_deg rig_variation lidar_lower_deg lidar_upper_deg lidar_range_m lidar_noise_m lidar_dropout
-            style crossing shift_margin_m sensor_noise""".split()
-        )
-    }
 
     resolution: str = ""
     """Image size of the scene: the longest side in pixels, e.g. 960, or WIDTHxHEIGHT (empty = as recorded). Images are
@@ -50,4 +42,4 @@ class IngestConfig:
     """Bridge gaps between vehicle poses with curves instead of refusing the frames in them."""
     untwist: Literal["auto", "yes", "no"] = "auto"
     """Compensate LiDAR scans for the vehicle's motion during a sweep (auto = if the dataset's scans need it)."""
-    city: CityConfig = setting(default_factory=CityConfig)
+    city: CitySettings = setting(default_factory=CitySettings)

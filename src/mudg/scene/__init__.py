@@ -9,6 +9,5 @@
     manifest.json                    sha256 of every file; checked at each read where it is there
 
 The writer builds the tree beside its destination and moves it into place at ``finish``: a scene is there completely or
-not at all. The same tree as one stored zip is the portable form: ``write_zip`` makes it, and every reader here takes
-both.
+not at all.
 """

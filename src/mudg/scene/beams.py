@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from scipy import ndimage, signal
 
 from mudg.base import geometry
-from mudg.base.types import EgoPath, Scene, Sweep, SweepPoints, Track
+from mudg.base.types import EgoPath, Scene, Sweep, Track
 from mudg.core.fusion import STATIC, FusionRules, SweepShots, judge_track, separate
 from mudg.core.returns import Returns
-from mudg.scene.read import read_points
+from mudg.scene.read import read_points, sweeps_beside
 
 Floats = NDArray[np.float64]
 WORLD: Final = ""
@@ -85,9 +85,9 @@ def sensor_pose(ego: EgoPath, sweep: Sweep, time_s: float) -> Floats:
     return poses[1] @ geometry.invert(poses[0]) @ sweep.world_from_lidar
 
 
-def beams_of(scene: Scene, sweep: Sweep, points: SweepPoints | None = None) -> Beams:
+def beams_of(scene: Scene, sweep: Sweep) -> Beams:
     """The beams of a sweep that returned, in the order of its points."""
-    points = read_points(scene, sweep) if points is None else points
+    points = read_points(scene, sweep)
     dt_s, xyz = points.dt_s.astype(np.float64), points.xyz.astype(np.float64)
     first, last = (float(dt_s.min()), float(dt_s.max())) if len(dt_s) else (0.0, 0.0)
     turns = last - first > 1e-6
@@ -181,14 +181,8 @@ def _doubled(rows: Floats, height: Floats) -> NDArray[np.bool_]:
 
 def held_out(scene: Scene) -> frozenset[str]:
     """Ids of the sweeps of held-out frames: of every sensor the one nearest in time to each of them."""
-    found = set()
-    for frame in scene.frames_in("test"):
-        for sensor in {sweep.sensor for sweep in scene.sweeps}:
-            own = [sweep for sweep in scene.sweeps if sweep.sensor == sensor]
-            best = min(own, key=lambda sweep: abs(sweep.time_s - frame.view.time_s))
-            if abs(best.time_s - frame.view.time_s) <= SAME_MOMENT_S:
-                found.add(best.id)
-    return frozenset(found)
+    frames = scene.frames_in("test")
+    return frozenset(sweep.id for frame in frames for sweep in sweeps_beside(scene, frame, SAME_MOMENT_S))
 
 
 def training_sweeps(scene: Scene) -> tuple[Sweep, ...]:

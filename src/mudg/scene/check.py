@@ -19,7 +19,7 @@ from mudg.scene import motion
 from mudg.scene.clouds import FLOAT32_SPACING_M, LEAST_RANGE_M, at_sensor, float32_spacing_m
 from mudg.scene.labels import read_label
 from mudg.scene.motion import VEHICLES
-from mudg.scene.read import load_scene, read_image, read_points
+from mudg.scene.read import load_scene, read_image, read_points, sweeps_beside
 
 # how well the LiDAR fits each camera of a scene, by edges; see ``core/calibration.py`` ------------
 
@@ -28,28 +28,12 @@ IMAGES_PER_CAMERA = 6
 MAX_GAP_S = 0.06
 
 
-def sweeps_beside(scene: Scene, frame: Frame, max_gap_s: float) -> list[Sweep]:
-    """The nearest sweep of each LiDAR within ``max_gap_s`` seconds of the image, in the order of their distance in
-    time."""
-    nearest: dict[str, Sweep] = {}
-    for sweep in scene.sweeps:
-        best = nearest.get(sweep.sensor)
-        gap = abs(sweep.time_s - frame.view.time_s)
-        if gap <= max_gap_s and (best is None or gap < abs(best.time_s - frame.view.time_s)):
-            nearest[sweep.sensor] = sweep
-    return sorted(nearest.values(), key=lambda sweep: abs(sweep.time_s - frame.view.time_s))
-
-
 def camera_alignment(scene: Scene) -> dict[str, EdgeAlignment]:
     """Camera name -> how its images fit the sweeps of the same time, from up to six images; empty without sweeps."""
     if not scene.sweeps:
         return {}
-    with log.task("comparing LiDAR and image edges", len(scene.cameras)) as bar:
-        found = {}
-        for name in scene.cameras:
-            found[name] = edge_alignment(_shots(scene, name))
-            bar.advance()
-    return found
+    names = log.progress(scene.cameras, len(scene.cameras), "comparing LiDAR and image edges")
+    return {name: edge_alignment(_shots(scene, name)) for name in names}
 
 
 def _shots(scene: Scene, name: str) -> Iterator[tuple[View, Any, Any, Any]]:
@@ -162,7 +146,7 @@ def _note(where: str, message: str) -> Finding:
 
 
 def check_scene(path: Path | str) -> list[Finding]:
-    """Check a scene directory or stored zip, reading every image, sweep and label.
+    """Check a scene directory, reading every image, sweep and label.
 
     Nothing is raised for what is wrong with the scene: it is all in the list, worst first. An empty list means that
     nothing was found.
@@ -173,16 +157,26 @@ def check_scene(path: Path | str) -> list[Finding]:
     except MudgError as problem:
         return [*findings, finding_of(problem, str(path))]
     findings.extend(check_records(scene))
-    with log.task("checking files", len(scene.frames) + len(scene.sweeps)) as bar:
-        for frame in scene.frames:
-            findings.extend(collected(_check_image_file(scene, frame), str(path)))
-            for name in frame.labels:
-                findings.extend(collected(_check_label(scene, frame, name), str(path)))
-            bar.advance()
-        for sweep in scene.sweeps:
-            findings.extend(collected(_check_sweep(scene, sweep), str(path)))
-            bar.advance()
+    records = (*scene.frames, *scene.sweeps)
+    for record in log.progress(records, len(records), "checking files"):
+        findings.extend(collected(_check_file(scene, record), str(path)))
+        if isinstance(record, Frame):
+            for name in record.labels:
+                findings.extend(collected(_check_label(scene, record, name), str(path)))
     return worst_first(findings)
+
+
+def _check_file(scene: Scene, record: Frame | Sweep) -> Findings:
+    if isinstance(record, Frame):
+        yield from check_image(record, read_image(scene, record))
+    else:
+        yield from check_points(scene, record, read_points(scene, record))
+
+
+def _check_label(scene: Scene, frame: Frame, name: str) -> Findings:
+    label = read_label(scene, frame, name)
+    if name == "depth" and not np.isfinite(label).any():
+        yield _warning(f"frame {frame.id}", "its depth label has no valid pixel")
 
 
 def collected(findings: Findings, where: str) -> list[Finding]:
@@ -245,10 +239,6 @@ def _check_cameras(scene: Scene) -> Findings:
 
 def _check_ego(scene: Scene) -> Findings:
     ego = scene.ego
-    if len(ego.times_s) > 1:
-        speed = _speeds(ego.world_from_ego[:, :3, 3], ego.times_s)
-        if speed.max() > MAX_SPEED_M_S:
-            yield _warning("ego path", f"the vehicle moves at {speed.max():.0f} m/s; check units of time and place")
     for gap in motion.gaps(ego.times_s, ego.world_from_ego):
         yield _warning("ego path", f"{gap}{'; frames in it would have guessed poses' if gap.is_guess else ''}")
     yield from _check_keys("ego path", ego.times_s, ego.world_from_ego, motion.MOST_TURN_RAD_S, of_box=False)
@@ -280,10 +270,13 @@ def check_distance(scene: Scene) -> Findings:
 def _check_keys(
     where: str, times_s: NDArray[np.float64], poses: NDArray[np.float64], most_rad_s: float, *, of_box: bool
 ) -> Findings:
-    """Headings that flip, turns, jumps and accelerations that nothing on wheels makes: of each, how many and the first
-    or largest."""
+    """Speeds, headings that flip, turns, jumps and accelerations that nothing on wheels makes: of each, how many and
+    the first or largest."""
     if len(times_s) < 2:
         return
+    speed = _speeds(poses[:, :3, 3], times_s).max()
+    if speed > MAX_SPEED_M_S:
+        yield _warning(where, f"it moves at {speed:.0f} m/s; check ids, poses, and units of time and place")
     flips = motion.heading_flips(times_s, poses, most_rad_s)
     if len(flips):
         mended = len(motion.unflipped(times_s, poses, most_rad_s)[1])
@@ -344,9 +337,6 @@ def _check_tracks(scene: Scene) -> Findings:
             if gaps.max() > MAX_TRACK_GAP_S:
                 unseen = f"it is not seen for {gaps.max():.1f} s from {track.times_s[int(gaps.argmax())]:.1f} s on"
                 yield _warning(where, f"{unseen}; its path across the gap is a guess: split the track")
-            speed = np.linalg.norm(np.diff(track.world_from_object[:, :3, 3], axis=0), axis=1) / steps
-            if speed.max() > MAX_SPEED_M_S:
-                yield _warning(where, f"it moves at {speed.max():.0f} m/s; check ids and poses")
             most_rad_s = motion.most_turn_rad_s(track.label)
             yield from _check_keys(where, track.times_s, track.world_from_object, most_rad_s, of_box=True)
             yield from _check_course(track, where)
@@ -404,20 +394,6 @@ def _check_relations(scene: Scene) -> Findings:
         if outside:
             lie = f"{len(outside)} tracks lie outside the time of the frames (first: {outside[0]})"
             yield _warning("tracks", f"{lie}; are the clocks the same?")
-
-
-def _check_image_file(scene: Scene, frame: Frame) -> Findings:
-    yield from check_image(frame, read_image(scene, frame))
-
-
-def _check_sweep(scene: Scene, sweep: Sweep) -> Findings:
-    yield from check_points(scene, sweep, read_points(scene, sweep))
-
-
-def _check_label(scene: Scene, frame: Frame, name: str) -> Findings:
-    label = read_label(scene, frame, name)
-    if name == "depth" and not np.isfinite(label).any():
-        yield _warning(f"frame {frame.id}", "its depth label has no valid pixel")
 
 
 def check_image(frame: Frame, image: NDArray[np.uint8]) -> Findings:

@@ -9,20 +9,20 @@ people violet, of all else light blue, and the edges of their fronts red.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Final
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from mudg.base import geometry, store
+from mudg.base import geometry
 from mudg.base.types import Frame, Scene, Track, View
 from mudg.core.pictures import depth_colors, resize_area
-from mudg.scene.check import sweeps_beside
 from mudg.scene.motion import VEHICLES
-from mudg.scene.read import read_image, read_points
+from mudg.scene.read import read_image, read_points, sweeps_beside
+
+Floats = NDArray[np.float64]
+Record = TypeVar("Record")
 
 # a scene from above: points, the recorded path, boxes and their courses ---------------------------
 
@@ -42,77 +42,64 @@ PEOPLE: Final = frozenset(
 ) | {"person (sitting)"}
 
 
-@dataclass(frozen=True, eq=False)
-class TopView:
-    """What a view from above shows.
+def draw_top_view(
+    scene: Scene,
+    size: tuple[int, int],
+    xyz: Floats,
+    rgb: NDArray[np.uint8],
+    boxes: Mapping[str, Floats | None],
+    caption: str,
+    *,
+    dot_px: int = 1,
+    outer_percent: float = 4.0,
+) -> Image.Image:
+    """Draw a scene from above, x to the right, y up.
 
     Args:
-        xyz: points f64[N, 3] in the world. rgb: their colours u8[N, 3]; higher points lie over lower ones.
+        size: width and height of the picture. xyz: points f64[N, 3] in the world. rgb: their colours u8[N, 3]; higher
+            points lie over lower ones.
         boxes: id of a track -> ``world_from_object`` of its box, or None for its course alone. caption: upper left.
         dot_px: side of a point, pixels. outer_percent: of the points on each side that need not fit into the picture.
     """
-
-    xyz: Floats
-    rgb: NDArray[np.uint8]
-    boxes: Mapping[str, Floats | None]
-    caption: str
-    dot_px: int = 1
-    outer_percent: float = 4.0
-
-
-def draw_top_view(scene: Scene, content: TopView, width: int, height: int) -> Image.Image:
-    """Draw a scene from above into a picture of this size, x to the right, y up."""
-    path = scene.ego.world_from_ego[:, :3, 3]
-    tracks = [track for track in scene.tracks if track.id in content.boxes]
-    places = [content.xyz] if len(content.xyz) else [track.world_from_object[:, :3, 3] for track in tracks]
-    around = np.concatenate([path[:, :2], *(xyz[:, :2] for xyz in places)])
-    low, high = np.percentile(around, [content.outer_percent, 100 - content.outer_percent], axis=0)
+    path, (width, height) = scene.ego.world_from_ego[:, :3, 3], size
+    tracks = [track for track in scene.tracks if track.id in boxes]
+    places = [xyz] if len(xyz) else [track.world_from_object[:, :3, 3] for track in tracks]
+    around = np.concatenate([path[:, :2], *(one[:, :2] for one in places)])
+    low, high = np.percentile(around, [outer_percent, 100 - outer_percent], axis=0)
     low, high = np.minimum(low, path[:, :2].min(0)) - _MARGIN_M, np.maximum(high, path[:, :2].max(0)) + _MARGIN_M
     scale = float(min(width / (high[0] - low[0]), height / (high[1] - low[1])))
     middle = (low + high) / 2
-
-    def pixels(xyz: Floats) -> Floats:
-        return (xyz[:, :2] - middle) * [scale, -scale] + [width / 2, height / 2]
-
-    image = Image.fromarray(_points(pixels(content.xyz), content, width, height))
+    pixels = lambda xyz: (xyz[:, :2] - middle) * [scale, -scale] + [width / 2, height / 2]
+    canvas, uv = np.full((height, width, 3), GROUND_COLOR, np.uint8), pixels(xyz)
+    order = np.argsort(xyz[:, 2], kind="stable")
+    order = order[((uv[order] >= 0) & (uv[order] < [width, height])).all(1)]
+    for down, right in np.ndindex(dot_px, dot_px):
+        rows, columns = uv[order, 1].astype(int) + down, uv[order, 0].astype(int) + right
+        canvas[rows.clip(0, height - 1), columns.clip(0, width - 1)] = rgb[order]
+    image = Image.fromarray(canvas)
     draw = ImageDraw.Draw(image)
     for track in tracks:
         draw.line(pairs(pixels(track.world_from_object[:, :3, 3])), fill=_COURSE_COLOR)
-        pose = content.boxes[track.id]
+        pose = boxes[track.id]
         if pose is not None:
             corners = pixels(geometry.transform_points(pose, geometry.box_corners(track.size_m)[[0, 2, 6, 4]]))
             draw.polygon(pairs(corners), outline=box_color(track.label))
             draw.line(pairs(corners[[2, 3]]), fill=FRONT_COLOR, width=2)
     if len(path) > 1:
         draw.line(pairs(pixels(path)), fill=PATH_COLOR, width=2)
-    start = pixels(path[:1])[0]
-    draw.ellipse((start[0] - 4, start[1] - 4, start[0] + 4, start[1] + 4), outline=PATH_COLOR)
+    x, y = pixels(path[:1])[0]
+    draw.ellipse((x - 4, y - 4, x + 4, y + 4), outline=PATH_COLOR)
     draw.line((10, height - 12, 10 + 10 * scale, height - 12), fill=TEXT_COLOR, width=2)
     draw.text((10, height - 28), "10 m", fill=TEXT_COLOR)
     _legend(draw, width, height)
-    draw_caption(draw, content.caption)
+    draw_caption(draw, caption)
     return image
-
-
-def _points(uv: Floats, content: TopView, width: int, height: int) -> NDArray[np.uint8]:
-    canvas = np.full((height, width, 3), GROUND_COLOR, np.uint8)
-    order = np.argsort(content.xyz[:, 2], kind="stable")
-    order = order[((uv[order] >= 0) & (uv[order] < [width, height])).all(1)]
-    for down, right in np.ndindex(content.dot_px, content.dot_px):
-        rows, columns = uv[order, 1].astype(int) + down, uv[order, 0].astype(int) + right
-        canvas[rows.clip(0, height - 1), columns.clip(0, width - 1)] = content.rgb[order]
-    return canvas
 
 
 def _legend(draw: ImageDraw.ImageDraw, width: int, height: int) -> None:
     """What the colours mean, at the lower right."""
-    entries = (
-        ("vehicles", VEHICLE_COLOR),
-        ("people", PEOPLE_COLOR),
-        ("other boxes", OTHER_COLOR),
-        ("fronts", FRONT_COLOR),
-        ("path", PATH_COLOR),
-    )
+    colors = VEHICLE_COLOR, PEOPLE_COLOR, OTHER_COLOR, FRONT_COLOR, PATH_COLOR
+    entries = list(zip(("vehicles", "people", "other boxes", "fronts", "path"), colors, strict=True))
     left = width - 12 - sum(draw.textlength(text) + 14 for text, _ in entries)
     draw.rectangle((left - 6, height - 32, width - 6, height - 8), fill=GROUND_COLOR)
     for text, color in entries:
@@ -159,59 +146,35 @@ _THICKER_FROM_PX: Final = 700
 _EDGES: Final = ((0, 1), (1, 3), (3, 2), (2, 0), (4, 5), (5, 7), (7, 6), (6, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 """Pairs of corners (``geometry.box_corners``)."""
 
-Floats = NDArray[np.float64]
-
-
-def write_contact_sheet(scene: Scene, path: Path) -> Path:
-    """Draw the scene's contact sheet as a JPEG at ``path``."""
-    store.write_image(path, contact_sheet(scene), quality=88)
-    return path
-
 
 def contact_sheet(scene: Scene) -> Image.Image:
-    """The cameras, the view from above below.
-
-    A camera has a row of its first, middle and last image. Where no camera has more than one, they share rows.
-    """
-    chosen = []
-    for name in scene.cameras:
-        frames = scene.frames_of(name)
-        chosen.append(spread(frames, FRAMES_PER_CAMERA))
-    columns = max([1, *(len(frames) for frames in chosen)])
-    if columns == 1:
-        single = [frame for frames in chosen for frame in frames]
-        columns = max(1, min(FRAMES_PER_CAMERA, len(single)))
-        chosen = [single[first : first + columns] for first in range(0, len(single), columns)]
-    rows = [_beside([frame_tile(scene, f, WIDTH_PX // columns) for f in frames]) for frames in chosen if frames]
-    rows.append(top_view(scene, WIDTH_PX, TOP_HEIGHT_PX))
-    sheet = Image.new("RGB", (WIDTH_PX, sum(row.height for row in rows)), GROUND_COLOR)
+    """The first, middle and last image of each camera in rows of three, the view from above below."""
+    chosen = [frame for name in scene.cameras for frame in spread(scene.frames_of(name), FRAMES_PER_CAMERA)]
+    tiles = [frame_tile(scene, frame) for frame in chosen]
+    rows = [tiles[first : first + FRAMES_PER_CAMERA] for first in range(0, len(tiles), FRAMES_PER_CAMERA)]
+    heights = [max(tile.height for tile in row) for row in rows]
+    sheet = Image.new("RGB", (WIDTH_PX, sum(heights) + TOP_HEIGHT_PX), GROUND_COLOR)
     top = 0
-    for row in rows:
-        sheet.paste(row, (0, top))
-        top += row.height
+    for row, height in zip(rows, heights, strict=True):
+        for column, tile in enumerate(row):
+            sheet.paste(tile, (column * TILE_WIDTH_PX, top))
+        top += height
+    sheet.paste(top_view(scene, WIDTH_PX, TOP_HEIGHT_PX), (0, top))
     return sheet
 
 
-def spread(frames: Sequence[Frame], count: int) -> list[Frame]:
-    """At most ``count`` of the frames, evenly spread, first and last among them."""
-    return [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, count).astype(int))] if frames else []
-
-
-def _beside(tiles: list[Image.Image]) -> Image.Image:
-    row = Image.new("RGB", (sum(tile.width for tile in tiles), max(tile.height for tile in tiles)), GROUND_COLOR)
-    left = 0
-    for tile in tiles:
-        row.paste(tile, (left, 0))
-        left += tile.width
-    return row
+def spread(records: Sequence[Record], count: int) -> list[Record]:
+    """At most ``count`` of the records, evenly spread, first and last among them."""
+    places = np.unique(np.linspace(0, len(records) - 1, count).astype(int)) if records else ()
+    return [records[place] for place in places]
 
 
 # --- from the cameras -----------------------------------------------------------------------------
 
 
-def frame_tile(scene: Scene, frame: Frame, width: int = TILE_WIDTH_PX) -> Image.Image:
+def frame_tile(scene: Scene, frame: Frame) -> Image.Image:
     """One image with the points of the sweeps of its moment and the boxes of its time."""
-    camera = frame.view.camera
+    camera, width = frame.view.camera, TILE_WIDTH_PX
     height = max(1, round(camera.height * width / camera.width))
     view = frame.view.resized(width, height)
     pixels = np.array(resize_area(read_image(scene, frame), width, height))
@@ -302,23 +265,15 @@ def draw_box(draw: ImageDraw.ImageDraw, view: View, world_from_object: Floats, t
 def top_view(scene: Scene, width: int, height: int) -> Image.Image:
     """Points of up to 24 sweeps by height above the vehicle's path, the path, boxes at the middle of the log and their
     courses."""
-    xyz = _sample(scene)
+    parts = [np.zeros((0, 3))]
+    for sweep in spread(scene.sweeps, _TOP_SWEEPS):
+        points = read_points(scene, sweep).xyz
+        points = points[:: max(1, len(points) // _TOP_POINTS)].astype(np.float64)
+        parts.append(geometry.transform_points(sweep.world_from_lidar, points))
+    xyz = np.concatenate(parts)
     height_m = (xyz[:, 2] - np.median(scene.ego.world_from_ego[:, 2, 3])).clip(-2.5, 4.0)
     grey = np.repeat((60 + 170 * (height_m + 2.5) / 6.5).astype(np.uint8)[:, None], 3, 1)
     middle_s = float(np.median(scene.ego.times_s))
     caption = f"{scene.id}: {len(scene.sweeps)} sweeps, {len(scene.tracks)} tracked boxes (at {middle_s:.1f} s)"
     boxes = {track.id: track.pose_at(middle_s) for track in scene.tracks}
-    return draw_top_view(scene, TopView(xyz, grey, boxes, caption), width, height)
-
-
-def _sample(scene: Scene) -> Floats:
-    """Points of some sweeps in the world, f64[N, 3]."""
-    count = len(scene.sweeps)
-    chosen = np.unique(np.linspace(0, count - 1, min(count, _TOP_SWEEPS)).astype(int)) if count else []
-    parts = [np.zeros((0, 3))]
-    for index in chosen:
-        sweep = scene.sweeps[index]
-        xyz = read_points(scene, sweep).xyz
-        step = max(1, len(xyz) // _TOP_POINTS)
-        parts.append(geometry.transform_points(sweep.world_from_lidar, xyz[::step].astype(np.float64)))
-    return np.concatenate(parts)
+    return draw_top_view(scene, (width, height), xyz, grey, boxes, caption)

@@ -19,8 +19,9 @@ from mudg.base import config as configuration
 from mudg.base import log, store
 from mudg.base.camera_colors import SAME_COLORS, CameraColors
 from mudg.base.errors import InputError
+from mudg.base.geometry import transform_points
 from mudg.base.run_folder import RunDir
-from mudg.base.types import Frame, FusedCloud, Photo, Scene, Track
+from mudg.base.types import FusedCloud, Photo, Scene
 from mudg.core.calibration import match_cameras
 from mudg.core.fusion import (
     STATIC,
@@ -34,7 +35,7 @@ from mudg.core.fusion import (
 )
 from mudg.scene.check import check_distance
 from mudg.scene.clouds import write_fused
-from mudg.scene.contact_sheet import TopView, draw_top_view
+from mudg.scene.contact_sheet import draw_top_view
 from mudg.scene.labels import read_label
 from mudg.scene.read import read_image, read_points
 from mudg.scene.settings import FuseConfig
@@ -56,7 +57,7 @@ def write_fusion(config: FuseConfig, scene: Scene, work: RunDir) -> dict[str, An
     cloud, report = fuse_scene(scene, config)
     if report.sweeps and not len(cloud.static):
         log.warn("fuse: no static point projects into any image; check calibration and clocks with `mudg doctor`")
-    for words in (*describe(report), *describe_colors(cloud.colors)):
+    for words in describe(report, cloud.colors):
         log.info(f"fuse: {words}")
     write_fused(work.path, cloud, report_record(report, rules_of(config)))
     store.write_image(work.path / "top.png", top_view(scene, cloud, report))
@@ -100,10 +101,11 @@ def scene_sweeps(scene: Scene, config: FuseConfig) -> Iterator[SweepShots]:
     frames = scene.frames_in("train")
     by_camera = {name: [f for f in frames if f.view.camera.name == name] for name in scene.cameras}
     for sweep in log.progress(scene.sweeps, len(scene.sweeps), "fusing sweeps"):
-        chosen = [_nearest(found, sweep.time_s) for found in by_camera.values() if found]
-        shots = [_photo(scene, f) for f in chosen if abs(f.view.time_s - sweep.time_s) <= MOST_IMAGE_GAP_S]
-        points = read_points(scene, sweep)
-        yield SweepShots(sweep.time_s, sweep.world_from_lidar, points, shots)
+        gap = lambda frame, time_s=sweep.time_s: abs(frame.view.time_s - time_s)
+        chosen = [frame for own in by_camera.values() if own and gap(frame := min(own, key=gap)) <= MOST_IMAGE_GAP_S]
+        labels = [read_label(scene, f, "semantics") if "semantics" in f.labels else None for f in chosen]
+        shots = [Photo(f.view, read_image(scene, f), ids) for f, ids in zip(chosen, labels, strict=True)]
+        yield SweepShots(sweep.time_s, sweep.world_from_lidar, read_points(scene, sweep), shots)
 
 
 def camera_colors(scene: Scene, config: FuseConfig, rules: FusionRules) -> CameraColors:
@@ -147,21 +149,6 @@ def mean_around(rgb: NDArray[np.uint8], row: NDArray[np.intp], column: NDArray[n
     return ((total + 12) // 25).astype(np.uint8)
 
 
-def describe_colors(cameras: CameraColors) -> list[str]:
-    """Which cameras' colours differ, in sentences."""
-    gains = {name: " ".join(f"{gain:.2f}" for gain in found.gain) for name, found in cameras.to_common.items()}
-    return [f"colours of {name} brought to those of {cameras.reference}: gain {gain}" for name, gain in gains.items()]
-
-
-def _nearest(frames: list[Frame], time_s: float) -> Frame:
-    return min(frames, key=lambda frame: abs(frame.view.time_s - time_s))
-
-
-def _photo(scene: Scene, frame: Frame) -> Photo:
-    semantics = read_label(scene, frame, "semantics") if "semantics" in frame.labels else None
-    return Photo(frame.view, read_image(scene, frame), semantics)
-
-
 def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:
     """The report as JSON values for ``fuse.json``."""
     values = dataclasses.asdict(report)
@@ -174,7 +161,7 @@ def report_record(report: FusionReport, rules: FusionRules) -> dict[str, Any]:
     return {"counts": values, "rules": dataclasses.asdict(rules), "tracks": tracks}
 
 
-def describe(report: FusionReport) -> list[str]:
+def describe(report: FusionReport, cameras: CameraColors) -> list[str]:
     """What happened, in sentences."""
     dynamic = [track_id for track_id, verdict in report.verdicts.items() if verdict.moving]
     total = max(report.points_in, 1)
@@ -187,26 +174,20 @@ def describe(report: FusionReport) -> list[str]:
     lines += [f"dynamic object {track_id} left out: {words}" for track_id, words in shown]
     if len(report.left_out) > len(shown):
         lines.append(f"{len(report.left_out) - len(shown)} more dynamic objects left out: fuse.json says why")
-    return lines
+    gains = {name: " ".join(f"{gain:.2f}" for gain in found.gain) for name, found in cameras.to_common.items()}
+    to = f"brought to those of {cameras.reference}"
+    return lines + [f"colours of {name} {to}: gain {gain}" for name, gain in gains.items()]
 
 
 def top_view(scene: Scene, cloud: FusedCloud, report: FusionReport) -> Image.Image:
     """The clouds from above, dynamic objects at the middle of their tracks."""
-    xyz, rgb = _placed(scene, cloud)
-    boxes = {track.id: _middle(track) for track in scene.tracks if report.verdicts[track.id].moving}
+    middles = {track.id: track.world_from_object[len(track.times_s) // 2] for track in scene.tracks}
+    boxes = {track_id: pose for track_id, pose in middles.items() if report.verdicts[track_id].moving}
+    placed = [
+        transform_points(middles[track_id], one.xyz.astype(np.float64)) for track_id, one in cloud.objects.items()
+    ]
+    xyz = np.concatenate([cloud.static.xyz.astype(np.float64), *placed])
+    rgb = np.concatenate([cloud.static.rgb, *(one.rgb for one in cloud.objects.values())])
     caption = f"{scene.id}: {len(xyz)} points, {len(boxes)} dynamic objects"
     dot_px = 2 if len(xyz) < 400_000 else 1
-    return draw_top_view(scene, TopView(xyz, rgb, boxes, caption, dot_px, outer_percent=1.0), *_TOP_VIEW_PX)
-
-
-def _middle(track: Track) -> NDArray[np.float64]:
-    return track.world_from_object[len(track.times_s) // 2]
-
-
-def _placed(scene: Scene, cloud: FusedCloud) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-    xyz, rgb = [cloud.static.xyz.astype(np.float64)], [cloud.static.rgb]
-    for track_id, points in cloud.objects.items():
-        pose = _middle(scene.track(track_id))
-        xyz.append(points.xyz.astype(np.float64) @ pose[:3, :3].T + pose[:3, 3])
-        rgb.append(points.rgb)
-    return np.concatenate(xyz), np.concatenate(rgb)
+    return draw_top_view(scene, _TOP_VIEW_PX, xyz, rgb, boxes, caption, dot_px=dot_px, outer_percent=1.0)

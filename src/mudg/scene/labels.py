@@ -18,7 +18,6 @@ from mudg.scene.schema import LABEL_NAMES, MAX_IMAGE_SIDE_PX
 
 _PNG_LABELS: Final = ("semantics", "sky", "ego", "dynamic", "rendered")
 """Kept as PNG, the rest as safetensors; all but the first are masks."""
-_CLASS_IDS: Final = (*range(19), palette.UNLABELLED)
 TRUSTED_LABELS: Final = 0.5
 """Labels with less confidence than this are given to no model."""
 
@@ -133,10 +132,9 @@ def _check_size(array: NDArray[Any], camera: Camera, where: str) -> None:
 
 
 def _check_class_ids(array: NDArray[Any], where: str) -> None:
-    wrong = [int(value) for value in np.unique(array) if value not in _CLASS_IDS]
-    if wrong:
-        expected, got = "0..18 or 255 (unlabelled)", str(wrong[:8])
-        raise InputError("semantics hold values that are no train id", where=where, expected=expected, got=got)
+    if wrong := palette.other_ids(array):
+        what, expected = "semantics hold values that are no train id", "0..18 or 255 (unlabelled)"
+        raise InputError(what, where=where, expected=expected, got=str(wrong))
 
 
 def _decode_grey(content: bytes, where: str) -> NDArray[np.uint8]:

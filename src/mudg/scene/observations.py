@@ -19,12 +19,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
 from mudg.base import store
 from mudg.base.errors import InputError
-from mudg.base.types import Camera, Observation, ObservationKind, View
+from mudg.base.types import Observation, ObservationKind, View
 from mudg.core.pictures import to_bytes
+from mudg.scene.read import decode_image
 from mudg.scene.schema import camera_to_json, parse_camera
 
 _INDEX = "observations.json"
@@ -157,7 +157,8 @@ class ObservationSet:
 
     def rgb_u8(self, index: int) -> NDArray[np.uint8]:
         """Colour u8[H, W, 3] of one observation."""
-        return read_image_file(self.path / "rgb" / f"{index:06d}.png", self.views[index].camera)
+        path = self.path / "rgb" / f"{index:06d}.png"
+        return decode_image(store.read_bytes(path), str(path), self.views[index].camera)
 
     def arrays(self, index: int) -> dict[str, NDArray[Any]]:
         """What the data file of one observation holds, as stored: confidence f16, mask u8, and where there are any
@@ -184,19 +185,6 @@ class ObservationSet:
         )
 
 
-def read_image_file(path: Path, camera: Camera) -> NDArray[np.uint8]:
-    """Read an 8-bit colour image u8[H, W, 3]; InputError if it is missing, truncated or of another size."""
-    content = store.read_bytes(path)
-    try:
-        with Image.open(io.BytesIO(content)) as image:
-            if image.size != (camera.width, camera.height):
-                what, expected = "an image has another size than its camera", f"{camera.width}x{camera.height}"
-                raise InputError(what, where=str(path), expected=expected, got=f"{image.size[0]}x{image.size[1]}")
-            return np.asarray(image.convert("RGB"))
-    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as error:
-        raise InputError("an image cannot be decoded", where=str(path), got=str(error)) from error
-
-
 def read_observations(path: Path) -> ObservationSet:
     """Open a folder of observations; nothing but the index is read.
 
@@ -214,19 +202,18 @@ def read_observations(path: Path) -> ObservationSet:
         records = content["observations"]
         if not records:
             raise InputError("no views are listed", where=str(index))
-        cameras = [_camera(r["camera"], f"{index}: observations[{i}].camera") for i, r in enumerate(records)]
+        cameras = [
+            parse_camera(str(r["camera"].pop("name")), r["camera"], f"{index}: observations[{i}].camera")
+            for i, r in enumerate(records)
+        ]
         poses = [np.asarray(r["world_from_cam"], np.float64) for r in records]
         views = tuple(View(c, p, float(r["time_s"])) for c, p, r in zip(cameras, poses, records, strict=True))
         has_depth, has_semantics = (tuple(bool(r[key]) for r in records) for key in ("depth", "semantics"))
         kind: ObservationKind = "recorded" if content["kind"] == "recorded" else "virtual"
         trajectory, source = str(content["trajectory"]), str(content["source"])
         return ObservationSet(Path(path), trajectory, source, kind, views, has_depth, has_semantics)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise InputError("a record of the index is malformed", where=str(index), got=repr(error)) from error
-
-
-def _camera(record: Any, where: str) -> Camera:
-    return parse_camera(str(record["name"]), {key: value for key, value in record.items() if key != "name"}, where)
 
 
 def list_observation_sets(path: Path) -> dict[str, Path]:

@@ -8,11 +8,9 @@ import hashlib
 import io
 import os
 import stat
-import zipfile
-import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,9 +22,7 @@ from mudg.base.types import Camera, Frame, Ref, Scene, Sweep, SweepPoints
 from mudg.scene import schema
 from mudg.scene.schema import parse_object, ref_problem
 
-# files ---------------------------------------------------------------------------------------------
-#
-# The bytes of a scene, from a directory or from a stored zip, behind one interface.
+# files --------------------------------------------------------------------------------------------
 #
 # Nothing outside the scene can be reached: references are checked as text, and on disk as real paths. What this package
 # wrote carries a manifest of sha256 sums, and every file read is compared with it: a flipped bit is an error, not a
@@ -38,46 +34,33 @@ READABLE: Final = "a readable file inside the scene"
 
 
 def open_files(path: Path | str) -> SceneFiles:
-    """Open a scene directory or a stored zip; the index is kept until the file changes.
-
-    Raises:
-        InputError: no such path, not a scene, or a zip that is damaged or not stored.
-    """
+    """Open a scene directory; its manifest is kept until the index changes. InputError: no such path, or no scene."""
     path = Path(path)
-    index = path / "scene.json" if path.is_dir() else path
+    index, manifest = path / "scene.json", path / store.MANIFEST
     try:
         state = index.stat()
-    except FileNotFoundError as error:
+    except (FileNotFoundError, NotADirectoryError) as error:
         if path.is_dir():
             remedy = "make one with `mudg ingest`; an interrupted ingest leaves no scene.json"
             what = "folder is not a scene: it has no scene.json"
             raise InputError(what, where=str(path), expected="a scene directory", remedy=remedy) from error
-        expected = "a scene directory or a stored zip of one"
-        raise InputError("scene does not exist", where=str(path), expected=expected) from error
+        raise InputError("scene does not exist", where=str(path), expected="a scene directory") from error
     except OSError as error:
         raise InputError("scene cannot be read", where=str(path), got=str(error)) from error
-    manifest = path / store.MANIFEST
-    manifest_state = manifest.stat().st_mtime_ns if path.is_dir() and manifest.is_file() else 0
-    return _open_cached(str(path.absolute()), state.st_mtime_ns, state.st_size, manifest_state)
-
-
-@functools.lru_cache(maxsize=16)
-def _open_cached(path: str, _mtime_ns: int, _size: int, _manifest_ns: int) -> SceneFiles:
-    return FolderFiles(path) if os.path.isdir(path) else ZipFiles(path)
+    written_ns = manifest.stat().st_mtime_ns if manifest.is_file() else 0
+    return _open_cached(str(path.absolute()), state.st_mtime_ns, state.st_size, written_ns)
 
 
 class SceneFiles:
     """Read access to the files of one scene, which are compared with the sha256 sums that were written with it."""
 
-    expected, remedy = "", ""
-
-    def __init__(self, root: str, manifest: bytes | None) -> None:
-        self.root = root
+    def __init__(self, root: str) -> None:
+        self.root, self._real_root = root, os.path.realpath(root)
         self._hashes: dict[str, str] = {}
-        where = f"{root}: {store.MANIFEST}"
+        where, manifest = f"{root}: {store.MANIFEST}", Path(root) / store.MANIFEST
         try:
-            if manifest is not None:
-                files = parse_object(manifest, where)["files"]
+            if manifest.is_file():
+                files = parse_object(store.read_bytes(manifest), where)["files"]
                 self._hashes = {str(name): str(entry["sha256"]) for name, entry in files.items()}
         except (InputError, KeyError, TypeError, AttributeError) as error:
             remedy = "ingest again, or delete the manifest if you edited the scene on purpose"
@@ -87,8 +70,9 @@ class SceneFiles:
         """All bytes of the file ``ref``, checked against the manifest where there is one."""
         problem, where = self.problem(ref), f"{self.root}: {ref}"
         if problem is not None:
-            raise InputError(problem, where=where, expected=self.expected, remedy=self.remedy)
-        content, expected = self._raw(ref), self._hashes.get(ref)
+            remedy = "restore the file or ingest the log again"
+            raise InputError(problem, where=where, expected=READABLE, remedy=remedy)
+        content, expected = store.read_bytes(Path(self.root) / ref), self._hashes.get(ref)
         if expected is not None and hashlib.sha256(content).hexdigest() != expected:
             what, expected = "a file differs from what was written", f"sha256 {expected[:16]}..."
             remedy = "restore the file or ingest again; delete manifest.json if you edited the scene on purpose"
@@ -101,27 +85,6 @@ class SceneFiles:
 
     def problem(self, ref: str) -> str | None:
         """Say why ``ref`` cannot be read (missing, outside the scene), or None. Cheap: nothing is opened."""
-        raise NotImplementedError
-
-    def _raw(self, ref: str) -> bytes:
-        raise NotImplementedError
-
-
-class FolderFiles(SceneFiles):
-    """A scene in a directory."""
-
-    expected, remedy = READABLE, "restore the file or ingest the log again"
-
-    def __init__(self, root: str) -> None:
-        self._real_root = os.path.realpath(root)
-        manifest = Path(root) / store.MANIFEST
-        super().__init__(root, store.read_bytes(manifest) if manifest.is_file() else None)
-
-    def _raw(self, ref: str) -> bytes:
-        return store.read_bytes(Path(self.root) / ref)
-
-    def problem(self, ref: str) -> str | None:
-        """As above."""
         text_problem = ref_problem(ref)
         if text_problem is not None:
             return f"file reference {text_problem}"
@@ -139,91 +102,12 @@ class FolderFiles(SceneFiles):
         return None
 
 
-class _ZipEntry(NamedTuple):
-    header_offset: int
-    size: int
-    crc: int
+@functools.lru_cache(maxsize=16)
+def _open_cached(path: str, _mtime_ns: int, _size: int, _manifest_ns: int) -> SceneFiles:
+    return SceneFiles(path)
 
 
-class ZipFiles(SceneFiles):
-    """A scene in a stored (not deflated) zip, read by offset: opening a frame costs one seek."""
-
-    expected = "a file inside the zip"
-
-    def __init__(self, root: str) -> None:
-        self.root, self._entries = root, self._index(root)
-        super().__init__(root, self._raw(store.MANIFEST) if store.MANIFEST in self._entries else None)
-
-    @staticmethod
-    def _index(root: str) -> dict[str, _ZipEntry]:
-        try:
-            with zipfile.ZipFile(store.regular(Path(root))) as archive:
-                infos = archive.infolist()
-        except (zipfile.BadZipFile, OSError, ValueError, NotImplementedError, EOFError) as error:
-            what, expected = "file is neither a scene directory nor a readable zip", "a stored zip of a scene directory"
-            remedy = "is it cut off? copy it again"
-            raise InputError(what, where=root, got=str(error), expected=expected, remedy=remedy) from error
-        entries: dict[str, _ZipEntry] = {}
-        for info in infos:
-            if info.is_dir():
-                continue
-            name = info.orig_filename
-            _check_entry(info, root)
-            if name in entries:
-                raise InputError("zip holds the same name twice", where=root, got=name, expected="each file once")
-            entries[name] = _ZipEntry(info.header_offset, info.file_size, info.CRC)
-        if "scene.json" in entries:
-            return entries
-        folders = {name.split("/", 1)[0] for name in entries if "/" in name}
-        if len(folders) == 1 and f"{next(iter(folders))}/scene.json" in entries:
-            prefix = f"{next(iter(folders))}/"
-            return {name.removeprefix(prefix): entry for name, entry in entries.items() if name.startswith(prefix)}
-        expected = "scene.json at the top of the zip"
-        raise InputError("zip is not a scene: it has no scene.json", where=root, expected=expected)
-
-    def _raw(self, ref: str) -> bytes:
-        entry, where = self._entries[ref], f"{self.root}: {ref}"
-        try:
-            with store.open_file(Path(self.root)) as handle:
-                handle.seek(entry.header_offset)
-                header = handle.read(30)
-                if len(header) != 30 or header[:4] != b"PK\x03\x04":
-                    raise InputError("zip is damaged", where=where, got="no local header where the index says")
-                name_length, extra_length = (int.from_bytes(header[n : n + 2], "little") for n in (26, 28))
-                handle.seek(name_length + extra_length, os.SEEK_CUR)
-                content = handle.read(entry.size)
-        except OSError as error:
-            raise InputError("zip cannot be read", where=where, got=str(error)) from error
-        if len(content) != entry.size or zlib.crc32(content) != entry.crc:
-            expected = f"{entry.size} bytes with CRC {entry.crc:08x}"
-            got = f"{len(content)} bytes with CRC {zlib.crc32(content):08x}"
-            raise InputError("zip is damaged", where=where, expected=expected, got=got, remedy="copy the zip again")
-        return content
-
-    def problem(self, ref: str) -> str | None:
-        """As above."""
-        return None if ref in self._entries else "a file is missing"
-
-
-def _check_entry(info: zipfile.ZipInfo, root: str) -> None:
-    """Refuse what a stored zip of a scene does not hold: names that lead out, compression, encryption, links."""
-    name = info.orig_filename
-    where, problem = f"{root}: {name}", ref_problem(name)
-    if problem is not None:
-        expected = "relative paths inside the scene"
-        raise InputError(f"zip entry {problem}", where=root, got=repr(name)[:120], expected=expected)
-    if info.flag_bits & 0x1:
-        raise InputError("zip entry is encrypted", where=where)
-    if info.compress_type != zipfile.ZIP_STORED:
-        expected, remedy = "a stored zip (no compression)", "unpack it, or write it with `zip -0`"
-        raise InputError("zip entry is compressed", where=where, expected=expected, remedy=remedy)
-    if info.file_size != info.compress_size or info.file_size > MAX_FILE_BYTES:
-        raise InputError("zip entry declares a size that cannot be", where=where, got=f"{info.file_size} bytes")
-    if stat.S_ISLNK(info.external_attr >> 16):
-        raise InputError("zip entry is a link", where=where, expected="plain files")
-
-
-# read ----------------------------------------------------------------------------------------------
+# read ---------------------------------------------------------------------------------------------
 
 
 _EXIF_ORIENTATION: Final = 0x0112
@@ -234,7 +118,7 @@ def read_scene(path: Path | str) -> Scene:
     """Read and check a scene; images, points and labels stay on disk until asked for.
 
     Args:
-        path: a scene directory, or a stored zip of one.
+        path: a scene directory.
 
     Raises:
         InputError: a record, reference or relation is wrong, or a referenced file is missing.
@@ -246,7 +130,7 @@ def read_scene(path: Path | str) -> Scene:
 def load_scene(path: Path | str, complain: schema.Complain) -> Scene:
     """``read_scene`` with a choice of what happens to a problem (see ``schema.py``)."""
     files = open_files(path)
-    where = f"{files.root}: scene.json" if Path(path).is_file() else str(Path(path) / "scene.json")
+    where = str(Path(path) / "scene.json")
     scene_json = schema.parse_object(files.read("scene.json"), where)
     tracks_json = None
     if files.problem("tracks.json") is None:
@@ -365,6 +249,18 @@ def read_points(scene: Scene, sweep: Sweep) -> SweepPoints:
     return checked_points(arrays, where)
 
 
+def sweeps_beside(scene: Scene, frame: Frame, max_gap_s: float) -> list[Sweep]:
+    """The nearest sweep of each LiDAR within ``max_gap_s`` seconds of the image, in the order of their distance in
+    time."""
+    nearest: dict[str, Sweep] = {}
+    for sweep in scene.sweeps:
+        best = nearest.get(sweep.sensor)
+        gap = abs(sweep.time_s - frame.view.time_s)
+        if gap <= max_gap_s and (best is None or gap < abs(best.time_s - frame.view.time_s)):
+            nearest[sweep.sensor] = sweep
+    return sorted(nearest.values(), key=lambda sweep: abs(sweep.time_s - frame.view.time_s))
+
+
 def checked_points(arrays: Mapping[str, NDArray[Any]], where: str) -> SweepPoints:
     """Points from the arrays ``xyz``, ``intensity``, ``dt_s`` and, if there, ``classes``.
 
@@ -372,27 +268,19 @@ def checked_points(arrays: Mapping[str, NDArray[Any]], where: str) -> SweepPoint
         InputError: wrong shape or type, values that are not finite, or classes that are no train ids.
     """
     count, classes = len(arrays["xyz"]), arrays.get("classes")
-    for name, shape in (("xyz", (count, 3)), ("intensity", (count,)), ("dt_s", (count,))):
+    wanted = {"xyz": ((count, 3), "float32"), **dict.fromkeys(("intensity", "dt_s"), ((count,), "float32"))}
+    wanted |= {} if classes is None else {"classes": ((count,), "uint8")}
+    for name, (shape, dtype) in wanted.items():
         array = arrays[name]
-        if array.shape != shape or array.dtype != np.float32:
-            expected, got = f"float32 {shape}", f"{array.dtype} {array.shape}"
+        if array.shape != shape or array.dtype != dtype:
+            expected, got = f"{dtype} {shape}", f"{array.dtype} {array.shape}"
             raise InputError(f"sweep tensor {name!r} has the wrong form", where=where, expected=expected, got=got)
         if not np.isfinite(array).all():
             bad = int((~np.isfinite(array.reshape(count, -1)).all(1)).sum())
             what, where = "sweep holds values that are not finite", f"{where}: {name}"
             remedy = "drop missing returns when importing"
             raise InputError(what, where=where, got=f"{bad} of {count} points", expected="finite metres", remedy=remedy)
-    if classes is not None:
-        _check_classes(classes, count, f"{where}: classes")
+    if classes is not None and (wrong := palette.other_ids(classes)):
+        what, expected = "classes of points hold values that are no train id", "0..18 or 255 (unlabelled)"
+        raise InputError(what, where=f"{where}: classes", expected=expected, got=str(wrong))
     return SweepPoints(arrays["xyz"], arrays["intensity"], arrays["dt_s"], classes)
-
-
-def _check_classes(classes: NDArray[Any], count: int, where: str) -> None:
-    """Refuse classes of points that are not u8[count] train ids or ``UNLABELLED``."""
-    if classes.shape != (count,) or classes.dtype != np.uint8:
-        expected, got = f"uint8 ({count},)", f"{classes.dtype} {classes.shape}"
-        raise InputError("sweep tensor 'classes' has the wrong form", where=where, got=got, expected=expected)
-    wrong = np.unique(classes[(classes >= len(palette.CLASSES)) & (classes != palette.UNLABELLED)])
-    if len(wrong):
-        expected, got = "0..18 or 255 (unlabelled)", str(wrong[:8].tolist())
-        raise InputError("classes of points hold values that are no train id", where=where, expected=expected, got=got)

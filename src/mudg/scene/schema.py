@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from mudg.base import store
-from mudg.base.errors import InputError
+from mudg.base.errors import InputError, short
 from mudg.base.records import Number, StrictRecord, after, checked_by, named_by, parse_record, place, refuse_unknown
 from mudg.base.types import Camera, EgoPath, Frame, Ref, Scene, Source, Sweep, Track, View, increasing_problem
 
@@ -124,15 +124,8 @@ def sixteen_numbers(value: Any) -> list[Any]:
         numbers = [number for row in value for number in row]
     if not isinstance(numbers, list) or len(numbers) not in (12, 16):
         expected = "12 or 16 numbers, row by row (world metres)"
-        raise InputError("pose is not a 3x4 or 4x4 matrix", expected=expected, got=_describe_shape(value))
+        raise InputError("pose is not a 3x4 or 4x4 matrix", expected=expected, got=short(repr(value), 80))
     return numbers if len(numbers) == 16 else [*numbers, 0.0, 0.0, 0.0, 1.0]
-
-
-def _describe_shape(value: object) -> str:
-    if not isinstance(value, list):
-        return type(value).__name__
-    lengths = {len(item) if isinstance(item, list) else 0 for item in value}
-    return f"a list of {len(value)}" + (f" lists of length {sorted(lengths)}" if lengths - {0} else " values")
 
 
 def _known_labels(value: Any) -> Any:
@@ -311,7 +304,7 @@ def parse_scene(
     Args:
         scene_json: content of ``scene.json``.
         tracks_json: content of ``tracks.json``; None when the scene has none.
-        root: where the files lie (folder or zip), kept in the Scene.
+        root: where the files lie, kept in the Scene.
         where: path of ``scene.json`` for messages.
         complain: called with each problem; raises in the strict reader. A record with a problem is left out.
 

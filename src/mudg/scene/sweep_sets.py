@@ -11,7 +11,7 @@ sweeps.json          schema, trajectory, sensor, shift in metres; one record per
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -74,20 +74,8 @@ class SweepSet:
 
 def write_index(sweeps: SweepSet) -> None:
     """Write ``sweeps.json``; without it the folder is not a finished set."""
-    records = [
-        {
-            "id": sweep.id,
-            "own_beams": sweep.own_beams,
-            "start_s": sweep.start_s,
-            "end_s": sweep.end_s,
-            "start": sweep.start.tolist(),
-            "end": sweep.end.tolist(),
-            "file": sweep.file,
-        }
-        for sweep in sweeps.sweeps
-    ]
     head = {"schema": SCHEMA, "trajectory": sweeps.trajectory, "sensor": sweeps.sensor, "shift_m": sweeps.shift_m}
-    store.write_json(sweeps.folder / INDEX, {**head, "sweeps": records})
+    store.write_json(sweeps.folder / INDEX, {**head, "sweeps": list(map(asdict, sweeps.sweeps))})
 
 
 def read_sweep_sets(folder: Path) -> dict[str, SweepSet]:

@@ -1,14 +1,12 @@
-"""Writing scenes: built beside their destination, moved into place when complete; and packed into one stored zip."""
+"""Writing scenes: built beside their destination, moved into place when complete."""
 
 from __future__ import annotations
 
 import hashlib
-import io
 import os
 import shutil
 import threading
-import zipfile
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
@@ -17,7 +15,6 @@ from typing import Any, Final, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from mudg.base import log, store
 from mudg.base.errors import InputError, ResourceError
@@ -26,7 +23,7 @@ from mudg.base.run_folder import all_names
 from mudg.base.types import Camera, EgoPath, Frame, Matrix, Photo, Ref, Scene, Source, Sweep, SweepPoints, Track, View
 from mudg.scene import schema
 from mudg.scene.labels import encode_label, encode_png, encode_safetensors, label_ref, read_label
-from mudg.scene.read import all_refs, check_image, checked_points, is_grey, open_files, read_points, read_scene
+from mudg.scene.read import check_image, checked_points, is_grey, open_files, read_points, read_scene
 
 _MAX_PENDING_WRITES: Final = 8
 
@@ -49,12 +46,11 @@ class SceneWriter:
             alone.
         scene_id: name of the scene.
         source: where the log comes from and under which licence.
-        jpeg_quality: store images given as arrays as JPEG of this quality instead of lossless PNG.
     """
 
-    def __init__(self, root: Path | str, scene_id: str, source: Source, jpeg_quality: int | None = None) -> None:
+    def __init__(self, root: Path | str, scene_id: str, source: Source) -> None:
         self.root = Path(root)
-        self._scene_id, self._source, self._jpeg_quality = scene_id, source, jpeg_quality
+        self._scene_id, self._source = scene_id, source
         if (self.root / "scene.json").exists():
             remedy = "choose another folder or remove it"
             raise InputError("there is a scene here already", where=str(self.root), remedy=remedy)
@@ -73,9 +69,8 @@ class SceneWriter:
         self._hashes: dict[str, dict[str, Any]] = {}
         self._grey: Counter[str] = Counter()
         self._lock = threading.Lock()
-        self._slots = threading.Semaphore(_MAX_PENDING_WRITES)
         self._pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="scene-writer")
-        self._futures: list[Future[None]] = []
+        self._pending: deque[Future[None]] = deque()
         self._finished = False
 
     def __enter__(self) -> SceneWriter:
@@ -123,9 +118,8 @@ class SceneWriter:
             if image.dtype != np.uint8 or image.shape != size:
                 expected, got = f"uint8 {size}", f"{image.dtype} {image.shape}"
                 raise InputError("image array has the wrong form", where=where, got=got, expected=expected)
-            pixels, quality = np.ascontiguousarray(image), self._jpeg_quality
-            ref = self._add_frame(frame_id, view, "png" if quality is None else "jpg")
-            self._submit(ref, lambda: encode_png(pixels) if quality is None else _jpeg(pixels, quality))
+            pixels = np.ascontiguousarray(image)
+            self._submit(self._add_frame(frame_id, view, "png"), lambda: encode_png(pixels))
         for name, array in (labels or {}).items():
             self.add_label(frame_id, name, array)
 
@@ -248,7 +242,7 @@ class SceneWriter:
 
     def finish(self) -> Scene:
         """Check relations, write the index, read it back, and move the scene into place."""
-        for future in self._futures:
+        for future in self._pending:
             future.result()
         self._pool.shutdown(wait=True)
         where = f"SceneWriter: {self.root}"
@@ -290,29 +284,16 @@ class SceneWriter:
             raise ResourceError("scene cannot be moved into place", where=str(self.root), got=str(error)) from error
 
     def _submit(self, ref: str, encode: Callable[[], bytes]) -> None:
-        self._raise_failed()
-        self._slots.acquire()
-
-        def job() -> None:
-            try:
-                self._write(ref, encode())
-            finally:
-                self._slots.release()
-
         with self._lock:
-            self._futures.append(self._pool.submit(job))
-
-    def _raise_failed(self) -> None:
-        with self._lock:
-            done = [future for future in self._futures if future.done()]
-            self._futures = [future for future in self._futures if not future.done()]
-        for future in done:
-            future.result()
+            self._pending.append(self._pool.submit(lambda: self._write(ref, encode())))
+            waited_for = self._pending.popleft() if len(self._pending) > _MAX_PENDING_WRITES else None
+        if waited_for is not None:
+            waited_for.result()
 
     def _write(self, ref: str, content: bytes) -> None:
         store.write_in_tree(self._partial / ref, content)
         with self._lock:
-            self._hashes[ref] = _manifest_entry(content)
+            self._hashes[ref] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
 
 
 def _partial_folder(root: Path) -> Path:
@@ -330,54 +311,11 @@ def _partial_folder(root: Path) -> Path:
     return parent / f"{prefix}{os.getpid()}-{threading.get_ident()}.part"
 
 
-def _manifest_entry(content: bytes) -> dict[str, Any]:
-    return {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
-
-
 def _sweep_ref(sweep_id: str) -> Ref:
     return Ref(f"lidar/{sweep_id}.safetensors")
 
 
-def _jpeg(array: NDArray[np.uint8], quality: int) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(array).save(buffer, "JPEG", quality=quality, subsampling=0)
-    return buffer.getvalue()
-
-
-def write_zip(scene_dir: Path | str, zip_path: Path | str) -> Path:
-    """Pack a scene directory into one portable file: a stored zip (members are read by offset); returns ``zip_path``.
-
-    The scene is read first, so that a broken one is refused. Bookkeeping of the run that made it is left out.
-    """
-    scene_dir, zip_path = Path(scene_dir), Path(zip_path)
-    if not scene_dir.is_dir():
-        raise InputError("only a scene directory can be packed", where=str(scene_dir))
-    scene = read_scene(scene_dir)
-    names = ["scene.json", *sorted({ref.path for _, ref in all_refs(scene)})]
-    names[1:1] = ["tracks.json"] if (scene_dir / "tracks.json").is_file() else []
-    files = open_files(scene_dir)
-    listed = {}
-    with store.atomic_path(zip_path) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as archive:
-        for name in names:
-            content = files.read(name)
-            listed[name] = _manifest_entry(content)
-            archive.writestr(zipfile.ZipInfo(name), content)
-        archive.writestr(zipfile.ZipInfo(store.MANIFEST), store.json_text({"schema": 1, "files": listed}))
-    return zip_path
-
-
-# part ----------------------------------------------------------------------------------------------
-#
-# A part of a scene as a scene of its own: some frames and sweeps as they are, and frames of which only the place is
-# told.
-#
-# For measurements on held-out frames. What is held out is not in the files: an image is replaced by a black one, labels
-# and sweeps are left out, and so are the classes of LiDAR points, which are truth that is scored, and the recipe by
-# which a generated city could be drawn again. Whatever reads the part cannot have seen more.
-
-
-# a scene made of photographs at hand: for short fits to a part of a log, or to pictures that nobody took --------------
-
+# some photographs, for short fits to a part of a log, or to pictures that nobody took ---------------------------------
 
 PlacedSweep = tuple[str, float, Matrix, SweepPoints]
 """Sensor, time in seconds, world_from_lidar f64[4,4], points."""
@@ -415,7 +353,11 @@ def write_photos(
         writer.finish()
 
 
-# part ---------------------------------------------------------------------------------------------
+# a part of a scene, for measurements on held-out frames ---------------------------------------------------------------
+#
+# What is held out is not in the files: an image is replaced by a black one, labels and sweeps are left out, and so are
+# the classes of LiDAR points, which are truth that is scored, and the recipe by which a generated city could be drawn
+# again. Whatever reads the part cannot have seen more.
 
 
 def write_part(

@@ -97,20 +97,16 @@ class BatchProgress(Step):
     """Show how far a batch is, what failed and what it took."""
 
     verb_name = "batch status"
-    examples = ("mudg batch status runs --html --price 0.04",)
+    examples = ("mudg batch status runs --watch-s 60",)
     out: Annotated[str, OUT]
     """Folder or address of a batch."""
-    html: bool = False
-    """Also write OUT/status.html, with figures of the logs."""
     watch_s: float = 0.0
     """Show it again every so many seconds, until nothing is left (0 = once)."""
-    price: float = 0.0
-    """Price of one core-hour."""
 
     def act(self) -> dict[str, Any]:
         from mudg.steps import batching
 
-        return batching.show_status(self.out, self.html, self.price, self.watch_s)
+        return batching.show_status(self.out, self.watch_s)
 
 
 class BatchRetry(Step):

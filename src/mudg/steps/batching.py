@@ -168,16 +168,12 @@ def _with_absolute_paths(values: Any) -> Any:
     return os.path.abspath(values) if is_path else values
 
 
-def show_status(out: str, html: bool = False, price: float = 0.0, every_s: float = 0.0) -> dict[str, Any]:
-    """How far a batch is, what has failed and what it took. ``html``: also write ``status.html`` in its folder.
-    ``price``: of a core-hour. ``every_s``: show it again until nothing is left (0: once)."""
+def show_status(out: str, every_s: float = 0.0) -> dict[str, Any]:
+    """How far a batch is, what has failed and what it took. ``every_s``: show it again until nothing is left (0:
+    once)."""
     while True:
-        state = status.read_status(BatchFolder(Location.of(out)), price)
+        state = status.read_status(BatchFolder(Location.of(out)))
         result: dict[str, Any] = {**state.record(), "text": status.text_of(state)}
-        if html:
-            page = Location.of(out) / "status.html"
-            page.save(status.page_of(state).encode())
-            result |= {"page": str(page), "text": f"{result['text']}\npage: {page}"}
         if every_s <= 0 or not result["left"]:
             return result
         log.info(*result["text"].splitlines())

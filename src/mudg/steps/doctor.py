@@ -11,17 +11,13 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from mudg.base import memory
 from mudg.base.errors import plain_lines
 from mudg.base.plugins import origin, plugins
 from mudg.base.versions import installed, version
 from mudg.steps.step import Flag, Step
 
 if TYPE_CHECKING:
-    from mudg.base.types import Scene
     from mudg.scene.check import Finding
-    from mudg.steps.cost import SceneSize
-    from mudg.steps.settings import RunConfig
 
 
 class Doctor(Step):
@@ -79,13 +75,12 @@ def report_machine() -> dict[str, Any]:
 
 
 def report_scene(scene: Path) -> dict[str, Any]:
-    """Check a scene directory or zip, that of a run, or a log in the neutral layout, and say in words what is wrong or
+    """Check a scene directory, that of a run, or a log in the neutral layout, and say in words what is wrong or
     odd.
 
     Returns:
         Plain values for ``--json``; ``text`` is the same for people; ``exit_code`` is 3 if it cannot be used. Of a
-        sound scene, ``alignment`` tells for each camera whether LiDAR and image edges agree, and ``presets`` what every
-        preset of ``mudg run`` will take.
+        sound scene, ``alignment`` tells for each camera whether LiDAR and image edges agree.
     """
     from mudg.editing.runs import scene_of_run
     from mudg.formats.importers import RECOGNISERS
@@ -101,82 +96,23 @@ def report_scene(scene: Path) -> dict[str, Any]:
         found = [Finding("error", str(scene), words)]
     alignment: dict[str, Any] = {}
     agreements: list[str] = []
-    costs, cost_lines = {}, []
     if not is_log and not any(f.level == "error" for f in found):
         alignment, agreements, doubts = _alignment(scene)
         found = worst_first([*found, *doubts])
-        costs, cost_lines = _costs(scene)
     count = {level: sum(f.level == level for f in found) for level in ("error", "warning", "note")}
     lines = [f"{f.level}: {f.where}: {f.message}" for f in found] + agreements
     if count["error"]:
         lines.append(f"{scene} cannot be used: {count['error']} errors, {count['warning']} warnings")
     else:
         lines.append(f"{scene} can be used: {count['warning']} warnings, {count['note']} notes")
-    lines += cost_lines
     return {
         "scene": scene,
         "findings": [{"level": f.level, "where": f.where, "words": f.message} for f in found],
         "alignment": alignment,
-        "presets": costs,
         "usable": not count["error"],
         "text": plain_lines(lines),
         "exit_code": 3 if count["error"] else 0,
     }
-
-
-def _costs(path: Path) -> tuple[dict[str, Any], list[str]]:
-    """What every preset would take on a scene on this machine's CPU and, if there is one, its first CUDA card: for
-    JSON, and in words."""
-    import torch
-
-    from mudg import native
-    from mudg.core.raster import rasterize as probe
-    from mudg.scene.read import read_scene
-    from mudg.steps import cost
-    from mudg.steps.settings import PRESETS
-
-    scene = read_scene(path)
-    if not scene.sweeps:
-        return {}, ["no preset of `mudg run` applies: the log has no LiDAR"]
-    cores = native.default_threads()
-    size, speed = scene_size(scene), probe.speed().now
-    devices = {"cpu": memory.free_bytes()}
-    if torch.cuda.is_available():
-        devices["cuda"] = torch.cuda.mem_get_info()[0]
-    disk = shutil.disk_usage(Path.cwd()).free
-    records: dict[str, Any] = {}
-    lines, names = [], ("seconds", "total_s", "memory_bytes", "written_bytes", "processor_s")
-    for device, free in devices.items():
-        found = cost.of_presets(size, cores, speed, device)
-        lines += cost.in_words(found, free, device, disk)
-        records[device] = {
-            name: {key: getattr(one, key) for key in names} | {"fits": one.fits(free, disk) if free else None}
-            for name, one in found.items()
-        }
-    log_px = int(str(PRESETS["fast"]["ingest.resolution"]))
-    if max(size.width, size.height) > log_px and not size.exact:
-        makes = f"--preset fast makes images {log_px} pixels wide and takes less"
-        lines.append(f"of the log itself, in place of this scene, {makes}")
-    beside = f"{speed:.2f} of the one that forecasts were measured on, {cores} threads"
-    lines.append(f"speed of this machine at the moment: {beside}")
-    return records, lines
-
-
-def scene_size(scene: Scene, config: RunConfig | None = None) -> SceneSize:
-    """What forecasts depend on. The first sweep stands for all. config: of the run, whose cameras are shifted (None:
-    the first)."""
-    from mudg.scene.read import read_points
-    from mudg.steps.cost import SceneSize
-    from mudg.steps.settings import run_preset
-
-    first = scene.frames[0].view.camera
-    points = len(read_points(scene, scene.sweeps[0]).xyz) if scene.sweeps else 0
-    exact = scene.source.recipe is not None
-    config = config or run_preset()
-    cameras = [name for name in config.synthesize.cameras or (first.name,) if name in scene.cameras]
-    on_path = sum(len(scene.frames_of(name)) for name in cameras)
-    labelled = all("semantics" in frame.labels for frame in scene.frames)
-    return SceneSize(len(scene.frames), on_path, first.width, first.height, points, exact, labelled)
 
 
 def _alignment(path: Path) -> tuple[dict[str, Any], list[str], list[Finding]]:

@@ -89,7 +89,7 @@ class Ingest(Output):
 
     def reads(self) -> dict[str, Path | str | None]:
         if self.log != "city" and not Path(self.log).exists():
-            where, expected = str(self.log), "a folder, a scene zip, or the word city"
+            where, expected = str(self.log), "a folder, or the word city"
             remedy = similar_path(self.log)
             raise InputError("driving log does not exist", where=where, expected=expected, remedy=remedy)
         from mudg.formats import ingest

@@ -166,7 +166,7 @@ def _refuse_overlap(config: RunConfig, source: str | Path, out: Path) -> None:
 
 
 def _is_scene(source: str | Path) -> bool:
-    return (Path(source) / "scene.json").is_file() or str(source).endswith(".zip")
+    return (Path(source) / "scene.json").is_file()
 
 
 def _is_own_scene(source: str | Path, out: Path) -> bool:
@@ -184,28 +184,10 @@ def _prepare_scene(config: RunConfig, source: str | Path, out: Path, ledger: _Le
         settings = replace(config.ingest, resolution="") if str(source) == CITY and of_preset else config.ingest
         ingest = Ingest(log=str(source), out=out / "scene", overwrite=overwrite, settings=settings)
         scene = ledger.timed("ingest", ingest.out, ingest.run)
-    if not ledger.has_done("fuse"):
-        said, ledger.expected_s = _forecast(config, scene)
-        log.info(said)
     if not _has_semantics(scene):
         step = Annotate(scene=scene, out=out / "annotate", overwrite=overwrite, settings=config.annotate)
         return ledger.timed("annotate", step.out, step.run)
     return scene
-
-
-def _forecast(config: RunConfig, scene: Path) -> tuple[str, Mapping[str, float | None]]:
-    """A line on what the steps from here on will take, and the seconds of each on the machine as it is now."""
-    from mudg import native
-    from mudg.base import devices
-    from mudg.core.raster import rasterize as probe
-    from mudg.scene.read import read_scene
-    from mudg.steps import cost
-    from mudg.steps.doctor import scene_size
-
-    size, cores, speed = scene_size(read_scene(scene), config), native.default_threads(), probe.speed()
-    kind = "cpu" if config.device == "cpu" or devices.usual_device() == "cpu" else "cuda"
-    idle, now = (cost.estimate(config, size, cores, one, kind) for one in (speed.idle, speed.now))
-    return cost.in_a_line(idle, now), now.seconds
 
 
 def _has_semantics(scene: Path) -> bool:
@@ -289,8 +271,6 @@ class _Ledger:
         self.digests: dict[str, str] = {}
         self.ahead: list[str] = []
         """Names of the steps on a labelled scene, once they are known."""
-        self.expected_s: Mapping[str, float | None] = {}
-        """Forecast of steps by name."""
 
     @classmethod
     def open(cls, out: Path, config: RunConfig, source: str, overwrite: bool) -> _Ledger:
@@ -361,19 +341,9 @@ class _Ledger:
         return self._steps.get(step, {}).get("state") == "complete"
 
     def _standing(self, name: str) -> str:
-        """Which step of how many this is, and what is left: the forecast, corrected by what finished steps took."""
-        if name not in self.ahead:
-            return name
-        from mudg.steps import cost
-
-        at, known = self.ahead.index(name), {key: value for key, value in self.expected_s.items() if value}
-        done = [one for one in self.ahead[:at] if one in known]
-        place = f"{name}, step {at + 1} of {len(self.ahead)}"
-        if not set(self.ahead[at:]) & known.keys():
-            return place
-        taken = sum(self._steps[one]["seconds"] for one in done)
-        pace = taken / sum(known[one] for one in done) if done and taken else 1.0
-        return f"{place}, about {cost.duration(pace * sum(known.get(one, 0.0) for one in self.ahead[at:]))} left"
+        """A step, and which of how many it is."""
+        number = f", step {self.ahead.index(name) + 1} of {len(self.ahead)}" if name in self.ahead else ""
+        return name + number
 
     def _show(self, state: str) -> None:
         """Write the page of the unfinished run, but not over a report."""

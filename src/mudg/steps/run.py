@@ -29,7 +29,7 @@ class Run(Output):
     model (docs/presets.md)."""
     fast: bool = False
     """The same as --preset fast: images of a log 480 pixels wide, 3 m to each side. One to two minutes on 2 cores for
-    16 frames of one camera; a line at the start forecasts what it takes here."""
+    16 frames of one camera."""
     seed: Annotated[int | None, Flag("INT")] = None
     """Seed of all random numbers in all steps (not given: city 3 and seed 0, or the values in --config)."""
     cameras: tuple[str, ...] = ()

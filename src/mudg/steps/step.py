@@ -341,13 +341,13 @@ def options(cls: type[Any], base: Any = None) -> Iterator[Option]:
         yield from _setting_options(kind, kind() if base is None else base, "")
 
 
-def _setting_options(group: Any, values: Any, path: str, fixed: Sequence[str] = ()) -> Iterator[Option]:
+def _setting_options(group: Any, values: Any, path: str) -> Iterator[Option]:
     texts, types = texts_of(group), hints(group)
     for field in fields(group):
         value, name = getattr(values, field.name), f"{path}{field.name}"
         if is_dataclass(value):
-            yield from _setting_options(type(value), value, f"{name}.", getattr(group, "FIXED", {}).get(field.name, ()))
-        elif field.name not in fixed:
+            yield from _setting_options(type(value), value, f"{name}.")
+        else:
             kind = types[field.name]
             # constraints do not matter to the command line
             kind = get_args(kind)[0] if get_origin(kind) is Annotated else kind
